@@ -1,0 +1,137 @@
+"""The contracts: what a source, detector, SLAM module and sink must do.
+
+All poses are (4, 4) float64, metres, REP-103 axes. Calls come from one thread, in the order
+`activate`, then the rest, then `shutdown`. An expected failure is a value (`LOST`, `UNSURE`);
+an exception means a broken promise, and the bus stops the component for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Protocol, runtime_checkable
+
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.observation import Observation, SceneVote, Tracking
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.se3 import Transform
+from sceneslam.types.truth import GroundTruth
+
+
+@runtime_checkable
+class Source(Protocol):
+    """A recording, simulator or live robot."""
+
+    @property
+    def rig(self) -> Rig:
+        """Return the sensors, known before the first observation; raises InputError else."""
+        ...
+
+    @property
+    def length(self) -> int | None:
+        """Return how many observations there will be (for progress), None when unknown."""
+        ...
+
+    @property
+    def faults(self) -> Sequence[str]:
+        """Return, after reading, one sentence per kind of damage found in the input."""
+        ...
+
+    def __iter__(self) -> Iterator[Observation]:
+        """Yield observations from the beginning, by rising stamp; every call starts anew.
+
+        Raises InputError where the input cannot be read on; what came before stays valid.
+        """
+        ...
+
+    def ground_truth(self) -> GroundTruth | None:
+        """Return what is known to be true, None when nothing is. Never shown to a module."""
+        ...
+
+
+@runtime_checkable
+class Detector(Protocol):
+    """Names the scene around the robot."""
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """Return every scene that this detector can report."""
+        ...
+
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return the sets of sensors that suffice, one of which the source must have."""
+        ...
+
+    def activate(self, rig: Rig) -> None:
+        """Get ready for observations of `rig`."""
+        ...
+
+    def get_scene(self, observation: Observation) -> SceneVote:
+        """Return this observation's vote; UNSURE when it holds nothing to vote on."""
+        ...
+
+    def shutdown(self) -> None:
+        """Free what `activate` took. May be called twice."""
+        ...
+
+
+@runtime_checkable
+class SlamModule(Protocol):
+    """Estimates the robot's motion in a frame of its own, and maps on the way.
+
+    `local` is the robot's base at the first observation after `activate`: there T_local_base is
+    the identity. `T_map_local` (the paper's T_conversion) places it in the world.
+    """
+
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return the sets of sensors that suffice, one of which the source must have."""
+        ...
+
+    def activate(self, rig: Rig) -> None:
+        """Start anew: empty map, `local` at the next observation."""
+        ...
+
+    def set_pose(self, T_map_local: Transform) -> None:
+        """Place `local` in the map (Eq. 1)."""
+        ...
+
+    def set_scene(self, scene: str) -> None:
+        """Hear of the confirmed scene; a module may change its mode for it."""
+        ...
+
+    def track(self, observation: Observation) -> Tracking:
+        """Return T_local_base at the observation, which holds one of the `requires` sets.
+
+        LOST: the pose is the last one that was held. Never returns NaN.
+        """
+        ...
+
+    def get_pose(self) -> Transform:
+        """Return T_map_base = T_map_local @ T_local_base of the last observation (Eq. 2)."""
+        ...
+
+    def get_map(self) -> MapLayers:
+        """Return the map in `local`. May be slow; not called for every observation."""
+        ...
+
+    def shutdown(self) -> None:
+        """Free what `activate` took. The map stays readable. May be called twice."""
+        ...
+
+
+@runtime_checkable
+class Sink(Protocol):
+    """Receives what the bus decides, while it runs."""
+
+    def open(self, rig: Rig) -> None:
+        """Get ready to write."""
+        ...
+
+    def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
+        """Take one observation with its pose (None when there is none) and active module."""
+        ...
+
+    def close(self) -> None:
+        """Finish the output so that it can be read, also after an error. May be called twice."""
+        ...

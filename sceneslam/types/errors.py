@@ -1,0 +1,30 @@
+"""What can go wrong, each as one sentence that a user can act on."""
+
+from __future__ import annotations
+
+
+class SceneSlamError(Exception):
+    """Root of all errors that SceneSLAM raises on purpose."""
+
+
+class InputError(SceneSlamError):
+    """A recording, file or sensor stream is not what it has to be."""
+
+
+class ConfigError(SceneSlamError):
+    """A configuration key is unknown, missing or has a value that is not allowed."""
+
+    def __init__(self, key: str, value: object, allowed: str) -> None:
+        super().__init__(key, value, allowed)
+        self.key, self.value, self.allowed = key, value, allowed
+
+    def __str__(self) -> str:
+        return f"{self.key}: got {self.value!r}, allowed: {self.allowed}"
+
+    def under(self, prefix: str) -> ConfigError:
+        """Return the same error with its key below `prefix` (`policy` + `confirm_window_s`)."""
+        return ConfigError(f"{prefix}.{self.key}" if self.key else prefix, self.value, self.allowed)
+
+
+class ModuleError(SceneSlamError):
+    """A SLAM module or detector broke its contract and was stopped."""

@@ -1,0 +1,92 @@
+"""What the sensors saw at one instant, and what is made of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.rig import Sensor
+from sceneslam.types.se3 import Transform
+
+UNSURE = "Unsure"  # the scene of a vote that could not be cast
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LaserScan:
+    """One sweep of a planar laser, counter-clockwise."""
+
+    stamp_ns: int  # of the first beam
+    ranges_m: NDArray[np.float32]  # (N,); inf: no return within range; NaN: no measurement
+    angle_min_rad: float
+    angle_step_rad: float
+    range_min_m: float
+    range_max_m: float
+
+    @property
+    def angles_rad(self) -> NDArray[np.float32]:
+        """Return the beams' angles (N,) [rad] in the laser frame."""
+        count = np.arange(len(self.ranges_m), dtype=np.float32)
+        return np.asarray(self.angle_min_rad + self.angle_step_rad * count, dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Observation:
+    """All that a source measured at one stamp; a sensor that was silent is None.
+
+    One observation gets one pose in the trajectory. Arrays are read-only.
+    """
+
+    stamp_ns: int
+    image_bgr: NDArray[np.uint8] | None = None  # (H, W, 3)
+    depth_m: NDArray[np.float32] | None = None  # (H, W), registered to the image, 0 = missing
+    scan: LaserScan | None = None
+    points_lidar: NDArray[np.float32] | None = None  # (N, 3) [m], lidar frame
+    point_times_s: NDArray[np.float64] | None = None  # (N,) after stamp_ns, for deskewing
+    T_odom_base: Transform | None = None  # wheel odometry: smooth, drifting frame `odom`
+    gyro_base: NDArray[np.float64] | None = None  # (M, 4): t - stamp [s], rate [rad/s]
+
+    def has(self, sensor: Sensor) -> bool:
+        """Tell whether this observation holds a measurement of `sensor`."""
+        return getattr(self, _FIELD[sensor]) is not None
+
+
+_FIELD = {
+    Sensor.IMAGE: "image_bgr",
+    Sensor.DEPTH: "depth_m",
+    Sensor.SCAN: "scan",
+    Sensor.POINTS: "points_lidar",
+    Sensor.ODOMETRY: "T_odom_base",
+    Sensor.GYRO: "gyro_base",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneVote:
+    """What a detector takes one observation to show."""
+
+    stamp_ns: int
+    scene: str  # one of the detector's scenes, or UNSURE
+    value: float = float("nan")  # what the detector measured (grey mean, probability, ...)
+
+
+class TrackingStatus(Enum):
+    """How far a module's pose can be trusted."""
+
+    TRACKING = "tracking"
+    DEGRADED = "degraded"  # a pose, but some direction is not held by the measurements
+    LOST = "lost"  # no pose for this observation; T_local_base is the last one that was held
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Tracking:
+    """A module's answer to one observation."""
+
+    stamp_ns: int
+    T_local_base: Transform  # the paper's T_local
+    status: TrackingStatus
+    covariance: NDArray[np.float64] | None = None  # (6, 6) of se3.log order [m, rad], base frame
+    quality_ratio: float = 1.0  # 0 (nothing matched) to 1
+    inliers: int = 0  # measurements that agree with the pose

@@ -1,0 +1,71 @@
+"""What sensors a robot carries and where they sit on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.se3 import Transform, identity
+
+
+class Sensor(Enum):
+    """One kind of measurement that an observation can hold."""
+
+    IMAGE = "image"
+    DEPTH = "depth"
+    SCAN = "scan"
+    POINTS = "points"
+    ODOMETRY = "odometry"
+    GYRO = "gyro"
+
+
+def optical_to_rep103() -> Transform:
+    """Return T_base_cam of a camera that looks along base x (optical: x right, y down)."""
+    return np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=float)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Camera:
+    """A pinhole camera; its depth, where it has one, is registered to its image."""
+
+    size_wh: tuple[int, int]  # [px]
+    fx: float  # [px]
+    fy: float  # [px]
+    cx: float  # [px], pixel centres at whole numbers
+    cy: float  # [px]
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1 k2 p1 p2 k3 (OpenCV, plumb_bob)
+    depth_range_m: tuple[float, float] = (0.3, 8.0)  # depths outside are missing
+    T_base_cam: Transform = field(default_factory=optical_to_rep103)
+
+    @property
+    def K(self) -> NDArray[np.float64]:
+        """Return the (3, 3) intrinsic matrix [px]."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Laser:
+    """A planar laser scanner; beams lie in the laser frame's xy plane."""
+
+    T_base_laser: Transform = field(default_factory=identity)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Lidar:
+    """A scanner that gives 3D points."""
+
+    range_m: tuple[float, float] = (1.0, 100.0)
+    T_base_lidar: Transform = field(default_factory=identity)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rig:
+    """The sensors of a source. `sensors` names what its observations can hold."""
+
+    sensors: frozenset[Sensor]
+    camera: Camera | None = None
+    laser: Laser | None = None
+    lidar: Lidar | None = None

@@ -1,0 +1,49 @@
+"""What a run leaves behind, in memory: the input of evaluation, figures and report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.maps import HybridMap
+from sceneslam.types.se3 import Transform
+from sceneslam.types.trajectory import Trajectory
+
+Event = Mapping[str, Any]  # one line of events.jsonl: `event` (kind), `stamp_ns`, and its own keys
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Session:
+    """One activation of one module."""
+
+    index: int
+    module: str  # its key in `slam`
+    T_map_local: Transform  # the paper's T_conversion
+    trajectory: Trajectory  # T_local_base
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Timings:
+    """What things cost by the wall clock; not part of the deterministic output."""
+
+    detector_us: NDArray[np.float64]  # per observation
+    bus_us: NDArray[np.float64]  # per observation, all but detector and module
+    module_ms: Mapping[str, NDArray[np.float64]]  # per observation that the module tracked
+    wall_s: float  # the whole loop, reading included
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RunResult:
+    """Everything the bus and the atlas produced."""
+
+    observed_ns: NDArray[np.int64]  # stamps of all observations fed
+    trajectory: Trajectory  # T_map_base
+    modules: Sequence[str]  # per pose: key of the module that gave it, "" where it was bridged
+    sessions: Sequence[Session]
+    map: HybridMap
+    events: Sequence[Event]
+    timings: Timings

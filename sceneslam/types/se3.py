@@ -1,0 +1,170 @@
+"""Rigid transforms as 4x4 float64 matrices: `T_a_b` takes b coordinates to a."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Transform = NDArray[np.float64]  # (4, 4), rigid
+Vector = NDArray[np.float64]
+
+
+def identity() -> Transform:
+    """Return the transform that moves nothing."""
+    return np.eye(4)
+
+
+def from_parts(rotation: NDArray[np.float64], translation_m: NDArray[np.float64]) -> Transform:
+    """Return T from a (3, 3) rotation and a (3,) translation [m]."""
+    T_a_b = np.eye(4)
+    T_a_b[:3, :3] = rotation
+    T_a_b[:3, 3] = translation_m
+    return T_a_b
+
+
+def from_xy_yaw(x_m: float, y_m: float, yaw_rad: float) -> Transform:
+    """Return the planar motion (x, y, yaw) as a transform."""
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    T_a_b = np.eye(4)
+    T_a_b[:2, :2] = [[c, -s], [s, c]]
+    T_a_b[:2, 3] = x_m, y_m
+    return T_a_b
+
+
+def yaw_rad(T_a_b: Transform) -> float:
+    """Return the rotation about z [rad] (REP-103: x forward, z up)."""
+    return float(np.arctan2(T_a_b[1, 0], T_a_b[0, 0]))
+
+
+def inverse(T_a_b: Transform) -> Transform:
+    """Return T_b_a; works on a stack (..., 4, 4) too."""
+    rotation_t = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
+    T_b_a = np.zeros_like(T_a_b)
+    T_b_a[..., :3, :3] = rotation_t
+    T_b_a[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation_t, T_a_b[..., :3, 3])
+    T_b_a[..., 3, 3] = 1.0
+    return T_b_a
+
+
+def apply(T_a_b: Transform, points_b: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return points (N, 3) of b in a, in the points' own dtype."""
+    rotation = T_a_b[:3, :3].astype(points_b.dtype)
+    return np.asarray(points_b @ rotation.T + T_a_b[:3, 3].astype(points_b.dtype))
+
+
+def rotation_angle_rad(T_a_b: Transform) -> NDArray[np.float64]:
+    """Return the angle of the rotation in [0, pi]; works on a stack (..., 4, 4).
+
+    From sine and cosine together, which stays exact for angles near 0 and pi.
+    """
+    r = T_a_b[..., :3, :3]
+    vee = np.stack(
+        [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]],
+        axis=-1,
+    )
+    sine = 0.5 * np.linalg.norm(vee, axis=-1)
+    cosine = 0.5 * (np.trace(r, axis1=-2, axis2=-1) - 1.0)
+    return np.asarray(np.arctan2(sine, cosine))
+
+
+def so3_exp(rotvec_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the (3, 3) rotation by the vector (3,) [rad] (Rodrigues)."""
+    angle = float(np.linalg.norm(rotvec_rad))
+    k = _hat(rotvec_rad)
+    if angle < 1e-8:
+        return np.eye(3) + k + 0.5 * k @ k
+    a = np.sin(angle) / angle
+    b = (1.0 - np.cos(angle)) / angle**2
+    return np.asarray(np.eye(3) + a * k + b * k @ k)
+
+
+def so3_log(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation vector (3,) [rad] of a (3, 3) rotation."""
+    x, y, z, w = to_quat_xyzw(from_parts(rotation, np.zeros(3)))
+    vector = np.array([x, y, z])
+    sine = float(np.linalg.norm(vector))
+    if sine < 1e-12:
+        return 2.0 * vector
+    return np.asarray(vector * (2.0 * np.arctan2(sine, w) / sine))
+
+
+def exp(xi: NDArray[np.float64]) -> Transform:
+    """Return the transform of the twist (6,): translation [m] first, then rotation [rad]."""
+    rho, phi = xi[:3], xi[3:]
+    return from_parts(so3_exp(phi), _left_jacobian(phi) @ rho)
+
+
+def log(T_a_b: Transform) -> NDArray[np.float64]:
+    """Return the twist (6,) of a transform: translation [m] first, then rotation [rad]."""
+    phi = so3_log(T_a_b[:3, :3])
+    rho = np.linalg.solve(_left_jacobian(phi), T_a_b[:3, 3])
+    return np.concatenate([rho, phi])
+
+
+def interpolate(T_w_0: Transform, T_w_1: Transform, ratio: float) -> Transform:
+    """Return the pose at `ratio` of the way from 0 to 1 (straight line, slerp)."""
+    step = so3_log(T_w_0[:3, :3].T @ T_w_1[:3, :3])
+    rotation = T_w_0[:3, :3] @ so3_exp(ratio * step)
+    return from_parts(rotation, (1.0 - ratio) * T_w_0[:3, 3] + ratio * T_w_1[:3, 3])
+
+
+def from_quat_xyzw(translation_m: NDArray[np.float64], quat_xyzw: NDArray[np.float64]) -> Transform:
+    """Return T from (..., 3) translations [m] and (..., 4) quaternions, normalised here."""
+    q = quat_xyzw / np.linalg.norm(quat_xyzw, axis=-1, keepdims=True)
+    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    T_a_b = np.zeros((*q.shape[:-1], 4, 4))
+    T_a_b[..., 0, :3] = np.stack(
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], -1
+    )
+    T_a_b[..., 1, :3] = np.stack(
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], -1
+    )
+    T_a_b[..., 2, :3] = np.stack(
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], -1
+    )
+    T_a_b[..., :3, 3] = translation_m
+    T_a_b[..., 3, 3] = 1.0
+    return T_a_b
+
+
+def to_quat_xyzw(T_a_b: Transform) -> NDArray[np.float64]:
+    """Return unit quaternions (..., 4) with w >= 0 of transforms (..., 4, 4)."""
+    r = T_a_b[..., :3, :3]
+    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    # The four candidates of Shepperd's method; the largest diagonal term is the stable one.
+    squares = np.stack([1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz], -1)
+    off = {
+        "xy": r[..., 0, 1] + r[..., 1, 0],
+        "xz": r[..., 0, 2] + r[..., 2, 0],
+        "yz": r[..., 1, 2] + r[..., 2, 1],
+        "xw": r[..., 2, 1] - r[..., 1, 2],
+        "yw": r[..., 0, 2] - r[..., 2, 0],
+        "zw": r[..., 1, 0] - r[..., 0, 1],
+    }
+    rows = np.stack(
+        [
+            np.stack([squares[..., 0], off["xy"], off["xz"], off["xw"]], -1),
+            np.stack([off["xy"], squares[..., 1], off["yz"], off["yw"]], -1),
+            np.stack([off["xz"], off["yz"], squares[..., 2], off["zw"]], -1),
+            np.stack([off["xw"], off["yw"], off["zw"], squares[..., 3]], -1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(squares, axis=-1)
+    quat = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
+    quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
+    return np.asarray(np.where(quat[..., 3:] < 0, -quat, quat))
+
+
+def _hat(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def _left_jacobian(phi: NDArray[np.float64]) -> NDArray[np.float64]:
+    angle = float(np.linalg.norm(phi))
+    k = _hat(phi)
+    if angle < 1e-6:
+        return np.eye(3) + 0.5 * k + k @ k / 6.0
+    a = (1.0 - np.cos(angle)) / angle**2
+    b = (angle - np.sin(angle)) / angle**3
+    return np.asarray(np.eye(3) + a * k + b * k @ k)

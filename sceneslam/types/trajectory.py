@@ -1,0 +1,84 @@
+"""A trajectory: stamped poses, and its TUM text file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.errors import InputError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Trajectory:
+    """Poses of `base` in one frame, by rising stamp."""
+
+    stamps_ns: NDArray[np.int64]  # (N,)
+    T_world_base: NDArray[np.float64]  # (N, 4, 4)
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def positions_m(self) -> NDArray[np.float64]:
+        """Return the positions (N, 3) [m]."""
+        return self.T_world_base[:, :3, 3]
+
+    @classmethod
+    def empty(cls) -> Trajectory:
+        """Return a trajectory without poses."""
+        return cls(stamps_ns=np.zeros(0, np.int64), T_world_base=np.zeros((0, 4, 4)))
+
+    @classmethod
+    def read_tum(cls, path: Path) -> Trajectory:
+        """Return the poses of a TUM file: `stamp_s tx ty tz qx qy qz qw`, `#` for comments.
+
+        Poses are sorted by stamp; stamps keep their nanoseconds.
+        Raises InputError when the file is missing or a line is not eight finite numbers.
+        """
+        if not path.is_file():
+            raise InputError(f"trajectory file not found: {path}")
+        stamps_ns, rows = [], []
+        for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
+            words = line.replace(",", " ").split()
+            if not words or words[0].startswith("#"):
+                continue
+            try:
+                stamps_ns.append(_stamp_ns(words[0]))
+                rows.append([float(word) for word in words[1:8]])
+            except ValueError:
+                rows.append([])
+            if len(rows[-1]) != 7 or not np.isfinite(rows[-1]).all():
+                raise InputError(
+                    f"line {number}: expected `stamp tx ty tz qx qy qz qw`, "
+                    f"got {line.strip()[:60]!r}: {path}"
+                )
+        if not rows:
+            return cls.empty()
+        values = np.array(rows)
+        order = np.argsort(np.array(stamps_ns), kind="stable")
+        T_world_base = se3.from_quat_xyzw(values[:, :3], values[:, 3:])
+        return cls(stamps_ns=np.array(stamps_ns)[order], T_world_base=T_world_base[order])
+
+    def write_tum(self, path: Path) -> None:
+        """Write the poses as a TUM file (stamps with nine decimals)."""
+        quats_xyzw = se3.to_quat_xyzw(self.T_world_base) if len(self) else np.zeros((0, 4))
+        with path.open("w") as file:
+            file.write("# stamp_s tx ty tz qx qy qz qw\n")
+            for stamp_ns, position, quat in zip(
+                self.stamps_ns.tolist(), self.positions_m, quats_xyzw, strict=True
+            ):
+                numbers = " ".join(f"{value:.9f}" for value in (*position, *quat))
+                file.write(f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d} {numbers}\n")
+
+
+def _stamp_ns(text: str) -> int:
+    """Return a decimal number of seconds as whole nanoseconds, without a float's rounding."""
+    if "e" in text.lower():
+        return round(float(text) * 1e9)
+    whole, _, fraction = text.partition(".")
+    sign = -1 if whole.startswith("-") else 1
+    return int(whole or "0") * 10**9 + sign * int((fraction + "000000000")[:9])
