@@ -1,0 +1,1 @@
+"""ROS messages as SceneSLAM reads and writes them."""

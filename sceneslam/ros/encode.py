@@ -1,0 +1,196 @@
+"""Our values as ROS 2 messages, serialised to CDR."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.ros import names
+from sceneslam.types import se3
+from sceneslam.types.observation import LaserScan
+from sceneslam.types.rig import Camera
+from sceneslam.types.se3 import Transform
+
+FLOAT32, FLOAT64 = 7, 8  # sensor_msgs/PointField
+
+
+class Encoder:
+    """Builds and serialises the message types of `names.TYPES`."""
+
+    def __init__(self) -> None:
+        from rosbags.typesys import Stores, get_typestore
+
+        self._store = get_typestore(Stores.ROS2_HUMBLE)
+
+    def definition(self, msgtype: str) -> bytes:
+        """Return the type's `ros2msg` definition, its dependencies included."""
+        return self._store.generate_msgdef(msgtype, ros_version=2)[0].encode()
+
+    def camera_info(self, stamp_ns: int, camera: Camera) -> bytes:
+        """Return a CameraInfo (plumb_bob, unrectified)."""
+        projection = np.zeros((3, 4))
+        projection[:, :3] = camera.K
+        return self._cdr(
+            names.TYPES[names.CAMERA_INFO],
+            header=self._header(stamp_ns, names.CAMERA),
+            width=camera.size_wh[0],
+            height=camera.size_wh[1],
+            distortion_model="plumb_bob",
+            d=np.array(camera.distortion, dtype=np.float64),
+            k=camera.K.ravel(),
+            r=np.eye(3).ravel(),
+            p=projection.ravel(),
+            binning_x=0,
+            binning_y=0,
+            roi=self._new(
+                "sensor_msgs/msg/RegionOfInterest",
+                x_offset=0,
+                y_offset=0,
+                height=0,
+                width=0,
+                do_rectify=False,
+            ),
+        )
+
+    def compressed_image(self, stamp_ns: int, encoding: str, data: NDArray[np.uint8]) -> bytes:
+        """Return a CompressedImage; `encoding` is image_transport's format."""
+        return self._cdr(
+            names.TYPES[names.IMAGE],
+            header=self._header(stamp_ns, names.CAMERA),
+            format=encoding,
+            data=data.ravel(),
+        )
+
+    def scan(self, scan: LaserScan) -> bytes:
+        """Return a LaserScan; its angles and ranges are float32 by the type."""
+        last = max(len(scan.ranges_m) - 1, 0)
+        return self._cdr(
+            names.TYPES[names.SCAN],
+            header=self._header(scan.stamp_ns, names.LASER),
+            angle_min=scan.angle_min_rad,
+            angle_max=scan.angle_min_rad + scan.angle_step_rad * last,
+            angle_increment=scan.angle_step_rad,
+            time_increment=0.0,
+            scan_time=0.0,
+            range_min=scan.range_min_m,
+            range_max=scan.range_max_m,
+            ranges=np.ascontiguousarray(scan.ranges_m, dtype=np.float32),
+            intensities=np.zeros(0, dtype=np.float32),
+        )
+
+    def points(
+        self,
+        stamp_ns: int,
+        points_lidar: NDArray[np.float32],
+        point_times_s: NDArray[np.float64] | None,
+    ) -> bytes:
+        """Return a PointCloud2 with x y z, and `time` [s after the stamp] where it is known."""
+        layout: list[tuple[str, str, int]] = [(axis, "<f4", FLOAT32) for axis in "xyz"]
+        if point_times_s is not None:
+            layout.append(("time", "<f8", FLOAT64))
+        rows = np.zeros(len(points_lidar), dtype=[(name, dtype) for name, dtype, _ in layout])
+        for column, axis in enumerate("xyz"):
+            rows[axis] = points_lidar[:, column]
+        if point_times_s is not None:
+            rows["time"] = point_times_s
+        offsets = [rows.dtype.fields[name][1] for name, _, _ in layout] if rows.dtype.fields else []
+        fields = [
+            self._new(
+                "sensor_msgs/msg/PointField", name=name, offset=offset, datatype=code, count=1
+            )
+            for (name, _, code), offset in zip(layout, offsets, strict=True)
+        ]
+        return self._cdr(
+            names.TYPES[names.POINTS],
+            header=self._header(stamp_ns, names.LIDAR),
+            height=1,
+            width=len(rows),
+            fields=fields,
+            is_bigendian=False,
+            point_step=rows.dtype.itemsize,
+            row_step=rows.dtype.itemsize * len(rows),
+            data=rows.view(np.uint8).ravel(),
+            is_dense=True,
+        )
+
+    def odometry(self, stamp_ns: int, T_frame_base: Transform, frame: str) -> bytes:
+        """Return an Odometry of base_link in `frame`, without velocity and covariance."""
+        zero = self._new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        return self._cdr(
+            names.TYPES[names.ODOMETRY],
+            header=self._header(stamp_ns, frame),
+            child_frame_id=names.BASE,
+            pose=self._new(
+                "geometry_msgs/msg/PoseWithCovariance",
+                pose=self._pose(T_frame_base),
+                covariance=np.zeros(36),
+            ),
+            twist=self._new(
+                "geometry_msgs/msg/TwistWithCovariance",
+                twist=self._new("geometry_msgs/msg/Twist", linear=zero, angular=zero),
+                covariance=np.zeros(36),
+            ),
+        )
+
+    def imu(self, stamp_ns: int, gyro_base: NDArray[np.float64]) -> bytes:
+        """Return an Imu with the rate (3,) [rad/s]; the rest is marked as not measured."""
+        unknown = np.zeros(9)
+        unknown[0] = -1.0
+        x, y, z = gyro_base.tolist()
+        zero = self._new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        return self._cdr(
+            names.TYPES[names.IMU],
+            header=self._header(stamp_ns, names.BASE),
+            orientation=self._new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+            orientation_covariance=unknown,
+            angular_velocity=self._new("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            angular_velocity_covariance=np.zeros(9),
+            linear_acceleration=zero,
+            linear_acceleration_covariance=unknown,
+        )
+
+    def transforms(self, stamp_ns: int, parent: str, children: dict[str, Transform]) -> bytes:
+        """Return a TFMessage of `T_parent_child` for each child."""
+        stamped = []
+        for child, T_parent_child in children.items():
+            pose = self._pose(T_parent_child)
+            at = pose.position
+            stamped.append(
+                self._new(
+                    "geometry_msgs/msg/TransformStamped",
+                    header=self._header(stamp_ns, parent),
+                    child_frame_id=child,
+                    transform=self._new(
+                        "geometry_msgs/msg/Transform",
+                        translation=self._new("geometry_msgs/msg/Vector3", x=at.x, y=at.y, z=at.z),
+                        rotation=pose.orientation,
+                    ),
+                )
+            )
+        return self._cdr(names.TYPES[names.TF], transforms=stamped)
+
+    def text(self, text: str) -> bytes:
+        """Return a std_msgs/String."""
+        return self._cdr("std_msgs/msg/String", data=text)
+
+    def _pose(self, T_a_b: Transform) -> Any:
+        x, y, z = T_a_b[:3, 3].tolist()
+        qx, qy, qz, qw = se3.to_quat_xyzw(T_a_b).tolist()
+        return self._new(
+            "geometry_msgs/msg/Pose",
+            position=self._new("geometry_msgs/msg/Point", x=x, y=y, z=z),
+            orientation=self._new("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+        )
+
+    def _header(self, stamp_ns: int, frame: str) -> Any:
+        sec, nanosec = divmod(int(stamp_ns), 10**9)
+        stamp = self._new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        return self._new("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+    def _new(self, msgtype: str, **fields: Any) -> Any:
+        return self._store.types[msgtype](**fields)
+
+    def _cdr(self, msgtype: str, **fields: Any) -> bytes:
+        return bytes(self._store.serialize_cdr(self._new(msgtype, **fields), msgtype))

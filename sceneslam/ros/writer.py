@@ -1,0 +1,184 @@
+"""Observations and ground truth as an MCAP file of ROS 2 messages."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.ros import names
+from sceneslam.ros.encode import Encoder
+from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig
+from sceneslam.types.se3 import Transform
+from sceneslam.types.truth import GroundTruth
+
+_CHUNK_BYTES = 256 * 1024  # what a file that was cut off loses at most
+_DEPTH_UNITS_PER_M = 1000.0
+
+
+class ObservationWriter:
+    """Records observations so that `sources.rosbag` gives them back.
+
+    Colour as JPEG or PNG, depth as 16-bit PNG in mm, everything else as it is (angles and ranges
+    of a LaserScan are float32 by its type). Opens in Foxglove.
+    """
+
+    def __init__(self, path: Path, *, rig: Rig, image_format: str, jpeg_quality: int = 95) -> None:
+        from mcap.writer import CompressionType, Writer
+
+        if image_format not in ("jpeg", "png"):
+            raise ConfigError("image_format", image_format, "jpeg or png")
+        if not 1 <= jpeg_quality <= 100:
+            raise ConfigError("jpeg_quality", jpeg_quality, "1 to 100")
+        self._rig = rig
+        self._image_format = image_format
+        self._jpeg_quality = jpeg_quality
+        self._encoder = Encoder()
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._last_ns = 0
+        self._is_open, self._has_frames = True, False
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = path.open("wb")
+        self._mcap: Any = Writer(
+            self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.NONE
+        )
+        self._mcap.start(profile="ros2", library="sceneslam")
+        self._mcap.add_metadata(names.RIG_METADATA, _rig_metadata(rig))
+
+    def write(self, observation: Observation) -> None:
+        """Add all that the observation holds, at its stamp."""
+        stamp_ns, encoder = observation.stamp_ns, self._encoder
+        self._write_frames(stamp_ns)
+        if observation.gyro_base is not None:
+            for row in observation.gyro_base:
+                at_ns = stamp_ns + round(float(row[0]) * 1e9)
+                self._add(names.IMU, at_ns, encoder.imu(at_ns, row[1:]))
+        if observation.T_odom_base is not None:
+            data = encoder.odometry(stamp_ns, observation.T_odom_base, names.ODOM)
+            self._add(names.ODOMETRY, stamp_ns, data)
+        if observation.scan is not None:
+            self._add(names.SCAN, observation.scan.stamp_ns, encoder.scan(observation.scan))
+        if observation.points_lidar is not None:
+            data = encoder.points(stamp_ns, observation.points_lidar, observation.point_times_s)
+            self._add(names.POINTS, stamp_ns, data)
+        if self._rig.camera and (
+            observation.image_bgr is not None or observation.depth_m is not None
+        ):
+            self._add(names.CAMERA_INFO, stamp_ns, encoder.camera_info(stamp_ns, self._rig.camera))
+        if observation.depth_m is not None:
+            data = encoder.compressed_image(
+                stamp_ns, "16UC1; png compressed ", depth_png(observation.depth_m)
+            )
+            self._add(names.DEPTH, stamp_ns, data)
+        if observation.image_bgr is not None:
+            self._write_image(stamp_ns, observation.image_bgr)
+
+    def write_pose(self, stamp_ns: int, T_map_base: Transform) -> None:
+        """Add a result: the pose in `map`, as Odometry and as transform."""
+        self._write_frames(stamp_ns)
+        data = self._encoder.odometry(stamp_ns, T_map_base, names.MAP)
+        self._add(names.RESULT_ODOMETRY, stamp_ns, data)
+        data = self._encoder.transforms(stamp_ns, names.MAP, {names.BASE: T_map_base})
+        self._add(names.TF, stamp_ns, data)
+
+    def write_module(self, stamp_ns: int, module: str) -> None:
+        """Add a result: the module that is active from `stamp_ns` on."""
+        self._add(names.RESULT_MODULE, stamp_ns, self._encoder.text(module))
+
+    def write_truth(self, truth: GroundTruth) -> None:
+        """Add all true poses (float64) and scene changes; any time before `close`."""
+        for stamp_ns, T_gt_base in zip(
+            truth.trajectory.stamps_ns.tolist(), truth.trajectory.T_world_base, strict=True
+        ):
+            data = self._encoder.odometry(stamp_ns, T_gt_base, names.GT)
+            self._add(names.TRUTH_ODOMETRY, stamp_ns, data)
+        for change in truth.scenes:
+            self._add(names.TRUTH_SCENE, change.stamp_ns, self._encoder.text(change.scene))
+
+    def attach(self, name: str, text: str) -> None:
+        """Add a named text (a configuration, say) as an attachment."""
+        self._mcap.add_attachment(
+            create_time=0,
+            log_time=self._last_ns,
+            name=name,
+            media_type="text/plain",
+            data=text.encode(),
+        )
+
+    def close(self) -> None:
+        """Finish the file; a second call does nothing."""
+        if not self._is_open:
+            return
+        self._is_open = False
+        self._mcap.finish()
+        self._file.close()
+
+    def _write_image(self, stamp_ns: int, image_bgr: NDArray[np.uint8]) -> None:
+        options = [cv2.IMWRITE_JPEG_QUALITY, self._jpeg_quality]
+        done, data = cv2.imencode(
+            f".{self._image_format}", image_bgr, options if self._image_format == "jpeg" else []
+        )
+        if not done:
+            raise InputError(f"image at {stamp_ns} ns: could not be written: {image_bgr.shape}")
+        encoding = f"bgr8; {self._image_format} compressed bgr8"
+        message = self._encoder.compressed_image(stamp_ns, encoding, np.asarray(data, np.uint8))
+        self._add(names.IMAGE, stamp_ns, message)
+
+    def _write_frames(self, stamp_ns: int) -> None:
+        """Add the sensors' places on the robot, once, at the first stamp."""
+        if self._has_frames:
+            return
+        self._has_frames = True
+        rig = self._rig
+        frames: dict[str, Transform] = {}
+        if rig.camera:
+            frames[names.CAMERA] = rig.camera.T_base_cam
+        if rig.laser:
+            frames[names.LASER] = rig.laser.T_base_laser
+        if rig.lidar:
+            frames[names.LIDAR] = rig.lidar.T_base_lidar
+        if frames:
+            data = self._encoder.transforms(stamp_ns, names.BASE, frames)
+            self._add(names.TF_STATIC, stamp_ns, data)
+
+    def _add(self, topic: str, stamp_ns: int, data: bytes) -> None:
+        if topic not in self._channels:
+            msgtype = names.TYPES[topic]
+            if msgtype not in self._schemas:
+                self._schemas[msgtype] = self._mcap.register_schema(
+                    name=msgtype, encoding="ros2msg", data=self._encoder.definition(msgtype)
+                )
+            self._channels[topic] = self._mcap.register_channel(
+                topic=topic, message_encoding="cdr", schema_id=self._schemas[msgtype]
+            )
+        self._last_ns = max(self._last_ns, stamp_ns)
+        self._mcap.add_message(
+            channel_id=self._channels[topic], log_time=stamp_ns, publish_time=stamp_ns, data=data
+        )
+
+
+def depth_png(depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return a 16-bit PNG [mm] of a depth image; what does not fit is missing (0)."""
+    depth_mm = np.rint(depth_m * np.float32(_DEPTH_UNITS_PER_M))
+    fits = (depth_mm > 0) & (depth_mm <= np.iinfo(np.uint16).max)
+    done, data = cv2.imencode(".png", np.where(fits, depth_mm, 0).astype(np.uint16))
+    if not done:
+        raise InputError(f"depth image could not be written: {depth_m.shape}")
+    return np.asarray(data, np.uint8)
+
+
+def _rig_metadata(rig: Rig) -> dict[str, str]:
+    """Return what no ROS message says of a rig."""
+    said: dict[str, object] = {"sensors": sorted(sensor.value for sensor in rig.sensors)}
+    if rig.camera:
+        said["depth_range_m"] = list(rig.camera.depth_range_m)
+    if rig.lidar:
+        said["lidar_range_m"] = list(rig.lidar.range_m)
+    return {key: json.dumps(value) for key, value in said.items()}
