@@ -1,0 +1,164 @@
+"""A planar laser scan made of a depth image, as in the paper: the depth camera is the laser.
+
+The scan's frame `laser` lies below (or above) the camera in base's z = 0 plane and looks along the
+optical axis: T_base_laser = (camera x, camera y, yaw of the axis). So every pixel belongs to one
+beam whatever its depth is, and a scan is three look-ups in a table that is made once per camera.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.observation import LaserScan
+from sceneslam.types.rig import Camera
+
+_PIXELS_MIN = 2  # one pixel alone is a speckle
+
+
+def scan_frame(camera: Camera) -> se3.Transform:
+    """Return T_base_laser of the scans that are made of this camera's depth."""
+    axis = camera.T_base_cam[:3, 2]
+    if np.hypot(axis[0], axis[1]) < 1e-3:  # looks straight up or down: the image's up is forward
+        axis = -camera.T_base_cam[:3, 1]
+    x_m, y_m = camera.T_base_cam[:2, 3]
+    return se3.from_xy_yaw(x_m, y_m, float(np.arctan2(axis[1], axis[0])))
+
+
+def scan_from_depth(
+    depth_m: NDArray[np.float32],
+    camera: Camera,
+    *,
+    stamp_ns: int,
+    height_min_m: float | None = None,
+    height_max_m: float | None = None,
+    beams: int = 180,
+    stride_px: int = 2,
+) -> LaserScan:
+    """Return the scan of one depth image; see DepthScanner, which to keep where there are many."""
+    scanner = DepthScanner(
+        camera,
+        height_min_m=height_min_m,
+        height_max_m=height_max_m,
+        beams=beams,
+        stride_px=stride_px,
+    )
+    return scanner.scan(depth_m, stamp_ns=stamp_ns)
+
+
+class DepthScanner:
+    """Makes scans of one camera's depth images: the nearest return per beam within a band."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        *,
+        height_min_m: float | None,
+        height_max_m: float | None,
+        beams: int,
+        stride_px: int,
+    ) -> None:
+        """Tabulate each pixel's beam, range and height per metre of depth.
+
+        The band [height_min_m, height_max_m] is above base. None: 0.15 m below (above) the camera,
+        which is the part of the world that stays in view near and far, and, on a robot, holds no
+        floor.
+        """
+        height_m = float(camera.T_base_cam[2, 3])
+        self.band_m = (
+            height_m - 0.15 if height_min_m is None else height_min_m,
+            height_m + 0.15 if height_max_m is None else height_max_m,
+        )
+        if self.band_m[0] >= self.band_m[1]:
+            raise ConfigError("height_max_m", self.band_m[1], f"above {self.band_m[0]:g} m")
+        if beams < 2:
+            raise ConfigError("beams", beams, "2 or more")
+        if stride_px < 1:
+            raise ConfigError("stride_px", stride_px, "1 or more")
+        self.T_base_laser = scan_frame(camera)
+        self._camera, self._beams, self._stride_px = camera, beams, stride_px
+        self._camera_height_m = height_m
+        self._tabulate()
+
+    def scan(self, depth_m: NDArray[np.float32], *, stamp_ns: int) -> LaserScan:
+        """Return the scan of a depth image (H, W) [m] in `laser`.
+
+        A beam without a return in the band is NaN: a depth camera does not tell far from blind.
+        Raises InputError when the image has another size than the camera.
+        """
+        width, height = self._camera.size_wh
+        if depth_m.shape != (height, width):
+            raise InputError(f"depth_m: expected ({height}, {width}), got {depth_m.shape}")
+        depths = depth_m[:: self._stride_px, :: self._stride_px].ravel()[self._pixels]
+        z_min_m, z_max_m = self._camera.depth_range_m
+        heights = self._camera_height_m + self._height_ratio * depths
+        valid = (depths >= z_min_m) & (depths <= z_max_m)  # false for NaN and for infinity
+        valid &= (heights >= self.band_m[0]) & (heights <= self.band_m[1])
+        beam = self._beam[valid]
+        ranges = self._nearest(beam, (self._range_ratio * depths)[valid])
+        ratio_max = float(self._range_ratio.max(initial=1.0))
+        return LaserScan(
+            stamp_ns=stamp_ns,
+            ranges_m=ranges,
+            angle_min_rad=self._angle_min_rad + 0.5 * self._step_rad,
+            angle_step_rad=self._step_rad,
+            range_min_m=0.0,
+            range_max_m=z_max_m * ratio_max,
+        )
+
+    def _nearest(
+        self, beam: NDArray[np.int64], ranges_m: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Return per beam the mean of the returns that are as near as noise can tell.
+
+        The mean, since the least of many noisy depths would be too short; a triangulating
+        camera's noise grows with the square of the distance.
+        """
+        nearest = np.full(self._beams, np.inf, dtype=np.float32)
+        np.minimum.at(nearest, beam, ranges_m)
+        limit = nearest + 0.01 + 0.006 * nearest * nearest
+        agrees = ranges_m <= limit[beam]
+        count = np.bincount(beam[agrees], minlength=self._beams)
+        total = np.bincount(beam[agrees], weights=ranges_m[agrees], minlength=self._beams)
+        mean = total / np.maximum(count, 1)
+        scan = np.where(count >= _PIXELS_MIN, mean, np.nan).astype(np.float32)
+        scan.flags.writeable = False
+        return scan
+
+    def _tabulate(self) -> None:
+        rays_base = _rays_cam(self._camera, self._stride_px) @ self._camera.T_base_cam[:3, :3].T
+        yaw = se3.yaw_rad(self.T_base_laser)
+        angle = np.arctan2(rays_base[:, 1], rays_base[:, 0]) - yaw
+        angle = (angle + np.pi) % (2 * np.pi) - np.pi
+        range_ratio = np.hypot(rays_base[:, 0], rays_base[:, 1])
+        low_m, high_m = (limit - self._camera_height_m for limit in self.band_m)
+        farthest = rays_base[:, 2] * self._camera.depth_range_m[1]
+        nearest = rays_base[:, 2] * self._camera.depth_range_m[0]
+        # A ray that passes the band at none of its depths never gives a return.
+        crosses = (np.minimum(nearest, farthest) <= high_m) & (
+            np.maximum(nearest, farthest) >= low_m
+        )
+        crosses &= range_ratio > 1e-3
+        if not crosses.any():
+            raise ConfigError("height_min_m", self.band_m, "a band that the depth camera sees")
+        self._pixels = np.flatnonzero(crosses)
+        angle = angle[crosses]
+        half_rad = float(np.abs(angle).max()) + 1e-9
+        self._angle_min_rad = -half_rad
+        self._step_rad = 2 * half_rad / self._beams
+        beam = np.floor((angle + half_rad) / self._step_rad).astype(np.int64)
+        self._beam = np.clip(beam, 0, self._beams - 1)
+        self._range_ratio = range_ratio[crosses].astype(np.float32)
+        self._height_ratio = rays_base[crosses, 2].astype(np.float32)
+
+
+def _rays_cam(camera: Camera, stride_px: int) -> NDArray[np.float64]:
+    """Return the rays (N, 3) with z = 1 of every stride-th pixel, lens distortion taken out."""
+    width, height = camera.size_wh
+    u, v = np.meshgrid(np.arange(0, width, stride_px), np.arange(0, height, stride_px))
+    pixels = np.stack([u.ravel(), v.ravel()], axis=-1).astype(np.float64)
+    xy = cv2.undistortPoints(pixels[:, None], camera.K, np.array(camera.distortion)).reshape(-1, 2)
+    return np.column_stack([xy, np.ones(len(xy))])
