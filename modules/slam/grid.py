@@ -1,0 +1,115 @@
+"""An occupancy grid in log odds that grows with what is seen."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.maps import GridLayer
+from sceneslam.types.observation import LaserScan
+
+_HIT, _MISS = 0.85, -0.4  # log odds per measurement
+_LIMIT = 3.5  # so that a door that opens is believed after some scans
+_GROWTH_CELLS = 128  # rows and columns are added in blocks, since growing copies the grid
+_SHIFT = 4  # cv2 polygons with sub-cell corners, in 1/16 cells
+
+
+class OccupancyGrid:
+    """Log odds of cells: hits at the ends of beams, misses along them."""
+
+    def __init__(
+        self, resolution_m: float, *, clear_max_m: float = 10.0, cells_max: int = 64_000_000
+    ) -> None:
+        """Make an empty grid.
+
+        A beam without a return (inf) clears up to `clear_max_m` only: black or slanted surfaces
+        give no return either. The grid never has more than `cells_max` cells; what lies outside
+        then is left out.
+        """
+        if not resolution_m > 0:
+            raise ConfigError("resolution_m", resolution_m, "above 0")
+        if not clear_max_m >= 0:
+            raise ConfigError("clear_max_m", clear_max_m, "0 or more")
+        if cells_max < _GROWTH_CELLS**2:
+            raise ConfigError("cells_max", cells_max, f"{_GROWTH_CELLS**2} or more")
+        self.resolution_m = resolution_m
+        self._clear_max_m, self._cells_max = clear_max_m, cells_max
+        self._log_odds = np.zeros((0, 0), dtype=np.float32)
+        self._origin = np.zeros(2, dtype=np.int64)  # cell (column, row) of the array's corner
+
+    def insert(self, T_local_laser: se3.Transform, scan: LaserScan) -> None:
+        """Add a scan that was taken at T_local_laser (any mounting; seen from above)."""
+        ranges = scan.ranges_m.astype(np.float64)
+        hit = np.isfinite(ranges) & (ranges >= scan.range_min_m) & (ranges <= scan.range_max_m)
+        free_to = np.where(hit, ranges - 0.5 * self.resolution_m, 0.0)
+        free_to[np.isposinf(ranges)] = min(self._clear_max_m, scan.range_max_m)
+        angles = scan.angles_rad.astype(np.float64)
+        half = 0.5 * scan.angle_step_rad
+        # One star-shaped polygon is the space that all beams passed: each beam is a wedge.
+        corners = _ends(
+            T_local_laser,
+            np.column_stack([angles - half, angles + half]).ravel(),
+            np.repeat(np.maximum(free_to, 0.0), 2),
+        )
+        origin_xy = T_local_laser[:2, 3]
+        hits_xy = _ends(T_local_laser, angles[hit], ranges[hit])
+        seen = np.vstack([corners, hits_xy, origin_xy[None]])
+        self._grow(seen)
+        if self._log_odds.size == 0:
+            return
+        self._add(np.vstack([corners, origin_xy[None]]), hits_xy)
+
+    def layer(self) -> GridLayer:
+        """Return a copy of the grid in `local`."""
+        x_m, y_m = (self._origin * self.resolution_m).tolist()
+        log_odds = self._log_odds.copy()
+        log_odds.flags.writeable = False
+        return GridLayer(log_odds=log_odds, resolution_m=self.resolution_m, origin_xy_m=(x_m, y_m))
+
+    def _add(self, free_xy: NDArray[np.float64], hits_xy: NDArray[np.float64]) -> None:
+        rows, columns = self._log_odds.shape
+        polygon = free_xy / self.resolution_m - self._origin - 0.5  # cell centres at whole numbers
+        lowest = np.clip(np.floor(polygon.min(axis=0)), 0, (columns - 1, rows - 1)).astype(int)
+        highest = np.clip(np.ceil(polygon.max(axis=0)), 0, (columns - 1, rows - 1)).astype(int)
+        width, height = highest - lowest + 1
+        free = np.zeros((height, width), dtype=np.uint8)
+        corners = np.round((polygon - lowest) * 2**_SHIFT).astype(np.int32)
+        cv2.fillPoly(free, [corners], 1, lineType=cv2.LINE_8, shift=_SHIFT)
+        window = self._log_odds[lowest[1] : lowest[1] + height, lowest[0] : lowest[0] + width]
+        cells = np.floor(hits_xy / self.resolution_m).astype(np.int64) - self._origin
+        cells = cells[np.all((cells >= 0) & (cells < (columns, rows)), axis=1)]
+        was = self._log_odds[cells[:, 1], cells[:, 0]]
+        window += np.float32(_MISS) * free
+        np.maximum(window, -_LIMIT, out=window)
+        # A cell that was hit is not free, and one scan is one measurement of it.
+        self._log_odds[cells[:, 1], cells[:, 0]] = np.minimum(was + np.float32(_HIT), _LIMIT)
+
+    def _grow(self, seen_xy: NDArray[np.float64]) -> None:
+        cells = np.floor(seen_xy / self.resolution_m)
+        lowest = (np.floor((cells.min(axis=0) - 1) / _GROWTH_CELLS) * _GROWTH_CELLS).astype(int)
+        end = (np.ceil((cells.max(axis=0) + 2) / _GROWTH_CELLS) * _GROWTH_CELLS).astype(int)
+        rows, columns = self._log_odds.shape
+        if self._log_odds.size:
+            lowest = np.minimum(lowest, self._origin)
+            end = np.maximum(end, self._origin + np.array([columns, rows]))
+        size = end - lowest
+        unchanged = self._log_odds.size and tuple(size) == (columns, rows)
+        if unchanged or int(size[0]) * int(size[1]) > self._cells_max:
+            return
+        grown = np.zeros((size[1], size[0]), dtype=np.float32)
+        if self._log_odds.size:
+            column, row = self._origin - lowest
+            grown[row : row + rows, column : column + columns] = self._log_odds
+        self._log_odds, self._origin = grown, lowest
+
+
+def _ends(
+    T_local_laser: se3.Transform, angles_rad: NDArray[np.float64], ranges_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return where beams end (N, 2) [m] in the local xy plane."""
+    x = ranges_m * np.cos(angles_rad)
+    y = ranges_m * np.sin(angles_rad)
+    return np.asarray(np.column_stack([x, y]) @ T_local_laser[:2, :2].T + T_local_laser[:2, 3])
