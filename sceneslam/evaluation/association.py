@@ -1,0 +1,116 @@
+"""Which pose belongs to which stamp: nearest in time, or interpolated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.trajectory import Trajectory
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Matches:
+    """Pairs of poses of two trajectories: `first[k]` belongs to `second[k]`."""
+
+    first: Indices
+    second: Indices
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+
+def nearest(stamps_ns: NDArray[np.int64], wanted_ns: NDArray[np.int64]) -> Indices:
+    """Return for each wanted stamp the index of the nearest of `stamps_ns` (sorted, not empty).
+
+    Of two that are equally near it is the earlier one.
+    """
+    right = np.clip(np.searchsorted(stamps_ns, wanted_ns), 0, len(stamps_ns) - 1)
+    left = np.maximum(right - 1, 0)
+    left_is_nearer = wanted_ns - stamps_ns[left] <= np.abs(stamps_ns[right] - wanted_ns)
+    index = np.where(left_is_nearer, left, right)
+    return np.searchsorted(stamps_ns, stamps_ns[index])  # the first of equal stamps
+
+
+def associate(first: Trajectory, second: Trajectory, max_gap_s: float) -> Matches:
+    """Return, for each pose of the shorter trajectory, the nearest of the longer.
+
+    Pairs further apart than `max_gap_s` are left out. The rule is the one of evo
+    (`sync.associate_trajectories`), so that numbers can be compared.
+    """
+    if len(second) <= len(first):
+        swapped = _nearest_within(second.stamps_ns, first.stamps_ns, max_gap_s)
+        return Matches(first=swapped.second, second=swapped.first)
+    return _nearest_within(first.stamps_ns, second.stamps_ns, max_gap_s)
+
+
+def select(trajectory: Trajectory, index: Indices) -> Trajectory:
+    """Return the poses at `index`."""
+    return Trajectory(
+        stamps_ns=trajectory.stamps_ns[index], T_world_base=trajectory.T_world_base[index]
+    )
+
+
+def clip(trajectory: Trajectory, start_ns: int, end_ns: int) -> Trajectory:
+    """Return the poses from `start_ns` to `end_ns`, both included."""
+    inside = (trajectory.stamps_ns >= start_ns) & (trajectory.stamps_ns <= end_ns)
+    return select(trajectory, np.flatnonzero(inside))
+
+
+def covered(trajectory: Trajectory, stamps_ns: NDArray[np.int64], max_gap_s: float) -> Indices:
+    """Return the indices of the stamps with a pose at most `max_gap_s` away on either side."""
+    if not len(trajectory):
+        return np.zeros(0, np.int64)
+    times = trajectory.stamps_ns
+    right = np.searchsorted(times, stamps_ns)
+    inside = (stamps_ns >= times[0]) & (stamps_ns <= times[-1])
+    right = np.clip(right, 0, len(times) - 1)
+    left = np.where(times[right] == stamps_ns, right, np.maximum(right - 1, 0))
+    max_gap_ns = max_gap_s * 1e9
+    near = (stamps_ns - times[left] <= max_gap_ns) & (times[right] - stamps_ns <= max_gap_ns)
+    return np.flatnonzero(inside & near)
+
+
+def interpolated(trajectory: Trajectory, stamps_ns: NDArray[np.int64]) -> Trajectory:
+    """Return the poses at the given stamps, which the trajectory has to cover.
+
+    Positions lie on the straight line, rotations on the great arc between the neighbours.
+    """
+    times = trajectory.stamps_ns
+    right = np.clip(np.searchsorted(times, stamps_ns), min(1, len(times) - 1), len(times) - 1)
+    left = np.maximum(right - 1, 0)
+    span_ns = np.maximum(times[right] - times[left], 1)
+    ratio = ((stamps_ns - times[left]) / span_ns)[:, None]
+    positions = trajectory.positions_m
+    position_m = (1.0 - ratio) * positions[left] + ratio * positions[right]
+    quats_xyzw = se3.to_quat_xyzw(trajectory.T_world_base)
+    quat_xyzw = _slerp(quats_xyzw[left], quats_xyzw[right], ratio)
+    return Trajectory(stamps_ns=stamps_ns, T_world_base=se3.from_quat_xyzw(position_m, quat_xyzw))
+
+
+def _nearest_within(
+    short_ns: NDArray[np.int64], long_ns: NDArray[np.int64], max_gap_s: float
+) -> Matches:
+    if not len(short_ns) or not len(long_ns):
+        return Matches(first=np.zeros(0, np.int64), second=np.zeros(0, np.int64))
+    partner = nearest(long_ns, short_ns)
+    kept = np.flatnonzero(np.abs(long_ns[partner] - short_ns) <= round(max_gap_s * 1e9))
+    return Matches(first=kept, second=partner[kept])
+
+
+def _slerp(
+    q0: NDArray[np.float64], q1: NDArray[np.float64], ratio: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    cosine = np.sum(q0 * q1, axis=-1, keepdims=True)
+    q1 = np.where(cosine < 0, -q1, q1)  # q and -q are one rotation: take the short way
+    angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
+    sine = np.sin(angle)
+    straight = sine < 1e-9
+    sine = np.where(straight, 1.0, sine)
+    weight_0 = np.where(straight, 1.0 - ratio, np.sin((1.0 - ratio) * angle) / sine)
+    weight_1 = np.where(straight, ratio, np.sin(ratio * angle) / sine)
+    return np.asarray(weight_0 * q0 + weight_1 * q1)

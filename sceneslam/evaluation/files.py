@@ -1,0 +1,43 @@
+"""Trajectory files of either layout, told apart by their numbers per line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from sceneslam.types.errors import InputError
+from sceneslam.types.trajectory import Trajectory
+
+
+def read_poses(path: Path) -> Trajectory:
+    """Return the poses of a TUM file (eight numbers per line) or a KITTI file (twelve).
+
+    KITTI poses have no stamps: pose k gets k seconds, so that equal files match line by line.
+    Raises InputError where the file is missing, empty or neither.
+    """
+    if not path.is_file():
+        raise InputError(f"trajectory file not found: {path}")
+    first = _first_line(path)
+    trajectory = _read_kitti(path) if len(first.split()) == 12 else Trajectory.read_tum(path)
+    if not len(trajectory):
+        raise InputError(f"trajectory file holds no poses: {path}")
+    return trajectory
+
+
+def _first_line(path: Path) -> str:
+    with path.open(errors="replace") as file:
+        return next((line for line in file if line.strip() and not line.startswith("#")), "")
+
+
+def _read_kitti(path: Path) -> Trajectory:
+    try:
+        values = np.loadtxt(path, ndmin=2)
+    except ValueError as err:
+        raise InputError(f"expected twelve numbers per line, {err}: {path}") from err
+    if values.shape[1] != 12 or not np.isfinite(values).all():
+        raise InputError(f"expected twelve finite numbers per line: {path}")
+    T_world_base = np.tile(np.eye(4), (len(values), 1, 1))
+    T_world_base[:, :3] = values.reshape(-1, 3, 4)
+    stamps_ns = np.arange(len(values), dtype=np.int64) * 10**9
+    return Trajectory(stamps_ns=stamps_ns, T_world_base=T_world_base)

@@ -1,0 +1,173 @@
+"""The numbers of a run: `metrics.json`."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.evaluation.accuracy import absolute_errors, relative_errors, root_mean_square
+from sceneslam.evaluation.association import clip
+from sceneslam.evaluation.comparison import compare
+from sceneslam.evaluation.correctness import correct_rate
+from sceneslam.evaluation.settings import EvaluationSettings
+from sceneslam.evaluation.switches import count_false, list_switches
+from sceneslam.types.run import RunResult
+from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import GroundTruth
+
+Metrics = dict[str, Any]
+
+
+def evaluate(
+    result: RunResult,
+    truth: GroundTruth | None,
+    *,
+    settings: EvaluationSettings,
+    peak_rss_mb: float | None = None,
+    reference: Trajectory | None = None,
+) -> Metrics:
+    """Return all metrics of a run; what cannot be known (no ground truth) is None.
+
+    `reference` is another run's trajectory over the same path, compared without alignment.
+    `notes` says in sentences why a number is missing although it could be expected.
+    """
+    switches = list_switches(result, truth)
+    metrics: Metrics = {
+        **_accuracy(result, truth, settings),
+        "coverage": coverage(result),
+        "switches": switches,
+        "false_switches": count_false(switches, truth),
+        **_extent(result),
+        **_costs(result),
+        "modules": _per_module(result),
+        "bridged": sum(module == "" for module in result.modules),
+        "peak_rss_mb": peak_rss_mb,
+        "notes": _notes(result, truth, settings),
+    }
+    if reference is not None:
+        difference = compare(result.trajectory, reference, settings.association_gap_s)
+        metrics["reference"] = {
+            "max_difference_m": difference.max_m,
+            "rms_difference_m": difference.rms_m,
+            "matched": len(difference.differences_m),
+        }
+    return dict(_plain(metrics))
+
+
+def write_metrics(path: Path, metrics: Metrics) -> None:
+    """Write the metrics as JSON that any reader takes (no NaN)."""
+    path.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n")
+
+
+def coverage(result: RunResult) -> float | None:
+    """Return the share of observations, from the first pose on, that got a pose."""
+    if not len(result.observed_ns):
+        return None
+    if not len(result.trajectory):
+        return 0.0
+    observed_ns = result.observed_ns[result.observed_ns >= result.trajectory.stamps_ns[0]]
+    if not len(observed_ns):
+        return 0.0
+    return float(np.isin(observed_ns, result.trajectory.stamps_ns).mean())
+
+
+def _accuracy(
+    result: RunResult, truth: GroundTruth | None, settings: EvaluationSettings
+) -> Metrics:
+    true = truth.trajectory if truth else Trajectory.empty()
+    if len(result.observed_ns):
+        # What a longer ground truth says about other times is not this run's to answer for.
+        true = clip(true, int(result.observed_ns[0]), int(result.observed_ns[-1]))
+    estimate, gap_s = result.trajectory, settings.association_gap_s
+    absolute = absolute_errors(estimate, true, gap_s)
+    relative = relative_errors(estimate, true, gap_s, settings.rpe_interval_s)
+    rate = correct_rate(
+        estimate, true, limit_m=settings.correct_limit_m, limit_rad=settings.correct_limit_rad
+    )
+    return {
+        "ate_rmse_m": absolute.rmse_m,
+        "ate_max_m": absolute.max_m,
+        "rpe_trans_m": root_mean_square(relative.trans_m),
+        "rpe_rot_rad": root_mean_square(relative.rot_rad),
+        "correct_rate": rate,
+        "truth_matched": len(absolute.errors_m),
+    }
+
+
+def _extent(result: RunResult) -> Metrics:
+    observed_ns = result.observed_ns
+    duration_s = float(observed_ns[-1] - observed_ns[0]) * 1e-9 if len(observed_ns) else 0.0
+    steps_m = np.linalg.norm(np.diff(result.trajectory.positions_m, axis=0), axis=1)
+    wall_s = result.timings.wall_s
+    return {
+        "observations": len(observed_ns),
+        "poses": len(result.trajectory),
+        "start_ns": int(observed_ns[0]) if len(observed_ns) else None,
+        "duration_s": duration_s,
+        "path_length_m": float(steps_m.sum()),
+        "realtime_factor": duration_s / wall_s if wall_s > 0 else None,
+    }
+
+
+def _costs(result: RunResult) -> Metrics:
+    return {
+        "bus_overhead_us": _median_p95(result.timings.bus_us),
+        "detector_us": _median_p95(result.timings.detector_us),
+    }
+
+
+def _per_module(result: RunResult) -> Metrics:
+    named = [module for module in result.modules if module]
+    keys = sorted({*named, *result.timings.module_ms})
+    total = max(len(result.modules), 1)
+    return {
+        key: {
+            "frame_ms": _median_p95(result.timings.module_ms.get(key, np.zeros(0))),
+            "poses": named.count(key),
+            "share": named.count(key) / total,
+        }
+        for key in keys
+    }
+
+
+def _median_p95(values: NDArray[np.float64]) -> Metrics:
+    if not len(values):
+        return {"median": None, "p95": None}
+    return {"median": float(np.median(values)), "p95": float(np.percentile(values, 95))}
+
+
+def _notes(result: RunResult, truth: GroundTruth | None, settings: EvaluationSettings) -> list[str]:
+    estimate = result.trajectory
+    if truth is None or not len(truth.trajectory) or not len(estimate):
+        return []
+    if len(absolute_errors(estimate, truth.trajectory, settings.association_gap_s).errors_m):
+        return []
+    return [
+        "no pose could be held against the ground truth: "
+        f"trajectory {_span(estimate)}, ground truth {_span(truth.trajectory)}, "
+        f"association_gap_s {settings.association_gap_s:g}"
+    ]
+
+
+def _span(trajectory: Trajectory) -> str:
+    first_s, last_s = trajectory.stamps_ns[[0, -1]] * 1e-9
+    return f"{first_s:.3f} s to {last_s:.3f} s"
+
+
+def _plain(value: Any) -> Any:
+    """Return a value that JSON knows: plain numbers, and None for NaN and infinity."""
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,96 @@
+"""A run in a few lines for the terminal."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from sceneslam.evaluation.metrics import Metrics
+
+_MAX_SWITCHES = 3  # the others are counted; the report has all of them
+
+
+def summary_lines(metrics: Metrics) -> list[str]:
+    """Return at most ten short lines that say how a run went."""
+    lines = [_what_was_seen(metrics), _who_worked(metrics)]
+    lines += [_switch_line(metrics, switch) for switch in metrics["switches"][:_MAX_SWITCHES]]
+    hidden = len(metrics["switches"]) - _MAX_SWITCHES
+    if hidden > 0:
+        lines.append(f"and {hidden} more switches (see report.html)")
+    if metrics["ate_rmse_m"] is not None:
+        lines.append(_accuracy_line(metrics))
+    if "reference" in metrics:
+        lines.append(_reference_line(metrics["reference"]))
+    lines += metrics["notes"][:1]
+    return [*lines, _cost_line(metrics)]
+
+
+def seconds(metrics: Metrics, stamp_ns: int) -> float:
+    """Return an instant as seconds since the first observation."""
+    return (stamp_ns - (metrics["start_ns"] or 0)) * 1e-9
+
+
+def number(value: float | None, digits: int = 3, unit: str = "", scale: float = 1.0) -> str:
+    """Return a number with its unit, or a dash for what is not known."""
+    return "–" if value is None else f"{value * scale:.{digits}f}{unit}"
+
+
+def percent(value: float | None, digits: int = 1) -> str:
+    """Return a share as a percentage, or a dash for what is not known."""
+    return number(value, digits, " %", 100.0)
+
+
+def degrees(value_rad: float | None, digits: int = 2) -> str:
+    """Return an angle in degrees, or a dash for what is not known."""
+    return number(value_rad, digits, "°", math.degrees(1.0))
+
+
+def _what_was_seen(metrics: Metrics) -> str:
+    return (
+        f"{metrics['observations']} observations in {metrics['duration_s']:.1f} s, "
+        f"{metrics['poses']} poses (coverage {percent(metrics['coverage'])}), "
+        f"path {metrics['path_length_m']:.2f} m"
+    )
+
+
+def _who_worked(metrics: Metrics) -> str:
+    shares = [f"{key} {percent(module['share'], 0)}" for key, module in metrics["modules"].items()]
+    return f"modules: {', '.join(shares) or 'none'}; {metrics['bridged']} poses bridged"
+
+
+def _switch_line(metrics: Metrics, switch: dict[str, Any]) -> str:
+    delay_s = switch["confirm_delay_s"]
+    delay = "" if delay_s is None else f", {delay_s:.2f} s after the change"
+    return (
+        f"{seconds(metrics, switch['stamp_ns']):.1f} s: {switch['from']} -> {switch['to']} "
+        f"({switch['reason']}: {switch['scene']}){delay}, "
+        f"jump {number(switch['jump_m'], 3, ' m')} {degrees(switch['jump_rad'])}, "
+        f"gap {number(switch['gap_s'], 2, ' s')}"
+    )
+
+
+def _accuracy_line(metrics: Metrics) -> str:
+    return (
+        f"against ground truth: ATE {number(metrics['ate_rmse_m'], 4, ' m')} "
+        f"(max {number(metrics['ate_max_m'], 3)}), "
+        f"RPE {number(metrics['rpe_trans_m'], 4, ' m')} {degrees(metrics['rpe_rot_rad'])}, "
+        f"correct {percent(metrics['correct_rate'])}, "
+        f"false switches {number(metrics['false_switches'], 0)}"
+    )
+
+
+def _reference_line(reference: Metrics) -> str:
+    return (
+        f"difference from the reference: at most {number(reference['max_difference_m'], 3, ' m')}, "
+        f"RMS {number(reference['rms_difference_m'], 3, ' m')} "
+        f"({reference['matched']} poses)"
+    )
+
+
+def _cost_line(metrics: Metrics) -> str:
+    return (
+        f"{number(metrics['realtime_factor'], 2)} x real time, "
+        f"bus {number(metrics['bus_overhead_us']['median'], 0, ' us')}, "
+        f"detector {number(metrics['detector_us']['median'], 0, ' us')} per observation, "
+        f"peak memory {number(metrics['peak_rss_mb'], 0, ' MB')}"
+    )

@@ -1,0 +1,148 @@
+"""Every change of module in a run: when, why, how late, and what it did to the trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sceneslam.evaluation.association import covered, interpolated
+from sceneslam.types import se3
+from sceneslam.types.run import Event, RunResult
+from sceneslam.types.se3 import Transform
+from sceneslam.types.truth import GroundTruth, SceneChange
+
+_TRUTH_GAP_S = 0.5  # ground truth is not interpolated over more
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Seam:
+    """The poses on either side of a hand-over; bridged poses may lie between them."""
+
+    before: int  # last pose that a module gave
+    after: int  # first pose of the module that took over
+
+
+def list_switches(result: RunResult, truth: GroundTruth | None) -> list[dict[str, Any]]:
+    """Return one entry for every decision that replaced a module, for `metrics.json`.
+
+    `jump_m` and `jump_rad` are the error of the estimated motion across the seam against the true
+    motion; where the truth does not cover it, what the hand-over itself measured. None is unknown.
+    """
+    decisions = [event for event in result.events if is_switch(event)]
+    return [_describe(decision, result, truth) for decision in decisions]
+
+
+def count_false(switches: Sequence[dict[str, Any]], truth: GroundTruth | None) -> int | None:
+    """Return how many switches followed a scene that was not the true one; None without truth."""
+    if truth is None or not truth.scenes:
+        return None
+    by_scene = [switch for switch in switches if switch["reason"] == "scene"]
+    false = [s for s in by_scene if true_scene(truth, s["stamp_ns"]) != s["scene"]]
+    return len(false)
+
+
+def is_switch(event: Event) -> bool:
+    """Tell whether an event is a decision that replaced a module."""
+    return event["event"] == "decision" and event.get("from") is not None
+
+
+def true_scene(truth: GroundTruth, stamp_ns: int) -> str | None:
+    """Return the true scene at an instant, None before the first that is known."""
+    change = _change_in_force(truth.scenes, stamp_ns)
+    return change.scene if change else None
+
+
+def find_seam(result: RunResult, decision: Event) -> Seam | None:
+    """Return the seam of a switch, None when there is no pose on one of its sides.
+
+    With `rewind` the new module also gives poses for stamps before the decision; the seam is
+    where its poses begin.
+    """
+    modules = np.array(result.modules, dtype=object)
+    stamps_ns = result.trajectory.stamps_ns
+    later = np.flatnonzero((modules == decision["to"]) & (stamps_ns >= decision["stamp_ns"]))
+    if not len(later):
+        return None
+    others = np.flatnonzero(modules[: later[0]] != decision["to"])
+    given = np.flatnonzero((modules[: later[0]] != decision["to"]) & (modules[: later[0]] != ""))
+    if not len(given):
+        return None
+    return Seam(before=int(given[-1]), after=int(others[-1]) + 1)
+
+
+def _describe(decision: Event, result: RunResult, truth: GroundTruth | None) -> dict[str, Any]:
+    handover = _same_stamp(result.events, "handover", decision)
+    cost = _same_stamp(result.events, "cost", decision)
+    seam = find_seam(result, decision)
+    T_error = _motion_error(result, truth, seam) if seam else None
+    jump_m, jump_rad = handover.get("jump_m"), handover.get("jump_rad")
+    if T_error is not None:
+        jump_m = float(np.linalg.norm(T_error[:3, 3]))
+        jump_rad = float(se3.rotation_angle_rad(T_error))
+    return {
+        "stamp_ns": int(decision["stamp_ns"]),
+        "scene": decision["scene"],
+        "from": decision["from"],
+        "to": decision["to"],
+        "reason": decision["reason"],
+        "confirm_delay_s": _confirm_delay_s(decision, truth),
+        "gap_s": _gap_s(result, seam) if seam else handover.get("gap_s"),
+        "jump_m": jump_m,
+        "jump_rad": jump_rad,
+        "cost_ms": cost.get("handover_ms"),
+    }
+
+
+def _same_stamp(events: Sequence[Event], kind: str, decision: Event) -> Event:
+    """Return the event of a kind that belongs to a decision, an empty one when there is none."""
+    for event in events:
+        same = event["event"] == kind and event["stamp_ns"] == decision["stamp_ns"]
+        if same and event["module"] == decision["to"]:
+            return event
+    return {}
+
+
+def _confirm_delay_s(decision: Event, truth: GroundTruth | None) -> float | None:
+    """Return the time since the true change that a switch answers, None when it answers none."""
+    if truth is None or decision["reason"] != "scene":
+        return None
+    change = _change_in_force(truth.scenes, decision["stamp_ns"])
+    if change is None or change is truth.scenes[0] or change.scene != decision["scene"]:
+        return None
+    return float(decision["stamp_ns"] - change.stamp_ns) * 1e-9
+
+
+def _change_in_force(changes: Sequence[SceneChange], stamp_ns: int) -> SceneChange | None:
+    """Return the last change up to an instant that really changed the scene (or is the first)."""
+    in_force: SceneChange | None = None
+    for change in changes:
+        if change.stamp_ns > stamp_ns:
+            break
+        if in_force is None or change.scene != in_force.scene:
+            in_force = change
+    return in_force
+
+
+def _gap_s(result: RunResult, seam: Seam) -> float:
+    """Return the longest time without a pose across the seam, less the usual period."""
+    stamps_ns = result.trajectory.stamps_ns[seam.before : seam.after + 1]
+    steps_ns = np.diff(result.observed_ns)
+    period_ns = float(np.median(steps_ns)) if len(steps_ns) else 0.0
+    return max(0.0, (float(np.diff(stamps_ns).max()) - period_ns) * 1e-9)
+
+
+def _motion_error(result: RunResult, truth: GroundTruth | None, seam: Seam) -> Transform | None:
+    """Return inv(true motion) @ estimated motion over the seam, None where truth is missing."""
+    if truth is None:
+        return None
+    ends = [seam.before, seam.after]
+    stamps_ns = result.trajectory.stamps_ns[ends]
+    if len(covered(truth.trajectory, stamps_ns, _TRUTH_GAP_S)) < 2:
+        return None
+    T_gt_before, T_gt_after = interpolated(truth.trajectory, stamps_ns).T_world_base
+    T_map_before, T_map_after = result.trajectory.T_world_base[ends]
+    true_motion = se3.inverse(T_gt_before) @ T_gt_after
+    return np.asarray(se3.inverse(true_motion) @ se3.inverse(T_map_before) @ T_map_after)
