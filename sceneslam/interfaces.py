@@ -8,6 +8,7 @@ an exception means a broken promise, and the bus stops the component for it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from sceneslam.types.maps import MapLayers
@@ -124,12 +125,16 @@ class SlamModule(Protocol):
 class Sink(Protocol):
     """Receives what the bus decides, while it runs."""
 
-    def open(self, rig: Rig) -> None:
-        """Get ready to write."""
+    def open(self, rig: Rig, folder: Path) -> None:
+        """Get ready to write; relative paths are relative to `folder`, the run's own."""
         ...
 
     def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
         """Take one observation with its pose (None when there is none) and active module."""
+        ...
+
+    def write_truth(self, truth: GroundTruth) -> None:
+        """Take what is known to be true, once, after the last observation."""
         ...
 
     def close(self) -> None:

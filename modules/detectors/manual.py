@@ -1,0 +1,65 @@
+"""Scenes from a schedule or from an operator's keyboard, as in the authors' manual bus."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from bisect import bisect_right
+
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.observation import Observation, SceneVote
+from sceneslam.types.rig import Rig, Sensor
+
+_SCHEDULE = "a list of [seconds, scene] by rising seconds, the first at 0"
+
+
+class Manual:
+    """Votes for the scene that the schedule names, or that the operator typed last.
+
+    `schedule` holds [seconds since the first observation, scene]. With `operator` a line typed on
+    standard input that is one of the scenes takes over from the schedule from then on.
+    """
+
+    requires = (frozenset[Sensor](),)
+
+    def __init__(self, schedule: list[list[float | str]], operator: bool) -> None:
+        if not schedule or any(len(entry) != 2 for entry in schedule):
+            raise ConfigError("schedule", schedule, _SCHEDULE)
+        try:
+            self._starts_s = [float(entry[0]) for entry in schedule]
+        except ValueError:
+            raise ConfigError("schedule", schedule, _SCHEDULE) from None
+        if self._starts_s[0] != 0 or sorted(set(self._starts_s)) != self._starts_s:
+            raise ConfigError("schedule", schedule, _SCHEDULE)
+        self._names = [str(entry[1]) for entry in schedule]
+        self._operator = operator
+        self._typed: str | None = None
+        self._first_ns: int | None = None
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """Return the scenes of the schedule, each once."""
+        return tuple(dict.fromkeys(self._names))
+
+    def activate(self, rig: Rig) -> None:
+        """Start the schedule at the next observation; listen to the operator."""
+        self._first_ns, self._typed = None, None
+        if self._operator:
+            threading.Thread(target=self._listen, daemon=True, name="operator").start()
+
+    def get_scene(self, observation: Observation) -> SceneVote:
+        """Return the scene that holds at the observation's stamp."""
+        if self._first_ns is None:
+            self._first_ns = observation.stamp_ns
+        elapsed_s = (observation.stamp_ns - self._first_ns) / 1e9
+        index = max(bisect_right(self._starts_s, elapsed_s) - 1, 0)
+        scene = self._typed or self._names[index]
+        return SceneVote(stamp_ns=observation.stamp_ns, scene=scene)
+
+    def shutdown(self) -> None:
+        """Do nothing: the listening thread ends with the process."""
+
+    def _listen(self) -> None:
+        for line in sys.stdin:
+            if line.strip() in self.scenes:
+                self._typed = line.strip()

@@ -1,0 +1,62 @@
+"""The robot's motion while no module tells it: odometry, else constant velocity."""
+
+from __future__ import annotations
+
+from sceneslam.types import se3
+from sceneslam.types.observation import Observation
+from sceneslam.types.se3 import Transform
+
+
+class Bridge:
+    """Predicts T_map_base from the last known pose on."""
+
+    def __init__(self, *, velocity_horizon_s: float) -> None:
+        self._horizon_ns = round(velocity_horizon_s * 1e9)
+        self._T_map_base: Transform | None = None
+        self._T_odom_base: Transform | None = None
+        self._stamp_ns = 0
+        self._before: tuple[int, Transform] | None = None  # the pose before the last known one
+        self._known: tuple[int, Transform] | None = None  # the last pose that a module gave
+
+    @property
+    def T_map_base(self) -> Transform:
+        """Return the last pose, known or predicted; the identity before there is one."""
+        return se3.identity() if self._T_map_base is None else self._T_map_base
+
+    def update(self, observation: Observation, T_map_base: Transform) -> None:
+        """Take a pose that a module gave."""
+        self._before, self._known = self._known, (observation.stamp_ns, T_map_base)
+        self._move(observation, T_map_base)
+
+    def predict(self, observation: Observation, *, by_velocity: bool) -> Transform | None:
+        """Return T_map_base at the observation and go on from there, None when nothing tells it.
+
+        Odometry bridges any gap. Constant velocity is allowed by `by_velocity` and only within
+        the horizon after the last known pose.
+        """
+        if self._T_map_base is None:
+            return None
+        if observation.T_odom_base is not None and self._T_odom_base is not None:
+            T_prev_curr = se3.inverse(self._T_odom_base) @ observation.T_odom_base
+        elif by_velocity and self._within_horizon(observation.stamp_ns):
+            T_prev_curr = self._at_constant_velocity(observation.stamp_ns - self._stamp_ns)
+        else:
+            return None
+        self._move(observation, self._T_map_base @ T_prev_curr)
+        return self._T_map_base
+
+    def _within_horizon(self, stamp_ns: int) -> bool:
+        return self._known is not None and stamp_ns - self._known[0] <= self._horizon_ns
+
+    def _at_constant_velocity(self, elapsed_ns: int) -> Transform:
+        """Return the motion in `elapsed_ns` if the last two known poses tell the velocity."""
+        if self._known is None or self._before is None:
+            return se3.identity()
+        step_ns = self._known[0] - self._before[0]
+        T_prev_curr = se3.inverse(self._before[1]) @ self._known[1]
+        return se3.exp(elapsed_ns / step_ns * se3.log(T_prev_curr))
+
+    def _move(self, observation: Observation, T_map_base: Transform) -> None:
+        self._T_map_base = T_map_base
+        self._T_odom_base = observation.T_odom_base
+        self._stamp_ns = observation.stamp_ns

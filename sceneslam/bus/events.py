@@ -1,0 +1,55 @@
+"""The event log: every vote, decision and hand-over, one JSON object per line."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TextIO
+
+from sceneslam.types.run import Event
+
+
+class EventLog:
+    """Collects events in memory and writes them to `events.jsonl` as they come.
+
+    All events but `cost` are functions of the recording and the configuration alone.
+    """
+
+    def __init__(self, path: Path | None = None) -> None:
+        self._events: list[Event] = []
+        self._file: TextIO | None = path.open("w") if path else None
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """Return all events so far."""
+        return tuple(self._events)
+
+    def add(self, event: str, stamp_ns: int, **fields: Any) -> None:
+        """Record an event; NaN becomes null. All but votes reach the disk at once."""
+        line: dict[str, Any] = {"event": event, "stamp_ns": stamp_ns}
+        for key, value in fields.items():
+            line[key] = None if isinstance(value, float) and not math.isfinite(value) else value
+        self._events.append(line)
+        if self._file:
+            self._file.write(json.dumps(line) + "\n")
+            if event != "vote":
+                self._file.flush()
+
+    def close(self) -> None:
+        """Close the file. May be called twice."""
+        if self._file:
+            self._file.close()
+            self._file = None
+
+    def __enter__(self) -> EventLog:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()

@@ -1,0 +1,102 @@
+"""One SLAM module under the bus's care: called, timed, and stopped when it breaks its promise."""
+
+from __future__ import annotations
+
+import logging
+import math
+from time import perf_counter_ns
+
+from sceneslam.interfaces import SlamModule
+from sceneslam.types.errors import ModuleError, SceneSlamError
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.observation import Observation, Tracking
+from sceneslam.types.rig import Rig
+from sceneslam.types.se3 import Transform
+
+_log = logging.getLogger(__name__)
+
+
+class Runner:
+    """Turns whatever a module raises into a ModuleError, and refuses poses that are not finite."""
+
+    def __init__(self, key: str, module: SlamModule) -> None:
+        self.key = key
+        self.is_failed = False
+        self.T_map_local: Transform | None = None  # None until it is placed
+        self.track_ms: list[float] = []
+        self.spent_ns = 0  # in all calls together
+        self._module = module
+
+    def activate(self, rig: Rig, scene: str) -> None:
+        """Start the module anew; raises ModuleError when it cannot."""
+        self.T_map_local = None
+        began_ns = perf_counter_ns()
+        try:
+            self._module.activate(rig)
+            self._module.set_scene(scene)
+        except Exception as error:
+            raise self._failed("could not be activated", error) from error
+        finally:
+            self.spent_ns += perf_counter_ns() - began_ns
+
+    def place(self, T_map_local: Transform) -> None:
+        """Place the module's frame in the map."""
+        self.T_map_local = T_map_local
+        try:
+            self._module.set_pose(T_map_local)
+        except Exception as error:
+            raise self._failed("could not be placed", error) from error
+
+    def set_scene(self, scene: str) -> None:
+        """Tell the module of a confirmed scene that it goes on with."""
+        try:
+            self._module.set_scene(scene)
+        except Exception as error:
+            raise self._failed("could not take the scene", error) from error
+
+    def can_use(self, observation: Observation) -> bool:
+        """Tell whether the observation holds one of the sensor sets that suffice."""
+        return any(
+            all(observation.has(sensor) for sensor in sensors) for sensors in self._module.requires
+        )
+
+    def track(self, observation: Observation) -> Tracking:
+        """Return the module's answer; raises ModuleError on an exception or a pose of NaN."""
+        began_ns = perf_counter_ns()
+        try:
+            tracking = self._module.track(observation)
+        except Exception as error:
+            raise self._failed("failed while tracking", error) from error
+        finally:
+            cost_ns = perf_counter_ns() - began_ns
+            self.spent_ns += cost_ns
+            self.track_ms.append(cost_ns / 1e6)
+        if not math.isfinite(tracking.T_local_base.sum()):
+            raise self._failed("returned a pose that is not finite", None)
+        return tracking
+
+    def retire(self) -> MapLayers:
+        """Shut the module down and return its map, empty layers when it cannot give one."""
+        layers = MapLayers()
+        began_ns = perf_counter_ns()
+        try:
+            layers = self._module.get_map()
+        except Exception as error:
+            self._report("could not give its map", error)
+        try:
+            self._module.shutdown()
+        except Exception as error:
+            self._report("could not be shut down", error)
+        self.spent_ns += perf_counter_ns() - began_ns
+        return layers
+
+    def _failed(self, what: str, error: Exception | None) -> ModuleError:
+        self.is_failed = True
+        return ModuleError(self._sentence(what, error))
+
+    def _report(self, what: str, error: Exception) -> None:
+        _log.warning(self._sentence(what, error), exc_info=not isinstance(error, SceneSlamError))
+
+    def _sentence(self, what: str, error: Exception | None) -> str:
+        reason = f": {type(error).__name__}: {error}" if error else ""
+        return f"slam.{self.key} {what}{reason}"

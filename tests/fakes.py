@@ -1,0 +1,106 @@
+"""Stand-ins that break their promises on demand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sceneslam.types import se3
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.observation import (
+    UNSURE,
+    Observation,
+    SceneVote,
+    Tracking,
+    TrackingStatus,
+)
+from sceneslam.types.rig import Rig, Sensor
+
+PERIOD_NS = 100_000_000
+SPEED_M_S = 0.5
+RIG = Rig(sensors=frozenset({Sensor.ODOMETRY, Sensor.IMAGE}))
+
+
+def observation(index: int, *, has_odometry: bool = True) -> Observation:
+    """The robot drives along x at constant speed."""
+    stamp_ns = index * PERIOD_NS
+    T_odom_base = se3.from_xy_yaw(SPEED_M_S * stamp_ns / 1e9, 0.0, 0.0)
+    return Observation(
+        stamp_ns=stamp_ns,
+        image_bgr=np.zeros((2, 2, 3), np.uint8),
+        T_odom_base=T_odom_base if has_odometry else None,
+    )
+
+
+class ScriptedDetector:
+    """Votes for the scene that `scene_at` names for an index."""
+
+    scenes = ("Bright", "Dark")
+    requires = (frozenset({Sensor.IMAGE}),)
+
+    def __init__(self, scene_at):
+        self.scene_at = scene_at
+        self.is_shut_down = False
+
+    def activate(self, rig):
+        pass
+
+    def get_scene(self, observation):
+        scene = self.scene_at(observation.stamp_ns // PERIOD_NS)
+        return SceneVote(stamp_ns=observation.stamp_ns, scene=scene or UNSURE)
+
+    def shutdown(self):
+        self.is_shut_down = True
+
+
+class ExactModule:
+    """Knows the motion exactly; `lost`, `raises` and `returns_nan` name indices where it does not."""
+
+    requires = (frozenset({Sensor.IMAGE}),)
+
+    def __init__(self, *, lost=(), raises=(), returns_nan=(), raises_on_activate=False):
+        self.lost, self.raises, self.returns_nan = set(lost), set(raises), set(returns_nan)
+        self.raises_on_activate = raises_on_activate
+        self.activations, self.shutdowns, self.scenes = 0, 0, []
+
+    def activate(self, rig):
+        if self.raises_on_activate:
+            raise RuntimeError("no licence")
+        self.activations += 1
+        self._first_ns, self._T_local_base, self._T_map_local = None, se3.identity(), se3.identity()
+
+    def set_pose(self, T_map_local):
+        self._T_map_local = T_map_local
+
+    def set_scene(self, scene):
+        self.scenes.append(scene)
+
+    def track(self, observation):
+        index = observation.stamp_ns // PERIOD_NS
+        if index in self.raises:
+            raise RuntimeError("out of memory")
+        if index in self.lost:
+            return Tracking(
+                stamp_ns=observation.stamp_ns,
+                T_local_base=self._T_local_base,
+                status=TrackingStatus.LOST,
+            )
+        if self._first_ns is None:
+            self._first_ns = observation.stamp_ns
+        moved_m = SPEED_M_S * (observation.stamp_ns - self._first_ns) / 1e9
+        self._T_local_base = se3.from_xy_yaw(moved_m, 0.0, 0.0)
+        if index in self.returns_nan:
+            self._T_local_base = self._T_local_base * np.nan
+        return Tracking(
+            stamp_ns=observation.stamp_ns,
+            T_local_base=self._T_local_base,
+            status=TrackingStatus.TRACKING,
+        )
+
+    def get_pose(self):
+        return self._T_map_local @ self._T_local_base
+
+    def get_map(self):
+        return MapLayers()
+
+    def shutdown(self):
+        self.shutdowns += 1

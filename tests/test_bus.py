@@ -1,0 +1,208 @@
+"""The bus: states, hand-over, fallbacks, and what happens when a module breaks its promise."""
+
+import numpy as np
+import pytest
+from fakes import PERIOD_NS, RIG, SPEED_M_S, ExactModule, ScriptedDetector, observation
+
+from sceneslam.atlas.atlas import BRIDGED, Atlas
+from sceneslam.bus.bus import Bus
+from sceneslam.bus.events import EventLog
+from sceneslam.bus.policy import Policy
+
+TABLE = {"Bright": ["bright", "dark"], "Dark": ["dark", "bright"]}
+
+
+def policy(**changes):
+    values = {
+        "handover": "cold",
+        "confirm_window_s": 2.0,
+        "first_confirm_window_s": 0.0,
+        "lost_patience_s": 0.3,
+        "bridge_s": 0.5,
+    }
+    return Policy(**(values | changes))
+
+
+def drive(modules, *, steps=100, scene_at=lambda i: "Bright", table=TABLE, **options):
+    """Run the bus over a straight drive; return it with its atlas, log and detector."""
+    has_odometry = options.pop("has_odometry", True)
+    atlas, log, detector = Atlas(voxel_m=0.05), EventLog(), ScriptedDetector(scene_at)
+    bus = Bus(
+        detector=detector,
+        modules=modules,
+        scenes=table,
+        policy=policy(**options),
+        rig=RIG,
+        atlas=atlas,
+        log=log,
+    )
+    for index in range(steps):
+        if bus.state == "terminate":
+            break
+        bus.step(observation(index, has_odometry=has_odometry))
+    bus.close(index * PERIOD_NS)
+    return bus, atlas, log, detector
+
+
+def events(log, kind):
+    return [event for event in log.events if event["event"] == kind]
+
+
+def dark_from(index):
+    return lambda i: "Dark" if i >= index else "Bright"
+
+
+def assert_exact(atlas, *, within_m=1e-9):
+    x_m = atlas.trajectory.positions_m[:, 0]
+    expected = SPEED_M_S * (atlas.trajectory.stamps_ns - atlas.trajectory.stamps_ns[0]) / 1e9
+    np.testing.assert_allclose(x_m, expected, atol=within_m)
+
+
+def test_first_scene_starts_its_module_at_the_origin():
+    _, atlas, log, _ = drive({"bright": ExactModule(), "dark": ExactModule()}, steps=5)
+    assert set(atlas.pose_modules) == {"bright"}
+    np.testing.assert_array_equal(atlas.trajectory.T_world_base[0], np.eye(4))
+    path = [(e["from"], e["to"]) for e in events(log, "state")]
+    assert path == [("init", "start"), ("start", "run"), ("run", "terminate")]
+
+
+def test_switch_waits_for_the_confirmation_window():
+    _, atlas, log, _ = drive(
+        {"bright": ExactModule(), "dark": ExactModule()}, scene_at=dark_from(40)
+    )
+    decision = events(log, "decision")[1]
+    assert decision["stamp_ns"] == (40 + 20) * PERIOD_NS
+    assert (decision["from"], decision["to"], decision["reason"]) == ("bright", "dark", "scene")
+
+
+def test_one_disagreeing_image_starts_the_window_anew():
+    def scene_at(index):
+        return "Bright" if index < 40 or index == 59 else "Dark"
+
+    _, _, log, _ = drive({"bright": ExactModule(), "dark": ExactModule()}, scene_at=scene_at)
+    assert events(log, "decision")[1]["stamp_ns"] == (60 + 20) * PERIOD_NS
+
+
+def test_trajectory_is_continuous_and_complete_across_the_switch():
+    _, atlas, log, _ = drive(
+        {"bright": ExactModule(), "dark": ExactModule()}, scene_at=dark_from(40)
+    )
+    assert len(atlas.trajectory) == 100
+    assert_exact(atlas)
+    T_map_local = np.array(events(log, "handover")[1]["T_map_local"])
+    assert T_map_local[0, 3] == pytest.approx(SPEED_M_S * 6.0)
+
+
+def test_same_module_for_the_new_scene_is_told_and_not_restarted():
+    module = ExactModule()
+    _, _, log, _ = drive(
+        {"only": module}, scene_at=dark_from(40), table={"Bright": ["only"], "Dark": ["only"]}
+    )
+    assert module.activations == 1 and module.scenes == ["Bright", "Dark"]
+    assert len(events(log, "decision")) == 1
+
+
+def test_lost_module_is_bridged_by_odometry_then_replaced():
+    bright = ExactModule(lost=range(50, 200))
+    _, atlas, log, _ = drive({"bright": bright, "dark": ExactModule()})
+    assert len(atlas.trajectory) == 100
+    assert_exact(atlas)
+    assert atlas.pose_modules[49:55] == ("bright", BRIDGED, BRIDGED, BRIDGED, BRIDGED, "dark")
+    assert events(log, "decision")[1]["reason"] == "lost"
+
+
+def test_lost_module_is_bridged_by_constant_velocity_without_odometry():
+    bright = ExactModule(lost=range(50, 200))
+    _, atlas, _, _ = drive({"bright": bright, "dark": ExactModule()}, has_odometry=False)
+    assert len(atlas.trajectory) == 100
+    assert_exact(atlas)
+
+
+def test_lost_module_without_a_fallback_invents_no_pose():
+    module = ExactModule(lost=range(50, 70))
+    bus, atlas, log, _ = drive(
+        {"only": module},
+        table={"Bright": ["only"], "Dark": ["only"]},
+        has_odometry=False,
+    )
+    assert len(atlas.trajectory) == 80
+    assert len(events(log, "decision")) == 1
+    assert atlas.pose_modules[-1] == "only"
+
+
+def test_two_lost_modules_do_not_take_turns_for_ever():
+    lost = range(50, 400)
+    _, _, log, _ = drive(
+        {"bright": ExactModule(lost=lost), "dark": ExactModule(lost=lost)}, steps=300
+    )
+    assert len(events(log, "decision")) <= 4
+
+
+def test_raising_module_is_stopped_and_its_fallback_runs():
+    bright = ExactModule(raises={50})
+    _, atlas, log, _ = drive({"bright": bright, "dark": ExactModule()})
+    assert len(atlas.trajectory) == 100
+    assert_exact(atlas)
+    assert "out of memory" in events(log, "fault")[0]["what"]
+    assert bright.shutdowns == 1
+
+
+def test_pose_of_nan_never_reaches_the_trajectory():
+    bright = ExactModule(returns_nan={50})
+    _, atlas, log, _ = drive({"bright": bright, "dark": ExactModule()})
+    assert np.isfinite(atlas.trajectory.T_world_base).all()
+    assert "not finite" in events(log, "fault")[0]["what"]
+
+
+def test_module_that_cannot_be_activated_gives_way_at_the_start():
+    bus, atlas, log, _ = drive(
+        {"bright": ExactModule(raises_on_activate=True), "dark": ExactModule()}
+    )
+    assert set(atlas.pose_modules) == {"dark"}
+    path = [(e["from"], e["to"]) for e in events(log, "state")]
+    assert path[:3] == [("init", "start"), ("start", "start"), ("start", "run")]
+
+
+def test_module_that_cannot_be_activated_leaves_the_old_one_running():
+    bright = ExactModule()
+    _, atlas, log, _ = drive(
+        {"bright": bright, "dark": ExactModule(raises_on_activate=True)}, scene_at=dark_from(40)
+    )
+    assert set(atlas.pose_modules) == {"bright"}
+    assert len(atlas.trajectory) == 100 and bright.activations == 1
+    path = [(e["from"], e["to"], e["reason"]) for e in events(log, "state")]
+    assert ("switch", "run", "failure") in path
+
+
+def test_run_terminates_when_no_module_is_left():
+    bus, atlas, log, detector = drive(
+        {"bright": ExactModule(raises={50}), "dark": ExactModule(raises_on_activate=True)}
+    )
+    assert bus.state == "terminate" and detector.is_shut_down
+    assert len(atlas.trajectory) == 51  # the last one bridged
+
+
+def test_detector_that_raises_keeps_the_scene():
+    def scene_at(index):
+        if index == 30:
+            raise ValueError("bad weights")
+        return "Bright"
+
+    _, atlas, log, _ = drive({"bright": ExactModule(), "dark": ExactModule()}, scene_at=scene_at)
+    assert len(atlas.trajectory) == 100
+    assert "bad weights" in events(log, "fault")[0]["what"]
+
+
+def test_unsure_votes_neither_confirm_nor_break_a_window():
+    def scene_at(index):
+        return ("Bright" if index < 40 else "Dark") if index % 2 else None
+
+    _, _, log, _ = drive({"bright": ExactModule(), "dark": ExactModule()}, scene_at=scene_at)
+    assert events(log, "decision")[1]["stamp_ns"] == (41 + 20) * PERIOD_NS
+
+
+def test_modules_and_detector_are_shut_down_at_the_end():
+    modules = {"bright": ExactModule(), "dark": ExactModule()}
+    _, _, _, detector = drive(modules, scene_at=dark_from(40))
+    assert [module.shutdowns for module in modules.values()] == [1, 1]
+    assert detector.is_shut_down
