@@ -10,7 +10,7 @@ from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
 
 _TRUTH_GAP_S = 0.5  # ground truth is not interpolated over more
-_POSE_GAP_S = 1.0  # a pose vouches for no more than this
+_POSE_GAP_NS = 10**9  # a pose vouches for no more than this
 
 
 def correct_rate(
@@ -37,6 +37,5 @@ def correct_rate(
     angle_rad = se3.rotation_angle_rad(se3.inverse(true.T_world_base) @ T_gt_base)
     is_correct = (distance_m <= limit_m) & (angle_rad <= limit_rad)
     end_ns = max(truth.stamps_ns[-1], matched.stamps_ns[-1])
-    vouched_s = np.diff(matched.stamps_ns, append=end_ns) * 1e-9
-    span_s = (end_ns - truth.stamps_ns[0]) * 1e-9
-    return float(np.minimum(vouched_s, _POSE_GAP_S)[is_correct].sum() / span_s)
+    vouched_ns = np.minimum(np.diff(matched.stamps_ns, append=end_ns), _POSE_GAP_NS)
+    return float(vouched_ns[is_correct].sum() / (end_ns - truth.stamps_ns[0]))

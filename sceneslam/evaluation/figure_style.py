@@ -1,0 +1,131 @@
+"""How all figures look: size, colours that the colour-blind can tell apart, bands of time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.run import RunResult
+from sceneslam.types.truth import GroundTruth
+
+# Okabe and Ito's palette, darkest first; yellow is left out, it vanishes on paper.
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+BRIDGED = "#777777"
+INK = "#222222"
+MUTED = "#666666"
+SCENE_TINTS = ("#FBF3D0", "#CFD6E4", "#DDEBDD", "#EFDCE6", "#E3E3E3")
+_TINT_OF = {"Bright": SCENE_TINTS[0], "Dark": SCENE_TINTS[1]}
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A stretch of time [s] with one label."""
+
+    start_s: float
+    end_s: float
+    label: str
+
+
+def new_figure(width_in: float = 8.0, height_in: float = 4.2) -> Any:
+    """Return an empty figure that draws with Agg and leaves no global state behind."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def style(axes: Any, *, x_label: str = "time [s]", y_label: str = "") -> None:
+    """Give axes their labels, sizes that a phone shows, and a light grid."""
+    axes.set_xlabel(x_label, fontsize=11, color=INK)
+    axes.set_ylabel(y_label, fontsize=11, color=INK)
+    axes.tick_params(labelsize=10, colors=INK)
+    axes.grid(visible=True, color="#DDDDDD", linewidth=0.6)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def save(figure: Any, path: Path) -> Path:
+    """Write a PNG whose bytes depend on the data alone."""
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+    return path
+
+
+def module_colors(result: RunResult) -> dict[str, str]:
+    """Return a colour for every module: in the map's order, then by first appearance."""
+    keys = dict.fromkeys([*result.map.modules, *(key for key in result.modules if key)])
+    return {key: PALETTE[number % len(PALETTE)] for number, key in enumerate(keys)}
+
+
+def scene_tints(scenes: Iterable[str]) -> dict[str, str]:
+    """Return a background tint for every scene."""
+    others = [scene for scene in dict.fromkeys(scenes) if scene not in _TINT_OF]
+    spare = SCENE_TINTS[2:]
+    return {**_TINT_OF, **{scene: spare[n % len(spare)] for n, scene in enumerate(others)}}
+
+
+def elapsed_s(result: RunResult, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return stamps as seconds since the first observation."""
+    origin_ns = result.observed_ns[0] if len(result.observed_ns) else np.int64(0)
+    return np.asarray((stamps_ns - origin_ns) * 1e-9)
+
+
+def duration_s(result: RunResult) -> float:
+    """Return the time from the first to the last observation [s]."""
+    return float(elapsed_s(result, result.observed_ns[-1:]).sum())
+
+
+def spans(times_s: NDArray[np.float64], labels: Sequence[str], end_s: float) -> list[Span]:
+    """Return the stretches of equal labels; each lasts until the next begins."""
+    if not len(labels):
+        return []
+    names = np.array(labels, dtype=object)
+    starts = np.flatnonzero(np.append(True, names[1:] != names[:-1]))
+    ends_s = np.append(times_s[starts[1:]], max(end_s, times_s[-1]))
+    return [
+        Span(float(times_s[start]), float(stop_s), str(names[start]))
+        for start, stop_s in zip(starts, ends_s, strict=True)
+    ]
+
+
+def module_spans(result: RunResult) -> list[Span]:
+    """Return who gave the poses when; "" where they were bridged."""
+    times_s = elapsed_s(result, result.trajectory.stamps_ns)
+    return spans(times_s, result.modules, duration_s(result))
+
+
+def true_scene_spans(result: RunResult, truth: GroundTruth | None) -> list[Span]:
+    """Return the true scenes within the run."""
+    changes = truth.scenes if truth else ()
+    stamps_ns = np.array([change.stamp_ns for change in changes], np.int64)
+    found = spans(
+        elapsed_s(result, stamps_ns), [change.scene for change in changes], duration_s(result)
+    )
+    return within(found, duration_s(result))
+
+
+def within(found: Sequence[Span], end_s: float) -> list[Span]:
+    """Return the parts of the spans that lie between 0 and `end_s`."""
+    cut = [Span(max(s.start_s, 0.0), min(s.end_s, end_s), s.label) for s in found]
+    return [span for span in cut if span.end_s > span.start_s]
+
+
+def draw_bands(axes: Any, bands: Sequence[Span], colors: dict[str, str], alpha: float) -> None:
+    """Shade stretches of time and name each at the top where there is room for it."""
+    total_s = max((band.end_s for band in bands), default=0.0)
+    for band in bands:
+        color = colors.get(band.label, BRIDGED)
+        axes.axvspan(band.start_s, band.end_s, color=color, alpha=alpha, linewidth=0, zorder=0)
+        if band.end_s - band.start_s > 0.06 * total_s:
+            centre_s = 0.5 * (band.start_s + band.end_s)
+            axes.text(
+                centre_s, 0.985, band.label or "bridged", transform=axes.get_xaxis_transform(),
+                ha="center", va="top", fontsize=10, color=INK,
+            )  # fmt: skip

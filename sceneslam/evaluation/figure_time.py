@@ -1,0 +1,183 @@
+"""Figures over time: what the detector saw, who worked, and how far off the poses were."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.evaluation import figure_style as look
+from sceneslam.evaluation.switches import is_switch
+from sceneslam.types.run import Event, RunResult
+from sceneslam.types.truth import GroundTruth
+
+
+def draw_votes(
+    result: RunResult, truth: GroundTruth | None, threshold: float | None, value_label: str
+) -> Any:
+    """Return the detector's value over time (the paper's Fig. 5), None without any value."""
+    votes = [e for e in result.events if e["event"] == "vote"]
+    values = np.array([e["value"] for e in votes], dtype=float)  # None becomes NaN
+    if not np.isfinite(values).any():
+        return None
+    times_s = look.elapsed_s(result, np.array([e["stamp_ns"] for e in votes], np.int64))
+    figure = look.new_figure()
+    axes = figure.add_subplot()
+    bands = look.true_scene_spans(result, truth)
+    look.draw_bands(axes, bands, look.scene_tints(b.label for b in bands), 0.9)
+    axes.plot(times_s, values, color=look.PALETTE[0], linewidth=1.4, label=value_label)
+    if threshold is not None:
+        axes.axhline(
+            threshold, color=look.PALETTE[1], linestyle="--", linewidth=1.4,
+            label=f"threshold {threshold:g}",
+        )  # fmt: skip
+    _mark_confirmed(axes, result)
+    look.style(axes, y_label=value_label)
+    axes.set_xlim(0.0, max(look.duration_s(result), 1e-3))
+    _leave_room(axes)
+    _legend_below(figure, axes)
+    return figure
+
+
+def draw_series(
+    result: RunResult,
+    stamps_ns: NDArray[np.int64],
+    values_m: NDArray[np.float64],
+    *,
+    y_label: str,
+    limit_m: float | None = None,
+) -> Any:
+    """Return a distance over time with a band per module, None when there is none."""
+    if not len(values_m):
+        return None
+    figure = look.new_figure()
+    axes = figure.add_subplot()
+    look.draw_bands(axes, look.module_spans(result), look.module_colors(result), 0.16)
+    times_s = look.elapsed_s(result, stamps_ns)
+    rms_m = float(np.sqrt(np.mean(values_m**2)))
+    label = f"{y_label.split(' [')[0]}: RMS {rms_m:.3f} m, max {values_m.max():.3f} m"
+    marker = "o" if len(values_m) == 1 else None
+    axes.plot(times_s, values_m, color=look.INK, linewidth=1.3, marker=marker, label=label)
+    if limit_m is not None:
+        axes.axhline(limit_m, color=look.MUTED, linestyle=":", label=f"{limit_m:g} m")
+    for event in filter(is_switch, result.events):
+        axes.axvline(_at_s(result, event), color=look.INK, linewidth=0.9, linestyle="-.")
+    look.style(axes, y_label=y_label)
+    axes.set_xlim(0.0, max(look.duration_s(result), 1e-3))
+    axes.set_ylim(bottom=0.0)
+    _leave_room(axes)
+    _legend_below(figure, axes)
+    return figure
+
+
+def draw_timeline(result: RunResult, truth: GroundTruth | None) -> Any:
+    """Return who worked when: scenes above, one row per module, its bad moments hatched."""
+    if not len(result.observed_ns):
+        return None
+    confirmed = _confirmed_spans(result)
+    true = look.true_scene_spans(result, truth)
+    tints = look.scene_tints(span.label for span in (*true, *confirmed))
+    colors = look.module_colors(result)
+    rows = [("true scene", true), ("confirmed", confirmed)]
+    rows = [(name, bars) for name, bars in rows if bars]
+    active = look.module_spans(result)
+    rows += [(key, [s for s in active if s.label == key]) for key in colors]
+    if any(span.label == "" for span in active):
+        rows.append(("bridged", [s for s in active if s.label == ""]))
+    figure = look.new_figure(8.0, 1.3 + 0.5 * len(rows))
+    axes = figure.add_subplot()
+    for row, (name, bars) in enumerate(rows):
+        is_scene = name in ("true scene", "confirmed")
+        for bar in bars:
+            color = (tints if is_scene else colors).get(bar.label, look.BRIDGED)
+            _draw_bar(axes, bar, row, color, name_it=is_scene, total_s=look.duration_s(result))
+        _draw_trouble(axes, result, name, row)
+    faults_s = [_at_s(result, e) for e in result.events if e["event"] in ("fault", "dropped")]
+    if faults_s:
+        axes.plot(faults_s, [len(rows)] * len(faults_s), "x", color=look.INK, clip_on=False)
+        rows.append(("faults", []))
+    look.style(axes)
+    axes.set_yticks(range(len(rows)), [name for name, _ in rows])
+    axes.set_ylim(max(len(rows), 1) - 0.4, -0.6)
+    axes.set_xlim(0.0, max(look.duration_s(result), 1e-3))
+    _key_to_trouble(figure, result)
+    return figure
+
+
+def _at_s(result: RunResult, event: Event) -> float:
+    return float(look.elapsed_s(result, np.array([event["stamp_ns"]], np.int64))[0])
+
+
+def _mark_confirmed(axes: Any, result: RunResult) -> None:
+    for event in result.events:
+        if event["event"] == "scene" and event["previous"] is not None:
+            at_s = _at_s(result, event)
+            axes.axvline(at_s, color=look.INK, linewidth=1.1, linestyle="-.")
+            axes.text(
+                at_s, 0.5, f"{event['scene']} confirmed", transform=axes.get_xaxis_transform(),
+                rotation=90, ha="center", va="center", fontsize=9, color=look.INK,
+                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5},
+            )  # fmt: skip
+
+
+def _confirmed_spans(result: RunResult) -> list[look.Span]:
+    changes = [e for e in result.events if e["event"] == "scene"]
+    times_s = look.elapsed_s(result, np.array([e["stamp_ns"] for e in changes], np.int64))
+    return look.spans(times_s, [e["scene"] for e in changes], look.duration_s(result))
+
+
+def _draw_bar(
+    axes: Any, bar: look.Span, row: int, color: str, *, name_it: bool, total_s: float
+) -> None:
+    width_s = max(bar.end_s - bar.start_s, 0.002 * total_s)
+    axes.barh(row, width_s, left=bar.start_s, height=0.62, color=color, linewidth=0)
+    if name_it and width_s > 0.08 * total_s:
+        axes.text(bar.start_s + width_s / 2, row, bar.label, ha="center", va="center", fontsize=10)
+
+
+def _draw_trouble(axes: Any, result: RunResult, module: str, row: int) -> None:
+    for bar in _trouble(result, module):
+        hatch = "xxxx" if bar.label == "lost" else "////"
+        axes.barh(
+            row, max(bar.end_s - bar.start_s, 1e-3), left=bar.start_s, height=0.62, hatch=hatch,
+            facecolor="none", edgecolor=look.INK, linewidth=0.4,
+        )  # fmt: skip
+
+
+def _trouble(result: RunResult, module: str) -> list[look.Span]:
+    """Return when a module was not simply tracking, until it was replaced."""
+    changes = [e for e in result.events if e["event"] == "tracking" and e["module"] == module]
+    times_s = look.elapsed_s(result, np.array([e["stamp_ns"] for e in changes], np.int64))
+    found = look.spans(times_s, [e["status"] for e in changes], look.duration_s(result))
+    replaced = [e for e in result.events if is_switch(e) and e["from"] == module]
+    replaced_s = [*(_at_s(result, e) for e in replaced), float("inf")]
+    return [
+        look.Span(s.start_s, min(s.end_s, *(t for t in replaced_s if t >= s.start_s)), s.label)
+        for s in found
+        if s.label != "tracking"
+    ]
+
+
+def _key_to_trouble(figure: Any, result: RunResult) -> None:
+    from matplotlib.patches import Patch
+
+    seen = {e["status"] for e in result.events if e["event"] == "tracking"}
+    keys = [
+        Patch(facecolor="none", edgecolor=look.INK, hatch=hatch, label=status)
+        for status, hatch in (("degraded", "////"), ("lost", "xxxx"))
+        if status in seen
+    ]
+    if keys:
+        figure.legend(handles=keys, loc="outside lower right", ncols=2, fontsize=9, frameon=False)
+
+
+def _leave_room(axes: Any) -> None:
+    """Raise the upper limit, so that curves stay clear of the names at the top."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.12 * (high - low))
+
+
+def _legend_below(figure: Any, axes: Any) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=10, frameon=False)

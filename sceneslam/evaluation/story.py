@@ -1,0 +1,74 @@
+"""What happened in a run, in plain sentences."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sceneslam.evaluation.metrics import Metrics
+from sceneslam.evaluation.summary import degrees, number, percent, seconds
+
+_TOLD_SWITCHES = 8
+_WHY = {
+    "scene": "the scene was confirmed to be {scene}",
+    "lost": "{from} had lost track",
+    "failed": "{from} had failed",
+}
+
+
+def tell(metrics: Metrics) -> list[str]:
+    """Return a run as a few paragraphs, without a term that needs the manual."""
+    paragraphs = [_opening(metrics)]
+    told = metrics["switches"][:_TOLD_SWITCHES]
+    if told:
+        paragraphs.append(" ".join(_change(metrics, switch) for switch in told))
+    if len(metrics["switches"]) > len(told):
+        paragraphs.append("The later changes are in the table below.")
+    paragraphs += [_accuracy(metrics)] if metrics["ate_rmse_m"] is not None else []
+    return paragraphs
+
+
+def _opening(metrics: Metrics) -> str:
+    if not metrics["observations"]:
+        return "The source gave no observations, so there is nothing to report."
+    seen = f"{metrics['observations']} observations over {metrics['duration_s']:.1f} s"
+    if not metrics["poses"]:
+        return f"The run took in {seen}, but no module ever gave a pose."
+    text = (
+        f"The run took in {seen}. From the first pose on, {percent(metrics['coverage'])} of them "
+        f"got a pose; the path is {metrics['path_length_m']:.2f} m long."
+    )
+    if metrics["bridged"]:
+        text += f" {metrics['bridged']} poses were bridged: no module gave them."
+    if not metrics["switches"]:
+        worked = [key for key, module in metrics["modules"].items() if module["poses"]]
+        text += f" {' and '.join(worked) or 'No module'} did all the work; nothing was switched."
+    return text
+
+
+def _change(metrics: Metrics, switch: dict[str, Any]) -> str:
+    text = (
+        f"At {seconds(metrics, switch['stamp_ns']):.1f} s {switch['to']} took over from "
+        f"{switch['from']}, because {_WHY.get(switch['reason'], switch['reason']).format(**switch)}"
+    )
+    if switch["confirm_delay_s"] is not None:
+        text += f", {switch['confirm_delay_s']:.2f} s after it really changed"
+    if switch["jump_m"] is None:
+        return text + "."
+    text += (
+        f"; the trajectory is off by {number(switch['jump_m'], 3, ' m')} and "
+        f"{degrees(switch['jump_rad'])} across the change"
+    )
+    if switch["gap_s"]:
+        return text + f" and has no pose for {switch['gap_s']:.2f} s."
+    return text + " and has no gap."
+
+
+def _accuracy(metrics: Metrics) -> str:
+    text = (
+        f"Against the ground truth the position is off by {number(metrics['ate_rmse_m'], 3, ' m')} "
+        f"(root mean square) and at most {number(metrics['ate_max_m'], 3, ' m')}. "
+        f"For {percent(metrics['correct_rate'])} of the time the pose was correct"
+    )
+    if metrics["false_switches"]:
+        return text + f"; {metrics['false_switches']} switches followed a scene that was not there."
+    return text + "."

@@ -1,0 +1,151 @@
+"""Made-up runs for the tests of evaluation: a robot that drives a loop and changes modules."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.evaluation.settings import EvaluationSettings
+from sceneslam.types import se3
+from sceneslam.types.maps import GridLayer, HybridMap, PointLayer
+from sceneslam.types.run import Event, RunResult, Timings
+from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import GroundTruth, SceneChange
+
+START_NS = 1_700_000_000_000_000_000
+PERIOD_NS = 100_000_000
+SETTINGS = EvaluationSettings(
+    association_gap_s=0.01, rpe_interval_s=1.0, correct_limit_m=0.25, correct_limit_rad=0.1745
+)
+
+
+def stamps(count: int, start_ns: int = START_NS) -> NDArray[np.int64]:
+    return start_ns + PERIOD_NS * np.arange(count, dtype=np.int64)
+
+
+def loop(count: int, start_ns: int = START_NS) -> Trajectory:
+    """An oval of 4 m by 2 m, once around, heading along the path."""
+    angle = 2 * np.pi * np.arange(count) / max(count, 1)
+    poses = [
+        se3.from_xy_yaw(2 * np.sin(a), 1 - np.cos(a), np.arctan2(np.sin(a), 2 * np.cos(a)))
+        for a in angle
+    ]
+    return Trajectory(
+        stamps_ns=stamps(count, start_ns),
+        T_world_base=np.array(poses).reshape(-1, 4, 4),
+    )
+
+
+def moved(trajectory: Trajectory, T_a_world: NDArray[np.float64]) -> Trajectory:
+    return Trajectory(
+        stamps_ns=trajectory.stamps_ns, T_world_base=T_a_world @ trajectory.T_world_base
+    )
+
+
+def shaken(trajectory: Trajectory, sigma_m: float, seed: int = 1) -> Trajectory:
+    T_world_base = trajectory.T_world_base.copy()
+    rng = np.random.default_rng(seed)
+    T_world_base[:, :3, 3] += rng.normal(0, sigma_m, (len(trajectory), 3))
+    return Trajectory(stamps_ns=trajectory.stamps_ns, T_world_base=T_world_base)
+
+
+def switch_events(stamp_ns: int, since_ns: int) -> list[Event]:
+    return [
+        {"event": "scene", "stamp_ns": stamp_ns, "scene": "Dark", "previous": "Bright",
+         "since_ns": since_ns},
+        {"event": "state", "stamp_ns": stamp_ns, "from": "run", "to": "switch", "reason": "scene"},
+        {"event": "decision", "stamp_ns": stamp_ns, "scene": "Dark", "from": "rgbd",
+         "to": "laser", "reason": "scene"},
+        {"event": "handover", "stamp_ns": stamp_ns, "session": 1, "module": "laser",
+         "kind": "cold", "T_map_local": np.eye(4).tolist(), "jump_m": 0.5, "jump_rad": 0.25,
+         "gap_s": 0.75},
+        {"event": "cost", "stamp_ns": stamp_ns, "module": "laser", "handover_ms": 3.5},
+    ]  # fmt: skip
+
+
+def first_events() -> list[Event]:
+    return [
+        {"event": "scene", "stamp_ns": START_NS, "scene": "Bright", "previous": None,
+         "since_ns": START_NS},
+        {"event": "decision", "stamp_ns": START_NS, "scene": "Bright", "from": None,
+         "to": "rgbd", "reason": "first"},
+        {"event": "tracking", "stamp_ns": START_NS, "module": "rgbd", "status": "tracking"},
+    ]  # fmt: skip
+
+
+def votes(count: int, dark_from: int) -> list[Event]:
+    values = 130 - 100 / (1 + np.exp(-(np.arange(count) - dark_from) / 3.0))
+    return [
+        {"event": "vote", "stamp_ns": int(stamp_ns), "value": float(value),
+         "scene": "Bright" if value > 100 else "Dark"}
+        for stamp_ns, value in zip(stamps(count), values, strict=True)
+    ]  # fmt: skip
+
+
+def hybrid_map(points: int = 3000) -> HybridMap:
+    rng = np.random.default_rng(0)
+    cloud = rng.uniform([-3, -1, 0], [3, 3, 2], (points, 3)).astype(np.float32)
+    wall = rng.integers(0, 2, points).astype(bool)
+    cloud[wall, 1] = -1.0
+    log_odds = np.zeros((80, 120), np.float32)
+    log_odds[10:70, 10:110] = -2.0
+    log_odds[[10, 69], 10:110] = 3.0
+    return HybridMap(
+        points=PointLayer(points=cloud),
+        point_modules=(cloud[:, 0] > 0).astype(np.uint8),
+        modules=("rgbd", "laser"),
+        grid=GridLayer(log_odds=log_odds, resolution_m=0.05, origin_xy_m=(-3.0, -1.5)),
+    )
+
+
+def empty_map() -> HybridMap:
+    return HybridMap(
+        points=PointLayer(points=np.zeros((0, 3), np.float32)),
+        point_modules=np.zeros(0, np.uint8),
+        modules=(),
+    )
+
+
+def timings(count: int) -> Timings:
+    cost = np.linspace(10, 30, count)
+    return Timings(
+        detector_us=cost, bus_us=2 * cost, module_ms={"rgbd": cost, "laser": cost / 3}, wall_s=8.0
+    )
+
+
+def switched_run(count: int = 200, true_at: int = 80, decided_at: int = 100) -> RunResult:
+    """A run that is exact but for 1 mm of noise, and changes to `laser` at `decided_at`."""
+    return RunResult(
+        observed_ns=stamps(count),
+        trajectory=shaken(loop(count), 0.001),
+        modules=["rgbd"] * decided_at + ["laser"] * (count - decided_at),
+        sessions=[],
+        map=hybrid_map(),
+        events=[
+            *first_events(),
+            *votes(count, true_at),
+            *switch_events(int(stamps(count)[decided_at]), int(stamps(count)[true_at])),
+        ],
+        timings=timings(count),
+    )
+
+
+def true_loop(count: int = 200, true_at: int = 80) -> GroundTruth:
+    """The truth of `switched_run`, in a frame of its own."""
+    T_gt_map = se3.exp(np.array([3.0, -2.0, 0.5, 0.1, -0.2, 2.0]))
+    changes = [SceneChange(stamp_ns=START_NS, scene="Bright")]
+    changes.append(SceneChange(stamp_ns=int(stamps(count)[true_at]), scene="Dark"))
+    return GroundTruth(trajectory=moved(loop(count), T_gt_map), scenes=tuple(changes))
+
+
+def poseless_run(observed: int = 0) -> RunResult:
+    none = np.zeros(0)
+    return RunResult(
+        observed_ns=stamps(observed),
+        trajectory=Trajectory.empty(),
+        modules=[],
+        sessions=[],
+        map=empty_map(),
+        events=[],
+        timings=Timings(detector_us=none, bus_us=none, module_ms={}, wall_s=0.0),
+    )
