@@ -1,0 +1,114 @@
+"""Features of one image: ORB corners spread over it, undistorted, with their depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.rig import Camera
+
+LEVELS = 8
+SCALE = 1.2  # between two levels of the pyramid
+_CELL_PX = 40  # side of the cells that share out the features
+_SURPLUS = 3  # corners detected per corner kept
+_FAST_THRESHOLD_MAX = 20  # ORB's own default, right for a bright and clean image
+_DEPTH_SPREAD_RATIO = 0.03  # neighbours further apart than this lie across an edge
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Features:
+    """What is recognisable in one image."""
+
+    uv_px: NDArray[np.float64]  # (N, 2), without distortion
+    levels: NDArray[np.int64]  # (N,), of the pyramid
+    descriptors: NDArray[np.uint8]  # (N, 32)
+    depth_m: NDArray[np.float64]  # (N,), along the optical axis, 0 = missing
+
+    def __len__(self) -> int:
+        return len(self.levels)
+
+
+class FeatureExtractor:
+    """Finds features where the image holds structure above its own noise."""
+
+    def __init__(
+        self, camera: Camera, *, count: int, fast_threshold_min: int, fast_noise_ratio: float
+    ) -> None:
+        self._camera, self._count = camera, count
+        self._threshold_min, self._noise_ratio = fast_threshold_min, fast_noise_ratio
+        self._orb = cv2.ORB.create(nfeatures=_SURPLUS * count, scaleFactor=SCALE, nlevels=LEVELS)
+
+    def extract(self, gray: NDArray[np.uint8], depth_m: NDArray[np.float32] | None) -> Features:
+        """Return the features of `gray` (H, W); without a depth image all depths are missing."""
+        self._orb.setFastThreshold(self.fast_threshold(gray))
+        corners = self._orb.detect(gray, None)
+        corners, descriptors = self._orb.compute(gray, _spread(corners, self._count))
+        if not corners:
+            return _none_found()
+        uv_image = cv2.KeyPoint.convert(corners).astype(np.float64)
+        return Features(
+            uv_px=self._undistort(uv_image),
+            levels=np.array([corner.octave for corner in corners], dtype=np.int64),
+            descriptors=np.asarray(descriptors, dtype=np.uint8),
+            depth_m=self._depths(uv_image, depth_m),
+        )
+
+    def fast_threshold(self, gray: NDArray[np.uint8]) -> int:
+        """Return the grey step that makes a corner: a multiple of the noise, within limits.
+
+        The noise is the median response of a Laplacian, whose gain on white noise is sqrt(20).
+        """
+        response = np.abs(cv2.Laplacian(gray, cv2.CV_16S)[::4, ::4])
+        noise = float(np.median(response)) / 0.6745 / np.sqrt(20.0)
+        return int(np.clip(self._noise_ratio * noise, self._threshold_min, _FAST_THRESHOLD_MAX))
+
+    def _undistort(self, uv_image: NDArray[np.float64]) -> NDArray[np.float64]:
+        if not any(self._camera.distortion):
+            return uv_image
+        K, distortion = self._camera.K, np.array(self._camera.distortion)
+        return np.asarray(cv2.undistortPoints(uv_image[:, None], K, distortion, P=K)[:, 0])
+
+    def _depths(
+        self, uv_image: NDArray[np.float64], depth_m: NDArray[np.float32] | None
+    ) -> NDArray[np.float64]:
+        """Return the depth at each corner; missing at depth edges, where it may be either."""
+        if depth_m is None:
+            return np.zeros(len(uv_image))
+        height, width = depth_m.shape
+        column, row = np.rint(uv_image).astype(np.int64).T
+        columns = np.clip(column + np.array([[0], [-2], [2], [0], [0]]), 0, width - 1)
+        rows = np.clip(row + np.array([[0], [0], [0], [-2], [2]]), 0, height - 1)
+        depths = depth_m[rows, columns].astype(np.float64)  # (5, N), the corner's own first
+        low_m, high_m = self._camera.depth_range_m
+        usable = (depths >= low_m) & (depths <= high_m)  # False for NaN
+        depth = np.where(usable[0], depths[0], 0.0)
+        step = np.where(usable, np.abs(depths - depth), 0.0).max(axis=0)
+        return np.where(step <= _DEPTH_SPREAD_RATIO * depth * np.maximum(depth, 1.0), depth, 0.0)
+
+
+def _spread(corners: Any, count: int) -> Any:
+    """Return `count` corners: every cell's best first, then every cell's second, and so on."""
+    if len(corners) <= count:
+        return corners
+    uv_px = cv2.KeyPoint.convert(corners)
+    strength = np.array([corner.response for corner in corners])
+    cells = (uv_px // _CELL_PX).astype(np.int64) @ np.array([1, 10_000])
+    order = np.lexsort((-strength, cells))
+    first = np.concatenate([[True], np.diff(cells[order]) != 0])
+    starts = np.flatnonzero(first)
+    rank = np.arange(len(order)) - starts[np.cumsum(first) - 1]
+    chosen = order[np.lexsort((-strength[order], rank))[:count]]
+    return tuple(corners[index] for index in chosen)
+
+
+def _none_found() -> Features:
+    return Features(
+        uv_px=np.zeros((0, 2)),
+        levels=np.zeros(0, np.int64),
+        descriptors=np.zeros((0, 32), np.uint8),
+        depth_m=np.zeros(0),
+    )

@@ -1,0 +1,116 @@
+"""The keyframe store: where the camera was, what it saw, and which keyframes saw the same."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.observation import LaserScan
+from sceneslam.types.se3 import Transform
+
+from .features import Features
+
+NO_LANDMARK = -1
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class Keyframe:
+    """One image that the map is built of. Pose and landmarks may be corrected later."""
+
+    stamp_ns: int
+    T_local_base: Transform
+    features: Features
+    landmark_ids: NDArray[np.int64]  # (N,), per feature, or NO_LANDMARK
+    appearance: NDArray[np.float32]  # thumbnail, zero mean, unit length
+    points_base: NDArray[np.float32]  # (M, 3) [m], thinned depth
+    colors_bgr: NDArray[np.uint8]  # (M, 3)
+    scan: LaserScan | None = None  # of the same depth, in base
+
+
+class KeyframeStore:
+    """Keyframes by rising id, with what they have in common."""
+
+    def __init__(self) -> None:
+        self._keyframes: dict[int, Keyframe] = {}
+        self._next_id = 0
+        self._id_limit = 1  # above all landmark ids ever referred to
+
+    def __len__(self) -> int:
+        return len(self._keyframes)
+
+    def __getitem__(self, keyframe_id: int) -> Keyframe:
+        return self._keyframes[keyframe_id]
+
+    @property
+    def ids(self) -> list[int]:
+        """Return the ids, oldest keyframe first."""
+        return list(self._keyframes)
+
+    def all(self) -> Iterable[Keyframe]:
+        """Return the keyframes, oldest first."""
+        return self._keyframes.values()
+
+    def insert(self, keyframe: Keyframe) -> int:
+        """Store a keyframe and return its id."""
+        keyframe_id, self._next_id = self._next_id, self._next_id + 1
+        self._keyframes[keyframe_id] = keyframe
+        self._id_limit = max(self._id_limit, int(keyframe.landmark_ids.max(initial=0)) + 1)
+        return keyframe_id
+
+    def remove(self, keyframe_id: int) -> None:
+        """Forget a keyframe."""
+        del self._keyframes[keyframe_id]
+
+    def covisible(self, landmark_ids: NDArray[np.int64], *, limit: int) -> list[int]:
+        """Return the keyframes that share most of these landmarks, most first."""
+        wanted = self._marked(landmark_ids)
+        ids = np.array(self.ids)
+        shared = np.array([np.count_nonzero(wanted[k.landmark_ids]) for k in self.all()])
+        order = np.argsort(-shared, kind="stable")[:limit]
+        return [int(keyframe_id) for keyframe_id in ids[order][shared[order] > 0]]
+
+    def alike(self, appearance: NDArray[np.float32], *, limit: int) -> list[int]:
+        """Return the keyframes whose thumbnails correlate best with this one, best first."""
+        ids = self.ids
+        scores = np.array([float(k.appearance @ appearance) for k in self.all()])
+        return [ids[row] for row in np.argsort(-scores, kind="stable")[:limit]]
+
+    def landmarks_of(self, keyframe_ids: Iterable[int]) -> NDArray[np.int64]:
+        """Return the ids of all landmarks that these keyframes saw, rising."""
+        seen = [self._keyframes[keyframe_id].landmark_ids for keyframe_id in keyframe_ids]
+        ids = np.unique(np.concatenate([*seen, np.array([NO_LANDMARK])]))
+        return ids[ids != NO_LANDMARK]
+
+    def forget_landmarks(self, landmark_ids: NDArray[np.int64]) -> None:
+        """Let no keyframe refer to these landmarks any more."""
+        gone = self._marked(landmark_ids)
+        for keyframe in self.all():
+            keyframe.landmark_ids[gone[keyframe.landmark_ids]] = NO_LANDMARK
+
+    def nearest(self, T_local_base: Transform, *, per_m: float, per_rad: float) -> float:
+        """Return how far the nearest keyframe is, metres and radians weighed and added."""
+        T_keyframes = np.stack([keyframe.T_local_base for keyframe in self.all()])
+        T_keyframe_base = se3.inverse(T_keyframes) @ T_local_base
+        distances_m = np.linalg.norm(T_keyframe_base[:, :3, 3], axis=1)
+        return float((per_m * distances_m + per_rad * se3.rotation_angle_rad(T_keyframe_base)).min())
+
+    def most_redundant(self) -> int:
+        """Return the keyframe that stands closest to another, the latest and first left out."""
+        ids = self.ids
+        positions_m = np.stack([keyframe.T_local_base[:3, 3] for keyframe in self.all()])
+        axes = np.stack([keyframe.T_local_base[:3, :3] for keyframe in self.all()])
+        gaps_m = np.linalg.norm(positions_m[:, None] - positions_m, axis=2)
+        turns = np.sqrt(np.maximum(3.0 - np.einsum("aij,bij->ab", axes, axes), 0.0))
+        closeness = gaps_m + turns + 1e9 * np.eye(len(ids))
+        return ids[1 + int(np.argmin(closeness.min(axis=1)[1:-1]))]
+
+    def _marked(self, landmark_ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return a table that is true at these ids; its last row answers for NO_LANDMARK."""
+        marks = np.zeros(self._id_limit + 1, bool)
+        marks[landmark_ids] = True
+        marks[NO_LANDMARK] = False
+        return marks

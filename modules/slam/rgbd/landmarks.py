@@ -1,0 +1,86 @@
+"""The landmark table: one row per landmark, one array per property."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+_FIRST_CAPACITY = 4096
+
+
+class LandmarkTable:
+    """Landmarks in `local`, each a Gaussian that every further sighting sharpens.
+
+    An id is a row; rows of removed landmarks are given out again, so ids stay below the limit
+    that the map keeps. Properties are views: read them, change them through the methods.
+    """
+
+    def __init__(self) -> None:
+        self.points_local = np.zeros((_FIRST_CAPACITY, 3))  # (C, 3) [m]
+        self.information = np.zeros((_FIRST_CAPACITY, 3, 3))  # inverse covariance [1/m^2]
+        self.normals_local = np.zeros((_FIRST_CAPACITY, 3))  # from the landmark to its viewer
+        self.reach_m = np.zeros(_FIRST_CAPACITY)  # distance at which it shows on level 0
+        self.descriptors = np.zeros((_FIRST_CAPACITY, 32), np.uint8)
+        self.alive = np.zeros(_FIRST_CAPACITY, bool)
+        self.expected = np.zeros(_FIRST_CAPACITY, np.int64)  # images that should show it
+        self.found = np.zeros(_FIRST_CAPACITY, np.int64)  # images that did
+
+    def __len__(self) -> int:
+        return int(self.alive.sum())
+
+    def add(
+        self,
+        *,
+        points_local: NDArray[np.float64],
+        information: NDArray[np.float64],
+        normals_local: NDArray[np.float64],
+        reach_m: NDArray[np.float64],
+        descriptors: NDArray[np.uint8],
+    ) -> NDArray[np.int64]:
+        """Store N landmarks and return their ids (N,)."""
+        self._reserve(len(points_local))
+        ids = np.flatnonzero(~self.alive)[: len(points_local)]
+        self.points_local[ids], self.information[ids] = points_local, information
+        self.normals_local[ids], self.reach_m[ids] = normals_local, reach_m
+        self.descriptors[ids] = descriptors
+        self.alive[ids], self.expected[ids], self.found[ids] = True, 1, 1
+        return ids
+
+    def fuse(
+        self,
+        ids: NDArray[np.int64],
+        *,
+        points_local: NDArray[np.float64],
+        information: NDArray[np.float64],
+    ) -> None:
+        """Move landmarks towards what was measured of them, by inverse variance."""
+        total = self.information[ids] + information
+        pull = information @ (points_local - self.points_local[ids])[:, :, None]
+        self.points_local[ids] += np.linalg.solve(total, pull)[:, :, 0]
+        self.information[ids] = total
+
+    def describe(
+        self,
+        ids: NDArray[np.int64],
+        *,
+        descriptors: NDArray[np.uint8],
+        normals_local: NDArray[np.float64],
+        reach_m: NDArray[np.float64],
+    ) -> None:
+        """Replace how landmarks look by how they look now."""
+        self.descriptors[ids], self.normals_local[ids] = descriptors, normals_local
+        self.reach_m[ids] = reach_m
+
+    def remove(self, ids: NDArray[np.int64]) -> None:
+        """Forget landmarks; their ids are given out again."""
+        self.alive[ids] = False
+
+    def _reserve(self, count: int) -> None:
+        capacity = len(self.alive)
+        if count <= capacity - len(self):
+            return
+        extra = max(capacity, count)
+        for name in vars(self):
+            rows = getattr(self, name)
+            grown = np.concatenate([rows, np.zeros((extra, *rows.shape[1:]), rows.dtype)])
+            setattr(self, name, grown)

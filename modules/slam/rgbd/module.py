@@ -1,0 +1,289 @@
+"""RGB-D SLAM for lit, textured scenes: ORB features tracked against a map of keyframes."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.rig import Camera, Rig, Sensor
+from sceneslam.types.se3 import Transform
+
+from .features import FeatureExtractor, Features
+from .judgement import HealthRule, KeyframeRule
+from .keyframes import NO_LANDMARK, Keyframe
+from .layers import LayerBuilder
+from .localizer import Fix, Localizer
+from .motion import MotionModel
+from .pose_solver import PoseSolver
+from .relocalizer import Relocalizer, appearance
+from .visual_map import VisualMap
+
+_START_FEATURES = 50  # with depth, that the first keyframe needs
+_START_VARIANCE = 1e-8  # the first pose is the origin by definition
+
+
+class RgbdSlam:
+    """Tracks a camera with depth; without depth for a while, on what the map knows.
+
+    After ORB-SLAM2's front end (Mur-Artal and Tardos 2017): corners, a guided search in the local
+    map, PnP, motion-only least squares; keyframes where the view has changed.
+    """
+
+    def __init__(
+        self,
+        *,
+        feature_count: int,
+        fast_threshold_min: int,
+        fast_noise_ratio: float,
+        sigma_px: float,
+        inverse_depth_sigma_per_m: float,
+        search_radius_px: float,
+        min_inliers: int,
+        degraded_inliers: int,
+        degraded_sigma_m: float,
+        keyframe_step_m: float,
+        keyframe_turn_rad: float,
+        keyframe_inlier_ratio: float,
+        keyframe_limit: int,
+        landmark_limit: int,
+        cloud_stride_px: int,
+        cloud_voxel_m: float,
+        grid_resolution_m: float,
+        seed: int,
+    ) -> None:
+        _check_limits(locals())
+        self._min_inliers, self._degraded_inliers = min_inliers, degraded_inliers
+        self._make_extractor = partial(
+            FeatureExtractor,
+            count=feature_count,
+            fast_threshold_min=fast_threshold_min,
+            fast_noise_ratio=fast_noise_ratio,
+        )
+        self._make_map = partial(
+            VisualMap,
+            sigma_px=sigma_px,
+            inverse_depth_sigma_per_m=inverse_depth_sigma_per_m,
+            keyframe_limit=keyframe_limit,
+            landmark_limit=landmark_limit,
+        )
+        self._make_solver = partial(
+            PoseSolver, inverse_depth_sigma_per_m=inverse_depth_sigma_per_m, seed=seed
+        )
+        self._make_localizer = partial(
+            Localizer, radius_px=search_radius_px, min_inliers=min_inliers
+        )
+        self._make_layers = partial(
+            LayerBuilder,
+            cloud_stride_px=cloud_stride_px,
+            cloud_voxel_m=cloud_voxel_m,
+            grid_resolution_m=grid_resolution_m,
+        )
+        self._make_keyframe_rule = partial(
+            KeyframeRule,
+            step_m=keyframe_step_m,
+            turn_rad=keyframe_turn_rad,
+            inlier_ratio=keyframe_inlier_ratio,
+        )
+        self._health = HealthRule(
+            degraded_inliers=degraded_inliers, degraded_sigma_m=degraded_sigma_m
+        )
+        self._T_map_local = se3.identity()
+        self._T_local_base = se3.identity()
+
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return that colour and depth together suffice."""
+        return (frozenset({Sensor.IMAGE, Sensor.DEPTH}),)
+
+    def activate(self, rig: Rig) -> None:
+        """Start anew with an empty map; raises InputError for a rig without a camera."""
+        if rig.camera is None:
+            raise InputError("rig: rgbd needs the camera's intrinsics, got none")
+        self._camera: Camera = rig.camera
+        self._extractor = self._make_extractor(rig.camera)
+        self._map = self._make_map(rig.camera)
+        self._localizer = self._make_localizer(self._map, self._make_solver(rig.camera))
+        self._relocalizer = Relocalizer(
+            self._map.keyframes, self._localizer, min_inliers=self._degraded_inliers
+        )
+        self._layers = self._make_layers(rig.camera)
+        self._keyframe_rule = self._make_keyframe_rule()
+        self._motion = MotionModel()
+        self._T_local_base = se3.identity()
+        self._local_ids = np.zeros(0, np.int64)  # landmarks of the local map
+        self._observations = 0
+        self._is_lost = False
+
+    def set_pose(self, T_map_local: Transform) -> None:
+        """Place `local` in the map (Eq. 1)."""
+        self._T_map_local = T_map_local.copy()
+
+    def set_scene(self, scene: str) -> None:
+        """Hear of the scene; there is one mode only."""
+
+    def track(self, observation: Observation) -> Tracking:
+        """Return T_local_base at the observation; LOST where the image does not show the map."""
+        self._check(observation)
+        self._observations += 1
+        T_predicted = self._motion.predict(observation)
+        if observation.image_bgr is None:
+            return self._lose(observation, T_predicted)
+        gray = np.asarray(cv2.cvtColor(observation.image_bgr, cv2.COLOR_BGR2GRAY), np.uint8)
+        features = self._extractor.extract(gray, observation.depth_m)
+        if not len(self._map.keyframes):
+            return self._start(observation, gray, features, T_predicted)
+        fix = self._locate(features, gray, T_predicted)
+        if fix is None:
+            return self._lose(observation, T_predicted)
+        return self._hold(observation, gray, features, fix)
+
+    def get_pose(self) -> Transform:
+        """Return T_map_base = T_map_local @ T_local_base of the last observation (Eq. 2)."""
+        return self._T_map_local @ self._T_local_base
+
+    def get_map(self) -> MapLayers:
+        """Return the keyframes' cloud and, for a robot in the plane, their grid, in `local`."""
+        return self._layers.build(list(self._map.keyframes.all()))
+
+    def shutdown(self) -> None:
+        """Stop; nothing but memory is held, and the map stays readable."""
+
+    def _locate(
+        self, features: Features, gray: NDArray[np.uint8], T_predicted: Transform
+    ) -> Fix | None:
+        fix = self._localizer.near(features, T_predicted, self._local_ids)
+        if fix is None and not self._is_lost:
+            fix = self._localizer.anywhere(features, self._local_ids)
+        return fix if fix is not None else self._relocalizer.find(features, gray)
+
+    def _start(
+        self,
+        observation: Observation,
+        gray: NDArray[np.uint8],
+        features: Features,
+        T_predicted: Transform,
+    ) -> Tracking:
+        """Make the first keyframe; wait, lost, for an image that has features with depth."""
+        count = int((features.depth_m > 0).sum())
+        if count < _START_FEATURES:
+            return self._lose(observation, T_predicted)
+        self._T_local_base = T_predicted
+        self._motion.hold(observation, T_predicted)
+        unseen = np.full(len(features), NO_LANDMARK)
+        self._insert_keyframe(observation, gray, features, unseen)
+        self._is_lost = False
+        is_first = self._observations == 1
+        return Tracking(
+            stamp_ns=observation.stamp_ns,
+            T_local_base=self._T_local_base.copy(),
+            # What the robot did before the first usable image is known from odometry at best.
+            status=TrackingStatus.TRACKING if is_first else TrackingStatus.DEGRADED,
+            covariance=_START_VARIANCE * np.eye(6),
+            inliers=count,
+        )
+
+    def _hold(
+        self, observation: Observation, gray: NDArray[np.uint8], features: Features, fix: Fix
+    ) -> Tracking:
+        """Accept a pose, and extend the map where it is due."""
+        T_local_base, covariance = fix.estimate.T_local_base, fix.estimate.covariance
+        self._T_local_base, self._is_lost = T_local_base, False
+        self._motion.hold(observation, T_local_base)
+        self._local_ids = fix.local_ids
+        self._map.count_sightings(fix.expected_ids, fix.landmark_ids)
+        count = len(fix.landmark_ids)
+        status = self._health.judge(count, covariance)
+        wanted = self._keyframe_rule.wants(T_local_base, fix, self._map.keyframes)
+        if wanted and status is TrackingStatus.TRACKING:
+            landmark_ids = np.full(len(features), NO_LANDMARK)
+            landmark_ids[fix.feature_rows] = fix.landmark_ids
+            self._insert_keyframe(observation, gray, features, landmark_ids)
+        possible = max(1, min(len(fix.expected_ids), len(features)))
+        return Tracking(
+            stamp_ns=observation.stamp_ns,
+            T_local_base=T_local_base.copy(),
+            status=status,
+            covariance=covariance,
+            quality_ratio=min(1.0, count / possible),
+            inliers=count,
+        )
+
+    def _lose(self, observation: Observation, T_predicted: Transform) -> Tracking:
+        self._motion.lose(observation, T_predicted)
+        self._is_lost = True
+        return Tracking(
+            stamp_ns=observation.stamp_ns,
+            T_local_base=self._T_local_base.copy(),
+            status=TrackingStatus.LOST,
+            quality_ratio=0.0,
+        )
+
+    def _insert_keyframe(
+        self,
+        observation: Observation,
+        gray: NDArray[np.uint8],
+        features: Features,
+        landmark_ids: NDArray[np.int64],
+    ) -> None:
+        image_bgr, depth_m = observation.image_bgr, observation.depth_m
+        if image_bgr is None or depth_m is None:
+            return
+        points_base, colors_bgr = self._layers.thin_cloud(depth_m, image_bgr)
+        keyframe = Keyframe(
+            stamp_ns=observation.stamp_ns,
+            T_local_base=self._T_local_base.copy(),
+            features=features,
+            landmark_ids=landmark_ids,
+            appearance=appearance(gray),
+            points_base=points_base,
+            colors_bgr=colors_bgr,
+            scan=self._layers.scan(depth_m, stamp_ns=observation.stamp_ns),
+        )
+        self._map.insert(keyframe)
+        self._keyframe_rule.restart()
+        self._local_ids = self._map.around(keyframe.landmark_ids)
+
+    def _check(self, observation: Observation) -> None:
+        """Raise InputError where an array has not the camera's size."""
+        width, height = self._camera.size_wh
+        image_bgr, depth_m = observation.image_bgr, observation.depth_m
+        if image_bgr is not None and image_bgr.shape != (height, width, 3):
+            raise InputError(f"image_bgr: expected ({height}, {width}, 3), got {image_bgr.shape}")
+        if depth_m is not None and depth_m.shape != (height, width):
+            raise InputError(f"depth_m: expected ({height}, {width}), got {depth_m.shape}")
+
+
+_LIMITS: dict[str, tuple[float, float]] = {
+    "feature_count": (100, 10_000),
+    "fast_threshold_min": (1, 20),
+    "fast_noise_ratio": (0, 100),
+    "sigma_px": (0.01, 10),
+    "inverse_depth_sigma_per_m": (1e-5, 1),
+    "search_radius_px": (1, 200),
+    "min_inliers": (6, 1000),
+    "degraded_inliers": (6, 1000),
+    "degraded_sigma_m": (1e-4, 10),
+    "keyframe_step_m": (0.001, 100),
+    "keyframe_turn_rad": (0.001, 3.2),
+    "keyframe_inlier_ratio": (0, 1),
+    "keyframe_limit": (3, 1_000_000),
+    "landmark_limit": (1000, 100_000_000),
+    "cloud_stride_px": (1, 100),
+    "cloud_voxel_m": (0.001, 10),
+    "grid_resolution_m": (0.001, 10),
+    "seed": (0, 2**31 - 1),
+}
+
+
+def _check_limits(arguments: dict[str, object]) -> None:
+    for name, (low, high) in _LIMITS.items():
+        value = arguments[name]
+        if not (isinstance(value, (int, float)) and low <= value <= high):
+            raise ConfigError(name, value, f"{low:g} to {high:g}")

@@ -1,0 +1,56 @@
+"""Where the robot should be by now, before its camera is asked."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sceneslam.types import se3
+from sceneslam.types.observation import Observation
+from sceneslam.types.se3 import Transform
+
+_NS = 1e-9
+_MAX_GAP_S = 0.5  # beyond it, a velocity says nothing any more
+
+
+class MotionModel:
+    """Predicts by odometry, else by constant velocity with the gyro's rotation."""
+
+    def __init__(self) -> None:
+        self._T_local_base = se3.identity()
+        self._twist_per_s = np.zeros(6)
+        self._stamp_ns: int | None = None
+        self._T_odom_base: Transform | None = None
+
+    def predict(self, observation: Observation) -> Transform:
+        """Return the expected T_local_base at the observation."""
+        gap_s = self._gap_s(observation)
+        if self._T_odom_base is not None and observation.T_odom_base is not None:
+            T_prev_curr = se3.inverse(self._T_odom_base) @ observation.T_odom_base
+            return self._T_local_base @ T_prev_curr
+        twist = self._twist_per_s * gap_s
+        gyro = observation.gyro_base
+        if gyro is not None and len(gyro) and np.isfinite(gyro[:, 1:4]).all():
+            twist[3:] = gyro[:, 1:4].mean(axis=0) * gap_s
+        return self._T_local_base @ se3.exp(twist)
+
+    def hold(self, observation: Observation, T_local_base: Transform) -> None:
+        """Go on from a pose that was measured."""
+        gap_s = self._gap_s(observation)
+        T_prev_curr = se3.inverse(self._T_local_base) @ T_local_base
+        self._twist_per_s = se3.log(T_prev_curr) / gap_s if gap_s > 0 else np.zeros(6)
+        self._step(observation, T_local_base)
+
+    def lose(self, observation: Observation, T_predicted: Transform) -> None:
+        """Go on from a prediction; without odometry or gyro, as if at rest."""
+        self._twist_per_s = np.zeros(6)
+        self._step(observation, T_predicted)
+
+    def _step(self, observation: Observation, T_local_base: Transform) -> None:
+        self._T_local_base, self._stamp_ns = T_local_base, observation.stamp_ns
+        self._T_odom_base = observation.T_odom_base
+
+    def _gap_s(self, observation: Observation) -> float:
+        if self._stamp_ns is None:
+            return 0.0
+        gap_s = (observation.stamp_ns - self._stamp_ns) * _NS
+        return gap_s if 0.0 < gap_s <= _MAX_GAP_S else 0.0

@@ -1,0 +1,157 @@
+"""The map that the camera is tracked against: landmarks held together by keyframes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.rig import Camera
+from sceneslam.types.se3 import Transform
+
+from .features import LEVELS, SCALE, Features
+from .keyframes import NO_LANDMARK, Keyframe, KeyframeStore
+from .landmarks import LandmarkTable
+
+_COVISIBLE = 12  # keyframes whose landmarks make the local map
+_MIN_COS_VIEW = 0.5  # a landmark looks like itself within 60 degrees of where it was seen from
+_MIN_FOUND_RATIO = 0.25
+_PROBATION = 8  # images that should show a landmark before it is judged
+_NEAREST_M = 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Prediction:
+    """Landmarks that the camera should see."""
+
+    ids: NDArray[np.int64]  # (N,)
+    uv_px: NDArray[np.float64]  # (N, 2)
+    levels: NDArray[np.int64]  # (N,)
+
+
+class VisualMap:
+    """Landmarks and keyframes in `local`, kept within limits."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        *,
+        sigma_px: float,
+        inverse_depth_sigma_per_m: float,
+        keyframe_limit: int,
+        landmark_limit: int,
+    ) -> None:
+        self.landmarks, self.keyframes = LandmarkTable(), KeyframeStore()
+        self._camera = camera
+        self._sigma_px, self._sigma_per_m = sigma_px, inverse_depth_sigma_per_m
+        self._keyframe_limit, self._landmark_limit = keyframe_limit, landmark_limit
+
+    def sigma_px(self, levels: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return how exactly features of these pyramid levels are located [px]."""
+        return np.asarray(self._sigma_px * SCALE ** levels.astype(np.float64))
+
+    def around(self, landmark_ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the local map: the landmarks of the keyframes that saw these ones."""
+        return self.keyframes.landmarks_of(
+            self.keyframes.covisible(landmark_ids, limit=_COVISIBLE)
+        )
+
+    def predict(self, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> Prediction:
+        """Return which of these landmarks the image should show from a pose, and where."""
+        camera = self._camera
+        T_local_cam = T_local_base @ camera.T_base_cam
+        points_local = self.landmarks.points_local[landmark_ids]
+        points_cam = se3.apply(se3.inverse(T_local_cam), points_local)
+        z = np.maximum(points_cam[:, 2], _NEAREST_M)
+        uv_px = points_cam[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        to_viewer = T_local_cam[:3, 3] - points_local
+        distance_m = np.maximum(np.linalg.norm(to_viewer, axis=1), _NEAREST_M)
+        cos_view = (to_viewer * self.landmarks.normals_local[landmark_ids]).sum(1) / distance_m
+        levels = np.log(self.landmarks.reach_m[landmark_ids] / distance_m) / np.log(SCALE)
+        visible = (points_cam[:, 2] > _NEAREST_M) & (cos_view > _MIN_COS_VIEW)
+        visible &= ((uv_px >= 0) & (uv_px <= camera.size_wh)).all(axis=1)
+        visible &= (levels > -1.5) & (levels < LEVELS + 0.5)
+        return Prediction(
+            ids=landmark_ids[visible],
+            uv_px=uv_px[visible],
+            levels=np.clip(np.rint(levels[visible]), 0, LEVELS - 1).astype(np.int64),
+        )
+
+    def count_sightings(
+        self, expected_ids: NDArray[np.int64], found_ids: NDArray[np.int64]
+    ) -> None:
+        """Remember which landmarks an image should have shown, and which it did."""
+        self.landmarks.expected[expected_ids] += 1
+        self.landmarks.found[found_ids] += 1
+
+    def insert(self, keyframe: Keyframe) -> None:
+        """Add a keyframe: sharpen the landmarks it saw, make new ones of its other features."""
+        features, ids = keyframe.features, keyframe.landmark_ids
+        known = np.flatnonzero(ids != NO_LANDMARK)
+        fresh = np.flatnonzero((ids == NO_LANDMARK) & (features.depth_m > 0))
+        deep = known[features.depth_m[known] > 0]
+        points_local, information = self._locate(keyframe, deep)
+        self.landmarks.fuse(ids[deep], points_local=points_local, information=information)
+        self.landmarks.describe(
+            ids[known],
+            descriptors=features.descriptors[known],
+            **self._view(keyframe, known, self.landmarks.points_local[ids[known]]),
+        )
+        points_local, information = self._locate(keyframe, fresh)
+        ids[fresh] = self.landmarks.add(
+            points_local=points_local,
+            information=information,
+            descriptors=features.descriptors[fresh],
+            **self._view(keyframe, fresh, points_local),
+        )
+        self.keyframes.insert(keyframe)
+        self._keep_limits()
+
+    def _locate(
+        self, keyframe: Keyframe, rows: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return positions (N, 3) of features in `local` and their information (N, 3, 3)."""
+        camera, features = self._camera, keyframe.features
+        z = features.depth_m[rows]
+        rays = (features.uv_px[rows] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+        points_cam = np.column_stack([rays, np.ones(len(rows))]) * z[:, None]
+        T_local_cam = keyframe.T_local_base @ camera.T_base_cam
+        across_m = self.sigma_px(features.levels[rows]) * z / camera.fx
+        along_m = self._sigma_per_m * z**2
+        weights = np.stack([across_m, across_m, np.maximum(along_m, across_m)], axis=1) ** -2.0
+        rotation = T_local_cam[:3, :3]
+        information = np.einsum("ik,nk,jk->nij", rotation, weights, rotation)
+        return se3.apply(T_local_cam, points_cam), information
+
+    def _view(
+        self, keyframe: Keyframe, rows: NDArray[np.int64], points_local: NDArray[np.float64]
+    ) -> dict[str, NDArray[np.float64]]:
+        viewer = (keyframe.T_local_base @ self._camera.T_base_cam)[:3, 3]
+        to_viewer = viewer - points_local
+        distance_m = np.maximum(np.linalg.norm(to_viewer, axis=1), _NEAREST_M)
+        return {
+            "normals_local": to_viewer / distance_m[:, None],
+            "reach_m": distance_m * SCALE ** keyframe.features.levels[rows],
+        }
+
+    def _keep_limits(self) -> None:
+        """Drop landmarks that are seldom found again, then what is beyond the limits."""
+        table = self.landmarks
+        judged = table.alive & (table.expected >= _PROBATION)
+        self._drop(np.flatnonzero(judged & (table.found < _MIN_FOUND_RATIO * table.expected)))
+        if len(self.keyframes) > self._keyframe_limit:
+            self.keyframes.remove(self.keyframes.most_redundant())
+            held = self.keyframes.landmarks_of(self.keyframes.ids)
+            orphans = table.alive.copy()
+            orphans[held] = False
+            self._drop(np.flatnonzero(orphans))
+        surplus = len(table) - self._landmark_limit
+        if surplus > 0:
+            alive = np.flatnonzero(table.alive)
+            self._drop(alive[np.argsort(table.found[alive], kind="stable")[:surplus]])
+
+    def _drop(self, landmark_ids: NDArray[np.int64]) -> None:
+        self.keyframes.forget_landmarks(landmark_ids)
+        self.landmarks.remove(landmark_ids)
