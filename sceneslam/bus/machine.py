@@ -36,10 +36,10 @@ class BusMachine(StateMachine):
     switch = State()
     terminate = State(final=True)
 
-    success = init.to(start) | start.to(run) | run.to.itself(internal=True) | switch.to(run)
+    success = init.to(start) | start.to(run) | run.to(run, internal=True) | switch.to(run)
     failure = (
         init.to(terminate)
-        | start.to.itself(cond="candidate_left")
+        | start.to(start, cond="candidate_left")
         | start.to(terminate)
         | run.to(switch)
         | switch.to(run, cond="fallback_active")
