@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from sceneslam.types import se3
+from sceneslam.types.errors import InputError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import (
     UNSURE,
@@ -14,6 +17,8 @@ from sceneslam.types.observation import (
     TrackingStatus,
 )
 from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import GroundTruth, SceneChange
 
 PERIOD_NS = 100_000_000
 SPEED_M_S = 0.5
@@ -53,7 +58,7 @@ class ScriptedDetector:
 
 
 class ExactModule:
-    """Knows the motion exactly; `lost`, `raises` and `returns_nan` name indices where it does not."""
+    """Knows the motion exactly, but at the indices in `lost`, `raises` and `returns_nan`."""
 
     requires = (frozenset({Sensor.IMAGE}),)
 
@@ -104,3 +109,55 @@ class ExactModule:
 
     def shutdown(self):
         self.shutdowns += 1
+
+
+class FakeSource:
+    """A straight drive of `steps` observations with exact truth; it can break half-way."""
+
+    def __init__(self, steps: int, dark_from: int, breaks_at: int | None = None, fault: str = ""):
+        self._steps, self._dark_from, self._breaks_at = steps, dark_from, breaks_at
+        self._fault = fault
+        self.rig = RIG
+
+    @property
+    def length(self):
+        return self._steps
+
+    @property
+    def faults(self):
+        return (self._fault,) if self._fault else ()
+
+    def __iter__(self):
+        for index in range(self._steps):
+            if index == self._breaks_at:
+                raise InputError("the recording breaks off: fake.bag")
+            grey = 30 if index >= self._dark_from else 180
+            yield replace(observation(index), image_bgr=np.full((2, 2, 3), grey, np.uint8))
+
+    def ground_truth(self):
+        poses = np.stack([observation(index).T_odom_base for index in range(self._steps)])
+        stamps_ns = np.arange(self._steps, dtype=np.int64) * PERIOD_NS
+        scenes = (SceneChange(stamp_ns=0, scene="Bright"),)
+        if self._dark_from < self._steps:
+            scenes += (SceneChange(stamp_ns=self._dark_from * PERIOD_NS, scene="Dark"),)
+        trajectory = Trajectory(stamps_ns=stamps_ns, T_world_base=poses)
+        return GroundTruth(trajectory=trajectory, scenes=scenes)
+
+
+class InterruptedModule(ExactModule):
+    """Presses Ctrl-C at an index."""
+
+    def __init__(self, at: int):
+        super().__init__()
+        self._at = at
+
+    def track(self, observation):
+        if observation.stamp_ns // PERIOD_NS == self._at:
+            raise KeyboardInterrupt
+        return super().track(observation)
+
+
+class DepthModule(ExactModule):
+    """Needs what the fake source has not."""
+
+    requires = (frozenset({Sensor.DEPTH}),)

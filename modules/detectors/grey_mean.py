@@ -47,4 +47,4 @@ def grey_mean(image_bgr: NDArray[np.uint8]) -> float:
     """
     blue, green, red, _ = cv2.sumElems(image_bgr)
     pixels = image_bgr.shape[0] * image_bgr.shape[1]
-    return float(0.299 * red + 0.587 * green + 0.114 * blue) / pixels
+    return float((0.299 * red + 0.587 * green + 0.114 * blue) / pixels)

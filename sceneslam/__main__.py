@@ -1,0 +1,5 @@
+"""`python -m sceneslam`."""
+
+from sceneslam.cli import main
+
+main()

@@ -1,0 +1,80 @@
+"""The command line: composes the configuration, runs it, and says in a few lines what happened.
+
+Exit codes: 0 all well; 1 the run ended early or its input was damaged, and what was computed is
+saved; 2 nothing was run because the configuration or the input cannot be used.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any, cast
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from sceneslam.app import Finished, run
+from sceneslam.evaluation.summary import summary_lines
+from sceneslam.types.errors import ConfigError, SceneSlamError
+from sceneslam.types.trajectory import Trajectory
+
+OK, INCOMPLETE, UNUSABLE = 0, 1, 2
+
+
+def main() -> None:
+    """Run `python -m sceneslam` and exit."""
+    codes: list[int] = []
+
+    @hydra.main(version_base="1.3", config_path="pkg://sceneslam.conf", config_name="config")
+    def job(config: DictConfig) -> None:
+        codes.append(_job(config))
+
+    job()
+    sys.exit(max(codes, default=OK))
+
+
+def _job(config: DictConfig) -> int:
+    """Run one job; return its exit code."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    try:
+        finished = _run(config, folder)
+    except SceneSlamError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return UNUSABLE
+    except KeyboardInterrupt:
+        print("error: stopped before the first observation", file=sys.stderr)
+        return INCOMPLETE
+    for fault in finished.faults:
+        print(f"error: {fault}", file=sys.stderr)
+    print("\n".join([*summary_lines(finished.metrics), f"report   {_short(folder)}/report.html"]))
+    return INCOMPLETE if finished.faults else OK
+
+
+def _run(config: DictConfig, folder: Path) -> Finished:
+    """Run the reference, if there is one, then the configuration itself."""
+    title = str(HydraConfig.get().runtime.choices.get("scenario") or "sceneslam")
+    reference: Trajectory | None = None
+    if config.get("reference"):
+        other = cast(DictConfig, OmegaConf.merge(config, config.reference, {"reference": None}))
+        finished = run(_resolved(other), folder / "reference", title="reference")
+        reference = finished.trajectory
+    return run(_resolved(config), folder, title=title, reference=reference)
+
+
+def _resolved(config: DictConfig) -> dict[str, Any]:
+    """Return the configuration as plain values."""
+    try:
+        resolved = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    except OmegaConfBaseException as error:
+        key = str(getattr(error, "full_key", "") or "configuration")
+        reason = str(error).splitlines()[0]
+        raise ConfigError(key, "an interpolation", f"one that resolves ({reason})") from error
+    return cast("dict[str, Any]", resolved)
+
+
+def _short(folder: Path) -> Path:
+    """Return the folder as a user would type it."""
+    here = Path.cwd()
+    return folder.relative_to(here) if folder.is_relative_to(here) else folder

@@ -1,0 +1,166 @@
+"""Checks a configuration before anything of it is built: every mistake is named by its full key."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.utils import get_object
+
+from sceneslam.types.errors import ConfigError
+
+OWN_PREFIX = "sceneslam."
+TOP_LEVEL = (
+    "allow_targets",
+    "atlas",
+    "detector",
+    "effects",
+    "evaluation",
+    "lights",
+    "policy",
+    "reference",
+    "run",
+    "scenes",
+    "seed",
+    "sinks",
+    "slam",
+    "source",
+    "story",
+)
+
+
+class _Nothing:
+    """Stands in an error message for a value that was not given."""
+
+    def __repr__(self) -> str:
+        return "nothing"
+
+
+NOTHING = _Nothing()
+
+
+def check_keys(config: Mapping[str, Any]) -> None:
+    """Raise ConfigError for a top-level key that is not known or a value that was not given."""
+    for key in config:
+        if key not in TOP_LEVEL:
+            close = difflib.get_close_matches(key, (*TOP_LEVEL, "scenario", "experiment"), n=1)
+            hint = f" (did you mean {close[0]}?)" if close else ""
+            raise ConfigError(key, config[key], f"{', '.join(TOP_LEVEL)}{hint}")
+    _check_given(config, "")
+
+
+def check_node(node: object, key: str, *, allow: Sequence[str], positional: int = 0) -> None:
+    """Raise ConfigError where a component's node does not fit the signature of its `_target_`.
+
+    `allow` are the prefixes outside our own package that the user vouches for, since a `_target_`
+    is code. `positional` arguments are passed by the builder and must not be in the node.
+    """
+    if not isinstance(node, Mapping) or "_target_" not in node:
+        raise ConfigError(key, node, "a component: `_target_` and its arguments")
+    target = _locate(node["_target_"], f"{key}._target_", allow)
+    arguments = {name: value for name, value in node.items() if not name.startswith("_")}
+    parameters = list(inspect.signature(target).parameters.values())[positional:]
+    names = [parameter.name for parameter in parameters]
+    takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+    for name, value in arguments.items():
+        if name not in names and not takes_any:
+            raise ConfigError(f"{key}.{name}", value, f"one of: {', '.join(names) or 'nothing'}")
+    for parameter in parameters:
+        is_required = parameter.default is parameter.empty and parameter.kind in (
+            parameter.POSITIONAL_OR_KEYWORD,
+            parameter.KEYWORD_ONLY,
+        )
+        if is_required and parameter.name not in arguments:
+            raise ConfigError(f"{key}.{parameter.name}", NOTHING, "a value; it has no default")
+    hints = typing.get_type_hints(target.__init__ if inspect.isclass(target) else target)
+    for name, value in arguments.items():
+        if isinstance(value, Mapping) and "_target_" in value:
+            check_node(value, f"{key}.{name}", allow=allow)
+        elif name in hints and not _fits(value, hints[name]):
+            raise ConfigError(f"{key}.{name}", value, _describe(hints[name]))
+
+
+def _check_given(value: object, key: str) -> None:
+    if isinstance(value, Mapping):
+        for name, item in value.items():
+            _check_given(item, f"{key}.{name}" if key else str(name))
+    elif value == "???":
+        raise ConfigError(key, NOTHING, f"a value, as in {key}=...")
+
+
+def _locate(target: object, key: str, allow: Sequence[str]) -> Callable[..., object]:
+    prefixes = (OWN_PREFIX, *(f"{prefix.rstrip('.')}." for prefix in allow))
+    if not isinstance(target, str) or not target.startswith(prefixes):
+        package = str(target).partition(".")[0]
+        raise ConfigError(
+            key,
+            target,
+            f"a name under {' or '.join(prefixes)} "
+            f"(a target is code: allow your own by allow_targets=[{package}])",
+        )
+    try:
+        found = get_object(target)
+    except Exception as error:
+        reason = str(error).strip().splitlines()[0]
+        raise ConfigError(key, target, f"a class that can be imported ({reason})") from error
+    if not callable(found):
+        raise ConfigError(key, target, "a class or a function")
+    return typing.cast("Callable[..., object]", found)
+
+
+def _fits(value: object, hint: Any) -> bool:
+    """Tell whether a YAML value can stand for an annotated argument; unknown hints accept all."""
+    origin = typing.get_origin(hint)
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, part) for part in typing.get_args(hint))
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    if hint in (str, bool) or hint is type(None):
+        return isinstance(value, hint)
+    if hint is Path:
+        return isinstance(value, str)
+    if origin in (list, tuple, Sequence):
+        return isinstance(value, list) and _items_fit(value, origin, typing.get_args(hint))
+    if origin in (dict, Mapping):
+        part = typing.get_args(hint)[1]
+        return isinstance(value, dict) and all(_fits(item, part) for item in value.values())
+    return True
+
+
+def _items_fit(value: list[object], origin: Any, parts: tuple[Any, ...]) -> bool:
+    if origin is tuple and not (len(parts) == 2 and parts[1] is Ellipsis):
+        return len(value) == len(parts) and all(map(_fits, value, parts))
+    return all(_fits(item, parts[0]) for item in value)
+
+
+_WORDS = {
+    float: "a number",
+    int: "a whole number",
+    str: "text",
+    bool: "true or false",
+    type(None): "null",
+    Path: "a path",
+}
+
+
+def _describe(hint: Any) -> str:
+    """Return in words what an annotation accepts."""
+    if hint in _WORDS:
+        return _WORDS[hint]
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(_describe(part) for part in parts)
+    if origin is tuple and Ellipsis not in parts:
+        return f"a list of {len(parts)}: {', '.join(_describe(part) for part in parts)}"
+    if origin in (list, tuple, Sequence):
+        return f"a list, each {_describe(parts[0])}"
+    if origin in (dict, Mapping):
+        return f"a table, each value {_describe(parts[1])}"
+    return str(hint)

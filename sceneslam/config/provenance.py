@@ -1,0 +1,88 @@
+"""What a run was made of: its configuration, the versions and the hashes of code and input."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+import sceneslam
+
+_EDGE_BYTES = 1 << 20  # of the head and the tail of an input file that are hashed
+
+
+def save_config(config: Mapping[str, Any], path: Path) -> dict[str, str]:
+    """Write the resolved configuration with its provenance; return the provenance."""
+    provenance = {
+        "config_sha256": _sha256(OmegaConf.to_yaml(OmegaConf.create(dict(config))).encode()),
+        "code_sha256": _code_sha256(),
+        "input_sha256": _input_sha256(config.get("source") or {}),
+        "sceneslam": sceneslam.__version__,
+        "python": platform.python_version(),
+        **_dependencies(),
+    }
+    lines = "".join(f"#   {key}: {value}\n" for key, value in provenance.items())
+    text = OmegaConf.to_yaml(OmegaConf.create(dict(config)))
+    path.write_text(f"# Resolved configuration. Made by:\n{lines}{text}")
+    return provenance
+
+
+def _dependencies() -> dict[str, str]:
+    """Return the versions of the packages that SceneSLAM stands on, where they are installed."""
+    found = {}
+    for requirement in requires("sceneslam") or [] if _is_installed() else []:
+        name = requirement.split(";")[0].split("[")[0].strip()
+        name = name[: next((i for i, c in enumerate(name) if c in "<>=!~ "), len(name))]
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _is_installed() -> bool:
+    try:
+        version("sceneslam")
+    except PackageNotFoundError:
+        return False
+    return True
+
+
+def _code_sha256() -> str:
+    """Return the hash of all Python and YAML files of the package, by name."""
+    digest = hashlib.sha256()
+    for package in ("sceneslam", "sceneslam.modules", "sceneslam.conf"):
+        root = Path(str(files(package)))
+        for file in sorted([*root.rglob("*.py"), *root.rglob("*.yaml")]):
+            digest.update(str(file.relative_to(root)).encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+def _input_sha256(source: Mapping[str, Any]) -> str:
+    """Return a hash of the input's names, sizes, heads and tails; "none" without a `path`."""
+    root = Path(str(source.get("path") or ""))
+    if not source.get("path") or not root.exists():
+        return "none"
+    digest = hashlib.sha256()
+    for file in sorted(root.rglob("*")) if root.is_dir() else [root]:
+        if file.is_file():
+            digest.update(f"{file.relative_to(root)} {file.stat().st_size}\n".encode())
+            digest.update(_edges(file))
+    return digest.hexdigest()
+
+
+def _edges(file: Path) -> bytes:
+    with file.open("rb") as stream:
+        head = stream.read(_EDGE_BYTES)
+        stream.seek(max(file.stat().st_size - _EDGE_BYTES, 0))
+        return head + stream.read(_EDGE_BYTES)
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()

@@ -1,0 +1,176 @@
+"""A whole run in memory: what its folder holds, and what is saved when it goes wrong."""
+
+import json
+from copy import deepcopy
+
+import numpy as np
+import pytest
+
+from sceneslam.app import run
+from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.trajectory import Trajectory
+
+CONFIG = {
+    "source": {"_target_": "fakes.FakeSource", "steps": 100, "dark_from": 40},
+    "detector": {
+        "_target_": "sceneslam.modules.detectors.grey_mean.GreyMean",
+        "threshold": 100.0,
+    },
+    "slam": {
+        "bright": {"_target_": "fakes.ExactModule"},
+        "dark": {"_target_": "fakes.ExactModule"},
+    },
+    "scenes": {"Bright": ["bright", "dark"], "Dark": ["dark", "bright"]},
+    "policy": {
+        "_target_": "sceneslam.bus.policy.Policy",
+        "handover": "cold",
+        "confirm_window_s": 2.0,
+        "first_confirm_window_s": 0.0,
+        "lost_patience_s": 0.3,
+        "bridge_s": 0.5,
+    },
+    "atlas": {"_target_": "sceneslam.atlas.atlas.Atlas", "voxel_m": 0.05},
+    "evaluation": {
+        "_target_": "sceneslam.evaluation.settings.EvaluationSettings",
+        "association_gap_s": 0.01,
+        "rpe_interval_s": 1.0,
+        "correct_limit_m": 0.25,
+        "correct_limit_rad": 0.17,
+    },
+    "run": {
+        "_target_": "sceneslam.config.settings.RunSettings",
+        "mode": "recording",
+        "threads": 1,
+        "progress": False,
+        "max_observations": None,
+    },
+    "allow_targets": ["fakes"],
+}
+
+
+def config(**changes):
+    """Return the configuration with values changed by dotted key (dots as __)."""
+    changed = deepcopy(CONFIG)
+    for key, value in changes.items():
+        *path, last = key.split("__")
+        node = changed
+        for name in path:
+            node = node[name]
+        if value is ...:
+            del node[last]
+        else:
+            node[last] = value
+    return changed
+
+
+def test_run_through_a_scene_change_is_measured_and_written(tmp_path):
+    finished = run(config(), tmp_path)
+    assert finished.faults == ()
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["coverage"] == 1.0 and metrics["ate_rmse_m"] < 1e-9
+    (switch,) = metrics["switches"]
+    assert (switch["from"], switch["to"]) == ("bright", "dark")
+    assert switch["confirm_delay_s"] == pytest.approx(2.0)
+    assert metrics["false_switches"] == 0
+    for name in ("events.jsonl", "config.yaml", "report.html", "map/points.ply"):
+        assert (tmp_path / name).stat().st_size > 0
+    for name in ("trajectory_0_bright.tum", "trajectory_1_dark.tum"):
+        local = Trajectory.read_tum(tmp_path / name)
+        np.testing.assert_allclose(local.T_world_base[0], np.eye(4), atol=1e-9)
+
+
+def test_two_runs_give_identical_trajectories_and_events(tmp_path):
+    for name in ("one", "two"):
+        run(config(), tmp_path / name)
+    one, two = ((tmp_path / name / "trajectory.tum").read_bytes() for name in ("one", "two"))
+    assert one == two
+
+    def decisions(name):
+        lines = (tmp_path / name / "events.jsonl").read_text().splitlines()
+        return [line for line in lines if json.loads(line)["event"] != "cost"]
+
+    assert decisions("one") == decisions("two")
+
+
+def test_input_that_breaks_off_leaves_what_was_computed(tmp_path):
+    finished = run(config(source__breaks_at=70), tmp_path)
+    assert finished.faults == ("the recording breaks off: fake.bag",)
+    assert len(Trajectory.read_tum(tmp_path / "trajectory.tum")) == 70
+    assert "breaks off" in (tmp_path / "report.html").read_text()
+
+
+def test_ctrl_c_leaves_what_was_computed(tmp_path):
+    module = {"_target_": "fakes.InterruptedModule", "at": 30}
+    finished = run(config(slam__bright=module), tmp_path)
+    assert "stopped" in finished.faults[0]
+    assert len(Trajectory.read_tum(tmp_path / "trajectory.tum")) == 30
+    assert (tmp_path / "metrics.json").exists()
+
+
+def test_run_without_a_module_left_says_so_and_is_saved(tmp_path):
+    broken = {"_target_": "fakes.ExactModule", "raises": [10]}
+    finished = run(config(slam__bright=broken, slam__dark=broken), tmp_path)
+    assert "no module is left for scene Bright" in finished.faults[0]
+    assert len(Trajectory.read_tum(tmp_path / "trajectory.tum")) >= 10
+
+
+def test_damage_that_the_source_reports_is_passed_on(tmp_path):
+    finished = run(config(source__fault="3 % of the file could not be read"), tmp_path)
+    assert finished.faults == ("3 % of the file could not be read",)
+
+
+def test_run_stops_after_so_many_observations(tmp_path):
+    finished = run(config(run__max_observations=12), tmp_path)
+    assert len(finished.trajectory) == 12
+
+
+def test_live_run_gives_every_taken_observation_a_pose(tmp_path):
+    finished = run(config(run__mode="live", source__steps=10), tmp_path)
+    assert finished.metrics["coverage"] == 1.0
+    assert finished.metrics["realtime_factor"] <= 1.1
+
+
+def test_reference_is_compared(tmp_path):
+    reference = run(config(source__dark_from=1000), tmp_path / "reference").trajectory
+    finished = run(config(), tmp_path / "run", reference=reference)
+    assert finished.metrics["reference"]["max_difference_m"] < 1e-9
+
+
+def test_a_run_that_never_sees_a_first_scene_says_so(tmp_path):
+    finished = run(config(policy__first_confirm_window_s=100.0), tmp_path)
+    assert len(finished.trajectory) == 0
+    assert "no pose" in finished.faults[0]
+
+
+BAD = {
+    "an unknown key": ({"scenaro": "x"}, "scenaro: got 'x'"),
+    "an unknown argument": ({"policy__confirm_windw_s": 1.0}, "policy.confirm_windw_s"),
+    "a missing argument": ({"detector__threshold": ...}, "detector.threshold: got nothing"),
+    "a value that was not given": ({"source__steps": "???"}, "source.steps: got nothing"),
+    "a wrong type": ({"detector__threshold": "abc"}, "detector.threshold: got 'abc'"),
+    "a flag for a number": ({"run__threads": True}, "run.threads: got True"),
+    "a value out of range": ({"policy__confirm_window_s": -1.0}, "policy.confirm_window_s: got -1"),
+    "a target that was not allowed": ({"detector___target_": "os.system"}, "detector._target_"),
+    "a target that does not exist": (
+        {"detector___target_": "sceneslam.modules.nothing.Nothing"},
+        "detector._target_",
+    ),
+    "no module": ({"slam": {}}, "slam: got nothing"),
+    "a scene without a module": ({"scenes__Dark": ...}, "scenes.Dark: got nothing"),
+    "an unknown module in the table": ({"scenes__Dark": ["drak"]}, "scenes.Dark: got ['drak']"),
+    "an empty list of modules": ({"scenes__Dark": []}, "scenes.Dark: got []"),
+    "a module twice": ({"scenes__Dark": ["dark", "dark"]}, "scenes.Dark"),
+    "an argument of the wrong kind": ({"slam__dark": 7}, "slam.dark: got 7"),
+    "a sensor that the source lacks": (
+        {"slam__dark": {"_target_": "fakes.DepthModule"}},
+        "slam.dark: got 'DepthModule', allowed: a source with depth; this one has: image",
+    ),
+}
+
+
+@pytest.mark.parametrize(("changes", "sentence"), BAD.values(), ids=BAD)
+def test_mistake_is_named_before_the_first_frame(tmp_path, changes, sentence):
+    with pytest.raises((ConfigError, InputError)) as caught:
+        run(config(**changes), tmp_path / "run")
+    assert sentence in str(caught.value)
+    assert not (tmp_path / "run").exists()
