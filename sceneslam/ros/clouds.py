@@ -1,0 +1,76 @@
+"""PointCloud2 messages as arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.errors import InputError
+
+_DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_TIME_NAMES = ("time", "t", "timestamp", "time_stamp", "offset_time")
+_ABSOLUTE_S = 1e6  # a `time` beyond is no offset but an instant
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Cloud:
+    """The finite points of one message."""
+
+    points_lidar: NDArray[np.float32]  # (N, 3) [m]
+    point_times_s: NDArray[np.float64] | None  # (N,) after the message's stamp
+
+
+def cloud(message: Any, stamp_ns: int) -> Cloud | None:
+    """Return the points of a PointCloud2, None when its data are cut off.
+
+    Raises InputError when it has no x, y and z.
+    """
+    fields = {field.name: field for field in message.fields}
+    if not {"x", "y", "z"} <= fields.keys():
+        raise InputError(f"point cloud fields: expected x, y, z, got {', '.join(fields)}")
+    rows = _rows(message, fields)
+    if rows is None:
+        return None
+    points = np.stack([rows[axis] for axis in "xyz"], axis=-1).astype(np.float32)
+    is_good = np.isfinite(points).all(axis=1)
+    name = next((name for name in _TIME_NAMES if name in fields), None)
+    times_s = None if name is None else _offsets_s(rows[name], stamp_ns)[is_good]
+    return Cloud(points_lidar=points[is_good], point_times_s=times_s)
+
+
+def _rows(message: Any, fields: dict[str, Any]) -> NDArray[Any] | None:
+    """Return the points as a structured array (N,), None when there are too few bytes."""
+    order = ">" if message.is_bigendian else "<"
+    kept = [field for field in fields.values() if field.datatype in _DTYPES]
+    dtype = np.dtype(
+        {
+            "names": [field.name for field in kept],
+            "formats": [order + _DTYPES[field.datatype] for field in kept],
+            "offsets": [int(field.offset) for field in kept],
+            "itemsize": int(message.point_step),
+        }
+    )
+    width, height = int(message.width), int(message.height)
+    data = np.ascontiguousarray(message.data, dtype=np.uint8)
+    row_bytes = width * dtype.itemsize
+    step = int(message.row_step) if height > 1 else row_bytes
+    if step < row_bytes or data.size < step * height:
+        return None
+    packed = data[: step * height].reshape(height, step)[:, :row_bytes]
+    return np.ascontiguousarray(packed).reshape(-1).view(dtype)
+
+
+def _offsets_s(values: NDArray[Any], stamp_ns: int) -> NDArray[np.float64]:
+    """Return seconds after the stamp: whole numbers are ns, large ones instants."""
+    if values.dtype.kind in "iu":
+        if values.dtype.itemsize < 8 or not len(values) or int(values.max()) < 10**15:
+            return values.astype(np.float64) * 1e-9
+        return (values.astype(np.int64) - stamp_ns).astype(np.float64) * 1e-9
+    times = values.astype(np.float64)
+    largest = float(np.nanmax(times)) if len(times) else 0.0
+    if largest > _ABSOLUTE_S * 1e9:
+        return (times - stamp_ns) * 1e-9
+    return times - stamp_ns * 1e-9 if largest > _ABSOLUTE_S else times

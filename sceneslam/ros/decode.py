@@ -1,0 +1,216 @@
+"""Pixels, scans, points and poses of decoded ROS messages (either generation)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.ros import pixels
+from sceneslam.types import se3
+from sceneslam.types.errors import InputError
+from sceneslam.types.observation import LaserScan
+from sceneslam.types.rig import Camera
+from sceneslam.types.se3 import Transform
+
+# Encoding -> (dtype, channels, OpenCV conversion to BGR, None where it is BGR already).
+_COLOR: dict[str, tuple[str, int, int | None]] = {
+    "bgr8": ("u1", 3, None),
+    "8UC3": ("u1", 3, None),
+    "rgb8": ("u1", 3, cv2.COLOR_RGB2BGR),
+    "bgra8": ("u1", 4, cv2.COLOR_BGRA2BGR),
+    "8UC4": ("u1", 4, cv2.COLOR_BGRA2BGR),
+    "rgba8": ("u1", 4, cv2.COLOR_RGBA2BGR),
+    "mono8": ("u1", 1, cv2.COLOR_GRAY2BGR),
+    "8UC1": ("u1", 1, cv2.COLOR_GRAY2BGR),
+    "mono16": ("u2", 1, cv2.COLOR_GRAY2BGR),
+    "yuv422": ("u1", 2, cv2.COLOR_YUV2BGR_UYVY),
+    "uyvy": ("u1", 2, cv2.COLOR_YUV2BGR_UYVY),
+    "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2BGR_YUY2),
+    "yuyv": ("u1", 2, cv2.COLOR_YUV2BGR_YUY2),
+    # ROS names a Bayer pattern by its first row, OpenCV by the second row from the second column.
+    "bayer_rggb8": ("u1", 1, cv2.COLOR_BayerBG2BGR),
+    "bayer_bggr8": ("u1", 1, cv2.COLOR_BayerRG2BGR),
+    "bayer_gbrg8": ("u1", 1, cv2.COLOR_BayerGR2BGR),
+    "bayer_grbg8": ("u1", 1, cv2.COLOR_BayerGB2BGR),
+}
+_DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+_COMPRESSED_DEPTH_HEADER = 12  # bytes: a format number and two float32 parameters
+
+
+def stamp_ns(message: Any) -> int:
+    """Return a message's header stamp [ns]."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def frame_id(message: Any) -> str:
+    """Return a message's frame without the leading slash of old."""
+    return str(message.header.frame_id).lstrip("/")
+
+
+def is_depth(message: Any, topic: str) -> bool:
+    """Tell whether an Image or CompressedImage holds depth rather than colour."""
+    encoding, is_compressed = _encoding(message)
+    if "compressedDepth" in encoding:
+        return True
+    kind = encoding.split(";")[0].strip()
+    if kind in ("16UC1", "32FC1"):
+        return True
+    if kind in _COLOR and kind != "mono16":
+        return False
+    if is_compressed and "jp" not in encoding:
+        stored = pixels.decode(message.data.tobytes(), cv2.IMREAD_UNCHANGED)
+        return stored is not None and stored.dtype == np.uint16 and stored.ndim == 2
+    return kind == "mono16" and "depth" in topic
+
+
+def is_grey(message: Any) -> bool:
+    """Tell whether an image message says that it has no colour."""
+    return _encoding(message)[0].split(";")[0].strip() in ("mono8", "mono16", "8UC1")
+
+
+def image_bgr(message: Any) -> NDArray[np.uint8] | None:
+    """Return the image (H, W, 3) uint8 BGR of an Image or CompressedImage, None when damaged.
+
+    Raises InputError for an encoding that is not known.
+    """
+    encoding, is_compressed = _encoding(message)
+    if is_compressed:
+        return pixels.decode_bgr(message.data.tobytes())
+    if encoding not in _COLOR:
+        allowed = ", ".join(sorted(_COLOR))
+        raise InputError(f"image encoding: got {encoding!r}, allowed: {allowed}")
+    dtype, channels, conversion = _COLOR[encoding]
+    raw = _raw(message, dtype, channels)
+    if raw is None:
+        return None
+    if dtype == "u2":
+        raw = (raw >> 8).astype(np.uint8)
+    image = raw if conversion is None else cv2.cvtColor(raw, conversion)
+    return pixels.locked(np.ascontiguousarray(image, dtype=np.uint8))
+
+
+def depth_m(message: Any, units: pixels.DepthUnits) -> NDArray[np.float32] | None:
+    """Return the depth (H, W) float32 [m] of an image message, None when it is damaged.
+
+    Raises InputError when it holds something else than 16-bit or float depth.
+    """
+    encoding, is_compressed = _encoding(message)
+    if not is_compressed:
+        if encoding not in _DEPTH:
+            raise InputError(f"depth encoding: got {encoding!r}, allowed: {', '.join(_DEPTH)}")
+        raw = _raw(message, _DEPTH[encoding], 1)
+        if raw is None:
+            return None
+        return units.of_metres(raw) if raw.dtype == np.float32 else units.of_integers(raw)
+    data = message.data.tobytes()
+    if "compressedDepth" not in encoding:
+        return _integers(pixels.decode(data, cv2.IMREAD_UNCHANGED), units)
+    if "rvl" in encoding.lower():
+        raise InputError(f"depth encoding: got {encoding!r}, allowed: compressedDepth with PNG")
+    stored = pixels.decode(data[_COMPRESSED_DEPTH_HEADER:], cv2.IMREAD_UNCHANGED)
+    if encoding.startswith("32FC1") and stored is not None:
+        return units.of_metres(_inverse_depth_m(stored, data[:_COMPRESSED_DEPTH_HEADER]))
+    return _integers(stored, units)
+
+
+def scan(message: Any) -> LaserScan | None:
+    """Return a LaserScan by our conventions, None when its angles make no sense.
+
+    Out of range above (REP-117: also +inf) is inf; NaN, zero and too close are NaN. A laser that
+    turns clockwise is turned round.
+    """
+    low_m, high_m = float(message.range_min), float(message.range_max)
+    step_rad, start_rad = float(message.angle_increment), float(message.angle_min)
+    ranges_m = np.array(message.ranges, dtype=np.float32)
+    if not np.isfinite([start_rad, step_rad, low_m]).all() or step_rad == 0 or not len(ranges_m):
+        return None
+    if step_rad < 0:
+        start_rad, step_rad = start_rad + step_rad * (len(ranges_m) - 1), -step_rad
+        ranges_m = ranges_m[::-1].copy()
+    with np.errstate(invalid="ignore"):
+        ranges_m[(ranges_m < np.float32(low_m)) | (ranges_m <= 0)] = np.nan
+        ranges_m[ranges_m >= np.float32(high_m)] = np.inf
+    return LaserScan(
+        stamp_ns=stamp_ns(message),
+        ranges_m=pixels.locked(ranges_m),
+        angle_min_rad=start_rad,
+        angle_step_rad=step_rad,
+        range_min_m=low_m,
+        range_max_m=high_m,
+    )
+
+
+def camera(message: Any) -> Camera | None:
+    """Return the camera of a CameraInfo, None when it was never calibrated (K is zero)."""
+    k, d = (_coefficients(message, letter) for letter in "kd")
+    if k[0] <= 0 or k[4] <= 0:
+        return None
+    model = str(message.distortion_model)
+    if d.any() and model not in ("plumb_bob", "rational_polynomial", ""):
+        raise InputError(f"distortion model: got {model!r}, allowed: plumb_bob")
+    distortion = (*d.tolist(), 0.0, 0.0, 0.0, 0.0, 0.0)[: max(5, len(d))]
+    return Camera(
+        size_wh=(int(message.width), int(message.height)),
+        fx=float(k[0]),
+        fy=float(k[4]),
+        cx=float(k[2]),
+        cy=float(k[5]),
+        distortion=distortion,
+    )
+
+
+def transform(at: Any, turn: Any) -> Transform | None:
+    """Return T of a Point or Vector3 and a Quaternion, None when it is no rigid motion."""
+    quat_xyzw = np.array([turn.x, turn.y, turn.z, turn.w], dtype=np.float64)
+    position = np.array([at.x, at.y, at.z], dtype=np.float64)
+    norm = float(np.linalg.norm(quat_xyzw))
+    if not np.isfinite(position).all() or not 0.5 < norm < 2.0:
+        return None
+    return se3.from_quat_xyzw(position, quat_xyzw)
+
+
+def _encoding(message: Any) -> tuple[str, bool]:
+    if message.__msgtype__ == "sensor_msgs/msg/CompressedImage":
+        return str(message.format), True
+    return str(message.encoding), False
+
+
+def _coefficients(message: Any, letter: str) -> NDArray[np.float64]:
+    """Return CameraInfo's `k` or `d`, which are `K` and `D` in ROS 1."""
+    values = vars(message)
+    return np.asarray(values.get(letter, values.get(letter.upper())), dtype=np.float64)
+
+
+def _raw(message: Any, dtype: str, channels: int) -> NDArray[Any] | None:
+    """Return an Image's rows (H, W) or (H, W, channels) in this machine's byte order."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    row_bytes = width * channels * np.dtype(dtype).itemsize
+    data = np.asarray(message.data, dtype=np.uint8)
+    if height < 1 or width < 1 or step < row_bytes or data.size < step * height:
+        return None
+    rows = data[: step * height].reshape(height, step)[:, :row_bytes]
+    order = ">" if message.is_bigendian else "<"
+    values = np.ascontiguousarray(rows).view(order + dtype).astype(dtype, copy=False)
+    return values.reshape(height, width, channels) if channels > 1 else values
+
+
+def _integers(stored: NDArray[Any] | None, units: pixels.DepthUnits) -> NDArray[np.float32] | None:
+    if stored is None:
+        return None
+    if stored.dtype != np.uint16 or stored.ndim != 2:
+        raise InputError(
+            f"depth image: expected one 16-bit channel, got {stored.dtype} {stored.shape}"
+        )
+    return units.of_integers(stored)
+
+
+def _inverse_depth_m(stored: NDArray[Any], header: bytes) -> NDArray[np.float32]:
+    """Return metres of compressedDepth's quantised inverse depth (0 stays missing)."""
+    scale, offset = np.frombuffer(header, dtype="<f4", count=2, offset=4)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        metres = scale / (stored.astype(np.float32) - offset)
+    return np.where(stored == 0, np.float32(0), metres).astype(np.float32)

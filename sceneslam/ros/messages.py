@@ -1,0 +1,71 @@
+"""Decoding of messages by the definitions that a recording carries."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TopicType:
+    """What a topic's messages are."""
+
+    msgtype: str  # `sensor_msgs/msg/Image`, for ROS 1 too
+    encoding: str  # of messages: `cdr` or `ros1`
+    definition: str  # as `definition_format` says; "" when the recording has none
+    definition_format: str  # `ros2msg`, `ros1msg` or `ros2idl`
+    count: int  # messages
+
+    def with_count(self, count: int) -> TopicType:
+        """Return the same with another count."""
+        return replace(self, count=count)
+
+
+class MessageDecoder:
+    """Turns messages into objects; reads a type's definition when it is first met."""
+
+    def __init__(self, topics: Mapping[str, TopicType]) -> None:
+        self._topics = topics
+        self._stores: dict[str, Any] = {}  # by topic: files may define one type in two ways
+
+    def decode(self, topic: str, data: bytes) -> Any:
+        """Return the message, None when its bytes or its definition make no sense."""
+        kind = self._topics[topic]
+        if topic not in self._stores:
+            self._stores[topic] = _typestore(kind)
+        store = self._stores[topic]
+        if store is None:
+            return None
+        try:
+            if kind.encoding == "ros1":
+                return store.deserialize_ros1(data, kind.msgtype)
+            return store.deserialize_cdr(data, kind.msgtype)
+        except Exception:  # generated code: broken bytes raise whatever they run into
+            return None
+
+
+def _typestore(kind: TopicType) -> Any:
+    """Return a typestore that knows the type, None when its definition cannot be read."""
+    from rosbags.typesys import (
+        Stores,
+        TypesysError,
+        get_types_from_idl,
+        get_types_from_msg,
+        get_typestore,
+    )
+
+    if not kind.definition:
+        store = get_typestore(Stores.ROS1_NOETIC if kind.encoding == "ros1" else Stores.LATEST)
+        return store if kind.msgtype in store.types else None
+    store = get_typestore(Stores.EMPTY)
+    try:
+        if kind.definition_format == "ros2idl":
+            store.register(get_types_from_idl(kind.definition))
+        else:
+            # Bags of before 2011 keep the header in a package that is gone.
+            text = kind.definition.replace("roslib/Header", "std_msgs/Header")
+            store.register(get_types_from_msg(text, kind.msgtype))
+    except (TypesysError, ValueError, KeyError):
+        return None
+    return store if kind.msgtype in store.types else None

@@ -1,0 +1,63 @@
+"""Encoded and raw pixels as arrays."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+_PNG, _JPEG = b"\x89PNG", b"\xff\xd8"
+
+
+def decode(data: bytes, flags: int) -> NDArray[Any] | None:
+    """Return the pixels of a JPEG, PNG (or other) file, None when it is damaged or cut off.
+
+    `flags` are OpenCV's: IMREAD_COLOR for BGR, IMREAD_UNCHANGED for what is stored.
+    """
+    is_cut = (data[:4] == _PNG and b"IEND" not in data[-64:]) or (
+        data[:2] == _JPEG and b"\xff\xd9" not in data[-64:]
+    )
+    if not data or is_cut:
+        return None
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+    except cv2.error:
+        return None
+    return None if pixels is None else np.asarray(pixels)
+
+
+def decode_bgr(data: bytes) -> NDArray[np.uint8] | None:
+    """Return the image (H, W, 3) uint8 BGR of a file's bytes, None when it is damaged."""
+    pixels = decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return None if pixels is None else locked(pixels)
+
+
+def locked(array: NDArray[Scalar]) -> NDArray[Scalar]:
+    """Return the array, read-only from now on."""
+    array.flags.writeable = False
+    return array
+
+
+class DepthUnits:
+    """Turns stored depths into metres; what is not finite or out of range is missing (0)."""
+
+    def __init__(self, units_per_m: float, range_m: tuple[float, float]) -> None:
+        self._low_m, self._high_m = np.float32(range_m[0]), np.float32(range_m[1])
+        count = np.arange(1 << 16, dtype=np.float32)
+        self._table_m = self._cut(count / np.float32(units_per_m))
+
+    def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
+        """Return metres (H, W) of whole units."""
+        return locked(np.take(self._table_m, stored))
+
+    def of_metres(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return metres (H, W) of metres, NaN and infinite ones missing (REP-118)."""
+        return locked(self._cut(depth_m))
+
+    def _cut(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        is_good = (depth_m >= self._low_m) & (depth_m <= self._high_m)
+        return np.where(is_good, depth_m, np.float32(0)).astype(np.float32, copy=False)

@@ -1,0 +1,98 @@
+"""ROS 1 bags as chunks of messages."""
+
+from __future__ import annotations
+
+from mmap import ACCESS_READ, mmap
+from pathlib import Path
+
+from sceneslam.ros.messages import TopicType
+from sceneslam.sources import bag_records as records
+from sceneslam.sources.bag_survey import BagSurvey
+from sceneslam.sources.recording import (
+    Chunk,
+    ChunkContent,
+    ChunkedRecording,
+    Layout,
+    Message,
+)
+from sceneslam.types.errors import InputError
+
+
+def open_bag(path: Path) -> ChunkedRecording:
+    """Return the recording; raises InputError when the file is no ROS 1 bag."""
+    bag = BagFile(path)
+    return ChunkedRecording([bag.layout()], bag.read)
+
+
+class BagFile:
+    """One bag; knows its connections once `layout` has been called."""
+
+    def __init__(self, path: Path) -> None:
+        if path.stat().st_size == 0:
+            raise InputError(f"recording: expected a ROS 1 bag, got an empty file: {path}")
+        with path.open("rb") as file:
+            blob = mmap(file.fileno(), 0, access=ACCESS_READ)
+        if blob[: len(records.MAGIC)] != records.MAGIC:
+            raise InputError(f"recording: this is no ROS 1 bag of format 2.0: {path}")
+        self._path = path
+        self._survey = BagSurvey(blob)
+        self._names: dict[int, str] = {}  # connection -> topic
+
+    def layout(self) -> Layout:
+        """Return the chunks and topics."""
+        survey = self._survey
+        survey.run()
+        topics = self._topics()
+        chunks = [
+            Chunk(
+                file=self._path,
+                offset=place,
+                length=min(survey.chunks[place].end, len(survey.blob)) - place,
+                start_ns=span.start_ns,
+                end_ns=span.end_ns,
+                topics=frozenset(
+                    self._names[number] for number in span.counts if number in self._names
+                ),
+            )
+            for place, span in survey.spans.items()
+            if place in survey.chunks
+        ]
+        note = "" if survey.is_sound else "the bag's index is damaged or cut off (read without it)"
+        return Layout(
+            chunks=chunks, topics=topics, metadata={}, lost_bytes=survey.lost_bytes, note=note
+        )
+
+    def read(self, chunk: Chunk) -> ChunkContent:
+        """Return a chunk's messages up to the first that is damaged."""
+        data = self._survey.content(self._survey.chunks[chunk.offset])
+        if data is None:
+            return ChunkContent(messages=(), lost_bytes=chunk.length)
+        messages, position = [], 0
+        for record in records.records_in(data):
+            position = record.end
+            if record.opcode != records.MESSAGE or len(record.fields.get(b"time", b"")) != 8:
+                continue
+            topic = self._names.get(record.number(b"conn"))
+            if topic is not None:
+                payload = data[record.data_at : record.end]
+                messages.append(Message(topic=topic, log_ns=record.time_ns(b"time"), data=payload))
+        return ChunkContent(messages=messages, lost_bytes=len(data) - position)
+
+    def _topics(self) -> dict[str, TopicType]:
+        """Return the topics that hold messages; remember which connection is which."""
+        topics: dict[str, TopicType] = {}
+        counts = self._survey.counts()
+        for number, fields in self._survey.connections.items():
+            if not counts[number]:
+                continue
+            topic = "/" + fields[b"topic"].decode(errors="replace").strip("/")
+            self._names[number] = topic
+            known = topics.get(topic)
+            topics[topic] = TopicType(
+                msgtype=fields[b"type"].decode(errors="replace").replace("/", "/msg/"),
+                encoding="ros1",
+                definition=fields.get(b"message_definition", b"").decode(errors="replace"),
+                definition_format="ros1msg",
+                count=counts[number] + (known.count if known else 0),
+            )
+        return topics

@@ -1,0 +1,61 @@
+"""Where the sensors of a recording sit on its robot."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+from sceneslam.ros import decode, names
+from sceneslam.sources.recording import Recording
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.se3 import Transform
+
+_BASES = ("base_link", "base_footprint", "base")
+_FIRST_MOVING = 200  # messages of /tf that are looked through for mounts
+
+
+class FrameTree:
+    """The transforms of /tf_static and, where those say nothing, the first of /tf."""
+
+    def __init__(self, recording: Recording, base_frame: str | None) -> None:
+        self._up: dict[str, tuple[str, Transform]] = {}  # child -> parent, T_parent_child
+        for topic, count in ((names.TF_STATIC, None), (names.TF, _FIRST_MOVING)):
+            if topic not in recording.topics:
+                continue
+            for message in islice(recording.messages({topic}), count):
+                for entry in getattr(recording.decode(message), "transforms", ()):
+                    self._add(entry)
+        frames = {*self._up, *(parent for parent, _ in self._up.values())}
+        if base_frame is not None and frames and base_frame not in frames:
+            raise ConfigError(
+                "base_frame", base_frame, f"null or one of {', '.join(sorted(frames))}"
+            )
+        self.base = base_frame or next((name for name in _BASES if name in frames), None)
+
+    def T_base(self, frame: str) -> Transform | None:
+        """Return T_base_frame, None when the recording does not connect the two."""
+        if self.base is None:
+            return None
+        base_root, T_root_base = self._to_root(self.base)
+        frame_root, T_root_frame = self._to_root(frame)
+        if base_root != frame_root:
+            return None
+        return se3.inverse(T_root_base) @ T_root_frame
+
+    def _add(self, entry: object) -> None:
+        at = entry.transform.translation  # type: ignore[attr-defined]
+        turn = entry.transform.rotation  # type: ignore[attr-defined]
+        T_parent_child = decode.transform(at, turn)
+        child = str(entry.child_frame_id).lstrip("/")  # type: ignore[attr-defined]
+        if T_parent_child is not None:
+            self._up.setdefault(child, (decode.frame_id(entry), T_parent_child))
+
+    def _to_root(self, frame: str) -> tuple[str, Transform]:
+        T_root_frame, met = se3.identity(), {frame}
+        while frame in self._up:
+            frame, T_parent_child = self._up[frame]
+            if frame in met:
+                break
+            met.add(frame)
+            T_root_frame = T_parent_child @ T_root_frame
+        return frame, T_root_frame

@@ -1,0 +1,131 @@
+"""Bundles of ROS messages as observations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.ros import decode
+from sceneslam.ros.clouds import Cloud, cloud
+from sceneslam.ros.pixels import DepthUnits, locked
+from sceneslam.sources.synchronise import Bundle, Sample
+from sceneslam.types.errors import InputError
+from sceneslam.types.observation import LaserScan, Observation
+from sceneslam.types.rig import Rig, Sensor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Decoded:
+    """An observation, None when nothing of it could be decoded, and what was wrong."""
+
+    observation: Observation | None
+    problems: tuple[str, ...]
+    stamp_ns: int
+
+
+class BundleDecoder:
+    """Decodes bundles; safe to call from several threads."""
+
+    def __init__(self, primary: Sensor, rig: Rig, units: DepthUnits) -> None:
+        self._primary = primary
+        self._rig = rig
+        self._units = units
+
+    def observe(self, bundle: Bundle) -> Decoded:
+        """Return the bundle's observation; raises InputError when an image changes its size."""
+        problems: list[str] = []
+        stamp_ns = bundle.primary.stamp_ns
+        scan, points = self._scan(bundle, problems), self._points(bundle, problems)
+        observation = Observation(
+            stamp_ns=stamp_ns,
+            image_bgr=self._image(bundle, problems),
+            depth_m=self._depth(bundle, problems),
+            scan=scan,
+            points_lidar=None if points is None else points.points_lidar,
+            point_times_s=None if points is None else points.point_times_s,
+            T_odom_base=self._odometry(bundle),
+            gyro_base=_gyro(bundle),
+        )
+        is_empty = not any(observation.has(sensor) for sensor in self._rig.sensors)
+        return Decoded(
+            observation=None if is_empty else observation,
+            problems=tuple(problems),
+            stamp_ns=stamp_ns,
+        )
+
+    def _sample(self, sensor: Sensor, bundle: Bundle) -> Sample | None:
+        others = {
+            Sensor.DEPTH: bundle.depth,
+            Sensor.SCAN: bundle.scan,
+            Sensor.POINTS: bundle.points,
+        }
+        return bundle.primary if sensor is self._primary else others.get(sensor)
+
+    def _image(self, bundle: Bundle, problems: list[str]) -> NDArray[np.uint8] | None:
+        sample = self._sample(Sensor.IMAGE, bundle)
+        if sample is None:
+            return None
+        image = decode.image_bgr(sample.value)
+        if image is None:
+            problems.append("a colour image could not be decoded")
+            return None
+        self._check_size("image", sample.stamp_ns, image)
+        return image
+
+    def _depth(self, bundle: Bundle, problems: list[str]) -> NDArray[np.float32] | None:
+        sample = self._sample(Sensor.DEPTH, bundle)
+        if sample is None:
+            return None
+        depth_m = decode.depth_m(sample.value, self._units)
+        if depth_m is None:
+            problems.append("a depth image could not be decoded")
+            return None
+        self._check_size("depth", sample.stamp_ns, depth_m)
+        return depth_m
+
+    def _check_size(self, name: str, stamp_ns: int, picture: NDArray[np.generic]) -> None:
+        expected_wh = self._rig.camera.size_wh if self._rig.camera else None
+        height, width = picture.shape[:2]
+        if expected_wh and (width, height) != expected_wh:
+            raise InputError(
+                f"{name} at stamp {stamp_ns * 1e-9:.6f} s: expected {expected_wh[0]}x"
+                f"{expected_wh[1]} pixels as in the first image, got {width}x{height}"
+            )
+
+    def _scan(self, bundle: Bundle, problems: list[str]) -> LaserScan | None:
+        sample = self._sample(Sensor.SCAN, bundle)
+        scan = None if sample is None else decode.scan(sample.value)
+        if sample is not None and scan is None:
+            problems.append("a laser scan has no usable angles")
+        return scan
+
+    def _points(self, bundle: Bundle, problems: list[str]) -> Cloud | None:
+        sample = self._sample(Sensor.POINTS, bundle)
+        if sample is None:
+            return None
+        found = cloud(sample.value, bundle.primary.stamp_ns)
+        if found is None:
+            problems.append("a point cloud is shorter than it says")
+            return None
+        times_s = found.point_times_s
+        if times_s is not None:
+            times_s = locked(times_s)
+        return Cloud(points_lidar=locked(found.points_lidar), point_times_s=times_s)
+
+    def _odometry(self, bundle: Bundle) -> NDArray[np.float64] | None:
+        is_primary = self._primary is Sensor.ODOMETRY
+        T_odom_base = bundle.primary.value if is_primary else bundle.T_odom_base
+        return None if T_odom_base is None else locked(np.array(T_odom_base))
+
+
+def _gyro(bundle: Bundle) -> NDArray[np.float64] | None:
+    """Return (M, 4): seconds after the stamp, rates [rad/s] in base."""
+    if not bundle.gyro:
+        return None
+    rows = [
+        [(sample.stamp_ns - bundle.primary.stamp_ns) * 1e-9, *sample.value]
+        for sample in bundle.gyro
+    ]
+    return locked(np.array(rows, dtype=np.float64))

@@ -1,0 +1,107 @@
+"""Records of a ROS 1 bag (format 2.0)."""
+
+from __future__ import annotations
+
+import bz2
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from mmap import mmap
+
+MAGIC = b"#ROSBAG V2.0\n"
+MESSAGE, CHUNK, CHUNK_INFO, CONNECTION = 2, 5, 6, 7
+_U32, _TIME = struct.Struct("<I"), struct.Struct("<II")
+_LONGEST_HEADER = 1 << 16  # [bytes]; a longer one is damage
+
+Blob = bytes | mmap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Record:
+    """One record: its header fields, and where its data are."""
+
+    opcode: int
+    fields: dict[bytes, bytes]
+    data_at: int  # [bytes]
+    data_length: int  # [bytes]
+
+    @property
+    def end(self) -> int:
+        """Return where the next record begins [bytes]."""
+        return self.data_at + self.data_length
+
+    def number(self, name: bytes) -> int:
+        """Return a field that is an unsigned 32-bit number."""
+        return int(_U32.unpack(self.fields[name])[0])
+
+    def time_ns(self, name: bytes) -> int:
+        """Return a field that is a time [ns]."""
+        seconds, nanoseconds = _TIME.unpack(self.fields[name])
+        return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def header_fields(header: bytes) -> dict[bytes, bytes] | None:
+    """Return the fields of a record's header, None when they do not add up."""
+    fields, position = {}, 0
+    while position < len(header):
+        if position + _U32.size > len(header):
+            return None
+        (length,) = _U32.unpack_from(header, position)
+        position += _U32.size
+        name, equals, value = header[position : position + length].partition(b"=")
+        position += length
+        if not equals or position > len(header):
+            return None
+        fields[name] = value
+    return fields
+
+
+def record_at(data: Blob, position: int) -> Record | None:
+    """Return the record at a place, None when there is none; its data may reach beyond the end."""
+    if position + _U32.size > len(data):
+        return None
+    (length,) = _U32.unpack_from(data, position)
+    start = position + _U32.size
+    end = start + length
+    if length > _LONGEST_HEADER or end + _U32.size > len(data):
+        return None
+    fields = header_fields(data[start:end])
+    if fields is None or len(fields.get(b"op", b"")) != 1:
+        return None
+    (size,) = _U32.unpack_from(data, end)
+    return Record(opcode=fields[b"op"][0], fields=fields, data_at=end + _U32.size, data_length=size)
+
+
+def records_in(data: Blob, start: int = 0) -> Iterator[Record]:
+    """Yield records until the end or the first that is damaged or cut off."""
+    position = start
+    while (record := record_at(data, position)) is not None and record.end <= len(data):
+        yield record
+        position = record.end
+
+
+def find_chunk(data: Blob, start: int) -> int | None:
+    """Return the next place at or after `start` where a chunk record begins, None if none does."""
+    found = data.find(b"compression=", start)
+    while found >= 0:
+        # The fields stand in any order: the record begins up to 64 bytes before this one.
+        for position in range(max(start, found - 64), found - 7):
+            record = record_at(data, position)
+            if record is not None and record.opcode == CHUNK:
+                return position
+        found = data.find(b"compression=", found + 1)
+    return None
+
+
+def unpack(compression: bytes, data: bytes) -> bytes | None:
+    """Return a chunk's records, None when they cannot be decompressed."""
+    import lz4.frame  # type: ignore[import-untyped]
+
+    try:
+        if compression == b"bz2":
+            return bz2.decompress(data)
+        if compression == b"lz4":
+            return bytes(lz4.frame.decompress(data))
+    except (OSError, ValueError, RuntimeError, EOFError):
+        return None
+    return data if compression == b"none" else None

@@ -1,0 +1,126 @@
+"""The sensors of a recording: kinds, intrinsics and places."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from typing import Any
+
+from sceneslam.ros import decode, names, pixels
+from sceneslam.sources.bag_frames import FrameTree
+from sceneslam.sources.bag_topics import Topics, first
+from sceneslam.sources.intrinsics import Intrinsics
+from sceneslam.sources.recording import Recording
+from sceneslam.types import se3
+from sceneslam.types.errors import InputError
+from sceneslam.types.rig import Camera, Laser, Lidar, Rig, Sensor, optical_to_rep103
+from sceneslam.types.se3 import Transform
+
+_SENSORS = {
+    "image": Sensor.IMAGE,
+    "depth": Sensor.DEPTH,
+    "scan": Sensor.SCAN,
+    "points": Sensor.POINTS,
+    "odometry": Sensor.ODOMETRY,
+    "imu": Sensor.GYRO,
+}
+_DEPTH_RANGE_M, _LIDAR_RANGE_M = (0.3, 8.0), (1.0, 100.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Given:
+    """What the configuration says in place of the recording; None: as recorded."""
+
+    intrinsics: Intrinsics | None
+    depth_range_m: tuple[float, float] | None
+    lidar_range_m: tuple[float, float] | None
+
+
+def sensor_topics(topics: Topics) -> dict[Sensor, str]:
+    """Return the topic of each sensor that the recording has."""
+    chosen = {sensor: getattr(topics, need) for need, sensor in _SENSORS.items()}
+    return {sensor: name for sensor, name in chosen.items() if name is not None}
+
+
+def make_rig(recording: Recording, topics: Topics, frames: FrameTree, given: Given) -> Rig:
+    """Return the rig; raises InputError for depth without intrinsics."""
+    said = recording.metadata.get(names.RIG_METADATA, {})
+    laser = lidar = None
+    if topics.scan:
+        laser = Laser(T_base_laser=place(recording, topics.scan, frames))
+    if topics.points:
+        lidar = Lidar(
+            range_m=given.lidar_range_m or _said(said, "lidar_range_m") or _LIDAR_RANGE_M,
+            T_base_lidar=place(recording, topics.points, frames),
+        )
+    camera = None
+    if topics.image or topics.depth:
+        depth_range_m = given.depth_range_m or _said(said, "depth_range_m") or _DEPTH_RANGE_M
+        camera = _camera(recording, topics, frames, given.intrinsics, depth_range_m)
+    sensors = frozenset(sensor_topics(topics))
+    return Rig(sensors=sensors, camera=camera, laser=laser, lidar=lidar)
+
+
+def place(recording: Recording, topic: str, frames: FrameTree) -> Transform:
+    """Return T_base_sensor of a topic's sensor, the identity where the recording is silent."""
+    message = first(recording, topic)
+    T_base_sensor = None if message is None else frames.T_base(decode.frame_id(message))
+    return se3.identity() if T_base_sensor is None else T_base_sensor
+
+
+def _camera(
+    recording: Recording,
+    topics: Topics,
+    frames: FrameTree,
+    given: Intrinsics | None,
+    depth_range_m: tuple[float, float],
+) -> Camera | None:
+    """Return the camera of the image, or of the depth where there is no image."""
+    message = first(recording, topics.image or topics.depth or "")
+    size_wh = _size_wh(message, is_depth=topics.image is None)
+    info = first(recording, topics.camera_info) if topics.camera_info else None
+    recorded = decode.camera(info) if info is not None else None
+    if recorded is None and given is None:
+        if topics.depth is None:
+            return None
+        raise InputError(
+            "depth without intrinsics: the recording has no usable camera_info; "
+            "give source.camera.fx, fy, cx and cy [px]"
+        )
+    if given is None and recorded is not None and recorded.size_wh != size_wh:
+        raise InputError(
+            f"camera_info is for {recorded.size_wh[0]}x{recorded.size_wh[1]} pixels but the images "
+            f"have {size_wh[0]}x{size_wh[1]}: give source.camera.fx, fy, cx and cy [px]"
+        )
+    T_base_cam = frames.T_base(decode.frame_id(message))
+    camera = recorded or Camera(size_wh=size_wh, fx=1.0, fy=1.0, cx=0.0, cy=0.0)
+    if given is not None:
+        camera = replace(camera, fx=given.fx, fy=given.fy, cx=given.cx, cy=given.cy)
+        if given.distortion is not None:
+            camera = replace(camera, distortion=given.distortion)
+    return replace(
+        camera,
+        size_wh=size_wh,
+        depth_range_m=depth_range_m,
+        T_base_cam=optical_to_rep103() if T_base_cam is None else T_base_cam,
+    )
+
+
+def _size_wh(message: Any, *, is_depth: bool) -> tuple[int, int]:
+    """Return the size of an image message."""
+    if is_depth:
+        picture: Any = decode.depth_m(message, pixels.DepthUnits(1000.0, _DEPTH_RANGE_M))
+    else:
+        picture = decode.image_bgr(message)
+    if picture is None:
+        raise InputError("the recording's first image cannot be decoded")
+    return int(picture.shape[1]), int(picture.shape[0])
+
+
+def _said(said: Any, key: str) -> tuple[float, float] | None:
+    """Return a range that our own recordings carry, None when it is missing or damaged."""
+    try:
+        low, high = json.loads(said[key])
+        return float(low), float(high)
+    except (KeyError, TypeError, ValueError):
+        return None

@@ -1,0 +1,126 @@
+"""What a ROS 1 bag holds and where: from its index, or from its content where that is damaged."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from mmap import mmap
+
+from sceneslam.sources import bag_records as records
+from sceneslam.sources.bag_records import Record
+
+_INDEX_RECORD_BYTES, _INDEX_ENTRY_BYTES = 55, 12
+_CONNECTION_BYTES = 8192  # of a connection record with its definition, about
+_KNOWN = range(records.MESSAGE, records.CONNECTION + 1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Span:
+    """What a chunk holds: when, and how many messages of each connection."""
+
+    start_ns: int
+    end_ns: int
+    counts: dict[int, int]
+
+
+@dataclass(slots=True, eq=False)
+class BagSurvey:
+    """The contents of a bag; the place of a chunk is its record's first byte."""
+
+    blob: mmap
+    chunks: dict[int, Record] = field(default_factory=dict)
+    spans: dict[int, Span] = field(default_factory=dict)
+    connections: dict[int, dict[bytes, bytes]] = field(default_factory=dict)  # topic, type, ...
+    is_sound: bool = True
+    lost_bytes: int = 0
+
+    def run(self) -> None:
+        """Go through the records; look into the chunks as well when the index is not sound."""
+        gaps = self._walk()
+        if self.is_sound and set(self.spans) == set(self.chunks):
+            return
+        self.is_sound = False
+        for place, record in self.chunks.items():
+            self._look_into(place, record)
+        for place, gap_bytes in gaps.items():
+            span = self.spans.get(place)
+            counts = span.counts if span else {}
+            index_bytes = _INDEX_RECORD_BYTES * len(counts)
+            index_bytes += _INDEX_ENTRY_BYTES * sum(counts.values())
+            self.lost_bytes += max(0, gap_bytes - index_bytes)
+
+    def counts(self) -> Counter[int]:
+        """Return how many messages each connection has."""
+        total: Counter[int] = Counter()
+        for span in self.spans.values():
+            total.update(span.counts)
+        return total
+
+    def content(self, record: Record) -> bytes | None:
+        """Return a chunk's records, as many as there are; None when they cannot be unpacked."""
+        data = self.blob[record.data_at : record.end]
+        return records.unpack(record.fields.get(b"compression", b""), data)
+
+    def _walk(self) -> dict[int, int]:
+        """Take the records; return how many bytes after which chunk made no sense."""
+        gaps: dict[int, int] = {}
+        position = chunk_end = len(records.MAGIC)
+        last = -1  # place of the last chunk
+        while position < len(self.blob):
+            record = records.record_at(self.blob, position)
+            if record is not None and self._take(position, record):
+                if record.opcode == records.CHUNK:
+                    last, chunk_end = position, record.end
+                position = record.end
+                continue
+            self.is_sound = False
+            found = records.find_chunk(self.blob, chunk_end)
+            spare = _CONNECTION_BYTES * max(len(self.connections), 1)
+            end = len(self.blob) - spare if found is None else found
+            gaps[last] = end - chunk_end
+            position = len(self.blob) if found is None else found
+        self.is_sound &= position == len(self.blob)
+        return gaps
+
+    def _take(self, place: int, record: Record) -> bool:
+        """Tell whether this is a record (a chunk may be cut off), and remember what it says."""
+        if record.opcode not in _KNOWN:
+            return False
+        if record.opcode != records.CHUNK and record.end > len(self.blob):
+            return False
+        if record.opcode == records.CHUNK:
+            self.chunks[place] = record
+        elif record.opcode == records.CONNECTION:
+            self._take_connection(record, self.blob[record.data_at : record.end])
+        elif record.opcode == records.CHUNK_INFO:
+            data = self.blob[record.data_at : record.end]
+            numbers = [int.from_bytes(data[at : at + 4], "little") for at in range(0, len(data), 4)]
+            counts = dict(zip(numbers[::2], numbers[1::2], strict=False))
+            self.spans[int.from_bytes(record.fields[b"chunk_pos"], "little")] = Span(
+                start_ns=record.time_ns(b"start_time"),
+                end_ns=record.time_ns(b"end_time"),
+                counts=counts,
+            )
+        return True
+
+    def _take_connection(self, record: Record, data: bytes) -> None:
+        definition = records.header_fields(data)
+        if definition and b"type" in definition and b"topic" in record.fields:
+            topic = {b"topic": record.fields[b"topic"]}
+            self.connections[record.number(b"conn")] = {**definition, **topic}
+
+    def _look_into(self, place: int, record: Record) -> None:
+        """Take a chunk's connections, times and counts from its content."""
+        data = self.content(record) or b""
+        counts: Counter[int] = Counter()
+        times_ns = []
+        for inner in records.records_in(data):
+            if inner.opcode == records.CONNECTION:
+                self._take_connection(inner, data[inner.data_at : inner.end])
+            elif inner.opcode == records.MESSAGE:
+                counts[inner.number(b"conn")] += 1
+                times_ns.append(inner.time_ns(b"time"))
+        if times_ns:
+            self.spans[place] = Span(
+                start_ns=min(times_ns), end_ns=max(times_ns), counts=dict(counts)
+            )

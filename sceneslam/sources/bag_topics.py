@@ -1,0 +1,150 @@
+"""Which topic of a recording serves which need."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sceneslam.ros import decode, names
+from sceneslam.sources.recording import Recording
+from sceneslam.types.errors import ConfigError, InputError
+
+NONE = "none"  # as a topic's name: do without
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_POSES = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+)
+_TYPES = {
+    "image": _IMAGES,
+    "depth": _IMAGES,
+    "camera_info": ("sensor_msgs/msg/CameraInfo",),
+    "scan": ("sensor_msgs/msg/LaserScan",),
+    "points": ("sensor_msgs/msg/PointCloud2",),
+    "odometry": ("nav_msgs/msg/Odometry",),
+    "imu": ("sensor_msgs/msg/Imu",),
+    "ground_truth": _POSES,
+    "scene": ("std_msgs/msg/String",),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Topics:
+    """One topic per need, None where there is none."""
+
+    image: str | None
+    depth: str | None
+    camera_info: str | None
+    scan: str | None
+    points: str | None
+    odometry: str | None
+    imu: str | None
+    ground_truth: str | None
+    scene: str | None
+
+
+def choose_topics(recording: Recording, given: Mapping[str, str | None]) -> Topics:
+    """Return the topics that are named and, for the rest, those found by type and encoding.
+
+    Raises ConfigError for a name that is not there, InputError when several topics could serve.
+    """
+    for need, name in given.items():
+        _check_given(recording, need, name)
+    chosen = {need: name for need, name in given.items() if name is not None}
+    images = [
+        name
+        for name in _of_type(recording, _IMAGES)
+        if name not in chosen.values() and not {"image", "depth"} <= chosen.keys()
+    ]
+    firsts = {name: first(recording, name) for name in images}
+    depths = [name for name in images if firsts[name] and decode.is_depth(firsts[name], name)]
+    colors = [name for name in images if firsts[name] and name not in depths]
+    found = {
+        "image": _without_grey(_one_transport(colors), firsts),
+        "depth": _prefer(_one_transport(depths), lambda name: "align" in name or "regist" in name),
+        **{need: _of_type(recording, _TYPES[need]) for need in ("scan", "points", "imu")},
+        "odometry": [n for n in _of_type(recording, _TYPES["odometry"]) if not _is_truth(n)],
+        "ground_truth": [n for n in _of_type(recording, _POSES) if _is_truth(n)],
+        "scene": [n for n in _of_type(recording, _TYPES["scene"]) if _is_truth(n)],
+    }
+    for need, candidates in found.items():
+        chosen.setdefault(need, _only(need, candidates))
+    picture = chosen["image"] if chosen["image"] != NONE else chosen["depth"]
+    infos = _of_type(recording, _TYPES["camera_info"])
+    chosen.setdefault("camera_info", _only("camera_info", _beside(picture, infos)))
+    return Topics(**{need: None if name == NONE else name for need, name in chosen.items()})
+
+
+def first(recording: Recording, topic: str) -> Any:
+    """Return a topic's first message that makes sense, None when there is none."""
+    for message in recording.messages({topic}):
+        decoded = recording.decode(message)
+        if decoded is not None:
+            return decoded
+    return None
+
+
+def describe(recording: Recording) -> str:
+    """Return the topics and their types, to show."""
+    return ", ".join(f"{name} ({kind.msgtype})" for name, kind in sorted(recording.topics.items()))
+
+
+def _check_given(recording: Recording, need: str, name: str | None) -> None:
+    key = f"topics.{need}"
+    if need not in _TYPES:
+        raise ConfigError(key, name, f"a topic for one of {', '.join(_TYPES)}")
+    if name in (None, NONE):
+        return
+    if name not in recording.topics:
+        raise ConfigError(key, name, f"{NONE}, null (find it) or one of {describe(recording)}")
+    msgtype = recording.topics[name].msgtype
+    if msgtype not in _TYPES[need]:
+        raise ConfigError(key, f"{name} ({msgtype})", f"a topic of {' or '.join(_TYPES[need])}")
+
+
+def _of_type(recording: Recording, types: Collection[str]) -> list[str]:
+    return [
+        name
+        for name, kind in sorted(recording.topics.items())
+        if kind.msgtype in types and not name.startswith(names.OWN_PREFIX)
+    ]
+
+
+def _is_truth(name: str) -> bool:
+    return "ground_truth" in name or "groundtruth" in name
+
+
+def _one_transport(topics: Sequence[str]) -> list[str]:
+    """Return the topics without the compressed ones whose raw images are there as well."""
+    return [name for name in topics if name.rsplit("/", 1)[0] not in topics]
+
+
+def _without_grey(topics: Sequence[str], firsts: Mapping[str, Any]) -> list[str]:
+    return _prefer(topics, lambda name: not decode.is_grey(firsts[name]))
+
+
+def _prefer(topics: Sequence[str], is_better: Callable[[str], bool]) -> list[str]:
+    """Return the better topics where there are some, else all."""
+    return [name for name in topics if is_better(name)] or list(topics)
+
+
+def _beside(picture: str | None, infos: Sequence[str]) -> list[str]:
+    """Return the CameraInfo topic nearest above the image's own name, else all."""
+    parts = (picture or "").split("/")
+    for length in range(len(parts) - 1, 0, -1):
+        candidate = "/".join([*parts[:length], "camera_info"])
+        if candidate in infos:
+            return [candidate]
+    return list(infos)
+
+
+def _only(need: str, candidates: Sequence[str]) -> str:
+    if len(candidates) > 1:
+        raise InputError(
+            f"topics.{need}: several topics could be it ({', '.join(candidates)}): "
+            f"choose one, such as source.topics.{need}={candidates[0]} ({NONE}: do without)"
+        )
+    return candidates[0] if candidates else NONE

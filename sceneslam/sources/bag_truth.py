@@ -1,0 +1,91 @@
+"""The ground truth of a recording."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sceneslam.ros import decode
+from sceneslam.sources.bag_frames import FrameTree
+from sceneslam.sources.bag_topics import Topics, first
+from sceneslam.sources.recording import Recording
+from sceneslam.types import se3
+from sceneslam.types.rig import Rig
+from sceneslam.types.se3 import Transform
+from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import GroundTruth, SceneChange
+
+CAMERA, BASE = "camera", "base"
+
+
+def read_truth(
+    recording: Recording, topics: Topics, frames: FrameTree, rig: Rig, truth_frame: str | None
+) -> GroundTruth | None:
+    """Return the true poses of `base` and the true scenes, None when there is neither.
+
+    `truth_frame` says whose poses they are, `camera` (optical) or `base`; None: what the messages
+    say, else the base where the recording knows one and the camera where it does not.
+    """
+    trajectory = Trajectory.empty()
+    scenes: tuple[SceneChange, ...] = ()
+    if topics.ground_truth:
+        T_base_tracked = _tracked(recording, topics.ground_truth, frames, rig, truth_frame)
+        trajectory = _trajectory(recording, topics.ground_truth, se3.inverse(T_base_tracked))
+    if topics.scene:
+        scenes = _scenes(recording, topics.scene)
+    if not len(trajectory) and not scenes:
+        return None
+    return GroundTruth(trajectory=trajectory, scenes=scenes)
+
+
+def _tracked(
+    recording: Recording, topic: str, frames: FrameTree, rig: Rig, truth_frame: str | None
+) -> Transform:
+    """Return T_base_tracked of the frame whose poses the topic holds."""
+    child = str(getattr(first(recording, topic), "child_frame_id", "")).lstrip("/")
+    T_base_child = frames.T_base(child) if child else None
+    if truth_frame is None and T_base_child is not None:
+        return T_base_child
+    is_camera = truth_frame == CAMERA or (
+        truth_frame is None and not child and frames.base is None and _is_pose(recording, topic)
+    )
+    return rig.camera.T_base_cam if is_camera and rig.camera else se3.identity()
+
+
+def _is_pose(recording: Recording, topic: str) -> bool:
+    """Tell whether the topic's type has no place for the frame that is tracked."""
+    return "Pose" in recording.topics[topic].msgtype
+
+
+def _trajectory(recording: Recording, topic: str, T_tracked_base: Transform) -> Trajectory:
+    poses: dict[int, Transform] = {}
+    for message in recording.messages({topic}):
+        decoded = recording.decode(message)
+        T_gt_tracked = None if decoded is None else _pose(decoded)
+        if T_gt_tracked is not None:
+            poses[decode.stamp_ns(decoded) or message.log_ns] = T_gt_tracked @ T_tracked_base
+    if not poses:
+        return Trajectory.empty()
+    stamps_ns = np.array(sorted(poses), dtype=np.int64)
+    return Trajectory(
+        stamps_ns=stamps_ns, T_world_base=np.stack([poses[int(stamp)] for stamp in stamps_ns])
+    )
+
+
+def _pose(message: Any) -> Transform | None:
+    if message.__msgtype__ == "geometry_msgs/msg/TransformStamped":
+        return decode.transform(message.transform.translation, message.transform.rotation)
+    is_plain = message.__msgtype__ == "geometry_msgs/msg/PoseStamped"
+    pose = message.pose if is_plain else message.pose.pose
+    return decode.transform(pose.position, pose.orientation)
+
+
+def _scenes(recording: Recording, topic: str) -> tuple[SceneChange, ...]:
+    """Return the changes, without repetitions of the same scene."""
+    changes: list[SceneChange] = []
+    for message in recording.messages({topic}):
+        decoded = recording.decode(message)
+        if decoded is not None and (not changes or changes[-1].scene != decoded.data):
+            changes.append(SceneChange(stamp_ns=message.log_ns, scene=str(decoded.data)))
+    return tuple(changes)

@@ -1,0 +1,157 @@
+"""MCAP files as chunks: by their index where it is sound, by reading through where it is not."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import IO
+
+from sceneslam.ros.messages import TopicType
+from sceneslam.sources import mcap_records as records
+from sceneslam.sources.recording import Chunk, ChunkContent, ChunkedRecording, Layout, Message
+from sceneslam.types.errors import InputError
+
+_ENCODINGS = ("cdr", "ros1")
+_KEPT = (records.SCHEMA, records.CHANNEL, records.MESSAGE, records.CHUNK, records.METADATA)
+
+
+def open_mcap(paths: Sequence[Path]) -> ChunkedRecording:
+    """Return one recording of all files; raises InputError when one is no MCAP file."""
+    files = {path: McapFile(path) for path in paths}
+    layouts = [file.layout() for file in files.values()]
+    return ChunkedRecording(layouts, lambda chunk: files[chunk.file].read(chunk))
+
+
+class McapFile:
+    """One file; knows its channels once `layout` has been called."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._names: dict[int, str] = {}  # channel -> topic
+
+    def layout(self) -> Layout:
+        """Return the chunks and topics, from the index or, failing that, from the content."""
+        size = self._path.stat().st_size
+        if size == 0:
+            raise InputError(f"recording: expected an MCAP file, got an empty one: {self._path}")
+        with self._path.open("rb") as file:
+            if file.read(len(records.MAGIC)) != records.MAGIC:
+                raise InputError(f"recording: this is no MCAP file: {self._path}")
+            return self._from_index(file) or self._from_content(file, size)
+
+    def read(self, chunk: Chunk) -> ChunkContent:
+        """Return a chunk's messages; a damaged one is lost as a whole."""
+        with self._path.open("rb") as file:
+            file.seek(chunk.offset)
+            found = records.read_records(file.read(chunk.length))
+        if found is None:
+            return ChunkContent(messages=(), lost_bytes=chunk.length)
+        messages = []
+        for record in found:
+            if record.opcode != records.MESSAGE:
+                continue
+            channel, _, log_ns, _ = records.MESSAGE_HEAD.unpack_from(record.body)
+            if channel in self._names:
+                data = bytes(record.body[records.MESSAGE_HEAD.size :])
+                messages.append(Message(topic=self._names[channel], log_ns=log_ns, data=data))
+        return ChunkContent(messages=messages)
+
+    def _from_index(self, file: IO[bytes]) -> Layout | None:
+        """Return the layout by the file's summary, None when that is missing or damaged."""
+        from mcap.exceptions import McapError
+        from mcap.reader import SeekingReader
+
+        if not records.has_sound_summary(file):
+            return None
+        file.seek(0)
+        try:
+            reader = SeekingReader(file)
+            summary = reader.get_summary()
+            if summary is None or summary.statistics is None or not summary.chunk_indexes:
+                return None
+            metadata = {entry.name: dict(entry.metadata) for entry in reader.iter_metadata()}
+        except (McapError, ValueError, KeyError, struct.error, OSError):
+            return None
+        content = records.Content(
+            schemas=summary.schemas,
+            channels=summary.channels,
+            counts=Counter(summary.statistics.channel_message_counts),
+            metadata=metadata,
+        )
+        topics = self._topics(content)
+        chunks = [
+            Chunk(
+                file=self._path,
+                offset=entry.chunk_start_offset,
+                length=entry.chunk_length,
+                start_ns=entry.message_start_time,
+                end_ns=entry.message_end_time,
+                topics=self._named(entry.message_index_offsets or summary.channels),
+            )
+            for entry in summary.chunk_indexes
+        ]
+        return Layout(chunks=chunks, topics=topics, metadata=metadata)
+
+    def _from_content(self, file: IO[bytes], size: int) -> Layout:
+        """Return the layout by reading the file through, as far as it goes."""
+        content, spans, lost = records.Content(), [], 0
+        position, is_complete = len(records.MAGIC), False
+        while position + records.RECORD_HEAD.size <= size and not is_complete:
+            file.seek(position)
+            opcode, length = records.RECORD_HEAD.unpack(file.read(records.RECORD_HEAD.size))
+            whole = records.RECORD_HEAD.size + length
+            if position + whole > size:
+                break
+            is_complete = opcode == records.DATA_END
+            if opcode in _KEPT:
+                file.seek(position)
+                found = records.read_records(file.read(whole))
+                lost += whole if found is None else 0
+                spans.append((position, whole, content.take(found or ())))
+            position += whole
+        topics = self._topics(content)
+        chunks = [
+            Chunk(
+                file=self._path,
+                offset=offset,
+                length=length,
+                start_ns=min(first for first, _ in span.values()),
+                end_ns=max(last for _, last in span.values()),
+                topics=self._named(span),
+            )
+            for offset, length, span in spans
+            if span
+        ]
+        return Layout(
+            chunks=chunks,
+            topics=topics,
+            metadata=content.metadata,
+            lost_bytes=lost + (0 if is_complete else size - position),
+            note="" if is_complete else "the recording is cut off",
+        )
+
+    def _named(self, channels: Iterable[int]) -> frozenset[str]:
+        return frozenset(self._names[number] for number in channels if number in self._names)
+
+    def _topics(self, content: records.Content) -> dict[str, TopicType]:
+        """Return the topics that hold ROS messages; remember which channel is which."""
+        topics: dict[str, TopicType] = {}
+        for number, channel in content.channels.items():
+            schema = content.schemas.get(channel.schema_id)
+            count = content.counts[number]
+            if channel.message_encoding not in _ENCODINGS or schema is None or not count:
+                continue
+            self._names[number] = channel.topic
+            known = topics.get(channel.topic)
+            topics[channel.topic] = TopicType(
+                msgtype=schema.name
+                if "/msg/" in schema.name
+                else schema.name.replace("/", "/msg/"),
+                encoding=channel.message_encoding,
+                definition=schema.data.decode(errors="replace"),
+                definition_format=schema.encoding,
+                count=count + (known.count if known else 0),
+            )
+        return topics

@@ -1,0 +1,119 @@
+"""Records of an MCAP file, checked by their checksums."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from io import BytesIO
+from typing import IO, Any
+
+MAGIC = b"\x89MCAP0\r\n"
+RECORD_HEAD = struct.Struct("<BQ")  # opcode, length
+MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA, DATA_END = 2, 3, 4, 5, 6, 12, 15
+_FOOTER_BODY = struct.Struct("<QQI")  # summary start, summary offset start, summary checksum
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Record:
+    """One record outside of any chunk."""
+
+    opcode: int
+    body: memoryview
+
+
+@dataclass(slots=True)
+class Content:
+    """What was met on the way through a file."""
+
+    schemas: dict[int, Any] = field(default_factory=dict)
+    channels: dict[int, Any] = field(default_factory=dict)
+    counts: Counter[int] = field(default_factory=Counter)  # by channel
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+
+    def take(self, records: Sequence[Record]) -> dict[int, tuple[int, int]]:
+        """Add records; return each channel's first and last log time [ns] among them."""
+        from mcap import records as mcap
+        from mcap.data_stream import ReadDataStream
+
+        span: dict[int, tuple[int, int]] = {}
+        for record in records:
+            if record.opcode == MESSAGE:
+                channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(record.body)
+                first_ns, last_ns = span.get(channel, (log_ns, log_ns))
+                span[channel] = (min(first_ns, log_ns), max(last_ns, log_ns))
+                self.counts[channel] += 1
+                continue
+            stream = ReadDataStream(BytesIO(record.body))
+            if record.opcode == SCHEMA:
+                schema = mcap.Schema.read(stream)
+                self.schemas[schema.id] = schema
+            elif record.opcode == CHANNEL:
+                found = mcap.Channel.read(stream)
+                self.channels[found.id] = found
+            elif record.opcode == METADATA:
+                named = mcap.Metadata.read(stream)
+                self.metadata[named.name] = dict(named.metadata)
+        return span
+
+
+def read_records(data: bytes) -> Sequence[Record] | None:
+    """Return the records in the bytes of one record (a chunk's own), None when it is damaged."""
+    view = memoryview(data)
+    if len(view) < RECORD_HEAD.size:
+        return None
+    opcode, length = RECORD_HEAD.unpack_from(view)
+    body = view[RECORD_HEAD.size :]
+    if len(body) != length:
+        return None
+    if opcode != CHUNK:
+        return [Record(opcode=opcode, body=body)]
+    unpacked = _unpack_chunk(body)
+    return None if unpacked is None else _split(memoryview(unpacked))
+
+
+def has_sound_summary(file: IO[bytes]) -> bool:
+    """Tell whether the file is finished and its summary is as it was written."""
+    tail = RECORD_HEAD.size + _FOOTER_BODY.size + len(MAGIC)
+    size = file.seek(0, 2)
+    if size < tail + len(MAGIC):
+        return False
+    file.seek(size - tail)
+    end = file.read(tail)
+    opcode, length = RECORD_HEAD.unpack_from(end)
+    if end[-len(MAGIC) :] != MAGIC or opcode != FOOTER or length != _FOOTER_BODY.size:
+        return False
+    start, _, checksum = _FOOTER_BODY.unpack_from(end, RECORD_HEAD.size)
+    if not len(MAGIC) <= start <= size - tail:
+        return False
+    file.seek(start)
+    summary = file.read(size - len(MAGIC) - 4 - start)  # the checksum does not cover itself
+    return checksum in (0, zlib.crc32(summary))
+
+
+def _unpack_chunk(body: memoryview) -> bytes | None:
+    from mcap import records as mcap
+    from mcap.data_stream import ReadDataStream
+    from mcap.stream_reader import get_chunk_data_stream
+
+    try:
+        chunk = mcap.Chunk.read(ReadDataStream(BytesIO(body)))
+        stream, length = get_chunk_data_stream(chunk, validate_crc=True)
+        return bytes(stream.read(length))
+    except Exception:  # three libraries of compression, each with errors of its own
+        return None
+
+
+def _split(view: memoryview) -> Sequence[Record] | None:
+    records, position = [], 0
+    while position + RECORD_HEAD.size <= len(view):
+        opcode, length = RECORD_HEAD.unpack_from(view, position)
+        start = position + RECORD_HEAD.size
+        position = start + length
+        if position > len(view) or (opcode == MESSAGE and length < MESSAGE_HEAD.size):
+            return None
+        records.append(Record(opcode=opcode, body=view[start:position]))
+    return records

@@ -1,0 +1,96 @@
+"""Opening of recordings: ROS 1 bags, rosbag2 folders (MCAP, sqlite3) and bare MCAP files."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from sceneslam.ros.messages import MessageDecoder, TopicType
+from sceneslam.sources import bag_records, mcap_records
+from sceneslam.sources.bag_file import open_bag
+from sceneslam.sources.mcap_file import open_mcap
+from sceneslam.sources.recording import Message, Recording
+from sceneslam.types.errors import InputError
+
+
+def open_recording(path: Path) -> Recording:
+    """Return the recording at `path`; raises InputError when there is none that can be read."""
+    if not path.exists():
+        raise InputError(f"recording not found: {path}")
+    if path.is_dir():
+        return _open_folder(path)
+    with path.open("rb") as file:
+        start = file.read(16)
+    if not start:
+        raise InputError(f"recording: the file is empty: {path}")
+    if start.startswith(bag_records.MAGIC):
+        return open_bag(path)
+    if start.startswith(mcap_records.MAGIC):
+        return open_mcap([path])
+    if start.startswith(b"SQLite format 3"):
+        raise InputError(f"recording: give the rosbag2 folder, not the .db3 file in it: {path}")
+    raise InputError(f"recording: expected a ROS 1 bag, rosbag2 folder or MCAP file: {path}")
+
+
+def _open_folder(path: Path) -> Recording:
+    files = sorted(path.glob("*.mcap"))
+    if files:
+        return open_mcap(files)
+    if not (path / "metadata.yaml").is_file():
+        raise InputError(f"recording: the folder has neither metadata.yaml nor *.mcap: {path}")
+    return FolderRecording(path)
+
+
+class FolderRecording:
+    """A rosbag2 folder with sqlite3 storage (or compressed files)."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.faults: Sequence[str] = ()
+        self.metadata: Mapping[str, Mapping[str, str]] = {}
+        self.topics = self._read_topics()
+        self._decoder = MessageDecoder(self.topics)
+
+    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+        """Yield the messages of `topics` by log time."""
+        from rosbags.rosbag2 import Reader
+
+        try:
+            with Reader(self._path) as reader:
+                wanted = [entry for entry in reader.connections if entry.topic in topics]
+                for entry, log_ns, data in reader.messages(wanted) if wanted else ():
+                    yield Message(topic=entry.topic, log_ns=log_ns, data=bytes(data))
+        except Exception as err:  # sqlite3, yaml, zstd and rosbags each have errors of their own
+            raise InputError(f"recording cannot be read on ({err}): {self._path}") from err
+
+    def last(self, topic: str) -> Message | None:
+        """Return None: the storage is read from the beginning only."""
+        return None
+
+    def decode(self, message: Message) -> Any:
+        """Return the decoded message, None when its bytes make no sense."""
+        return self._decoder.decode(message.topic, message.data)
+
+    def _read_topics(self) -> dict[str, TopicType]:
+        from rosbags.rosbag2 import Reader
+
+        topics: dict[str, TopicType] = {}
+        try:
+            with Reader(self._path) as reader:
+                for entry in reader.connections:
+                    if not entry.msgcount:
+                        continue
+                    known = topics.get(entry.topic)
+                    topics[entry.topic] = TopicType(
+                        msgtype=entry.msgtype,
+                        encoding="cdr",
+                        definition=entry.msgdef.data,
+                        definition_format="ros2idl"
+                        if entry.msgdef.format.name == "IDL"
+                        else "ros2msg",
+                        count=entry.msgcount + (known.count if known else 0),
+                    )
+        except Exception as err:  # as above
+            raise InputError(f"recording cannot be opened ({err}): {self._path}") from err
+        return topics

@@ -1,0 +1,165 @@
+"""A recording of ROS messages, whatever file holds it."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from sceneslam.ros.messages import MessageDecoder, TopicType
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Message:
+    """One recorded message, not yet decoded."""
+
+    topic: str
+    log_ns: int  # when it was recorded
+    data: bytes
+
+
+class Recording(Protocol):
+    """Messages by time."""
+
+    @property
+    def topics(self) -> Mapping[str, TopicType]:
+        """Return the topics that hold messages."""
+        ...
+
+    @property
+    def faults(self) -> Sequence[str]:
+        """Return one sentence per kind of damage met so far."""
+        ...
+
+    @property
+    def metadata(self) -> Mapping[str, Mapping[str, str]]:
+        """Return named texts that were recorded beside the messages."""
+        ...
+
+    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+        """Yield the messages of `topics` by log time, from the beginning."""
+        ...
+
+    def last(self, topic: str) -> Message | None:
+        """Return a topic's last message, None when finding it takes reading everything."""
+        ...
+
+    def decode(self, message: Message) -> Any:
+        """Return the message as an object, None when its bytes make no sense."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Chunk:
+    """A stretch of a file that holds messages; unit of reading and of loss."""
+
+    file: Path
+    offset: int  # [bytes]
+    length: int  # [bytes]
+    start_ns: int
+    end_ns: int
+    topics: frozenset[str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Layout:
+    """Where everything is in a file."""
+
+    chunks: Sequence[Chunk]
+    topics: Mapping[str, TopicType]
+    metadata: Mapping[str, Mapping[str, str]]
+    lost_bytes: int = 0  # that belong to no chunk
+    note: str = ""  # what is wrong with the file, "" when nothing is
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ChunkContent:
+    """What could be read of a chunk."""
+
+    messages: Sequence[Message]
+    lost_bytes: int = 0
+
+
+ChunkReader = Callable[[Chunk], ChunkContent]
+
+
+class ChunkedRecording:
+    """Files of chunks, read one chunk at a time; a damaged chunk is left out and reported."""
+
+    def __init__(self, layouts: Sequence[Layout], read_chunk: ChunkReader) -> None:
+        self._chunks = sorted(
+            (chunk for layout in layouts for chunk in layout.chunks),
+            key=lambda chunk: (chunk.start_ns, chunk.file, chunk.offset),
+        )
+        self._read_chunk = read_chunk
+        self._layouts = layouts
+        self._damaged: dict[Chunk, int] = {}
+        self._recent: tuple[Chunk, ChunkContent] | None = None
+        self.topics = _merge_topics(layouts)
+        self.metadata = {name: text for layout in layouts for name, text in layout.metadata.items()}
+        self._decoder = MessageDecoder(self.topics)
+
+    @property
+    def faults(self) -> Sequence[str]:
+        """Return what is wrong with the files and how much was lost."""
+        notes = [layout.note for layout in self._layouts if layout.note]
+        lost = sum(layout.lost_bytes for layout in self._layouts) + sum(self._damaged.values())
+        if lost:
+            size = sum(path.stat().st_size for path in {chunk.file for chunk in self._chunks})
+            notes.append(
+                f"{100 * lost / max(size, 1):.1f} % of the file ({lost / 1e6:.1f} MB of "
+                f"{size / 1e6:.1f} MB) is damaged and could not be read"
+            )
+        return ["; ".join(notes)] if notes else []
+
+    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+        """Yield by log time, holding only chunks that overlap."""
+        waiting: list[tuple[int, int, int, Message]] = []
+        for number, chunk in enumerate(self._chunks):
+            if chunk.topics.isdisjoint(topics):
+                continue
+            while waiting and waiting[0][0] < chunk.start_ns:
+                yield heapq.heappop(waiting)[3]
+            for index, message in enumerate(self._read(chunk)):
+                if message.topic in topics:
+                    heapq.heappush(waiting, (message.log_ns, number, index, message))
+        while waiting:
+            yield heapq.heappop(waiting)[3]
+
+    def last(self, topic: str) -> Message | None:
+        """Return the topic's last message by log time."""
+        best: Message | None = None
+        for chunk in sorted(self._chunks, key=lambda chunk: chunk.end_ns, reverse=True):
+            if best is not None and chunk.end_ns < best.log_ns:
+                break
+            if topic in chunk.topics:
+                found = [message for message in self._read(chunk) if message.topic == topic]
+                best = max(
+                    [*found, *([best] if best else [])], key=lambda m: m.log_ns, default=None
+                )
+        return best
+
+    def decode(self, message: Message) -> Any:
+        """Return the decoded message, None when its bytes make no sense."""
+        return self._decoder.decode(message.topic, message.data)
+
+    def _read(self, chunk: Chunk) -> Sequence[Message]:
+        if self._recent is not None and self._recent[0] == chunk:
+            return self._recent[1].messages
+        content = self._read_chunk(chunk)
+        self._recent = (chunk, content)
+        if content.lost_bytes:
+            self._damaged[chunk] = content.lost_bytes
+        return content.messages
+
+
+def _merge_topics(layouts: Sequence[Layout]) -> dict[str, TopicType]:
+    """Return the topics of all files, their counts added up."""
+    merged: dict[str, TopicType] = {}
+    for layout in layouts:
+        for name, topic in layout.topics.items():
+            known = merged.get(name)
+            merged[name] = topic if known is None else topic.with_count(topic.count + known.count)
+    return merged

@@ -1,0 +1,174 @@
+"""ROS recordings: ROS 1 bags, rosbag2 folders and bare MCAP files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sceneslam.ros import decode
+from sceneslam.ros.pixels import DepthUnits
+from sceneslam.sources.bag_frames import FrameTree
+from sceneslam.sources.bag_observation import BundleDecoder, Decoded
+from sceneslam.sources.bag_rig import Given, make_rig, place, sensor_topics
+from sceneslam.sources.bag_topics import choose_topics, describe
+from sceneslam.sources.bag_truth import BASE, CAMERA, read_truth
+from sceneslam.sources.faults import FaultLog
+from sceneslam.sources.intrinsics import checked_above_zero, given_intrinsics, given_range_m
+from sceneslam.sources.open_recording import open_recording
+from sceneslam.sources.prefetch import prefetched
+from sceneslam.sources.recording import Message
+from sceneslam.sources.spanned import Span
+from sceneslam.sources.synchronise import Bundle, Sample, Synchroniser
+from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.truth import GroundTruth
+
+_PRIMARY = (Sensor.IMAGE, Sensor.DEPTH, Sensor.POINTS, Sensor.SCAN, Sensor.ODOMETRY)
+
+
+class RosBag:
+    """Gives one observation per message of the first of image, depth, points, scan, odometry.
+
+    `topics` names the topic per need (null: found by type and encoding; `none`: do without).
+    """
+
+    def __init__(
+        self,
+        path: str,
+        topics: dict[str, Any],
+        camera: dict[str, Any],
+        depth_scale: float,
+        depth_range_m: list[float] | None,
+        lidar_range_m: list[float] | None,
+        sync_tolerance_s: float,
+        base_frame: str | None,
+        ground_truth_frame: str | None,
+    ) -> None:
+        checked_above_zero("depth_scale", depth_scale)
+        checked_above_zero("sync_tolerance_s", sync_tolerance_s)
+        if ground_truth_frame not in (None, CAMERA, BASE):
+            raise ConfigError("ground_truth_frame", ground_truth_frame, "null, camera or base")
+        given = Given(
+            intrinsics=given_intrinsics(camera),
+            depth_range_m=given_range_m("depth_range_m", depth_range_m),
+            lidar_range_m=given_range_m("lidar_range_m", lidar_range_m),
+        )
+        self._path = Path(path)
+        self._depth_scale = depth_scale
+        self._sync_tolerance_s = sync_tolerance_s
+        self._truth_frame = ground_truth_frame
+        self._faults = FaultLog()
+        self._recording = open_recording(self._path)
+        try:
+            self._topics = choose_topics(self._recording, topics)
+            self._by_sensor = sensor_topics(self._topics)
+            self._primary = self._choose_primary()
+            self._frames = FrameTree(self._recording, base_frame)
+            self._rig = make_rig(self._recording, self._topics, self._frames, given)
+        except InputError as err:
+            raise InputError(f"{err}: {path}") from err
+
+    @property
+    def rig(self) -> Rig:
+        """Return the sensors whose topics were found."""
+        return self._rig
+
+    @property
+    def length(self) -> int | None:
+        """Return how many messages the primary topic has."""
+        return self._recording.topics[self._by_sensor[self._primary]].count
+
+    @property
+    def faults(self) -> Sequence[str]:
+        """Return the damage of the file and of single messages."""
+        return [f"{fault}: {self._path}" for fault in self._recording.faults] + [
+            f"{fault}: {self._path}" for fault in self._faults.sentences()
+        ]
+
+    @property
+    def span(self) -> Span | None:
+        """Return the first and last stamp of the primary topic."""
+        topic = self._by_sensor[self._primary]
+        first = next(self._recording.messages({topic}), None)
+        last = self._recording.last(topic)
+        if first is None or last is None:
+            return None
+        return Span(start_ns=self._stamp_ns(first), end_ns=self._stamp_ns(last))
+
+    def __iter__(self) -> Iterator[Observation]:
+        """Yield observations; decodes pixels ahead in threads."""
+        self._faults.clear()
+        try:
+            for decoded in prefetched(self._jobs()):
+                for problem in decoded.problems:
+                    self._faults.add(problem, f"stamp {decoded.stamp_ns * 1e-9:.6f} s")
+                if decoded.observation is not None:
+                    yield decoded.observation
+        except InputError as err:
+            raise InputError(f"{err}: {self._path}") from err
+
+    def ground_truth(self) -> GroundTruth | None:
+        """Return the poses and scenes of the ground-truth topics."""
+        return read_truth(self._recording, self._topics, self._frames, self._rig, self._truth_frame)
+
+    def _jobs(self) -> Iterator[Callable[[], Decoded]]:
+        """Yield what is to be decoded for each observation."""
+        depth_range_m = self._rig.camera.depth_range_m if self._rig.camera else (0.0, 100.0)
+        units = DepthUnits(self._depth_scale, depth_range_m)
+        decoder = BundleDecoder(self._primary, self._rig, units)
+        for bundle in self._bundles():
+            yield partial(decoder.observe, bundle)
+
+    def _bundles(self) -> Iterator[Bundle]:
+        sensors = {topic: sensor for sensor, topic in self._by_sensor.items()}
+        synchroniser = Synchroniser(
+            self._primary, frozenset(sensors.values()), self._sync_tolerance_s
+        )
+        T_base_imu = np.eye(4)
+        if self._topics.imu:
+            T_base_imu = place(self._recording, self._topics.imu, self._frames)
+        for message in self._recording.messages(sensors.keys()):
+            sensor = sensors[message.topic]
+            sample = self._sample(message, sensor, T_base_imu)
+            if sample is not None:
+                yield from synchroniser.add(sensor, sample)
+        yield from synchroniser.flush()
+
+    def _sample(self, message: Message, sensor: Sensor, T_base_imu: Any) -> Sample | None:
+        """Return a message's sample, None (and a fault) when it makes no sense."""
+        value = self._recording.decode(message)
+        if value is None:
+            self._faults.add(f"a message of {message.topic} makes no sense", _when(message.log_ns))
+            return None
+        stamp_ns = decode.stamp_ns(value) or message.log_ns
+        if sensor is Sensor.ODOMETRY:
+            value = decode.transform(value.pose.pose.position, value.pose.pose.orientation)
+            if value is None:
+                self._faults.add(f"a pose of {message.topic} is no rigid motion", _when(stamp_ns))
+                return None
+        elif sensor is Sensor.GYRO:
+            rate = value.angular_velocity
+            value = T_base_imu[:3, :3] @ np.array([rate.x, rate.y, rate.z])
+        return Sample(stamp_ns=stamp_ns, value=value)
+
+    def _stamp_ns(self, message: Message) -> int:
+        decoded = self._recording.decode(message)
+        return message.log_ns if decoded is None else decode.stamp_ns(decoded) or message.log_ns
+
+    def _choose_primary(self) -> Sensor:
+        for sensor in _PRIMARY:
+            if sensor in self._by_sensor:
+                return sensor
+        there = describe(self._recording) or "no readable messages at all"
+        raise InputError(
+            f"no image, depth, points, scan or odometry topic in the recording: {there}"
+        )
+
+
+def _when(stamp_ns: int) -> str:
+    return f"stamp {stamp_ns * 1e-9:.6f} s"

@@ -1,0 +1,24 @@
+"""Sources that know when they begin and end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Span:
+    """The first and last stamp of a recording."""
+
+    start_ns: int
+    end_ns: int
+
+
+@runtime_checkable
+class Spanned(Protocol):
+    """A source that knows its span before it is read."""
+
+    @property
+    def span(self) -> Span | None:
+        """Return the stamps of the first and last observation, None when unknown."""
+        ...

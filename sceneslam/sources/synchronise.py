@@ -1,0 +1,140 @@
+"""One bundle of measurements per message of the primary sensor, from streams with own stamps."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from sceneslam.types import se3
+from sceneslam.types.rig import Sensor
+from sceneslam.types.se3 import Transform
+
+_PATIENCE_NS = 1_000_000_000  # how long a message waits for a stream that is behind
+_ODOMETRY_GAP_NS = 1_000_000_000  # beyond, odometry is not interpolated
+_ODOMETRY_HOLD_NS = 100_000_000  # how far the first and last odometry reach beyond themselves
+_MOST_HELD = 4096  # samples of one stream
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sample:
+    """One message's stamp and what it holds."""
+
+    stamp_ns: int
+    value: Any
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Bundle:
+    """What belongs to one message of the primary sensor."""
+
+    primary: Sample
+    depth: Sample | None = None  # nearest in time
+    scan: Sample | None = None  # the last since the bundle before
+    points: Sample | None = None  # the last since the bundle before
+    T_odom_base: Transform | None = None  # interpolated
+    gyro: Sequence[Sample] = field(default_factory=tuple)  # all since the bundle before
+
+
+class Synchroniser:
+    """Takes samples in the order of recording, gives bundles in the order of the primary's."""
+
+    def __init__(
+        self, primary: Sensor, streams: frozenset[Sensor], sync_tolerance_s: float
+    ) -> None:
+        self._primary = primary
+        self._tolerance_ns = round(sync_tolerance_s * 1e9)
+        self._waiting: deque[Sample] = deque()
+        self._held: dict[Sensor, deque[Sample]] = {
+            sensor: deque(maxlen=_MOST_HELD) for sensor in streams - {primary}
+        }
+        self._seen_ns: dict[Sensor, int] = {}  # the latest stamp of each stream
+        self._newest_ns = 0
+        self._previous_ns: int | None = None
+
+    def add(self, sensor: Sensor, sample: Sample) -> Iterator[Bundle]:
+        """Take one sample; yield the bundles that are complete by it."""
+        (self._waiting if sensor is self._primary else self._held[sensor]).append(sample)
+        self._seen_ns[sensor] = max(self._seen_ns.get(sensor, 0), sample.stamp_ns)
+        self._newest_ns = max(self._newest_ns, sample.stamp_ns)
+        while self._waiting and self._is_complete(self._waiting[0].stamp_ns):
+            yield self._bundle(self._waiting.popleft())
+
+    def flush(self) -> Iterator[Bundle]:
+        """Yield what still waits, at the end of the recording."""
+        while self._waiting:
+            yield self._bundle(self._waiting.popleft())
+
+    def _is_complete(self, stamp_ns: int) -> bool:
+        """Tell whether no stream can still bring something that belongs to the stamp."""
+        if self._newest_ns - stamp_ns > _PATIENCE_NS:
+            return True
+        for sensor, held in self._held.items():
+            needed_ns = stamp_ns
+            if sensor is Sensor.DEPTH and not any(one.stamp_ns == stamp_ns for one in held):
+                needed_ns += self._tolerance_ns
+            if self._seen_ns.get(sensor, -1) < needed_ns:
+                return False
+        return True
+
+    def _bundle(self, primary: Sample) -> Bundle:
+        stamp_ns = primary.stamp_ns
+        bundle = Bundle(
+            primary=primary,
+            depth=self._nearest(Sensor.DEPTH, stamp_ns),
+            scan=self._last_since(Sensor.SCAN, stamp_ns),
+            points=self._last_since(Sensor.POINTS, stamp_ns),
+            T_odom_base=self._odometry_at(stamp_ns),
+            gyro=self._take_until(Sensor.GYRO, stamp_ns),
+        )
+        self._previous_ns = stamp_ns
+        return bundle
+
+    def _nearest(self, sensor: Sensor, stamp_ns: int) -> Sample | None:
+        """Return the sample nearest to the stamp within the tolerance; each is used once."""
+        held = self._held.get(sensor)
+        while held and held[0].stamp_ns < stamp_ns - self._tolerance_ns:
+            held.popleft()
+        if not held:
+            return None
+        best = min(held, key=lambda sample: abs(sample.stamp_ns - stamp_ns))
+        if abs(best.stamp_ns - stamp_ns) > self._tolerance_ns:
+            return None
+        held.remove(best)
+        return best
+
+    def _last_since(self, sensor: Sensor, stamp_ns: int) -> Sample | None:
+        found = self._take_until(sensor, stamp_ns)
+        return found[-1] if found else None
+
+    def _take_until(self, sensor: Sensor, stamp_ns: int) -> Sequence[Sample]:
+        """Return the samples since the bundle before up to the stamp, by stamp."""
+        held = self._held.get(sensor)
+        if not held:
+            return ()
+        found = [sample for sample in held if sample.stamp_ns <= stamp_ns]
+        later = [sample for sample in held if sample.stamp_ns > stamp_ns]
+        held.clear()
+        held.extend(later)
+        since_ns = stamp_ns - _PATIENCE_NS if self._previous_ns is None else self._previous_ns
+        found = [sample for sample in found if sample.stamp_ns > since_ns]
+        return sorted(found, key=lambda sample: sample.stamp_ns)
+
+    def _odometry_at(self, stamp_ns: int) -> Transform | None:
+        held = self._held.get(Sensor.ODOMETRY)
+        if not held:
+            return None
+        while len(held) > 1 and held[1].stamp_ns <= stamp_ns:
+            held.popleft()
+        before, after = held[0], held[min(1, len(held) - 1)]
+        if before.stamp_ns == stamp_ns or before is after or before.stamp_ns > stamp_ns:
+            is_near = abs(before.stamp_ns - stamp_ns) <= _ODOMETRY_HOLD_NS
+            return np.array(before.value) if is_near else None
+        gap_ns = after.stamp_ns - before.stamp_ns
+        if gap_ns > _ODOMETRY_GAP_NS:
+            return None
+        ratio = (stamp_ns - before.stamp_ns) / gap_ns
+        return se3.interpolate(before.value, after.value, ratio)
