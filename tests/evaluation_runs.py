@@ -74,7 +74,7 @@ def first_events() -> list[Event]:
 
 
 def votes(count: int, dark_from: int) -> list[Event]:
-    values = 130 - 100 / (1 + np.exp(-(np.arange(count) - dark_from) / 3.0))
+    values = 80 - 50 * np.tanh((np.arange(count) - dark_from) / 6.0)
     return [
         {"event": "vote", "stamp_ns": int(stamp_ns), "value": float(value),
          "scene": "Bright" if value > 100 else "Dark"}

@@ -64,18 +64,20 @@ def relative_errors(
 ) -> RelativeErrors:
     """Return the errors of all motions over `interval_s`.
 
-    Every matched pose i is paired with the matched pose j nearest to `interval_s` later, where
-    one lies within a tenth of the interval. The error is inv(inv(Q_i) Q_j) inv(P_i) P_j with
-    true poses Q and estimates P; neither frame has to be aligned.
+    Every matched pose i that has the whole interval of trajectory after it (less half a usual
+    step) is paired with the matched pose j nearest to the interval's end, if that is within a
+    tenth of the interval. The error is inv(inv(Q_i) Q_j) inv(P_i) P_j with true poses Q and
+    estimates P; neither frame has to be aligned.
     """
     matches = associate(estimate, truth, max_gap_s)
-    if not len(matches):
+    if len(matches) < 2:
         return RelativeErrors(trans_m=np.zeros(0), rot_rad=np.zeros(0))
     stamps_ns = estimate.stamps_ns[matches.first]
     wanted_ns = stamps_ns + round(interval_s * 1e9)
     later = nearest(stamps_ns, wanted_ns)
-    off_ns = np.abs(stamps_ns[later] - wanted_ns)
-    i = np.flatnonzero((off_ns <= 0.1e9 * interval_s) & (later > np.arange(len(later))))
+    is_near = np.abs(stamps_ns[later] - wanted_ns) <= 0.1e9 * interval_s
+    is_inside = wanted_ns <= stamps_ns[-1] + np.median(np.diff(stamps_ns)) / 2
+    i = np.flatnonzero(is_near & is_inside & (later > np.arange(len(later))))
     j = later[i]
     T_world_base = estimate.T_world_base[matches.first]
     T_gt_base = truth.T_world_base[matches.second]

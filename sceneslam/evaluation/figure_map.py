@@ -29,7 +29,7 @@ def draw_map(result: RunResult, truth: GroundTruth | None, T_map_gt: Transform |
         return None
     low, high = bounds
     ratio = float(np.clip((high - low)[1] / (high - low)[0], 0.45, 1.3))
-    figure = look.new_figure(8.0, 8.0 * ratio + 0.9)
+    figure = look.new_figure(look.WIDTH_IN, look.WIDTH_IN * ratio + 0.9)
     axes = figure.add_subplot()
     colors = look.module_colors(result)
     if result.map.grid is not None:
@@ -38,14 +38,15 @@ def draw_map(result: RunResult, truth: GroundTruth | None, T_map_gt: Transform |
     if truth is not None and T_map_gt is not None and len(truth.trajectory):
         true_m = se3.apply(T_map_gt, truth.trajectory.positions_m)
         axes.plot(
-            true_m[:, 0], true_m[:, 1], color="black", linewidth=0.8, label="ground truth", zorder=5
-        )
+            true_m[:, 0], true_m[:, 1], color="black", linewidth=0.9, dashes=(4, 4),
+            label="ground truth", zorder=5,
+        )  # fmt: skip
     _draw_trajectory(axes, result, colors)
     look.style(axes, x_label="x [m]", y_label="y [m]")
     axes.set_aspect("equal")
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
-    figure.legend(loc="outside lower center", ncols=4, fontsize=10, frameon=False)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=11, frameon=False)
     return figure
 
 
@@ -116,7 +117,7 @@ def _draw_trajectory(axes: Any, result: RunResult, colors: dict[str, str]) -> No
 
     path = result.trajectory.positions_m
     modules = np.array(result.modules, dtype=object)
-    casing = [Stroke(linewidth=4.6, foreground="white"), Normal()]
+    casing = [Stroke(linewidth=3.8, foreground="white"), Normal()]
     for key in dict.fromkeys(result.modules):
         # A step belongs to the module that gave the pose it leads to.
         mine = modules == key
@@ -124,16 +125,16 @@ def _draw_trajectory(axes: Any, result: RunResult, colors: dict[str, str]) -> No
         line = np.where(shown[:, None], path[:, :2], np.nan)
         style = ":" if key == "" else "-"
         axes.plot(
-            line[:, 0], line[:, 1], style, color=colors.get(key, look.BRIDGED), linewidth=2.4,
+            line[:, 0], line[:, 1], style, color=colors.get(key, look.BRIDGED), linewidth=2.0,
             label=key or "bridged", path_effects=casing, zorder=4,
         )  # fmt: skip
     if len(path):
-        axes.plot(*path[0, :2], "o", color=look.INK, markersize=7, label="start", zorder=6)
-        axes.plot(*path[-1, :2], "s", color=look.INK, markersize=7, label="end", zorder=6)
+        axes.plot(*path[0, :2], "o", color=look.INK, markersize=6, label="start", zorder=6)
+        axes.plot(*path[-1, :2], "s", color=look.INK, markersize=6, label="end", zorder=6)
     seams = [find_seam(result, event) for event in result.events if is_switch(event)]
     at = path[[seam.after for seam in seams if seam is not None]]
     if len(at):
         axes.plot(
-            at[:, 0], at[:, 1], "D", markersize=8, markerfacecolor="white",
+            at[:, 0], at[:, 1], "D", markersize=7, markerfacecolor="white",
             markeredgecolor=look.INK, markeredgewidth=1.6, label="switch", zorder=7,
         )  # fmt: skip

@@ -17,6 +17,7 @@ from sceneslam.types.truth import GroundTruth
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 BRIDGED = "#777777"
 INK = "#222222"
+WIDTH_IN = 6.0  # small, so that 11 pt stay legible when a phone shrinks the figure
 MUTED = "#666666"
 SCENE_TINTS = ("#FBF3D0", "#CFD6E4", "#DDEBDD", "#EFDCE6", "#E3E3E3")
 _TINT_OF = {"Bright": SCENE_TINTS[0], "Dark": SCENE_TINTS[1]}
@@ -31,7 +32,7 @@ class Span:
     label: str
 
 
-def new_figure(width_in: float = 8.0, height_in: float = 4.2) -> Any:
+def new_figure(width_in: float = WIDTH_IN, height_in: float = 3.6) -> Any:
     """Return an empty figure that draws with Agg and leaves no global state behind."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -43,9 +44,9 @@ def new_figure(width_in: float = 8.0, height_in: float = 4.2) -> Any:
 
 def style(axes: Any, *, x_label: str = "time [s]", y_label: str = "") -> None:
     """Give axes their labels, sizes that a phone shows, and a light grid."""
-    axes.set_xlabel(x_label, fontsize=11, color=INK)
-    axes.set_ylabel(y_label, fontsize=11, color=INK)
-    axes.tick_params(labelsize=10, colors=INK)
+    axes.set_xlabel(x_label, fontsize=12, color=INK)
+    axes.set_ylabel(y_label, fontsize=12, color=INK)
+    axes.tick_params(labelsize=11, colors=INK)
     axes.grid(visible=True, color="#DDDDDD", linewidth=0.6)
     axes.set_axisbelow(True)
     for side in ("top", "right"):
@@ -54,7 +55,7 @@ def style(axes: Any, *, x_label: str = "time [s]", y_label: str = "") -> None:
 
 def save(figure: Any, path: Path) -> Path:
     """Write a PNG whose bytes depend on the data alone."""
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    figure.savefig(path, dpi=150, metadata={"Software": None})
     return path
 
 
@@ -127,5 +128,5 @@ def draw_bands(axes: Any, bands: Sequence[Span], colors: dict[str, str], alpha: 
             centre_s = 0.5 * (band.start_s + band.end_s)
             axes.text(
                 centre_s, 0.985, band.label or "bridged", transform=axes.get_xaxis_transform(),
-                ha="center", va="top", fontsize=10, color=INK,
+                ha="center", va="top", fontsize=11, color=INK,
             )  # fmt: skip

@@ -56,11 +56,11 @@ def draw_series(
     look.draw_bands(axes, look.module_spans(result), look.module_colors(result), 0.16)
     times_s = look.elapsed_s(result, stamps_ns)
     rms_m = float(np.sqrt(np.mean(values_m**2)))
-    label = f"{y_label.split(' [')[0]}: RMS {rms_m:.3f} m, max {values_m.max():.3f} m"
+    label = f"RMS {rms_m:.3f} m, max {values_m.max():.3f} m"
     marker = "o" if len(values_m) == 1 else None
     axes.plot(times_s, values_m, color=look.INK, linewidth=1.3, marker=marker, label=label)
     if limit_m is not None:
-        axes.axhline(limit_m, color=look.MUTED, linestyle=":", label=f"{limit_m:g} m")
+        axes.axhline(limit_m, color=look.MUTED, linestyle=":", label=f"limit {limit_m:g} m")
     for event in filter(is_switch, result.events):
         axes.axvline(_at_s(result, event), color=look.INK, linewidth=0.9, linestyle="-.")
     look.style(axes, y_label=y_label)
@@ -85,7 +85,7 @@ def draw_timeline(result: RunResult, truth: GroundTruth | None) -> Any:
     rows += [(key, [s for s in active if s.label == key]) for key in colors]
     if any(span.label == "" for span in active):
         rows.append(("bridged", [s for s in active if s.label == ""]))
-    figure = look.new_figure(8.0, 1.3 + 0.5 * len(rows))
+    figure = look.new_figure(look.WIDTH_IN, 1.3 + 0.45 * len(rows))
     axes = figure.add_subplot()
     for row, (name, bars) in enumerate(rows):
         is_scene = name in ("true scene", "confirmed")
@@ -116,7 +116,7 @@ def _mark_confirmed(axes: Any, result: RunResult) -> None:
             axes.axvline(at_s, color=look.INK, linewidth=1.1, linestyle="-.")
             axes.text(
                 at_s, 0.5, f"{event['scene']} confirmed", transform=axes.get_xaxis_transform(),
-                rotation=90, ha="center", va="center", fontsize=9, color=look.INK,
+                rotation=90, ha="center", va="center", fontsize=10, color=look.INK,
                 bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5},
             )  # fmt: skip
 
@@ -133,7 +133,7 @@ def _draw_bar(
     width_s = max(bar.end_s - bar.start_s, 0.002 * total_s)
     axes.barh(row, width_s, left=bar.start_s, height=0.62, color=color, linewidth=0)
     if name_it and width_s > 0.08 * total_s:
-        axes.text(bar.start_s + width_s / 2, row, bar.label, ha="center", va="center", fontsize=10)
+        axes.text(bar.start_s + width_s / 2, row, bar.label, ha="center", va="center", fontsize=11)
 
 
 def _draw_trouble(axes: Any, result: RunResult, module: str, row: int) -> None:
@@ -169,7 +169,7 @@ def _key_to_trouble(figure: Any, result: RunResult) -> None:
         if status in seen
     ]
     if keys:
-        figure.legend(handles=keys, loc="outside lower right", ncols=2, fontsize=9, frameon=False)
+        figure.legend(handles=keys, loc="outside lower right", ncols=2, fontsize=10, frameon=False)
 
 
 def _leave_room(axes: Any) -> None:
@@ -180,4 +180,4 @@ def _leave_room(axes: Any) -> None:
 
 def _legend_below(figure: Any, axes: Any) -> None:
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=10, frameon=False)
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=11, frameon=False)

@@ -47,7 +47,7 @@ def write_figures(
         difference = compare(result.trajectory, reference, association_gap_s)
         drawn["difference"] = draw_series(
             result, difference.stamps_ns, difference.differences_m,
-            y_label="difference from the reference [m]", limit_m=_PAPER_DIFFERENCE_M,
+            y_label="difference [m]", limit_m=_PAPER_DIFFERENCE_M,
         )  # fmt: skip
     return [
         look.save(figure, folder / f"{name}.png")

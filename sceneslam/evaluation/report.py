@@ -18,11 +18,12 @@ from sceneslam.types.run import RunResult
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
+_SHOWN_FAULTS = 20
 _CAPTIONS = {
     "grey_mean": "What the detector measured. Shading: the true scene, where it is known; "
     "dash-dotted: the instant at which a change of scene was confirmed.",
     "map": "The map from above: occupancy grid in grey, points and trajectory in the colour of "
-    "the module that gave them, ground truth as a thin line.",
+    "the module that gave them, ground truth dashed.",
     "timeline": "Which module gave the poses, and when it was in trouble.",
     "error": "Distance from the true position after one rigid alignment of the whole trajectory.",
     "difference": "Distance from the reference run over the same path, without any alignment.",
@@ -83,7 +84,7 @@ def _numbers(metrics: Metrics) -> str:
         "Correct Rate": percent(metrics["correct_rate"]),
         "switches": str(len(metrics["switches"])),
         "false switches": number(metrics["false_switches"], 0),
-        "speed": number(metrics["realtime_factor"], 2, " × real time"),
+        "speed, times real time": number(metrics["realtime_factor"], 2, " ×"),
         "bus, median per observation": number(bus["median"], 0, " µs"),
         "detector, median": number(detector["median"], 0, " µs"),
         "peak memory": number(metrics["peak_rss_mb"], 0, " MB"),
@@ -101,8 +102,11 @@ def _numbers(metrics: Metrics) -> str:
 def _faults(faults: Sequence[str]) -> str:
     if not faults:
         return ""
-    sentences = dict.fromkeys(faults)  # each once, in order
-    items = "".join(f"<li>{escape(fault)}</li>" for fault in sentences)
+    sentences = list(dict.fromkeys(faults))  # each once, in order
+    shown = sentences[:_SHOWN_FAULTS]
+    if len(sentences) > len(shown):
+        shown.append(f"and {len(sentences) - len(shown)} more (see events.jsonl)")
+    items = "".join(f"<li>{escape(fault)}</li>" for fault in shown)
     return f'<h2>Faults</h2><div class="faults"><ul>{items}</ul></div>'
 
 

@@ -1,0 +1,173 @@
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+from evaluation_runs import (
+    PERIOD_NS,
+    SETTINGS,
+    START_NS,
+    hybrid_map,
+    loop,
+    poseless_run,
+    switched_run,
+    timings,
+    true_loop,
+)
+
+from sceneslam.evaluation.association import select
+from sceneslam.evaluation.figures import write_figures
+from sceneslam.evaluation.metrics import evaluate
+from sceneslam.evaluation.report import write_report
+from sceneslam.types.run import RunResult
+from sceneslam.types.truth import GroundTruth
+
+LIMIT_BYTES = 150_000
+
+
+def draw(folder, run, truth, **more):
+    paths = write_figures(folder, run, truth, threshold=100.0, **more)
+    assert all(path.stat().st_size < LIMIT_BYTES for path in paths)
+    return [path.stem for path in paths]
+
+
+def report(folder, run, truth, **more) -> str:
+    metrics = evaluate(run, truth, settings=SETTINGS, reference=more.get("reference"))
+    given = {"threshold": 100.0, "config_yaml": "a: 1\n", "versions": {}, "faults": []}
+    path = write_report(folder, run, truth, metrics, **{**given, **more})
+    return path.read_text(encoding="utf-8")
+
+
+def single_pose() -> RunResult:
+    run = switched_run()
+    return replace(
+        run, trajectory=select(run.trajectory, np.array([0])), modules=["rgbd"],
+        observed_ns=run.observed_ns[:1], events=run.events[:4], timings=timings(1),
+    )  # fmt: skip
+
+
+def test_all_figures_of_a_switched_run_are_drawn(tmp_path):
+    names = draw(tmp_path, switched_run(), true_loop(), reference=loop(200))
+    assert names == ["grey_mean", "map", "timeline", "error", "difference"]
+
+
+def test_map_has_equal_axes(tmp_path):
+    draw(tmp_path, switched_run(), None)
+    image = cv2.imread(str(tmp_path / "map.png"))
+    assert image.shape[1] == 900
+    walls = np.all(np.abs(image.astype(int) - 105) < 6, axis=2)  # 5 m long, 3 m apart
+    rows = np.flatnonzero(walls.sum(axis=1) > 300)
+    length_px = np.flatnonzero(walls[rows].any(axis=0))
+    ratio = (length_px[-1] - length_px[0]) / (rows[-1] - rows[0])
+    assert ratio == pytest.approx(5.0 / 3.0, abs=0.03)
+
+
+def test_trajectory_has_a_colour_per_module(tmp_path):
+    draw(tmp_path, switched_run(), None)
+    image = cv2.imread(str(tmp_path / "map.png"))[:, :, ::-1].astype(int)
+    for color in ([0, 114, 178], [213, 94, 0]):
+        assert np.count_nonzero(np.abs(image - color).max(axis=2) < 8) > 300
+
+
+def test_figures_are_the_same_bytes_each_time(tmp_path):
+    draw(tmp_path / "a", switched_run(), true_loop())
+    draw(tmp_path / "b", switched_run(), true_loop())
+    for first in (tmp_path / "a").iterdir():
+        assert first.read_bytes() == (tmp_path / "b" / first.name).read_bytes()
+
+
+def test_figures_without_truth_leave_out_the_error(tmp_path):
+    assert draw(tmp_path, switched_run(), None) == ["grey_mean", "map", "timeline"]
+
+
+def test_figures_with_truth_of_another_time_leave_out_the_error(tmp_path):
+    late = GroundTruth(trajectory=loop(200, START_NS + 10**12))
+    assert draw(tmp_path, switched_run(), late) == ["grey_mean", "map", "timeline"]
+
+
+def test_run_without_images_has_no_grey_mean(tmp_path):
+    run = switched_run()
+    silent = [e for e in run.events if e["event"] != "vote"]
+    blind = [{**e, "value": None} if e["event"] == "vote" else e for e in run.events]
+    assert "grey_mean" not in draw(tmp_path / "silent", replace(run, events=silent), None)
+    assert "grey_mean" not in draw(tmp_path / "blind", replace(run, events=blind), None)
+
+
+def test_figures_survive_a_single_pose(tmp_path):
+    names = draw(tmp_path, single_pose(), true_loop(), reference=loop(200))
+    assert names == ["grey_mean", "map", "timeline", "error", "difference"]
+
+
+def test_figures_survive_no_poses_and_no_observations(tmp_path):
+    assert draw(tmp_path, poseless_run(30), true_loop(), reference=loop(3)) == ["timeline"]
+    assert draw(tmp_path, poseless_run(0), None) == []
+
+
+def test_figures_survive_two_million_points_and_14_thousand_poses(tmp_path):
+    count = 14_000
+    run = replace(switched_run(count, 6000, 7000), map=hybrid_map(2_000_000))
+    names = draw(tmp_path, run, true_loop(count, 6000))
+    assert names == ["grey_mean", "map", "timeline", "error"]
+
+
+def test_report_opens_alone_and_embeds_every_figure(tmp_path):
+    html = report(tmp_path, switched_run(), true_loop(), reference=loop(200))
+    assert html.count("data:image/png;base64,") == 5
+    links = re.findall(r"(?:src|href)=\"(?!data:)", html)
+    assert not links
+    assert "http" not in re.sub(r"base64,[^\"]*", "", html)
+    assert "url(" not in html
+
+
+def test_report_is_well_formed_html(tmp_path):
+    class Balance(HTMLParser):
+        def __init__(self) -> None:
+            super().__init__()
+            self.open: list[str] = []
+
+        def handle_starttag(self, tag, attrs):
+            if tag not in ("meta", "img", "br"):
+                self.open.append(tag)
+
+        def handle_endtag(self, tag):
+            assert self.open.pop() == tag
+
+    parser = Balance()
+    parser.feed(report(tmp_path, switched_run(), true_loop()))
+    assert not parser.open
+
+
+def test_report_tells_what_happened_in_words(tmp_path):
+    html = report(tmp_path, switched_run(), true_loop())
+    assert "At 10.0 s laser took over from rgbd" in html
+    assert "the scene was confirmed to be Dark, 2.00 s after it really changed" in html
+    assert "<td>3.5 ms</td>" in html
+
+
+def test_report_escapes_what_it_is_given(tmp_path):
+    evil = "<script>alert(1)</script> & $story ${x}"
+    run = switched_run()
+    fault = {"event": "fault", "stamp_ns": START_NS + 5 * PERIOD_NS, "what": evil}
+    html = report(
+        tmp_path, replace(run, events=[*run.events, fault]), None,
+        config_yaml=evil, versions={evil: evil}, faults=[evil], title=evil,
+    )  # fmt: skip
+    assert "<script" not in html
+    assert html.count("&lt;script&gt;alert(1)&lt;/script&gt; &amp; $story ${x}") >= 5
+
+
+def test_report_lists_each_fault_once_and_not_endlessly(tmp_path):
+    faults = ["depth was missing"] * 3 + [f"fault {k}" for k in range(40)]
+    html = report(tmp_path, switched_run(), None, faults=faults)
+    assert html.count("depth was missing") == 1
+    assert "and 21 more (see events.jsonl)" in html
+
+
+@pytest.mark.parametrize("run", [poseless_run(0), poseless_run(20), single_pose()])
+@pytest.mark.parametrize("truth", [None, true_loop(), GroundTruth()])
+def test_report_survives_runs_with_almost_nothing(tmp_path, run, truth):
+    html = report(tmp_path, run, truth)
+    assert "No module was replaced." in html
+    assert "nan " not in re.sub(r"base64,[^\"]*", "", html).lower()
