@@ -1,0 +1,107 @@
+"""Colour and depth images in files, as observations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.ros import pixels
+from sceneslam.types.errors import InputError
+from sceneslam.types.observation import Observation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameFiles:
+    """Where the images of one stamp are."""
+
+    stamp_ns: int
+    color: Path
+    depth: Path | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ReadFrame:
+    """An observation, None when no image of it could be read, and what was wrong where."""
+
+    observation: Observation | None
+    problems: Mapping[str, Path]
+
+
+class FrameReader:
+    """Reads images; safe to call from several threads."""
+
+    def __init__(self, size_wh: tuple[int, int], units: pixels.DepthUnits) -> None:
+        self._size_wh = size_wh
+        self._units = units
+
+    def read(self, frame: FrameFiles) -> ReadFrame:
+        """Return the frame's observation.
+
+        Raises InputError for an image of another size than the first, and for depth that is not
+        16 bit.
+        """
+        problems: dict[str, Path] = {}
+        image_bgr = self._image(frame.color, problems)
+        depth_m = None if frame.depth is None else self._depth(frame.depth, problems)
+        if image_bgr is None and depth_m is None:
+            return ReadFrame(observation=None, problems=problems)
+        observation = Observation(stamp_ns=frame.stamp_ns, image_bgr=image_bgr, depth_m=depth_m)
+        return ReadFrame(observation=observation, problems=problems)
+
+    def _image(self, path: Path, problems: dict[str, Path]) -> NDArray[np.uint8] | None:
+        data = _bytes(path, "colour image is missing", problems)
+        image_bgr = None if data is None else pixels.decode_bgr(data)
+        if image_bgr is not None:
+            self._check_size(path, image_bgr)
+        elif data is not None:
+            problems["colour image is damaged"] = path
+        return image_bgr
+
+    def _depth(self, path: Path, problems: dict[str, Path]) -> NDArray[np.float32] | None:
+        data = _bytes(path, "depth image is missing", problems)
+        stored = None if data is None else pixels.decode(data, cv2.IMREAD_UNCHANGED)
+        if stored is None:
+            if data is not None:
+                problems["depth image is damaged"] = path
+            return None
+        if stored.dtype != np.uint16 or stored.ndim != 2:
+            channels = 1 if stored.ndim == 2 else stored.shape[2]
+            raise InputError(
+                f"depth image: expected 16 bit in one channel, got {8 * stored.itemsize} bit "
+                f"in {channels}: {path}"
+            )
+        self._check_size(path, stored)
+        return self._units.of_integers(stored)
+
+    def _check_size(self, path: Path, picture: NDArray[np.generic]) -> None:
+        height, width = picture.shape[:2]
+        if (width, height) != self._size_wh:
+            raise InputError(
+                f"image size: expected {self._size_wh[0]}x{self._size_wh[1]} as the first image, "
+                f"got {width}x{height}: {path}"
+            )
+
+
+def first_size_wh(frames: Iterable[FrameFiles]) -> tuple[int, int]:
+    """Return the size of the first colour image that can be read; raises InputError if none."""
+    last = Path()
+    for frame in frames:
+        data = _bytes(frame.color, "", {})
+        image_bgr = None if data is None else pixels.decode_bgr(data)
+        if image_bgr is not None:
+            return int(image_bgr.shape[1]), int(image_bgr.shape[0])
+        last = frame.color
+    raise InputError(f"none of the colour images can be read, the last being: {last}")
+
+
+def _bytes(path: Path, problem: str, problems: dict[str, Path]) -> bytes | None:
+    try:
+        return path.read_bytes()
+    except OSError:
+        problems[problem] = path
+        return None

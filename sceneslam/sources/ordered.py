@@ -1,0 +1,111 @@
+"""Any source, with the promises of a source kept: stamps rise, arrays hold numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sceneslam.interfaces import Source
+from sceneslam.sources.faults import FaultLog
+from sceneslam.sources.spanned import Span, Spanned
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig
+from sceneslam.types.truth import GroundTruth
+
+
+class Ordered:
+    """Leaves out observations whose stamps repeat or run backwards, and points that are NaN.
+
+    A single stamp far ahead of its neighbours is left out too, rather than all that follow it. A
+    gap longer than `max_gap_s` is reported.
+    """
+
+    def __init__(self, source: Source, max_gap_s: float = 5.0) -> None:
+        if not max_gap_s > 0:
+            raise ConfigError("max_gap_s", max_gap_s, "a number above 0 [s]")
+        self._source = source
+        self._max_gap_ns = round(max_gap_s * 1e9)
+        self._log = FaultLog()
+
+    @property
+    def rig(self) -> Rig:
+        """Return the source's rig."""
+        return self._source.rig
+
+    @property
+    def length(self) -> int | None:
+        """Return how many observations the source will give at most."""
+        return self._source.length
+
+    @property
+    def faults(self) -> Sequence[str]:
+        """Return the source's faults and what was left out here."""
+        return [*self._source.faults, *self._log.sentences()]
+
+    @property
+    def span(self) -> Span | None:
+        """Return the source's span where it knows one."""
+        return self._source.span if isinstance(self._source, Spanned) else None
+
+    def __iter__(self) -> Iterator[Observation]:
+        """Yield the source's observations by rising stamp."""
+        self._log.clear()
+        last_ns: int | None = None
+        held: Observation | None = None  # after a jump: it may be the jump that is wrong
+        for observation in self._source:
+            stamp_ns = observation.stamp_ns
+            if held is not None:
+                is_back = stamp_ns < held.stamp_ns - self._max_gap_ns
+                if is_back and (last_ns is None or stamp_ns > last_ns):
+                    self._skip(held)
+                else:
+                    self._note_gap(last_ns, held.stamp_ns)
+                    last_ns = held.stamp_ns
+                    yield self._cleaned(held)
+                held = None
+            if last_ns is not None and stamp_ns <= last_ns:
+                self._skip(observation)
+            elif last_ns is None or stamp_ns - last_ns > self._max_gap_ns:
+                held = observation
+            else:
+                last_ns = stamp_ns
+                yield self._cleaned(observation)
+        if held is not None:
+            self._note_gap(last_ns, held.stamp_ns)
+            yield self._cleaned(held)
+
+    def ground_truth(self) -> GroundTruth | None:
+        """Return the source's ground truth."""
+        return self._source.ground_truth()
+
+    def _skip(self, observation: Observation) -> None:
+        kind = "observation left out, its stamp repeats, runs backwards or jumps"
+        self._log.add(kind, _when(observation.stamp_ns))
+
+    def _note_gap(self, last_ns: int | None, stamp_ns: int) -> None:
+        if last_ns is not None:
+            self._log.add(f"no observation for {(stamp_ns - last_ns) * 1e-9:.1f} s", _when(last_ns))
+
+    def _cleaned(self, observation: Observation) -> Observation:
+        """Return the observation without empty images and without points that are no numbers."""
+        changes: dict[str, object] = {}
+        for name in ("image_bgr", "depth_m"):
+            picture = getattr(observation, name)
+            if picture is not None and picture.size == 0:
+                self._log.add(f"empty {name}", _when(observation.stamp_ns))
+                changes[name] = None
+        points = observation.points_lidar
+        if points is not None and not np.isfinite(points).all():
+            is_good = np.isfinite(points).all(axis=1)
+            self._log.add("points that are not finite", _when(observation.stamp_ns))
+            changes["points_lidar"] = points[is_good]
+            if observation.point_times_s is not None:
+                changes["point_times_s"] = observation.point_times_s[is_good]
+        return replace(observation, **changes) if changes else observation  # type: ignore[arg-type]
+
+
+def _when(stamp_ns: int) -> str:
+    return f"stamp {stamp_ns * 1e-9:.6f} s"

@@ -1,0 +1,156 @@
+"""Recordings in the layout of the TUM RGB-D benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from sceneslam.ros.pixels import DepthUnits
+from sceneslam.sources.faults import FaultLog
+from sceneslam.sources.frame_files import FrameFiles, FrameReader, ReadFrame, first_size_wh
+from sceneslam.sources.intrinsics import (
+    Intrinsics,
+    checked_above_zero,
+    checked_range_m,
+    given_intrinsics,
+)
+from sceneslam.sources.prefetch import prefetched
+from sceneslam.sources.spanned import Span
+from sceneslam.sources.stamped_files import nearest_once, read_list
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Camera, Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import GroundTruth
+
+_NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
+_KNOWN = {  # the calibrations that the benchmark publishes
+    ("freiburg1", "fr1"): Intrinsics(
+        fx=517.3,
+        fy=516.5,
+        cx=318.6,
+        cy=255.3,
+        distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    ),
+    ("freiburg2", "fr2"): Intrinsics(
+        fx=520.9,
+        fy=521.0,
+        cx=325.1,
+        cy=249.7,
+        distortion=(0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    ),
+    ("freiburg3", "fr3"): Intrinsics(
+        fx=535.4, fy=539.2, cx=320.1, cy=247.6, distortion=_NO_DISTORTION
+    ),
+}
+
+
+class TumRgbd:
+    """Gives one observation per line of rgb.txt, with the depth nearest to it in time.
+
+    `camera` (fx, fy, cx, cy, distortion) may be null for the benchmark's own recordings, which
+    are known by their folder's name. Base is the camera's place, with REP-103 axes.
+    """
+
+    def __init__(
+        self,
+        path: str,
+        camera: dict[str, Any],
+        depth_scale: float,
+        depth_range_m: list[float],
+        sync_tolerance_s: float,
+    ) -> None:
+        checked_above_zero("depth_scale", depth_scale)
+        checked_above_zero("sync_tolerance_s", sync_tolerance_s)
+        range_m = checked_range_m("depth_range_m", depth_range_m)
+        given = given_intrinsics(camera)
+        self._folder = Path(path)
+        if not self._folder.is_dir():
+            raise InputError(f"recording not found, expected a folder: {path}")
+        colors = read_list(self._folder / "rgb.txt")
+        if not colors:
+            raise InputError(f"the list has no images: {self._folder / 'rgb.txt'}")
+        intrinsics = given or _known_intrinsics(self._folder)
+        has_depth = (self._folder / "depth.txt").is_file()
+        depths = read_list(self._folder / "depth.txt") if has_depth else ()
+        matches = nearest_once(
+            [color.stamp_ns for color in colors], depths, round(sync_tolerance_s * 1e9)
+        )
+        self._frames = [
+            FrameFiles(
+                stamp_ns=color.stamp_ns, color=color.path, depth=depth.path if depth else None
+            )
+            for color, depth in zip(colors, matches, strict=True)
+        ]
+        self._camera = Camera(
+            size_wh=first_size_wh(self._frames),
+            fx=intrinsics.fx,
+            fy=intrinsics.fy,
+            cx=intrinsics.cx,
+            cy=intrinsics.cy,
+            distortion=intrinsics.distortion or _NO_DISTORTION,
+            depth_range_m=range_m,
+        )
+        self._sensors = frozenset({Sensor.IMAGE, Sensor.DEPTH} if depths else {Sensor.IMAGE})
+        self._reader = FrameReader(self._camera.size_wh, DepthUnits(depth_scale, range_m))
+        self._faults = FaultLog()
+
+    @property
+    def rig(self) -> Rig:
+        """Return the one camera."""
+        return Rig(sensors=self._sensors, camera=self._camera)
+
+    @property
+    def length(self) -> int | None:
+        """Return the number of images in rgb.txt."""
+        return len(self._frames)
+
+    @property
+    def faults(self) -> Sequence[str]:
+        """Return the images that are missing or damaged."""
+        return self._faults.sentences()
+
+    @property
+    def span(self) -> Span | None:
+        """Return the first and last stamp of rgb.txt."""
+        stamps_ns = [frame.stamp_ns for frame in self._frames]
+        return Span(start_ns=min(stamps_ns), end_ns=max(stamps_ns))
+
+    def __iter__(self) -> Iterator[Observation]:
+        """Yield observations; reads and decodes images ahead in threads."""
+        self._faults.clear()
+        for frame in prefetched(self._jobs()):
+            for kind, path in frame.problems.items():
+                self._faults.add(kind, str(path))
+            if frame.observation is not None:
+                yield frame.observation
+
+    def ground_truth(self) -> GroundTruth | None:
+        """Return groundtruth.txt (poses of the camera's optical frame) as poses of base."""
+        path = self._folder / "groundtruth.txt"
+        if not path.is_file():
+            return None
+        cameras = Trajectory.read_tum(path)
+        T_cam_base = se3.inverse(self._camera.T_base_cam)
+        trajectory = Trajectory(
+            stamps_ns=cameras.stamps_ns, T_world_base=cameras.T_world_base @ T_cam_base
+        )
+        return GroundTruth(trajectory=trajectory)
+
+    def _jobs(self) -> Iterator[Callable[[], ReadFrame]]:
+        for frame in self._frames:
+            yield partial(self._reader.read, frame)
+
+
+def _known_intrinsics(folder: Path) -> Intrinsics:
+    """Return the calibration of a benchmark's recording; raises ConfigError for another folder."""
+    name = folder.resolve().name.lower()
+    for tags, intrinsics in _KNOWN.items():
+        if any(tag in name for tag in tags):
+            return intrinsics
+    raise ConfigError(
+        "camera.fx", None, f"a number [px], with fy, cx and cy: folder {name!r} names no TUM camera"
+    )
