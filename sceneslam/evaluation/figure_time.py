@@ -12,6 +12,8 @@ from sceneslam.evaluation.switches import is_switch
 from sceneslam.types.run import Event, RunResult
 from sceneslam.types.truth import GroundTruth
 
+_NAMED_CHANGES = 8  # more names than these lie on top of each other
+
 
 def draw_votes(
     result: RunResult, truth: GroundTruth | None, threshold: float | None, value_label: str
@@ -61,8 +63,10 @@ def draw_series(
     axes.plot(times_s, values_m, color=look.INK, linewidth=1.3, marker=marker, label=label)
     if limit_m is not None:
         axes.axhline(limit_m, color=look.MUTED, linestyle=":", label=f"limit {limit_m:g} m")
-    for event in filter(is_switch, result.events):
-        axes.axvline(_at_s(result, event), color=look.INK, linewidth=0.9, linestyle="-.")
+    switches = [event for event in result.events if is_switch(event)]
+    for event in switches:
+        alpha = min(1.0, 20 / len(switches))  # many must not black out the curve
+        axes.axvline(_at_s(result, event), color=look.INK, lw=0.9, linestyle="-.", alpha=alpha)
     look.style(axes, y_label=y_label)
     axes.set_xlim(0.0, max(look.duration_s(result), 1e-3))
     axes.set_ylim(bottom=0.0)
@@ -110,10 +114,13 @@ def _at_s(result: RunResult, event: Event) -> float:
 
 
 def _mark_confirmed(axes: Any, result: RunResult) -> None:
-    for event in result.events:
-        if event["event"] == "scene" and event["previous"] is not None:
-            at_s = _at_s(result, event)
-            axes.axvline(at_s, color=look.INK, linewidth=1.1, linestyle="-.")
+    changes = [e for e in result.events if e["event"] == "scene" and e["previous"] is not None]
+    for event in changes:
+        at_s = _at_s(result, event)
+        axes.axvline(
+            at_s, color=look.INK, lw=1.1, linestyle="-.", alpha=min(1.0, 20 / len(changes))
+        )
+        if len(changes) <= _NAMED_CHANGES:
             axes.text(
                 at_s, 0.5, f"{event['scene']} confirmed", transform=axes.get_xaxis_transform(),
                 rotation=90, ha="center", va="center", fontsize=10, color=look.INK,
