@@ -141,7 +141,7 @@ def test_report_is_well_formed_html(tmp_path):
 
 def test_report_tells_what_happened_in_words(tmp_path):
     html = report(tmp_path, switched_run(), true_loop())
-    assert "At 10.0 s laser took over from rgbd" in html
+    assert "At 10.0 s “laser” took over from “rgbd”" in html
     assert "the scene was confirmed to be Dark, 2.00 s after it really changed" in html
     assert "<td>3.5 ms</td>" in html
 

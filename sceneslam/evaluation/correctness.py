@@ -23,7 +23,7 @@ def correct_rate(
     limits and then counts the time to the next pose, at most 1 s. Unlike the mean error it
     cannot be improved by giving no poses. NaN when there is no truth.
     """
-    if len(truth) < 2:
+    if len(truth) < 2 or truth.stamps_ns[0] == truth.stamps_ns[-1]:
         return float("nan")
     index = covered(truth, estimate.stamps_ns, _TRUTH_GAP_S)
     if not len(index):

@@ -97,6 +97,7 @@ def _accuracy(
         "rpe_rot_rad": root_mean_square(relative.rot_rad),
         "correct_rate": rate,
         "truth_matched": len(absolute.errors_m),
+        "association_gap_s": gap_s,
     }
 
 

@@ -51,6 +51,7 @@ def write_report(
     images = write_figures(
         folder / "figures", result, truth,
         threshold=threshold, value_label=value_label, reference=reference,
+        association_gap_s=metrics["association_gap_s"],
     )  # fmt: skip
     happened = [str(event["what"]) for event in result.events if event["event"] == "fault"]
     page = Template(files("sceneslam.evaluation").joinpath("report.html").read_text("utf-8"))

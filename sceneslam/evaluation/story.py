@@ -10,8 +10,8 @@ from sceneslam.evaluation.summary import degrees, number, percent, seconds
 _TOLD_SWITCHES = 8
 _WHY = {
     "scene": "the scene was confirmed to be {scene}",
-    "lost": "{from} had lost track",
-    "failed": "{from} had failed",
+    "lost": "“{from}” had lost track",
+    "failed": "“{from}” had failed",
 }
 
 
@@ -41,14 +41,18 @@ def _opening(metrics: Metrics) -> str:
         text += f" {metrics['bridged']} poses were bridged: no module gave them."
     if not metrics["switches"]:
         worked = [key for key, module in metrics["modules"].items() if module["poses"]]
-        text += f" {' and '.join(worked) or 'No module'} did all the work; nothing was switched."
+        text += f" {_names(worked)} gave the poses; nothing was switched."
     return text
+
+
+def _names(keys: list[str]) -> str:
+    return " and ".join(f"“{key}”" for key in keys) or "No module"
 
 
 def _change(metrics: Metrics, switch: dict[str, Any]) -> str:
     text = (
-        f"At {seconds(metrics, switch['stamp_ns']):.1f} s {switch['to']} took over from "
-        f"{switch['from']}, because {_WHY.get(switch['reason'], switch['reason']).format(**switch)}"
+        f"At {seconds(metrics, switch['stamp_ns']):.1f} s “{switch['to']}” took over from "
+        f"“{switch['from']}”, because {_WHY.get(switch['reason'], switch['reason']).format(**switch)}"
     )
     if switch["confirm_delay_s"] is not None:
         text += f", {switch['confirm_delay_s']:.2f} s after it really changed"
