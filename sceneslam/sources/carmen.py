@@ -1,0 +1,130 @@
+"""CARMEN logs: a planar laser with odometry, as text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sceneslam.ros.pixels import locked
+from sceneslam.sources.carmen_lines import FLASER, ROBOTLASER, ScanLine, parse_scan, stamp_of
+from sceneslam.sources.faults import FaultLog
+from sceneslam.sources.intrinsics import checked_above_zero
+from sceneslam.sources.rising import rising_stamps
+from sceneslam.sources.spanned import Span
+from sceneslam.types import se3
+from sceneslam.types.errors import InputError
+from sceneslam.types.observation import LaserScan, Observation
+from sceneslam.types.rig import Laser, Rig, Sensor
+from sceneslam.types.truth import GroundTruth
+
+_OFFSET = b"robot_frontlaser_offset"
+
+
+class Carmen:
+    """Gives one observation per FLASER or ROBOTLASER1 line, stamped by its `ipc_timestamp`.
+
+    Odometry is that of the line; ODOM and RLASER lines are not used. The log's order is the order
+    in time: a scan whose stamp came late gets one between its neighbours', which `faults` tells.
+    Ranges of `range_max_m` and beyond are no return.
+    """
+
+    def __init__(self, path: str, range_max_m: float) -> None:
+        self._range_max_m = checked_above_zero("range_max_m", range_max_m)
+        self._path = Path(path)
+        if not self._path.is_file():
+            raise InputError(f"recording not found, expected a CARMEN log: {path}")
+        self._lines = self._scan_lines()
+        first = next((scan for scan in map(parse_scan, self._lines) if scan), None)
+        if first is None:
+            raise InputError(f"no scans, expected FLASER or ROBOTLASER1 lines: {path}")
+        logged_ns = np.array([stamp_of(line) for line in self._lines], dtype=np.int64)
+        self._stamps_ns = rising_stamps(logged_ns)
+        self._late = np.flatnonzero(self._stamps_ns != logged_ns)
+        T_base_laser = se3.from_xy_yaw(self._offset_m(), 0.0, 0.0)
+        if first.T_base_laser is not None:
+            T_base_laser = first.T_base_laser
+        self._rig = Rig(
+            sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}),
+            laser=Laser(T_base_laser=T_base_laser),
+        )
+        self._faults = FaultLog()
+
+    @property
+    def rig(self) -> Rig:
+        """Return the one laser and the wheel odometry."""
+        return self._rig
+
+    @property
+    def length(self) -> int | None:
+        """Return the number of scans."""
+        return len(self._lines)
+
+    @property
+    def faults(self) -> Sequence[str]:
+        """Return the lines that could not be read and the stamps that were out of order."""
+        late = []
+        if len(self._late):
+            stamp_s = self._stamps_ns[self._late[0]] * 1e-9
+            late.append(
+                f"{len(self._late)} of {len(self._lines)} scans, first at {stamp_s:.3f} s, are "
+                f"stamped later than scans after them; they were given stamps between their "
+                f"neighbours': {self._path}"
+            )
+        return [*late, *self._faults.sentences()]
+
+    @property
+    def span(self) -> Span | None:
+        """Return the first and last stamp."""
+        return Span(start_ns=int(self._stamps_ns[0]), end_ns=int(self._stamps_ns[-1]))
+
+    def __iter__(self) -> Iterator[Observation]:
+        """Yield the scans in the log's order."""
+        self._faults.clear()
+        for line, stamp_ns in zip(self._lines, self._stamps_ns.tolist(), strict=True):
+            scan = parse_scan(line)
+            if scan is None:
+                self._faults.add(
+                    "scan line makes no sense", f"{stamp_ns * 1e-9:.3f} s: {self._path}"
+                )
+            else:
+                yield self._observation(scan, stamp_ns)
+
+    def ground_truth(self) -> GroundTruth | None:
+        """Return None: a log has no truth of its own (relations are for the evaluation)."""
+        return None
+
+    def _observation(self, scan: ScanLine, stamp_ns: int) -> Observation:
+        ranges_m = scan.ranges_m
+        limit_m = min(self._range_max_m, scan.range_max_m or np.inf)
+        ranges_m[ranges_m <= 0] = np.nan
+        ranges_m[ranges_m >= limit_m] = np.inf
+        return Observation(
+            stamp_ns=stamp_ns,
+            scan=LaserScan(
+                stamp_ns=stamp_ns,
+                ranges_m=locked(ranges_m),
+                angle_min_rad=scan.angle_min_rad,
+                angle_step_rad=scan.angle_step_rad,
+                range_min_m=0.0,
+                range_max_m=limit_m,
+            ),
+            T_odom_base=locked(scan.T_odom_base),
+        )
+
+    def _scan_lines(self) -> Sequence[bytes]:
+        data = self._path.read_bytes()
+        return [line for line in data.splitlines() if line.startswith((FLASER, ROBOTLASER))]
+
+    def _offset_m(self) -> float:
+        """Return how far the laser sits before the robot's centre, 0 where the log is silent."""
+        with self._path.open("rb") as file:
+            for line in file:
+                words = line.split()
+                if words[:1] == [b"PARAM"] and words[1:2] == [_OFFSET] and len(words) > 2:
+                    try:
+                        return float(words[2])
+                    except ValueError:
+                        return 0.0
+        return 0.0

@@ -1,0 +1,90 @@
+"""Lines of a CARMEN log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.se3 import Transform
+
+FLASER, ROBOTLASER = b"FLASER ", b"ROBOTLASER1 "
+_HALF_TURN_COUNTS = {180: 1.0, 181: 1.0, 360: 0.5, 361: 0.5, 401: 0.25}  # SICK: degrees per beam
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScanLine:
+    """One scan and the odometry at it."""
+
+    ranges_m: NDArray[np.float32]  # (N,) as logged
+    angle_min_rad: float
+    angle_step_rad: float
+    range_max_m: float | None  # None: the line does not say
+    T_odom_base: Transform
+    T_base_laser: Transform | None  # None: the line does not say
+
+
+def parse_scan(line: bytes) -> ScanLine | None:
+    """Return the scan of a FLASER or ROBOTLASER1 line, None when the line makes no sense."""
+    try:
+        scan = _flaser(line) if line.startswith(FLASER) else _robotlaser(line)
+    except (ValueError, IndexError, OverflowError):
+        return None
+    return scan if np.isfinite(scan.T_odom_base).all() else None
+
+
+def stamp_of(line: bytes) -> int:
+    """Return the ns of a line's `ipc_timestamp`, the third word from its end; 0 if it is none."""
+    words = line.rsplit(maxsplit=3)
+    whole, _, fraction = (words[1] if len(words) == 4 else b"").partition(b".")
+    try:
+        return int(whole) * 10**9 + int((fraction + b"0" * 9)[:9])
+    except ValueError:
+        return 0
+
+
+def _flaser(line: bytes) -> ScanLine:
+    """FLASER count [ranges] x y theta odom_x odom_y odom_theta ipc_time host logger_time."""
+    words = line.split()
+    count = int(words[1])
+    ranges_m = _numbers(words, 2, count)
+    _, _, _, x_m, y_m, yaw_rad = map(float, words[2 + count : 8 + count])
+    step_deg = _HALF_TURN_COUNTS.get(count, 180.0 / max(count - 1, 1))
+    return ScanLine(
+        ranges_m=ranges_m,
+        angle_min_rad=-np.pi / 2,
+        angle_step_rad=float(np.deg2rad(step_deg)),
+        range_max_m=None,
+        T_odom_base=se3.from_xy_yaw(x_m, y_m, yaw_rad),
+        T_base_laser=None,
+    )
+
+
+def _robotlaser(line: bytes) -> ScanLine:
+    """ROBOTLASER1 type start fov step range_max accuracy mode count [ranges] count [remissions] ...
+
+    ... laser x y theta, robot x y theta, tv rv forward side turn, ipc_time host logger_time.
+    """
+    words = line.split()
+    start_rad, _, step_rad, range_max_m = map(float, words[2:6])
+    count = int(words[8])
+    ranges_m = _numbers(words, 9, count)
+    after = 9 + count + 1 + int(words[9 + count])
+    laser, robot = (se3.from_xy_yaw(*map(float, words[at : at + 3])) for at in (after, after + 3))
+    return ScanLine(
+        ranges_m=ranges_m,
+        angle_min_rad=start_rad,
+        angle_step_rad=step_rad,
+        range_max_m=range_max_m,
+        T_odom_base=robot,
+        T_base_laser=se3.inverse(robot) @ laser,
+    )
+
+
+def _numbers(words: list[bytes], start: int, count: int) -> NDArray[np.float32]:
+    ranges_m = np.array(words[start : start + count], dtype=np.float32)
+    if count < 2 or len(ranges_m) != count:
+        raise ValueError("too few ranges")
+    return ranges_m

@@ -1,0 +1,122 @@
+"""KITTI drives: a folder of lidar scans, with times and poses where it has them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.ros.pixels import locked
+from sceneslam.sources.faults import FaultLog
+from sceneslam.sources.intrinsics import checked_range_m
+from sceneslam.sources.kitti_times import read_times_ns
+from sceneslam.sources.prefetch import prefetched
+from sceneslam.sources.spanned import Span
+from sceneslam.types import se3
+from sceneslam.types.errors import InputError
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Lidar, Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import GroundTruth
+
+_FOLDERS = ("velodyne", "velodyne_points/data", ".")
+_POINT_BYTES = 16  # float32 x y z reflectance
+
+
+class Kitti:
+    """Gives one observation per scan; base is the lidar.
+
+    `velodyne/*.bin` (odometry benchmark) or `velodyne_points/data/*.bin` (raw data). Times come
+    from times.txt or timestamps.txt, else 10 Hz. Truth: groundtruth_tum.txt or poses*.txt, taken
+    for poses of the lidar.
+    """
+
+    def __init__(self, path: str, range_m: list[float]) -> None:
+        low_m, high_m = checked_range_m("range_m", range_m)
+        self._folder = Path(path)
+        if not self._folder.is_dir():
+            raise InputError(f"recording not found, expected a folder: {path}")
+        self._files = _scan_files(self._folder)
+        self._stamps_ns = read_times_ns(self._folder, len(self._files))
+        self._rig = Rig(sensors=frozenset({Sensor.POINTS}), lidar=Lidar(range_m=(low_m, high_m)))
+        self._faults = FaultLog()
+
+    @property
+    def rig(self) -> Rig:
+        """Return the one lidar."""
+        return self._rig
+
+    @property
+    def length(self) -> int | None:
+        """Return the number of scans."""
+        return len(self._files)
+
+    @property
+    def faults(self) -> Sequence[str]:
+        """Return the scans that were damaged."""
+        return self._faults.sentences()
+
+    @property
+    def span(self) -> Span | None:
+        """Return the first and last stamp."""
+        return Span(start_ns=int(self._stamps_ns[0]), end_ns=int(self._stamps_ns[-1]))
+
+    def __iter__(self) -> Iterator[Observation]:
+        """Yield the scans; reads files ahead in threads."""
+        self._faults.clear()
+        scans = prefetched(self._jobs())
+        for stamp_ns, path, points in zip(
+            self._stamps_ns.tolist(), self._files, scans, strict=True
+        ):
+            if points is None:
+                self._faults.add("scan is empty or cut off", str(path))
+            else:
+                yield Observation(stamp_ns=stamp_ns, points_lidar=points)
+
+    def ground_truth(self) -> GroundTruth | None:
+        """Return the drive's poses, None when it has none."""
+        tum = self._folder / "groundtruth_tum.txt"
+        if tum.is_file():
+            return GroundTruth(trajectory=Trajectory.read_tum(tum))
+        for path in sorted(self._folder.glob("poses*.txt")):
+            return GroundTruth(trajectory=self._read_poses(path))
+        return None
+
+    def _read_poses(self, path: Path) -> Trajectory:
+        """Return KITTI's twelve numbers per line (the upper rows of T_gt_lidar)."""
+        try:
+            rows = np.loadtxt(path, ndmin=2, dtype=np.float64)
+        except ValueError as err:
+            raise InputError(f"poses: expected 12 numbers per line ({err}): {path}") from err
+        if rows.shape != (len(self._files), 12) or not np.isfinite(rows).all():
+            raise InputError(
+                f"poses: expected {len(self._files)} lines of 12 finite numbers, got "
+                f"{rows.shape[0]} of {rows.shape[1]}: {path}"
+            )
+        T_gt_base = np.tile(se3.identity(), (len(rows), 1, 1))
+        T_gt_base[:, :3, :] = rows.reshape(-1, 3, 4)
+        return Trajectory(stamps_ns=self._stamps_ns, T_world_base=T_gt_base)
+
+    def _jobs(self) -> Iterator[Callable[[], NDArray[np.float32] | None]]:
+        for path in self._files:
+            yield partial(_read_scan, path)
+
+
+def _scan_files(folder: Path) -> Sequence[Path]:
+    for name in _FOLDERS:
+        files = sorted((folder / name).glob("*.bin"))
+        if files:
+            return files
+    raise InputError(f"no scans, expected velodyne/*.bin or velodyne_points/data/*.bin: {folder}")
+
+
+def _read_scan(path: Path) -> NDArray[np.float32] | None:
+    """Return the finite points (N, 3) [m] of a file, None when it is empty or cut off."""
+    data = path.read_bytes()
+    if not data or len(data) % _POINT_BYTES:
+        return None
+    points = np.frombuffer(data, dtype="<f4").reshape(-1, 4)[:, :3]
+    return locked(np.ascontiguousarray(points[np.isfinite(points).all(axis=1)], dtype=np.float32))

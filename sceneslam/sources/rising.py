@@ -1,0 +1,46 @@
+"""Stamps of a sequence whose order is known but whose clock now and then ran late."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def longest_rising(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the places of the longest strictly rising subsequence."""
+    tails: list[int] = []  # the smallest stamp that ends a rising run of each length
+    ends: list[int] = []  # and its place
+    before = np.full(len(stamps_ns), -1)
+    for place, stamp in enumerate(stamps_ns.tolist()):
+        length = bisect_left(tails, stamp)
+        tails[length : length + 1] = [stamp]
+        ends[length : length + 1] = [place]
+        before[place] = ends[length - 1] if length else -1
+    kept = []
+    place = ends[-1] if ends else -1
+    while place >= 0:
+        kept.append(place)
+        place = int(before[place])
+    return np.array(kept[::-1], dtype=np.int64)
+
+
+def rising_stamps(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return stamps that rise: those out of order are set evenly between their neighbours'.
+
+    At the ends, where there is a neighbour on one side only, they are set 1 ms apart.
+    """
+    kept = longest_rising(stamps_ns)
+    if not len(kept):
+        return stamps_ns
+    places = np.arange(len(stamps_ns))
+    first, last = int(kept[0]), int(kept[-1])
+    # Relative to the first, so that a float holds the nanoseconds.
+    origin = int(stamps_ns[first])
+    offsets = np.interp(places, kept, (stamps_ns[kept] - origin).astype(np.float64))
+    rising: NDArray[np.int64] = np.rint(offsets).astype(np.int64) + origin
+    rising[kept] = stamps_ns[kept]
+    rising[:first] = stamps_ns[first] - (first - places[:first]) * 1_000_000
+    rising[last + 1 :] = stamps_ns[last] + (places[last + 1 :] - last) * 1_000_000
+    return rising
