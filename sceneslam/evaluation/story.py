@@ -50,9 +50,10 @@ def _names(keys: list[str]) -> str:
 
 
 def _change(metrics: Metrics, switch: dict[str, Any]) -> str:
+    why = _WHY.get(switch["reason"], switch["reason"]).format(**switch)
     text = (
         f"At {seconds(metrics, switch['stamp_ns']):.1f} s “{switch['to']}” took over from "
-        f"“{switch['from']}”, because {_WHY.get(switch['reason'], switch['reason']).format(**switch)}"
+        f"“{switch['from']}”, because {why}"
     )
     if switch["confirm_delay_s"] is not None:
         text += f", {switch['confirm_delay_s']:.2f} s after it really changed"
