@@ -69,6 +69,7 @@ class _Loop:
     def __init__(self, parts: Parts, folder: Path, title: str) -> None:
         self._parts, self._title = parts, title
         self._log = EventLog(folder / "events.jsonl")
+        self._events_written = 0
         self._observed_ns: list[int] = []
         self._wall_s = 0.0
         self._sinks = list(parts.sinks.values())
@@ -162,13 +163,20 @@ class _Loop:
         """Feed one observation; return whether the run goes on."""
         self._observed_ns.append(observation.stamp_ns)
         self._bus.step(observation)
-        atlas = self._parts.atlas
         if self._sinks:
-            T_map_base = atlas.pose_at(observation.stamp_ns)
-            for sink in self._sinks:
-                sink.write(observation, T_map_base, self._bus.active)
+            self._write(observation)
         self._bar.update()
         return self._bus.state != "terminate"
+
+    def _write(self, observation: Observation) -> None:
+        """Give the sinks the observation with its pose, and the events since the last one."""
+        T_map_base = self._parts.atlas.pose_at(observation.stamp_ns)
+        events = self._log.since(self._events_written)
+        self._events_written += len(events)
+        for sink in self._sinks:
+            sink.write(observation, T_map_base, self._bus.active)
+            for event in events:
+                sink.write_event(event)
 
 
 def _save(
@@ -205,6 +213,7 @@ def _save(
         versions=versions,
         faults=faults,
         reference=reference,
+        value_label=parts.detector.quantity,
     )
     return Finished(metrics=metrics, trajectory=result.trajectory, faults=faults)
 

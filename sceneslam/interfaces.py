@@ -14,6 +14,7 @@ from typing import Protocol, runtime_checkable
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, SceneVote, Tracking
 from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.run import Event
 from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import GroundTruth
 
@@ -52,6 +53,11 @@ class Source(Protocol):
 @runtime_checkable
 class Detector(Protocol):
     """Names the scene around the robot."""
+
+    @property
+    def quantity(self) -> str:
+        """Return what the value of a vote measures, for figures; "" when it has none."""
+        ...
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -131,6 +137,10 @@ class Sink(Protocol):
 
     def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
         """Take one observation with its pose (None when there is none) and active module."""
+        ...
+
+    def write_event(self, event: Event) -> None:
+        """Take one event: a vote, a decision, a hand-over, ..."""
         ...
 
     def write_truth(self, truth: GroundTruth) -> None:

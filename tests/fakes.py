@@ -39,6 +39,7 @@ def observation(index: int, *, has_odometry: bool = True) -> Observation:
 class ScriptedDetector:
     """Votes for the scene that `scene_at` names for an index."""
 
+    quantity = ""
     scenes = ("Bright", "Dark")
     requires = (frozenset({Sensor.IMAGE}),)
 

@@ -67,7 +67,7 @@ def test_first_scene_starts_its_module_at_the_origin():
 
 
 def test_switch_waits_for_the_confirmation_window():
-    _, atlas, log, _ = drive(
+    _, _atlas, log, _ = drive(
         {"bright": ExactModule(), "dark": ExactModule()}, scene_at=dark_from(40)
     )
     decision = events(log, "decision")[1]
@@ -120,7 +120,7 @@ def test_lost_module_is_bridged_by_constant_velocity_without_odometry():
 
 def test_lost_module_without_a_fallback_invents_no_pose():
     module = ExactModule(lost=range(50, 70))
-    bus, atlas, log, _ = drive(
+    _bus, atlas, log, _ = drive(
         {"only": module},
         table={"Bright": ["only"], "Dark": ["only"]},
         has_odometry=False,
@@ -155,7 +155,7 @@ def test_pose_of_nan_never_reaches_the_trajectory():
 
 
 def test_module_that_cannot_be_activated_gives_way_at_the_start():
-    bus, atlas, log, _ = drive(
+    _bus, atlas, log, _ = drive(
         {"bright": ExactModule(raises_on_activate=True), "dark": ExactModule()}
     )
     assert set(atlas.pose_modules) == {"dark"}
@@ -175,7 +175,7 @@ def test_module_that_cannot_be_activated_leaves_the_old_one_running():
 
 
 def test_run_terminates_when_no_module_is_left():
-    bus, atlas, log, detector = drive(
+    bus, atlas, _log, detector = drive(
         {"bright": ExactModule(raises={50}), "dark": ExactModule(raises_on_activate=True)}
     )
     assert bus.state == "terminate" and detector.is_shut_down

@@ -18,6 +18,11 @@ RIG = Rig(
 )
 
 
+def sink_to(path, **changes):
+    values = {"required": False, "image_every": 1, "depth_every": 5, "scan_every": 5}
+    return RerunSink(path, **(values | {"jpeg_quality": 80} | changes))
+
+
 def observe(stamp_ns: int) -> Observation:
     ranges_m = np.full(90, 2.0, np.float32)
     ranges_m[:5] = np.inf
@@ -36,7 +41,7 @@ def observe(stamp_ns: int) -> Observation:
 def test_recording_holds_images_poses_and_detector_values(tmp_path):
     rerun = pytest.importorskip("rerun", reason="the extra `rerun` is not installed")
     path = tmp_path / "deep" / "run.rrd"
-    sink = RerunSink("deep/run.rrd")
+    sink = sink_to("deep/run.rrd")
     assert isinstance(sink, Sink)
     sink.open(RIG, tmp_path)
     path_of_robot = loop(30)
@@ -58,7 +63,7 @@ def test_recording_holds_images_poses_and_detector_values(tmp_path):
 
 def test_observation_with_nothing_in_it_is_written(tmp_path):
     pytest.importorskip("rerun", reason="the extra `rerun` is not installed")
-    sink = RerunSink("run.rrd")
+    sink = sink_to("run.rrd")
     sink.open(Rig(sensors=frozenset()), tmp_path)
     sink.write(Observation(stamp_ns=1), None, "")
     sink.write_truth(GroundTruth())
@@ -71,7 +76,7 @@ def test_observation_with_nothing_in_it_is_written(tmp_path):
 )
 def test_arguments_out_of_range_are_named(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
-        RerunSink("run.rrd", **wrong)
+        sink_to("run.rrd", **wrong)
 
 
 @pytest.fixture
@@ -81,11 +86,11 @@ def without_rerun(monkeypatch):
 
 def test_missing_extra_says_what_to_install_where_it_is_required(without_rerun):
     with pytest.raises(ConfigError, match=r"pip install 'sceneslam\[rerun\]'"):
-        RerunSink("run.rrd", required=True)
+        sink_to("run.rrd", required=True)
 
 
 def test_missing_extra_writes_nothing_where_it_is_not_required(without_rerun, tmp_path):
-    sink = RerunSink("run.rrd")
+    sink = sink_to("run.rrd")
     sink.open(RIG, tmp_path)
     sink.write(observe(0), loop(1).T_world_base[0], "rgbd")
     sink.write_event(first_events()[0])

@@ -16,6 +16,7 @@ BRIGHT, DARK = "Bright", "Dark"
 class GreyMean:
     """Votes Bright where the mean of S = 0.299 R + 0.587 G + 0.114 B is above the threshold."""
 
+    quantity = "mean of grey"
     scenes = (BRIGHT, DARK)
     requires = (frozenset({Sensor.IMAGE}),)
 

@@ -20,6 +20,7 @@ class Manual:
     standard input that is one of the scenes takes over from the schedule from then on.
     """
 
+    quantity = ""
     requires = (frozenset[Sensor](),)
 
     def __init__(self, schedule: list[list[float | str]], operator: bool) -> None:

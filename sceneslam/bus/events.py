@@ -26,6 +26,10 @@ class EventLog:
         """Return all events so far."""
         return tuple(self._events)
 
+    def since(self, count: int) -> list[Event]:
+        """Return the events after the first `count`."""
+        return self._events[count:]
+
     def add(self, event: str, stamp_ns: int, **fields: Any) -> None:
         """Record an event; NaN becomes null. All but votes reach the disk at once."""
         line: dict[str, Any] = {"event": event, "stamp_ns": stamp_ns}

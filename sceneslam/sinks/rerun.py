@@ -44,11 +44,11 @@ class RerunSink:
         self,
         path: str,
         *,
-        required: bool = False,
-        image_every: int = 1,
-        depth_every: int = 5,
-        scan_every: int = 5,
-        jpeg_quality: int = 80,
+        required: bool,
+        image_every: int,
+        depth_every: int,
+        scan_every: int,
+        jpeg_quality: int,
     ) -> None:
         """Get ready to write to `path`.
 
