@@ -18,6 +18,7 @@ class LandmarkTable:
     def __init__(self) -> None:
         self.points_local = np.zeros((_FIRST_CAPACITY, 3))  # (C, 3) [m]
         self.information = np.zeros((_FIRST_CAPACITY, 3, 3))  # inverse covariance [1/m^2]
+        self.covariance = np.zeros((_FIRST_CAPACITY, 3, 3))  # [m^2]
         self.normals_local = np.zeros((_FIRST_CAPACITY, 3))  # from the landmark to its viewer
         self.reach_m = np.zeros(_FIRST_CAPACITY)  # distance at which it shows on level 0
         self.descriptors = np.zeros((_FIRST_CAPACITY, 32), np.uint8)
@@ -41,6 +42,7 @@ class LandmarkTable:
         self._reserve(len(points_local))
         ids = np.flatnonzero(~self.alive)[: len(points_local)]
         self.points_local[ids], self.information[ids] = points_local, information
+        self.covariance[ids] = np.linalg.inv(information)
         self.normals_local[ids], self.reach_m[ids] = normals_local, reach_m
         self.descriptors[ids] = descriptors
         self.alive[ids], self.expected[ids], self.found[ids] = True, 1, 1
@@ -58,6 +60,7 @@ class LandmarkTable:
         pull = information @ (points_local - self.points_local[ids])[:, :, None]
         self.points_local[ids] += np.linalg.solve(total, pull)[:, :, 0]
         self.information[ids] = total
+        self.covariance[ids] = np.linalg.inv(total)
 
     def describe(
         self,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
 from .features import Features
@@ -26,6 +27,7 @@ class Fix:
     estimate: PoseEstimate
     landmark_ids: NDArray[np.int64]  # (N,), inliers
     feature_rows: NDArray[np.int64]  # (N,)
+    deep_rows: NDArray[np.int64]  # those of them whose depth agrees too
     expected_ids: NDArray[np.int64]  # landmarks that the image should show
     local_ids: NDArray[np.int64]  # the local map that they are of
 
@@ -52,7 +54,7 @@ class Localizer:
                 features,
                 radius_px=radius_px,
             )
-            fix = self._solve(features, prediction.ids, matches)
+            fix = self._solve(features, prediction.ids, matches, T_predicted)
             if fix is not None:
                 return fix
         return None
@@ -60,23 +62,20 @@ class Localizer:
     def anywhere(self, features: Features, landmark_ids: NDArray[np.int64]) -> Fix | None:
         """Return the pose found by comparing all descriptors."""
         matches = match_anywhere(self._map.landmarks.descriptors[landmark_ids], features)
-        return self._solve(features, landmark_ids, matches)
+        return self._solve(features, landmark_ids, matches, se3.identity())
 
     def _solve(
-        self, features: Features, landmark_ids: NDArray[np.int64], matches: Matches
+        self, features: Features, landmark_ids: NDArray[np.int64], matches: Matches, T_local_base: Transform
     ) -> Fix | None:
         """Return the pose that the matches agree on, confirmed by the landmarks around it."""
         if len(matches) < self._min_inliers:
             return None
         ids = landmark_ids[matches.landmark_rows]
-        T_coarse = self._solver.search(self._measured(features, ids, matches.feature_rows))
-        if T_coarse is None:
+        coarse = self._solver.search(self._measured(features, ids, matches.feature_rows, T_local_base))
+        if coarse is None or len(coarse.inlier_rows) < self._min_inliers:
             return None
-        first = self._solver.refine(self._measured(features, ids, matches.feature_rows), T_coarse)
-        if first is None or first.inliers.sum() < self._min_inliers:
-            return None
-        local_ids = self._map.around(ids[first.inliers])
-        return self._confirm(features, first.T_local_base, local_ids)
+        local_ids = self._map.around(ids[coarse.inlier_rows])
+        return self._confirm(features, coarse.T_local_base, local_ids)
 
     def _confirm(
         self, features: Features, T_local_base: Transform, landmark_ids: NDArray[np.int64]
@@ -93,7 +92,7 @@ class Localizer:
         if len(matches) < self._min_inliers:
             return None
         ids = prediction.ids[matches.landmark_rows]
-        measured = self._measured(features, ids, matches.feature_rows)
+        measured = self._measured(features, ids, matches.feature_rows, T_local_base)
         estimate = self._solver.refine(measured, T_local_base)
         if estimate is None:
             return None
@@ -104,16 +103,26 @@ class Localizer:
             estimate=estimate,
             landmark_ids=ids[estimate.inliers],
             feature_rows=matches.feature_rows[estimate.inliers],
+            deep_rows=matches.feature_rows[estimate.depth_inliers],
             expected_ids=prediction.ids,
             local_ids=landmark_ids,
         )
 
     def _measured(
-        self, features: Features, ids: NDArray[np.int64], rows: NDArray[np.int64]
+        self,
+        features: Features,
+        ids: NDArray[np.int64],
+        rows: NDArray[np.int64],
+        T_local_base: Transform,
     ) -> Measurements:
+        """Return what to solve for, seen from about T_local_base, with the landmarks' own doubt."""
+        across_px, inverse_depth_per_m = self._map.doubts(T_local_base, ids)
         return Measurements(
             points_local=self._map.landmarks.points_local[ids],
             uv_px=features.uv_px[rows],
-            sigma_px=self._map.sigma_px(features.levels[rows]),
+            sigma_px=np.hypot(self._map.sigma_px(features.levels[rows]), across_px),
             depth_m=features.depth_m[rows],
+            inverse_depth_sigma_per_m=np.hypot(
+                self._map.inverse_depth_sigma_per_m, inverse_depth_per_m
+            ),
         )

@@ -81,19 +81,22 @@ def _pairs_within(
     """
     if not len(uv_px) or not len(feature_uv_px):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    low = np.floor(np.minimum(uv_px.min(axis=0), feature_uv_px.min(axis=0)) / radius_px) - 1
-    cells = np.floor(uv_px / radius_px).astype(np.int64) - low.astype(np.int64)
-    feature_cells = np.floor(feature_uv_px / radius_px).astype(np.int64) - low.astype(np.int64)
-    width = int(max(cells[:, 0].max(), feature_cells[:, 0].max())) + 2
+    lowest = np.minimum(uv_px.min(axis=0), feature_uv_px.min(axis=0)) - radius_px
+    cells = ((uv_px - lowest) / radius_px).astype(np.int64)
+    feature_cells = ((feature_uv_px - lowest) / radius_px).astype(np.int64)
+    width, height = np.maximum(cells.max(axis=0), feature_cells.max(axis=0)) + 2
     flat = feature_cells[:, 1] * width + feature_cells[:, 0]
     order = np.argsort(flat, kind="stable")
+    starts_of_cells = np.zeros(width * height + 1, np.int64)
+    np.cumsum(np.bincount(flat, minlength=width * height), out=starts_of_cells[1:])
     middle = cells[:, 1:] * width + cells[:, :1] + width * np.array([[-1, 0, 1]])  # (M, 3)
-    starts = np.searchsorted(flat[order], middle - 1, side="left").ravel()
-    counts = np.searchsorted(flat[order], middle + 1, side="right").ravel() - starts
+    starts = starts_of_cells[middle - 1].ravel()
+    counts = starts_of_cells[middle + 2].ravel() - starts
     rows = np.repeat(np.arange(len(uv_px)), counts.reshape(-1, 3).sum(axis=1))
     offsets = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     candidates = order[np.repeat(starts, counts) + offsets]
-    near = ((uv_px[rows] - feature_uv_px[candidates]) ** 2).sum(axis=1) <= radius_px**2
+    apart = np.take(uv_px, rows, axis=0) - np.take(feature_uv_px, candidates, axis=0)
+    near = np.einsum("ij,ij->i", apart, apart) <= radius_px**2
     return rows[near], candidates[near]
 
 

@@ -73,9 +73,7 @@ class RgbdSlam:
             keyframe_limit=keyframe_limit,
             landmark_limit=landmark_limit,
         )
-        self._make_solver = partial(
-            PoseSolver, inverse_depth_sigma_per_m=inverse_depth_sigma_per_m, seed=seed
-        )
+        self._make_solver = partial(PoseSolver, seed=seed)
         self._make_localizer = partial(
             Localizer, radius_px=search_radius_px, min_inliers=min_inliers
         )
@@ -177,7 +175,7 @@ class RgbdSlam:
         self._T_local_base = T_predicted
         self._motion.hold(observation, T_predicted)
         unseen = np.full(len(features), NO_LANDMARK)
-        self._insert_keyframe(observation, gray, features, unseen)
+        self._insert_keyframe(observation, gray, features, unseen, unseen[:0])
         self._is_lost = False
         is_first = self._observations == 1
         return Tracking(
@@ -204,7 +202,7 @@ class RgbdSlam:
         if wanted and status is TrackingStatus.TRACKING:
             landmark_ids = np.full(len(features), NO_LANDMARK)
             landmark_ids[fix.feature_rows] = fix.landmark_ids
-            self._insert_keyframe(observation, gray, features, landmark_ids)
+            self._insert_keyframe(observation, gray, features, landmark_ids, fix.deep_rows)
         possible = max(1, min(len(fix.expected_ids), len(features)))
         return Tracking(
             stamp_ns=observation.stamp_ns,
@@ -231,6 +229,7 @@ class RgbdSlam:
         gray: NDArray[np.uint8],
         features: Features,
         landmark_ids: NDArray[np.int64],
+        deep_rows: NDArray[np.int64],
     ) -> None:
         image_bgr, depth_m = observation.image_bgr, observation.depth_m
         if image_bgr is None or depth_m is None:
@@ -246,7 +245,7 @@ class RgbdSlam:
             colors_bgr=colors_bgr,
             scan=self._layers.scan(depth_m, stamp_ns=observation.stamp_ns),
         )
-        self._map.insert(keyframe)
+        self._map.insert(keyframe, deep_rows=deep_rows)
         self._keyframe_rule.restart()
         self._local_ids = self._map.around(keyframe.landmark_ids)
 

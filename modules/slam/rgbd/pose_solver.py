@@ -19,8 +19,9 @@ _CHI2_PIXEL = 5.99  # 95 % of two degrees of freedom
 _CHI2_DEPTH = 3.84  # 95 % of one
 _HUBER = 2.0  # [sigma]
 _MIN_DEPTH_M = 0.05
-_ROUNDS = (6, 4, 2)  # Gauss-Newton steps between two looks at who is an outlier
-_SMALL_STEP = 1e-7
+_ROUNDS = (4, 3, 2)  # Gauss-Newton steps between two looks at who is an outlier
+_SMALL_STEP = 1e-5  # [m] and [rad]
+_MAX_CONDITION = 1e12  # of the normal matrix; beyond, some motion is not measured at all
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -31,6 +32,15 @@ class Measurements:
     uv_px: NDArray[np.float64]  # (N, 2), without distortion
     sigma_px: NDArray[np.float64]  # (N,)
     depth_m: NDArray[np.float64]  # (N,), 0 = missing
+    inverse_depth_sigma_per_m: NDArray[np.float64]  # (N,)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Consensus:
+    """A rough pose and the measurements that agree with it."""
+
+    T_local_base: Transform
+    inlier_rows: NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -46,17 +56,16 @@ class PoseEstimate:
 class PoseSolver:
     """Finds T_local_base; deterministic for a seed."""
 
-    def __init__(self, camera: Camera, *, inverse_depth_sigma_per_m: float, seed: int) -> None:
+    def __init__(self, camera: Camera, *, seed: int) -> None:
         self._camera, self._seed = camera, seed
-        self._sigma_per_m = inverse_depth_sigma_per_m
         self._T_cam_base = se3.inverse(camera.T_base_cam)
 
-    def search(self, measured: Measurements) -> Transform | None:
-        """Return the T_local_base that most pixels agree with (AP3P, RANSAC), None if none."""
+    def search(self, measured: Measurements) -> Consensus | None:
+        """Return the pose that most pixels agree with (AP3P, RANSAC), None where none is found."""
         if len(measured.uv_px) < 4:
             return None
         cv2.setRNGSeed(self._seed)
-        found, rotvec, translation, _ = cv2.solvePnPRansac(
+        found, rotvec, translation, inlier_rows = cv2.solvePnPRansac(
             measured.points_local,
             measured.uv_px,
             self._camera.K,
@@ -69,7 +78,10 @@ class PoseSolver:
         if not found or not (np.isfinite(rotvec).all() and np.isfinite(translation).all()):
             return None
         T_cam_local = se3.from_parts(se3.so3_exp(rotvec.ravel()), translation.ravel())
-        return se3.inverse(T_cam_local) @ self._T_cam_base
+        return Consensus(
+            T_local_base=se3.inverse(T_cam_local) @ self._T_cam_base,
+            inlier_rows=inlier_rows.ravel().astype(np.int64),
+        )
 
     def refine(self, measured: Measurements, T_local_base: Transform) -> PoseEstimate | None:
         """Return the pose that minimises pixel and inverse-depth errors, None if it has none.
@@ -82,24 +94,23 @@ class PoseSolver:
         inliers, depth_inliers = np.ones(len(measures_depth), bool), measures_depth
         for steps in _ROUNDS:
             for _ in range(steps):
-                residuals, jacobians = self._linearise(measured, T_local_base)
-                used = np.stack([inliers, inliers, depth_inliers], axis=1)
-                weights = np.where(used, _huber_weights(residuals), 0.0)
-                normal = np.einsum("nk,nki,nkj->ij", weights, jacobians, jacobians)
-                gradient = np.einsum("nk,nki,nk->i", weights, jacobians, residuals)
-                if not np.isfinite(normal).all() or np.linalg.cond(normal) > 1e12:
+                residuals, jacobian = self._linearise(measured, T_local_base)
+                weights = _huber_weights(residuals) * np.stack([inliers, inliers, depth_inliers])
+                weighted = (jacobian * weights).reshape(6, -1)
+                normal = np.einsum("ia,ja->ij", weighted, jacobian.reshape(6, -1))
+                if not np.isfinite(normal).all() or np.linalg.cond(normal) > _MAX_CONDITION:
                     return None
-                step = -np.linalg.solve(normal, gradient)
+                step = -np.linalg.solve(normal, weighted @ residuals.ravel())
                 T_local_base = T_local_base @ se3.exp(step)
                 if np.abs(step).max() < _SMALL_STEP:
                     break
             residuals, _ = self._linearise(measured, T_local_base)
-            inliers = (residuals[:, :2] ** 2).sum(axis=1) <= _CHI2_PIXEL
-            depth_inliers = inliers & measures_depth & (residuals[:, 2] ** 2 <= _CHI2_DEPTH)
+            inliers = (residuals[:2] ** 2).sum(axis=0) <= _CHI2_PIXEL
+            depth_inliers = inliers & measures_depth & (residuals[2] ** 2 <= _CHI2_DEPTH)
             if inliers.sum() < 4:
                 return None
         # Where the errors are larger than their sigmas say, so is the covariance.
-        pixel_variance = float((residuals[inliers, :2] ** 2).sum() / (2 * inliers.sum() - 6))
+        pixel_variance = float((residuals[:2, inliers] ** 2).sum() / (2 * inliers.sum() - 6))
         covariance = np.linalg.inv(normal) * max(1.0, pixel_variance)
         return PoseEstimate(
             T_local_base=_orthonormal(T_local_base),
@@ -111,43 +122,40 @@ class PoseSolver:
     def _linearise(
         self, measured: Measurements, T_local_base: Transform
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return residuals (N, 3) in sigmas of u, v and 1/z, and their Jacobians (N, 3, 6)."""
+        """Return residuals (3, N) in sigmas of u, v and 1/z, and their Jacobian (6, 3, N)."""
         camera = self._camera
         points_base = se3.apply(se3.inverse(T_local_base), measured.points_local)
         points_cam = se3.apply(self._T_cam_base, points_base)
         inverse_z = 1.0 / np.maximum(points_cam[:, 2], _MIN_DEPTH_M)
         x, y = points_cam[:, 0] * inverse_z, points_cam[:, 1] * inverse_z
         depth = np.where(measured.depth_m > 0, measured.depth_m, np.inf)
-        per_px = 1.0 / measured.sigma_px
-        zero = np.zeros(len(x))
+        per_px, per_m = 1.0 / measured.sigma_px, 1.0 / measured.inverse_depth_sigma_per_m
         residuals = np.stack(
             [
                 (camera.fx * x + camera.cx - measured.uv_px[:, 0]) * per_px,
                 (camera.fy * y + camera.cy - measured.uv_px[:, 1]) * per_px,
-                (inverse_z - 1.0 / depth) / self._sigma_per_m,
-            ],
-            axis=1,
+                (inverse_z - 1.0 / depth) * per_m,
+            ]
         )
-        du, dv = camera.fx * per_px * inverse_z, camera.fy * per_px * inverse_z
-        by_point_cam = np.stack(
-            [
-                np.stack([du, zero, -du * x], axis=1),
-                np.stack([zero, dv, -dv * y], axis=1),
-                np.stack([zero, zero, -(inverse_z**2) / self._sigma_per_m], axis=1),
-            ],
-            axis=1,
-        )
-        by_point_base = by_point_cam @ self._T_cam_base[:3, :3]
-        return residuals, np.concatenate(
-            [-by_point_base, np.cross(by_point_base, points_base[:, None])], axis=2
-        )
+        by_point_cam = np.zeros((3, 3, len(x)))  # residual, component of the point
+        by_point_cam[0, 0] = du = camera.fx * per_px * inverse_z
+        by_point_cam[1, 1] = dv = camera.fy * per_px * inverse_z
+        by_point_cam[0, 2], by_point_cam[1, 2] = -du * x, -dv * y
+        by_point_cam[2, 2] = -(inverse_z**2) * per_m
+        jacobian = np.empty((6, 3, len(x)))
+        jacobian[:3] = -np.einsum("kjn,ji->ikn", by_point_cam, self._T_cam_base[:3, :3])
+        p, move = points_base.T, jacobian[:3]
+        # A turn phi of the base moves the point by points_base x phi.
+        jacobian[3] = p[1] * move[2] - p[2] * move[1]
+        jacobian[4] = p[2] * move[0] - p[0] * move[2]
+        jacobian[5] = p[0] * move[1] - p[1] * move[0]
+        return residuals, jacobian
 
 
 def _huber_weights(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N, 3) weights; u and v share one, by their joint length."""
-    pixel = np.hypot(residuals[:, 0], residuals[:, 1])
-    sizes = np.stack([pixel, pixel, np.abs(residuals[:, 2])], axis=1)
-    return _HUBER / np.maximum(sizes, _HUBER)
+    """Return weights (3, N); u and v share one, by their joint length."""
+    pixel = np.hypot(residuals[0], residuals[1])
+    return _HUBER / np.maximum(np.stack([pixel, pixel, np.abs(residuals[2])]), _HUBER)
 
 
 def _orthonormal(T_a_b: Transform) -> Transform:

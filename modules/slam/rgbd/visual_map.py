@@ -45,12 +45,27 @@ class VisualMap:
     ) -> None:
         self.landmarks, self.keyframes = LandmarkTable(), KeyframeStore()
         self._camera = camera
-        self._sigma_px, self._sigma_per_m = sigma_px, inverse_depth_sigma_per_m
+        self._sigma_px, self.inverse_depth_sigma_per_m = sigma_px, inverse_depth_sigma_per_m
         self._keyframe_limit, self._landmark_limit = keyframe_limit, landmark_limit
 
     def sigma_px(self, levels: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return how exactly features of these pyramid levels are located [px]."""
         return np.asarray(self._sigma_px * SCALE ** levels.astype(np.float64))
+
+    def doubts(self, T_local_base: Transform, ids: NDArray[np.int64]):
+        """Return the landmarks' own sigmas as seen from a pose: across [px] and in 1/z [1/m]."""
+        camera = self._camera
+        T_cam_local = se3.inverse(T_local_base @ camera.T_base_cam)
+        rays = se3.apply(T_cam_local, self.landmarks.points_local[ids])
+        z = np.maximum(rays[:, 2], _NEAREST_M)
+        rays = rays / z[:, None]
+        R = T_cam_local[:3, :3]
+        covariance = np.einsum("ia,nab,jb->nij", R, self.landmarks.covariance[ids], R, optimize=True)
+        xx, yy, zz = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 2, 2]
+        xz, yz = covariance[:, 0, 2], covariance[:, 1, 2]
+        x, y = rays[:, 0], rays[:, 1]
+        v = 0.5 * (xx - 2 * x * xz + x * x * zz + yy - 2 * y * yz + y * y * zz)
+        return camera.fx / z * np.sqrt(np.maximum(v, 0)), np.sqrt(zz) / z**2
 
     def around(self, landmark_ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the local map: the landmarks of the keyframes that saw these ones."""
@@ -86,14 +101,16 @@ class VisualMap:
         self.landmarks.expected[expected_ids] += 1
         self.landmarks.found[found_ids] += 1
 
-    def insert(self, keyframe: Keyframe) -> None:
-        """Add a keyframe: sharpen the landmarks it saw, make new ones of its other features."""
+    def insert(self, keyframe: Keyframe, *, deep_rows: NDArray[np.int64]) -> None:
+        """Add a keyframe: sharpen the landmarks it saw, make new ones of its other features.
+
+        `deep_rows` are the features whose depth agrees with their landmark.
+        """
         features, ids = keyframe.features, keyframe.landmark_ids
         known = np.flatnonzero(ids != NO_LANDMARK)
         fresh = np.flatnonzero((ids == NO_LANDMARK) & (features.depth_m > 0))
-        deep = known[features.depth_m[known] > 0]
-        points_local, information = self._locate(keyframe, deep)
-        self.landmarks.fuse(ids[deep], points_local=points_local, information=information)
+        points_local, information = self._locate(keyframe, deep_rows)
+        self.landmarks.fuse(ids[deep_rows], points_local=points_local, information=information)
         self.landmarks.describe(
             ids[known],
             descriptors=features.descriptors[known],
@@ -119,7 +136,7 @@ class VisualMap:
         points_cam = np.column_stack([rays, np.ones(len(rows))]) * z[:, None]
         T_local_cam = keyframe.T_local_base @ camera.T_base_cam
         across_m = self.sigma_px(features.levels[rows]) * z / camera.fx
-        along_m = self._sigma_per_m * z**2
+        along_m = self.inverse_depth_sigma_per_m * z**2
         weights = np.stack([across_m, across_m, np.maximum(along_m, across_m)], axis=1) ** -2.0
         rotation = T_local_cam[:3, :3]
         information = np.einsum("ik,nk,jk->nij", rotation, weights, rotation)
