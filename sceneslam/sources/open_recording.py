@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,8 @@ from sceneslam.sources.bag_file import open_bag
 from sceneslam.sources.mcap_file import open_mcap
 from sceneslam.sources.recording import Message, Recording
 from sceneslam.types.errors import InputError
+
+_FIRST_LOOK_BACK_NS = 2_000_000_000
 
 
 def open_recording(path: Path) -> Recording:
@@ -56,17 +60,27 @@ class FolderRecording:
         """Yield the messages of `topics` by log time."""
         from rosbags.rosbag2 import Reader
 
-        try:
-            with Reader(self._path) as reader:
-                wanted = [entry for entry in reader.connections if entry.topic in topics]
-                for entry, log_ns, data in reader.messages(wanted) if wanted else ():
-                    yield Message(topic=entry.topic, log_ns=log_ns, data=bytes(data))
-        except Exception as err:  # sqlite3, yaml, zstd and rosbags each have errors of their own
-            raise InputError(f"recording cannot be read on ({err}): {self._path}") from err
+        with self._guarded(), Reader(self._path) as reader:
+            wanted = [entry for entry in reader.connections if entry.topic in topics]
+            for entry, log_ns, data in reader.messages(wanted) if wanted else ():
+                yield Message(topic=entry.topic, log_ns=log_ns, data=bytes(data))
 
     def last(self, topic: str) -> Message | None:
-        """Return None: the storage is read from the beginning only."""
-        return None
+        """Return the topic's last message: looks at ever longer stretches before the end."""
+        from rosbags.rosbag2 import Reader
+
+        with self._guarded(), Reader(self._path) as reader:
+            wanted = [entry for entry in reader.connections if entry.topic == topic]
+            back_ns = _FIRST_LOOK_BACK_NS
+            while True:
+                start_ns = max(reader.start_time, reader.end_time - back_ns)
+                found = deque(reader.messages(wanted, start=start_ns), maxlen=1)
+                if found:
+                    _, log_ns, data = found[0]
+                    return Message(topic=topic, log_ns=log_ns, data=bytes(data))
+                if start_ns == reader.start_time:
+                    return None
+                back_ns *= 8
 
     def decode(self, message: Message) -> Any:
         """Return the decoded message, None when its bytes make no sense."""
@@ -76,21 +90,26 @@ class FolderRecording:
         from rosbags.rosbag2 import Reader
 
         topics: dict[str, TopicType] = {}
-        try:
-            with Reader(self._path) as reader:
-                for entry in reader.connections:
-                    if not entry.msgcount:
-                        continue
-                    known = topics.get(entry.topic)
-                    topics[entry.topic] = TopicType(
-                        msgtype=entry.msgtype,
-                        encoding="cdr",
-                        definition=entry.msgdef.data,
-                        definition_format="ros2idl"
-                        if entry.msgdef.format.name == "IDL"
-                        else "ros2msg",
-                        count=entry.msgcount + (known.count if known else 0),
-                    )
-        except Exception as err:  # as above
-            raise InputError(f"recording cannot be opened ({err}): {self._path}") from err
+        with self._guarded(), Reader(self._path) as reader:
+            for entry in reader.connections:
+                if not entry.msgcount:
+                    continue
+                known = topics.get(entry.topic)
+                is_idl = entry.msgdef.format.name == "IDL"
+                topics[entry.topic] = TopicType(
+                    msgtype=entry.msgtype,
+                    encoding="cdr",
+                    definition=entry.msgdef.data,
+                    definition_format="ros2idl" if is_idl else "ros2msg",
+                    count=entry.msgcount + (known.count if known else 0),
+                )
         return topics
+
+    @contextmanager
+    def _guarded(self) -> Iterator[None]:
+        """Raise InputError for whatever the storage runs into."""
+        try:
+            yield
+        except Exception as err:  # sqlite3, yaml, zstd and rosbags each have errors of their own
+            reason = " ".join(str(err).split()) or type(err).__name__
+            raise InputError(f"recording cannot be read ({reason}): {self._path}") from err
