@@ -1,0 +1,62 @@
+"""Many small images on one large one, so that one look-up serves all panels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Pixels = NDArray[np.uint8] | NDArray[np.float32]
+
+_BORDER = 1  # repeats a block's edge, so that interpolation never sees a neighbour
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sheet:
+    """Where each block lies on the sheet, its border left out."""
+
+    shape: tuple[int, int]  # rows, columns
+    left_top: NDArray[np.int64]  # (N, 2)
+    size_wh: NDArray[np.int64]  # (N, 2)
+
+    def window(self, index: int) -> tuple[slice, slice]:
+        """Return the (rows, columns) of a block."""
+        (left, top), (wide, high) = self.left_top[index], self.size_wh[index]
+        return slice(top, top + high), slice(left, left + wide)
+
+    def paste(self, canvas: Pixels, index: int, block: Pixels) -> None:
+        """Put a block and its border onto a canvas of the sheet's shape."""
+        rows, columns = self.window(index)
+        area = canvas[
+            rows.start - _BORDER : rows.stop + _BORDER,
+            columns.start - _BORDER : columns.stop + _BORDER,
+        ]
+        area[:] = cv2.copyMakeBorder(block, *(_BORDER,) * 4, cv2.BORDER_REPLICATE)
+
+    def lookup(self) -> NDArray[np.float32]:
+        """Return (2 N, 4): x = a + b u, y = c + d v of a block's two triangles.
+
+        Coordinates are OpenCV's (pixel centres at whole numbers) for barycentric (u, v); the
+        second triangle is the first turned by half a circle.
+        """
+        start, size = self.left_top - 0.5, self.size_wh
+        upper = np.stack([start[:, 0], size[:, 0], start[:, 1], size[:, 1]], axis=1)
+        ends = start + size
+        lower = np.stack([ends[:, 0], -size[:, 0], ends[:, 1], -size[:, 1]], axis=1)
+        return np.stack([upper, lower], axis=1).reshape(-1, 4).astype(np.float32)
+
+
+def pack(size_wh: NDArray[np.int64], columns: int) -> Sheet:
+    """Return places for blocks (N, 2) on a sheet `columns` wide: in rows, highest first."""
+    left_top = np.zeros_like(size_wh)
+    left, top, row_height = 0, 0, 0
+    columns = max(columns, int(size_wh[:, 0].max()) + 2 * _BORDER)
+    for index in np.argsort(-size_wh[:, 1], kind="stable"):
+        wide, high = size_wh[index] + 2 * _BORDER
+        if left + wide > columns:
+            left, top, row_height = 0, top + row_height, 0
+        left_top[index] = left + _BORDER, top + _BORDER
+        left, row_height = left + wide, max(row_height, high)
+    return Sheet(shape=(int(top + row_height), columns), left_top=left_top, size_wh=size_wh)
