@@ -108,9 +108,10 @@ class SlamModule(Protocol):
         ...
 
     def track(self, observation: Observation) -> Tracking:
-        """Return T_local_base at the observation, which holds one of the `requires` sets.
+        """Return T_local_base at the observation.
 
-        LOST: the pose is the last one that was held. Never returns NaN.
+        It holds at least one of the sensors in `requires`; another may have been silent. LOST
+        where no pose can be told: the pose is then the last one that was held. Never returns NaN.
         """
         ...
 

@@ -122,6 +122,16 @@ def test_blind_from_the_first_observation_is_survived(make):
     module.get_map()
 
 
+@pytest.mark.parametrize("field", ["image_bgr", "depth_m", "scan", "points_lidar", "T_odom_base"])
+def test_a_silent_sensor_is_survived(make, field):
+    module = active(make)
+    for index in range(6):
+        observation = room_observation(index)
+        silent = replace(observation, **{field: None}) if index in (2, 3) else observation
+        tracking = module.track(silent)
+        assert np.isfinite(tracking.T_local_base).all()
+
+
 def test_map_is_finite_and_in_local(make):
     module = active(make)
     drive(module)

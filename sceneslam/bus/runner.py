@@ -10,7 +10,7 @@ from sceneslam.interfaces import SlamModule
 from sceneslam.types.errors import ModuleError, SceneSlamError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking
-from sceneslam.types.rig import Rig
+from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
 
 _log = logging.getLogger(__name__)
@@ -26,6 +26,7 @@ class Runner:
         self.track_ms: list[float] = []
         self.spent_ns = 0  # in all calls together
         self._module = module
+        self._sensors = frozenset[Sensor]().union(*module.requires)
 
     def activate(self, rig: Rig, scene: str) -> None:
         """Start the module anew; raises ModuleError when it cannot."""
@@ -55,10 +56,8 @@ class Runner:
             raise self._failed("could not take the scene", error) from error
 
     def can_use(self, observation: Observation) -> bool:
-        """Tell whether the observation holds one of the sensor sets that suffice."""
-        return any(
-            all(observation.has(sensor) for sensor in sensors) for sensors in self._module.requires
-        )
+        """Tell whether the observation holds any sensor that the module asks for."""
+        return any(observation.has(sensor) for sensor in self._sensors)
 
     def track(self, observation: Observation) -> Tracking:
         """Return the module's answer; raises ModuleError on an exception or a pose of NaN."""
