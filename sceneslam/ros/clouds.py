@@ -34,9 +34,11 @@ def cloud(message: Any, stamp_ns: int) -> Cloud | None:
     rows = _rows(message, fields)
     if rows is None:
         return None
+    if not {"x", "y", "z"} <= set(rows.dtype.names or ()):
+        return None
     points = np.stack([rows[axis] for axis in "xyz"], axis=-1).astype(np.float32)
     is_good = np.isfinite(points).all(axis=1)
-    name = next((name for name in _TIME_NAMES if name in fields), None)
+    name = next((name for name in _TIME_NAMES if name in (rows.dtype.names or ())), None)
     times_s = None if name is None else _offsets_s(rows[name], stamp_ns)[is_good]
     return Cloud(points_lidar=points[is_good], point_times_s=times_s)
 
@@ -45,6 +47,9 @@ def _rows(message: Any, fields: dict[str, Any]) -> NDArray[Any] | None:
     """Return the points as a structured array (N,), None when there are too few bytes."""
     order = ">" if message.is_bigendian else "<"
     kept = [field for field in fields.values() if field.datatype in _DTYPES]
+    ends = [field.offset + np.dtype(_DTYPES[field.datatype]).itemsize for field in kept]
+    if not kept or max(ends) > message.point_step:
+        return None
     dtype = np.dtype(
         {
             "names": [field.name for field in kept],

@@ -107,6 +107,8 @@ def depth_m(message: Any, units: pixels.DepthUnits) -> NDArray[np.float32] | Non
             return None
         return units.of_metres(raw) if raw.dtype == np.float32 else units.of_integers(raw)
     data = message.data.tobytes()
+    if "compressedDepth" in encoding and len(data) <= _COMPRESSED_DEPTH_HEADER:
+        return None
     if "compressedDepth" not in encoding:
         return _integers(pixels.decode(data, cv2.IMREAD_UNCHANGED), units)
     if "rvl" in encoding.lower():

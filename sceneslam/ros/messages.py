@@ -55,9 +55,9 @@ def _typestore(kind: TopicType) -> Any:
         get_typestore,
     )
 
+    standard = get_typestore(Stores.ROS1_NOETIC if kind.encoding == "ros1" else Stores.LATEST)
     if not kind.definition:
-        store = get_typestore(Stores.ROS1_NOETIC if kind.encoding == "ros1" else Stores.LATEST)
-        return store if kind.msgtype in store.types else None
+        return standard if kind.msgtype in standard.types else None
     store = get_typestore(Stores.EMPTY)
     try:
         if kind.definition_format == "ros2idl":
@@ -68,4 +68,14 @@ def _typestore(kind: TopicType) -> Any:
             store.register(get_types_from_msg(text, kind.msgtype))
     except (TypesysError, ValueError, KeyError):
         return None
-    return store if kind.msgtype in store.types else None
+    is_known = kind.msgtype in store.types
+    return store if is_known and _has_standard_fields(store, standard) else None
+
+
+def _has_standard_fields(store: Any, standard: Any) -> bool:
+    """Tell whether no standard type lacks a field: a definition may be damaged like the rest."""
+    for name, (_, fields) in store.fielddefs.items():
+        expected = standard.fielddefs.get(name, ((), ()))[1]
+        if not {field for field, _ in expected} <= {field for field, _ in fields}:
+            return False
+    return True

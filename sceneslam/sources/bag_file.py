@@ -63,20 +63,21 @@ class BagFile:
         )
 
     def read(self, chunk: Chunk) -> ChunkContent:
-        """Return a chunk's messages up to the first that is damaged."""
+        """Return a chunk's messages that are whole."""
         data = self._survey.content(self._survey.chunks[chunk.offset])
         if data is None:
             return ChunkContent(messages=(), lost_bytes=chunk.length)
-        messages, position = [], 0
+        messages, lost, position = [], 0, 0
         for record in records.records_in(data):
+            lost += record.start - position
             position = record.end
-            if record.opcode != records.MESSAGE or len(record.fields.get(b"time", b"")) != 8:
+            if record.opcode != records.MESSAGE:
                 continue
             topic = self._names.get(record.number(b"conn"))
             if topic is not None:
                 payload = data[record.data_at : record.end]
                 messages.append(Message(topic=topic, log_ns=record.time_ns(b"time"), data=payload))
-        return ChunkContent(messages=messages, lost_bytes=len(data) - position)
+        return ChunkContent(messages=messages, lost_bytes=lost + len(data) - position)
 
     def _topics(self) -> dict[str, TopicType]:
         """Return the topics that hold messages; remember which connection is which."""

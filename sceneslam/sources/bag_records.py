@@ -11,6 +11,12 @@ from mmap import mmap
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, CHUNK, CHUNK_INFO, CONNECTION = 2, 5, 6, 7
 _U32, _TIME = struct.Struct("<I"), struct.Struct("<II")
+_FIELDS = {  # what each record must say, and in how many bytes (0: any number)
+    MESSAGE: {b"conn": 4, b"time": 8},
+    CHUNK: {b"compression": 0},
+    CHUNK_INFO: {b"chunk_pos": 8, b"start_time": 8, b"end_time": 8},
+    CONNECTION: {b"conn": 4, b"topic": 0},
+}
 _LONGEST_HEADER = 1 << 16  # [bytes]; a longer one is damage
 
 Blob = bytes | mmap
@@ -22,6 +28,7 @@ class Record:
 
     opcode: int
     fields: dict[bytes, bytes]
+    start: int  # [bytes]
     data_at: int  # [bytes]
     data_length: int  # [bytes]
 
@@ -66,31 +73,58 @@ def record_at(data: Blob, position: int) -> Record | None:
     if length > _LONGEST_HEADER or end + _U32.size > len(data):
         return None
     fields = header_fields(data[start:end])
-    if fields is None or len(fields.get(b"op", b"")) != 1:
+    if fields is None or not _is_complete(fields):
         return None
     (size,) = _U32.unpack_from(data, end)
-    return Record(opcode=fields[b"op"][0], fields=fields, data_at=end + _U32.size, data_length=size)
+    return Record(
+        opcode=fields[b"op"][0],
+        fields=fields,
+        start=position,
+        data_at=end + _U32.size,
+        data_length=size,
+    )
 
 
-def records_in(data: Blob, start: int = 0) -> Iterator[Record]:
-    """Yield records until the end or the first that is damaged or cut off."""
-    position = start
-    while (record := record_at(data, position)) is not None and record.end <= len(data):
-        yield record
-        position = record.end
+def records_in(data: bytes) -> Iterator[Record]:
+    """Yield a chunk's records, going on at the next message after damage."""
+    position: int | None = 0
+    while position is not None and position < len(data):
+        record = record_at(data, position)
+        if record is None or record.end > len(data):
+            position = find_message(data, position + 1)
+        else:
+            yield record
+            position = record.end
 
 
 def find_chunk(data: Blob, start: int) -> int | None:
     """Return the next place at or after `start` where a chunk record begins, None if none does."""
-    found = data.find(b"compression=", start)
+    return _find(data, start, b"compression=", CHUNK)
+
+
+def find_message(data: bytes, start: int) -> int | None:
+    """Return the next place at or after `start` where a message begins, None if none does."""
+    return _find(data, start, b"op=\x02", MESSAGE)
+
+
+def _find(data: Blob, start: int, mark: bytes, opcode: int) -> int | None:
+    found = data.find(mark, start)
     while found >= 0:
         # The fields stand in any order: the record begins up to 64 bytes before this one.
         for position in range(max(start, found - 64), found - 7):
             record = record_at(data, position)
-            if record is not None and record.opcode == CHUNK:
+            if record is not None and record.opcode == opcode:
                 return position
-        found = data.find(b"compression=", found + 1)
+        found = data.find(mark, found + 1)
     return None
+
+
+def _is_complete(fields: dict[bytes, bytes]) -> bool:
+    """Tell whether a record says what its kind has to say."""
+    if len(fields.get(b"op", b"")) != 1:
+        return False
+    needed = _FIELDS.get(fields[b"op"][0], {})
+    return all(name in fields and size in (0, len(fields[name])) for name, size in needed.items())
 
 
 def unpack(compression: bytes, data: bytes) -> bytes | None:

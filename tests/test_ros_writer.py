@@ -1,0 +1,202 @@
+"""What is recorded is read back: observations, rig and truth."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ros_recordings import STAMP_NS, make_source
+
+from sceneslam.ros.writer import ObservationWriter
+from sceneslam.sinks.mcap import McapSink
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.observation import LaserScan, Observation
+from sceneslam.types.rig import Camera, Laser, Lidar, Rig, Sensor, optical_to_rep103
+from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import GroundTruth, SceneChange
+
+STEP_NS = 33_333_333
+T_BASE_CAM = se3.from_parts(optical_to_rep103()[:3, :3], np.array([0.1, 0.0, 0.3]))
+RIG = Rig(
+    sensors=frozenset(Sensor),
+    camera=Camera(
+        size_wh=(64, 48),
+        fx=50.5,
+        fy=51.0,
+        cx=31.0,
+        cy=23.0,
+        distortion=(0.1, -0.2, 0.001, 0.002, 0.05),
+        depth_range_m=(0.4, 4.5),
+        T_base_cam=T_BASE_CAM,
+    ),
+    laser=Laser(T_base_laser=se3.from_xy_yaw(0.2, 0.0, 0.5)),
+    lidar=Lidar(range_m=(0.5, 20.0), T_base_lidar=se3.from_xy_yaw(0.0, 0.1, -1.0)),
+)
+
+
+def observations(count: int) -> list[Observation]:
+    rng = np.random.default_rng(7)
+    made = []
+    for index in range(count):
+        stamp_ns = STAMP_NS + index * STEP_NS
+        depth_mm = rng.integers(400, 4500, (48, 64))
+        depth_mm[rng.random((48, 64)) < 0.2] = 0
+        ranges_m = rng.uniform(0.2, 9.0, 90).astype(np.float32)
+        ranges_m[:3] = np.inf, np.nan, 5.0
+        scan = LaserScan(
+            stamp_ns=stamp_ns - 1_000_000,
+            ranges_m=ranges_m,
+            angle_min_rad=-1.5,
+            angle_step_rad=0.03125,
+            range_min_m=0.125,
+            range_max_m=10.0,
+        )
+        gyro = np.column_stack([[-0.02, -0.01, 0.0], rng.normal(size=(3, 3))])
+        made.append(
+            Observation(
+                stamp_ns=stamp_ns,
+                image_bgr=rng.integers(0, 256, (48, 64, 3), dtype=np.uint8),
+                depth_m=(depth_mm / 1000).astype(np.float32),
+                scan=scan,
+                points_lidar=rng.normal(size=(40, 3)).astype(np.float32),
+                point_times_s=np.linspace(0, 0.1, 40),
+                T_odom_base=se3.exp(rng.normal(size=6) * 0.3),
+                gyro_base=gyro,
+            )
+        )
+    return made
+
+
+def truth(seen: list[Observation]) -> GroundTruth:
+    rng = np.random.default_rng(8)
+    stamps_ns = np.array([observation.stamp_ns for observation in seen])
+    poses = np.stack([se3.exp(rng.normal(size=6)) for _ in seen])
+    return GroundTruth(
+        trajectory=Trajectory(stamps_ns=stamps_ns, T_world_base=poses),
+        scenes=(
+            SceneChange(stamp_ns=seen[0].stamp_ns, scene="Bright"),
+            SceneChange(stamp_ns=seen[2].stamp_ns, scene="Dark"),
+        ),
+    )
+
+
+def record(path: Path, image_format: str = "png", count: int = 5) -> list[Observation]:
+    made = observations(count)
+    writer = ObservationWriter(path, rig=RIG, image_format=image_format)
+    for observation in made:
+        writer.write(observation)
+    writer.write_truth(truth(made))
+    writer.attach("config.yaml", "a: 1")
+    writer.close()
+    writer.close()
+    return made
+
+
+def test_what_is_recorded_is_read_back(tmp_path: Path) -> None:
+    made = record(tmp_path / "run.mcap")
+    source = make_source("mcap", tmp_path / "run.mcap")
+    read = list(source)
+    assert source.length == len(read) == len(made)
+    assert source.faults == []
+    for before, after in zip(made, read, strict=True):
+        assert after.stamp_ns == before.stamp_ns
+        np.testing.assert_array_equal(after.image_bgr, before.image_bgr)
+        np.testing.assert_array_equal(after.depth_m, before.depth_m)
+        np.testing.assert_array_equal(after.points_lidar, before.points_lidar)
+        np.testing.assert_array_equal(after.point_times_s, before.point_times_s)
+        np.testing.assert_allclose(after.T_odom_base, before.T_odom_base, atol=1e-14)
+        np.testing.assert_allclose(after.gyro_base, before.gyro_base, atol=1e-9)
+        assert after.scan.stamp_ns == before.scan.stamp_ns
+        np.testing.assert_array_equal(after.scan.ranges_m, before.scan.ranges_m)
+        assert after.scan.angle_min_rad == before.scan.angle_min_rad
+        assert after.scan.angle_step_rad == before.scan.angle_step_rad
+        assert after.scan.range_max_m == before.scan.range_max_m
+
+
+def test_rig_and_truth_are_read_back(tmp_path: Path) -> None:
+    expected = truth(record(tmp_path / "run.mcap"))
+    source = make_source("mcap", tmp_path / "run.mcap")
+    rig = source.rig
+    assert rig.sensors == RIG.sensors
+    assert rig.camera.size_wh == RIG.camera.size_wh
+    assert rig.camera.distortion == RIG.camera.distortion
+    assert rig.camera.depth_range_m == RIG.camera.depth_range_m
+    assert rig.lidar.range_m == RIG.lidar.range_m
+    np.testing.assert_array_equal(rig.camera.K, RIG.camera.K)
+    np.testing.assert_allclose(rig.camera.T_base_cam, T_BASE_CAM, atol=1e-15)
+    np.testing.assert_allclose(rig.laser.T_base_laser, RIG.laser.T_base_laser, atol=1e-15)
+    np.testing.assert_allclose(rig.lidar.T_base_lidar, RIG.lidar.T_base_lidar, atol=1e-15)
+    found = source.ground_truth()
+    np.testing.assert_array_equal(found.trajectory.stamps_ns, expected.trajectory.stamps_ns)
+    np.testing.assert_allclose(
+        found.trajectory.T_world_base, expected.trajectory.T_world_base, atol=1e-14
+    )
+    assert found.scenes == expected.scenes
+
+
+def test_every_whole_millimetre_of_depth_survives(tmp_path: Path) -> None:
+    rig = Rig(
+        sensors=frozenset({Sensor.DEPTH}),
+        camera=Camera(size_wh=(256, 256), fx=1, fy=1, cx=0, cy=0, depth_range_m=(0.001, 70.0)),
+    )
+    depth_m = (np.arange(65536).reshape(256, 256) / 1000).astype(np.float32)
+    writer = ObservationWriter(tmp_path / "d.mcap", rig=rig, image_format="png")
+    writer.write(Observation(stamp_ns=STAMP_NS, depth_m=depth_m))
+    writer.close()
+    (read,) = make_source("mcap", tmp_path / "d.mcap")
+    np.testing.assert_array_equal(read.depth_m, depth_m)
+
+
+def test_depth_that_is_no_number_is_recorded_as_missing(tmp_path: Path) -> None:
+    rig = Rig(
+        sensors=frozenset({Sensor.DEPTH}), camera=Camera(size_wh=(4, 1), fx=1, fy=1, cx=0, cy=0)
+    )
+    depth_m = np.array([[np.nan, np.inf, -1.0, 2.0]], np.float32)
+    writer = ObservationWriter(tmp_path / "d.mcap", rig=rig, image_format="png")
+    writer.write(Observation(stamp_ns=STAMP_NS, depth_m=depth_m))
+    writer.close()
+    (read,) = make_source("mcap", tmp_path / "d.mcap")
+    np.testing.assert_array_equal(read.depth_m, np.array([[0, 0, 0, 2]], np.float32))
+
+
+def test_two_recordings_of_the_same_are_the_same_bytes(tmp_path: Path) -> None:
+    record(tmp_path / "a.mcap", "jpeg")
+    record(tmp_path / "b.mcap", "jpeg")
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def test_reading_twice_starts_anew(tmp_path: Path) -> None:
+    record(tmp_path / "run.mcap")
+    source = make_source("mcap", tmp_path / "run.mcap")
+    assert [one.stamp_ns for one in source] == [one.stamp_ns for one in source]
+
+
+def test_an_unknown_image_format_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="image_format"):
+        ObservationWriter(tmp_path / "x.mcap", rig=RIG, image_format="gif")
+
+
+def test_the_sinks_poses_are_results_and_no_input(tmp_path: Path) -> None:
+    sink = McapSink(str(tmp_path / "run.mcap"), "jpeg")
+    sink.open(RIG)
+    made = observations(3)
+    for observation in made:
+        sink.write(observation, se3.from_xy_yaw(9.0, 9.0, 1.0), "visual")
+    sink.write_truth(truth(made))
+    sink.close()
+    sink.close()
+    source = make_source("mcap", tmp_path / "run.mcap")
+    read = list(source)
+    np.testing.assert_allclose(read[1].T_odom_base, made[1].T_odom_base, atol=1e-14)
+    assert len(source.ground_truth().trajectory) == 3
+
+
+def test_recordings_open_with_the_reference_reader(tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    record(tmp_path / "run.mcap")
+    with (tmp_path / "run.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        topics = {channel.topic for _, channel, _ in reader.iter_messages()}
+        assert {"/scan", "/points", "/odom", "/imu", "/tf_static"} <= topics
+        assert [one.name for one in reader.iter_attachments()] == ["config.yaml"]

@@ -1,0 +1,130 @@
+"""Damaged recordings: what is whole is read, the rest is said in a sentence."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ros_recordings import STAMP_NS, make_source
+
+from sceneslam.ros.writer import ObservationWriter
+from sceneslam.sources.rosbag import RosBag
+from sceneslam.types.errors import InputError
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Camera, Rig, Sensor
+
+COUNT = 60
+
+
+def record(path: Path) -> None:
+    """Write frames of noise: about 45 kB each, several to a chunk."""
+    rng = np.random.default_rng(1)
+    camera = Camera(size_wh=(160, 90), fx=100, fy=100, cx=80, cy=45)
+    rig = Rig(sensors=frozenset({Sensor.IMAGE}), camera=camera)
+    writer = ObservationWriter(path, rig=rig, image_format="png")
+    for index in range(COUNT):
+        image = rng.integers(0, 256, (90, 160, 3), dtype=np.uint8)
+        writer.write(Observation(stamp_ns=STAMP_NS + index * 10**8, image_bgr=image))
+    writer.close()
+
+
+def read(path: Path) -> tuple[RosBag, list[Observation]]:
+    source = make_source("mcap", path)
+    return source, list(source)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7, 0.97])
+def test_a_cut_off_mcap_gives_what_is_whole(tmp_path: Path, share: float) -> None:
+    record(tmp_path / "whole.mcap")
+    data = (tmp_path / "whole.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: int(len(data) * share)])
+    source, found = read(tmp_path / "cut.mcap")
+    assert COUNT * share - 8 <= len(found) <= COUNT * share
+    (fault,) = source.faults
+    assert "cut off" in fault
+    assert "% of the file" in fault
+    assert str(tmp_path / "cut.mcap") in fault
+
+
+def test_a_missing_index_alone_loses_nothing(tmp_path: Path) -> None:
+    record(tmp_path / "whole.mcap")
+    data = (tmp_path / "whole.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[:-9])
+    assert len(read(tmp_path / "cut.mcap")[1]) == COUNT
+
+
+def test_a_flipped_bit_costs_its_chunk_and_is_told(tmp_path: Path) -> None:
+    record(tmp_path / "flipped.mcap")
+    data = bytearray((tmp_path / "flipped.mcap").read_bytes())
+    data[len(data) // 2] ^= 4
+    (tmp_path / "flipped.mcap").write_bytes(data)
+    source, found = read(tmp_path / "flipped.mcap")
+    assert COUNT - 8 <= len(found) < COUNT
+    (fault,) = source.faults
+    assert "damaged" in fault
+
+
+def test_no_place_for_a_flipped_bit_makes_wrong_pixels_or_a_crash(tmp_path: Path) -> None:
+    record(tmp_path / "whole.mcap")
+    path = tmp_path / "flipped.mcap"
+    data = (tmp_path / "whole.mcap").read_bytes()
+    good = {one.stamp_ns: one.image_bgr.tobytes() for one in read(tmp_path / "whole.mcap")[1]}
+    for place in np.random.default_rng(5).integers(8, len(data), 25).tolist():
+        flipped = bytearray(data)
+        flipped[place] ^= 1 << (place % 8)
+        path.write_bytes(flipped)
+        for observation in read(path)[1]:
+            assert observation.image_bgr.tobytes() == good[observation.stamp_ns]
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "says"),
+    [
+        ("empty.mcap", b"", "empty"),
+        ("empty.bag", b"", "empty"),
+        ("text.mcap", b"this is no recording at all", "expected a ROS 1 bag"),
+        ("only_magic.mcap", b"\x89MCAP0\r\n", "no readable messages"),
+        ("only_magic.bag", b"#ROSBAG V2.0\n", "no readable messages"),
+        ("one.db3", b"SQLite format 3\0" + b"x" * 50, "rosbag2 folder"),
+    ],
+)
+def test_what_is_no_recording_is_one_sentence(
+    tmp_path: Path, name: str, data: bytes, says: str
+) -> None:
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError, match=says) as caught:
+        make_source("rosbag", tmp_path / name)
+    assert str(caught.value).endswith(str(tmp_path / name))
+
+
+def test_a_missing_path_and_an_empty_folder_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"not found: .*nowhere\.mcap"):
+        make_source("mcap", tmp_path / "nowhere.mcap")
+    with pytest.raises(InputError, match="neither metadata"):
+        make_source("rosbag", tmp_path)
+
+
+def test_a_bag_with_a_damaged_index_is_read_without_it(shared_data: Path) -> None:
+    source = make_source("rosbag", shared_data / "bags" / "broken_index.bag")
+    assert len(list(source)) == source.length == 360
+    (fault,) = source.faults
+    assert "index is damaged" in fault
+
+
+@pytest.mark.parametrize("share", [0.4, 0.8, 0.995])
+def test_a_cut_off_bag_gives_what_is_whole(shared_data: Path, tmp_path: Path, share: float) -> None:
+    data = (shared_data / "bags" / "hokuyo_scan.bag").read_bytes()
+    (tmp_path / "cut.bag").write_bytes(data[: int(len(data) * share)])
+    source = make_source("rosbag", tmp_path / "cut.bag")
+    found = list(source)
+    assert 360 * share - 20 <= len(found) <= 360
+    assert any("index is damaged or cut off" in fault for fault in source.faults)
+
+
+def test_a_damaged_sqlite_bag_is_one_sentence(shared_data: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    for file in (shared_data / "bags" / "hokuyo_scan_db3").iterdir():
+        data = file.read_bytes()
+        (folder / file.name).write_bytes(data[: len(data) // 3] if file.suffix == ".db3" else data)
+    with pytest.raises(InputError, match="cannot be read"):
+        list(make_source("rosbag", folder))
