@@ -7,7 +7,7 @@ import signal
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -71,7 +71,7 @@ class _Loop:
         self._log = EventLog(folder / "events.jsonl")
         self._events_written = 0
         self._observed_ns: list[int] = []
-        self._wall_s = 0.0
+        self._began_s, self._wall_s = perf_counter(), 0.0
         self._sinks = list(parts.sinks.values())
         for sink in self._sinks:
             sink.open(parts.rig, folder)
@@ -88,7 +88,6 @@ class _Loop:
     def run(self) -> tuple[str, ...]:
         """Run to the end; return what was wrong."""
         faults: list[str] = []
-        began_s = perf_counter()
         try:
             self._feed()
         except KeyboardInterrupt:
@@ -96,7 +95,7 @@ class _Loop:
         except InputError as error:
             faults.append(str(error))
         finally:
-            self._wall_s = perf_counter() - began_s
+            self._wall_s = perf_counter() - self._began_s
             is_over = self._bus.state == "terminate"
             self._bus.close(self._last_ns())
             self._close_sinks()
@@ -144,20 +143,29 @@ class _Loop:
             sink.close()
 
     def _feed(self) -> None:
-        limit, length = self._parts.run.max_observations, self._parts.source.length
-        total = min(limit, length) if limit and length else limit or length
-        is_shown = self._parts.run.progress
-        with tqdm(
-            total=total, desc=self._title, unit="obs", mininterval=_BAR_S, disable=not is_shown
-        ) as self._bar:
-            observations = islice(self._parts.source, limit)
+        observations = islice(self._parts.source, self._parts.run.max_observations)
+        first = next(observations, None)  # a simulator renders, a bag is indexed: not our time
+        if first is None:
+            return
+        self._began_s = perf_counter()
+        with self._progress() as self._bar:
             if self._parts.run.mode == "live":
-                dropped = run_live(observations, self._step)
+                dropped = run_live(chain([first], observations), self._step)
                 self._log.add("dropped", self._last_ns(), count=dropped)
                 return
-            for observation in observations:
+            for observation in chain([first], observations):
                 if not self._step(observation):
                     return
+
+    def _progress(self) -> Any:
+        limits = [self._parts.run.max_observations, self._parts.source.length]
+        return tqdm(
+            total=min([limit for limit in limits if limit is not None], default=None),
+            desc=self._title,
+            unit="obs",
+            mininterval=_BAR_S,
+            disable=not self._parts.run.progress,
+        )
 
     def _step(self, observation: Observation) -> bool:
         """Feed one observation; return whether the run goes on."""
