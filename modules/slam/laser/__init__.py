@@ -1,0 +1,1 @@
+"""2D laser SLAM: scan matching with odometry as prior."""

@@ -1,0 +1,83 @@
+"""What a scan is matched with: mean surface points in cells, and the nearest of them anywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .surface import SurfacePoints
+
+_REACH_M = 0.3  # the likelihood falls to 0 at this distance from a surface
+_MARGIN_CELLS = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Nearest:
+    """The surface nearest to each of N points."""
+
+    points: NDArray[np.float64]  # (N, 2) [m], local
+    shape: NDArray[np.float64]  # (N, 3)
+
+
+class LikelihoodField:
+    """Surfaces around the robot, in `local`, with look-ups that cost the same anywhere."""
+
+    def __init__(self, surfaces: SurfacePoints, resolution_m: float) -> None:
+        """Build the field of a local map of at least one point."""
+        self.resolution_m = resolution_m
+        cells = np.floor(surfaces.points / resolution_m).astype(np.int64)
+        self._origin = cells.min(axis=0) - _MARGIN_CELLS
+        columns, rows = (cells.max(axis=0) - self._origin + 1 + _MARGIN_CELLS).tolist()
+        self._limit = np.array([columns - 1, rows - 1])
+        flat = (cells[:, 1] - self._origin[1]) * columns + cells[:, 0] - self._origin[0]
+        occupied, index = np.unique(flat, return_inverse=True)
+        self._average(surfaces, index, len(occupied))
+        image = np.full((rows, columns), 255, dtype=np.uint8)
+        image.reshape(-1)[occupied] = 0
+        distance_px, labels = cv2.distanceTransformWithLabels(
+            image, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        self._labels = labels
+        self._surface_of_label = np.zeros(len(occupied) + 1, dtype=np.int64)
+        self._surface_of_label[labels.reshape(-1)[occupied]] = np.arange(len(occupied))
+        self._likelihood = np.maximum(
+            np.float32(1.0) - distance_px * np.float32(resolution_m / _REACH_M), np.float32(0.0)
+        )
+
+    def nearest(self, points_local: NDArray[np.float64]) -> Nearest:
+        """Return the nearest surfaces of points (N, 2) [m]."""
+        column, row = self._cells(points_local)
+        surface = self._surface_of_label[self._labels[row, column]]
+        return Nearest(points=self._points[surface], shape=self._shape[surface])
+
+    def likelihood(
+        self, points_local: NDArray[np.float64], offsets_m: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Return how well points (A, N, 2) fit (A, K) when moved by each offset (K, 2): 0 to 1."""
+        columns = int(self._limit[0]) + 1
+        start = np.floor(points_local / self.resolution_m).astype(np.int64) - self._origin
+        shift = np.round(offsets_m / self.resolution_m).astype(np.int64)
+        column = np.clip(start[:, None, :, 0] + shift[None, :, None, 0], 0, self._limit[0])
+        row = np.clip(start[:, None, :, 1] + shift[None, :, None, 1], 0, self._limit[1])
+        found = np.take(self._likelihood.reshape(-1), row * columns + column)
+        return np.asarray(found.mean(axis=-1))
+
+    def _average(self, surfaces: SurfacePoints, index: NDArray[np.int64], count: int) -> None:
+        weight = surfaces.weight
+        total = np.bincount(index, weights=weight, minlength=count)
+
+        def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.asarray(np.bincount(index, weights=weight * values, minlength=count) / total)
+
+        self._points = np.column_stack([mean(values) for values in surfaces.points.T])
+        self._shape = np.column_stack([mean(values) for values in surfaces.shape.T])
+
+    def _cells(
+        self, points_local: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        cells = np.floor(points_local / self.resolution_m).astype(np.int64) - self._origin
+        cells = np.clip(cells, 0, self._limit)
+        return cells[:, 0], cells[:, 1]

@@ -1,0 +1,194 @@
+"""The front end: predict, match, correct, and extend the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sceneslam.types import se3
+from sceneslam.types.observation import LaserScan, Observation, TrackingStatus
+
+from .field import LikelihoodField
+from .matcher import Match, Matcher
+from .motion import Motion, MotionModel
+from .planar import Matrix, Planar, between, compose, propagate
+from .submaps import Submaps
+from .surface import SurfacePoints, read_surfaces
+
+_OVERLAP_MIN_RATIO = 0.5  # with less, the map does not reach here yet
+_FAILURES_MAX = 10  # matches that fail in a row before the map goes on from dead reckoning
+_DEVIATION_MIN = np.array([1e-3, 1e-3, 5e-4])  # m, m, rad: no pose is believed to be better
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Estimate:
+    """Where the robot is, and how well that is known."""
+
+    T_local_base: Planar
+    covariance: Matrix  # axes of local
+    status: TrackingStatus
+    quality_ratio: float
+    inliers: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanSettings:
+    """How scans are read, and when a match is believed."""
+
+    resolution_m: float
+    range_max_m: float
+    noise_m: float
+    noise_per_m: float
+    beams_min: int
+    inlier_min_ratio: float
+    predict_max_s: float
+
+
+@dataclass(slots=True)
+class FrontEnd:
+    """One activation's estimate, from the first observation on."""
+
+    settings: ScanSettings
+    T_base_laser: se3.Transform
+    matcher: Matcher
+    motion: MotionModel
+    submaps: Submaps
+    _pose: Planar = field(default_factory=lambda: np.zeros(3), init=False)
+    _covariance: Matrix = field(default_factory=lambda: np.diag(_DEVIATION_MIN**2), init=False)
+    _stamp_ns: int | None = field(default=None, init=False)
+    _held_pose: Planar = field(default_factory=lambda: np.zeros(3), init=False)
+    _held_ns: int | None = field(default=None, init=False)
+    _is_measured: bool = field(default=True, init=False)  # all motion since a scan held the pose
+    _failures: int = field(default=0, init=False)
+    _field: LikelihoodField | None = field(default=None, init=False)
+
+    def track(self, observation: Observation, scan: LaserScan | None) -> Estimate:
+        """Return the pose at the observation, corrected by its scan where it has one."""
+        before, before_ns = self._pose, self._stamp_ns
+        motion = self.motion.step(observation)
+        self._stamp_ns = observation.stamp_ns
+        self._is_measured = self._is_measured and motion.is_measured
+        predicted = compose(before, motion.T_prev_curr)
+        self._covariance = propagate(
+            self._covariance, before, motion.T_prev_curr, motion.covariance
+        )
+        surfaces = self._read(scan)
+        if scan is None or surfaces is None:
+            return self._predict(observation, predicted, motion)
+        # The sweep may be older than the observation: match where the robot was then.
+        ratio = _share(scan.stamp_ns, before_ns, observation.stamp_ns)
+        predicted_then = compose(before, ratio * motion.T_prev_curr)
+        T_then_now = between(predicted_then, predicted)
+        if self._field is None:
+            self._extend(predicted_then, scan, surfaces)
+            return self._hold(observation, predicted, None)
+        match = self.matcher.match(surfaces, self._field, predicted_then, self._covariance)
+        if not self._believes(match):
+            return self._distrust(observation, predicted, motion, match, scan, surfaces)
+        if self.submaps.needs_keyframe(match.T_local_base):
+            self._extend(match.T_local_base, scan, surfaces)
+        return self._hold(observation, compose(match.T_local_base, T_then_now), match)
+
+    def _read(self, scan: LaserScan | None) -> SurfacePoints | None:
+        if scan is None:
+            return None
+        surfaces = read_surfaces(
+            scan,
+            self.T_base_laser,
+            range_max_m=self.settings.range_max_m,
+            noise_m=self.settings.noise_m,
+            noise_per_m=self.settings.noise_per_m,
+        )
+        return surfaces if len(surfaces) >= self.settings.beams_min else None
+
+    def _believes(self, match: Match) -> bool:
+        return (
+            match.inlier_ratio >= self.settings.inlier_min_ratio
+            and match.inliers >= self.settings.beams_min // 2
+            and bool(np.isfinite(match.T_local_base).all())
+        )
+
+    def _hold(self, observation: Observation, pose: Planar, match: Match | None) -> Estimate:
+        """Take over a pose that a scan holds."""
+        weak = match is not None and match.weak_directions > 0
+        if self._held_ns is None or match is None or weak:
+            self.motion.skip()
+        else:
+            duration_s = (observation.stamp_ns - self._held_ns) * 1e-9
+            deviation_rad = float(np.sqrt(match.covariance[2, 2]))
+            self.motion.learn(between(self._held_pose, pose), duration_s, deviation_rad)
+        self._pose, self._held_pose, self._held_ns = pose, pose, observation.stamp_ns
+        self._is_measured, self._failures = True, 0
+        if match is not None:
+            self._covariance = match.covariance + np.diag(_DEVIATION_MIN**2)
+        return Estimate(
+            T_local_base=pose,
+            covariance=self._covariance,
+            status=TrackingStatus.DEGRADED if weak else TrackingStatus.TRACKING,
+            quality_ratio=1.0 if match is None else match.inlier_ratio,
+            inliers=0 if match is None else match.inliers,
+        )
+
+    def _predict(self, observation: Observation, predicted: Planar, motion: Motion) -> Estimate:
+        """Go on without a scan: a gap between scans is normal, a longer one is not."""
+        since_ns = None if self._held_ns is None else observation.stamp_ns - self._held_ns
+        if since_ns is not None and since_ns <= self.settings.predict_max_s * 1e9:
+            return self._guess(predicted, TrackingStatus.TRACKING)
+        if self._is_measured and motion.is_measured:
+            return self._guess(predicted, TrackingStatus.DEGRADED)
+        return self._lose()
+
+    def _distrust(
+        self,
+        observation: Observation,
+        predicted: Planar,
+        motion: Motion,
+        match: Match,
+        scan: LaserScan,
+        surfaces: SurfacePoints,
+    ) -> Estimate:
+        """Go on without the match: dead reckoning holds the pose, or nothing does."""
+        self._failures += 1
+        if not (self._is_measured and motion.is_measured):
+            return self._lose()
+        unknown = match.overlap_ratio < _OVERLAP_MIN_RATIO or self._failures >= _FAILURES_MAX
+        if unknown and self.submaps.needs_keyframe(predicted):
+            self._extend(predicted, scan, surfaces)
+            self._failures = 0
+        return self._guess(predicted, TrackingStatus.DEGRADED)
+
+    def _guess(self, predicted: Planar, status: TrackingStatus) -> Estimate:
+        self._pose = predicted
+        return Estimate(
+            T_local_base=predicted,
+            covariance=self._covariance,
+            status=status,
+            quality_ratio=0.0,
+            inliers=0,
+        )
+
+    def _lose(self) -> Estimate:
+        """Stay at the last held pose and look for it in the whole window from now on."""
+        self._pose, self._is_measured = self._held_pose, False
+        window = np.array([self.matcher.window_m, self.matcher.window_m, self.matcher.window_rad])
+        self._covariance = np.diag(window**2)
+        self.motion.stop()
+        return Estimate(
+            T_local_base=self._held_pose,
+            covariance=self._covariance,
+            status=TrackingStatus.LOST,
+            quality_ratio=0.0,
+            inliers=0,
+        )
+
+    def _extend(self, T_local_base: Planar, scan: LaserScan, surfaces: SurfacePoints) -> None:
+        self.submaps.add(T_local_base, scan, surfaces)
+        self._field = LikelihoodField(self.submaps.surroundings(), self.settings.resolution_m)
+
+
+def _share(stamp_ns: int, before_ns: int | None, now_ns: int) -> float:
+    """Return where a stamp lies between the last observation (0) and this one (1)."""
+    if before_ns is None or now_ns <= before_ns:
+        return 1.0
+    return float(np.clip((stamp_ns - before_ns) / (now_ns - before_ns), 0.0, 1.0))

@@ -1,0 +1,188 @@
+"""Scan matching: a correlative search around the prediction, then Gauss-Newton with the prior.
+
+The search (after Olson, "Real-time correlative scan matching", ICRA 2009) finds the basin; the
+refinement is point-to-line where the map holds lines, with the prediction as one more measurement.
+Directions that the geometry does not hold are taken out of the laser's information (after Zhang,
+Kaess, Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016), so that
+there the prior alone decides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .field import LikelihoodField
+from .planar import Matrix, Planar, rotation, wrap
+from .surface import SurfacePoints
+
+_SEARCH_POINTS = 120  # more do not change the coarse answer
+_SEARCH_STEP_M = 0.1
+_SEARCH_SIGMAS = 3.0
+_PRIOR_WEIGHT = 0.01  # likelihood per squared sigma from the prediction
+_KERNELS_M = (0.25, 0.12, 0.06)  # of the robust weight: coarse to fine
+_ITERATIONS = 8  # at most, per kernel
+_CONVERGED = np.array([1e-4, 1e-4, 1e-5])  # m, m, rad
+_INLIER_M = 0.1
+_CORRELATION = 4.0  # neighbouring beams share their errors: information is this much less
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Match:
+    """A scan's pose in the local map."""
+
+    T_local_base: Planar
+    covariance: Matrix  # of the pose: laser and prior together, axes of local
+    inliers: int
+    inlier_ratio: float
+    overlap_ratio: float  # share of points where the map has anything near
+    weak_directions: int  # 0 to 3: how many the geometry does not hold
+
+
+@dataclass(slots=True)
+class Matcher:
+    """Fits scans into a likelihood field."""
+
+    window_m: float
+    window_rad: float
+    degeneracy_ratio: float
+
+    def match(
+        self, scan_base: SurfacePoints, field: LikelihoodField, predicted: Planar, prior: Matrix
+    ) -> Match:
+        """Return the pose of a scan near `predicted`, whose covariance is `prior`."""
+        information = np.asarray(np.linalg.inv(prior), dtype=np.float64)
+        found = self._search(scan_base, field, predicted, prior)
+        candidates = [predicted] if np.array_equal(found, predicted) else [predicted, found]
+        refined = [self._refine(scan_base, field, c, predicted, information) for c in candidates]
+        return max(refined, key=lambda match: match.inlier_ratio)
+
+    def _search(
+        self, scan_base: SurfacePoints, field: LikelihoodField, predicted: Planar, prior: Matrix
+    ) -> Planar:
+        """Return the likeliest pose on a grid around the prediction."""
+        stride = max(1, len(scan_base) // _SEARCH_POINTS)
+        points = scan_base.points[::stride]
+        reach = _SEARCH_SIGMAS * np.sqrt(np.diag(prior))
+        half_m = float(np.clip(max(reach[0], reach[1]), _SEARCH_STEP_M, self.window_m))
+        radius_m = float(np.median(np.linalg.norm(points, axis=1))) + 0.1
+        step_rad = _SEARCH_STEP_M / radius_m
+        half_rad = float(np.clip(reach[2], step_rad, self.window_rad))
+        shifts = _steps(half_m, _SEARCH_STEP_M)
+        offsets = np.stack(np.meshgrid(shifts, shifts), axis=-1).reshape(-1, 2)
+        turns = _steps(half_rad, step_rad)
+        yaws = predicted[2] + turns
+        c, s = np.cos(yaws)[:, None], np.sin(yaws)[:, None]
+        x, y = points.T
+        rotated = np.stack([c * x - s * y, s * x + c * y], axis=-1) + predicted[:2]
+        scores = field.likelihood(rotated, offsets)
+        scaled = np.concatenate([offsets / max(reach[0], reach[1]) * _SEARCH_SIGMAS])
+        penalty = (
+            np.sum(scaled**2, axis=1)[None] + (turns / reach[2] * _SEARCH_SIGMAS)[:, None] ** 2
+        )
+        best = int(np.argmax(scores - _PRIOR_WEIGHT * penalty))
+        turn, offset = divmod(best, len(offsets))
+        return np.array([*(predicted[:2] + offsets[offset]), wrap(float(yaws[turn]))])
+
+    def _refine(
+        self,
+        scan_base: SurfacePoints,
+        field: LikelihoodField,
+        start: Planar,
+        predicted: Planar,
+        information: Matrix,
+    ) -> Match:
+        pose = start.copy()
+        for kernel_m in _KERNELS_M:
+            for _ in range(_ITERATIONS):
+                H, g, weak = self._laser_equations(scan_base, field, pose, kernel_m)
+                off = pose - predicted
+                off[2] = wrap(off[2])
+                step = -np.linalg.solve(H + information, g + information @ off)
+                pose = pose + step
+                pose[2] = wrap(pose[2])
+                if np.all(np.abs(step) < _CONVERGED):
+                    break
+        H, _, weak = self._laser_equations(scan_base, field, pose, _KERNELS_M[-1])
+        residual, far = _residuals(scan_base, field, pose)
+        inlier = residual < _INLIER_M
+        count = max(len(scan_base), 1)
+        return Match(
+            T_local_base=pose,
+            covariance=np.asarray(np.linalg.inv(H + information), dtype=np.float64),
+            inliers=int(inlier.sum()),
+            inlier_ratio=float(inlier.sum() / count),
+            overlap_ratio=float((far < 0.5).sum() / count),
+            weak_directions=weak,
+        )
+
+    def _laser_equations(
+        self, scan_base: SurfacePoints, field: LikelihoodField, pose: Planar, kernel_m: float
+    ) -> tuple[Matrix, Planar, int]:
+        """Return the normal equations H, g in (x, y, yaw), and how many directions are weak."""
+        arms = scan_base.points @ rotation(pose[2]).T
+        near = field.nearest(arms + pose[:2])
+        error = arms + pose[:2] - near.points
+        xx, xy, yy = near.shape.T
+        across = np.column_stack(
+            [xx * error[:, 0] + xy * error[:, 1], xy * error[:, 0] + yy * error[:, 1]]
+        )
+        squared = np.sum(across * error, axis=1)
+        robust = (kernel_m**2 / (kernel_m**2 + squared)) ** 2
+        gate = np.sum(error**2, axis=1) < (4.0 * kernel_m) ** 2
+        weight = scan_base.weight * robust * gate / _CORRELATION
+        centre = (weight @ arms) / max(float(weight.sum()), 1e-12)
+        lever = np.column_stack([-(arms - centre)[:, 1], (arms - centre)[:, 0]])
+        turned = np.column_stack(
+            [xx * lever[:, 0] + xy * lever[:, 1], xy * lever[:, 0] + yy * lever[:, 1]]
+        )
+        H = np.empty((3, 3))
+        H[0, 0], H[0, 1], H[1, 1] = weight @ xx, weight @ xy, weight @ yy
+        H[1, 0] = H[0, 1]
+        H[:2, 2] = H[2, :2] = weight @ turned
+        H[2, 2] = weight @ np.sum(lever * turned, axis=1)
+        g = np.array([*(weight @ across), weight @ np.sum(lever * across, axis=1)])
+        spread = float(np.sqrt(weight @ np.sum(lever**2, axis=1) / max(weight.sum(), 1e-12)))
+        H, g, weak = self._keep_held(H, g, float(weight.sum()), max(spread, 1e-3))
+        # From turning about the points' centre to turning about base.
+        M = np.eye(3)
+        M[:2, 2] = -centre[1], centre[0]
+        return M.T @ H @ M, M.T @ g, weak
+
+    def _keep_held(
+        self, H: Matrix, g: Planar, total: float, spread_m: float
+    ) -> tuple[Matrix, Planar, int]:
+        """Take directions out that fewer than `degeneracy_ratio` of the points hold."""
+        if total <= 0:
+            return np.zeros((3, 3)), np.zeros(3), 3
+        scale = np.array([1.0, 1.0, 1.0 / spread_m])
+        values, vectors = np.linalg.eigh(H * np.outer(scale, scale) / total)
+        held = values > self.degeneracy_ratio
+        keep = vectors[:, held] @ vectors[:, held].T
+        inverse = 1.0 / scale
+        kept = keep @ (vectors * values) @ vectors.T @ keep
+        held_H: Matrix = total * np.outer(inverse, inverse) * kept
+        held_g: Planar = np.asarray(inverse * (keep @ (scale * g)), dtype=np.float64)
+        return held_H, held_g, int(3 - held.sum())
+
+
+def _residuals(
+    scan_base: SurfacePoints, field: LikelihoodField, pose: Planar
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the distances [m] to the nearest surface, and to its nearest point."""
+    points = scan_base.points @ rotation(pose[2]).T + pose[:2]
+    near = field.nearest(points)
+    error = points - near.points
+    xx, xy, yy = near.shape.T
+    across = xx * error[:, 0] ** 2 + 2 * xy * error[:, 0] * error[:, 1] + yy * error[:, 1] ** 2
+    far = np.linalg.norm(error, axis=1)
+    unknown = xx + yy == 0
+    across = np.where(unknown, far, np.sqrt(np.maximum(across, 0.0)))
+    return np.where(far < 4 * _INLIER_M, across, far), far
+
+
+def _steps(half: float, step: float) -> NDArray[np.float64]:
+    count = int(np.floor(half / step + 1e-9))
+    return np.arange(-count, count + 1).astype(np.float64) * step

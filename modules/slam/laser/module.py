@@ -1,0 +1,205 @@
+"""The `laser` SLAM module: its settings, its life and its map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.maps import MapLayers, PointLayer
+from sceneslam.types.observation import LaserScan, Observation, Tracking, TrackingStatus
+from sceneslam.types.rig import Rig, Sensor
+
+from ..depth_scan import DepthScanner
+from ..grid import OccupancyGrid
+from .frontend import Estimate, FrontEnd, ScanSettings
+from .matcher import Matcher
+from .motion import MotionModel
+from .planar import Planar, apply, to_transform, turn
+from .submaps import Submaps, thin
+
+_ABOVE_0 = (
+    "resolution_m range_max_m laser_noise_m depth_noise_m window_m window_rad "
+    "keyframe_distance_m keyframe_angle_rad odometry_noise_ratio gyro_noise_rad_s"
+)
+_NOT_BELOW_0 = "depth_noise_per_m odometry_turn_rad_per_m predict_max_s"
+_AT_LEAST_1 = "beams_min submap_keyframes depth_beams depth_stride_px"
+_RATIO = "inlier_min_ratio degeneracy_ratio"
+_PLANAR_DEVIATION = 0.01  # m and rad: what a floor's z, roll and pitch are believed to vary by
+
+
+@dataclass(kw_only=True, eq=False)
+class LaserSlam:
+    """2D SLAM from a laser, or from depth seen as one: x, y and yaw in `local`.
+
+    The fields are the settings; `conf/slam/laser.yaml` says what each one is.
+    """
+
+    resolution_m: float
+    range_max_m: float
+    laser_noise_m: float
+    depth_noise_m: float
+    depth_noise_per_m: float
+    beams_min: int
+    inlier_min_ratio: float
+    window_m: float
+    window_rad: float
+    degeneracy_ratio: float
+    keyframe_distance_m: float
+    keyframe_angle_rad: float
+    submap_keyframes: int
+    odometry_noise_ratio: float
+    odometry_turn_rad_per_m: float
+    gyro_noise_rad_s: float
+    predict_max_s: float
+    height_min_m: float | None
+    height_max_m: float | None
+    depth_beams: int
+    depth_stride_px: int
+    _scanner: DepthScanner | None = field(default=None, init=False)
+    _front_end: FrontEnd | None = field(default=None, init=False)
+    _T_base_laser: se3.Transform = field(default_factory=se3.identity, init=False)
+    _T_map_local: se3.Transform = field(default_factory=se3.identity, init=False)
+    _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        for names, least, most, allowed in (
+            (_ABOVE_0, 1e-9, np.inf, "above 0"),
+            (_NOT_BELOW_0, 0.0, np.inf, "0 or more"),
+            (_AT_LEAST_1, 1, np.inf, "1 or more"),
+            (_RATIO, 0.0, 1.0, "0 to 1"),
+        ):
+            for name in names.split():
+                if not least <= getattr(self, name) <= most:
+                    raise ConfigError(name, getattr(self, name), allowed)
+
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return the sensors, one of which suffices; odometry and gyro are used when present."""
+        return (frozenset({Sensor.SCAN}), frozenset({Sensor.DEPTH}))
+
+    def activate(self, rig: Rig) -> None:
+        """Start anew, with the laser where there is one, else with the depth camera."""
+        self._scanner = None
+        self._T_base_laser = se3.identity()
+        if Sensor.SCAN in rig.sensors or rig.camera is None:
+            if rig.laser is not None:
+                self._T_base_laser = rig.laser.T_base_laser
+        else:
+            self._scanner = DepthScanner(
+                rig.camera,
+                height_min_m=self.height_min_m,
+                height_max_m=self.height_max_m,
+                beams=self.depth_beams,
+                stride_px=self.depth_stride_px,
+            )
+            self._T_base_laser = self._scanner.T_base_laser
+        self._front_end = self._make_front_end()
+        self._T_map_local = se3.identity()
+        self._T_local_base = se3.identity()
+
+    def set_pose(self, T_map_local: se3.Transform) -> None:
+        """Place `local` in the map."""
+        self._T_map_local = np.array(T_map_local, dtype=np.float64)
+
+    def set_scene(self, scene: str) -> None:
+        """Do nothing: a laser sees the same by day and by night."""
+
+    def track(self, observation: Observation) -> Tracking:
+        """Return T_local_base at the observation."""
+        if self._front_end is None:
+            raise RuntimeError("track() before activate()")
+        estimate = self._front_end.track(observation, self._scan(observation))
+        self._T_local_base = to_transform(estimate.T_local_base)
+        return Tracking(
+            stamp_ns=observation.stamp_ns,
+            T_local_base=self._T_local_base.copy(),
+            status=estimate.status,
+            covariance=_covariance_base(estimate),
+            quality_ratio=estimate.quality_ratio,
+            inliers=estimate.inliers,
+        )
+
+    def get_pose(self) -> se3.Transform:
+        """Return T_map_base of the last observation."""
+        return self._T_map_local @ self._T_local_base
+
+    def get_map(self) -> MapLayers:
+        """Return the grid of all keyframes, and their returns as points, in `local`."""
+        if self._front_end is None:
+            return MapLayers()
+        grid = OccupancyGrid(self.resolution_m)
+        clouds = [np.zeros((0, 3), dtype=np.float32)]
+        for T_local_base, keyframe in self._front_end.submaps.placed():
+            T_local_laser = to_transform(T_local_base) @ self._T_base_laser
+            grid.insert(T_local_laser, self._cut(keyframe.scan))
+            clouds.append(_cloud(keyframe.surfaces_base.points, T_local_base, T_local_laser[2, 3]))
+        points = thin(np.concatenate(clouds), self.resolution_m)
+        return MapLayers(points=PointLayer(points=points), grid=grid.layer())
+
+    def shutdown(self) -> None:
+        """Free the depth tables; the map stays."""
+        self._scanner = None
+
+    def _scan(self, observation: Observation) -> LaserScan | None:
+        if self._scanner is None or observation.depth_m is None:
+            return observation.scan
+        return self._scanner.scan(observation.depth_m, stamp_ns=observation.stamp_ns)
+
+    def _cut(self, scan: LaserScan) -> LaserScan:
+        """Return the scan without what is too far to be believed."""
+        far = scan.ranges_m > self.range_max_m
+        ranges = np.where(far & np.isfinite(scan.ranges_m), np.inf, scan.ranges_m)
+        return replace(scan, ranges_m=ranges.astype(np.float32))
+
+    def _make_front_end(self) -> FrontEnd:
+        from_depth = self._scanner is not None
+        return FrontEnd(
+            settings=ScanSettings(
+                resolution_m=self.resolution_m,
+                range_max_m=self.range_max_m,
+                noise_m=self.depth_noise_m if from_depth else self.laser_noise_m,
+                noise_per_m=self.depth_noise_per_m if from_depth else 0.0,
+                beams_min=self.beams_min,
+                inlier_min_ratio=self.inlier_min_ratio,
+                predict_max_s=self.predict_max_s,
+            ),
+            T_base_laser=self._T_base_laser,
+            matcher=Matcher(
+                window_m=self.window_m,
+                window_rad=self.window_rad,
+                degeneracy_ratio=self.degeneracy_ratio,
+            ),
+            motion=MotionModel(
+                odometry_noise_ratio=self.odometry_noise_ratio,
+                odometry_turn_rad_per_m=self.odometry_turn_rad_per_m,
+                gyro_noise_rad_s=self.gyro_noise_rad_s,
+            ),
+            submaps=Submaps(
+                keyframe_distance_m=self.keyframe_distance_m,
+                keyframe_angle_rad=self.keyframe_angle_rad,
+                submap_keyframes=self.submap_keyframes,
+            ),
+        )
+
+
+def _covariance_base(estimate: Estimate) -> NDArray[np.float64] | None:
+    """Return the (6, 6) covariance in base's axes, None where there is no pose."""
+    if estimate.status is TrackingStatus.LOST:
+        return None
+    G = turn(-float(estimate.T_local_base[2]))
+    full = np.eye(6) * _PLANAR_DEVIATION**2
+    planar = [0, 1, 5]
+    full[np.ix_(planar, planar)] = G @ estimate.covariance @ G.T
+    return full
+
+
+def _cloud(
+    points_base: NDArray[np.float64], T_local_base: Planar, height_m: float
+) -> NDArray[np.float32]:
+    points = apply(T_local_base, points_base)
+    return np.column_stack([points, np.full(len(points), height_m)]).astype(np.float32)

@@ -1,0 +1,106 @@
+"""A scan as points on surfaces: where they are, and in which directions each one holds the pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.observation import LaserScan
+
+from .planar import Planar, rotation
+
+_SPAN_M = 0.2  # neighbours within this distance along the scan make a point's surface
+_NEIGHBOURS_MIN = 4  # fewer points do not tell a surface
+_BLOB_RATIO = (0.04, 0.24)  # least to largest variance: up to the first a line, from the second not
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SurfacePoints:
+    """Points and what they tell: `shape` is n n' for a wall with normal n, I for a post."""
+
+    points: Array  # (N, 2) [m], frame as in the owner's name
+    shape: Array  # (N, 3): xx, xy, yy; 0 where too few neighbours tell the surface
+    weight: Array  # (N,) [1/m^2], inverse variance of the range
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def moved(self, T_a_b: Planar) -> SurfacePoints:
+        """Return these points of b in a."""
+        R = rotation(T_a_b[2])
+        c, s = R[0, 0], R[1, 0]
+        xx, xy, yy = self.shape.T
+        shape = np.column_stack(
+            [
+                c * c * xx - 2 * c * s * xy + s * s * yy,
+                c * s * (xx - yy) + (c * c - s * s) * xy,
+                s * s * xx + 2 * c * s * xy + c * c * yy,
+            ]
+        )
+        return SurfacePoints(points=self.points @ R.T + T_a_b[:2], shape=shape, weight=self.weight)
+
+
+def read_surfaces(
+    scan: LaserScan,
+    T_base_laser: se3.Transform,
+    *,
+    range_max_m: float,
+    noise_m: float,
+    noise_per_m: float,
+) -> SurfacePoints:
+    """Return a scan's returns in base's xy plane, in the order of the beams.
+
+    A range's standard deviation is noise_m + noise_per_m * range^2 (0 for a laser; that of a
+    triangulating camera grows so).
+    """
+    ranges = scan.ranges_m.astype(np.float64)
+    limit = min(range_max_m, scan.range_max_m)
+    beam = np.flatnonzero(np.isfinite(ranges) & (ranges > scan.range_min_m) & (ranges <= limit))
+    r, angle = ranges[beam], scan.angles_rad[beam].astype(np.float64)
+    points_laser = np.column_stack([r * np.cos(angle), r * np.sin(angle)])
+    points_base = points_laser @ T_base_laser[:2, :2].T + T_base_laser[:2, 3]
+    spacing = np.maximum(r * abs(scan.angle_step_rad), 1e-4)
+    return SurfacePoints(
+        points=points_base,
+        shape=_shape(points_base, spacing),
+        weight=1.0 / (noise_m + noise_per_m * r * r) ** 2,
+    )
+
+
+def _shape(points: Array, spacing_m: Array) -> Array:
+    """Return each point's shape from the spread of its neighbours along the scan."""
+    count = len(points)
+    if count == 0:
+        return np.zeros((0, 3))
+    step = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    # A jump between neighbours is the edge of an object: surfaces end there.
+    jump = step > np.maximum(_SPAN_M, 3.0 * np.minimum(spacing_m[1:], spacing_m[:-1]))
+    index = np.arange(count)
+    first = np.maximum.accumulate(np.where(np.r_[True, jump], index, 0))
+    last = np.minimum.accumulate(np.where(np.r_[jump, True], index, count)[::-1])[::-1]
+    half = np.clip(np.ceil(_SPAN_M / spacing_m), 2, 60).astype(np.int64)
+    low, high = np.maximum(index - half, first), np.minimum(index + half, last) + 1
+    x, y = (points - points.mean(axis=0)).T
+    sums = np.cumsum(np.column_stack([x, y, x * x, x * y, y * y]), axis=0)
+    sums = np.vstack([np.zeros(5), sums])
+    number = high - low
+    mean_x, mean_y, xx, xy, yy = ((sums[high] - sums[low]) / number[:, None]).T
+    shape = _shape_of_spread(xx - mean_x**2, xy - mean_x * mean_y, yy - mean_y**2)
+    shape[number < _NEIGHBOURS_MIN] = 0.0
+    return shape
+
+
+def _shape_of_spread(xx: Array, xy: Array, yy: Array) -> Array:
+    root = np.hypot(0.5 * (xx - yy), xy)
+    largest = 0.5 * (xx + yy) + root
+    least = np.maximum(0.5 * (xx + yy) - root, 0.0)
+    low, high = _BLOB_RATIO
+    blob = np.clip((least / np.maximum(largest, 1e-12) - low) / (high - low), 0.0, 1.0)
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # along the surface
+    c, s = np.cos(angle), np.sin(angle)
+    return np.column_stack([s * s + blob * c * c, (blob - 1.0) * s * c, c * c + blob * s * s])

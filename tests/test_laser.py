@@ -1,0 +1,233 @@
+"""The laser module in worlds of straight walls, whose motion is known."""
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from test_laser_world import corridor, drive, loop_path, room
+
+from sceneslam.interfaces import SlamModule
+from sceneslam.modules.slam.laser.module import LaserSlam
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.observation import Observation, TrackingStatus
+from sceneslam.types.rig import Camera, Laser, Rig, Sensor
+
+SETTINGS = yaml.safe_load(
+    (Path(__file__).resolve().parent.parent / "conf/slam/laser.yaml").read_text()
+)
+SETTINGS.pop("_target_")
+LASER_RIG = Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser())
+
+
+def active(rig=LASER_RIG, **settings):
+    module = LaserSlam(**{**SETTINGS, **settings})
+    module.activate(rig)
+    return module
+
+
+def errors(path, trackings):
+    """Return position [m] and yaw [rad] errors (N, 2) against a path of (x, y, yaw)."""
+    T_world_local = se3.from_xy_yaw(*path[0])
+    off = [
+        se3.inverse(T_world_local @ tracking.T_local_base) @ se3.from_xy_yaw(*pose)
+        for pose, tracking in zip(path, trackings, strict=True)
+    ]
+    return np.array([[np.hypot(T[0, 3], T[1, 3]), abs(se3.yaw_rad(T))] for T in off])
+
+
+def test_module_fulfils_the_interface():
+    assert isinstance(active(), SlamModule)
+
+
+def test_motion_in_a_room_is_found_without_odometry():
+    path = loop_path(160)
+    module = active()
+    trackings = [module.track(o) for o in drive(room(), path, rng=np.random.default_rng(1))]
+    assert {tracking.status for tracking in trackings} == {TrackingStatus.TRACKING}
+    error = errors(path, trackings)
+    assert error[:, 0].max() < 0.012
+    assert error[:, 1].max() < 0.004
+
+
+def test_poses_and_odometry_of_a_narrow_view_agree_on_the_motion():
+    path = loop_path(200)
+    slipping = path * [1.05, 1.05, 1.0]
+    module = active()
+    view = {"fov_rad": np.radians(57), "beams": 180, "range_max_m": 4.5}
+    observations = drive(room(), path, odometry=slipping, rng=np.random.default_rng(2), **view)
+    trackings = [module.track(observation) for observation in observations]
+    assert TrackingStatus.LOST not in {tracking.status for tracking in trackings}
+    assert errors(path, trackings)[:, 0].max() < 0.05
+
+
+def test_corridor_takes_the_way_along_it_from_odometry_and_says_so():
+    steps = np.arange(60)
+    path = np.column_stack([0.06 * steps, 0.1 * np.sin(0.1 * steps), 0.05 * np.sin(0.2 * steps)])
+    module = active()
+    observations = drive(corridor(), path, odometry=path, rng=np.random.default_rng(3))
+    trackings = [module.track(observation) for observation in observations]
+    assert {t.status for t in trackings[2:]} == {TrackingStatus.DEGRADED}
+    error = errors(path, trackings)
+    assert error[:, 0].max() < 0.03
+    assert error[:, 1].max() < 0.005
+    variance = np.diag(trackings[-1].covariance)
+    assert variance[0] > 4 * variance[1]
+
+
+def test_corridor_corrects_the_drift_across_it():
+    steps = np.arange(80)
+    path = np.column_stack([0.06 * steps, 0 * steps, 0 * steps])
+    odometry = np.column_stack([0.06 * steps, 0.01 * steps, 0.003 * steps])
+    module = active()
+    observations = drive(corridor(), path, odometry=odometry, rng=np.random.default_rng(4))
+    last = [module.track(observation) for observation in observations][-1].T_local_base
+    assert abs(last[1, 3]) < 0.05
+    assert abs(se3.yaw_rad(last)) < 0.01
+    assert abs(last[0, 3] - 0.06 * 79) < 0.1
+
+
+def test_sweep_older_than_its_observation_is_matched_where_it_was_made():
+    path = loop_path(160)
+    observations = drive(room(), path, odometry=path, rng=np.random.default_rng(5))
+    late = [observations[0]]
+    for before, now in pairwise(observations):
+        half = Observation(
+            stamp_ns=now.stamp_ns - 40_000_000,
+            T_odom_base=se3.interpolate(before.T_odom_base, now.T_odom_base, 0.6),
+        )
+        late += [half, replace(now, stamp_ns=now.stamp_ns + 20_000_000, T_odom_base=None)]
+    ahead = path[1:] + 0.2 * np.diff(path, axis=0)
+    for index, pose in enumerate(ahead):
+        late[2 * index + 2] = replace(late[2 * index + 2], T_odom_base=se3.from_xy_yaw(*pose))
+    module = active()
+    trackings = [module.track(observation) for observation in late]
+    assert errors(np.vstack([path[:1], ahead]), trackings[::2])[:, 0].max() < 0.012
+
+
+def test_observations_between_scans_are_predicted():
+    path = loop_path(300)
+    observations = drive(room(), path, odometry=path, rng=np.random.default_rng(6))
+    sparse = [o if i % 3 == 0 else replace(o, scan=None) for i, o in enumerate(observations)]
+    module = active()
+    trackings = [module.track(observation) for observation in sparse]
+    assert {tracking.status for tracking in trackings} == {TrackingStatus.TRACKING}
+    assert errors(path, trackings)[:, 0].max() < 0.02
+
+
+def test_no_return_and_no_odometry_is_lost_and_found_again():
+    path = loop_path(160)
+    observations = drive(room(), path, rng=np.random.default_rng(7))
+    blind = np.full(360, np.nan, np.float32)
+    for index in range(60, 72):
+        scan = replace(observations[index].scan, ranges_m=blind)
+        observations[index] = replace(observations[index], scan=scan)
+    module = active()
+    trackings = [module.track(observation) for observation in observations]
+    assert trackings[71].status is TrackingStatus.LOST
+    assert trackings[71].covariance is None
+    np.testing.assert_array_equal(trackings[71].T_local_base, trackings[70].T_local_base)
+    assert trackings[-1].status is TrackingStatus.TRACKING
+    assert errors(path, trackings)[-1, 0] < 0.02
+
+
+def test_no_return_with_odometry_is_degraded_and_goes_on():
+    path = loop_path(160)
+    observations = drive(room(), path, odometry=path, rng=np.random.default_rng(8))
+    observations[60:80] = [replace(o, scan=None) for o in observations[60:80]]
+    module = active()
+    trackings = [module.track(observation) for observation in observations]
+    assert trackings[79].status is TrackingStatus.DEGRADED
+    assert np.trace(trackings[79].covariance) > np.trace(trackings[59].covariance)
+    assert errors(path, trackings)[:, 0].max() < 0.03
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, -1.0, 1e9])
+def test_broken_ranges_never_give_a_broken_pose(value):
+    observations = drive(room(), loop_path(160)[:20], rng=np.random.default_rng(9))
+    broken = replace(observations[0].scan, ranges_m=np.full(360, value, np.float32))
+    module = active()
+    for index, observation in enumerate(observations):
+        scan = broken if index % 4 != 1 else observation.scan
+        tracking = module.track(replace(observation, scan=scan))
+        assert np.isfinite(tracking.T_local_base).all()
+    empty = replace(broken, ranges_m=np.zeros(0, np.float32))
+    tracking = module.track(replace(observations[-1], stamp_ns=10**10, scan=empty))
+    assert np.isfinite(tracking.T_local_base).all()
+
+
+def test_first_observation_is_the_origin_and_activation_starts_anew():
+    path = loop_path(160)[30:]
+    observations = drive(room(), path, odometry=path, rng=np.random.default_rng(10))
+    module = active()
+    first = [module.track(observation) for observation in observations]
+    np.testing.assert_array_equal(first[0].T_local_base, np.eye(4))
+    module.shutdown()
+    module.shutdown()
+    assert (module.get_map().grid.log_odds > 0).any()
+    module.activate(LASER_RIG)
+    assert module.get_map().grid.log_odds.size == 0
+    np.testing.assert_array_equal(module.get_pose(), np.eye(4))
+    again = [module.track(observation) for observation in observations]
+    for one, two in zip(first, again, strict=True):
+        np.testing.assert_array_equal(one.T_local_base, two.T_local_base)
+        assert one.status is two.status
+
+
+def test_pose_in_the_map_is_the_product():
+    path = loop_path(160)[:30]
+    module = active()
+    T_map_local = se3.from_xy_yaw(3.0, -1.0, 2.0)
+    module.set_pose(T_map_local)
+    for observation in drive(room(), path):
+        tracking = module.track(observation)
+    np.testing.assert_array_equal(module.get_pose(), T_map_local @ tracking.T_local_base)
+
+
+def test_map_shows_the_walls_where_they_are():
+    path = loop_path(160)
+    module = active()
+    for observation in drive(room(), path, rng=np.random.default_rng(11)):
+        module.track(observation)
+    points = module.get_map().points.points
+    world = se3.apply(se3.from_xy_yaw(*path[0]), points.astype(float))
+    outer = np.minimum.reduce(
+        [np.abs(world[:, 0] + 2), np.abs(world[:, 0] - 4), np.abs(np.abs(world[:, 1]) - 2)]
+    )
+    assert 300 < len(points) < 3000
+    assert (outer < 0.05).mean() > 0.6
+
+
+def test_mounted_laser_gives_the_motion_of_base():
+    path = loop_path(160)
+    T_base_laser = se3.from_xy_yaw(0.25, -0.1, 0.6)
+    at_laser = [se3.from_xy_yaw(*pose) @ T_base_laser for pose in path]
+    laser_path = [(T[0, 3], T[1, 3], se3.yaw_rad(T)) for T in at_laser]
+    rig = Rig(sensors=frozenset({Sensor.SCAN}), laser=Laser(T_base_laser=T_base_laser))
+    module = active(rig)
+    observations = drive(room(), laser_path, rng=np.random.default_rng(12))
+    assert errors(path, [module.track(o) for o in observations])[:, 0].max() < 0.015
+
+
+def test_depth_is_the_laser_where_there_is_none():
+    camera = Camera(size_wh=(64, 48), fx=52.5, fy=52.5, cx=31.5, cy=23.5)
+    rig = Rig(sensors=frozenset({Sensor.DEPTH, Sensor.IMAGE}), camera=camera)
+    module = active(rig, depth_stride_px=1, depth_beams=60)
+    depth = np.full((48, 64), 2.0, np.float32)
+    for index in range(5):
+        tracking = module.track(Observation(stamp_ns=index * 10**8, depth_m=depth))
+    assert tracking.status is TrackingStatus.DEGRADED  # one wall does not hold the way along it
+    assert np.abs(tracking.T_local_base - np.eye(4)).max() < 0.01
+    assert (module.get_map().grid.log_odds > 0).sum() > 20
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("resolution_m", 0.0), ("beams_min", 0), ("inlier_min_ratio", 1.5), ("predict_max_s", -1.0)],
+)
+def test_settings_out_of_range_are_named(name, value):
+    with pytest.raises(ConfigError, match=name):
+        LaserSlam(**{**SETTINGS, name: value})
