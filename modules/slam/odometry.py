@@ -1,0 +1,132 @@
+"""The `odometry` SLAM module: dead reckoning from the source's own odometry, without a map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.rig import Rig, Sensor
+
+_DEVIATION_MIN = 1e-4  # m and rad, of any pose
+
+
+@dataclass(kw_only=True, eq=False)
+class Odometry:
+    """Dead reckoning; `conf/slam/odometry.yaml` says what the settings are."""
+
+    use_gyro: bool
+    translation_noise_ratio: float
+    rotation_noise_ratio: float
+    rotation_noise_rad_per_m: float
+    _T_odom_prev: se3.Transform | None = field(default=None, init=False)
+    _stamp_ns: int | None = field(default=None, init=False)
+    _T_map_local: se3.Transform = field(default_factory=se3.identity, init=False)
+    _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
+    _covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)), init=False)
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        for name in ("translation_noise_ratio", "rotation_noise_ratio", "rotation_noise_rad_per_m"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise ConfigError(name, getattr(self, name), "0 or more")
+
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return odometry; the gyro is used when present."""
+        return (frozenset({Sensor.ODOMETRY}),)
+
+    def activate(self, rig: Rig) -> None:
+        """Start anew: `local` at the next observation that has odometry."""
+        self._T_odom_prev, self._stamp_ns = None, None
+        self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
+        self._covariance = np.eye(6) * _DEVIATION_MIN**2
+
+    def set_pose(self, T_map_local: se3.Transform) -> None:
+        """Place `local` in the map."""
+        self._T_map_local = np.array(T_map_local, dtype=np.float64)
+
+    def set_scene(self, scene: str) -> None:
+        """Do nothing: wheels turn alike in every scene."""
+
+    def track(self, observation: Observation) -> Tracking:
+        """Return T_local_base; LOST where the observation has no odometry.
+
+        When odometry is back, its own motion over the gap counts.
+        """
+        T_odom_base = observation.T_odom_base
+        if T_odom_base is None or not np.isfinite(T_odom_base).all():
+            self._stamp_ns = None  # the gyro's samples no longer cover the whole motion
+            return self._answer(observation, TrackingStatus.LOST)
+        if self._T_odom_prev is not None:
+            T_prev_curr = se3.inverse(self._T_odom_prev) @ T_odom_base
+            if self.use_gyro:
+                T_prev_curr = self._turned_by_gyro(T_prev_curr, observation)
+            self._move(T_prev_curr)
+        self._T_odom_prev, self._stamp_ns = T_odom_base, observation.stamp_ns
+        return self._answer(observation, TrackingStatus.TRACKING)
+
+    def get_pose(self) -> se3.Transform:
+        """Return T_map_base of the last observation."""
+        return self._T_map_local @ self._T_local_base
+
+    def get_map(self) -> MapLayers:
+        """Return no layers: dead reckoning sees nothing."""
+        return MapLayers()
+
+    def shutdown(self) -> None:
+        """Do nothing: nothing was taken."""
+
+    def _move(self, T_prev_curr: se3.Transform) -> None:
+        distance_m = float(np.linalg.norm(T_prev_curr[:3, 3]))
+        angle_rad = float(se3.rotation_angle_rad(T_prev_curr))
+        along = self.translation_noise_ratio * distance_m
+        turn = self.rotation_noise_ratio * angle_rad + self.rotation_noise_rad_per_m * distance_m
+        # Errors of odometry go on in the same way: deviations add up, not variances.
+        carried = _adjoint(se3.inverse(T_prev_curr))
+        covariance = carried @ self._covariance @ carried.T
+        deviation = np.sqrt(np.diag(covariance)) + np.array([along] * 3 + [turn] * 3)
+        scale = deviation / np.sqrt(np.diag(covariance))
+        self._covariance = covariance * np.outer(scale, scale)
+        self._T_local_base = self._T_local_base @ T_prev_curr
+
+    def _turned_by_gyro(
+        self, T_prev_curr: se3.Transform, observation: Observation
+    ) -> se3.Transform:
+        """Return the motion with the gyro's rotation, where it covers all of the interval."""
+        gyro = observation.gyro_base
+        if gyro is None or self._stamp_ns is None or not np.isfinite(gyro).all():
+            return T_prev_curr
+        interval_s = (observation.stamp_ns - self._stamp_ns) * 1e-9
+        inside = gyro[(gyro[:, 0] > -interval_s) & (gyro[:, 0] <= 0.0)]
+        if interval_s <= 0 or len(inside) == 0:
+            return T_prev_curr
+        times = np.concatenate([[-interval_s], inside[:, 0], [0.0]])
+        rates = np.concatenate([inside[:1, 1:], inside[:, 1:], inside[-1:, 1:]])
+        turned = se3.so3_exp(np.trapezoid(rates, times, axis=0))
+        return se3.from_parts(turned, T_prev_curr[:3, 3])
+
+    def _answer(self, observation: Observation, status: TrackingStatus) -> Tracking:
+        is_lost = status is TrackingStatus.LOST
+        return Tracking(
+            stamp_ns=observation.stamp_ns,
+            T_local_base=self._T_local_base.copy(),
+            status=status,
+            covariance=None if is_lost else self._covariance.copy(),
+            quality_ratio=0.0 if is_lost else 1.0,
+        )
+
+
+def _adjoint(T_a_b: se3.Transform) -> NDArray[np.float64]:
+    """Return the (6, 6) matrix that takes twists of b to a (translation first)."""
+    R, (x, y, z) = T_a_b[:3, :3], T_a_b[:3, 3]
+    hat = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    adjoint = np.zeros((6, 6))
+    adjoint[:3, :3] = adjoint[3:, 3:] = R
+    adjoint[:3, 3:] = hat @ R
+    return adjoint
