@@ -13,7 +13,7 @@ from sceneslam.ros.pixels import DepthUnits, locked
 from sceneslam.sources.synchronise import Bundle, Sample
 from sceneslam.types.errors import InputError
 from sceneslam.types.observation import LaserScan, Observation
-from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.rig import Sensor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,9 +28,16 @@ class Decoded:
 class BundleDecoder:
     """Decodes bundles; safe to call from several threads."""
 
-    def __init__(self, primary: Sensor, rig: Rig, units: DepthUnits) -> None:
+    def __init__(
+        self,
+        primary: Sensor,
+        sensors: frozenset[Sensor],
+        size_wh: tuple[int, int] | None,
+        units: DepthUnits,
+    ) -> None:
         self._primary = primary
-        self._rig = rig
+        self._sensors = sensors
+        self._size_wh = size_wh
         self._units = units
 
     def observe(self, bundle: Bundle) -> Decoded:
@@ -48,7 +55,7 @@ class BundleDecoder:
             T_odom_base=self._odometry(bundle),
             gyro_base=_gyro(bundle),
         )
-        is_empty = not any(observation.has(sensor) for sensor in self._rig.sensors)
+        is_empty = not any(observation.has(sensor) for sensor in self._sensors)
         return Decoded(
             observation=None if is_empty else observation,
             problems=tuple(problems),
@@ -86,12 +93,11 @@ class BundleDecoder:
         return depth_m
 
     def _check_size(self, name: str, stamp_ns: int, picture: NDArray[np.generic]) -> None:
-        expected_wh = self._rig.camera.size_wh if self._rig.camera else None
         height, width = picture.shape[:2]
-        if expected_wh and (width, height) != expected_wh:
+        if self._size_wh and (width, height) != self._size_wh:
             raise InputError(
-                f"{name} at stamp {stamp_ns * 1e-9:.6f} s: expected {expected_wh[0]}x"
-                f"{expected_wh[1]} pixels as in the first image, got {width}x{height}"
+                f"{name} at stamp {stamp_ns * 1e-9:.6f} s: expected {self._size_wh[0]}x"
+                f"{self._size_wh[1]} pixels as in the first image, got {width}x{height}"
             )
 
     def _scan(self, bundle: Bundle, problems: list[str]) -> LaserScan | None:

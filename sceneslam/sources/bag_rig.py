@@ -68,6 +68,21 @@ def place(recording: Recording, topic: str, frames: FrameTree) -> Transform:
     return se3.identity() if T_base_sensor is None else T_base_sensor
 
 
+def picture_size_wh(recording: Recording, topics: Topics) -> tuple[int, int]:
+    """Return the size of the first image (or depth, where there are no images) that is whole."""
+    topic = topics.image or topics.depth or ""
+    for message in recording.messages({topic}):
+        decoded = recording.decode(message)
+        picture: Any = None
+        if decoded is not None and topics.image:
+            picture = decode.image_bgr(decoded)
+        elif decoded is not None:
+            picture = decode.depth_m(decoded, pixels.DepthUnits(1000.0, _DEPTH_RANGE_M))
+        if picture is not None:
+            return int(picture.shape[1]), int(picture.shape[0])
+    raise InputError(f"none of the images of {topic} can be decoded")
+
+
 def _camera(
     recording: Recording,
     topics: Topics,
@@ -77,7 +92,7 @@ def _camera(
 ) -> Camera | None:
     """Return the camera of the image, or of the depth where there is no image."""
     message = first(recording, topics.image or topics.depth or "")
-    size_wh = _size_wh(message, is_depth=topics.image is None)
+    size_wh = picture_size_wh(recording, topics)
     info = first(recording, topics.camera_info) if topics.camera_info else None
     recorded = decode.camera(info) if info is not None else None
     if recorded is None and given is None:
@@ -104,17 +119,6 @@ def _camera(
         depth_range_m=depth_range_m,
         T_base_cam=optical_to_rep103() if T_base_cam is None else T_base_cam,
     )
-
-
-def _size_wh(message: Any, *, is_depth: bool) -> tuple[int, int]:
-    """Return the size of an image message."""
-    if is_depth:
-        picture: Any = decode.depth_m(message, pixels.DepthUnits(1000.0, _DEPTH_RANGE_M))
-    else:
-        picture = decode.image_bgr(message)
-    if picture is None:
-        raise InputError("the recording's first image cannot be decoded")
-    return int(picture.shape[1]), int(picture.shape[0])
 
 
 def _said(said: Any, key: str) -> tuple[float, float] | None:

@@ -13,7 +13,7 @@ from sceneslam.ros import decode
 from sceneslam.ros.pixels import DepthUnits
 from sceneslam.sources.bag_frames import FrameTree
 from sceneslam.sources.bag_observation import BundleDecoder, Decoded
-from sceneslam.sources.bag_rig import Given, make_rig, place, sensor_topics
+from sceneslam.sources.bag_rig import Given, make_rig, picture_size_wh, place, sensor_topics
 from sceneslam.sources.bag_topics import choose_topics, describe
 from sceneslam.sources.bag_truth import BASE, CAMERA, read_truth
 from sceneslam.sources.faults import FaultLog
@@ -120,7 +120,9 @@ class RosBag:
         """Yield what is to be decoded for each observation."""
         depth_range_m = self._rig.camera.depth_range_m if self._rig.camera else (0.0, 100.0)
         units = DepthUnits(self._depth_scale, depth_range_m)
-        decoder = BundleDecoder(self._primary, self._rig, units)
+        is_seeing = bool(self._topics.image or self._topics.depth)
+        size_wh = picture_size_wh(self._recording, self._topics) if is_seeing else None
+        decoder = BundleDecoder(self._primary, self._rig.sensors, size_wh, units)
         for bundle in self._bundles():
             yield partial(decoder.observe, bundle)
 

@@ -1,0 +1,191 @@
+"""Messages of all encodings become our arrays."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from ros_recordings import STAMP_NS, Recorder
+
+from sceneslam.ros import decode, pixels
+from sceneslam.ros.clouds import cloud
+from sceneslam.ros.encode import Encoder
+from sceneslam.sources.open_recording import open_recording
+from sceneslam.types.errors import InputError
+
+BGR = np.random.default_rng(2).integers(0, 256, (6, 8, 3), dtype=np.uint8)
+UNITS = pixels.DepthUnits(1000.0, (0.3, 8.0))
+DEPTH_MM = np.array([[0, 100, 400], [1234, 8000, 9000]], np.uint16)
+DEPTH_M = np.array([[0, 0, 0.4], [1.234, 8.0, 0]], np.float32)
+
+
+def decoded(path: Path) -> Any:
+    recording = open_recording(path)
+    return recording.decode(next(recording.messages(set(recording.topics))))
+
+
+def image(tmp_path: Path, stored: np.ndarray, encoding: str, **options: Any) -> Any:
+    with Recorder(tmp_path / "one.mcap") as recorder:
+        recorder.image("/image", STAMP_NS, stored, encoding, **options)
+    return decoded(tmp_path / "one.mcap")
+
+
+@pytest.mark.parametrize(
+    ("encoding", "stored"),
+    [
+        ("bgr8", BGR),
+        ("rgb8", BGR[..., ::-1].copy()),
+        ("bgra8", np.dstack([BGR, np.full((6, 8), 255, np.uint8)])),
+        ("rgba8", np.dstack([BGR[..., ::-1], np.full((6, 8), 255, np.uint8)])),
+    ],
+)
+def test_colour_encodings_give_bgr(tmp_path: Path, encoding: str, stored: np.ndarray) -> None:
+    found = decode.image_bgr(image(tmp_path, stored, encoding, padding=5))
+    np.testing.assert_array_equal(found, BGR)
+    assert not found.flags.writeable
+
+
+@pytest.mark.parametrize("is_bigendian", [False, True])
+def test_grey_encodings_give_three_equal_channels(tmp_path: Path, is_bigendian: bool) -> None:
+    grey = BGR[..., 0]
+    wide = grey.astype(np.uint16) << 8
+    for stored, encoding in ((grey, "mono8"), (wide, "mono16")):
+        message = image(tmp_path, stored, encoding, is_bigendian=is_bigendian)
+        np.testing.assert_array_equal(decode.image_bgr(message), np.dstack([grey] * 3))
+
+
+@pytest.mark.parametrize("encoding", ["yuv422", "yuv422_yuy2"])
+def test_grey_in_yuv_stays_grey(tmp_path: Path, encoding: str) -> None:
+    stored = np.full((6, 8, 2), 128, np.uint8)
+    np.testing.assert_allclose(decode.image_bgr(image(tmp_path, stored, encoding)), 130, atol=1)
+
+
+def test_an_unknown_encoding_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="'hsv8'"):
+        decode.image_bgr(image(tmp_path, BGR, "hsv8"))
+
+
+def test_an_image_shorter_than_it_says_is_damaged(tmp_path: Path) -> None:
+    message = image(tmp_path, BGR, "bgr8")
+    message.data = message.data[:-1]
+    assert decode.image_bgr(message) is None
+
+
+@pytest.mark.parametrize("is_bigendian", [False, True])
+@pytest.mark.parametrize("encoding", ["16UC1", "mono16"])
+def test_integer_depth_is_metres_within_range(
+    tmp_path: Path, encoding: str, is_bigendian: bool
+) -> None:
+    message = image(tmp_path, DEPTH_MM, encoding, is_bigendian=is_bigendian, padding=3)
+    np.testing.assert_array_equal(decode.depth_m(message, UNITS), DEPTH_M)
+
+
+def test_float_depth_that_is_not_finite_is_missing(tmp_path: Path) -> None:
+    stored = np.array([[np.nan, np.inf, -np.inf], [0.1, 2.5, 9.0]], np.float32)
+    found = decode.depth_m(image(tmp_path, stored, "32FC1"), UNITS)
+    np.testing.assert_array_equal(found, np.array([[0, 0, 0], [0, 2.5, 0]], np.float32))
+
+
+def test_colour_as_depth_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="depth encoding: got 'bgr8'"):
+        decode.depth_m(image(tmp_path, BGR, "bgr8"), UNITS)
+
+
+def compressed(tmp_path: Path, data: bytes, encoding: str) -> Any:
+    with Recorder(tmp_path / "one.mcap") as recorder:
+        recorder.compressed("/image/compressed", STAMP_NS, data, encoding)
+    return decoded(tmp_path / "one.mcap")
+
+
+def test_compressed_depth_of_both_kinds_is_read(tmp_path: Path) -> None:
+    png = cv2.imencode(".png", DEPTH_MM)[1].tobytes()
+    header = np.zeros(3, "<f4").tobytes()
+    for data, encoding in (
+        (png, "16UC1; png compressed "),
+        (header + png, "16UC1; compressedDepth"),
+        (header + png, "16UC1; compressedDepth png"),
+    ):
+        message = compressed(tmp_path, data, encoding)
+        assert decode.is_depth(message, "/image")
+        np.testing.assert_array_equal(decode.depth_m(message, UNITS), DEPTH_M)
+
+
+def test_inverse_depth_is_turned_round(tmp_path: Path) -> None:
+    scale, offset = 10000.0, -5.0
+    metres = np.array([[1.0, 2.0, 4.0]])
+    stored = np.rint(scale / metres + offset).astype(np.uint16)
+    stored[0, 2] = 0
+    header = np.zeros(1, "<i4").tobytes() + np.array([scale, offset], "<f4").tobytes()
+    data = header + cv2.imencode(".png", stored)[1].tobytes()
+    found = decode.depth_m(compressed(tmp_path, data, "32FC1; compressedDepth"), UNITS)
+    np.testing.assert_allclose(found, [[1.0, 2.0, 0.0]], atol=1e-3)
+
+
+def test_eight_bit_depth_is_refused(tmp_path: Path) -> None:
+    data = cv2.imencode(".png", BGR[..., 0])[1].tobytes()
+    with pytest.raises(InputError, match="16-bit"):
+        decode.depth_m(compressed(tmp_path, data, "16UC1; png compressed "), UNITS)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_a_cut_off_picture_is_damaged(suffix: str) -> None:
+    data = cv2.imencode(suffix, np.tile(BGR, (20, 20, 1)))[1].tobytes()
+    assert pixels.decode_bgr(data) is not None
+    for length in (0, 3, len(data) // 2, len(data) - 20):
+        assert pixels.decode_bgr(data[:length]) is None
+
+
+def scan(tmp_path: Path, ranges: list[float], **changes: float) -> Any:
+    with Recorder(tmp_path / "one.mcap") as recorder:
+        recorder.scan("/scan", STAMP_NS, ranges, **changes)
+    return decode.scan(decoded(tmp_path / "one.mcap"))
+
+
+def test_ranges_follow_our_conventions(tmp_path: Path) -> None:
+    inf, nan = float("inf"), float("nan")
+    found = scan(tmp_path, [1.0, 0.0, nan, inf, -inf, 0.05, 10.0, 12.0, 9.5])
+    expected = np.array([1.0, nan, nan, inf, nan, nan, inf, inf, 9.5], np.float32)
+    np.testing.assert_array_equal(found.ranges_m, expected)
+
+
+def test_a_clockwise_laser_is_turned_round(tmp_path: Path) -> None:
+    found = scan(tmp_path, [1.0, 2.0, 3.0], angle_min=0.5, angle_increment=-0.25)
+    np.testing.assert_array_equal(found.ranges_m, np.array([3, 2, 1], np.float32))
+    assert found.angle_step_rad == 0.25
+    np.testing.assert_allclose(found.angles_rad, [0.0, 0.25, 0.5])
+
+
+def test_a_scan_without_angles_is_damaged(tmp_path: Path) -> None:
+    assert scan(tmp_path, [1.0], angle_increment=0.0) is None
+    assert scan(tmp_path, [1.0], angle_min=float("nan")) is None
+    assert scan(tmp_path, []) is None
+
+
+def cloud_message(times_s: np.ndarray | None = None) -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    points = np.array([[1, 2, 3], [np.nan, 0, 0], [4, 5, 6]], np.float32)
+    data = Encoder().points(STAMP_NS, points, times_s)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    return store.deserialize_cdr(data, "sensor_msgs/msg/PointCloud2")
+
+
+def test_points_that_are_no_numbers_are_dropped_with_their_times() -> None:
+    found = cloud(cloud_message(np.array([0.0, 0.05, 0.1])), STAMP_NS)
+    np.testing.assert_array_equal(found.points_lidar, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(found.point_times_s, [0.0, 0.1])
+
+
+def test_absolute_point_times_become_offsets() -> None:
+    found = cloud(cloud_message(STAMP_NS * 1e-9 + np.array([0.0, 0.05, 0.1])), STAMP_NS)
+    np.testing.assert_allclose(found.point_times_s, [0.0, 0.1], atol=1e-6)
+
+
+def test_a_cloud_without_z_or_with_too_few_bytes_is_told() -> None:
+    message = cloud_message()
+    message.data = message.data[:-1]
+    assert cloud(message, STAMP_NS) is None
+    message.fields = message.fields[:2]
+    with pytest.raises(InputError, match="expected x, y, z, got x, y"):
+        cloud(message, STAMP_NS)

@@ -1,0 +1,104 @@
+"""CARMEN logs."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from ros_recordings import make_source
+
+from sceneslam.sources.rising import longest_rising, rising_stamps
+from sceneslam.types.errors import InputError
+from sceneslam.types.se3 import from_xy_yaw
+
+
+def flaser(ranges: list[float], stamp: str, x: float = 1.0) -> str:
+    values = " ".join(f"{one:.2f}" for one in ranges)
+    return f"FLASER {len(ranges)} {values} 9 9 9 {x} 2.0 0.5 {stamp} nohost 0.1"
+
+
+def write(path: Path, *lines: str) -> Path:
+    path.write_text("\n".join(lines))
+    return path
+
+
+def test_the_intel_log_is_read_whole(shared_data: Path) -> None:
+    source = make_source("carmen", shared_data / "carmen_intel" / "intel.clf")
+    found = list(source)
+    assert len(found) == source.length == 13631
+    stamps_ns = np.array([one.stamp_ns for one in found])
+    assert (np.diff(stamps_ns) > 0).all()
+    assert stamps_ns[0] == 976052857_337530000
+    (fault,) = source.faults
+    assert "787 of 13631 scans" in fault
+    scan = found[0].scan
+    assert len(scan.ranges_m) == 180
+    assert scan.angle_step_rad == pytest.approx(np.pi / 180)
+    assert np.isinf(scan.ranges_m[87])
+
+
+@pytest.mark.parametrize(("count", "degrees"), [(180, 1.0), (181, 1.0), (360, 0.5), (361, 0.5)])
+def test_the_count_tells_the_step(tmp_path: Path, count: int, degrees: float) -> None:
+    path = write(tmp_path / "a.log", flaser([2.0] * count, "10.5"))
+    (one,) = make_source("carmen", path)
+    assert one.scan.angle_min_rad == pytest.approx(-np.pi / 2)
+    assert one.scan.angle_step_rad == pytest.approx(np.deg2rad(degrees))
+
+
+def test_odometry_and_stamp_are_those_of_the_line(tmp_path: Path) -> None:
+    lines = ["ODOM 5 5 5 0 0 0 1.0 nohost 0", flaser([2.0] * 180, "10.123456")]
+    (one,) = make_source("carmen", write(tmp_path / "a.log", *lines, "RLASER 1 2 3"))
+    np.testing.assert_allclose(one.T_odom_base, from_xy_yaw(1.0, 2.0, 0.5))
+    assert one.stamp_ns == 10_123456000
+
+
+def test_the_parameter_places_the_laser(tmp_path: Path) -> None:
+    parameter = "PARAM robot_frontlaser_offset 0.115 nohost 0"
+    source = make_source("carmen", write(tmp_path / "a.log", parameter, flaser([1.0] * 180, "1.0")))
+    assert source.rig.laser.T_base_laser[0, 3] == 0.115
+
+
+def test_new_lines_say_their_angles_and_mount(tmp_path: Path) -> None:
+    line = (
+        "ROBOTLASER1 0 -2.0 4.0 0.5 30.0 0.01 0 4 1.0 2.0 31.0 0.0 1 7 "
+        "1.25 2.0 0.0 1.0 2.0 0.0 0 0 0.1 0.1 0 77.5 host 0.1"
+    )
+    source = make_source("carmen", write(tmp_path / "a.log", line))
+    (one,) = source
+    assert one.stamp_ns == 77_500000000
+    assert one.scan.angle_min_rad == -2.0
+    assert one.scan.range_max_m == 30.0
+    np.testing.assert_array_equal(one.scan.ranges_m, np.array([1, 2, np.inf, np.nan], np.float32))
+    np.testing.assert_allclose(source.rig.laser.T_base_laser[:2, 3], [0.25, 0.0])
+
+
+def test_a_cut_off_line_is_passed_over_and_told(tmp_path: Path) -> None:
+    whole = flaser([2.0] * 180, "1.0")
+    path = write(tmp_path / "a.log", whole, whole[:200], flaser([2.0] * 180, "3.0"))
+    source = make_source("carmen", path)
+    assert [one.stamp_ns for one in source] == [10**9, 3 * 10**9]
+    assert any("makes no sense: 1 time" in fault for fault in source.faults)
+
+
+def test_files_without_scans_are_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="not found"):
+        make_source("carmen", tmp_path / "nowhere.log")
+    with pytest.raises(InputError, match="no scans"):
+        make_source("carmen", write(tmp_path / "a.log", "ODOM 1 2 3"))
+    (tmp_path / "b.log").write_bytes(b"")
+    with pytest.raises(InputError, match="no scans"):
+        make_source("carmen", tmp_path / "b.log")
+
+
+@given(st.lists(st.integers(0, 10**6), max_size=40))
+def test_stamps_are_made_to_rise_with_the_fewest_changes(places: list[int]) -> None:
+    stamps_ns = np.array(places, dtype=np.int64) * 10**9
+    rising = rising_stamps(stamps_ns)
+    assert (np.diff(rising) > 0).all()
+    assert (rising == stamps_ns).sum() >= len(longest_rising(stamps_ns))
+
+
+def test_one_late_stamp_is_set_between_its_neighbours() -> None:
+    stamps_ns = np.array([1, 2, 9, 4, 5]) * 10**9
+    np.testing.assert_array_equal(rising_stamps(stamps_ns), np.array([1, 2, 3, 4, 5]) * 10**9)

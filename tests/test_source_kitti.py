@@ -1,0 +1,94 @@
+"""KITTI drives."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ros_recordings import make_source
+
+from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.rig import Sensor
+
+POINTS = np.random.default_rng(4).normal(size=(50, 4)).astype("<f4")
+
+
+def make_folder(path: Path, name: str = "velodyne", count: int = 3) -> Path:
+    (path / name).mkdir(parents=True)
+    for index in range(count):
+        (path / name / f"{index:06d}.bin").write_bytes(POINTS.tobytes())
+    return path
+
+
+def test_the_drive_is_read_with_its_truth(shared_data: Path) -> None:
+    source = make_source("kitti", shared_data / "kitti_raw_2011_09_26_drive_0001")
+    found = list(source)
+    assert len(found) == source.length == 108
+    assert source.rig.sensors == {Sensor.POINTS}
+    truth = source.ground_truth().trajectory
+    assert len(truth) == 108
+    assert truth.stamps_ns[5] == found[5].stamp_ns == source.span.start_ns + 520_000_000
+    steps = np.linalg.norm(np.diff(truth.positions_m, axis=0), axis=1)
+    assert steps.sum() == pytest.approx(106.9, abs=0.5)
+
+
+@pytest.mark.parametrize("name", ["velodyne", "velodyne_points/data"])
+def test_both_layouts_are_read_at_ten_hertz(tmp_path: Path, name: str) -> None:
+    found = list(make_source("kitti", make_folder(tmp_path / "a", name)))
+    assert [one.stamp_ns for one in found] == [0, 100_000_000, 200_000_000]
+    np.testing.assert_array_equal(found[0].points_lidar, POINTS[:, :3])
+
+
+def test_the_dates_of_raw_drives_are_stamps(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "a", "velodyne_points/data", 1)
+    times = "2011-09-26 13:02:25.964389445\n"
+    (folder / "velodyne_points" / "timestamps.txt").write_text(times)
+    (one,) = make_source("kitti", folder)
+    assert one.stamp_ns == 1317042145_964389445
+
+
+def test_poses_of_twelve_numbers_are_truth(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "a")
+    rows = np.tile(np.eye(4)[:3].ravel(), (3, 1))
+    rows[:, 3] = [0, 1, 2]
+    np.savetxt(folder / "poses.txt", rows)
+    truth = make_source("kitti", folder).ground_truth().trajectory
+    np.testing.assert_array_equal(truth.positions_m[:, 0], [0, 1, 2])
+    np.savetxt(folder / "poses.txt", rows[:2])
+    with pytest.raises(InputError, match="expected 3 lines of 12"):
+        make_source("kitti", folder).ground_truth()
+
+
+def test_damaged_scans_are_passed_over_and_named(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "a")
+    (folder / "velodyne" / "000001.bin").write_bytes(POINTS.tobytes()[:-3])
+    (folder / "velodyne" / "000002.bin").write_bytes(b"")
+    source = make_source("kitti", folder)
+    assert len(list(source)) == 1
+    (fault,) = source.faults
+    assert "2 times" in fault
+    assert "000001.bin" in fault
+
+
+def test_points_that_are_no_numbers_are_dropped(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "a", count=1)
+    broken = POINTS.copy()
+    broken[7, 1] = np.nan
+    (folder / "velodyne" / "000000.bin").write_bytes(broken.tobytes())
+    (one,) = make_source("kitti", folder)
+    assert len(one.points_lidar) == 49
+
+
+def test_wrong_folders_times_and_ranges_are_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="not found"):
+        make_source("kitti", tmp_path / "nowhere")
+    with pytest.raises(InputError, match="no scans"):
+        make_source("kitti", tmp_path)
+    folder = make_folder(tmp_path / "a")
+    with pytest.raises(ConfigError, match="range_m"):
+        make_source("kitti", folder, range_m=[5.0, 1.0])
+    (folder / "times.txt").write_text("0.0\n0.1\n")
+    with pytest.raises(InputError, match="expected 3 as there are scans, got 2"):
+        make_source("kitti", folder)
+    (folder / "times.txt").write_text("0.0\nsoon\n0.2")
+    with pytest.raises(InputError, match="'soon'"):
+        make_source("kitti", folder)

@@ -1,0 +1,271 @@
+"""Recordings of others: topics, intrinsics, frames, truth."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ros_recordings import STAMP_NS, Recorder, make_source
+
+from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.rig import Sensor, optical_to_rep103
+
+COLOR = np.full((30, 40, 3), 90, np.uint8)
+DEPTH = np.full((30, 40), 1500, np.uint16)
+
+
+@pytest.mark.parametrize("name", ["rgbd_3s.bag", "rgbd_3s_ros2.mcap"])
+def test_the_kinect_bags_give_images_depth_and_truth(shared_data: Path, name: str) -> None:
+    source = make_source("rosbag", shared_data / "bags" / name)
+    found = list(source)
+    assert len(found) == source.length == 30
+    assert source.faults == []
+    assert all(one.has(Sensor.IMAGE) and one.has(Sensor.DEPTH) for one in found)
+    assert source.rig.camera.fx == 517.3
+    assert source.rig.camera.distortion == (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
+    assert source.span.start_ns == found[0].stamp_ns
+    assert source.span.end_ns == found[-1].stamp_ns
+
+
+def test_bag_mcap_and_tum_folder_agree(shared_data: Path) -> None:
+    bag = make_source("rosbag", shared_data / "bags" / "rgbd_3s.bag")
+    mcap = make_source("mcap", shared_data / "bags" / "rgbd_3s_ros2.mcap")
+    folder = make_source("tum_rgbd", shared_data / "tum_fr1_rpy")
+    one, two = next(iter(bag)), next(iter(mcap))
+    np.testing.assert_array_equal(one.image_bgr, two.image_bgr)
+    np.testing.assert_array_equal(one.depth_m, two.depth_m)
+    near = min(folder, key=lambda frame: abs(frame.stamp_ns - one.stamp_ns))
+    assert abs(near.stamp_ns - one.stamp_ns) < 1000
+    both = (near.depth_m > 0) & (one.depth_m > 0)
+    np.testing.assert_allclose(near.depth_m[both], one.depth_m[both], atol=6e-4)
+    truths = [source.ground_truth().trajectory for source in (bag, folder)]
+    index = int(np.argmin(np.abs(truths[1].stamps_ns - one.stamp_ns)))
+    np.testing.assert_allclose(truths[0].T_world_base[0], truths[1].T_world_base[index], atol=0.02)
+
+
+@pytest.mark.parametrize("name", ["hokuyo_scan.bag", "hokuyo_scan_ros2.mcap", "hokuyo_scan_db3"])
+def test_all_storages_give_the_same_scans(shared_data: Path, name: str) -> None:
+    source = make_source("rosbag", shared_data / "bags" / name)
+    found = list(source)
+    assert len(found) == source.length == 360
+    assert found[0].stamp_ns == source.span.start_ns == 1282836370970876375
+    assert found[-1].stamp_ns == source.span.end_ns
+    assert source.rig.sensors == {Sensor.SCAN}
+    assert np.isnan(found[0].scan.ranges_m[16])
+    assert source.ground_truth() is None
+
+
+def test_points_come_before_scans_and_truth_is_no_odometry(shared_data: Path) -> None:
+    source = make_source("rosbag", shared_data / "bags" / "embag_test.bag")
+    assert source.rig.sensors == {Sensor.POINTS, Sensor.SCAN}
+    assert len(list(source)) == 5
+    assert len(source.ground_truth().trajectory) == 5
+
+
+def test_odometry_alone_will_do(shared_data: Path) -> None:
+    source = make_source("mcap", shared_data / "bags" / "nav2_turtlebot.mcap")
+    found = list(source)
+    assert len(found) == 2639
+    assert all(one.T_odom_base is not None for one in found)
+
+
+def record(path: Path, **images: tuple[np.ndarray, str]) -> Path:
+    """Write three frames of each image topic (`left__image` is /left/image)."""
+    with Recorder(path) as recorder:
+        for index in range(3):
+            for name, (stored, encoding) in images.items():
+                topic = "/" + name.replace("__", "/")
+                recorder.image(topic, STAMP_NS + index * 10**8, stored, encoding)
+    return path
+
+
+def test_two_candidates_for_the_image_have_to_be_chosen_from(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", left__image=(COLOR, "bgr8"), right__image=(COLOR, "bgr8"))
+    with pytest.raises(InputError) as caught:
+        make_source("mcap", path)
+    assert "topics.image" in str(caught.value)
+    assert "/left/image, /right/image" in str(caught.value)
+    assert "source.topics.image=/left/image" in str(caught.value)
+    source = make_source("mcap", path, topics={"image": "/right/image"})
+    assert source.rig.sensors == {Sensor.IMAGE}
+    assert len(list(source)) == 3
+
+
+def test_colour_is_preferred_to_infrared_and_raw_to_compressed(tmp_path: Path) -> None:
+    infrared = COLOR[..., 0]
+    path = record(tmp_path / "a.mcap", infra__image=(infrared, "mono8"), rgb__image=(COLOR, "rgb8"))
+    assert len(list(make_source("mcap", path))) == 3
+
+
+def test_a_name_that_is_not_there_shows_what_is(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", rgb__image=(COLOR, "bgr8"))
+    with pytest.raises(ConfigError, match=r"/rgb/image \(sensor_msgs/msg/Image\)") as caught:
+        make_source("mcap", path, topics={"image": "/camera"})
+    assert caught.value.key == "topics.image"
+    with pytest.raises(ConfigError) as caught:
+        make_source("mcap", path, topics={"scan": "/rgb/image"})
+    assert caught.value.key == "topics.scan"
+    with pytest.raises(ConfigError) as caught:
+        make_source("mcap", path, topics={"picture": None})
+    assert caught.value.key == "topics.picture"
+
+
+def test_a_recording_without_any_sensor_says_what_it_has(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", rgb__image=(COLOR, "bgr8"))
+    with pytest.raises(InputError, match=r"no image, depth, points.*/rgb/image"):
+        make_source("mcap", path, topics={"image": "none"})
+
+
+def rgbd(path: Path, **camera_info: Any) -> Path:
+    with Recorder(path) as recorder:
+        for index in range(3):
+            stamp_ns = STAMP_NS + index * 10**8
+            recorder.image("/cam/depth", stamp_ns + 5_000_000, DEPTH, "16UC1")
+            recorder.image("/cam/rgb", stamp_ns, COLOR, "bgr8")
+            if camera_info:
+                recorder.camera_info("/cam/camera_info", stamp_ns, **camera_info)
+    return path
+
+
+def test_depth_without_intrinsics_asks_for_them(tmp_path: Path) -> None:
+    path = rgbd(tmp_path / "a.mcap")
+    with pytest.raises(InputError, match=r"depth without intrinsics.*source\.camera\.fx"):
+        make_source("mcap", path)
+    given = {"fx": 40.0, "fy": 41.0, "cx": 20.0, "cy": 15.0}
+    source = make_source("mcap", path, camera=given)
+    assert source.rig.camera.fy == 41.0
+    assert all(one.has(Sensor.DEPTH) for one in source)
+
+
+def test_camera_info_of_another_size_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="80x60 pixels but the images have 40x30"):
+        make_source("mcap", rgbd(tmp_path / "a.mcap", size_wh=(80, 60)))
+
+
+def test_depth_goes_to_the_nearest_image_within_the_tolerance(tmp_path: Path) -> None:
+    path = rgbd(tmp_path / "a.mcap", size_wh=(40, 30))
+    assert all(one.has(Sensor.DEPTH) for one in make_source("mcap", path))
+    strict = make_source("mcap", path, sync_tolerance_s=0.004)
+    assert not any(one.has(Sensor.DEPTH) for one in strict)
+
+
+def test_images_that_change_size_end_the_reading_with_both_sizes(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.image("/rgb", STAMP_NS, COLOR, "bgr8")
+        recorder.image("/rgb", STAMP_NS + 10**8, COLOR[:20], "bgr8")
+    source = iter(make_source("mcap", tmp_path / "a.mcap"))
+    next(source)
+    with pytest.raises(InputError, match=r"expected 40x30.*got 40x20.*a\.mcap"):
+        next(source)
+
+
+def test_depth_of_another_size_than_the_image_is_refused(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.camera_info("/camera_info", STAMP_NS, (40, 30))
+        recorder.image("/rgb", STAMP_NS, COLOR, "bgr8")
+        recorder.image("/depth", STAMP_NS, DEPTH[:20], "16UC1")
+    with pytest.raises(InputError, match="depth at stamp"):
+        list(make_source("mcap", tmp_path / "a.mcap"))
+
+
+def test_a_damaged_picture_is_passed_over_and_told(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.image("/rgb", STAMP_NS, COLOR, "bgr8")
+        recorder.image("/rgb", STAMP_NS + 10**8, COLOR, "bgr8")
+        broken = recorder.new(
+            "sensor_msgs/msg/Image",
+            header=recorder.header(STAMP_NS + 2 * 10**8),
+            height=30,
+            width=40,
+            encoding="bgr8",
+            is_bigendian=0,
+            step=120,
+            data=np.zeros(10, np.uint8),
+        )
+        recorder.add("/rgb", STAMP_NS + 2 * 10**8, broken)
+    source = make_source("mcap", tmp_path / "a.mcap")
+    assert len(list(source)) == 2
+    (fault,) = source.faults
+    assert "colour image could not be decoded: 1 time" in fault
+
+
+def transform(recorder: Recorder, parent: str, child: str, x_m: float) -> Any:
+    return recorder.new(
+        "geometry_msgs/msg/TransformStamped",
+        header=recorder.header(STAMP_NS, parent),
+        child_frame_id=child,
+        transform=recorder.new(
+            "geometry_msgs/msg/Transform",
+            translation=recorder.new("geometry_msgs/msg/Vector3", x=x_m, y=0.0, z=0.0),
+            rotation=recorder.new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+        ),
+    )
+
+
+def test_mounts_come_from_the_transform_tree(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        tree = [
+            transform(recorder, "base_footprint", "base_link", 0.0),
+            transform(recorder, "base_link", "mast", 0.5),
+            transform(recorder, "mast", "laser", 0.25),
+        ]
+        recorder.add("/tf_static", 0, recorder.new("tf2_msgs/msg/TFMessage", transforms=tree))
+        recorder.scan("/scan", STAMP_NS, [1.0, 2.0])
+    source = make_source("mcap", tmp_path / "a.mcap")
+    assert source.rig.laser.T_base_laser[0, 3] == 0.75
+    other = make_source("mcap", tmp_path / "a.mcap", base_frame="mast")
+    assert other.rig.laser.T_base_laser[0, 3] == 0.25
+    with pytest.raises(ConfigError, match="base_link, laser, mast"):
+        make_source("mcap", tmp_path / "a.mcap", base_frame="robot")
+
+
+def test_without_transforms_the_camera_looks_ahead(tmp_path: Path) -> None:
+    source = make_source("mcap", rgbd(tmp_path / "a.mcap", size_wh=(40, 30)))
+    np.testing.assert_array_equal(source.rig.camera.T_base_cam, optical_to_rep103())
+
+
+def pose_truth(path: Path) -> Path:
+    with Recorder(path) as recorder:
+        recorder.image("/rgb", STAMP_NS, COLOR, "bgr8")
+        recorder.camera_info("/camera_info", STAMP_NS, (40, 30))
+        pose = recorder.new(
+            "geometry_msgs/msg/Pose",
+            position=recorder.new("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0),
+            orientation=recorder.new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+        )
+        header = recorder.header(STAMP_NS, "world")
+        stamped = recorder.new("geometry_msgs/msg/PoseStamped", header=header, pose=pose)
+        recorder.add("/ground_truth", STAMP_NS, stamped)
+    return path
+
+
+def test_poses_without_a_robot_are_the_cameras(tmp_path: Path) -> None:
+    path = pose_truth(tmp_path / "a.mcap")
+    expected = {"base": np.eye(3), "camera": optical_to_rep103()[:3, :3].T}
+    for frame, rotation in ((None, expected["camera"]), *expected.items()):
+        source = make_source("mcap", path, ground_truth_frame=frame)
+        (T_gt_base,) = source.ground_truth().trajectory.T_world_base
+        np.testing.assert_allclose(T_gt_base[:3, :3], rotation, atol=1e-12)
+        np.testing.assert_allclose(T_gt_base[:3, 3], [1, 2, 3])
+
+
+@pytest.mark.parametrize(
+    ("key", "changes"),
+    [
+        ("depth_scale", {"depth_scale": 0.0}),
+        ("sync_tolerance_s", {"sync_tolerance_s": -1.0}),
+        ("ground_truth_frame", {"ground_truth_frame": "laser"}),
+        ("depth_range_m", {"depth_range_m": [3.0, 1.0]}),
+        ("camera.cy", {"camera": {"fx": 1.0, "fy": 1.0, "cx": 1.0}}),
+        ("camera.fx", {"camera": {"fx": -1.0, "fy": 1.0, "cx": 1.0, "cy": 1.0}}),
+        ("camera.focal", {"camera": {"focal": 1.0}}),
+        ("camera.distortion", {"camera": {"distortion": [1.0]}}),
+    ],
+)
+def test_wrong_values_are_named_by_their_key(
+    tmp_path: Path, key: str, changes: dict[str, Any]
+) -> None:
+    path = record(tmp_path / "a.mcap", rgb__image=(COLOR, "bgr8"))
+    with pytest.raises(ConfigError) as caught:
+        make_source("mcap", path, **changes)
+    assert caught.value.key == key
