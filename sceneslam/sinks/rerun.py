@@ -167,7 +167,9 @@ class RerunSink:
             recording.log("world/base/camera/image", image)
         if observation.depth_m is not None and self._is_due("depth"):
             depth_mm = np.clip(observation.depth_m * 1000.0, 0, 65535).astype(np.uint16)
-            recording.log("world/base/camera/depth", self._rr.DepthImage(depth_mm, meter=1000.0))
+            _, png = cv2.imencode(".png", depth_mm)
+            depth = self._rr.EncodedDepthImage(png.tobytes(), media_type="image/png", meter=1000.0)
+            recording.log("world/base/camera/depth", depth)
         scan = observation.scan
         if scan is not None and self._is_due("scan"):
             hit = np.isfinite(scan.ranges_m)
