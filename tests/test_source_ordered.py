@@ -1,0 +1,117 @@
+"""Any source, wrapped so that its stamps rise."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sceneslam.interfaces import Source
+from sceneslam.sources.ordered import Ordered
+from sceneslam.sources.spanned import Span
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.truth import GroundTruth
+
+
+@dataclass
+class Listed:
+    """A source that gives the observations of a list."""
+
+    observations: Sequence[Observation]
+    faults: Sequence[str] = ()
+    rig: Rig = field(default_factory=lambda: Rig(sensors=frozenset({Sensor.POINTS})))
+
+    @property
+    def length(self) -> int:
+        return len(self.observations)
+
+    @property
+    def span(self) -> Span | None:
+        return None
+
+    def __iter__(self) -> Iterator[Observation]:
+        return iter(self.observations)
+
+    def ground_truth(self) -> GroundTruth | None:
+        return None
+
+
+def at(*seconds: float) -> Listed:
+    return Listed([Observation(stamp_ns=round(second * 1e9)) for second in seconds])
+
+
+def seconds(source: Source) -> list[float]:
+    return [observation.stamp_ns / 1e9 for observation in source]
+
+
+def test_a_sound_source_passes_unchanged() -> None:
+    inner = at(1, 2, 3)
+    ordered = Ordered(inner)
+    assert isinstance(ordered, Source)
+    assert list(ordered) == list(inner.observations)
+    assert ordered.faults == []
+    assert ordered.length == 3
+
+
+def test_repeated_and_backward_stamps_are_left_out_and_counted() -> None:
+    ordered = Ordered(at(1, 2, 2, 1.5, 3))
+    assert seconds(ordered) == [1, 2, 3]
+    (fault,) = ordered.faults
+    assert "2 times, first at stamp 2.000000 s" in fault
+
+
+def test_one_stamp_far_ahead_does_not_cost_the_rest() -> None:
+    ordered = Ordered(at(1, 2, 900, 3, 4))
+    assert seconds(ordered) == [1, 2, 3, 4]
+    assert len(ordered.faults) == 1
+    assert seconds(Ordered(at(900, 1, 2, 3))) == [1, 2, 3]
+
+
+def test_a_gap_is_told_and_nothing_is_left_out() -> None:
+    ordered = Ordered(at(1, 2, 10, 11), max_gap_s=5.0)
+    assert seconds(ordered) == [1, 2, 10, 11]
+    assert ordered.faults == ["no observation for 8.0 s: 1 time at stamp 2.000000 s"]
+
+
+def test_reading_twice_counts_once() -> None:
+    ordered = Ordered(at(1, 1))
+    assert seconds(ordered) == seconds(ordered) == [1]
+    assert "1 time" in ordered.faults[0]
+
+
+def test_points_that_are_no_numbers_and_empty_images_are_dropped() -> None:
+    points = np.array([[1, 2, 3], [np.nan, 0, 0], [np.inf, 0, 0]], np.float32)
+    observation = Observation(
+        stamp_ns=1,
+        points_lidar=points,
+        point_times_s=np.array([0.0, 0.1, 0.2]),
+        image_bgr=np.zeros((0, 5, 3), np.uint8),
+        depth_m=np.zeros((0, 5), np.float32),
+    )
+    ordered = Ordered(Listed([observation]))
+    (found,) = ordered
+    assert found.image_bgr is None
+    assert found.depth_m is None
+    np.testing.assert_array_equal(found.points_lidar, points[:1])
+    assert len(found.point_times_s) == 1
+    assert len(ordered.faults) == 3
+
+
+def test_the_sources_own_faults_come_first() -> None:
+    assert Ordered(Listed([], faults=["broken"])).faults == ["broken"]
+
+
+def test_a_gap_of_nothing_is_refused() -> None:
+    with pytest.raises(ConfigError, match="max_gap_s"):
+        Ordered(at(1), max_gap_s=0.0)
+
+
+@given(st.lists(st.integers(0, 60), max_size=30))
+def test_stamps_always_rise(places: list[int]) -> None:
+    found = seconds(Ordered(at(*places)))
+    assert all(before < after for before, after in pairwise(found))

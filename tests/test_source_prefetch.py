@@ -1,0 +1,120 @@
+"""Decoding ahead, and bringing streams together."""
+
+import threading
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from sceneslam.sources.prefetch import prefetched
+from sceneslam.sources.synchronise import Bundle, Sample, Synchroniser
+from sceneslam.types import se3
+from sceneslam.types.rig import Sensor
+
+MS = 1_000_000
+
+
+def jobs(count: int, drawn: list[int] | None = None) -> Iterator[Callable[[], int]]:
+    for number in range(count):
+        if drawn is not None:
+            drawn.append(number)
+        yield lambda number=number: number
+
+
+def decode_threads() -> int:
+    return sum(thread.name.startswith("decode") for thread in threading.enumerate())
+
+
+def test_results_come_in_order() -> None:
+    assert list(prefetched(jobs(100), workers=4, ahead=7)) == list(range(100))
+
+
+def test_no_more_than_ahead_is_drawn() -> None:
+    drawn: list[int] = []
+    results = prefetched(jobs(100, drawn), ahead=3)
+    assert next(results) == 0
+    assert len(drawn) == 4
+    results.close()
+    assert decode_threads() == 0
+
+
+def test_an_exception_comes_where_its_result_would() -> None:
+    def fail() -> int:
+        raise ValueError("broken")
+
+    results = prefetched([lambda: 1, fail, lambda: 3])
+    assert next(results) == 1
+    with pytest.raises(ValueError, match="broken"):
+        next(results)
+    assert decode_threads() == 0
+
+
+def bundles(
+    primary: Sensor, samples: list[tuple[Sensor, int, object]], tolerance_s: float = 0.02
+) -> list[Bundle]:
+    streams = frozenset(sensor for sensor, _, _ in samples)
+    synchroniser = Synchroniser(primary, streams, tolerance_s)
+    found: list[Bundle] = []
+    for sensor, stamp_ms, value in samples:
+        found += synchroniser.add(sensor, Sample(stamp_ns=stamp_ms * MS, value=value))
+    return [*found, *synchroniser.flush()]
+
+
+def test_depth_goes_to_the_nearest_image_once() -> None:
+    found = bundles(
+        Sensor.IMAGE,
+        [
+            (Sensor.IMAGE, 100, "a"),
+            (Sensor.DEPTH, 95, 1),
+            (Sensor.DEPTH, 101, 2),
+            (Sensor.IMAGE, 110, "b"),
+            (Sensor.IMAGE, 112, "c"),
+        ],
+    )
+    assert [one.depth and one.depth.value for one in found] == [2, 1, None]
+
+
+def test_depth_may_be_recorded_after_its_image() -> None:
+    found = bundles(
+        Sensor.IMAGE,
+        [
+            (Sensor.IMAGE, 100, "a"),
+            (Sensor.IMAGE, 133, "b"),
+            (Sensor.DEPTH, 100, 1),
+            (Sensor.DEPTH, 133, 2),
+        ],
+    )
+    assert [one.depth.value for one in found] == [1, 2]
+
+
+def test_the_last_scan_since_the_image_before_is_taken() -> None:
+    scans = [(Sensor.SCAN, stamp, stamp) for stamp in (10, 90, 120, 150, 210)]
+    images = [(Sensor.IMAGE, stamp, "") for stamp in (100, 160, 170)]
+    found = bundles(Sensor.IMAGE, sorted(scans + images, key=lambda one: one[1]))
+    assert [one.scan and one.scan.value for one in found] == [90, 150, None]
+
+
+def test_all_gyro_samples_since_the_image_before_are_taken() -> None:
+    gyro = [(Sensor.GYRO, stamp, stamp) for stamp in range(5, 300, 10)]
+    images = [(Sensor.IMAGE, stamp, "") for stamp in (100, 200)]
+    found = bundles(Sensor.IMAGE, sorted(gyro + images, key=lambda one: one[1]))
+    assert [sample.value for sample in found[1].gyro] == list(range(105, 200, 10))
+
+
+def test_odometry_is_interpolated_and_not_across_a_gap() -> None:
+    poses = [(Sensor.ODOMETRY, t, se3.from_xy_yaw(t * 0.01, 0, 0)) for t in (0, 100, 200, 5000)]
+    images = [(Sensor.IMAGE, stamp, "") for stamp in (100, 150, 2500)]
+    found = bundles(Sensor.IMAGE, sorted(poses + images, key=lambda one: one[1]))
+    xs = [None if one.T_odom_base is None else one.T_odom_base[0, 3] for one in found]
+    assert xs[2] is None
+    np.testing.assert_allclose(xs[:2], [1.0, 1.5])
+
+
+def test_a_stream_that_stopped_holds_nothing_up_for_long() -> None:
+    streams = frozenset({Sensor.IMAGE, Sensor.ODOMETRY})
+    synchroniser = Synchroniser(Sensor.IMAGE, streams, 0.02)
+    given = [
+        len(list(synchroniser.add(Sensor.IMAGE, Sample(stamp_ns=index * 100 * MS, value=""))))
+        for index in range(30)
+    ]
+    assert sum(given) >= 18
