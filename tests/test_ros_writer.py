@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from ros_recordings import STAMP_NS, make_source
 
+from sceneslam.interfaces import Sink
 from sceneslam.ros.writer import ObservationWriter
 from sceneslam.sinks.mcap import McapSink
 from sceneslam.types import se3
@@ -177,11 +178,13 @@ def test_an_unknown_image_format_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_sinks_poses_are_results_and_no_input(tmp_path: Path) -> None:
-    sink = McapSink(str(tmp_path / "run.mcap"), "jpeg")
-    sink.open(RIG)
+    sink = McapSink("run.mcap", "jpeg")
+    assert isinstance(sink, Sink)
+    sink.open(RIG, tmp_path)
     made = observations(3)
     for observation in made:
         sink.write(observation, se3.from_xy_yaw(9.0, 9.0, 1.0), "visual")
+    sink.write_event({"event": "vote", "stamp_ns": STAMP_NS, "scene": "Dark"})
     sink.write_truth(truth(made))
     sink.close()
     sink.close()

@@ -19,6 +19,7 @@ TRUTH_SCENE = "/ground_truth/scene"
 OWN_PREFIX = "/sceneslam/"  # results, never an input
 RESULT_ODOMETRY = OWN_PREFIX + "odom"
 RESULT_MODULE = OWN_PREFIX + "module"
+RESULT_EVENTS = OWN_PREFIX + "events"  # JSON
 
 RIG_METADATA = "sceneslam.rig"  # MCAP metadata: what no ROS message says of a rig
 
@@ -36,4 +37,5 @@ TYPES = {
     TRUTH_SCENE: "std_msgs/msg/String",
     RESULT_ODOMETRY: "nav_msgs/msg/Odometry",
     RESULT_MODULE: "std_msgs/msg/String",
+    RESULT_EVENTS: "std_msgs/msg/String",
 }

@@ -44,8 +44,11 @@ class ObservationWriter:
         self._schemas: dict[str, int] = {}
         self._last_ns = 0
         self._is_open, self._has_frames = True, False
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = path.open("wb")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("wb")
+        except OSError as err:
+            raise InputError(f"recording cannot be written ({err.strerror}): {path}") from err
         self._mcap: Any = Writer(
             self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.NONE
         )
@@ -91,6 +94,10 @@ class ObservationWriter:
     def write_module(self, stamp_ns: int, module: str) -> None:
         """Add a result: the module that is active from `stamp_ns` on."""
         self._add(names.RESULT_MODULE, stamp_ns, self._encoder.text(module))
+
+    def write_event(self, stamp_ns: int, text: str) -> None:
+        """Add a result: what was decided."""
+        self._add(names.RESULT_EVENTS, stamp_ns, self._encoder.text(text))
 
     def write_truth(self, truth: GroundTruth) -> None:
         """Add all true poses (float64) and scene changes; any time before `close`."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from sceneslam.ros.writer import ObservationWriter
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
+from sceneslam.types.run import Event
 from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import GroundTruth
 
@@ -20,9 +22,10 @@ class McapSink:
         self._writer: ObservationWriter | None = None
         self._module = ""
 
-    def open(self, rig: Rig) -> None:
-        """Begin the file."""
-        self._writer = ObservationWriter(self._path, rig=rig, image_format=self._image_format)
+    def open(self, rig: Rig, folder: Path) -> None:
+        """Begin the file; a relative path is one in `folder`."""
+        path = folder / self._path
+        self._writer = ObservationWriter(path, rig=rig, image_format=self._image_format)
         self._module = ""
 
     def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
@@ -35,6 +38,12 @@ class McapSink:
         if module != self._module:
             self._writer.write_module(observation.stamp_ns, module)
             self._module = module
+
+    def write_event(self, event: Event) -> None:
+        """Add one event as JSON text."""
+        if self._writer is not None:
+            text = json.dumps(dict(event), default=str)
+            self._writer.write_event(int(event["stamp_ns"]), text)
 
     def write_truth(self, truth: GroundTruth) -> None:
         """Add what is known to be true, so that a re-run can be measured as well."""
