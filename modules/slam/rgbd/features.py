@@ -31,6 +31,11 @@ class Features:
     def __len__(self) -> int:
         return len(self.levels)
 
+    @property
+    def deep_count(self) -> int:
+        """Return how many features have a depth."""
+        return int(np.count_nonzero(self.depth_m))
+
 
 class FeatureExtractor:
     """Finds features where the image holds structure above its own noise."""
@@ -49,7 +54,7 @@ class FeatureExtractor:
         corners, descriptors = self._orb.compute(gray, _spread(corners, self._count))
         if not corners:
             return _none_found()
-        uv_image = cv2.KeyPoint.convert(corners).astype(np.float64)
+        uv_image = np.asarray(cv2.KeyPoint.convert(corners), dtype=np.float64)
         return Features(
             uv_px=self._undistort(uv_image),
             levels=np.array([corner.octave for corner in corners], dtype=np.int64),
@@ -94,7 +99,7 @@ def _spread(corners: Any, count: int) -> Any:
     """Return `count` corners: every cell's best first, then every cell's second, and so on."""
     if len(corners) <= count:
         return corners
-    uv_px = cv2.KeyPoint.convert(corners)
+    uv_px = np.asarray(cv2.KeyPoint.convert(corners))
     strength = np.array([corner.response for corner in corners])
     cells = (uv_px // _CELL_PX).astype(np.int64) @ np.array([1, 10_000])
     order = np.lexsort((-strength, cells))

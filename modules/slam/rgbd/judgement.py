@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sceneslam.types.observation import TrackingStatus
 from sceneslam.types.se3 import Transform
 
 from .keyframes import KeyframeStore
 from .localizer import Fix
+from .pose_solver import PoseEstimate
+
+_MIN_DEPTH_AGREEMENT_RATIO = 0.2  # below, image and depth do not show the same place
 
 
 class HealthRule:
-    """Calls a pose degraded that few landmarks hold, or that some direction is unsure of."""
+    """Calls a pose degraded that few landmarks hold, or that some direction is unsure of,
+    or that the depth image contradicts.
+    """
 
     def __init__(self, *, degraded_inliers: int, degraded_sigma_m: float) -> None:
         self._inliers, self._variance = degraded_inliers, degraded_sigma_m**2
 
-    def judge(self, inliers: int, covariance: NDArray[np.float64]) -> TrackingStatus:
+    def judge(self, estimate: PoseEstimate) -> TrackingStatus:
         """Return TRACKING or DEGRADED."""
-        worst_variance = float(np.linalg.eigvalsh(covariance[:3, :3])[-1])
-        if inliers < self._inliers or worst_variance > self._variance:
+        worst_variance = float(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1])
+        if (
+            int(estimate.inliers.sum()) < self._inliers
+            or worst_variance > self._variance
+            or estimate.depth_agreement_ratio < _MIN_DEPTH_AGREEMENT_RATIO
+        ):
             return TrackingStatus.DEGRADED
         return TrackingStatus.TRACKING
 

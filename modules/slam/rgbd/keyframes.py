@@ -17,6 +17,15 @@ from .features import Features
 NO_LANDMARK = -1
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DepthView:
+    """What is kept of a depth image for the map layers."""
+
+    points_base: NDArray[np.float32]  # (M, 3) [m]
+    colors_bgr: NDArray[np.uint8]  # (M, 3)
+    scan: LaserScan | None  # None where the camera does not see the scan's band
+
+
 @dataclass(slots=True, kw_only=True, eq=False)
 class Keyframe:
     """One image that the map is built of. Pose and landmarks may be corrected later."""
@@ -26,9 +35,7 @@ class Keyframe:
     features: Features
     landmark_ids: NDArray[np.int64]  # (N,), per feature, or NO_LANDMARK
     appearance: NDArray[np.float32]  # thumbnail, zero mean, unit length
-    points_base: NDArray[np.float32]  # (M, 3) [m], thinned depth
-    colors_bgr: NDArray[np.uint8]  # (M, 3)
-    scan: LaserScan | None = None  # of the same depth, in base
+    view: DepthView
 
 
 class KeyframeStore:
@@ -83,7 +90,7 @@ class KeyframeStore:
         """Return the ids of all landmarks that these keyframes saw, rising."""
         seen = [self._keyframes[keyframe_id].landmark_ids for keyframe_id in keyframe_ids]
         ids = np.unique(np.concatenate([*seen, np.array([NO_LANDMARK])]))
-        return ids[ids != NO_LANDMARK]
+        return np.asarray(ids[ids != NO_LANDMARK])
 
     def forget_landmarks(self, landmark_ids: NDArray[np.int64]) -> None:
         """Let no keyframe refer to these landmarks any more."""
@@ -96,7 +103,9 @@ class KeyframeStore:
         T_keyframes = np.stack([keyframe.T_local_base for keyframe in self.all()])
         T_keyframe_base = se3.inverse(T_keyframes) @ T_local_base
         distances_m = np.linalg.norm(T_keyframe_base[:, :3, 3], axis=1)
-        return float((per_m * distances_m + per_rad * se3.rotation_angle_rad(T_keyframe_base)).min())
+        return float(
+            (per_m * distances_m + per_rad * se3.rotation_angle_rad(T_keyframe_base)).min()
+        )
 
     def most_redundant(self) -> int:
         """Return the keyframe that stands closest to another, the latest and first left out."""

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 _FIRST_CAPACITY = 4096
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Looks:
+    """How landmarks look from a viewer."""
+
+    descriptors: NDArray[np.uint8]  # (N, 32)
+    normals_local: NDArray[np.float64]  # (N, 3), unit vectors towards the viewer
+    reach_m: NDArray[np.float64]  # (N,), distance at which they would show on level 0
 
 
 class LandmarkTable:
@@ -19,8 +30,8 @@ class LandmarkTable:
         self.points_local = np.zeros((_FIRST_CAPACITY, 3))  # (C, 3) [m]
         self.information = np.zeros((_FIRST_CAPACITY, 3, 3))  # inverse covariance [1/m^2]
         self.covariance = np.zeros((_FIRST_CAPACITY, 3, 3))  # [m^2]
-        self.normals_local = np.zeros((_FIRST_CAPACITY, 3))  # from the landmark to its viewer
-        self.reach_m = np.zeros(_FIRST_CAPACITY)  # distance at which it shows on level 0
+        self.normals_local = np.zeros((_FIRST_CAPACITY, 3))  # see Looks, as for the next two
+        self.reach_m = np.zeros(_FIRST_CAPACITY)
         self.descriptors = np.zeros((_FIRST_CAPACITY, 32), np.uint8)
         self.alive = np.zeros(_FIRST_CAPACITY, bool)
         self.expected = np.zeros(_FIRST_CAPACITY, np.int64)  # images that should show it
@@ -34,17 +45,14 @@ class LandmarkTable:
         *,
         points_local: NDArray[np.float64],
         information: NDArray[np.float64],
-        normals_local: NDArray[np.float64],
-        reach_m: NDArray[np.float64],
-        descriptors: NDArray[np.uint8],
+        looks: Looks,
     ) -> NDArray[np.int64]:
         """Store N landmarks and return their ids (N,)."""
         self._reserve(len(points_local))
         ids = np.flatnonzero(~self.alive)[: len(points_local)]
         self.points_local[ids], self.information[ids] = points_local, information
         self.covariance[ids] = np.linalg.inv(information)
-        self.normals_local[ids], self.reach_m[ids] = normals_local, reach_m
-        self.descriptors[ids] = descriptors
+        self.describe(ids, looks)
         self.alive[ids], self.expected[ids], self.found[ids] = True, 1, 1
         return ids
 
@@ -62,17 +70,10 @@ class LandmarkTable:
         self.information[ids] = total
         self.covariance[ids] = np.linalg.inv(total)
 
-    def describe(
-        self,
-        ids: NDArray[np.int64],
-        *,
-        descriptors: NDArray[np.uint8],
-        normals_local: NDArray[np.float64],
-        reach_m: NDArray[np.float64],
-    ) -> None:
+    def describe(self, ids: NDArray[np.int64], looks: Looks) -> None:
         """Replace how landmarks look by how they look now."""
-        self.descriptors[ids], self.normals_local[ids] = descriptors, normals_local
-        self.reach_m[ids] = reach_m
+        self.descriptors[ids] = looks.descriptors
+        self.normals_local[ids], self.reach_m[ids] = looks.normals_local, looks.reach_m
 
     def remove(self, ids: NDArray[np.int64]) -> None:
         """Forget landmarks; their ids are given out again."""

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import GridLayer, MapLayers, PointLayer
-from sceneslam.types.observation import LaserScan
 from sceneslam.types.rig import Camera
 
 from ..depth_scan import DepthScanner
 from ..grid import OccupancyGrid
-from .keyframes import Keyframe
+from .keyframes import DepthView, Keyframe
 
 _LOG = logging.getLogger(__name__)
 _BEAMS = 180
@@ -29,17 +28,22 @@ class LayerBuilder:
     """Keeps from every keyframe's depth what the map layers need, and builds them on demand."""
 
     def __init__(
-        self, camera: Camera, *, cloud_stride_px: int, cloud_voxel_m: float, grid_resolution_m: float
+        self,
+        camera: Camera,
+        *,
+        cloud_stride_px: int,
+        cloud_voxel_m: float,
+        grid_resolution_m: float,
     ) -> None:
         self._camera = camera
         self._stride_px, self._voxel_m = cloud_stride_px, cloud_voxel_m
         self._resolution_m = grid_resolution_m
         self._scanner = _make_scanner(camera)
 
-    def thin_cloud(
-        self, depth_m: NDArray[np.float32], image_bgr: NDArray[np.uint8]
-    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Return every stride-th depth pixel as points in base (N, 3) [m] and colours (N, 3)."""
+    def view(
+        self, depth_m: NDArray[np.float32], image_bgr: NDArray[np.uint8], *, stamp_ns: int
+    ) -> DepthView:
+        """Return what the layers will need of a depth image, every stride-th pixel of it."""
         camera, step = self._camera, self._stride_px
         depth = depth_m[step // 2 :: step, step // 2 :: step]
         low_m, high_m = camera.depth_range_m
@@ -49,11 +53,8 @@ class LayerBuilder:
         x, y = (u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z
         points_cam = np.stack([x, y, z], axis=1).astype(np.float32)
         points_base = se3.apply(camera.T_base_cam, points_cam).astype(np.float32)
-        return points_base, image_bgr[v, u]
-
-    def scan(self, depth_m: NDArray[np.float32], *, stamp_ns: int) -> LaserScan | None:
-        """Return the planar scan that a depth image holds, None where the camera sees no band."""
-        return self._scanner.scan(depth_m, stamp_ns=stamp_ns) if self._scanner else None
+        scan = None if self._scanner is None else self._scanner.scan(depth_m, stamp_ns=stamp_ns)
+        return DepthView(points_base=points_base, colors_bgr=image_bgr[v, u], scan=scan)
 
     def build(self, keyframes: Sequence[Keyframe]) -> MapLayers:
         """Return the layers in `local`; a grid only of a robot that moves in the plane."""
@@ -62,8 +63,8 @@ class LayerBuilder:
     def _points(self, keyframes: Sequence[Keyframe]) -> PointLayer | None:
         if not keyframes:
             return None
-        points = np.concatenate([se3.apply(k.T_local_base, k.points_base) for k in keyframes])
-        colors_bgr = np.concatenate([k.colors_bgr for k in keyframes])
+        points = np.concatenate([se3.apply(k.T_local_base, k.view.points_base) for k in keyframes])
+        colors_bgr = np.concatenate([k.view.colors_bgr for k in keyframes])
         points, colors_bgr = _thin_by_voxel(points, colors_bgr, self._voxel_m)
         points.flags.writeable = colors_bgr.flags.writeable = False
         return PointLayer(points=points, colors_bgr=colors_bgr)
@@ -77,8 +78,8 @@ class LayerBuilder:
             return None
         grid = OccupancyGrid(self._resolution_m)
         for keyframe in keyframes:
-            if keyframe.scan is not None:
-                grid.insert(keyframe.T_local_base @ self._scanner.T_base_laser, keyframe.scan)
+            if keyframe.view.scan is not None:
+                grid.insert(keyframe.T_local_base @ self._scanner.T_base_laser, keyframe.view.scan)
         return grid.layer()
 
 

@@ -25,7 +25,7 @@ class Fix:
     """A pose and the landmarks that hold it."""
 
     estimate: PoseEstimate
-    landmark_ids: NDArray[np.int64]  # (N,), inliers
+    landmark_ids: NDArray[np.int64]  # (N,), pixels agree
     feature_rows: NDArray[np.int64]  # (N,)
     deep_rows: NDArray[np.int64]  # those of them whose depth agrees too
     expected_ids: NDArray[np.int64]  # landmarks that the image should show
@@ -65,13 +65,19 @@ class Localizer:
         return self._solve(features, landmark_ids, matches, se3.identity())
 
     def _solve(
-        self, features: Features, landmark_ids: NDArray[np.int64], matches: Matches, T_local_base: Transform
+        self,
+        features: Features,
+        landmark_ids: NDArray[np.int64],
+        matches: Matches,
+        T_local_base: Transform,
     ) -> Fix | None:
         """Return the pose that the matches agree on, confirmed by the landmarks around it."""
         if len(matches) < self._min_inliers:
             return None
         ids = landmark_ids[matches.landmark_rows]
-        coarse = self._solver.search(self._measured(features, ids, matches.feature_rows, T_local_base))
+        coarse = self._solver.search(
+            self._measured(features, ids, matches.feature_rows, T_local_base)
+        )
         if coarse is None or len(coarse.inlier_rows) < self._min_inliers:
             return None
         local_ids = self._map.around(ids[coarse.inlier_rows])
@@ -116,13 +122,13 @@ class Localizer:
         T_local_base: Transform,
     ) -> Measurements:
         """Return what to solve for, seen from about T_local_base, with the landmarks' own doubt."""
-        across_px, inverse_depth_per_m = self._map.doubts(T_local_base, ids)
+        doubts = self._map.doubts(T_local_base, ids)
         return Measurements(
             points_local=self._map.landmarks.points_local[ids],
             uv_px=features.uv_px[rows],
-            sigma_px=np.hypot(self._map.sigma_px(features.levels[rows]), across_px),
+            sigma_px=np.hypot(self._map.sigma_px(features.levels[rows]), doubts.across_px),
             depth_m=features.depth_m[rows],
             inverse_depth_sigma_per_m=np.hypot(
-                self._map.inverse_depth_sigma_per_m, inverse_depth_per_m
+                self._map.inverse_depth_sigma_per_m, doubts.inverse_depth_per_m
             ),
         )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.errors import InputError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Camera, Rig, Sensor
@@ -19,13 +19,14 @@ from .features import FeatureExtractor, Features
 from .judgement import HealthRule, KeyframeRule
 from .keyframes import NO_LANDMARK, Keyframe
 from .layers import LayerBuilder
+from .limits import check_limits, check_sizes
 from .localizer import Fix, Localizer
 from .motion import MotionModel
 from .pose_solver import PoseSolver
 from .relocalizer import Relocalizer, appearance
 from .visual_map import VisualMap
 
-_START_FEATURES = 50  # with depth, that the first keyframe needs
+_KEYFRAME_FEATURES = 50  # with depth, that a keyframe needs
 _START_VARIANCE = 1e-8  # the first pose is the origin by definition
 
 
@@ -58,8 +59,8 @@ class RgbdSlam:
         grid_resolution_m: float,
         seed: int,
     ) -> None:
-        _check_limits(locals())
-        self._min_inliers, self._degraded_inliers = min_inliers, degraded_inliers
+        check_limits(locals())
+        self._degraded_inliers = degraded_inliers
         self._make_extractor = partial(
             FeatureExtractor,
             count=feature_count,
@@ -128,7 +129,7 @@ class RgbdSlam:
 
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base at the observation; LOST where the image does not show the map."""
-        self._check(observation)
+        check_sizes(observation, self._camera)
         self._observations += 1
         T_predicted = self._motion.predict(observation)
         if observation.image_bgr is None:
@@ -169,8 +170,7 @@ class RgbdSlam:
         T_predicted: Transform,
     ) -> Tracking:
         """Make the first keyframe; wait, lost, for an image that has features with depth."""
-        count = int((features.depth_m > 0).sum())
-        if count < _START_FEATURES:
+        if features.deep_count < _KEYFRAME_FEATURES:
             return self._lose(observation, T_predicted)
         self._T_local_base = T_predicted
         self._motion.hold(observation, T_predicted)
@@ -184,7 +184,7 @@ class RgbdSlam:
             # What the robot did before the first usable image is known from odometry at best.
             status=TrackingStatus.TRACKING if is_first else TrackingStatus.DEGRADED,
             covariance=_START_VARIANCE * np.eye(6),
-            inliers=count,
+            inliers=features.deep_count,
         )
 
     def _hold(
@@ -197,9 +197,10 @@ class RgbdSlam:
         self._local_ids = fix.local_ids
         self._map.count_sightings(fix.expected_ids, fix.landmark_ids)
         count = len(fix.landmark_ids)
-        status = self._health.judge(count, covariance)
+        status = self._health.judge(fix.estimate)
         wanted = self._keyframe_rule.wants(T_local_base, fix, self._map.keyframes)
-        if wanted and status is TrackingStatus.TRACKING:
+        can_extend = features.deep_count >= _KEYFRAME_FEATURES
+        if wanted and can_extend and status is TrackingStatus.TRACKING:
             landmark_ids = np.full(len(features), NO_LANDMARK)
             landmark_ids[fix.feature_rows] = fix.landmark_ids
             self._insert_keyframe(observation, gray, features, landmark_ids, fix.deep_rows)
@@ -234,55 +235,14 @@ class RgbdSlam:
         image_bgr, depth_m = observation.image_bgr, observation.depth_m
         if image_bgr is None or depth_m is None:
             return
-        points_base, colors_bgr = self._layers.thin_cloud(depth_m, image_bgr)
         keyframe = Keyframe(
             stamp_ns=observation.stamp_ns,
             T_local_base=self._T_local_base.copy(),
             features=features,
             landmark_ids=landmark_ids,
             appearance=appearance(gray),
-            points_base=points_base,
-            colors_bgr=colors_bgr,
-            scan=self._layers.scan(depth_m, stamp_ns=observation.stamp_ns),
+            view=self._layers.view(depth_m, image_bgr, stamp_ns=observation.stamp_ns),
         )
         self._map.insert(keyframe, deep_rows=deep_rows)
         self._keyframe_rule.restart()
         self._local_ids = self._map.around(keyframe.landmark_ids)
-
-    def _check(self, observation: Observation) -> None:
-        """Raise InputError where an array has not the camera's size."""
-        width, height = self._camera.size_wh
-        image_bgr, depth_m = observation.image_bgr, observation.depth_m
-        if image_bgr is not None and image_bgr.shape != (height, width, 3):
-            raise InputError(f"image_bgr: expected ({height}, {width}, 3), got {image_bgr.shape}")
-        if depth_m is not None and depth_m.shape != (height, width):
-            raise InputError(f"depth_m: expected ({height}, {width}), got {depth_m.shape}")
-
-
-_LIMITS: dict[str, tuple[float, float]] = {
-    "feature_count": (100, 10_000),
-    "fast_threshold_min": (1, 20),
-    "fast_noise_ratio": (0, 100),
-    "sigma_px": (0.01, 10),
-    "inverse_depth_sigma_per_m": (1e-5, 1),
-    "search_radius_px": (1, 200),
-    "min_inliers": (6, 1000),
-    "degraded_inliers": (6, 1000),
-    "degraded_sigma_m": (1e-4, 10),
-    "keyframe_step_m": (0.001, 100),
-    "keyframe_turn_rad": (0.001, 3.2),
-    "keyframe_inlier_ratio": (0, 1),
-    "keyframe_limit": (3, 1_000_000),
-    "landmark_limit": (1000, 100_000_000),
-    "cloud_stride_px": (1, 100),
-    "cloud_voxel_m": (0.001, 10),
-    "grid_resolution_m": (0.001, 10),
-    "seed": (0, 2**31 - 1),
-}
-
-
-def _check_limits(arguments: dict[str, object]) -> None:
-    for name, (low, high) in _LIMITS.items():
-        value = arguments[name]
-        if not (isinstance(value, (int, float)) and low <= value <= high):
-            raise ConfigError(name, value, f"{low:g} to {high:g}")

@@ -51,6 +51,7 @@ class PoseEstimate:
     covariance: NDArray[np.float64]  # (6, 6), se3.log order, base frame
     inliers: NDArray[np.bool_]  # (N,), pixels agree
     depth_inliers: NDArray[np.bool_]  # (N,), depths agree too
+    depth_agreement_ratio: float  # of the inliers that have a depth; 1 where none has
 
 
 class PoseSolver:
@@ -77,7 +78,8 @@ class PoseSolver:
         )
         if not found or not (np.isfinite(rotvec).all() and np.isfinite(translation).all()):
             return None
-        T_cam_local = se3.from_parts(se3.so3_exp(rotvec.ravel()), translation.ravel())
+        rotation = se3.so3_exp(rotvec.ravel().astype(np.float64))
+        T_cam_local = se3.from_parts(rotation, translation.ravel().astype(np.float64))
         return Consensus(
             T_local_base=se3.inverse(T_cam_local) @ self._T_cam_base,
             inlier_rows=inlier_rows.ravel().astype(np.int64),
@@ -117,6 +119,7 @@ class PoseSolver:
             covariance=0.5 * (covariance + covariance.T),
             inliers=inliers,
             depth_inliers=depth_inliers,
+            depth_agreement_ratio=_share(depth_inliers, inliers & measures_depth),
         )
 
     def _linearise(
@@ -155,7 +158,12 @@ class PoseSolver:
 def _huber_weights(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return weights (3, N); u and v share one, by their joint length."""
     pixel = np.hypot(residuals[0], residuals[1])
-    return _HUBER / np.maximum(np.stack([pixel, pixel, np.abs(residuals[2])]), _HUBER)
+    sizes = np.stack([pixel, pixel, np.abs(residuals[2])])
+    return np.asarray(_HUBER / np.maximum(sizes, _HUBER))
+
+
+def _share(chosen: NDArray[np.bool_], of: NDArray[np.bool_]) -> float:
+    return float(chosen.sum() / of.sum()) if of.any() else 1.0
 
 
 def _orthonormal(T_a_b: Transform) -> Transform:

@@ -11,15 +11,16 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
-from .features import LEVELS, SCALE, Features
+from .features import LEVELS, SCALE
 from .keyframes import NO_LANDMARK, Keyframe, KeyframeStore
-from .landmarks import LandmarkTable
+from .landmarks import LandmarkTable, Looks
 
 _COVISIBLE = 12  # keyframes whose landmarks make the local map
 _MIN_COS_VIEW = 0.5  # a landmark looks like itself within 60 degrees of where it was seen from
 _MIN_FOUND_RATIO = 0.25
 _PROBATION = 8  # images that should show a landmark before it is judged
 _NEAREST_M = 0.1
+_FEWEST_KEYFRAMES = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,7 +29,15 @@ class Prediction:
 
     ids: NDArray[np.int64]  # (N,)
     uv_px: NDArray[np.float64]  # (N, 2)
-    levels: NDArray[np.int64]  # (N,)
+    levels: NDArray[np.int64]  # (N,), of the pyramid
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Doubts:
+    """Standard deviations that landmarks add to those of their measurements."""
+
+    across_px: NDArray[np.float64]  # (N,)
+    inverse_depth_per_m: NDArray[np.float64]  # (N,)
 
 
 class VisualMap:
@@ -52,26 +61,27 @@ class VisualMap:
         """Return how exactly features of these pyramid levels are located [px]."""
         return np.asarray(self._sigma_px * SCALE ** levels.astype(np.float64))
 
-    def doubts(self, T_local_base: Transform, ids: NDArray[np.int64]):
-        """Return the landmarks' own sigmas as seen from a pose: across [px] and in 1/z [1/m]."""
-        camera = self._camera
-        T_cam_local = se3.inverse(T_local_base @ camera.T_base_cam)
-        rays = se3.apply(T_cam_local, self.landmarks.points_local[ids])
-        z = np.maximum(rays[:, 2], _NEAREST_M)
-        rays = rays / z[:, None]
-        R = T_cam_local[:3, :3]
-        covariance = np.einsum("ia,nab,jb->nij", R, self.landmarks.covariance[ids], R, optimize=True)
-        xx, yy, zz = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 2, 2]
-        xz, yz = covariance[:, 0, 2], covariance[:, 1, 2]
-        x, y = rays[:, 0], rays[:, 1]
-        v = 0.5 * (xx - 2 * x * xz + x * x * zz + yy - 2 * y * yz + y * y * zz)
-        return camera.fx / z * np.sqrt(np.maximum(v, 0)), np.sqrt(zz) / z**2
+    def doubts(self, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> Doubts:
+        """Return the landmarks' own uncertainty as the camera sees it from a pose."""
+        T_cam_local = se3.inverse(T_local_base @ self._camera.T_base_cam)
+        points_cam = se3.apply(T_cam_local, self.landmarks.points_local[landmark_ids])
+        z = np.maximum(points_cam[:, 2], _NEAREST_M)
+        # Moves of a landmark: across the ray (two ways) and along the optical axis.
+        rows = np.zeros((len(z), 3, 3))
+        rows[:, 0, 0] = rows[:, 1, 1] = rows[:, 2, 2] = 1.0
+        rows[:, :2, 2] = -points_cam[:, :2] / z[:, None]
+        rows = rows @ T_cam_local[:3, :3]
+        covariance = self.landmarks.covariance[landmark_ids]
+        variances = ((rows @ covariance) * rows).sum(axis=2)
+        across_m = np.sqrt(0.5 * variances[:, :2].sum(axis=1))
+        return Doubts(
+            across_px=self._camera.fx * across_m / z,
+            inverse_depth_per_m=np.sqrt(variances[:, 2]) / z**2,
+        )
 
     def around(self, landmark_ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the local map: the landmarks of the keyframes that saw these ones."""
-        return self.keyframes.landmarks_of(
-            self.keyframes.covisible(landmark_ids, limit=_COVISIBLE)
-        )
+        return self.keyframes.landmarks_of(self.keyframes.covisible(landmark_ids, limit=_COVISIBLE))
 
     def predict(self, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> Prediction:
         """Return which of these landmarks the image should show from a pose, and where."""
@@ -111,17 +121,12 @@ class VisualMap:
         fresh = np.flatnonzero((ids == NO_LANDMARK) & (features.depth_m > 0))
         points_local, information = self._locate(keyframe, deep_rows)
         self.landmarks.fuse(ids[deep_rows], points_local=points_local, information=information)
-        self.landmarks.describe(
-            ids[known],
-            descriptors=features.descriptors[known],
-            **self._view(keyframe, known, self.landmarks.points_local[ids[known]]),
-        )
+        points_local = self.landmarks.points_local[ids[known]]
+        self.landmarks.describe(ids[known], self._looks(keyframe, known, points_local))
         points_local, information = self._locate(keyframe, fresh)
+        looks = self._looks(keyframe, fresh, points_local)
         ids[fresh] = self.landmarks.add(
-            points_local=points_local,
-            information=information,
-            descriptors=features.descriptors[fresh],
-            **self._view(keyframe, fresh, points_local),
+            points_local=points_local, information=information, looks=looks
         )
         self.keyframes.insert(keyframe)
         self._keep_limits()
@@ -140,35 +145,34 @@ class VisualMap:
         weights = np.stack([across_m, across_m, np.maximum(along_m, across_m)], axis=1) ** -2.0
         rotation = T_local_cam[:3, :3]
         information = np.einsum("ik,nk,jk->nij", rotation, weights, rotation)
-        return se3.apply(T_local_cam, points_cam), information
+        return points_cam @ rotation.T + T_local_cam[:3, 3], information
 
-    def _view(
+    def _looks(
         self, keyframe: Keyframe, rows: NDArray[np.int64], points_local: NDArray[np.float64]
-    ) -> dict[str, NDArray[np.float64]]:
-        viewer = (keyframe.T_local_base @ self._camera.T_base_cam)[:3, 3]
-        to_viewer = viewer - points_local
+    ) -> Looks:
+        viewer_local = (keyframe.T_local_base @ self._camera.T_base_cam)[:3, 3]
+        to_viewer = viewer_local - points_local
         distance_m = np.maximum(np.linalg.norm(to_viewer, axis=1), _NEAREST_M)
-        return {
-            "normals_local": to_viewer / distance_m[:, None],
-            "reach_m": distance_m * SCALE ** keyframe.features.levels[rows],
-        }
+        return Looks(
+            descriptors=keyframe.features.descriptors[rows],
+            normals_local=to_viewer / distance_m[:, None],
+            reach_m=distance_m * SCALE ** keyframe.features.levels[rows].astype(np.float64),
+        )
 
     def _keep_limits(self) -> None:
-        """Drop landmarks that are seldom found again, then what is beyond the limits."""
+        """Drop landmarks that are seldom found again, and keyframes beyond the limits."""
         table = self.landmarks
         judged = table.alive & (table.expected >= _PROBATION)
-        self._drop(np.flatnonzero(judged & (table.found < _MIN_FOUND_RATIO * table.expected)))
-        if len(self.keyframes) > self._keyframe_limit:
+        self._drop(judged & (table.found < _MIN_FOUND_RATIO * table.expected))
+        while len(self.keyframes) > self._keyframe_limit or (
+            len(table) > self._landmark_limit and len(self.keyframes) > _FEWEST_KEYFRAMES
+        ):
             self.keyframes.remove(self.keyframes.most_redundant())
-            held = self.keyframes.landmarks_of(self.keyframes.ids)
             orphans = table.alive.copy()
-            orphans[held] = False
-            self._drop(np.flatnonzero(orphans))
-        surplus = len(table) - self._landmark_limit
-        if surplus > 0:
-            alive = np.flatnonzero(table.alive)
-            self._drop(alive[np.argsort(table.found[alive], kind="stable")[:surplus]])
+            orphans[self.keyframes.landmarks_of(self.keyframes.ids)] = False
+            self._drop(orphans)
 
-    def _drop(self, landmark_ids: NDArray[np.int64]) -> None:
+    def _drop(self, doomed: NDArray[np.bool_]) -> None:
+        landmark_ids = np.flatnonzero(doomed)
         self.keyframes.forget_landmarks(landmark_ids)
         self.landmarks.remove(landmark_ids)
