@@ -21,7 +21,7 @@ from sceneslam.types.errors import InputError
 def open_bag(path: Path) -> ChunkedRecording:
     """Return the recording; raises InputError when the file is no ROS 1 bag."""
     bag = BagFile(path)
-    return ChunkedRecording([bag.layout()], bag.read)
+    return ChunkedRecording([bag.layout()], bag.read, is_slow=bag.is_slow)
 
 
 class BagFile:
@@ -37,6 +37,12 @@ class BagFile:
         self._path = path
         self._survey = BagSurvey(blob)
         self._names: dict[int, str] = {}  # connection -> topic
+
+    @property
+    def is_slow(self) -> bool:
+        """Tell whether a chunk takes long to unpack."""
+        kinds = {record.fields[b"compression"] for record in self._survey.chunks.values()}
+        return b"bz2" in kinds
 
     def layout(self) -> Layout:
         """Return the chunks and topics."""

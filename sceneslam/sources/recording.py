@@ -5,10 +5,12 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 from sceneslam.ros.messages import MessageDecoder, TopicType
+from sceneslam.sources.prefetch import prefetched
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -88,7 +90,10 @@ ChunkReader = Callable[[Chunk], ChunkContent]
 class ChunkedRecording:
     """Files of chunks, read one chunk at a time; a damaged chunk is left out and reported."""
 
-    def __init__(self, layouts: Sequence[Layout], read_chunk: ChunkReader) -> None:
+    def __init__(
+        self, layouts: Sequence[Layout], read_chunk: ChunkReader, *, is_slow: bool = False
+    ) -> None:
+        self._is_slow = is_slow  # to unpack: worth threads
         self._chunks = sorted(
             (chunk for layout in layouts for chunk in layout.chunks),
             key=lambda chunk: (chunk.start_ns, chunk.file, chunk.offset),
@@ -117,12 +122,12 @@ class ChunkedRecording:
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Yield by log time, holding only chunks that overlap."""
         waiting: list[tuple[int, int, int, Message]] = []
-        for number, chunk in enumerate(self._chunks):
-            if chunk.topics.isdisjoint(topics):
-                continue
+        chunks = [chunk for chunk in self._chunks if not chunk.topics.isdisjoint(topics)]
+        contents = self._contents(chunks)
+        for number, chunk in enumerate(chunks):
             while waiting and waiting[0][0] < chunk.start_ns:
                 yield heapq.heappop(waiting)[3]
-            for index, message in enumerate(self._read(chunk)):
+            for index, message in enumerate(next(contents).messages):
                 if message.topic in topics:
                     heapq.heappush(waiting, (message.log_ns, number, index, message))
         while waiting:
@@ -135,7 +140,9 @@ class ChunkedRecording:
             if best is not None and chunk.end_ns < best.log_ns:
                 break
             if topic in chunk.topics:
-                found = [message for message in self._read(chunk) if message.topic == topic]
+                found = [
+                    message for message in self._read(chunk).messages if message.topic == topic
+                ]
                 best = max(
                     [*found, *([best] if best else [])], key=lambda m: m.log_ns, default=None
                 )
@@ -145,14 +152,26 @@ class ChunkedRecording:
         """Return the decoded message, None when its bytes make no sense."""
         return self._decoder.decode(message.topic, message.data)
 
-    def _read(self, chunk: Chunk) -> Sequence[Message]:
-        if self._recent is not None and self._recent[0] == chunk:
-            return self._recent[1].messages
-        content = self._read_chunk(chunk)
-        self._recent = (chunk, content)
+    def _contents(self, chunks: Sequence[Chunk]) -> Iterator[ChunkContent]:
+        """Yield what is in the chunks; slow ones are read ahead."""
+        begin = (
+            1 if self._is_slow else len(chunks)
+        )  # who looks at the first message only stops here
+        yield from map(self._read, chunks[:begin])
+        jobs = (partial(self._read_chunk, chunk) for chunk in chunks[begin:])
+        if begin < len(chunks):
+            for chunk, content in zip(chunks[begin:], prefetched(jobs, ahead=2), strict=True):
+                yield self._noted(chunk, content)
+
+    def _read(self, chunk: Chunk) -> ChunkContent:
+        if self._recent is None or self._recent[0] != chunk:
+            self._recent = (chunk, self._noted(chunk, self._read_chunk(chunk)))
+        return self._recent[1]
+
+    def _noted(self, chunk: Chunk, content: ChunkContent) -> ChunkContent:
         if content.lost_bytes:
             self._damaged[chunk] = content.lost_bytes
-        return content.messages
+        return content
 
 
 def _merge_topics(layouts: Sequence[Layout]) -> dict[str, TopicType]:
