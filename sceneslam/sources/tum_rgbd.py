@@ -76,13 +76,10 @@ class TumRgbd:
         intrinsics = given or _known_intrinsics(self._folder)
         has_depth = (self._folder / "depth.txt").is_file()
         depths = read_list(self._folder / "depth.txt") if has_depth else ()
-        matches = nearest_once(
-            [color.stamp_ns for color in colors], depths, round(sync_tolerance_s * 1e9)
-        )
+        stamps_ns = [color.stamp_ns for color in colors]
+        matches = nearest_once(stamps_ns, depths, round(sync_tolerance_s * 1e9))
         self._frames = [
-            FrameFiles(
-                stamp_ns=color.stamp_ns, color=color.path, depth=depth.path if depth else None
-            )
+            FrameFiles(stamp_ns=color.stamp_ns, color=color.path, depth=depth and depth.path)
             for color, depth in zip(colors, matches, strict=True)
         ]
         self._camera = Camera(
