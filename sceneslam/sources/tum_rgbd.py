@@ -18,7 +18,7 @@ from sceneslam.sources.intrinsics import (
 )
 from sceneslam.sources.prefetch import prefetched
 from sceneslam.sources.spanned import Span
-from sceneslam.sources.stamped_files import nearest_once, read_list
+from sceneslam.sources.stamped_files import StampedFile, nearest_once, read_list
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import Observation
@@ -79,7 +79,7 @@ class TumRgbd:
         stamps_ns = [color.stamp_ns for color in colors]
         matches = nearest_once(stamps_ns, depths, round(sync_tolerance_s * 1e9))
         self._frames = [
-            FrameFiles(stamp_ns=color.stamp_ns, color=color.path, depth=depth and depth.path)
+            FrameFiles(stamp_ns=color.stamp_ns, color=color.path, depth=_path(depth))
             for color, depth in zip(colors, matches, strict=True)
         ]
         self._camera = Camera(
@@ -140,6 +140,10 @@ class TumRgbd:
     def _jobs(self) -> Iterator[Callable[[], ReadFrame]]:
         for frame in self._frames:
             yield partial(self._reader.read, frame)
+
+
+def _path(file: StampedFile | None) -> Path | None:
+    return None if file is None else file.path
 
 
 def _known_intrinsics(folder: Path) -> Intrinsics:
