@@ -11,6 +11,7 @@ from sceneslam.types import se3
 from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Camera, Laser, Lidar, Rig, Sensor, optical_to_rep103
 
+START_NS = 10**9
 WIDTH, HEIGHT, FOCAL = 320, 240, 290.0
 HALF_X_M, HALF_Y_M, HALF_Z_M = 3.0, 2.0, 1.2  # walls, floor and ceiling around the origin
 
@@ -29,11 +30,11 @@ def room_observation(index: int, *, rate_hz: float = 30.0) -> Observation:
     ranges_m = _hit(T_room_base, _fan())[0]
     cloud = _sphere() * _hit(T_room_base, _sphere())[0][:, None]
     return Observation(
-        stamp_ns=round(t_s * 1e9),
+        stamp_ns=START_NS + round(t_s * 1e9),
         image_bgr=image_bgr,
         depth_m=depth_m,
         scan=LaserScan(
-            stamp_ns=round(t_s * 1e9),
+            stamp_ns=START_NS + round(t_s * 1e9),
             ranges_m=ranges_m.astype(np.float32),
             angle_min_rad=-np.pi,
             angle_step_rad=np.pi / 180,
