@@ -1,0 +1,129 @@
+"""The command line: exit codes, one sentence per mistake, and stopping half-way."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from time import monotonic, sleep
+
+import numpy as np
+import pytest
+from scenery import RIG, room_observation
+
+from sceneslam.ros.writer import ObservationWriter
+from sceneslam.types.trajectory import Trajectory
+
+ROOT = Path(__file__).parents[1]
+SINGLE = ("+scenario=single", "source=mcap", "source.path=room.mcap")
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    path = tmp_path_factory.mktemp("recording") / "room.mcap"
+    writer = ObservationWriter(path, rig=RIG, image_format="png")
+    for index in range(30):
+        writer.write(room_observation(index))
+    writer.close()
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path, recording):
+    (tmp_path / "room.mcap").symlink_to(recording)
+    return tmp_path
+
+
+def command(*overrides):
+    return [sys.executable, "-m", "sceneslam", *overrides, "hydra.run.dir=out"]
+
+
+def call(folder, *overrides):
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        command(*overrides),
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+def test_run_says_what_happened_in_ten_lines_at_most(folder):
+    done = call(folder, *SINGLE)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.strip().splitlines()
+    assert len(lines) <= 10 and lines[-1].endswith("out/report.html")
+    assert "30/30" in done.stderr  # the progress bar
+    assert json.loads((folder / "out" / "metrics.json").read_text())["coverage"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        ((), "slam: got nothing"),
+        (("+scenario=single", "source=mcap"), "source.path: got nothing"),
+        (("+scenario=single", "source=mcap", "source.path=nowhere.mcap"), "nowhere.mcap"),
+        ((*SINGLE, "+scenaro=x"), "did you mean scenario?"),
+        ((*SINGLE, "policy.confirm_window_s=-1"), "policy.confirm_window_s: got -1"),
+        ((*SINGLE, "detector._target_=os.system"), "detector._target_: got 'os.system'"),
+        ((*SINGLE, "slam.only.feature_count=many"), "slam.only.feature_count: got 'many'"),
+        ((*SINGLE, "policy=typo"), "policy/typo"),
+        ((*SINGLE, "policy.typo=1"), "policy.typo"),
+        ((*SINGLE, "scenes.Any=[onyl]"), "scenes.Any: got ['onyl']"),
+    ],
+)
+def test_mistake_is_one_sentence_without_a_traceback(folder, overrides, sentence):
+    done = call(folder, *overrides)
+    assert done.returncode in (1, 2)
+    assert sentence in done.stderr + done.stdout
+    assert "Traceback" not in done.stderr + done.stdout
+
+
+def test_cut_recording_is_read_as_far_as_it_goes(folder, recording):
+    data = recording.read_bytes()
+    (folder / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
+    done = call(folder, "+scenario=single", "source=mcap", "source.path=cut.mcap")
+    assert done.returncode == 1 and "could not be read" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert 5 < len(Trajectory.read_tum(folder / "out" / "trajectory.tum")) < 30
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_run_saves_what_it_has(folder, number):
+    overrides = (*SINGLE, "run.mode=live")  # paced: 30 observations take a second
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(
+        command(*overrides), cwd=folder, env=environment, stderr=subprocess.PIPE, text=True
+    )
+    events = folder / "out" / "events.jsonl"
+    deadline_s = monotonic() + 60
+    while not (events.exists() and events.stat().st_size) and monotonic() < deadline_s:
+        sleep(0.02)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 1 and "stopped after" in errors
+    assert "Traceback" not in errors
+    saved = Trajectory.read_tum(folder / "out" / "trajectory.tum")
+    assert np.isfinite(saved.T_world_base).all() and (folder / "out" / "report.html").exists()
+
+
+def test_sweep_runs_every_job(folder):
+    done = call(folder, "-m", *SINGLE, "hydra.sweep.dir=sweep", "slam.only.feature_count=300,500")
+    assert done.returncode == 0, done.stderr
+    assert {path.parent.name for path in (folder / "sweep").glob("*/metrics.json")} == {"0", "1"}
+    assert not list(Path(folder).glob("out/metrics.json"))
+
+
+def test_recorded_run_can_be_run_again_to_the_same_trajectory(folder):
+    done = call(folder, *SINGLE, "+sinks@sinks.mcap=mcap")
+    assert done.returncode == 0, done.stderr
+    first = (folder / "out" / "trajectory.tum").read_bytes()
+    (folder / "out" / "run.mcap").rename(folder / "again.mcap")
+    done = call(folder, "+scenario=single", "source=mcap", "source.path=again.mcap")
+    assert done.returncode == 0, done.stderr
+    assert (folder / "out" / "trajectory.tum").read_bytes() == first
