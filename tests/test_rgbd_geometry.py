@@ -1,0 +1,154 @@
+"""How the rgbd module matches descriptors and solves for the pose."""
+
+import numpy as np
+
+from sceneslam.modules.slam.rgbd.features import Features
+from sceneslam.modules.slam.rgbd.matching import match_anywhere, match_near
+from sceneslam.modules.slam.rgbd.pose_solver import Measurements, PoseSolver
+from sceneslam.types import se3
+from sceneslam.types.rig import Camera
+
+CAMERA = Camera(size_wh=(640, 480), fx=525.0, fy=520.0, cx=319.0, cy=241.0)
+
+
+def features_at(uv_px, descriptors, levels=None, depth_m=None):
+    count = len(uv_px)
+    return Features(
+        uv_px=np.asarray(uv_px, float),
+        levels=np.zeros(count, np.int64) if levels is None else levels,
+        descriptors=descriptors,
+        depth_m=np.zeros(count) if depth_m is None else depth_m,
+    )
+
+
+def random_descriptors(rng, count):
+    return rng.integers(0, 256, (count, 32), dtype=np.uint8)
+
+
+def with_flipped_bits(descriptors, bits):
+    flipped = descriptors.copy()
+    flipped[:, :bits] ^= 1
+    return flipped
+
+
+def scene(rng, count=200):
+    """Return T_local_base and exact measurements of points in front of it."""
+    T_local_base = se3.exp(np.array([0.3, -0.2, 0.1, 0.05, -0.1, 0.2]))
+    depth_m = rng.uniform(0.8, 4.0, count)
+    uv_px = rng.uniform([0, 0], CAMERA.size_wh, (count, 2))
+    rays = (uv_px - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy]
+    points_cam = np.column_stack([rays, np.ones(count)]) * depth_m[:, None]
+    measured = Measurements(
+        points_local=se3.apply(T_local_base @ CAMERA.T_base_cam, points_cam),
+        uv_px=uv_px,
+        sigma_px=np.ones(count),
+        depth_m=depth_m,
+        inverse_depth_sigma_per_m=np.full(count, 0.003),
+    )
+    return T_local_base, measured
+
+
+def changed(measured, **fields):
+    names = ("points_local", "uv_px", "sigma_px", "depth_m", "inverse_depth_sigma_per_m")
+    return Measurements(**{name: getattr(measured, name) for name in names} | fields)
+
+
+def test_match_near_finds_every_landmark_close_to_its_prediction():
+    rng = np.random.default_rng(0)
+    descriptors, uv_px = random_descriptors(rng, 300), rng.uniform(0, 480, (300, 2))
+    order = rng.permutation(300)
+    features = features_at(uv_px[order], with_flipped_bits(descriptors[order], 20))
+    predicted = uv_px + rng.uniform(-5, 5, (300, 2))
+    matches = match_near(predicted, np.zeros(300, np.int64), descriptors, features, radius_px=10)
+    assert len(matches) == 300
+    assert (order[matches.feature_rows] == matches.landmark_rows).all()
+
+
+def test_match_near_ignores_twins_outside_the_radius_and_on_other_levels():
+    descriptors = random_descriptors(np.random.default_rng(0), 1)
+    level = np.zeros(1, np.int64)
+    far = features_at([[111.0, 100.0]], descriptors)
+    other_level = features_at([[101.0, 100.0]], descriptors, levels=level + 3)
+    at = np.array([[100.0, 100.0]])
+    assert len(match_near(at, level, descriptors, far, radius_px=10)) == 0
+    assert len(match_near(at, level, descriptors, other_level, radius_px=10)) == 0
+    assert len(match_near(at, level, descriptors, far, radius_px=12)) == 1
+
+
+def test_match_near_refuses_what_two_features_resemble_alike():
+    descriptors = random_descriptors(np.random.default_rng(0), 1)
+    twins = features_at([[100.0, 100.0], [104.0, 100.0]], np.repeat(descriptors, 2, axis=0))
+    at = np.array([[102.0, 100.0]])
+    near = match_near(at, np.zeros(1, np.int64), descriptors, twins, radius_px=10)
+    assert len(near) == 0
+
+
+def test_match_near_equals_the_brute_force_search():
+    rng = np.random.default_rng(3)
+    descriptors = random_descriptors(rng, 150)
+    uv_px = rng.uniform(-20, 660, (150, 2))
+    features = features_at(
+        uv_px[::-1] + rng.uniform(-25, 25, (150, 2)), with_flipped_bits(descriptors[::-1], 10)
+    )
+    matches = match_near(uv_px, np.zeros(150, np.int64), descriptors, features, radius_px=20)
+    apart = np.linalg.norm(uv_px - features.uv_px[::-1], axis=1)
+    assert matches.landmark_rows.tolist() == np.flatnonzero(apart <= 20).tolist()
+
+
+def test_unrelated_descriptors_do_not_match_anywhere():
+    rng = np.random.default_rng(1)
+    features = features_at(rng.uniform(0, 480, (500, 2)), random_descriptors(rng, 500))
+    assert len(match_anywhere(random_descriptors(rng, 500), features)) == 0
+    assert len(match_anywhere(features.descriptors, features)) == 500
+
+
+def test_pose_is_found_despite_a_third_of_outliers():
+    rng = np.random.default_rng(0)
+    T_local_base, measured = scene(rng)
+    uv_px = measured.uv_px + rng.normal(0, 0.5, (200, 2))
+    uv_px[:66] = rng.uniform([0, 0], CAMERA.size_wh, (66, 2))
+    measured = changed(measured, uv_px=uv_px)
+    solver = PoseSolver(CAMERA, seed=0)
+    coarse = solver.search(measured)
+    assert coarse is not None
+    estimate = solver.refine(measured, coarse.T_local_base)
+    assert estimate is not None
+    assert np.linalg.norm(se3.log(se3.inverse(T_local_base) @ estimate.T_local_base)) < 0.005
+    assert estimate.inliers[66:].mean() > 0.95
+    assert estimate.inliers[:66].mean() < 0.1
+
+
+def test_pose_without_any_depth_is_still_found():
+    T_local_base, measured = scene(np.random.default_rng(0))
+    measured = changed(measured, depth_m=np.zeros(200))
+    estimate = PoseSolver(CAMERA, seed=0).refine(measured, se3.identity() @ T_local_base)
+    assert estimate is not None
+    assert np.abs(estimate.T_local_base - T_local_base).max() < 1e-6
+    assert estimate.depth_agreement_ratio == 1.0
+
+
+def test_covariance_is_the_spread_of_the_estimates():
+    solver, errors = PoseSolver(CAMERA, seed=0), []
+    rng = np.random.default_rng(5)
+    T_local_base, exact = scene(rng)
+    for _ in range(150):
+        inverse_depth = 1 / exact.depth_m + rng.normal(0, 0.003, 200)
+        measured = changed(
+            exact, uv_px=exact.uv_px + rng.normal(0, 1, (200, 2)), depth_m=1 / inverse_depth
+        )
+        estimate = solver.refine(measured, T_local_base)
+        assert estimate is not None
+        errors.append(se3.log(se3.inverse(T_local_base) @ estimate.T_local_base))
+    spread = np.std(errors, axis=0)
+    claimed = np.sqrt(np.diag(estimate.covariance))
+    assert (spread / claimed < 1.4).all()
+    assert (spread / claimed > 0.7).all()
+
+
+def test_pose_solver_gives_up_on_points_that_hold_no_pose():
+    _, measured = scene(np.random.default_rng(0))
+    one_point = changed(measured, points_local=np.zeros((200, 3)), uv_px=np.full((200, 2), 100.0))
+    solver = PoseSolver(CAMERA, seed=0)
+    coarse = solver.search(one_point)
+    assert coarse is None or np.isfinite(coarse.T_local_base).all()
+    assert solver.refine(one_point, se3.identity()) is None

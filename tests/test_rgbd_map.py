@@ -1,0 +1,200 @@
+"""What the rgbd module keeps: features, landmarks, keyframes, motion, layers."""
+
+import cv2
+import numpy as np
+import pytest
+
+from sceneslam.modules.slam.rgbd.features import FeatureExtractor, Features
+from sceneslam.modules.slam.rgbd.keyframes import DepthView, Keyframe, KeyframeStore
+from sceneslam.modules.slam.rgbd.landmarks import LandmarkTable, Looks
+from sceneslam.modules.slam.rgbd.layers import LayerBuilder
+from sceneslam.modules.slam.rgbd.motion import MotionModel
+from sceneslam.modules.slam.rgbd.visual_map import VisualMap
+from sceneslam.types import se3
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Camera
+
+CAMERA = Camera(size_wh=(640, 480), fx=525.0, fy=520.0, cx=319.0, cy=241.0)
+
+
+def features_at(uv_px, descriptors, levels=None, depth_m=None):
+    count = len(uv_px)
+    return Features(
+        uv_px=np.asarray(uv_px, float),
+        levels=np.zeros(count, np.int64) if levels is None else levels,
+        descriptors=descriptors,
+        depth_m=np.zeros(count) if depth_m is None else depth_m,
+    )
+
+
+def random_descriptors(rng, count):
+    return rng.integers(0, 256, (count, 32), dtype=np.uint8)
+
+
+def looks(count):
+    return Looks(
+        descriptors=np.zeros((count, 32), np.uint8),
+        normals_local=np.zeros((count, 3)),
+        reach_m=np.ones(count),
+    )
+
+
+def test_landmarks_fuse_by_inverse_variance_and_reuse_rows():
+    table = LandmarkTable()
+    eye = np.eye(3)[None]
+    ids = table.add(points_local=np.zeros((1, 3)), information=eye, looks=looks(1))
+    table.fuse(ids, points_local=np.ones((1, 3)), information=3 * eye)
+    assert table.points_local[ids] == pytest.approx(0.75 * np.ones((1, 3)))
+    assert table.covariance[ids] == pytest.approx(0.25 * eye)
+    table.remove(ids)
+    many = np.repeat(eye, 10_000, axis=0)
+    ids = table.add(points_local=np.zeros((10_000, 3)), information=many, looks=looks(10_000))
+    assert ids.tolist() == list(range(10_000))
+    assert len(table) == 10_000
+
+
+def keyframe_at(x_m, landmark_ids=(), count=60, camera=CAMERA):
+    rng = np.random.default_rng(int(1000 * x_m))
+    ids = np.full(count, -1)
+    ids[: len(landmark_ids)] = landmark_ids
+    return Keyframe(
+        stamp_ns=0,
+        T_local_base=se3.from_xy_yaw(x_m, 0, 0),
+        features=features_at(
+            rng.uniform([0, 0], camera.size_wh, (count, 2)),
+            random_descriptors(rng, count),
+            depth_m=np.full(count, 2.0),
+        ),
+        landmark_ids=ids,
+        appearance=np.zeros(1200, np.float32),
+        view=DepthView(
+            points_base=np.zeros((0, 3), np.float32),
+            colors_bgr=np.zeros((0, 3), np.uint8),
+            scan=None,
+        ),
+    )
+
+
+def test_covisible_keyframes_are_ranked_by_shared_landmarks():
+    store = KeyframeStore()
+    first = store.insert(keyframe_at(0, [1, 2, 3]))
+    second = store.insert(keyframe_at(1, [3, 4]))
+    store.insert(keyframe_at(2, [9]))
+    assert store.covisible(np.array([2, 3, -1]), limit=5) == [first, second]
+    store.forget_landmarks(np.array([2, 3]))
+    assert store.landmarks_of([first, second]).tolist() == [1, 4]
+
+
+def test_map_stays_within_its_limits_and_forgets_only_redundant_keyframes():
+    visual_map = VisualMap(
+        CAMERA,
+        sigma_px=1.0,
+        inverse_depth_sigma_per_m=0.003,
+        keyframe_limit=10,
+        landmark_limit=100_000,
+    )
+    for step in range(30):
+        visual_map.insert(keyframe_at(0.1 * step), deep_rows=np.zeros(0, np.int64))
+    assert len(visual_map.keyframes) == 10
+    assert len(visual_map.landmarks) == 10 * 60
+    positions = [keyframe.T_local_base[0, 3] for keyframe in visual_map.keyframes.all()]
+    assert positions[0] == 0.0
+    assert positions[-1] == pytest.approx(2.9)
+    assert max(np.diff(positions)) < 0.8
+
+
+def test_landmarks_are_predicted_where_they_were_seen():
+    visual_map = VisualMap(
+        CAMERA, sigma_px=1.0, inverse_depth_sigma_per_m=0.003, keyframe_limit=9, landmark_limit=9999
+    )
+    keyframe = keyframe_at(0.5)
+    visual_map.insert(keyframe, deep_rows=np.zeros(0, np.int64))
+    prediction = visual_map.predict(keyframe.T_local_base, keyframe.landmark_ids)
+    assert prediction.uv_px == pytest.approx(keyframe.features.uv_px)
+    assert (prediction.levels == keyframe.features.levels).all()
+    behind = keyframe.T_local_base @ se3.from_xy_yaw(0, 0, np.pi)
+    assert len(visual_map.predict(behind, keyframe.landmark_ids).ids) == 0
+
+
+def at(second, **fields):
+    return Observation(stamp_ns=round(second * 1e9), **fields)
+
+
+def test_motion_goes_on_at_constant_velocity_and_stops_when_lost():
+    motion = MotionModel()
+    motion.hold(at(0.0), se3.identity())
+    motion.hold(at(0.1), se3.from_xy_yaw(0.1, 0, 0))
+    assert motion.predict(at(0.3))[0, 3] == pytest.approx(0.3)
+    assert motion.predict(at(5.0))[0, 3] == pytest.approx(0.1)
+    motion.lose(at(0.2), motion.predict(at(0.2)))
+    assert motion.predict(at(0.3))[0, 3] == pytest.approx(0.2)
+
+
+def test_motion_prefers_odometry_and_takes_rotation_from_the_gyro():
+    odometry, gyro = MotionModel(), MotionModel()
+    odometry.hold(at(0.0, T_odom_base=se3.from_xy_yaw(7, 0, 0)), se3.identity())
+    T_local_base = odometry.predict(at(0.1, T_odom_base=se3.from_xy_yaw(7.2, 0, 0.1)))
+    assert T_local_base == pytest.approx(se3.from_xy_yaw(0.2, 0, 0.1))
+    gyro.hold(at(0.0), se3.identity())
+    rates = np.array([[-0.05, 0, 0, 1.0], [0.0, 0, 0, 1.0]])
+    assert se3.yaw_rad(gyro.predict(at(0.1, gyro_base=rates))) == pytest.approx(0.1)
+
+
+def patchwork(rng, fine_px=24, coarse_px=48):
+    """Return a grey image whose left half has small patches, the right half large ones."""
+    halves = [
+        cv2.resize(
+            rng.integers(0, 255, (480 // size, 320 // size), np.uint8),
+            (320, 480),
+            interpolation=cv2.INTER_NEAREST,
+        )
+        for size in (fine_px, coarse_px)
+    ]
+    return cv2.GaussianBlur(np.hstack(halves), (0, 0), 1)
+
+
+def test_features_cover_more_of_the_image_than_the_strongest_corners():
+    gray = patchwork(np.random.default_rng(0))
+    extractor = FeatureExtractor(CAMERA, count=500, fast_threshold_min=7, fast_noise_ratio=4.0)
+    spread = extractor.extract(gray, None).uv_px
+    strongest = cv2.KeyPoint.convert(cv2.ORB.create(nfeatures=500).detect(gray, None))
+    assert len(spread) == 500
+    assert cells_covered(spread) > 1.5 * cells_covered(strongest)
+
+
+def cells_covered(uv_px):
+    return len(np.unique(uv_px // 40, axis=0))
+
+
+def test_noise_and_black_give_few_features():
+    rng = np.random.default_rng(0)
+    extractor = FeatureExtractor(CAMERA, count=500, fast_threshold_min=7, fast_noise_ratio=4.0)
+    noise = np.clip(rng.normal(20, 4, (480, 640)), 0, 255).astype(np.uint8)
+    assert len(extractor.extract(noise, None)) < 150
+    assert len(extractor.extract(np.zeros((480, 640), np.uint8), None)) == 0
+
+
+def test_depth_is_missing_at_depth_edges_and_where_it_is_not_a_number():
+    extractor = FeatureExtractor(CAMERA, count=500, fast_threshold_min=7, fast_noise_ratio=4.0)
+    gray = patchwork(np.random.default_rng(0), fine_px=16, coarse_px=16)
+    depth_m = np.full((480, 640), 1.0, np.float32)
+    depth_m[:, 320:] = 3.0
+    depth_m[:100] = np.nan
+    features = extractor.extract(gray, depth_m)
+    u, v = np.rint(features.uv_px).T
+    edge = (u >= 318) & (u <= 321)
+    assert (features.depth_m[(v < 100) | edge] == 0).all()
+    assert (features.depth_m[(v > 102) & (u < 317)] == 1.0).all()
+
+
+@pytest.mark.parametrize(("height_m", "has_grid"), [(0.0, True), (0.5, False)])
+def test_only_a_robot_in_the_plane_gets_a_grid(height_m, has_grid):
+    layers = LayerBuilder(CAMERA, cloud_stride_px=8, cloud_voxel_m=0.03, grid_resolution_m=0.05)
+    wall_m, image_bgr = np.full((480, 640), 2.0, np.float32), np.zeros((480, 640, 3), np.uint8)
+    keyframe = keyframe_at(0)
+    keyframe.T_local_base[2, 3] = height_m
+    keyframe.view = layers.view(wall_m, image_bgr, stamp_ns=0)
+    built = layers.build([keyframe])
+    assert (built.grid is not None) == has_grid
+    assert built.points.points[:, 0] == pytest.approx(2.0)
+    assert layers.build([]).points is None
