@@ -41,15 +41,17 @@ class Eye:
     def __init__(self, place: Place, light: LightMap, caster: RayCaster, camera: Camera) -> None:
         self._caster, self._light, self._camera = caster, light, camera
         self._skin, self._skin_lookup = _paint_skin(place)
-        self._normals = np.stack([panel.normal for panel in place.panels]).astype(np.float32)
+        normals = np.stack([panel.normal for panel in place.panels])
+        self._normals = np.repeat(normals, 2, axis=0).astype(np.float32)  # of triangles
         self._sky = np.sqrt(place.sun.sky) * 255.0 if place.sun else 0.0
         self._directions = _directions(camera, (0.0, 0.0))
+        self._lengths = np.linalg.norm(self._directions.reshape(-1, 3), axis=1)
         self._edge_directions = [_directions(camera, offset) for offset in _EDGE_OFFSETS_PX]
 
     def look(self, T_gt_cam: Transform, levels: Mapping[str, float]) -> View:
         """Return the view from a pose, each group of lamps at its level (0 off, 1 full)."""
         lit = self._lit(levels)
-        shaded = self._shade(_rays(T_gt_cam, self._directions), lit, levels)
+        shaded = self._shade(_rays(T_gt_cam, self._directions), self._lengths, lit, levels)
         self._soften_edges(shaded, T_gt_cam, lit, levels)
         return View(
             image_bgr=np.minimum(shaded.image_bgr, 255.0),
@@ -66,17 +68,19 @@ class Eye:
                 total += np.float32(levels[group]) * light
         return np.asarray(np.sqrt(total))
 
-    def _shade(self, rays: Image, lit: Image, levels: Mapping[str, float]) -> _Shaded:
-        """Return what rays (rows, columns, 6) show."""
+    def _shade(
+        self, rays: Image, lengths: Image, lit: Image, levels: Mapping[str, float]
+    ) -> _Shaded:
+        """Return what rays (rows, columns, 6), whose ways are so long, show."""
         shape = rays.shape[:2]
         hits = self._caster.first_hits(rays.reshape(-1, 6))
         u, v = np.ascontiguousarray(hits.uv.T)
         way = rays.reshape(-1, 6)[:, 3:]
-        facing = np.abs(np.einsum("ij,ij->i", self._normals[hits.triangle // 2], way))
-        cosine = facing / np.linalg.norm(way, axis=1)
+        cosine = np.abs(np.einsum("ij,ij->i", np.take(self._normals, hits.triangle, 0), way))
+        cosine /= lengths
         detail = self._detail(hits.reach, cosine) * len(self._light.lookup) + hits.triangle
-        skin = _sample(self._skin, self._skin_lookup[detail], u, v, shape)
-        at = self._light.lookup[hits.triangle]
+        skin = _sample(self._skin, np.take(self._skin_lookup, detail, 0), u, v, shape)
+        at = np.take(self._light.lookup, hits.triangle, 0)
         light = _sample(lit, at, u, v, shape)
         image = skin * light
         image[~np.isfinite(hits.reach).reshape(shape)] = self._sky * np.sqrt(levels[SUN])
@@ -109,7 +113,9 @@ class Eye:
         squares = np.zeros((len(padded), 3), np.float32)
         for directions in self._edge_directions:
             rays = _rays(T_gt_cam, directions.reshape(-1, 3)[padded]).reshape(-1, _ROW, 6)
-            squares += self._shade(rays, lit, levels).image_bgr.reshape(-1, 3) ** 2
+            squares += (
+                self._shade(rays, self._lengths[padded], lit, levels).image_bgr.reshape(-1, 3) ** 2
+            )
         image.reshape(-1, 3)[padded] = np.sqrt(squares / len(self._edge_directions))
 
 

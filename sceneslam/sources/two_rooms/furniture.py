@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sceneslam.sources.two_rooms.pictures import decorated, spines
+from sceneslam.sources.two_rooms.pictures import decorated, poster, spines
 from sceneslam.sources.two_rooms.place import Builder
 from sceneslam.sources.two_rooms.surfaces import (
     OAK,
@@ -121,6 +121,42 @@ def cabinet(
     turned = yaw_deg + float(rng.uniform(-30, 30))
     thing = spot.at(width_m / 4, -0.02)
     builder.box(thing, (0.18, 0.16, 0.14), cardboard, bottom_m=height_m, yaw_deg=turned)
+
+
+def sideboard(builder: Builder, spot: Spot, width_m: float) -> None:
+    """Put up a low board: bays with books or behind doors, and more books on top of it."""
+    rng, yaw_deg, look = builder.rng, spot.yaw_deg, wood((186, 200, 206), 0.8)
+    for bottom_m in (0.05, 0.53):
+        builder.box(spot.at(0, 0), (width_m, 0.36, 0.03), look, bottom_m=bottom_m, yaw_deg=yaw_deg)
+    builder.box(spot.at(0, 0.17), (width_m, 0.01, 0.56), look, yaw_deg=yaw_deg)
+    walls, bay_m = np.linspace(-width_m / 2, width_m / 2, 5), width_m / 4
+    for right_m in walls:
+        wall = spot.at(float(right_m) * (1 - 0.02 / width_m), 0)
+        builder.box(wall, (0.02, 0.35, 0.48), look, bottom_m=0.05, yaw_deg=yaw_deg)
+    sticker = decorated(paint(WHITE), (0.06, 0.07, 0.2, 0.3, poster))
+    for number, right_m in enumerate(walls[:-1] + bay_m / 2):
+        if number % 2:
+            door = spot.at(right_m, -0.17)
+            size = (bay_m - 0.03, 0.02, 0.44)
+            looks = {"front": sticker}
+            builder.box(door, size, look, bottom_m=0.085, yaw_deg=yaw_deg, looks=looks)
+        else:
+            size = (float(rng.uniform(0.28, 0.32)), 0.2, float(rng.uniform(0.3, 0.38)))
+            _books(builder, spot.at(right_m, -0.06), size, 0.08, yaw_deg)
+        top = (float(rng.uniform(0.12, 0.26)), 0.16, float(rng.uniform(0.1, 0.26)))
+        _books(builder, spot.at(right_m - 0.05, -0.02), top, 0.56, yaw_deg)
+
+
+def wall_shelf(builder: Builder, spot: Spot, width_m: float) -> None:
+    """Hang two small boards on a wall, one above the other, with things on them."""
+    yaw_deg = spot.yaw_deg
+    for bottom_m in (0.25, 0.6):
+        centre = spot.at(0, 0)
+        builder.box(centre, (width_m, 0.14, 0.02), wood(OAK), bottom_m=bottom_m, yaw_deg=yaw_deg)
+        books = spot.at(-width_m / 4, 0.01)
+        _books(builder, books, (width_m / 3, 0.11, 0.2), bottom_m + 0.02, yaw_deg)
+        thing = spot.at(width_m / 4, 0)
+        builder.box(thing, (0.1, 0.1, 0.14), cardboard, bottom_m=bottom_m + 0.02, yaw_deg=yaw_deg)
 
 
 def door_leaf(builder: Builder, spot: Spot) -> None:

@@ -18,6 +18,15 @@ from sceneslam.sources.two_rooms.surfaces import (
     write_lines,
 )
 
+_BINDINGS = (
+    (62, 56, 150),
+    (150, 110, 70),
+    (96, 132, 96),
+    (190, 200, 205),
+    (120, 178, 205),
+    (62, 66, 72),
+)
+
 
 def painting(rng: np.random.Generator, width_m: float, height_m: float) -> Texture:
     """Return a framed abstract painting: a sky of brush strokes with shapes over it."""

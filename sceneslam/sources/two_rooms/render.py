@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
-from collections.abc import Generator, Sequence
-from multiprocessing.connection import Connection
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Generator
+from typing import IO
 
 import cv2
 
@@ -23,46 +25,61 @@ def render(shot: Shot, count: int, workers: int) -> Generator[Frame]:
         for index in range(count):
             yield photographer.take(index)
         return
-    # Processes, since ray casting holds the interpreter's lock; spawned, since it has threads.
-    context = multiprocessing.get_context("spawn")
-    crew = []
+    crew = [_hire() for _ in range(workers)]
     try:
-        for number in range(workers):
-            ours, theirs = context.Pipe(duplex=False)
-            share = range(number, count, workers)
-            worker = context.Process(target=_work, args=(shot, share, theirs), daemon=True)
-            worker.start()
-            theirs.close()
-            crew.append((worker, ours))
+        for number, worker in enumerate(crew):
+            _brief(worker, shot, range(number, count, workers))
         for index in range(count):
-            yield _receive(crew[index % workers][1], index)
+            yield _receive(crew[index % workers], index)
     finally:
-        for worker, ours in crew:
-            worker.terminate()
-            worker.join()
-            ours.close()
+        for worker in crew:
+            worker.kill()
+            worker.communicate()
 
 
-def _receive(connection: Connection, index: int) -> Frame:
-    try:
-        frame = connection.recv()
-    except EOFError:
-        raise InputError(f"two_rooms: a rendering process ended at frame {index}") from None
-    if isinstance(frame, Exception):
-        raise frame
-    assert isinstance(frame, Frame)
-    return frame
-
-
-def _work(shot: Shot, share: Sequence[int], connection: Connection) -> None:
-    """Render a share of the frames; the parent ends this process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def work() -> None:
+    """Render a share of a shot's frames: both from standard input, the frames to its output."""
     cv2.setNumThreads(1)
-    try:
+    with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as output:
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever a library prints
+        shot, share = pickle.load(sys.stdin.buffer)
         photographer = Photographer(shot)
         for index in share:
-            connection.send(photographer.take(index))
+            pickle.dump(photographer.take(index), output, protocol=5)
+            output.flush()
+
+
+def _hire() -> subprocess.Popen[bytes]:
+    """Start a worker.
+
+    Processes, since ray casting holds the interpreter's lock. Not by multiprocessing, which runs
+    the caller's main module anew in each; in a session of their own, which Ctrl-C does not reach.
+    """
+    command = f"from {__name__} import work; work()"
+    return subprocess.Popen(
+        [sys.executable, "-c", command],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+        start_new_session=True,
+    )
+
+
+def _brief(worker: subprocess.Popen[bytes], shot: Shot, share: range) -> None:
+    assert worker.stdin is not None
+    try:
+        pickle.dump((shot, share), worker.stdin, protocol=5)
+        worker.stdin.flush()
     except BrokenPipeError:
-        return
-    except Exception as err:
-        connection.send(err)
+        raise InputError("two_rooms: a rendering process could not start") from None
+
+
+def _receive(worker: subprocess.Popen[bytes], index: int) -> Frame:
+    output: IO[bytes] | None = worker.stdout
+    assert output is not None
+    try:
+        frame = pickle.load(output)
+    except (EOFError, pickle.UnpicklingError):
+        raise InputError(f"two_rooms: a rendering process ended at frame {index}") from None
+    assert isinstance(frame, Frame)
+    return frame

@@ -16,8 +16,10 @@ from sceneslam.sources.two_rooms.furniture import (
     door_leaf,
     parcels,
     plant,
+    sideboard,
     sofa,
     table,
+    wall_shelf,
 )
 from sceneslam.sources.two_rooms.pictures import decorated, painting, pin_board, poster
 from sceneslam.sources.two_rooms.place import Builder, Lamp, Place, Sun
@@ -45,15 +47,18 @@ _B_X_M, _B_Y_M = (5.12, 10.2), (0.0, 4.2)
 _CORRIDOR_X_M, _CORRIDOR_Y_M = (5.12, 19.5), (1.15, 2.8)
 _WINDOW_X_M, _WINDOW_Z_M = (1.3, 2.9), (0.95, 2.1)
 _BLUE_GREY: Colour = (162, 150, 138)
-_POWER_A, _POWER_B, _POWER_CORRIDOR = 5.0, 9.5, 1.5
+_POWER_A, _POWER_B, _POWER_CORRIDOR = 5.4, 9.5, 1.5
 _NIGHT_POWER = 0.03  # stand-by lights and the street: never quite dark
 _SUN = Sun(direction=(0.42, -0.62, -0.66), power=4.4, sky=3.0)
 
 
-def two_rooms(rng: np.random.Generator, *, sunny: bool) -> Place:
-    """Return rooms A and B; when sunny, the window of A stands open to the sun."""
+def two_rooms(rng: np.random.Generator, *, sunny: bool = False, bare: bool = False) -> Place:
+    """Return rooms A and B.
+
+    Sunny: the window of A stands open to the sun. Bare: nothing stands at its south wall.
+    """
     builder = Builder(rng)
-    _room_a(builder, sunny=sunny)
+    _room_a(builder, sunny=sunny, bare=bare)
     _room_b(builder)
     lamps = [*_lamps_a(), _night((2.6, 3.0)), _night((7.9, 3.4))]
     lamps += [_lamp("b", (x_m, 2.1), (0.6, 0.6), _POWER_B) for x_m in (6.5, 8.9)]
@@ -63,7 +68,7 @@ def two_rooms(rng: np.random.Generator, *, sunny: bool) -> Place:
 def corridor(rng: np.random.Generator) -> Place:
     """Return room A and, behind its door, a bare corridor 14 m long."""
     builder = Builder(rng)
-    _room_a(builder, sunny=False)
+    _room_a(builder)
     (x0, x1), (y0, y1) = _CORRIDOR_X_M, _CORRIDOR_Y_M
     wall = paint((166, 174, 178))
     builder.level((x0, x1), (y0, y1), 0.0, carpet_tiles)
@@ -80,14 +85,15 @@ def corridor(rng: np.random.Generator) -> Place:
     return Place(panels=tuple(builder.panels), lamps=tuple(lamps))
 
 
-def _room_a(builder: Builder, *, sunny: bool) -> None:
-    """Build the living room: its south wall is plain."""
+def _room_a(builder: Builder, *, sunny: bool = False, bare: bool = False) -> None:
+    """Build the living room."""
     white = paint(WHITE)
     (x0, x1), (y0, y1) = _A_X_M, _A_Y_M
     carpet = decorated(floorboards(OAK), (0.75, 1.35, 2.2, 1.5, rug))
     builder.level((x0, x1), (y0, y1), 0.0, carpet)
     builder.level((x0, x1), (y0, y1), HEIGHT_M, white, faces_up=False)
-    builder.wall((x1, y0), (x0, y0), (0, HEIGHT_M), white)
+    south = decorated(white, (1.05, 0.75, 0.9, 0.7, painting), (2.15, 0.8, 0.55, 0.8, poster))
+    builder.wall((x1, y0), (x0, y0), (0, HEIGHT_M), white if bare else south)
     west = decorated(white, (1.9, 0.7, 0.8, 0.6, painting), (2.85, 0.85, 0.5, 0.7, poster))
     builder.wall((x0, y0), (x0, y1), (0, HEIGHT_M), west)
     _wall_with_window(builder, y1, sunny=sunny)
@@ -102,6 +108,9 @@ def _room_a(builder: Builder, *, sunny: bool) -> None:
     chair(builder, Spot(1.15, 1.62, 12), wood(OAK), fabric((110, 70, 40)))
     cabinet(builder, Spot(4.74, 0.45, -90), (0.75, 0.42, 0.92), wood(BIRCH, 1.4))
     parcels(builder, Spot(4.55, 3.9, 8))
+    if not bare:
+        sideboard(builder, Spot(3.2, 0.19, 180), 1.5)
+        plant(builder, Spot(2.2, 0.3), 0.9)
     door_leaf(builder, Spot(4.54, 1.47, 180))
 
 
@@ -127,6 +136,9 @@ def _room_b(builder: Builder) -> None:
     parcels(builder, Spot(6.3, 0.35, 172))
     cabinet(builder, Spot(8.1, 0.25, 180), (0.9, 0.4, 0.8), wood(WALNUT, 1.4))
     plant(builder, Spot(5.5, 3.85), 1.1)
+    parcels(builder, Spot(6.85, 2.72, 30))
+    table(builder, Spot(6.9, 1.1, 12), (0.6, 0.45, 0.45), wood(WALNUT, 1.4))
+    wall_shelf(builder, Spot(5.2, 3.4, 90), 0.55)
 
 
 def _wall_with_door(

@@ -101,11 +101,11 @@ class Photographer:
 
 
 def build_place(kind: str, seed: int) -> Place:
-    """Return a story's place: `two_rooms`, `sunny_rooms` or `corridor`."""
+    """Return a story's place: `two_rooms`, `sunny_rooms`, `bare_rooms` or `corridor`."""
     rng = np.random.default_rng([seed, _PLACE_STREAM, 0])
     if kind == "corridor":
         return rooms.corridor(rng)
-    return rooms.two_rooms(rng, sunny=kind == "sunny_rooms")
+    return rooms.two_rooms(rng, sunny=kind == "sunny_rooms", bare=kind == "bare_rooms")
 
 
 def light_place(place: Place, seed: int) -> LightMap:

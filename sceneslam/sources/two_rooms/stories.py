@@ -21,7 +21,7 @@ class Story:
     """One drive. Lamps that are not named are at full power."""
 
     about: str
-    place: str = "two_rooms"  # or "sunny_rooms", "corridor"
+    place: str = "two_rooms"  # or sunny_rooms, bare_rooms, corridor
     start_x_y_deg: tuple[float, float, float] = (3.0, 2.9, -150.0)
     moves: tuple[Move, ...]
     lamps: Mapping[str, Knots] = field(default_factory=lambda: {"b": _OFF})
@@ -57,7 +57,7 @@ STORIES: Mapping[str, Story] = {
         about="from a lit room through the door into a dark one",
         moves=(
             Wait(1.5),
-            Drive((*_TO_DOOR, (6.0, 2.0), (7.2, 2.5), (8.3, 2.4), (8.6, 1.7), (7.8, 1.2))),
+            Drive((*_TO_DOOR, (6.2, 2.0), (7.2, 2.05), (8.3, 2.3), (8.5, 1.7), (7.9, 1.25))),
             Wait(0.5),
         ),
     ),
@@ -66,7 +66,17 @@ STORIES: Mapping[str, Story] = {
         start_x_y_deg=(8.2, 1.5, 115.0),
         moves=(
             Wait(1.5),
-            Drive(((7.6, 2.7), *_BACK_TO_DOOR, (4.4, 1.95), (3.5, 2.2), (2.8, 1.9), (2.8, 1.1))),
+            Drive(
+                (
+                    (8.0, 2.6),
+                    (7.4, 3.25),
+                    *_BACK_TO_DOOR,
+                    (4.4, 1.95),
+                    (3.5, 2.2),
+                    (2.8, 1.9),
+                    (2.8, 1.1),
+                )
+            ),
             Face(60.0),
             Wait(1.0),
         ),
@@ -75,7 +85,7 @@ STORIES: Mapping[str, Story] = {
         about="bright, dark, bright: a loop closed at the start",
         moves=(
             Wait(1.5),
-            Drive((*_TO_DOOR, (6.0, 2.0), (7.3, 1.7), (8.3, 1.8), (8.2, 2.8), (7.2, 3.1))),
+            Drive((*_TO_DOOR, (6.2, 2.0), (7.3, 1.9), (8.3, 2.0), (8.2, 2.9), (7.4, 3.25))),
             Drive((*_BACK_TO_DOOR, (4.4, 1.97), (3.8, 2.5), (3.0, 2.9))),
             Face(-150.0),
             Wait(1.5),
@@ -98,6 +108,7 @@ STORIES: Mapping[str, Story] = {
     ),
     "white_wall": Story(
         about="lit, but for seconds nothing but a plain wall in view",
+        place="bare_rooms",
         moves=(
             Wait(1.5),
             Drive(((2.8, 2.2), (2.9, 1.5), (3.0, 1.0))),
