@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import resource
-import signal
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
@@ -24,6 +22,7 @@ from sceneslam.config.build import Parts, build
 from sceneslam.config.provenance import save_config
 from sceneslam.evaluation.metrics import Metrics, evaluate, write_metrics
 from sceneslam.evaluation.report import write_report
+from sceneslam.interrupts import termination_as_interrupt, uninterrupted
 from sceneslam.types.errors import InputError
 from sceneslam.types.observation import Observation
 from sceneslam.types.run import RunResult, Timings
@@ -56,10 +55,10 @@ def run(
     parts = build(config)
     folder.mkdir(parents=True, exist_ok=True)
     cv2.setNumThreads(parts.run.threads)
-    with _termination_as_interrupt():
+    with termination_as_interrupt():
         loop = _Loop(parts, folder, title)
         faults = loop.run()
-        with _uninterrupted():
+        with uninterrupted():
             return _save(config, parts, folder, loop.result(), faults, reference)
 
 
@@ -224,34 +223,3 @@ def _save(
         value_label=parts.detector.quantity,
     )
     return Finished(metrics=metrics, trajectory=result.trajectory, faults=faults)
-
-
-@contextmanager
-def _termination_as_interrupt() -> Iterator[None]:
-    """Let SIGTERM end a run as Ctrl-C does."""
-
-    def interrupt(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
-    with _handler(signal.SIGTERM, interrupt):
-        yield
-
-
-@contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Finish saving although Ctrl-C is pressed again."""
-    with _handler(signal.SIGINT, signal.SIG_IGN):
-        yield
-
-
-@contextmanager
-def _handler(number: int, handler: Any) -> Iterator[None]:
-    try:
-        previous = signal.signal(number, handler)
-    except ValueError:  # not the main thread: signals are not ours
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(number, previous)

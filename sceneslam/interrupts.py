@@ -1,0 +1,39 @@
+"""Ctrl-C and SIGTERM: both end a run, neither spoils what is being saved."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+
+@contextmanager
+def termination_as_interrupt() -> Iterator[None]:
+    """Let SIGTERM end a run as Ctrl-C does."""
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    with _handler(signal.SIGTERM, interrupt):
+        yield
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Finish saving although Ctrl-C is pressed again."""
+    with _handler(signal.SIGINT, signal.SIG_IGN):
+        yield
+
+
+@contextmanager
+def _handler(number: int, handler: Any) -> Iterator[None]:
+    try:
+        previous = signal.signal(number, handler)
+    except ValueError:  # not the main thread: signals are not ours
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(number, previous)
