@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from sceneslam.interfaces import Source
+from sceneslam.sources.two_rooms import source as module
 from sceneslam.sources.two_rooms.source import TwoRooms
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.rig import Sensor
@@ -26,6 +29,15 @@ def make(folder: Path, **changes: Any) -> TwoRooms:
     arguments["camera"]["size_wh"] = [96, 72]
     arguments.pop("_target_")
     return TwoRooms(**(arguments | changes))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def light_once() -> Iterator[None]:
+    """Light each place once for all tests of this file: it takes seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "build_place", cache(module.build_place))
+        patch.setattr(module, "light_place", cache(module.light_place))
+        yield
 
 
 @pytest.fixture(scope="module")

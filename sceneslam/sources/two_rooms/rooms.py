@@ -47,7 +47,7 @@ _B_X_M, _B_Y_M = (5.12, 10.2), (0.0, 4.2)
 _CORRIDOR_X_M, _CORRIDOR_Y_M = (5.12, 19.5), (1.15, 2.8)
 _WINDOW_X_M, _WINDOW_Z_M = (1.3, 2.9), (0.95, 2.1)
 _BLUE_GREY: Colour = (162, 150, 138)
-_POWER_A, _POWER_B, _POWER_CORRIDOR = 5.4, 9.5, 1.5
+_POWER_A, _POWER_B, _POWER_CORRIDOR = 5.4, 13.0, 2.0
 _NIGHT_POWER = 0.03  # stand-by lights and the street: never quite dark
 _SUN = Sun(direction=(0.42, -0.62, -0.66), power=4.4, sky=3.0)
 
