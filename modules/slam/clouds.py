@@ -1,0 +1,104 @@
+"""Clouds in base, from a lidar's points or a depth image, with the motion within a sweep undone."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.errors import InputError
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Camera, Rig, Sensor
+
+Cloud = NDArray[np.float64]  # (N, 3) [m], base
+
+
+class CloudReader:
+    """Reads one rig's clouds: the lidar's where there is one, else the depth camera's."""
+
+    def __init__(self, rig: Rig, *, depth_range_max_m: float, depth_stride_px: int) -> None:
+        """Choose the sensor; `range_m` is what it is believed within."""
+        self.is_depth = Sensor.POINTS not in rig.sensors and rig.camera is not None
+        self.range_m = (0.0, 100.0)
+        self._T_base_sensor = se3.identity()
+        self._stride_px = depth_stride_px
+        self._camera = rig.camera
+        if self.is_depth and rig.camera is not None:
+            near_m, far_m = rig.camera.depth_range_m
+            self.range_m = (near_m, min(far_m, depth_range_max_m))
+            self._T_base_sensor = rig.camera.T_base_cam
+            self._rays_cam = _rays_cam(rig.camera, depth_stride_px)
+        elif rig.lidar is not None:
+            self.range_m = rig.lidar.range_m
+            self._T_base_sensor = rig.lidar.T_base_lidar
+
+    def read(self, observation: Observation) -> Cloud | None:
+        """Return the observation's valid points, unswept; None where it has no cloud."""
+        found = self._sensed(observation)
+        if found is None:
+            return None
+        return np.asarray(se3.apply(self._T_base_sensor, found[self._valid(found)]))
+
+    def read_unswept(self, observation: Observation, twist_s: NDArray[np.float64]) -> Cloud | None:
+        """Return the valid points as they were at the observation's stamp.
+
+        `twist_s` is base's motion per second; without times of points, or with broken ones, the
+        points stay where they are.
+        """
+        times_s = observation.point_times_s
+        if self.is_depth or times_s is None or observation.points_lidar is None:
+            return self.read(observation)
+        found = observation.points_lidar.astype(np.float64)
+        if len(times_s) != len(found):
+            raise InputError(f"point_times_s: expected {len(found)} values, got {len(times_s)}")
+        valid = self._valid(found)
+        points = np.asarray(se3.apply(self._T_base_sensor, found[valid]))
+        times = np.nan_to_num(times_s[valid], nan=0.0, posinf=0.0, neginf=0.0)
+        return _moved(points, times, twist_s)
+
+    def _sensed(self, observation: Observation) -> Cloud | None:
+        if not self.is_depth:
+            points = observation.points_lidar
+            return None if points is None else points.astype(np.float64)
+        if observation.depth_m is None or self._camera is None:
+            return None
+        width, height = self._camera.size_wh
+        if observation.depth_m.shape != (height, width):
+            raise InputError(
+                f"depth_m: expected ({height}, {width}), got {observation.depth_m.shape}"
+            )
+        start = self._stride_px // 2
+        depth = observation.depth_m[start :: self._stride_px, start :: self._stride_px]
+        return np.asarray(self._rays_cam * depth.reshape(-1, 1).astype(np.float64))
+
+    def _valid(self, points_sensor: Cloud) -> NDArray[np.bool_]:
+        """Tell which points are measurements; a camera's range is its depth."""
+        near_m, far_m = self.range_m
+        with np.errstate(invalid="ignore", over="ignore"):
+            reach = points_sensor[:, 2] if self.is_depth else np.linalg.norm(points_sensor, axis=1)
+        return np.asarray((reach >= near_m) & (reach <= far_m))  # false for NaN
+
+
+def _moved(points: Cloud, times_s: NDArray[np.float64], twist_s: NDArray[np.float64]) -> Cloud:
+    """Return each point moved by the motion that base made in its time."""
+    rate = twist_s[3:]
+    speed = float(np.linalg.norm(rate))
+    shift = times_s[:, None] * twist_s[:3]
+    if speed < 1e-9:
+        return points + shift
+    axis = rate / speed
+    angle = (speed * times_s)[:, None]
+    across = np.cross(axis, points)
+    turned = points + np.sin(angle) * across + (1.0 - np.cos(angle)) * np.cross(axis, across)
+    return np.asarray(turned + shift)
+
+
+def _rays_cam(camera: Camera, stride_px: int) -> Cloud:
+    """Return the rays (N, 3) with z = 1 of every stride-th pixel, lens distortion taken out."""
+    width, height = camera.size_wh
+    start = stride_px // 2
+    u, v = np.meshgrid(np.arange(start, width, stride_px), np.arange(start, height, stride_px))
+    pixels = np.stack([u.ravel(), v.ravel()], axis=-1).astype(np.float64)
+    xy = cv2.undistortPoints(pixels[:, None], camera.K, np.array(camera.distortion)).reshape(-1, 2)
+    return np.column_stack([xy, np.ones(len(xy))])

@@ -1,0 +1,249 @@
+"""The KISS-ICP adapter on clouds of a cluttered hall, whose motion is known."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from sceneslam.interfaces import SlamModule
+from sceneslam.modules.slam.clouds import CloudReader
+from sceneslam.modules.slam.kiss_icp import KissIcp
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.observation import Observation, TrackingStatus
+from sceneslam.types.rig import Camera, Lidar, Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
+
+SETTINGS = yaml.safe_load(
+    (Path(__file__).resolve().parent.parent / "conf/slam/kiss_icp.yaml").read_text()
+)
+SETTINGS.pop("_target_")
+RANGE_M = (0.5, 30.0)
+RIG = Rig(sensors=frozenset({Sensor.POINTS}), lidar=Lidar(range_m=RANGE_M))
+CAMERA = Camera(size_wh=(64, 48), fx=52.5, fy=52.5, cx=31.5, cy=23.5)
+
+
+def active(rig=RIG, **settings):
+    module = KissIcp(**{**SETTINGS, **settings})
+    module.activate(rig)
+    return module
+
+
+def hall():
+    """Return the points (N, 3) of a hall's floor and of many boxes that stand on it."""
+    rng = np.random.default_rng(0)
+    centres = rng.uniform([-15, -15], [15, 15], (60, 2))
+    corner = rng.uniform(-0.6, 0.6, (60, 250, 3)) * rng.uniform(0.3, 1.5, (60, 1, 3))
+    face = rng.integers(0, 3, (60, 250))[..., None] == np.arange(3)
+    boxes = np.where(face, 0.6 * np.sign(corner), corner) + np.array([0, 0, 0.6])
+    boxes[..., :2] += centres[:, None]
+    floor = np.column_stack([rng.uniform(-15, 15, (4000, 2)), np.zeros(4000)])
+    return np.vstack([boxes.reshape(-1, 3), floor])
+
+
+def seen(points, T_world_lidar, *, seed):
+    """Return the points in the lidar's frame, with 1 cm of noise."""
+    noise = np.random.default_rng(seed).normal(0, 0.01, points.shape)
+    return (se3.apply(se3.inverse(T_world_lidar), points) + noise).astype(np.float32)
+
+
+def drive(count, T_base_lidar=None, *, speed_m=0.15, odometry=False):
+    """Return observations and their T_world_base."""
+    points = hall()
+    T_base_lidar = se3.identity() if T_base_lidar is None else T_base_lidar
+    poses = [se3.from_xy_yaw(speed_m * i, 0.02 * i, 0.02 * i) for i in range(count)]
+    observations = [
+        Observation(
+            stamp_ns=index * 100_000_000,
+            points_lidar=seen(points, T @ T_base_lidar, seed=index),
+            T_odom_base=T if odometry else None,
+        )
+        for index, T in enumerate(poses)
+    ]
+    return observations, poses
+
+
+def worst_error_m(trackings, poses):
+    return max(
+        np.linalg.norm((se3.inverse(poses[0]) @ T)[:3, 3] - tracking.T_local_base[:3, 3])
+        for tracking, T in zip(trackings, poses, strict=True)
+    )
+
+
+def test_module_fulfils_the_interface():
+    assert isinstance(active(), SlamModule)
+
+
+@pytest.mark.parametrize("odometry", [False, True])
+def test_motion_in_a_hall_is_found(odometry):
+    observations, poses = drive(25, odometry=odometry)
+    module = active()
+    trackings = [module.track(observation) for observation in observations]
+    assert {tracking.status for tracking in trackings} == {TrackingStatus.TRACKING}
+    np.testing.assert_allclose(trackings[0].T_local_base, np.eye(4), atol=1e-9)
+    assert worst_error_m(trackings, poses) < 0.06
+    assert trackings[-1].quality_ratio > 0.7
+    assert 1000 < len(module.get_map().points.points) < 100_000
+
+
+def test_mounted_lidar_gives_the_motion_of_base():
+    T_base_lidar = se3.from_xy_yaw(0.5, 0.2, 0.7)
+    T_base_lidar[2, 3] = 1.2
+    rig = Rig(sensors=RIG.sensors, lidar=Lidar(range_m=RANGE_M, T_base_lidar=T_base_lidar))
+    observations, poses = drive(20, T_base_lidar)
+    module = active(rig)
+    assert worst_error_m([module.track(o) for o in observations], poses) < 0.06
+
+
+def test_two_runs_are_identical_to_the_bit():
+    observations, _ = drive(12)
+    runs = []
+    for _ in range(2):
+        module = active()
+        runs.append([module.track(observation).T_local_base for observation in observations])
+    np.testing.assert_array_equal(runs[0], runs[1])
+
+
+def test_environment_does_not_change_the_settings(monkeypatch):
+    observations, _ = drive(8)
+    module = active()
+    plain = [module.track(observation).T_local_base for observation in observations]
+    monkeypatch.setenv("kiss_icp_mapping", '{"voxel_size": 5.0, "max_points_per_voxel": 1}')
+    monkeypatch.setenv("kiss_icp_registration", "not even JSON")
+    monkeypatch.setenv("kiss_icp_adaptive_threshold", '{"fixed_threshold": 0.001}')
+    module = active()
+    again = [module.track(observation).T_local_base for observation in observations]
+    np.testing.assert_array_equal(plain, again)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0])
+def test_broken_clouds_are_lost_and_tracking_comes_back(value):
+    observations, poses = drive(12, speed_m=0.02)
+    module = active()
+    for index, observation in enumerate(observations):
+        if index in (5, 6):
+            observation = replace(observation, points_lidar=np.full((500, 3), value, np.float32))
+        if index == 7:
+            observation = replace(observation, points_lidar=np.zeros((0, 3), np.float32))
+        tracking = module.track(observation)
+        assert np.isfinite(tracking.T_local_base).all()
+        assert (tracking.status is TrackingStatus.LOST) == (index in (5, 6, 7))
+    expected = (se3.inverse(poses[0]) @ poses[-1])[:3, 3]
+    assert np.linalg.norm(tracking.T_local_base[:3, 3] - expected) < 0.06
+
+
+def test_jump_that_no_robot_makes_is_refused():
+    observations, _ = drive(8)
+    module = active(speed_max_m_s=3.0)
+    for observation in observations:
+        held = module.track(observation)
+    away = replace(
+        observations[-1],
+        stamp_ns=observations[-1].stamp_ns + 100_000_000,
+        points_lidar=observations[-1].points_lidar + np.float32([0.9, 0, 0]),
+    )
+    tracking = module.track(away)
+    assert tracking.status is TrackingStatus.LOST
+    np.testing.assert_array_equal(tracking.T_local_base, held.T_local_base)
+
+
+def test_odometry_carries_on_without_clouds():
+    observations, poses = drive(20, odometry=True)
+    empty = np.zeros((0, 3), np.float32)
+    module = active()
+    blind = [
+        replace(observation, points_lidar=empty) if index >= 10 else observation
+        for index, observation in enumerate(observations)
+    ]
+    trackings = [module.track(observation) for observation in blind]
+    assert trackings[-1].status is TrackingStatus.DEGRADED
+    assert worst_error_m(trackings, poses) < 0.06
+    assert np.trace(trackings[-1].covariance) > np.trace(trackings[9].covariance)
+
+
+def test_observations_without_a_cloud_are_predicted_for_a_moment():
+    observations, _ = drive(10)
+    module = active()
+    for observation in observations:
+        last = module.track(observation)
+    stamps = [observations[-1].stamp_ns + step * 100_000_000 for step in (1, 9)]
+    soon, late = [module.track(Observation(stamp_ns=stamp)) for stamp in stamps]
+    assert soon.status is TrackingStatus.TRACKING
+    assert soon.T_local_base[0, 3] > last.T_local_base[0, 3] + 0.05
+    assert late.status is TrackingStatus.LOST
+
+
+def test_activation_starts_anew_and_shutdown_may_come_twice():
+    observations, _ = drive(6)
+    module = active()
+    first = [module.track(observation).T_local_base for observation in observations]
+    module.set_pose(se3.from_xy_yaw(1.0, 2.0, 3.0))
+    np.testing.assert_array_equal(module.get_pose(), se3.from_xy_yaw(1.0, 2.0, 3.0) @ first[-1])
+    module.shutdown()
+    module.shutdown()
+    assert len(module.get_map().points.points) > 1000
+    module.activate(RIG)
+    assert len(module.get_map().points.points) == 0
+    again = [module.track(observation).T_local_base for observation in observations]
+    np.testing.assert_array_equal(first, again)
+
+
+def test_sweep_is_undone_to_the_stamp():
+    rig = Rig(sensors=RIG.sensors, lidar=Lidar(range_m=(0.1, 50.0)))
+    reader = CloudReader(rig, depth_range_max_m=5.0, depth_stride_px=8)
+    twist_s = np.array([2.0, -1.0, 0.5, 0.1, -0.2, 0.9])
+    times = np.linspace(0.0, 0.1, 50)
+    still = np.random.default_rng(1).uniform(-10, 10, (50, 3))
+    swept = np.array(
+        [
+            se3.apply(se3.inverse(se3.exp(twist_s * time)), point[None])[0]
+            for time, point in zip(times, still, strict=True)
+        ]
+    ).astype(np.float32)
+    observation = Observation(stamp_ns=0, points_lidar=swept, point_times_s=times)
+    np.testing.assert_allclose(reader.read_unswept(observation, twist_s), still, atol=0.02)
+    equal = replace(observation, point_times_s=np.full(50, 0.1))
+    assert np.isfinite(reader.read_unswept(equal, twist_s)).all()
+    with pytest.raises(InputError, match="point_times_s: expected 50 values, got 3"):
+        reader.read_unswept(replace(observation, point_times_s=np.zeros(3)), twist_s)
+
+
+def test_depth_becomes_points_of_base():
+    rig = Rig(sensors=frozenset({Sensor.DEPTH}), camera=CAMERA)
+    reader = CloudReader(rig, depth_range_max_m=5.0, depth_stride_px=4)
+    depth = np.full((48, 64), 2.0, np.float32)
+    depth[:, :32] = [[0.0], [np.nan], [np.inf], [6.0]] * 12
+    cloud = reader.read(Observation(stamp_ns=0, depth_m=depth))
+    assert len(cloud) == 12 * 8
+    np.testing.assert_allclose(cloud[:, 0], 2.0)
+    assert (cloud[:, 1] < 0).all()  # the right half of the image lies to the right
+    with pytest.raises(InputError, match="depth_m"):
+        reader.read(Observation(stamp_ns=0, depth_m=np.zeros((4, 4), np.float32)))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("voxel_m", 0.0), ("depth_stride_px", -1), ("overlap_min_ratio", 2.0)]
+)
+def test_settings_out_of_range_are_named(name, value):
+    with pytest.raises(ConfigError, match=name):
+        KissIcp(**{**SETTINGS, name: value})
+
+
+def test_start_of_a_real_drive_is_followed(shared_data):
+    folder = shared_data / "kitti_raw_2011_09_26_drive_0001"
+    truth = Trajectory.read_tum(folder / "groundtruth_tum.txt")
+    module = active(Rig(sensors=RIG.sensors, lidar=Lidar()))
+    positions = []
+    for index in range(2, 16):  # from standstill to 13 m/s in one scan is another matter
+        cloud = np.fromfile(folder / "velodyne" / f"{index:06d}.bin", np.float32)
+        observation = Observation(
+            stamp_ns=int(truth.stamps_ns[index]),
+            points_lidar=cloud.reshape(-1, 4)[:, :3],
+            T_odom_base=truth.T_world_base[index] if index < 4 else None,
+        )
+        positions.append(module.track(observation).T_local_base[:3, 3])
+    driven = np.linalg.norm(positions[-1])
+    expected = np.linalg.norm(truth.positions_m[15] - truth.positions_m[2])
+    assert driven == pytest.approx(expected, abs=0.4)
