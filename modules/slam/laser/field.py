@@ -79,5 +79,5 @@ class LikelihoodField:
         self, points_local: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         cells = np.floor(points_local / self.resolution_m).astype(np.int64) - self._origin
-        cells = np.clip(cells, 0, self._limit)
+        cells = np.minimum(np.maximum(cells, 0), self._limit)
         return cells[:, 0], cells[:, 1]

@@ -23,8 +23,8 @@ _SEARCH_STEP_M = 0.1
 _SEARCH_SIGMAS = 3.0
 _PRIOR_WEIGHT = 0.01  # likelihood per squared sigma from the prediction
 _KERNELS_M = (0.25, 0.12, 0.06)  # of the robust weight: coarse to fine
-_ITERATIONS = 8  # at most, per kernel
-_CONVERGED = np.array([1e-4, 1e-4, 1e-5])  # m, m, rad
+_ITERATIONS = (3, 3, 8)  # at most, per kernel
+_CONVERGED = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: a step this small is the last
 _INLIER_M = 0.1
 _CORRELATION = 4.0  # neighbouring beams share their errors: information is this much less
 
@@ -95,8 +95,8 @@ class Matcher:
         information: Matrix,
     ) -> Match:
         pose = start.copy()
-        for kernel_m in _KERNELS_M:
-            for _ in range(_ITERATIONS):
+        for kernel_m, iterations in zip(_KERNELS_M, _ITERATIONS, strict=True):
+            for _ in range(iterations):
                 H, g, weak = self._laser_equations(scan_base, field, pose, kernel_m)
                 off = pose - predicted
                 off[2] = wrap(off[2])
@@ -124,28 +124,23 @@ class Matcher:
         """Return the normal equations H, g in (x, y, yaw), and how many directions are weak."""
         arms = scan_base.points @ rotation(pose[2]).T
         near = field.nearest(arms + pose[:2])
-        error = arms + pose[:2] - near.points
+        ex, ey = (arms + pose[:2] - near.points).T
         xx, xy, yy = near.shape.T
-        across = np.column_stack(
-            [xx * error[:, 0] + xy * error[:, 1], xy * error[:, 0] + yy * error[:, 1]]
-        )
-        squared = np.sum(across * error, axis=1)
-        robust = (kernel_m**2 / (kernel_m**2 + squared)) ** 2
-        gate = np.sum(error**2, axis=1) < (4.0 * kernel_m) ** 2
+        ax, ay = xx * ex + xy * ey, xy * ex + yy * ey  # the error across the surface
+        robust = (kernel_m**2 / (kernel_m**2 + ax * ex + ay * ey)) ** 2
+        gate = ex * ex + ey * ey < (4.0 * kernel_m) ** 2
         weight = scan_base.weight * robust * gate / _CORRELATION
-        centre = (weight @ arms) / max(float(weight.sum()), 1e-12)
-        lever = np.column_stack([-(arms - centre)[:, 1], (arms - centre)[:, 0]])
-        turned = np.column_stack(
-            [xx * lever[:, 0] + xy * lever[:, 1], xy * lever[:, 0] + yy * lever[:, 1]]
-        )
+        total = float(weight.sum())
+        centre = (weight @ arms) / max(total, 1e-12)
+        lx, ly = -(arms[:, 1] - centre[1]), arms[:, 0] - centre[0]  # what a turn moves a point by
+        tx, ty = xx * lx + xy * ly, xy * lx + yy * ly
         H = np.empty((3, 3))
         H[0, 0], H[0, 1], H[1, 1] = weight @ xx, weight @ xy, weight @ yy
-        H[1, 0] = H[0, 1]
-        H[:2, 2] = H[2, :2] = weight @ turned
-        H[2, 2] = weight @ np.sum(lever * turned, axis=1)
-        g = np.array([*(weight @ across), weight @ np.sum(lever * across, axis=1)])
-        spread = float(np.sqrt(weight @ np.sum(lever**2, axis=1) / max(weight.sum(), 1e-12)))
-        H, g, weak = self._keep_held(H, g, float(weight.sum()), max(spread, 1e-3))
+        H[0, 2], H[1, 2], H[2, 2] = weight @ tx, weight @ ty, weight @ (lx * tx + ly * ty)
+        H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
+        g = np.array([weight @ ax, weight @ ay, weight @ (lx * ax + ly * ay)])
+        spread_m = float(np.sqrt(weight @ (lx * lx + ly * ly) / max(total, 1e-12)))
+        H, g, weak = self._keep_held(H, g, total, max(spread_m, 1e-3))
         # From turning about the points' centre to turning about base.
         M = np.eye(3)
         M[:2, 2] = -centre[1], centre[0]
