@@ -11,10 +11,11 @@ Item = TypeVar("Item")
 
 
 def prefetched(
-    jobs: Iterable[Callable[[], Item]], *, workers: int = 2, ahead: int = 4
+    jobs: Iterable[Callable[[], Item]], *, workers: int = 1, ahead: int = 4
 ) -> Iterator[Item]:
     """Yield each job's result in the jobs' order while up to `ahead` more are being worked on.
 
+    One worker beside the caller is what two cores carry: more only take turns with the tracking.
     The jobs themselves are drawn in the caller's thread. A job's exception is raised where its
     result would have come. When the caller stops, work that has not begun is dropped.
     """
