@@ -1,0 +1,71 @@
+"""The laser module on a real log, against relative poses that people checked."""
+
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from sceneslam.modules.slam.laser.module import LaserSlam
+from sceneslam.types import se3
+from sceneslam.types.observation import LaserScan, Observation, TrackingStatus
+from sceneslam.types.rig import Laser, Rig, Sensor
+
+SCANS = 1200
+
+
+def read_log(path):
+    """Return the first scans of a CARMEN log: stamp text, observation."""
+    found = []
+    with path.open() as log:
+        for line in log:
+            if not line.startswith("FLASER"):
+                continue
+            words = line.split()
+            count = int(words[1])
+            ranges = np.array(words[2 : 2 + count], np.float32)
+            stamp_ns = len(found) * 200_000_000  # the log's own stamps go back and forth
+            scan = LaserScan(
+                stamp_ns=stamp_ns,
+                ranges_m=np.where(ranges > 80, np.inf, ranges).astype(np.float32),
+                angle_min_rad=-np.pi / 2,
+                angle_step_rad=np.pi / 180,
+                range_min_m=0.01,
+                range_max_m=80.0,
+            )
+            T_odom_base = se3.from_xy_yaw(*(float(word) for word in words[5 + count : 8 + count]))
+            observation = Observation(stamp_ns=stamp_ns, scan=scan, T_odom_base=T_odom_base)
+            found.append((words[8 + count], observation))
+            if len(found) == SCANS:
+                break
+    return found
+
+
+def relation_errors(path, T_world_base):
+    """Return translation [m] and yaw [rad] errors (N, 2) of the relations between known stamps."""
+    errors = []
+    for line in path.read_text().splitlines():
+        first, second, x, y, _, _, _, yaw = line.split()
+        if first in T_world_base and second in T_world_base:
+            T_first_second = se3.inverse(T_world_base[first]) @ T_world_base[second]
+            T_true = se3.from_xy_yaw(float(x), float(y), float(yaw))
+            T_off = se3.inverse(T_true) @ T_first_second
+            errors.append([np.hypot(*T_off[:2, 3]), abs(se3.yaw_rad(T_off))])
+    return np.array(errors)
+
+
+def test_real_corridors_are_tracked_far_better_than_by_odometry(shared_data):
+    folder = shared_data / "carmen_intel"
+    conf = Path(__file__).resolve().parent.parent / "conf/slam/laser.yaml"
+    settings = yaml.safe_load(conf.read_text())
+    settings.pop("_target_")
+    module = LaserSlam(**settings)
+    module.activate(Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser()))
+    log = read_log(folder / "intel.clf")
+    trackings = {stamp: module.track(observation) for stamp, observation in log}
+    assert TrackingStatus.LOST not in {tracking.status for tracking in trackings.values()}
+    relations = folder / "intel.relations"
+    laser = relation_errors(relations, {s: t.T_local_base for s, t in trackings.items()})
+    odometry = relation_errors(relations, {s: o.T_odom_base for s, o in log})
+    assert len(laser) > 100
+    assert laser[:, 0].mean() < 0.03
+    assert laser[:, 1].mean() < 0.5 * odometry[:, 1].mean()
