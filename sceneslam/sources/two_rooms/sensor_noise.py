@@ -27,13 +27,17 @@ def expose(view: View, rng: np.random.Generator) -> NDArray[np.uint8]:
 
     The camera's response is the square root, so that photon noise is the same at all levels.
     """
-    sharp = cv2.GaussianBlur(view.image_bgr, (3, 3), _LENS_SIGMA_PX)
-    signal = (sharp * sharp) * np.float32(1.0 / 255.0**2)
-    noise = rng.standard_normal(signal.shape, dtype=np.float32)
-    noise *= np.sqrt(signal / np.float32(_FULL_WELL) + np.float32((_READ_NOISE / _FULL_WELL) ** 2))
-    signal += noise
+    signal = np.asarray(cv2.GaussianBlur(view.image_bgr, (3, 3), _LENS_SIGMA_PX), np.float32)
+    signal *= np.float32(1.0 / 255.0)
+    signal *= signal  # photons; from here on in place, since fresh memory costs more than sums
+    sigma = signal * np.float32(1.0 / _FULL_WELL)
+    sigma += np.float32((_READ_NOISE / _FULL_WELL) ** 2)
+    np.sqrt(sigma, out=sigma)
+    sigma *= rng.standard_normal(signal.shape, dtype=np.float32)
+    signal += sigma
     np.maximum(signal, 0.0, out=signal)
-    return np.asarray(cv2.convertScaleAbs(np.sqrt(signal), alpha=255.0), dtype=np.uint8)
+    np.sqrt(signal, out=signal)
+    return np.asarray(cv2.convertScaleAbs(signal, alpha=255.0), dtype=np.uint8)
 
 
 def measure_depth(view: View, camera: Camera, rng: np.random.Generator) -> NDArray[np.uint16]:

@@ -154,7 +154,11 @@ class TwoRooms:
         label = f"rendering two_rooms/{self._story_name}"
         writer = ros_writer.ObservationWriter(path, rig=self.rig, image_format="jpeg")
         try:
-            self._write(writer, shot, tqdm(frames, desc=label, total=self.length, unit="frame"))
+            self._write(
+                writer,
+                shot,
+                tqdm(frames, desc=label, total=self.length, unit="frame", mininterval=0.5),
+            )
         finally:
             frames.close()
             writer.close()
