@@ -27,6 +27,7 @@ CONFIG = {
         "confirm_window_s": 2.0,
         "first_confirm_window_s": 0.0,
         "lost_patience_s": 0.3,
+        "blind_patience_s": 0.1,
         "bridge_s": 0.5,
     },
     "atlas": {"_target_": "sceneslam.atlas.atlas.Atlas", "voxel_m": 0.05},

@@ -18,6 +18,7 @@ def policy(**changes):
         "confirm_window_s": 2.0,
         "first_confirm_window_s": 0.0,
         "lost_patience_s": 0.3,
+        "blind_patience_s": 0.1,
         "bridge_s": 0.5,
     }
     return Policy(**(values | changes))
@@ -116,6 +117,13 @@ def test_lost_module_is_bridged_by_constant_velocity_without_odometry():
     _, atlas, _, _ = drive({"bright": bright, "dark": ExactModule()}, has_odometry=False)
     assert len(atlas.trajectory) == 100
     assert_exact(atlas)
+
+
+def test_patience_is_shorter_where_the_pose_is_guessed():
+    bright = ExactModule(lost=range(50, 200))
+    _, atlas, log, _ = drive({"bright": bright, "dark": ExactModule()}, has_odometry=False)
+    assert events(log, "decision")[1]["stamp_ns"] == 51 * PERIOD_NS
+    assert atlas.pose_modules[49:53] == ("bright", BRIDGED, BRIDGED, "dark")
 
 
 def test_lost_module_without_a_fallback_invents_no_pose():

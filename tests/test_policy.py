@@ -80,6 +80,7 @@ def test_impossible_policy_is_refused_with_its_key(key, value):
         "confirm_window_s": 2.0,
         "first_confirm_window_s": 0.0,
         "lost_patience_s": 0.3,
+        "blind_patience_s": 0.1,
         "bridge_s": 0.5,
     }
     with pytest.raises(ConfigError) as caught:

@@ -132,7 +132,7 @@ class Bus:
     def _run(self, observation: Observation) -> Outcome | None:
         """Track; fail when the scene calls for another module or the active one is unhealthy."""
         self._track(observation)
-        reason = self._reason_to_switch(observation.stamp_ns)
+        reason = self._reason_to_switch(observation)
         if reason is None:
             return None
         self._reason = reason
@@ -181,7 +181,7 @@ class Bus:
             self._fault(observation.stamp_ns, str(error))
             self._estimator.bridge(observation)
 
-    def _reason_to_switch(self, stamp_ns: int) -> str | None:
+    def _reason_to_switch(self, observation: Observation) -> str | None:
         """Return why another module has to take over, None when the active one goes on."""
         active = self._estimator.active
         assert active is not None
@@ -190,10 +190,10 @@ class Bus:
             if self._candidates()[:1] != [active.key]:
                 return "scene"
             self._tried = {active.key}
-            self._tell_scene(active, stamp_ns)
+            self._tell_scene(active, observation.stamp_ns)
         if active.is_failed:
             return "failed"
-        return "lost" if self._is_out_of_patience(stamp_ns) and self.candidate_left() else None
+        return "lost" if self._is_out_of_patience(observation) and self.candidate_left() else None
 
     def _tell_scene(self, active: Runner, stamp_ns: int) -> None:
         try:
@@ -201,7 +201,7 @@ class Bus:
         except ModuleError as error:
             self._fault(stamp_ns, str(error))
 
-    def _is_out_of_patience(self, stamp_ns: int) -> bool:
+    def _is_out_of_patience(self, observation: Observation) -> bool:
         """Tell whether the active module has been lost for too long.
 
         One that had held its pose for a window earns the scene's other modules a new chance.
@@ -211,7 +211,10 @@ class Bus:
             return False
         if self._estimator.held_ns >= round(self._policy.confirm_window_s * 1e9):
             self._tried = {self.active}
-        return stamp_ns - lost_since_ns >= round(self._policy.lost_patience_s * 1e9)
+        is_blind = self._estimator.is_lost and observation.T_odom_base is None
+        policy = self._policy
+        patience_s = policy.blind_patience_s if is_blind else policy.lost_patience_s
+        return observation.stamp_ns - lost_since_ns >= round(patience_s * 1e9)
 
     def _candidates(self) -> list[str]:
         """Return the scene's modules that can still be tried, in the table's order."""

@@ -29,6 +29,11 @@ class Estimator:
         self._status: TrackingStatus | None = None
         self._held_since_ns: int | None = None
 
+    @property
+    def is_lost(self) -> bool:
+        """Tell whether the active module's last word was that it is lost."""
+        return self._status is TrackingStatus.LOST
+
     def launch(self, runner: Runner, observation: Observation, scene: str) -> bool:
         """Hand over to a module; return whether it could be activated and fed.
 

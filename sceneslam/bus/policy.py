@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import UNSURE, SceneVote
@@ -17,16 +17,17 @@ class Policy:
     handover: str  # how the pose passes from module to module
     confirm_window_s: float  # all images of this window must agree on a new scene
     first_confirm_window_s: float  # the same for the first scene
-    lost_patience_s: float  # a module may be lost this long before its fallback takes over
+    lost_patience_s: float  # a lost module is bridged this long before its fallback takes over ...
+    blind_patience_s: float  # ... and this long where no odometry bridges
     bridge_s: float  # without odometry, constant velocity fills gaps up to this long
 
     def __post_init__(self) -> None:
         if self.handover not in HANDOVERS:
             raise ConfigError("handover", self.handover, " | ".join(HANDOVERS))
-        for key in ("confirm_window_s", "first_confirm_window_s", "lost_patience_s", "bridge_s"):
-            value = getattr(self, key)
-            if not 0 <= value < float("inf"):
-                raise ConfigError(key, value, "seconds, 0 or more")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name.endswith("_s") and not 0 <= value < float("inf"):
+                raise ConfigError(field.name, value, "seconds, 0 or more")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
