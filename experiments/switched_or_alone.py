@@ -1,0 +1,63 @@
+"""Print what switching gives, beside each module alone, over the same path.
+
+Run it with the overrides of any source, and the module for the dark:
+
+    python experiments/switched_or_alone.py dark=laser story=bright_to_dark
+    python experiments/switched_or_alone.py dark=kiss_icp source=tum_rgbd source.path=FOLDER \
+        effects=lights_out
+
+The result is a Markdown table; runs are kept below `outputs/switched_or_alone`.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+FOLDER = Path("outputs/switched_or_alone")
+COLUMNS = ("run", "ATE RMSE [m]", "max [m]", "coverage", "correct rate", "x real time")
+
+
+def run(name: str, *overrides: str) -> dict[str, Any]:
+    """Run SceneSLAM and return its metrics; the run's own lines go to standard error."""
+    folder = FOLDER / name
+    command = [sys.executable, "-m", "sceneslam", *overrides, f"hydra.run.dir={folder}"]
+    print(" ".join(command[1:]), file=sys.stderr)
+    subprocess.run(command, stdout=sys.stderr, check=True)
+    metrics: dict[str, Any] = json.loads((folder / "metrics.json").read_text())
+    return metrics
+
+
+def row(name: str, metrics: dict[str, Any]) -> str:
+    """Return one line of the table."""
+    return (
+        f"| {name} | {metrics['ate_rmse_m']:.3f} | {metrics['ate_max_m']:.3f} "
+        f"| {metrics['coverage']:.1%} | {metrics['correct_rate']:.1%} "
+        f"| {metrics['realtime_factor']:.1f} |"
+    )
+
+
+def main() -> None:
+    """Run switched, each module alone, and the light's module with all lights on."""
+    dark = next((word[5:] for word in sys.argv[1:] if word.startswith("dark=")), "laser")
+    source = [word for word in sys.argv[1:] if not word.startswith("dark=")]
+    single = ("+scenario=single", *source)
+    table = {
+        f"switched: rgbd, then {dark}": run(
+            "switched", "+scenario=bright_to_dark", f"slam@slam.dark={dark}", *source
+        ),
+        "rgbd alone": run("rgbd", *single, "slam@slam.only=rgbd"),
+        f"{dark} alone": run(dark, *single, f"slam@slam.only={dark}"),
+        "rgbd alone, all lights on": run("lit", *single, "slam@slam.only=rgbd", "lights=on"),
+    }
+    print("| " + " | ".join(COLUMNS) + " |")
+    print("|---" * len(COLUMNS) + "|")
+    for name, metrics in table.items():
+        print(row(name, metrics))
+
+
+if __name__ == "__main__":
+    main()
