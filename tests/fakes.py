@@ -21,14 +21,18 @@ from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth, SceneChange
 
 PERIOD_NS = 100_000_000
-SPEED_M_S = 0.5
+TWIST = np.array([0.5, 0.1, 0.05, 0.1, -0.2, 0.3])  # per second: it climbs and turns on all axes
 RIG = Rig(sensors=frozenset({Sensor.ODOMETRY, Sensor.IMAGE}))
 
 
+def true_pose(stamp_ns: int) -> np.ndarray:
+    """The robot moves at a constant twist."""
+    return se3.exp(stamp_ns / 1e9 * TWIST)
+
+
 def observation(index: int, *, has_odometry: bool = True) -> Observation:
-    """The robot drives along x at constant speed."""
     stamp_ns = index * PERIOD_NS
-    T_odom_base = se3.from_xy_yaw(SPEED_M_S * stamp_ns / 1e9, 0.0, 0.0)
+    T_odom_base = true_pose(stamp_ns)
     return Observation(
         stamp_ns=stamp_ns,
         image_bgr=np.zeros((2, 2, 3), np.uint8),
@@ -92,8 +96,8 @@ class ExactModule:
             )
         if self._first_ns is None:
             self._first_ns = observation.stamp_ns
-        moved_m = SPEED_M_S * (observation.stamp_ns - self._first_ns) / 1e9
-        self._T_local_base = se3.from_xy_yaw(moved_m, 0.0, 0.0)
+        T_first = true_pose(self._first_ns)
+        self._T_local_base = se3.inverse(T_first) @ true_pose(observation.stamp_ns)
         if index in self.returns_nan:
             self._T_local_base = self._T_local_base * np.nan
         return Tracking(
@@ -113,7 +117,7 @@ class ExactModule:
 
 
 class FakeSource:
-    """A straight drive of `steps` observations with exact truth; it can break half-way."""
+    """A drive of `steps` observations with exact truth; it can break half-way."""
 
     def __init__(self, steps: int, dark_from: int, breaks_at: int | None = None, fault: str = ""):
         self._steps, self._dark_from, self._breaks_at = steps, dark_from, breaks_at

@@ -25,7 +25,9 @@ class Bridge:
 
     def update(self, observation: Observation, T_map_base: Transform) -> None:
         """Take a pose that a module gave."""
-        self._before, self._known = self._known, (observation.stamp_ns, T_map_base)
+        if self._known is not None and self._known[0] < observation.stamp_ns:
+            self._before = self._known  # at a hand-over both modules give the same instant a pose
+        self._known = (observation.stamp_ns, T_map_base)
         self._move(observation, T_map_base)
 
     def predict(self, observation: Observation, *, by_velocity: bool) -> Transform | None:

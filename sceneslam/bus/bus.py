@@ -8,6 +8,7 @@ from enum import Enum
 from time import perf_counter_ns
 
 from sceneslam.atlas.atlas import Atlas
+from sceneslam.bus.candidates import Candidates
 from sceneslam.bus.estimator import Estimator
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.machine import BusMachine
@@ -48,16 +49,15 @@ class Bus:
         self.runners = {key: Runner(key, module) for key, module in modules.items()}
         self.detector_us: list[float] = []
         self.bus_us: list[float] = []
-        self._detector, self._scenes, self._policy, self._log = detector, scenes, policy, log
+        self._detector, self._policy, self._log = detector, policy, log
         self._filter = SceneFilter(
             window_s=policy.confirm_window_s, first_window_s=policy.first_confirm_window_s
         )
         self._estimator = Estimator(policy=policy, rig=rig, atlas=atlas, log=log)
         self._machine = BusMachine(self)
         self._state = self._machine.state
-        self._scene = ""  # the confirmed scene that the active module answers to
+        self._candidates = Candidates(scenes, self.runners, policy.confirm_window_s)
         self._reason = "first"  # why a module is chosen: first, scene, lost, failed
-        self._tried: set[str] = set()  # modules that this scene has used up
         self._detector_works = True
         detector.activate(rig)
 
@@ -74,7 +74,7 @@ class Bus:
     @property
     def scene(self) -> str:
         """Return the confirmed scene, "" before the first."""
-        return self._scene
+        return self._candidates.scene
 
     def step(self, observation: Observation) -> None:
         """Take one observation: vote, track, and change state where that is called for."""
@@ -99,7 +99,7 @@ class Bus:
 
     def candidate_left(self) -> bool:
         """Tell whether the scene has a module that was not tried yet."""
-        return bool(self._candidates())
+        return bool(self._candidates.left())
 
     def fallback_active(self) -> bool:
         """Tell whether a module runs, though not the first choice."""
@@ -113,7 +113,7 @@ class Bus:
             return Outcome.FAILURE
         if self._filter.scene is None:
             return None
-        self._scene = self._filter.scene
+        self._candidates.begin(self._filter.scene)
         return Outcome.SUCCESS
 
     def _enter(self, observation: Observation) -> Outcome | None:
@@ -126,7 +126,7 @@ class Bus:
 
     def _start(self, observation: Observation) -> Outcome:
         """Activate the next candidate."""
-        is_launched = self._launch(self._candidates()[0], observation)
+        is_launched = self._launch(self._candidates.left()[0], observation)
         return Outcome.SUCCESS if is_launched else Outcome.FAILURE
 
     def _run(self, observation: Observation) -> Outcome | None:
@@ -141,7 +141,7 @@ class Bus:
     def _switch(self, observation: Observation) -> Outcome:
         """Hand over to the first choice, else to the first fallback that can be activated."""
         outcome = Outcome.SUCCESS
-        for key in self._candidates():
+        for key in self._candidates.left():
             if key == self.active or self._launch(key, observation):
                 return outcome
             outcome = Outcome.FAILURE
@@ -185,11 +185,11 @@ class Bus:
         """Return why another module has to take over, None when the active one goes on."""
         active = self._estimator.active
         assert active is not None
-        if self._filter.scene is not None and self._filter.scene != self._scene:
-            self._scene, self._tried = self._filter.scene, set()
-            if self._candidates()[:1] != [active.key]:
+        if self._filter.scene is not None and self._filter.scene != self.scene:
+            self._candidates.begin(self._filter.scene)
+            if self._candidates.left()[:1] != [active.key]:
                 return "scene"
-            self._tried = {active.key}
+            self._candidates.use(active.key)
             self._tell_scene(active, observation.stamp_ns)
         if active.is_failed:
             return "failed"
@@ -197,44 +197,33 @@ class Bus:
 
     def _tell_scene(self, active: Runner, stamp_ns: int) -> None:
         try:
-            active.set_scene(self._scene)
+            active.set_scene(self.scene)
         except ModuleError as error:
             self._fault(stamp_ns, str(error))
 
     def _is_out_of_patience(self, observation: Observation) -> bool:
-        """Tell whether the active module has been lost for too long.
-
-        One that had held its pose for a window earns the scene's other modules a new chance.
-        """
+        """Tell whether the active module has been lost for too long."""
         lost_since_ns = self._estimator.lost_since_ns
         if lost_since_ns is None:
             return False
-        if self._estimator.held_ns >= round(self._policy.confirm_window_s * 1e9):
-            self._tried = {self.active}
+        lost_ns = observation.stamp_ns - lost_since_ns
+        self._candidates.reconsider(self.active, held_ns=self._estimator.held_ns, lost_ns=lost_ns)
         is_blind = self._estimator.is_lost and observation.T_odom_base is None
         policy = self._policy
         patience_s = policy.blind_patience_s if is_blind else policy.lost_patience_s
-        return observation.stamp_ns - lost_since_ns >= round(patience_s * 1e9)
-
-    def _candidates(self) -> list[str]:
-        """Return the scene's modules that can still be tried, in the table's order."""
-        return [
-            key
-            for key in self._scenes[self._scene]
-            if key not in self._tried and not self.runners[key].is_failed
-        ]
+        return lost_ns >= round(patience_s * 1e9)
 
     def _launch(self, key: str, observation: Observation) -> bool:
         previous = self.active or None
         self._log.add(
             "decision",
             observation.stamp_ns,
-            scene=self._scene,
+            scene=self.scene,
             **{"from": previous, "to": key},
             reason=self._reason,
         )
-        self._tried.add(key)
-        return self._estimator.launch(self.runners[key], observation, self._scene)
+        self._candidates.use(key)
+        return self._estimator.launch(self.runners[key], observation, self.scene)
 
     def _send(self, event: str, stamp_ns: int) -> None:
         """Send an event to the machine and log the state it leads to."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from time import perf_counter_ns
 
 from sceneslam.atlas.atlas import BRIDGED, Atlas
@@ -14,6 +15,8 @@ from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
+
+_log = logging.getLogger(__name__)
 
 
 class Estimator:
@@ -28,6 +31,9 @@ class Estimator:
         self._session: int | None = None  # None until the active module is placed
         self._status: TrackingStatus | None = None
         self._held_since_ns: int | None = None
+        self._fed_ns: int | None = None  # when the active module's sensors last spoke ...
+        self._unknown_period_ns = round(policy.lost_patience_s * 1e9)
+        self._fed_period_ns = self._unknown_period_ns  # ... and how long after the time before
 
     @property
     def is_lost(self) -> bool:
@@ -44,10 +50,12 @@ class Estimator:
         self._bridge_to(observation)
         self.active, self._session, self._status = runner, None, None
         self.lost_since_ns, self._held_since_ns, self.held_ns = None, None, 0
+        self._fed_ns, self._fed_period_ns = None, self._unknown_period_ns
         try:
             runner.activate(self._rig, scene)
             self.track(observation, by_velocity=True)
         except ModuleError as error:
+            _log.warning(str(error))
             self._log.add("fault", observation.stamp_ns, what=str(error))
             runner.retire()
             self.active, self._session, self.lost_since_ns, self._held_since_ns = before
@@ -63,7 +71,7 @@ class Estimator:
         Where the module gives none, odometry bridges, or constant velocity if `by_velocity`.
         """
         assert self.active is not None
-        tracking = self.active.track(observation) if self.active.can_use(observation) else None
+        tracking = self._ask(self.active, observation)
         if tracking is not None and tracking.status is not self._status:
             self._status = tracking.status
             self._log.add(
@@ -73,7 +81,8 @@ class Estimator:
                 status=tracking.status.value,
             )
         if tracking is None or tracking.status is TrackingStatus.LOST:
-            self._note_loss(observation.stamp_ns)
+            if tracking is not None or self._is_overdue(observation.stamp_ns):
+                self._note_loss(observation.stamp_ns)
             T_map_base = self._bridge.predict(
                 observation, by_velocity=by_velocity or tracking is None
             )
@@ -92,6 +101,19 @@ class Estimator:
         T_map_base = self._bridge.predict(observation, by_velocity=True)
         if T_map_base is not None:
             self._atlas.add(observation.stamp_ns, T_map_base, BRIDGED)
+
+    def _ask(self, runner: Runner, observation: Observation) -> Tracking | None:
+        """Return the module's answer, None when none of its sensors spoke."""
+        if not runner.can_use(observation):
+            return None
+        if self._fed_ns is not None:
+            self._fed_period_ns = observation.stamp_ns - self._fed_ns
+        self._fed_ns = observation.stamp_ns
+        return runner.track(observation)
+
+    def _is_overdue(self, stamp_ns: int) -> bool:
+        """Tell whether the module's sensors have been silent for longer than they usually are."""
+        return self._fed_ns is None or stamp_ns - self._fed_ns > 2 * self._fed_period_ns
 
     def _take(self, observation: Observation, tracking: Tracking) -> None:
         """Put the module's pose into the map."""

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import replace
 from time import perf_counter_ns
 
+import numpy as np
+
 from sceneslam.interfaces import SlamModule
-from sceneslam.types.errors import ModuleError, SceneSlamError
+from sceneslam.types.errors import ModuleError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking
 from sceneslam.types.rig import Rig, Sensor
@@ -25,6 +28,7 @@ class Runner:
         self.T_map_local: Transform | None = None  # None until it is placed
         self.track_ms: list[float] = []
         self.spent_ns = 0  # in all calls together
+        self._is_active = False
         self._module = module
         self._sensors = frozenset[Sensor]().union(*module.requires)
 
@@ -35,6 +39,7 @@ class Runner:
         try:
             self._module.activate(rig)
             self._module.set_scene(scene)
+            self._is_active = True
         except Exception as error:
             raise self._failed("could not be activated", error) from error
         finally:
@@ -60,18 +65,16 @@ class Runner:
         return any(observation.has(sensor) for sensor in self._sensors)
 
     def track(self, observation: Observation) -> Tracking:
-        """Return the module's answer; raises ModuleError on an exception or a pose of NaN."""
+        """Return the module's answer; raises ModuleError on an exception or no proper pose."""
         began_ns = perf_counter_ns()
         try:
-            tracking = self._module.track(observation)
+            tracking = _checked(self._module.track(observation))
         except Exception as error:
             raise self._failed("failed while tracking", error) from error
         finally:
             cost_ns = perf_counter_ns() - began_ns
             self.spent_ns += cost_ns
             self.track_ms.append(cost_ns / 1e6)
-        if not math.isfinite(tracking.T_local_base.sum()):
-            raise self._failed("returned a pose that is not finite", None)
         return tracking
 
     def retire(self) -> MapLayers:
@@ -79,23 +82,38 @@ class Runner:
         layers = MapLayers()
         began_ns = perf_counter_ns()
         try:
-            layers = self._module.get_map()
+            if self._is_active:
+                layers = self._module.get_map()
         except Exception as error:
             self._report("could not give its map", error)
         try:
             self._module.shutdown()
         except Exception as error:
             self._report("could not be shut down", error)
+        self._is_active = False
         self.spent_ns += perf_counter_ns() - began_ns
         return layers
 
-    def _failed(self, what: str, error: Exception | None) -> ModuleError:
+    def _failed(self, what: str, error: Exception) -> ModuleError:
         self.is_failed = True
         return ModuleError(self._sentence(what, error))
 
     def _report(self, what: str, error: Exception) -> None:
-        _log.warning(self._sentence(what, error), exc_info=not isinstance(error, SceneSlamError))
+        _log.warning(self._sentence(what, error))
 
-    def _sentence(self, what: str, error: Exception | None) -> str:
-        reason = f": {type(error).__name__}: {error}" if error else ""
-        return f"slam.{self.key} {what}{reason}"
+    def _sentence(self, what: str, error: Exception) -> str:
+        _log.info("slam.%s %s", self.key, what, exc_info=error)
+        return f"slam.{self.key} {what}: {type(error).__name__}: {error}"
+
+
+def _checked(tracking: object) -> Tracking:
+    """Return an answer whose pose is the bus's to keep; raises TypeError or ValueError."""
+    if not isinstance(tracking, Tracking):
+        raise TypeError(f"track returned {type(tracking).__name__}, expected Tracking")
+    T_local_base = np.array(tracking.T_local_base, dtype=np.float64)
+    if T_local_base.shape != (4, 4):
+        raise ValueError(f"T_local_base: expected (4, 4), got {T_local_base.shape}")
+    if not math.isfinite(T_local_base.sum()):
+        raise ValueError("T_local_base: it is not finite")
+    T_local_base.flags.writeable = False
+    return replace(tracking, T_local_base=T_local_base)
