@@ -7,6 +7,7 @@ saved; 2 nothing was run because the configuration or the input cannot be used.
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -31,7 +32,10 @@ def main() -> None:
     def job(config: DictConfig) -> None:
         codes.append(_job(config))
 
-    job()
+    try:
+        job()
+    except KeyboardInterrupt:  # ends a sweep as well
+        codes.append(INCOMPLETE)
     sys.exit(max(codes, default=OK))
 
 
@@ -49,6 +53,8 @@ def _job(config: DictConfig) -> int:
     for fault in finished.faults:
         print(f"error: {fault}", file=sys.stderr)
     print("\n".join([*summary_lines(finished.metrics), f"report   {_short(folder)}/report.html"]))
+    if finished.is_interrupted:
+        raise KeyboardInterrupt
     return INCOMPLETE if finished.faults else OK
 
 
@@ -57,10 +63,25 @@ def _run(config: DictConfig, folder: Path) -> Finished:
     title = str(HydraConfig.get().runtime.choices.get("scenario") or "sceneslam")
     reference: Trajectory | None = None
     if config.get("reference"):
-        other = cast(DictConfig, OmegaConf.merge(config, config.reference, {"reference": None}))
-        finished = run(_resolved(other), folder / "reference", title="reference")
+        finished = run(_reference(config), folder / "reference", title="reference")
+        if finished.faults:
+            faults = tuple(f"reference: {fault}" for fault in finished.faults)
+            return replace(finished, faults=faults)
         reference = finished.trajectory
     return run(_resolved(config), folder, title=title, reference=reference)
+
+
+def _reference(config: DictConfig) -> dict[str, Any]:
+    """Return the configuration of the run to compare with."""
+    allowed = "overrides of this configuration, as a table"
+    if not isinstance(config.reference, DictConfig):
+        raise ConfigError("reference", config.reference, allowed)
+    try:
+        other = OmegaConf.merge(config, config.reference, {"reference": None})
+    except OmegaConfBaseException as error:
+        key = f"reference.{getattr(error, 'full_key', '') or ''}".rstrip(".")
+        raise ConfigError(key, OmegaConf.to_container(config.reference), allowed) from error
+    return _resolved(cast(DictConfig, other))
 
 
 def _resolved(config: DictConfig) -> dict[str, Any]:

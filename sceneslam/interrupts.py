@@ -21,8 +21,8 @@ def termination_as_interrupt() -> Iterator[None]:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Finish saving although Ctrl-C is pressed again."""
-    with _handler(signal.SIGINT, signal.SIG_IGN):
+    """Finish saving although Ctrl-C is pressed again or SIGTERM comes."""
+    with _handler(signal.SIGINT, signal.SIG_IGN), _handler(signal.SIGTERM, signal.SIG_IGN):
         yield
 
 

@@ -166,3 +166,42 @@ class DepthModule(ExactModule):
     """Needs what the fake source has not."""
 
     requires = (frozenset({Sensor.DEPTH}),)
+
+
+class Mute:
+    """Cannot be built, and does not say why."""
+
+    def __init__(self):
+        raise AssertionError
+
+
+class SourceWithoutTruth(FakeSource):
+    def ground_truth(self):
+        raise InputError("groundtruth.txt: line 3")
+
+
+class BuggySource(FakeSource):
+    """Divides by zero half-way."""
+
+    def __iter__(self):
+        for index, found in enumerate(super().__iter__()):
+            yield found if index < 50 else index / 0
+
+
+class FullDisk:
+    """A sink that cannot write."""
+
+    def open(self, rig, folder):
+        pass
+
+    def write(self, observation, T_map_base, module):
+        raise OSError("no space left on device")
+
+    def write_event(self, event):
+        pass
+
+    def write_truth(self, truth):
+        pass
+
+    def close(self):
+        pass

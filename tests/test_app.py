@@ -143,6 +143,35 @@ def test_a_run_that_never_sees_a_first_scene_says_so(tmp_path):
     assert "no pose" in finished.faults[0]
 
 
+def test_ground_truth_that_cannot_be_read_costs_no_result(tmp_path):
+    finished = run(config(source___target_="fakes.SourceWithoutTruth"), tmp_path)
+    assert finished.faults == ("no ground truth: groundtruth.txt: line 3",)
+    assert finished.metrics["ate_rmse_m"] is None and len(finished.trajectory) == 100
+
+
+def test_unexpected_error_leaves_what_was_computed(tmp_path):
+    finished = run(config(source___target_="fakes.BuggySource"), tmp_path)
+    assert "unexpected ZeroDivisionError" in finished.faults[0]
+    assert len(Trajectory.read_tum(tmp_path / "trajectory.tum")) == 50
+
+
+def test_sink_that_cannot_write_is_left_out_and_named(tmp_path):
+    finished = run(config(sinks={"full": {"_target_": "fakes.FullDisk"}}), tmp_path)
+    assert finished.faults == ("sinks.full stopped writing: OSError: no space left on device",)
+    assert len(finished.trajectory) == 100
+
+
+def test_folder_holds_the_newest_run_alone(tmp_path):
+    run(config(), tmp_path)
+    run(config(source__dark_from=1000), tmp_path)
+    assert not (tmp_path / "trajectory_1_dark.tum").exists()
+
+
+def test_module_that_no_scene_names_is_said_not_to_run(tmp_path, caplog):
+    run(config(scenes__Dark=["bright"], scenes__Bright=["bright"]), tmp_path)
+    assert "slam.dark: no scene names it" in caplog.text
+
+
 BAD = {
     "an unknown key": ({"scenaro": "x"}, "scenaro: got 'x'"),
     "an unknown argument": ({"policy__confirm_windw_s": 1.0}, "policy.confirm_windw_s"),
@@ -155,6 +184,23 @@ BAD = {
     "a target that does not exist": (
         {"detector___target_": "sceneslam.modules.nothing.Nothing"},
         "detector._target_",
+    ),
+    "a target within a table": (
+        {"source__fault": {"inner": {"_target_": "os.mkdir", "path": "x"}}},
+        "source.fault.inner._target_: got 'os.mkdir'",
+    ),
+    "a target that leads through our code to another's": (
+        {"slam__dark": {"_target_": "sceneslam.config.check.inspect.os.mkdir", "path": "x"}},
+        "slam.dark._target_",
+    ),
+    "a key of Hydra's": ({"detector___partial_": True}, "detector._partial_: got True"),
+    "a component that is no detector": (
+        {"detector": {"_target_": "fakes.ExactModule"}},
+        "allowed: a Detector, which has: quantity, get_scene",
+    ),
+    "a component that breaks without a word": (
+        {"slam__dark": {"_target_": "fakes.Mute"}},
+        "slam.dark: got 'fakes.Mute', allowed: a target that builds (AssertionError)",
     ),
     "no module": ({"slam": {}}, "slam: got nothing"),
     "a scene without a module": ({"scenes__Dark": ...}, "scenes.Dark: got nothing"),

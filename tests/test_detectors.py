@@ -58,7 +58,9 @@ def test_threshold_out_of_range_is_refused(threshold):
 
 
 def test_schedule_counts_from_the_first_observation():
-    detector = Manual(schedule=[[0, "Bright"], [1.5, "Dark"], [3, "Bright"]], operator=False)
+    detector = Manual(
+        schedule=[[0, "Bright"], [1.5, "Dark"], [3, "Bright"]], operator=False, scenes=None
+    )
     detector.activate(RIG)
     start_ns = 10**18
     scenes = [
@@ -74,14 +76,14 @@ def test_schedule_counts_from_the_first_observation():
 )
 def test_impossible_schedule_is_refused(schedule):
     with pytest.raises(ConfigError):
-        Manual(schedule=schedule, operator=False)
+        Manual(schedule=schedule, operator=False, scenes=None)
 
 
 def test_operator_takes_over_from_the_schedule(monkeypatch):
     import io
 
     monkeypatch.setattr("sys.stdin", io.StringIO("nonsense\nDark\n"))
-    detector = Manual(schedule=[[0, "Bright"], [9, "Dark"]], operator=True)
+    detector = Manual(schedule=[[0, "Bright"]], operator=True, scenes=["Dark"])
     detector.activate(RIG)
     for thread in __import__("threading").enumerate():
         if thread.name == "operator":

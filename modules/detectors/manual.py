@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import threading
 from bisect import bisect_right
@@ -10,6 +11,7 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation, SceneVote
 from sceneslam.types.rig import Rig, Sensor
 
+_log = logging.getLogger(__name__)
 _SCHEDULE = "a list of [seconds, scene] by rising seconds, the first at 0"
 
 
@@ -17,13 +19,16 @@ class Manual:
     """Votes for the scene that the schedule names, or that the operator typed last.
 
     `schedule` holds [seconds since the first observation, scene]. With `operator` a line typed on
-    standard input that is one of the scenes takes over from the schedule from then on.
+    standard input takes over from the schedule from then on, if it is a scene of the schedule or
+    of `scenes`.
     """
 
     quantity = ""
     requires = (frozenset[Sensor](),)
 
-    def __init__(self, schedule: list[list[float | str]], operator: bool) -> None:
+    def __init__(
+        self, schedule: list[list[float | str]], operator: bool, scenes: list[str] | None
+    ) -> None:
         if not schedule or any(len(entry) != 2 for entry in schedule):
             raise ConfigError("schedule", schedule, _SCHEDULE)
         try:
@@ -34,13 +39,9 @@ class Manual:
             raise ConfigError("schedule", schedule, _SCHEDULE)
         self._names = [str(entry[1]) for entry in schedule]
         self._operator = operator
+        self.scenes = tuple(dict.fromkeys([*self._names, *(scenes or [])]))
         self._typed: str | None = None
         self._first_ns: int | None = None
-
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        """Return the scenes of the schedule, each once."""
-        return tuple(dict.fromkeys(self._names))
 
     def activate(self, rig: Rig) -> None:
         """Start the schedule at the next observation; listen to the operator."""
@@ -64,3 +65,5 @@ class Manual:
         for line in sys.stdin:
             if line.strip() in self.scenes:
                 self._typed = line.strip()
+            elif line.strip():
+                _log.warning("scene: got %r, allowed: %s", line.strip(), ", ".join(self.scenes))

@@ -59,7 +59,11 @@ class Bus:
         self._candidates = Candidates(scenes, self.runners, policy.confirm_window_s)
         self._reason = "first"  # why a module is chosen: first, scene, lost, failed
         self._detector_works = True
-        detector.activate(rig)
+        try:
+            detector.activate(rig)
+        except Exception as error:
+            what = f"detector could not be activated: {type(error).__name__}: {error}"
+            raise ModuleError(what) from error
 
     @property
     def state(self) -> str:

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.bus.policy import Policy
-from sceneslam.config.check import NOTHING, check_keys, check_node
+from sceneslam.config.check import NOTHING, check_keys, check_node, first_line
 from sceneslam.config.settings import RunSettings
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.interfaces import Detector, Sink, SlamModule, Source
 from sceneslam.sources.ordered import Ordered
 from sceneslam.types.errors import ConfigError, SceneSlamError
 from sceneslam.types.rig import Rig, Sensor
+
+Part = TypeVar("Part")
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,17 +45,17 @@ def build(config: Mapping[str, Any]) -> Parts:
     """Return all parts; raises ConfigError or InputError naming what does not fit."""
     check_keys(config)
     builder = _Builder(config)
-    run = cast(RunSettings, builder.make("run"))
-    policy = cast(Policy, builder.make("policy"))
-    detector = cast(Detector, builder.make("detector"))
+    run = builder.make("run", RunSettings)
+    policy = builder.make("policy", Policy)
+    detector = builder.make("detector", Detector)
     scenes = _table(config, detector)
-    modules = {key: cast(SlamModule, builder.make(f"slam.{key}")) for key in _used(scenes)}
-    atlas = cast(Atlas, builder.make("atlas"))
-    evaluation = cast(EvaluationSettings, builder.make("evaluation"))
-    sinks = {key: cast(Sink, builder.make(f"sinks.{key}")) for key in config.get("sinks") or {}}
-    source = cast(Source, builder.make("source"))
+    modules = {key: builder.make(f"slam.{key}", SlamModule) for key in _used(scenes)}
+    atlas = builder.make("atlas", Atlas)
+    evaluation = builder.make("evaluation", EvaluationSettings)
+    sinks = {key: builder.make(f"sinks.{key}", Sink) for key in config.get("sinks") or {}}
+    source = builder.make("source", Source)
     if config.get("effects"):
-        source = cast(Source, builder.make("effects", source))
+        source = builder.make("effects", Source, source)
     source = Ordered(source)
     rig = source.rig
     _check_sensors("detector", config["detector"], detector.requires, rig)
@@ -82,14 +86,24 @@ class _Builder:
             raise ConfigError("allow_targets", allow, "a list of package names")
         self._allow = allow
 
-    def make(self, key: str, *arguments: object) -> object:
-        """Return the component at a dotted key."""
+    def make(self, key: str, kind: type[Part], *arguments: object) -> Part:
+        """Return the component at a dotted key; it must have all members of `kind`."""
         node: Any = self._config
         for name in key.split("."):
             node = node.get(name) if isinstance(node, Mapping) else None
         if node is None:
             raise ConfigError(key, NOTHING, "a component: `_target_` and its arguments")
         check_node(node, key, allow=self._allow, positional=len(arguments))
+        part = self._instantiate(node, key, arguments)
+        missing = [name for name in _members(kind) if name not in dir(part)]
+        if missing:
+            needs = f"a {kind.__name__}, which has: {', '.join(missing)}"
+            raise ConfigError(key, node["_target_"], needs)
+        return cast(Part, part)
+
+    def _instantiate(
+        self, node: Mapping[str, Any], key: str, arguments: tuple[object, ...]
+    ) -> object:
         try:
             return instantiate(node, *arguments, _convert_="all")
         except InstantiationException as error:
@@ -98,13 +112,18 @@ class _Builder:
                 raise cause.under(key) from error
             if isinstance(cause, SceneSlamError):
                 raise cause from error
-            reason = str(cause or error).strip().splitlines()[0]
+            reason = first_line(cause or error)
             raise ConfigError(key, node["_target_"], f"a target that builds ({reason})") from error
+
+
+def _members(kind: type) -> list[str]:
+    """Return the public names that a Protocol or class asks for."""
+    return [name for name in vars(kind) if not name.startswith("_")]
 
 
 def _table(config: Mapping[str, Any], detector: Detector) -> dict[str, tuple[str, ...]]:
     """Return scene -> module keys after checking it against the detector and `slam`."""
-    modules = config.get("slam") or {}
+    modules = [key for key, node in (config.get("slam") or {}).items() if node is not None]
     if not modules:
         raise ConfigError("slam", NOTHING, "SLAM modules; choose a scenario: +scenario=single")
     known = f"a list of keys of slam: {', '.join(modules)}"
@@ -116,7 +135,11 @@ def _table(config: Mapping[str, Any], detector: Detector) -> dict[str, tuple[str
         is_list = isinstance(keys, list) and len(keys) > 0
         if not is_list or not all(key in modules for key in keys) or len(set(keys)) < len(keys):
             raise ConfigError(f"scenes.{scene}", keys, f"{known}, each once")
-    return {scene: tuple(table[scene]) for scene in detector.scenes}
+    scenes = {scene: tuple(table[scene]) for scene in detector.scenes}
+    for key in modules:
+        if key not in _used(scenes):
+            _log.warning("slam.%s: no scene names it, so it does not run", key)
+    return scenes
 
 
 def _used(scenes: Mapping[str, Sequence[str]]) -> list[str]:

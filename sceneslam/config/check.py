@@ -63,7 +63,10 @@ def check_node(node: object, key: str, *, allow: Sequence[str], positional: int 
     if not isinstance(node, Mapping) or "_target_" not in node:
         raise ConfigError(key, node, "a component: `_target_` and its arguments")
     target = _locate(node["_target_"], f"{key}._target_", allow)
-    arguments = {name: value for name, value in node.items() if not name.startswith("_")}
+    for name in node:
+        if name.startswith("_") and name != "_target_":
+            raise ConfigError(f"{key}.{name}", node[name], "no key of Hydra's but _target_")
+    arguments = {name: value for name, value in node.items() if name != "_target_"}
     parameters = list(inspect.signature(target).parameters.values())[positional:]
     names = [parameter.name for parameter in parameters]
     takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
@@ -77,12 +80,34 @@ def check_node(node: object, key: str, *, allow: Sequence[str], positional: int 
         )
         if is_required and parameter.name not in arguments:
             raise ConfigError(f"{key}.{parameter.name}", NOTHING, "a value; it has no default")
-    hints = typing.get_type_hints(target.__init__ if inspect.isclass(target) else target)
+    hints = _hints(target)
     for name, value in arguments.items():
-        if isinstance(value, Mapping) and "_target_" in value:
-            check_node(value, f"{key}.{name}", allow=allow)
-        elif name in hints and not _fits(value, hints[name]):
+        if not _check_inner(value, f"{key}.{name}", allow):
+            continue
+        if name in hints and not _fits(value, hints[name]):
             raise ConfigError(f"{key}.{name}", value, _describe(hints[name]))
+
+
+def _check_inner(value: object, key: str, allow: Sequence[str]) -> bool:
+    """Check components at any depth of a value; return whether it is itself a plain value."""
+    if isinstance(value, Mapping):
+        if "_target_" in value:
+            check_node(value, key, allow=allow)
+            return False
+        for name, item in value.items():
+            _check_inner(item, f"{key}.{name}", allow)
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            _check_inner(item, f"{key}[{index}]", allow)
+    return True
+
+
+def _hints(target: Callable[..., object]) -> dict[str, Any]:
+    """Return the types of a target's arguments, nothing where they cannot be told at run time."""
+    try:
+        return typing.get_type_hints(target.__init__ if inspect.isclass(target) else target)
+    except (NameError, TypeError):
+        return {}
 
 
 def _check_given(value: object, key: str) -> None:
@@ -106,11 +131,19 @@ def _locate(target: object, key: str, allow: Sequence[str]) -> Callable[..., obj
     try:
         found = get_object(target)
     except Exception as error:
-        reason = str(error).strip().splitlines()[0]
+        reason = first_line(error)
         raise ConfigError(key, target, f"a class that can be imported ({reason})") from error
-    if not callable(found):
+    if not inspect.isclass(found) and not inspect.isfunction(found):
         raise ConfigError(key, target, "a class or a function")
+    home = f"{found.__module__}."  # a name may lead through an allowed module to another's code
+    if not home.startswith(prefixes):
+        raise ConfigError(key, target, f"what is defined under {' or '.join(prefixes)}")
     return typing.cast("Callable[..., object]", found)
+
+
+def first_line(error: BaseException) -> str:
+    """Return what an error says, in one line."""
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)
 
 
 def _fits(value: object, hint: Any) -> bool:

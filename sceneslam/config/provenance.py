@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 
 import sceneslam
 
-_EDGE_BYTES = 1 << 20  # of the head and the tail of an input file that are hashed
+_EDGE_BYTES = 32 << 20  # of the head and the tail of an input file that are hashed
 
 
 def save_config(config: Mapping[str, Any], path: Path) -> dict[str, str]:
@@ -55,17 +55,22 @@ def _is_installed() -> bool:
 
 
 def _code_sha256() -> str:
-    """Return the hash of all Python and YAML files of the package, by name."""
+    """Return the hash of the package's Python and YAML files, the same in checkout and wheel."""
     digest = hashlib.sha256()
     for package in ("sceneslam", "sceneslam.modules", "sceneslam.conf"):
         root = Path(str(files(package)))
         for file in sorted([*root.rglob("*.py"), *root.rglob("*.yaml")]):
-            digest.update(str(file.relative_to(root)).encode() + file.read_bytes())
+            name = file.relative_to(root)
+            if package != "sceneslam" or name.parts[0] not in ("modules", "conf"):
+                digest.update(f"{package}/{name}".encode() + file.read_bytes())
     return digest.hexdigest()
 
 
 def _input_sha256(source: Mapping[str, Any]) -> str:
-    """Return a hash of the input's names, sizes, heads and tails; "none" without a `path`."""
+    """Return a hash of the input's names, sizes and contents; "none" without a `path`.
+
+    Of files above 64 MiB it takes the first and last 32, so that a long recording does not wait.
+    """
     root = Path(str(source.get("path") or ""))
     if not source.get("path") or not root.exists():
         return "none"
@@ -73,15 +78,11 @@ def _input_sha256(source: Mapping[str, Any]) -> str:
     for file in sorted(root.rglob("*")) if root.is_dir() else [root]:
         if file.is_file():
             digest.update(f"{file.relative_to(root)} {file.stat().st_size}\n".encode())
-            digest.update(_edges(file))
+            with file.open("rb") as stream:
+                digest.update(stream.read(_EDGE_BYTES))
+                stream.seek(max(file.stat().st_size - _EDGE_BYTES, _EDGE_BYTES))
+                digest.update(stream.read())
     return digest.hexdigest()
-
-
-def _edges(file: Path) -> bytes:
-    with file.open("rb") as stream:
-        head = stream.read(_EDGE_BYTES)
-        stream.seek(max(file.stat().st_size - _EDGE_BYTES, 0))
-        return head + stream.read(_EDGE_BYTES)
 
 
 def _sha256(data: bytes) -> str:

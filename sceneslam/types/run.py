@@ -47,3 +47,4 @@ class RunResult:
     map: HybridMap
     events: Sequence[Event]
     timings: Timings
+    dropped: int = 0  # observations that live mode did not take
