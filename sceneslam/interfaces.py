@@ -1,9 +1,9 @@
 """The contracts: what a source, detector, SLAM module and sink must do.
 
 All poses are (4, 4) float64, metres, REP-103 axes. Calls never overlap and come in the order
-`activate`, then the rest, then `shutdown`; in live mode not all of them from one thread. An expected
-failure is a value (`LOST`, `UNSURE`); an exception means a broken promise, and the bus stops the
-component for it.
+`activate`, then the rest, then `shutdown`; in live mode not all of them from one thread. An
+expected failure is a value (`LOST`, `UNSURE`); an exception means a broken promise, and the bus
+stops the component for it.
 """
 
 from __future__ import annotations
