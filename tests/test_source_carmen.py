@@ -1,5 +1,6 @@
 """CARMEN logs."""
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -23,15 +24,19 @@ def write(path: Path, *lines: str) -> Path:
     return path
 
 
-def test_the_intel_log_is_read_whole(shared_data: Path) -> None:
+def test_the_intel_log_is_read_whole_and_without_fault(
+    shared_data: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     source = make_source("carmen", shared_data / "carmen_intel" / "intel.clf")
     found = list(source)
     assert len(found) == source.length == 13631
     stamps_ns = np.array([one.stamp_ns for one in found])
     assert (np.diff(stamps_ns) > 0).all()
     assert stamps_ns[0] == 976052857_337530000
-    (fault,) = source.faults
-    assert "787 of 13631 scans" in fault
+    assert list(source.faults) == []
+    (record,) = caplog.records
+    assert record.levelno == logging.WARNING
+    assert "787 of 13631 scans" in record.getMessage()
     scan = found[0].scan
     assert len(scan.ranges_m) == 180
     assert scan.angle_step_rad == pytest.approx(np.pi / 180)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.ros.pixels import locked
 from sceneslam.sources.carmen_lines import FLASER, ROBOTLASER, ScanLine, parse_scan, stamp_of
@@ -19,6 +21,7 @@ from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Laser, Rig, Sensor
 from sceneslam.types.truth import GroundTruth
 
+_LOG = logging.getLogger(__name__)
 _OFFSET = b"robot_frontlaser_offset"
 
 
@@ -26,7 +29,7 @@ class Carmen:
     """Gives one observation per FLASER or ROBOTLASER1 line, stamped by its `ipc_timestamp`.
 
     Odometry is that of the line; ODOM and RLASER lines are not used. The log's order is the order
-    in time: a scan whose stamp came late gets one between its neighbours', which `faults` tells.
+    in time: a scan whose stamp came late gets one between its neighbours', and a warning is logged.
     Ranges of `range_max_m` and beyond are no return.
     """
 
@@ -41,7 +44,7 @@ class Carmen:
             raise InputError(f"no scans, expected FLASER or ROBOTLASER1 lines: {path}")
         logged_ns = np.array([stamp_of(line) for line in self._lines], dtype=np.int64)
         self._stamps_ns = rising_stamps(logged_ns)
-        self._late = np.flatnonzero(self._stamps_ns != logged_ns)
+        self._warn_of_late(np.flatnonzero(self._stamps_ns != logged_ns))
         T_base_laser = se3.from_xy_yaw(self._offset_m(), 0.0, 0.0)
         if first.T_base_laser is not None:
             T_base_laser = first.T_base_laser
@@ -63,16 +66,8 @@ class Carmen:
 
     @property
     def faults(self) -> Sequence[str]:
-        """Return the lines that could not be read and the stamps that were out of order."""
-        late = []
-        if len(self._late):
-            stamp_s = self._stamps_ns[self._late[0]] * 1e-9
-            late.append(
-                f"{len(self._late)} of {len(self._lines)} scans, first at {stamp_s:.3f} s, are "
-                f"stamped later than scans after them; they were given stamps between their "
-                f"neighbours': {self._path}"
-            )
-        return [*late, *self._faults.sentences()]
+        """Return the lines that could not be read."""
+        return self._faults.sentences()
 
     @property
     def span(self) -> Span | None:
@@ -112,6 +107,18 @@ class Carmen:
             ),
             T_odom_base=locked(scan.T_odom_base),
         )
+
+    def _warn_of_late(self, late: NDArray[np.int64]) -> None:
+        """Tell of stamps that were set right: nothing is lost, so it is no fault."""
+        if len(late):
+            _LOG.warning(
+                "%d of %d scans, first at %.3f s, are stamped later than scans after them; they "
+                "were given stamps between their neighbours': %s",
+                len(late),
+                len(self._lines),
+                self._stamps_ns[late[0]] * 1e-9,
+                self._path,
+            )
 
     def _scan_lines(self) -> Sequence[bytes]:
         data = self._path.read_bytes()
