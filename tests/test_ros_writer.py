@@ -177,6 +177,12 @@ def test_an_unknown_image_format_is_refused(tmp_path: Path) -> None:
         ObservationWriter(tmp_path / "x.mcap", rig=RIG, image_format="gif")
 
 
+def test_the_sink_refuses_an_unknown_image_format_before_the_run() -> None:
+    with pytest.raises(ConfigError) as caught:
+        McapSink("run.mcap", "bmp")
+    assert caught.value.key == "image_format"
+
+
 def test_the_sinks_poses_are_results_and_no_input(tmp_path: Path) -> None:
     sink = McapSink("run.mcap", "jpeg")
     assert isinstance(sink, Sink)

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from sceneslam.ros.writer import ObservationWriter
+from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.run import Event
@@ -17,6 +18,8 @@ class McapSink:
     """Writes observations, poses in `map` and active modules; read back by `source=mcap`."""
 
     def __init__(self, path: str, image_format: str) -> None:
+        if image_format not in ("jpeg", "png"):
+            raise ConfigError("image_format", image_format, "jpeg or png")
         self._path = Path(path)
         self._image_format = image_format
         self._writer: ObservationWriter | None = None
