@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from hydra import compose, initialize_config_module
 from hydra.utils import get_class
 from omegaconf import OmegaConf
 
-_CONF = Path(__file__).resolve().parents[1] / "conf" / "source"
 STAMP_NS = 1_700_000_000_123_456_789
 
 
 def make_source(name: str, path: Path, **changes: Any) -> Any:
     """Build a source from its YAML with some values changed (dictionaries are merged)."""
-    config: Any = OmegaConf.to_container(OmegaConf.load(_CONF / f"{name}.yaml"))
+    config = _source_config(name)
     config["path"] = str(path)
     for key, value in changes.items():
         config[key] = {**config[key], **value} if isinstance(value, dict) else value
     return get_class(config.pop("_target_"))(**config)
+
+
+@cache
+def _composed(name: str) -> Any:
+    with initialize_config_module("sceneslam.conf", version_base="1.3"):
+        return compose(f"source/{name}").source
+
+
+def _source_config(name: str) -> Any:
+    return OmegaConf.to_container(_composed(name))
 
 
 class Recorder:
