@@ -102,6 +102,65 @@ def test_points_that_are_no_numbers_and_empty_images_are_dropped() -> None:
     assert len(ordered.faults) == 3
 
 
+def test_depth_that_is_no_number_is_missing_and_no_fault() -> None:
+    depth_m = np.array([[np.nan, np.inf, -np.inf, 1.5]], np.float32)
+    depth_m.flags.writeable = False
+    ordered = Ordered(Listed([Observation(stamp_ns=1, depth_m=depth_m)]))
+    (found,) = ordered
+    np.testing.assert_array_equal(found.depth_m, np.array([[0, 0, 0, 1.5]], np.float32))
+    assert found.depth_m.dtype == np.float32
+    assert not found.depth_m.flags.writeable
+    assert np.isnan(depth_m[0, 0])
+    assert ordered.faults == []
+
+
+def test_depth_without_one_number_is_told() -> None:
+    blank = [
+        Observation(stamp_ns=stamp_ns, depth_m=np.full((2, 3), np.nan, np.float32))
+        for stamp_ns in (1, 2)
+    ]
+    zero = Observation(stamp_ns=3, depth_m=np.zeros((2, 3), np.float32))
+    ordered = Ordered(Listed([*blank, zero]))
+    assert all(not observation.depth_m.any() for observation in ordered)
+    (fault,) = ordered.faults
+    assert fault == "depth image without one finite value: 2 times, first at stamp 0.000000 s"
+
+
+def test_gyro_samples_that_are_no_numbers_are_dropped_and_counted() -> None:
+    gyro = np.arange(16, dtype=np.float64).reshape(4, 4)
+    gyro[1, 2] = np.nan
+    gyro[3, 1] = np.inf
+    some = Observation(stamp_ns=1, gyro_base=gyro)
+    none = Observation(stamp_ns=2, gyro_base=np.full((2, 4), np.nan))
+    ordered = Ordered(Listed([some, none]))
+    first, second = ordered
+    np.testing.assert_array_equal(first.gyro_base, gyro[[0, 2]])
+    assert not first.gyro_base.flags.writeable
+    assert second.gyro_base is None
+    (fault,) = ordered.faults
+    assert fault == "gyro sample that is not finite: 4 times, first at stamp 0.000000 s"
+
+
+def test_odometry_that_is_no_number_is_left_out() -> None:
+    T_odom_base = np.eye(4)
+    T_odom_base[0, 3] = np.nan
+    ordered = Ordered(Listed([Observation(stamp_ns=1, T_odom_base=T_odom_base)]))
+    (found,) = ordered
+    assert found.T_odom_base is None
+    assert len(ordered.faults) == 1
+
+
+def test_sound_arrays_pass_as_they_are() -> None:
+    sound = Observation(
+        stamp_ns=1,
+        depth_m=np.ones((2, 3), np.float32),
+        points_lidar=np.ones((2, 3), np.float32),
+        gyro_base=np.ones((2, 4)),
+        T_odom_base=np.eye(4),
+    )
+    assert list(Ordered(Listed([sound]))) == [sound]
+
+
 def test_the_sources_own_faults_come_first() -> None:
     assert Ordered(Listed([], faults=["broken"])).faults == ["broken"]
 

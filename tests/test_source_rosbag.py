@@ -137,6 +137,18 @@ def test_depth_without_intrinsics_asks_for_them(tmp_path: Path) -> None:
     assert all(one.has(Sensor.DEPTH) for one in source)
 
 
+def test_float_depth_without_one_number_is_told(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for index, value in enumerate((np.nan, 1.0, np.nan)):
+            stamp_ns = STAMP_NS + index * 10**8
+            recorder.image("/depth", stamp_ns, np.full((30, 40), value, np.float32), "32FC1")
+            recorder.camera_info("/camera_info", stamp_ns, (40, 30))
+    source = make_source("mcap", tmp_path / "a.mcap")
+    assert [one.depth_m.any() for one in source] == [False, True, False]
+    (fault,) = source.faults
+    assert "depth image without one finite value: 2 times, first at stamp" in fault
+
+
 def test_camera_info_of_another_size_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="80x60 pixels but the images have 40x30"):
         make_source("mcap", rgbd(tmp_path / "a.mcap", size_wh=(80, 60)))

@@ -119,6 +119,13 @@ def depth_m(message: Any, units: pixels.DepthUnits) -> NDArray[np.float32] | Non
     return _integers(stored, units)
 
 
+def is_blank_depth(message: Any) -> bool:
+    """Tell whether an image of float depth, not compressed, holds not one finite value."""
+    encoding, is_compressed = _encoding(message)
+    raw = None if is_compressed or encoding != "32FC1" else _raw(message, "f4", 1)
+    return raw is not None and not np.isfinite(raw).any()
+
+
 def scan(message: Any) -> LaserScan | None:
     """Return a LaserScan by our conventions, None when its angles make no sense.
 

@@ -90,6 +90,8 @@ class BundleDecoder:
             problems.append("a depth image could not be decoded")
             return None
         self._check_size("depth", sample.stamp_ns, depth_m)
+        if decode.is_blank_depth(sample.value):
+            problems.append("depth image without one finite value")
         return depth_m
 
     def _check_size(self, name: str, stamp_ns: int, picture: NDArray[np.generic]) -> None:

@@ -12,9 +12,9 @@ class FaultLog:
         self._counts: dict[str, int] = {}
         self._first: dict[str, str] = {}
 
-    def add(self, kind: str, where: str) -> None:
-        """Count one fault; `kind` reads like `colour image could not be decoded`."""
-        self._counts[kind] = self._counts.get(kind, 0) + 1
+    def add(self, kind: str, where: str, count: int = 1) -> None:
+        """Count faults; `kind` reads like `colour image could not be decoded`."""
+        self._counts[kind] = self._counts.get(kind, 0) + count
         self._first.setdefault(kind, where)
 
     def clear(self) -> None:
@@ -28,3 +28,8 @@ class FaultLog:
             f"{kind}: {count} {'time' if count == 1 else 'times, first'} at {self._first[kind]}"
             for kind, count in self._counts.items()
         ]
+
+
+def at_stamp(stamp_ns: int) -> str:
+    """Return the words for a place in time."""
+    return f"stamp {stamp_ns * 1e-9:.6f} s"

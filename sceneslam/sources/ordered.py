@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-
-import numpy as np
 
 from sceneslam.interfaces import Source
-from sceneslam.sources.faults import FaultLog
+from sceneslam.sources.clean import cleaned
+from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.sources.spanned import Span, Spanned
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
@@ -17,7 +15,7 @@ from sceneslam.types.truth import GroundTruth
 
 
 class Ordered:
-    """Leaves out observations whose stamps repeat or run backwards, and points that are NaN.
+    """Leaves out observations whose stamps repeat or run backwards, and values that are NaN.
 
     A single stamp far ahead of its neighbours is left out too, rather than all that follow it. A
     gap longer than `max_gap_s` is reported.
@@ -64,7 +62,7 @@ class Ordered:
                 else:
                     self._note_gap(last_ns, held.stamp_ns)
                     last_ns = held.stamp_ns
-                    yield self._cleaned(held)
+                    yield cleaned(held, self._log)
                 held = None
             if last_ns is not None and stamp_ns <= last_ns:
                 self._skip(observation)
@@ -72,10 +70,10 @@ class Ordered:
                 held = observation
             else:
                 last_ns = stamp_ns
-                yield self._cleaned(observation)
+                yield cleaned(observation, self._log)
         if held is not None:
             self._note_gap(last_ns, held.stamp_ns)
-            yield self._cleaned(held)
+            yield cleaned(held, self._log)
 
     def ground_truth(self) -> GroundTruth | None:
         """Return the source's ground truth."""
@@ -83,29 +81,10 @@ class Ordered:
 
     def _skip(self, observation: Observation) -> None:
         kind = "observation left out, its stamp repeats, runs backwards or jumps"
-        self._log.add(kind, _when(observation.stamp_ns))
+        self._log.add(kind, at_stamp(observation.stamp_ns))
 
     def _note_gap(self, last_ns: int | None, stamp_ns: int) -> None:
         if last_ns is not None:
-            self._log.add(f"no observation for {(stamp_ns - last_ns) * 1e-9:.1f} s", _when(last_ns))
-
-    def _cleaned(self, observation: Observation) -> Observation:
-        """Return the observation without empty images and without points that are no numbers."""
-        changes: dict[str, object] = {}
-        for name in ("image_bgr", "depth_m"):
-            picture = getattr(observation, name)
-            if picture is not None and picture.size == 0:
-                self._log.add(f"empty {name}", _when(observation.stamp_ns))
-                changes[name] = None
-        points = observation.points_lidar
-        if points is not None and not np.isfinite(points).all():
-            is_good = np.isfinite(points).all(axis=1)
-            self._log.add("points that are not finite", _when(observation.stamp_ns))
-            changes["points_lidar"] = points[is_good]
-            if observation.point_times_s is not None:
-                changes["point_times_s"] = observation.point_times_s[is_good]
-        return replace(observation, **changes) if changes else observation  # type: ignore[arg-type]
-
-
-def _when(stamp_ns: int) -> str:
-    return f"stamp {stamp_ns * 1e-9:.6f} s"
+            self._log.add(
+                f"no observation for {(stamp_ns - last_ns) * 1e-9:.1f} s", at_stamp(last_ns)
+            )

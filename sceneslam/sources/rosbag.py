@@ -16,7 +16,7 @@ from sceneslam.sources.bag_observation import BundleDecoder, Decoded
 from sceneslam.sources.bag_rig import Given, make_rig, picture_size_wh, place, sensor_topics
 from sceneslam.sources.bag_topics import choose_topics, describe
 from sceneslam.sources.bag_truth import BASE, CAMERA, read_truth
-from sceneslam.sources.faults import FaultLog
+from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.sources.intrinsics import checked_above_zero, given_intrinsics, given_range_m
 from sceneslam.sources.open_recording import open_recording
 from sceneslam.sources.prefetch import prefetched
@@ -106,7 +106,7 @@ class RosBag:
         try:
             for decoded in prefetched(self._jobs()):
                 for problem in decoded.problems:
-                    self._faults.add(problem, f"stamp {decoded.stamp_ns * 1e-9:.6f} s")
+                    self._faults.add(problem, at_stamp(decoded.stamp_ns))
                 if decoded.observation is not None:
                     yield decoded.observation
         except InputError as err:
@@ -145,13 +145,17 @@ class RosBag:
         """Return a message's sample, None (and a fault) when it makes no sense."""
         value = self._recording.decode(message)
         if value is None:
-            self._faults.add(f"a message of {message.topic} makes no sense", _when(message.log_ns))
+            self._faults.add(
+                f"a message of {message.topic} makes no sense", at_stamp(message.log_ns)
+            )
             return None
         stamp_ns = decode.stamp_ns(value) or message.log_ns
         if sensor is Sensor.ODOMETRY:
             value = decode.transform(value.pose.pose.position, value.pose.pose.orientation)
             if value is None:
-                self._faults.add(f"a pose of {message.topic} is no rigid motion", _when(stamp_ns))
+                self._faults.add(
+                    f"a pose of {message.topic} is no rigid motion", at_stamp(stamp_ns)
+                )
                 return None
         elif sensor is Sensor.GYRO:
             rate = value.angular_velocity
@@ -167,10 +171,7 @@ class RosBag:
             if sensor in self._by_sensor:
                 return sensor
         there = describe(self._recording) or "no readable messages at all"
+        there = "; ".join([there, *self._recording.faults])
         raise InputError(
             f"no image, depth, points, scan or odometry topic in the recording: {there}"
         )
-
-
-def _when(stamp_ns: int) -> str:
-    return f"stamp {stamp_ns * 1e-9:.6f} s"

@@ -1,0 +1,70 @@
+"""Observations whose arrays hold numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from sceneslam.ros.pixels import locked
+from sceneslam.sources.faults import FaultLog, at_stamp
+from sceneslam.types.observation import Observation
+
+
+def cleaned(observation: Observation, log: FaultLog) -> Observation:
+    """Return the observation with finite arrays; the same object when there is nothing to mend.
+
+    Depth that is not finite is missing (REP-118), which is a value. Empty images, and points, gyro
+    samples and odometry that are not finite, are left out and told to `log`.
+    """
+    changes = {
+        **_pictures(observation, log),
+        **_points(observation, log),
+        **_motion(observation, log),
+    }
+    return replace(observation, **changes) if changes else observation  # type: ignore[arg-type]
+
+
+def _pictures(observation: Observation, log: FaultLog) -> Mapping[str, object]:
+    changes: dict[str, object] = {}
+    for name in ("image_bgr", "depth_m"):
+        picture = getattr(observation, name)
+        if picture is not None and picture.size == 0:
+            log.add(f"empty {name}", at_stamp(observation.stamp_ns))
+            changes[name] = None
+    depth_m = observation.depth_m
+    if depth_m is None or "depth_m" in changes:
+        return changes
+    is_good = np.isfinite(depth_m)
+    if not is_good.all():
+        changes["depth_m"] = locked(np.where(is_good, depth_m, np.float32(0)))
+        if not is_good.any():
+            log.add("depth image without one finite value", at_stamp(observation.stamp_ns))
+    return changes
+
+
+def _points(observation: Observation, log: FaultLog) -> Mapping[str, object]:
+    points, times_s = observation.points_lidar, observation.point_times_s
+    if points is None or np.isfinite(points).all():
+        return {}
+    is_good = np.isfinite(points).all(axis=1)
+    log.add("points that are not finite", at_stamp(observation.stamp_ns))
+    changes: dict[str, object] = {"points_lidar": locked(points[is_good])}
+    if times_s is not None:
+        changes["point_times_s"] = locked(times_s[is_good])
+    return changes
+
+
+def _motion(observation: Observation, log: FaultLog) -> Mapping[str, object]:
+    changes: dict[str, object] = {}
+    T_odom_base, gyro_base = observation.T_odom_base, observation.gyro_base
+    if T_odom_base is not None and not np.isfinite(T_odom_base).all():
+        log.add("odometry that is not finite", at_stamp(observation.stamp_ns))
+        changes["T_odom_base"] = None
+    if gyro_base is not None and not np.isfinite(gyro_base).all():
+        is_good = np.isfinite(gyro_base).all(axis=1)
+        bad = int(np.count_nonzero(~is_good))
+        log.add("gyro sample that is not finite", at_stamp(observation.stamp_ns), bad)
+        changes["gyro_base"] = locked(gyro_base[is_good]) if is_good.any() else None
+    return changes
