@@ -40,8 +40,9 @@ def test_a_cut_off_mcap_gives_what_is_whole(tmp_path: Path, share: float) -> Non
     source, found = read(tmp_path / "cut.mcap")
     assert COUNT * share - 8 <= len(found) <= COUNT * share
     (fault,) = source.faults
-    assert "cut off" in fault
-    assert "% of the file" in fault
+    assert f"cut off after {0.1 * (len(found) - 1):.1f} s / {2 * len(found) + 1} messages" in fault
+    assert "the rest of the recording is missing and could not be read" in fault
+    assert "%" not in fault
     assert str(tmp_path / "cut.mcap") in fault
 
 
@@ -49,7 +50,63 @@ def test_a_missing_index_alone_loses_nothing(tmp_path: Path) -> None:
     record(tmp_path / "whole.mcap")
     data = (tmp_path / "whole.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[:-9])
-    assert len(read(tmp_path / "cut.mcap")[1]) == COUNT
+    source, found = read(tmp_path / "cut.mcap")
+    assert len(found) == COUNT
+    (fault,) = source.faults
+    assert "its index is damaged (read without it)" in fault
+
+
+@pytest.mark.parametrize("from_end", [9, 20, 200])
+def test_a_flipped_bit_in_the_index_loses_nothing_and_is_told(
+    tmp_path: Path, from_end: int
+) -> None:
+    record(tmp_path / "flipped.mcap")
+    data = bytearray((tmp_path / "flipped.mcap").read_bytes())
+    data[-from_end] ^= 4
+    (tmp_path / "flipped.mcap").write_bytes(data)
+    source, found = read(tmp_path / "flipped.mcap")
+    assert len(found) == COUNT
+    (fault,) = source.faults
+    assert "its index is damaged (read without it)" in fault
+
+
+def test_a_file_that_was_written_without_an_index_is_sound(tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+    from mcap.writer import IndexType, Writer
+
+    record(tmp_path / "whole.mcap")
+    with (tmp_path / "whole.mcap").open("rb") as old, (tmp_path / "bare.mcap").open("wb") as new:
+        writer = Writer(
+            new,
+            index_types=IndexType.NONE,
+            use_statistics=False,
+            use_summary_offsets=False,
+            repeat_channels=False,
+            repeat_schemas=False,
+        )
+        writer.start(profile="ros2", library="test")
+        channels: dict[str, int] = {}
+        for schema, channel, message in make_reader(old).iter_messages():
+            if channel.topic not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
+            writer.add_message(channels[channel.topic], message.log_time, message.data, 0)
+        writer.finish()
+    source, found = read(tmp_path / "bare.mcap")
+    assert len(found) == COUNT
+    assert list(source.faults) == []
+
+
+def test_damage_in_a_file_that_is_cut_off_is_told_as_well(tmp_path: Path) -> None:
+    record(tmp_path / "whole.mcap")
+    data = bytearray((tmp_path / "whole.mcap").read_bytes())
+    data[len(data) // 3] ^= 4
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
+    source, found = read(tmp_path / "cut.mcap")
+    assert len(found) < COUNT * 2 / 3 - 2
+    (fault,) = source.faults
+    assert "cut off" in fault
+    assert "% of the file" in fault
 
 
 def test_a_flipped_bit_costs_its_chunk_and_is_told(tmp_path: Path) -> None:
@@ -82,7 +139,7 @@ def test_no_place_for_a_flipped_bit_makes_wrong_pixels_or_a_crash(tmp_path: Path
         ("empty.mcap", b"", "empty"),
         ("empty.bag", b"", "empty"),
         ("text.mcap", b"this is no recording at all", "expected a ROS 1 bag"),
-        ("only_magic.mcap", b"\x89MCAP0\r\n", "no readable messages"),
+        ("only_magic.mcap", b"\x89MCAP0\r\n", "no readable messages at all; cut off"),
         ("only_magic.bag", b"#ROSBAG V2.0\n", "no readable messages"),
         ("one.db3", b"SQLite format 3\0" + b"x" * 50, "rosbag2 folder"),
     ],
@@ -107,17 +164,43 @@ def test_a_bag_with_a_damaged_index_is_read_without_it(shared_data: Path) -> Non
     source = make_source("rosbag", shared_data / "bags" / "broken_index.bag")
     assert len(list(source)) == source.length == 360
     (fault,) = source.faults
-    assert "index is damaged" in fault
+    assert "its index is damaged (read without it)" in fault
+    assert "cut off" not in fault
 
 
-@pytest.mark.parametrize("share", [0.4, 0.8, 0.995])
+@pytest.mark.parametrize("share", [0.4, 0.8, 0.99])
 def test_a_cut_off_bag_gives_what_is_whole(shared_data: Path, tmp_path: Path, share: float) -> None:
     data = (shared_data / "bags" / "hokuyo_scan.bag").read_bytes()
     (tmp_path / "cut.bag").write_bytes(data[: int(len(data) * share)])
     source = make_source("rosbag", tmp_path / "cut.bag")
     found = list(source)
     assert 360 * share - 20 <= len(found) <= 360
-    assert any("index is damaged or cut off" in fault for fault in source.faults)
+    (fault,) = source.faults
+    length_s = (found[-1].stamp_ns - found[0].stamp_ns) * 1e-9
+    assert f"cut off after {length_s:.1f} s / {len(found)} messages" in fault
+    assert f"about {100 * (1 - share):.0f} % of the recording is missing" in fault
+
+
+def test_a_bag_that_lost_its_index_alone_lost_no_message(shared_data: Path, tmp_path: Path) -> None:
+    data = (shared_data / "bags" / "hokuyo_scan.bag").read_bytes()
+    (tmp_path / "cut.bag").write_bytes(data[:-100])
+    source = make_source("rosbag", tmp_path / "cut.bag")
+    assert len(list(source)) == 360
+    (fault,) = source.faults
+    assert fault.startswith("its index is damaged (read without it): ")
+
+
+@pytest.mark.parametrize("from_end", [5, 60])
+def test_a_flipped_bit_in_the_index_of_a_bag_loses_nothing_and_is_told(
+    shared_data: Path, tmp_path: Path, from_end: int
+) -> None:
+    data = bytearray((shared_data / "bags" / "hokuyo_scan.bag").read_bytes())
+    data[-from_end] ^= 16
+    (tmp_path / "flipped.bag").write_bytes(data)
+    source = make_source("rosbag", tmp_path / "flipped.bag")
+    assert len(list(source)) == 360
+    (fault,) = source.faults
+    assert "its index is damaged (read without it)" in fault
 
 
 def test_a_damaged_sqlite_bag_is_one_sentence(shared_data: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
@@ -9,11 +10,13 @@ from sceneslam.ros.messages import TopicType
 from sceneslam.sources import bag_records as records
 from sceneslam.sources.bag_survey import BagSurvey
 from sceneslam.sources.recording import (
+    INDEX_IS_DAMAGED,
     Chunk,
     ChunkContent,
     ChunkedRecording,
     Layout,
     Message,
+    cut_off,
 )
 from sceneslam.types.errors import InputError
 
@@ -63,16 +66,22 @@ class BagFile:
             for place, span in survey.spans.items()
             if place in survey.chunks
         ]
-        note = "" if survey.is_sound else "the bag's index is damaged or cut off (read without it)"
         return Layout(
-            chunks=chunks, topics=topics, metadata={}, lost_bytes=survey.lost_bytes, note=note
+            chunks=chunks,
+            topics=topics,
+            metadata={},
+            lost_bytes=survey.lost_bytes,
+            note=self._note(chunks, topics),
         )
 
     def read(self, chunk: Chunk) -> ChunkContent:
         """Return a chunk's messages that are whole."""
-        data = self._survey.content(self._survey.chunks[chunk.offset])
+        survey = self._survey
+        outer = survey.chunks[chunk.offset]
+        is_last = survey.is_cut_off and survey.is_beyond(outer)  # its rest is missing, not damaged
+        data = survey.content(outer)
         if data is None:
-            return ChunkContent(messages=(), lost_bytes=chunk.length)
+            return ChunkContent(messages=(), lost_bytes=0 if is_last else chunk.length)
         messages, lost, position = [], 0, 0
         for record in records.records_in(data):
             lost += record.start - position
@@ -83,7 +92,21 @@ class BagFile:
             if topic is not None:
                 payload = data[record.data_at : record.end]
                 messages.append(Message(topic=topic, log_ns=record.time_ns(b"time"), data=payload))
-        return ChunkContent(messages=messages, lost_bytes=lost + len(data) - position)
+        lost += 0 if is_last else len(data) - position
+        return ChunkContent(messages=messages, lost_bytes=lost)
+
+    def _note(self, chunks: Sequence[Chunk], topics: Mapping[str, TopicType]) -> str:
+        """Return what is wrong with the bag as a whole."""
+        survey = self._survey
+        if survey.is_sound:
+            return ""
+        if not survey.is_cut_off:
+            return INDEX_IS_DAMAGED
+        if not survey.index_at:
+            return cut_off(chunks, topics)
+        percent = round(100 * (1 - len(survey.blob) / survey.index_at))
+        share = f"about {percent} %" if percent else "less than 1 %"
+        return cut_off(chunks, topics, f"{share} of the recording")
 
     def _topics(self) -> dict[str, TopicType]:
         """Return the topics that hold messages; remember which connection is which."""

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from mmap import mmap
 
 MAGIC = b"#ROSBAG V2.0\n"
-MESSAGE, CHUNK, CHUNK_INFO, CONNECTION = 2, 5, 6, 7
+MESSAGE, BAG_HEADER, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 5, 6, 7
 _U32, _TIME = struct.Struct("<I"), struct.Struct("<II")
 _FIELDS = {  # what each record must say, and in how many bytes (0: any number)
     MESSAGE: {b"conn": 4, b"time": 8},
+    BAG_HEADER: {b"index_pos": 8},
     CHUNK: {b"compression": 0},
     CHUNK_INFO: {b"chunk_pos": 8, b"start_time": 8, b"end_time": 8},
     CONNECTION: {b"conn": 4, b"topic": 0},

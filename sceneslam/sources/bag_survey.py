@@ -31,13 +31,16 @@ class BagSurvey:
     chunks: dict[int, Record] = field(default_factory=dict)
     spans: dict[int, Span] = field(default_factory=dict)
     connections: dict[int, dict[bytes, bytes]] = field(default_factory=dict)  # topic, type, ...
+    index_at: int | None = None  # [bytes], by the bag's header; 0: the bag was never closed
     is_sound: bool = True
     lost_bytes: int = 0
 
     def run(self) -> None:
         """Go through the records; look into the chunks as well when the index is not sound."""
         gaps = self._walk()
-        if self.is_sound and set(self.spans) == set(self.chunks):
+        named = {number for span in self.spans.values() for number in span.counts}
+        is_whole = set(self.spans) == set(self.chunks) and named <= set(self.connections)
+        if self.is_sound and is_whole:
             return
         self.is_sound = False
         for place, record in self.chunks.items():
@@ -48,6 +51,17 @@ class BagSurvey:
             index_bytes = _INDEX_RECORD_BYTES * len(counts)
             index_bytes += _INDEX_ENTRY_BYTES * sum(counts.values())
             self.lost_bytes += max(0, gap_bytes - index_bytes)
+
+    @property
+    def is_cut_off(self) -> bool:
+        """Tell whether the bag ends before its index begins."""
+        if self.index_at:
+            return self.index_at > len(self.blob)
+        return self.index_at == 0 or any(map(self.is_beyond, self.chunks.values()))
+
+    def is_beyond(self, record: Record) -> bool:
+        """Tell whether a record reaches beyond the bag's end."""
+        return record.end > len(self.blob)
 
     def counts(self) -> Counter[int]:
         """Return how many messages each connection has."""
@@ -77,7 +91,8 @@ class BagSurvey:
             found = records.find_chunk(self.blob, chunk_end)
             spare = _CONNECTION_BYTES * max(len(self.connections), 1)
             end = len(self.blob) - spare if found is None else found
-            gaps[last] = end - chunk_end
+            if found is not None or not self.is_cut_off:
+                gaps[last] = end - chunk_end
             position = len(self.blob) if found is None else found
         self.is_sound &= position == len(self.blob)
         return gaps
@@ -86,10 +101,12 @@ class BagSurvey:
         """Tell whether this is a record (a chunk may be cut off), and remember what it says."""
         if record.opcode not in _KNOWN:
             return False
-        if record.opcode != records.CHUNK and record.end > len(self.blob):
+        if record.opcode != records.CHUNK and self.is_beyond(record):
             return False
         if record.opcode == records.CHUNK:
             self.chunks[place] = record
+        elif record.opcode == records.BAG_HEADER:
+            self.index_at = int.from_bytes(record.fields[b"index_pos"], "little")
         elif record.opcode == records.CONNECTION:
             self._take_connection(record, self.blob[record.data_at : record.end])
         elif record.opcode == records.CHUNK_INFO:

@@ -10,7 +10,15 @@ from typing import IO
 
 from sceneslam.ros.messages import TopicType
 from sceneslam.sources import mcap_records as records
-from sceneslam.sources.recording import Chunk, ChunkContent, ChunkedRecording, Layout, Message
+from sceneslam.sources.recording import (
+    INDEX_IS_DAMAGED,
+    Chunk,
+    ChunkContent,
+    ChunkedRecording,
+    Layout,
+    Message,
+    cut_off,
+)
 from sceneslam.types.errors import InputError
 
 _ENCODINGS = ("cdr", "ros1")
@@ -33,13 +41,19 @@ class McapFile:
 
     def layout(self) -> Layout:
         """Return the chunks and topics, from the index or, failing that, from the content."""
+        from mcap.exceptions import McapError
+
         size = self._path.stat().st_size
         if size == 0:
             raise InputError(f"recording: expected an MCAP file, got an empty one: {self._path}")
         with self._path.open("rb") as file:
             if file.read(len(records.MAGIC)) != records.MAGIC:
                 raise InputError(f"recording: this is no MCAP file: {self._path}")
-            return self._from_index(file) or self._from_content(file, size)
+            try:
+                layout, note = self._from_index(file), ""
+            except (McapError, ValueError, KeyError, struct.error, OSError):
+                layout, note = None, INDEX_IS_DAMAGED
+            return layout or self._from_content(file, size, note)
 
     def read(self, chunk: Chunk) -> ChunkContent:
         """Return a chunk's messages; a damaged one is lost as a whole."""
@@ -59,21 +73,20 @@ class McapFile:
         return ChunkContent(messages=messages)
 
     def _from_index(self, file: IO[bytes]) -> Layout | None:
-        """Return the layout by the file's summary, None when that is missing or damaged."""
-        from mcap.exceptions import McapError
+        """Return the layout by the file's summary, None when it was written without.
+
+        Raises whatever the reader runs into when the summary is damaged.
+        """
         from mcap.reader import SeekingReader
 
-        if not records.has_sound_summary(file):
+        if not records.has_summary(file):
             return None
         file.seek(0)
-        try:
-            reader = SeekingReader(file)
-            summary = reader.get_summary()
-            if summary is None or summary.statistics is None or not summary.chunk_indexes:
-                return None
-            metadata = {entry.name: dict(entry.metadata) for entry in reader.iter_metadata()}
-        except (McapError, ValueError, KeyError, struct.error, OSError):
+        reader = SeekingReader(file)
+        summary = reader.get_summary()
+        if summary is None or summary.statistics is None or not summary.chunk_indexes:
             return None
+        metadata = {entry.name: dict(entry.metadata) for entry in reader.iter_metadata()}
         content = records.Content(
             schemas=summary.schemas,
             channels=summary.channels,
@@ -94,8 +107,11 @@ class McapFile:
         ]
         return Layout(chunks=chunks, topics=topics, metadata=metadata)
 
-    def _from_content(self, file: IO[bytes], size: int) -> Layout:
-        """Return the layout by reading the file through, as far as it goes."""
+    def _from_content(self, file: IO[bytes], size: int, note: str) -> Layout:
+        """Return the layout by reading the file through, as far as it goes.
+
+        `note` says what is wrong with the index.
+        """
         content, spans, lost = records.Content(), [], 0
         position, is_complete = len(records.MAGIC), False
         while position + records.RECORD_HEAD.size <= size and not is_complete:
@@ -124,12 +140,12 @@ class McapFile:
             for offset, length, span in spans
             if span
         ]
+        if not is_complete and records.has_end(file):
+            lost += size - position  # the damage is inside
+        elif not is_complete:
+            note = cut_off(chunks, topics)
         return Layout(
-            chunks=chunks,
-            topics=topics,
-            metadata=content.metadata,
-            lost_bytes=lost + (0 if is_complete else size - position),
-            note="" if is_complete else "the recording is cut off",
+            chunks=chunks, topics=topics, metadata=content.metadata, lost_bytes=lost, note=note
         )
 
     def _named(self, channels: Iterable[int]) -> frozenset[str]:

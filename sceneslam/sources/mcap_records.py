@@ -75,23 +75,34 @@ def read_records(data: bytes) -> Sequence[Record] | None:
     return None if unpacked is None else _split(memoryview(unpacked))
 
 
-def has_sound_summary(file: IO[bytes]) -> bool:
-    """Tell whether the file is finished and its summary is as it was written."""
+def has_end(file: IO[bytes]) -> bool:
+    """Tell whether the file ends as a finished one does."""
+    size = file.seek(0, 2)
+    file.seek(max(size - len(MAGIC), len(MAGIC)))
+    return file.read() == MAGIC
+
+
+def has_summary(file: IO[bytes]) -> bool:
+    """Tell whether the file was written with a summary; raises ValueError when it is damaged."""
     tail = RECORD_HEAD.size + _FOOTER_BODY.size + len(MAGIC)
     size = file.seek(0, 2)
-    if size < tail + len(MAGIC):
-        return False
+    if size < tail + len(MAGIC) or not has_end(file):
+        raise ValueError("the file is not finished")
     file.seek(size - tail)
     end = file.read(tail)
     opcode, length = RECORD_HEAD.unpack_from(end)
-    if end[-len(MAGIC) :] != MAGIC or opcode != FOOTER or length != _FOOTER_BODY.size:
-        return False
+    if opcode != FOOTER or length != _FOOTER_BODY.size:
+        raise ValueError("the footer is damaged")
     start, _, checksum = _FOOTER_BODY.unpack_from(end, RECORD_HEAD.size)
-    if not len(MAGIC) <= start <= size - tail:
+    if start == 0:
         return False
+    if not len(MAGIC) <= start <= size - tail:
+        raise ValueError("the footer is damaged")
     file.seek(start)
     summary = file.read(size - len(MAGIC) - 4 - start)  # the checksum does not cover itself
-    return checksum in (0, zlib.crc32(summary))
+    if checksum not in (0, zlib.crc32(summary)):
+        raise ValueError("the summary is damaged")
+    return True
 
 
 def _unpack_chunk(body: memoryview) -> bytes | None:

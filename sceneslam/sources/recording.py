@@ -84,6 +84,25 @@ class ChunkContent:
     lost_bytes: int = 0
 
 
+INDEX_IS_DAMAGED = "its index is damaged (read without it)"
+
+
+def cut_off(
+    chunks: Sequence[Chunk],
+    topics: Mapping[str, TopicType],
+    missing: str = "the rest of the recording",
+) -> str:
+    """Return the note on a file whose end is missing: what there is, and what is missing."""
+    if not chunks:
+        return "cut off before its first chunk was complete"
+    span_s = (max(one.end_ns for one in chunks) - min(one.start_ns for one in chunks)) * 1e-9
+    count = sum(topic.count for topic in topics.values())
+    return (
+        f"cut off after {span_s:.1f} s / {count} messages; "
+        f"{missing} is missing and could not be read"
+    )
+
+
 ChunkReader = Callable[[Chunk], ChunkContent]
 
 
@@ -114,8 +133,8 @@ class ChunkedRecording:
         if lost:
             size = sum(path.stat().st_size for path in {chunk.file for chunk in self._chunks})
             notes.append(
-                f"{100 * lost / max(size, 1):.1f} % of the file ({lost / 1e6:.1f} MB of "
-                f"{size / 1e6:.1f} MB) is damaged and could not be read"
+                f"{100 * lost / max(size, 1):.1f} % of the file ({_amount(lost)} of "
+                f"{_amount(size)}) is damaged and could not be read"
             )
         return ["; ".join(notes)] if notes else []
 
@@ -172,6 +191,11 @@ class ChunkedRecording:
         if content.lost_bytes:
             self._damaged[chunk] = content.lost_bytes
         return content
+
+
+def _amount(count: int) -> str:
+    """Return a number of bytes in words."""
+    return f"{count / 1e6:.1f} MB" if count >= 100_000 else f"{count} bytes"
 
 
 def _merge_topics(layouts: Sequence[Layout]) -> dict[str, TopicType]:
