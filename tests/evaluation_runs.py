@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.evaluation.association import select
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.types import se3
 from sceneslam.types.maps import GridLayer, HybridMap, PointLayer
@@ -49,37 +53,46 @@ def shaken(trajectory: Trajectory, sigma_m: float, seed: int = 1) -> Trajectory:
     return Trajectory(stamps_ns=trajectory.stamps_ns, T_world_base=T_world_base)
 
 
-def switch_events(stamp_ns: int, since_ns: int) -> list[Event]:
+def happened(event: str, stamp_ns: int, **fields: Any) -> Event:
+    """One line of events.jsonl; `from_` is the key `from`."""
+    return {"event": event, "stamp_ns": stamp_ns, **{k.rstrip("_"): v for k, v in fields.items()}}
+
+
+def switch_events(
+    stamp_ns: int, since_ns: int, from_: str = "rgbd", to: str = "laser"
+) -> list[Event]:
+    handover = {
+        "session": 1,
+        "kind": "cold",
+        "T_map_local": np.eye(4).tolist(),
+        "jump_m": 0.5,
+        "jump_rad": 0.25,
+        "gap_s": 0.75,
+    }
     return [
-        {"event": "scene", "stamp_ns": stamp_ns, "scene": "Dark", "previous": "Bright",
-         "since_ns": since_ns},
-        {"event": "state", "stamp_ns": stamp_ns, "from": "run", "to": "switch", "reason": "scene"},
-        {"event": "decision", "stamp_ns": stamp_ns, "scene": "Dark", "from": "rgbd",
-         "to": "laser", "reason": "scene"},
-        {"event": "handover", "stamp_ns": stamp_ns, "session": 1, "module": "laser",
-         "kind": "cold", "T_map_local": np.eye(4).tolist(), "jump_m": 0.5, "jump_rad": 0.25,
-         "gap_s": 0.75},
-        {"event": "cost", "stamp_ns": stamp_ns, "module": "laser", "handover_ms": 3.5},
-    ]  # fmt: skip
+        happened("scene", stamp_ns, scene="Dark", previous="Bright", since_ns=since_ns),
+        happened("state", stamp_ns, from_="run", to="switch", reason="scene"),
+        happened("decision", stamp_ns, scene="Dark", from_=from_, to=to, reason="scene"),
+        happened("handover", stamp_ns, module=to, **handover),
+        happened("cost", stamp_ns, module=to, handover_ms=3.5),
+    ]
 
 
 def first_events() -> list[Event]:
+    at = START_NS
     return [
-        {"event": "scene", "stamp_ns": START_NS, "scene": "Bright", "previous": None,
-         "since_ns": START_NS},
-        {"event": "decision", "stamp_ns": START_NS, "scene": "Bright", "from": None,
-         "to": "rgbd", "reason": "first"},
-        {"event": "tracking", "stamp_ns": START_NS, "module": "rgbd", "status": "tracking"},
-    ]  # fmt: skip
+        happened("scene", at, scene="Bright", previous=None, since_ns=at),
+        happened("decision", at, scene="Bright", from_=None, to="rgbd", reason="first"),
+        happened("tracking", at, module="rgbd", status="tracking"),
+    ]
 
 
 def votes(count: int, dark_from: int) -> list[Event]:
     values = 80 - 50 * np.tanh((np.arange(count) - dark_from) / 6.0)
     return [
-        {"event": "vote", "stamp_ns": int(stamp_ns), "value": float(value),
-         "scene": "Bright" if value > 100 else "Dark"}
-        for stamp_ns, value in zip(stamps(count), values, strict=True)
-    ]  # fmt: skip
+        happened("vote", stamp_ns, value=value, scene="Bright" if value > 100 else "Dark")
+        for stamp_ns, value in zip(stamps(count).tolist(), values.tolist(), strict=True)
+    ]
 
 
 def hybrid_map(points: int = 3000) -> HybridMap:
@@ -149,3 +162,32 @@ def poseless_run(observed: int = 0) -> RunResult:
         events=[],
         timings=Timings(detector_us=none, bus_us=none, module_ms={}, wall_s=0.0),
     )
+
+
+def relabel(run: RunResult, index: slice, module: str) -> RunResult:
+    """Let `module` have given the poses at `index`."""
+    modules = list(run.modules)
+    modules[index] = [module] * len(modules[index])
+    return replace(run, modules=modules)
+
+
+def shift_from(run: RunResult, index: int, T_map_map: NDArray[np.float64]) -> RunResult:
+    """Move all poses from `index` on, as a bad hand-over does."""
+    T_world_base = run.trajectory.T_world_base.copy()
+    T_world_base[index:] = T_map_map @ T_world_base[index:]
+    trajectory = Trajectory(stamps_ns=run.trajectory.stamps_ns, T_world_base=T_world_base)
+    return replace(run, trajectory=trajectory)
+
+
+def without(run: RunResult, gone: slice | NDArray[np.int64]) -> RunResult:
+    """Take poses away."""
+    kept = np.delete(np.arange(len(run.trajectory)), gone)
+    modules = [run.modules[k] for k in kept]
+    return replace(run, trajectory=select(run.trajectory, kept), modules=modules)
+
+
+def part_of(run: RunResult, index: slice | NDArray[np.int64]) -> RunResult:
+    """Let there have been only the observations at `index`, each with its pose."""
+    kept = np.arange(len(run.trajectory))[index]
+    part = without(run, np.setdiff1d(np.arange(len(run.trajectory)), kept))
+    return replace(part, observed_ns=run.observed_ns[kept])

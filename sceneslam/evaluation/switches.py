@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.evaluation.association import covered, interpolated
 from sceneslam.types import se3
@@ -29,7 +30,8 @@ def list_switches(result: RunResult, truth: GroundTruth | None) -> list[dict[str
     """Return one entry for every decision that replaced a module, for `metrics.json`.
 
     `jump_m` and `jump_rad` are the error of the estimated motion across the seam against the true
-    motion; where the truth does not cover it, what the hand-over itself measured. None is unknown.
+    motion; where the truth does not cover it, what the hand-over itself measured. None is unknown:
+    a module that gave no pose before it was replaced has neither jump nor gap.
     """
     decisions = [event for event in result.events if is_switch(event)]
     return [_describe(decision, result, truth) for decision in decisions]
@@ -58,30 +60,48 @@ def true_scene(truth: GroundTruth, stamp_ns: int) -> str | None:
 def find_seam(result: RunResult, decision: Event) -> Seam | None:
     """Return the seam of a switch, None when there is no pose on one of its sides.
 
+    The module's side ends with the next decision: what it gives later is not this switch's doing.
     With `rewind` the new module also gives poses for stamps before the decision; the seam is
     where its poses begin.
     """
     modules = np.array(result.modules, dtype=object)
     stamps_ns = result.trajectory.stamps_ns
-    later = np.flatnonzero((modules == decision["to"]) & (stamps_ns >= decision["stamp_ns"]))
+    own = (modules == decision["to"]) & _in_turn(result, decision)
+    later = np.flatnonzero(own & (stamps_ns >= decision["stamp_ns"]))
     if not len(later):
         return None
-    others = np.flatnonzero(modules[: later[0]] != decision["to"])
-    given = np.flatnonzero((modules[: later[0]] != decision["to"]) & (modules[: later[0]] != ""))
+    others = np.flatnonzero(~own[: later[0]])
+    given = np.flatnonzero(~own[: later[0]] & (modules[: later[0]] != ""))
     if not len(given):
         return None
     return Seam(before=int(given[-1]), after=int(others[-1]) + 1)
+
+
+def _in_turn(result: RunResult, decision: Event) -> NDArray[np.bool_]:
+    """Tell of each pose whether it lies in the turn that a decision began.
+
+    A turn lies between the same module's last one and the next decision. A pose at the very stamp
+    at which a module is replaced is still its own.
+    """
+    stamps_ns = result.trajectory.stamps_ns
+    decisions = [event for event in result.events if event["event"] == "decision"]
+    at = next(k for k, event in enumerate(decisions) if event is decision)
+    inside = np.ones(len(stamps_ns), bool)
+    for earlier in decisions[:at]:
+        if earlier["from"] == decision["to"]:
+            inside &= stamps_ns > earlier["stamp_ns"]
+    if at + 1 < len(decisions):
+        following = decisions[at + 1]
+        began = following["from"] == decision["to"]  # else it could not even be activated
+        inside &= stamps_ns < following["stamp_ns"] + int(began)
+    return inside
 
 
 def _describe(decision: Event, result: RunResult, truth: GroundTruth | None) -> dict[str, Any]:
     handover = _same_stamp(result.events, "handover", decision)
     cost = _same_stamp(result.events, "cost", decision)
     seam = find_seam(result, decision)
-    T_error = _motion_error(result, truth, seam) if seam else None
-    jump_m, jump_rad = handover.get("jump_m"), handover.get("jump_rad")
-    if T_error is not None:
-        jump_m = float(np.linalg.norm(T_error[:3, 3]))
-        jump_rad = float(se3.rotation_angle_rad(T_error))
+    jump_m, jump_rad = _jump(result, truth, seam, handover) if seam else (None, None)
     return {
         "stamp_ns": int(decision["stamp_ns"]),
         "scene": decision["scene"],
@@ -89,7 +109,7 @@ def _describe(decision: Event, result: RunResult, truth: GroundTruth | None) -> 
         "to": decision["to"],
         "reason": decision["reason"],
         "confirm_delay_s": _confirm_delay_s(decision, truth),
-        "gap_s": _gap_s(result, seam) if seam else handover.get("gap_s"),
+        "gap_s": _gap_s(result, seam) if seam else None,
         "jump_m": jump_m,
         "jump_rad": jump_rad,
         "cost_ms": cost.get("handover_ms"),
@@ -124,6 +144,16 @@ def _change_in_force(changes: Sequence[SceneChange], stamp_ns: int) -> SceneChan
         if in_force is None or change.scene != in_force.scene:
             in_force = change
     return in_force
+
+
+def _jump(
+    result: RunResult, truth: GroundTruth | None, seam: Seam, handover: Event
+) -> tuple[float | None, float | None]:
+    """Return the error of the motion across the seam: [m] and [rad]."""
+    T_error = _motion_error(result, truth, seam)
+    if T_error is None:
+        return handover.get("jump_m"), handover.get("jump_rad")
+    return float(np.linalg.norm(T_error[:3, 3])), float(se3.rotation_angle_rad(T_error))
 
 
 def _gap_s(result: RunResult, seam: Seam) -> float:
