@@ -56,9 +56,13 @@ def select(trajectory: Trajectory, index: Indices) -> Trajectory:
 
 
 def clip(trajectory: Trajectory, start_ns: int, end_ns: int) -> Trajectory:
-    """Return the poses from `start_ns` to `end_ns`, both included."""
-    inside = (trajectory.stamps_ns >= start_ns) & (trajectory.stamps_ns <= end_ns)
-    return select(trajectory, np.flatnonzero(inside))
+    """Return the poses from the last up to `start_ns` to the first from `end_ns` on.
+
+    So each instant of the span keeps its neighbours on both sides.
+    """
+    first = int(np.searchsorted(trajectory.stamps_ns, start_ns, side="right")) - 1
+    last = int(np.searchsorted(trajectory.stamps_ns, end_ns))
+    return select(trajectory, np.arange(max(first, 0), min(last + 1, len(trajectory))))
 
 
 def covered(trajectory: Trajectory, stamps_ns: NDArray[np.int64], max_gap_s: float) -> Indices:

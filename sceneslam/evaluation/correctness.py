@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.evaluation.alignment import align
 from sceneslam.evaluation.association import covered, interpolated, select
@@ -11,6 +14,14 @@ from sceneslam.types.trajectory import Trajectory
 
 _TRUTH_GAP_S = 0.5  # ground truth is not interpolated over more
 _POSE_GAP_NS = 10**9  # a pose vouches for no more than this
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Judged:
+    """The poses that the truth covers, by rising stamp."""
+
+    stamps_ns: NDArray[np.int64]  # (N,)
+    is_correct: NDArray[np.bool_]  # (N,)
 
 
 def correct_rate(
@@ -25,9 +36,46 @@ def correct_rate(
     """
     if len(truth) < 2 or truth.stamps_ns[0] == truth.stamps_ns[-1]:
         return float("nan")
+    judged = _judge(estimate, truth, limit_m, limit_rad)
+    if not len(judged.stamps_ns):
+        return 0.0
+    end_ns = max(truth.stamps_ns[-1], judged.stamps_ns[-1])
+    vouched_ns = np.minimum(np.diff(judged.stamps_ns, append=end_ns), _POSE_GAP_NS)
+    return float(vouched_ns[judged.is_correct].sum() / (end_ns - truth.stamps_ns[0]))
+
+
+def correct_rate_observed(
+    estimate: Trajectory,
+    truth: Trajectory,
+    observed_ns: NDArray[np.int64],
+    *,
+    limit_m: float,
+    limit_rad: float,
+) -> float:
+    """Return the share of the time of a run with a correct pose, in [0, 1].
+
+    As `correct_rate`, but of the time between those successive observations (N,) that the truth
+    covers both: a run answers for no time at which it was given nothing or the truth is unknown,
+    and one that is right at each observation gets 1. NaN when there is no such time.
+    """
+    known = covered(truth, observed_ns, _TRUTH_GAP_S)
+    begins = known[:-1][np.diff(known) == 1]
+    lasts_ns = observed_ns[begins + 1] - observed_ns[begins]
+    if not lasts_ns.sum():
+        return float("nan")
+    judged = _judge(estimate, truth, limit_m, limit_rad)
+    if not len(judged.stamps_ns):
+        return 0.0
+    newest = np.searchsorted(judged.stamps_ns, observed_ns[begins], side="right") - 1
+    age_ns = observed_ns[begins] - judged.stamps_ns[newest]
+    holds = (newest >= 0) & (age_ns < _POSE_GAP_NS) & judged.is_correct[newest]
+    return float(lasts_ns[holds].sum() / lasts_ns.sum())
+
+
+def _judge(estimate: Trajectory, truth: Trajectory, limit_m: float, limit_rad: float) -> _Judged:
     index = covered(truth, estimate.stamps_ns, _TRUTH_GAP_S)
     if not len(index):
-        return 0.0
+        return _Judged(stamps_ns=np.zeros(0, np.int64), is_correct=np.zeros(0, bool))
     matched = select(estimate, index)
     true = interpolated(truth, matched.stamps_ns)
     # 0.1 m: a robot that drives straight on must not fail for a roll that nothing determines.
@@ -36,6 +84,4 @@ def correct_rate(
     distance_m = np.linalg.norm(T_gt_base[:, :3, 3] - true.positions_m, axis=1)
     angle_rad = se3.rotation_angle_rad(se3.inverse(true.T_world_base) @ T_gt_base)
     is_correct = (distance_m <= limit_m) & (angle_rad <= limit_rad)
-    end_ns = max(truth.stamps_ns[-1], matched.stamps_ns[-1])
-    vouched_ns = np.minimum(np.diff(matched.stamps_ns, append=end_ns), _POSE_GAP_NS)
-    return float(vouched_ns[is_correct].sum() / (end_ns - truth.stamps_ns[0]))
+    return _Judged(stamps_ns=matched.stamps_ns, is_correct=is_correct)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sceneslam.evaluation.accuracy import absolute_errors, relative_errors, root_mean_square
 from sceneslam.evaluation.association import clip
 from sceneslam.evaluation.comparison import compare
-from sceneslam.evaluation.correctness import correct_rate
+from sceneslam.evaluation.correctness import correct_rate_observed
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.evaluation.switches import count_false, list_switches
 from sceneslam.types.run import RunResult
@@ -48,6 +48,7 @@ def evaluate(
         "modules": _per_module(result),
         "bridged": sum(module == "" for module in result.modules),
         "peak_rss_mb": peak_rss_mb,
+        "faults": [str(e["what"]) for e in result.events if e["event"] == "fault"],
         "notes": _notes(result, truth, settings),
     }
     if reference is not None:
@@ -80,15 +81,19 @@ def coverage(result: RunResult) -> float | None:
 def _accuracy(
     result: RunResult, truth: GroundTruth | None, settings: EvaluationSettings
 ) -> Metrics:
-    true = truth.trajectory if truth else Trajectory.empty()
-    if len(result.observed_ns):
+    true, observed_ns = truth.trajectory if truth else Trajectory.empty(), result.observed_ns
+    if len(observed_ns):
         # What a longer ground truth says about other times is not this run's to answer for.
-        true = clip(true, int(result.observed_ns[0]), int(result.observed_ns[-1]))
+        true = clip(true, int(observed_ns[0]), int(observed_ns[-1]))
     estimate, gap_s = result.trajectory, settings.association_gap_s
     absolute = absolute_errors(estimate, true, gap_s)
     relative = relative_errors(estimate, true, gap_s, settings.rpe_interval_s)
-    rate = correct_rate(
-        estimate, true, limit_m=settings.correct_limit_m, limit_rad=settings.correct_limit_rad
+    rate = correct_rate_observed(
+        estimate,
+        true,
+        observed_ns,
+        limit_m=settings.correct_limit_m,
+        limit_rad=settings.correct_limit_rad,
     )
     return {
         "ate_rmse_m": absolute.rmse_m,
@@ -108,6 +113,7 @@ def _extent(result: RunResult) -> Metrics:
     wall_s = result.timings.wall_s
     return {
         "observations": len(observed_ns),
+        "dropped": result.dropped,
         "poses": len(result.trajectory),
         "start_ns": int(observed_ns[0]) if len(observed_ns) else None,
         "duration_s": duration_s,
