@@ -9,15 +9,17 @@ from evaluation_runs import (
     PERIOD_NS,
     SETTINGS,
     START_NS,
+    happened,
     hybrid_map,
     loop,
+    part_of,
     poseless_run,
     switched_run,
     timings,
     true_loop,
 )
 
-from sceneslam.evaluation.association import select
+from sceneslam.evaluation.figure_time import draw_timeline
 from sceneslam.evaluation.figures import write_figures
 from sceneslam.evaluation.metrics import evaluate
 from sceneslam.evaluation.report import write_report
@@ -42,10 +44,7 @@ def report(folder, run, truth, **more) -> str:
 
 def single_pose() -> RunResult:
     run = switched_run()
-    return replace(
-        run, trajectory=select(run.trajectory, np.array([0])), modules=["rgbd"],
-        observed_ns=run.observed_ns[:1], events=run.events[:4], timings=timings(1),
-    )  # fmt: skip
+    return replace(part_of(run, slice(0, 1)), events=run.events[:4], timings=timings(1))
 
 
 def test_all_figures_of_a_switched_run_are_drawn(tmp_path):
@@ -69,6 +68,15 @@ def test_trajectory_has_a_colour_per_module(tmp_path):
     image = cv2.imread(str(tmp_path / "map.png"))[:, :, ::-1].astype(int)
     for color in ([0, 114, 178], [213, 94, 0]):
         assert np.count_nonzero(np.abs(image - color).max(axis=2) < 8) > 300
+
+
+@pytest.mark.parametrize(("dropped", "is_marked"), [(0, False), (3, True)])
+def test_timeline_marks_dropped_observations_only_where_there_are_some(dropped, is_marked):
+    run = switched_run()
+    event = happened("dropped", int(run.observed_ns[-1]), count=dropped)
+    figure = draw_timeline(replace(run, events=[*run.events, event]), None)
+    names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert ("faults" in names) == is_marked
 
 
 def test_figures_are_the_same_bytes_each_time(tmp_path):
@@ -146,14 +154,16 @@ def test_report_tells_what_happened_in_words(tmp_path):
     assert "<td>3.5 ms</td>" in html
 
 
+def test_report_tells_how_many_observations_were_dropped(tmp_path):
+    assert "45 more were dropped" in report(tmp_path, replace(switched_run(), dropped=45), None)
+
+
 def test_report_escapes_what_it_is_given(tmp_path):
     evil = "<script>alert(1)</script> & $story ${x}"
     run = switched_run()
-    fault = {"event": "fault", "stamp_ns": START_NS + 5 * PERIOD_NS, "what": evil}
-    html = report(
-        tmp_path, replace(run, events=[*run.events, fault]), None,
-        config_yaml=evil, versions={evil: evil}, faults=[evil], title=evil,
-    )  # fmt: skip
+    fault = happened("fault", START_NS + 5 * PERIOD_NS, what=evil)
+    run = replace(run, events=[*run.events, fault])
+    html = report(tmp_path, run, None, config_yaml=evil, versions={evil: evil}, faults=[evil])
     assert "<script" not in html
     assert html.count("&lt;script&gt;alert(1)&lt;/script&gt; &amp; $story ${x}") >= 5
 

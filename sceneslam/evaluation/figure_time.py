@@ -31,9 +31,12 @@ def draw_votes(
     axes.plot(times_s, values, color=look.PALETTE[0], linewidth=1.4, label=value_label)
     if threshold is not None:
         axes.axhline(
-            threshold, color=look.PALETTE[1], linestyle="--", linewidth=1.4,
+            threshold,
+            color=look.PALETTE[1],
+            linestyle="--",
+            linewidth=1.4,
             label=f"threshold {threshold:g}",
-        )  # fmt: skip
+        )
     _mark_confirmed(axes, result)
     look.style(axes, y_label=value_label)
     axes.set_xlim(0.0, max(look.duration_s(result), 1e-3))
@@ -97,7 +100,7 @@ def draw_timeline(result: RunResult, truth: GroundTruth | None) -> Any:
             color = (tints if is_scene else colors).get(bar.label, look.BRIDGED)
             _draw_bar(axes, bar, row, color, name_it=is_scene, total_s=look.duration_s(result))
         _draw_trouble(axes, result, name, row)
-    faults_s = [_at_s(result, e) for e in result.events if e["event"] in ("fault", "dropped")]
+    faults_s = [_at_s(result, event) for event in result.events if _is_fault(event)]
     if faults_s:
         axes.plot(faults_s, [len(rows)] * len(faults_s), "x", color=look.INK, clip_on=False)
         rows.append(("faults", []))
@@ -113,6 +116,12 @@ def _at_s(result: RunResult, event: Event) -> float:
     return float(look.elapsed_s(result, np.array([event["stamp_ns"]], np.int64))[0])
 
 
+def _is_fault(event: Event) -> bool:
+    if event["event"] == "dropped":
+        return int(event["count"]) > 0  # live mode tells it always
+    return bool(event["event"] == "fault")
+
+
 def _mark_confirmed(axes: Any, result: RunResult) -> None:
     changes = [e for e in result.events if e["event"] == "scene" and e["previous"] is not None]
     for event in changes:
@@ -122,10 +131,17 @@ def _mark_confirmed(axes: Any, result: RunResult) -> None:
         )
         if len(changes) <= _NAMED_CHANGES:
             axes.text(
-                at_s, 0.5, f"{event['scene']} confirmed", transform=axes.get_xaxis_transform(),
-                rotation=90, ha="center", va="center", fontsize=10, color=look.INK,
+                at_s,
+                0.5,
+                f"{event['scene']} confirmed",
+                transform=axes.get_xaxis_transform(),
+                rotation=90,
+                ha="center",
+                va="center",
+                fontsize=10,
+                color=look.INK,
                 bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5},
-            )  # fmt: skip
+            )
 
 
 def _confirmed_spans(result: RunResult) -> list[look.Span]:
@@ -147,9 +163,15 @@ def _draw_trouble(axes: Any, result: RunResult, module: str, row: int) -> None:
     for bar in _trouble(result, module):
         hatch = "xxxx" if bar.label == "lost" else "////"
         axes.barh(
-            row, max(bar.end_s - bar.start_s, 1e-3), left=bar.start_s, height=0.62, hatch=hatch,
-            facecolor="none", edgecolor=look.INK, linewidth=0.4,
-        )  # fmt: skip
+            row,
+            max(bar.end_s - bar.start_s, 1e-3),
+            left=bar.start_s,
+            height=0.62,
+            hatch=hatch,
+            facecolor="none",
+            edgecolor=look.INK,
+            linewidth=0.4,
+        )
 
 
 def _trouble(result: RunResult, module: str) -> list[look.Span]:

@@ -42,36 +42,42 @@ def write_report(
     faults: Sequence[str],
     reference: Trajectory | None = None,
     value_label: str = "detector value",
-    title: str = "SceneSLAM run",
 ) -> Path:
     """Write `figures/*.png` and `report.html` into the run's folder; return the report's path.
 
     `threshold` is drawn with the detector's values, `faults` are sentences about the input.
     """
     images = write_figures(
-        folder / "figures", result, truth,
-        threshold=threshold, value_label=value_label, reference=reference,
+        folder / "figures",
+        result,
+        truth,
+        threshold=threshold,
+        value_label=value_label,
+        reference=reference,
         association_gap_s=metrics["association_gap_s"],
-    )  # fmt: skip
-    happened = [str(event["what"]) for event in result.events if event["event"] == "fault"]
-    page = Template(files("sceneslam.evaluation").joinpath("report.html").read_text("utf-8"))
-    path = folder / "report.html"
-    path.write_text(
-        page.substitute(
-            title=escape(title),
-            story="".join(f"<p>{escape(sentence)}</p>\n" for sentence in tell(metrics)),
-            numbers=_numbers(metrics),
-            faults=_faults([*faults, *happened, *metrics["notes"]]),
-            switches=_switches(metrics),
-            modules=_modules(metrics),
-            figures="".join(_figure(image) for image in images),
-            versions=_table(["part", "version"], [[*item] for item in versions.items()]),
-            config=escape(config_yaml),
-            metrics=escape(json.dumps(metrics, indent=2)),
-        ),
-        encoding="utf-8",
     )
+    told = {
+        **_told(metrics),
+        "faults": _faults([*faults, *metrics["faults"], *metrics["notes"]]),
+        "figures": "".join(_figure(image) for image in images),
+        "versions": _table(["part", "version"], [[*item] for item in versions.items()]),
+        "config": escape(config_yaml),
+    }
+    page = files("sceneslam.evaluation").joinpath("report.html").read_text("utf-8")
+    path = folder / "report.html"
+    path.write_text(Template(page).substitute(told), encoding="utf-8")
     return path
+
+
+def _told(metrics: Metrics) -> dict[str, str]:
+    """Return the parts of the page that say what the metrics say."""
+    return {
+        "story": "".join(f"<p>{escape(paragraph)}</p>\n" for paragraph in tell(metrics)),
+        "numbers": _numbers(metrics),
+        "switches": _switches(metrics),
+        "modules": _modules(metrics),
+        "metrics": escape(json.dumps(metrics, indent=2)),
+    }
 
 
 def _numbers(metrics: Metrics) -> str:

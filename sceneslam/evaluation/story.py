@@ -31,6 +31,8 @@ def _opening(metrics: Metrics) -> str:
     if not metrics["observations"]:
         return "The source gave no observations, so there is nothing to report."
     seen = f"{metrics['observations']} observations over {metrics['duration_s']:.1f} s"
+    if metrics["dropped"]:
+        seen += f" ({metrics['dropped']} more were dropped, for newer ones had come)"
     if not metrics["poses"]:
         return f"The run took in {seen}, but no module ever gave a pose."
     text = (

@@ -7,22 +7,21 @@ from typing import Any
 
 from sceneslam.evaluation.metrics import Metrics
 
+_MAX_LINES, _MAX_COLUMNS = 9, 120
 _MAX_SWITCHES = 3  # the others are counted; the report has all of them
 
 
 def summary_lines(metrics: Metrics) -> list[str]:
-    """Return at most ten short lines that say how a run went."""
-    lines = [_what_was_seen(metrics), _who_worked(metrics)]
-    lines += [_switch_line(metrics, switch) for switch in metrics["switches"][:_MAX_SWITCHES]]
-    hidden = len(metrics["switches"]) - _MAX_SWITCHES
-    if hidden > 0:
-        lines.append(f"and {hidden} more switches (see report.html)")
+    """Return at most nine short lines that say how a run went."""
+    first = [_what_was_seen(metrics), _who_worked(metrics)]
+    last = [_faults_line(metrics["faults"])] if metrics["faults"] else []
     if metrics["ate_rmse_m"] is not None:
-        lines.append(_accuracy_line(metrics))
+        last.append(_accuracy_line(metrics))
     if "reference" in metrics:
-        lines.append(_reference_line(metrics["reference"]))
-    lines += metrics["notes"][:1]
-    return [*lines, _cost_line(metrics)]
+        last.append(_reference_line(metrics["reference"]))
+    last += metrics["notes"][:1]
+    last.append(_cost_line(metrics))
+    return [*first, *_switch_lines(metrics, _MAX_LINES - len(first) - len(last)), *last]
 
 
 def seconds(metrics: Metrics, stamp_ns: int) -> float:
@@ -46,8 +45,9 @@ def degrees(value_rad: float | None, digits: int = 2) -> str:
 
 
 def _what_was_seen(metrics: Metrics) -> str:
+    dropped = f" ({metrics['dropped']} dropped)" if metrics["dropped"] else ""
     return (
-        f"{metrics['observations']} observations in {metrics['duration_s']:.1f} s, "
+        f"{metrics['observations']} observations in {metrics['duration_s']:.1f} s{dropped}, "
         f"{metrics['poses']} poses (coverage {percent(metrics['coverage'])}), "
         f"path {metrics['path_length_m']:.2f} m"
     )
@@ -56,6 +56,17 @@ def _what_was_seen(metrics: Metrics) -> str:
 def _who_worked(metrics: Metrics) -> str:
     shares = [f"{key} {percent(module['share'], 0)}" for key, module in metrics["modules"].items()]
     return f"modules: {', '.join(shares) or 'none'}; {metrics['bridged']} poses bridged"
+
+
+def _switch_lines(metrics: Metrics, room: int) -> list[str]:
+    """Return a line per switch, as many as there is room for, and one that counts the others."""
+    switches = metrics["switches"]
+    fit_all = len(switches) <= min(_MAX_SWITCHES, room)
+    shown = len(switches) if fit_all else min(_MAX_SWITCHES, room - 1)
+    lines = [_switch_line(metrics, switch) for switch in switches[:shown]]
+    if len(switches) > shown:
+        lines.append(f"and {len(switches) - shown} more switches (see report.html)")
+    return lines
 
 
 def _switch_line(metrics: Metrics, switch: dict[str, Any]) -> str:
@@ -67,6 +78,11 @@ def _switch_line(metrics: Metrics, switch: dict[str, Any]) -> str:
         f"jump {number(switch['jump_m'], 3, ' m')} {degrees(switch['jump_rad'])}, "
         f"gap {number(switch['gap_s'], 2, ' s')}"
     )
+
+
+def _faults_line(faults: list[str]) -> str:
+    line = " ".join(f"faults: {len(faults)}, first: {faults[0]}".split())
+    return line if len(line) <= _MAX_COLUMNS else line[: _MAX_COLUMNS - 1] + "…"
 
 
 def _accuracy_line(metrics: Metrics) -> str:
