@@ -94,15 +94,27 @@ def test_command_line_prints_relation_errors(tmp_path, capsys):
     assert main(["relations", f"{tmp_path}/poses.tum", f"{tmp_path}/x.relations"]) == 0
     scores = json.loads(capsys.readouterr().out)
     assert scores["trans_mean_m"] == pytest.approx(0.0, abs=1e-8)
-    assert set(scores) >= {"trans_std_m", "rot_mean_deg", "rot_std_deg", "trans_sq_mean",
-                           "rot_sq_mean", "matched", "total"}  # fmt: skip
+    assert set(scores) >= {
+        "trans_std_m",
+        "rot_mean_deg",
+        "rot_std_deg",
+        "trans_sq_mean",
+        "rot_sq_mean",
+        "matched",
+        "total",
+    }
 
 
 @pytest.mark.parametrize(
     ("name", "text"),
-    [("poses.tum", "garbage\n"), ("poses.tum", ""), ("x.relations", "1 2 3\n"),
-     ("x.relations", ""), ("x.relations", "\x00\x01\n")],
-)  # fmt: skip
+    [
+        ("poses.tum", "garbage\n"),
+        ("poses.tum", ""),
+        ("x.relations", "1 2 3\n"),
+        ("x.relations", ""),
+        ("x.relations", "\x00\x01\n"),
+    ],
+)
 def test_command_line_refuses_bad_files_in_one_sentence(tmp_path, capsys, name, text):
     four_poses().write_tum(tmp_path / "poses.tum")
     (tmp_path / "x.relations").write_text("0 1 0.1 0 0 0 0 0.2\n")
@@ -116,7 +128,9 @@ def test_command_line_refuses_bad_files_in_one_sentence(tmp_path, capsys, name, 
 def test_module_is_run_with_python_dash_m():
     done = subprocess.run(
         [sys.executable, "-m", "sceneslam.evaluation", "ate", "/nowhere", "/nowhere"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 2
     assert done.stderr == "error: trajectory file not found: /nowhere\n"

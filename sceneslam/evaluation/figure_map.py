@@ -38,9 +38,14 @@ def draw_map(result: RunResult, truth: GroundTruth | None, T_map_gt: Transform |
     if truth is not None and T_map_gt is not None and len(truth.trajectory):
         true_m = se3.apply(T_map_gt, truth.trajectory.positions_m)
         axes.plot(
-            true_m[:, 0], true_m[:, 1], color="black", linewidth=0.9, dashes=(4, 4),
-            label="ground truth", zorder=5,
-        )  # fmt: skip
+            true_m[:, 0],
+            true_m[:, 1],
+            color="black",
+            linewidth=0.9,
+            dashes=(4, 4),
+            label="ground truth",
+            zorder=5,
+        )
     _draw_trajectory(axes, result, colors)
     look.style(axes, x_label="x [m]", y_label="y [m]")
     axes.set_aspect("equal")
@@ -80,9 +85,15 @@ def _draw_grid(axes: Any, grid: GridLayer) -> None:
     rows, columns = shade.shape
     x_m, y_m = grid.origin_xy_m
     axes.imshow(
-        shade, cmap="gray", vmin=0.0, vmax=1.0, origin="lower", interpolation="nearest", zorder=1,
+        shade,
+        cmap="gray",
+        vmin=0.0,
+        vmax=1.0,
+        origin="lower",
+        interpolation="nearest",
+        zorder=1,
         extent=(x_m, x_m + columns * grid.resolution_m, y_m, y_m + rows * grid.resolution_m),
-    )  # fmt: skip
+    )
 
 
 def _draw_points(
@@ -126,9 +137,15 @@ def _draw_trajectory(axes: Any, result: RunResult, colors: dict[str, str]) -> No
         line = np.where(shown[:, None], path[:, :2], np.nan)
         style = ":" if key == "" else "-"
         axes.plot(
-            line[:, 0], line[:, 1], style, color=colors.get(key, look.BRIDGED), linewidth=2.0,
-            label=key or "bridged", path_effects=casing, zorder=4,
-        )  # fmt: skip
+            line[:, 0],
+            line[:, 1],
+            style,
+            color=colors.get(key, look.BRIDGED),
+            linewidth=2.0,
+            label=key or "bridged",
+            path_effects=casing,
+            zorder=4,
+        )
     if len(path):
         axes.plot(*path[0, :2], "o", color=look.INK, markersize=6, label="start", zorder=6)
         axes.plot(*path[-1, :2], "s", color=look.INK, markersize=6, label="end", zorder=6)
@@ -136,6 +153,13 @@ def _draw_trajectory(axes: Any, result: RunResult, colors: dict[str, str]) -> No
     at = path[[seam.after for seam in seams if seam is not None]]
     if len(at):
         axes.plot(
-            at[:, 0], at[:, 1], "D", markersize=7, markerfacecolor="white",
-            markeredgecolor=look.INK, markeredgewidth=1.6, label="switch", zorder=7,
-        )  # fmt: skip
+            at[:, 0],
+            at[:, 1],
+            "D",
+            markersize=7,
+            markerfacecolor="white",
+            markeredgecolor=look.INK,
+            markeredgewidth=1.6,
+            label="switch",
+            zorder=7,
+        )

@@ -137,6 +137,12 @@ def draw_bands(axes: Any, bands: Sequence[Span], colors: dict[str, str], alpha: 
         if band.end_s - band.start_s > 0.06 * total_s:
             centre_s = 0.5 * (band.start_s + band.end_s)
             axes.text(
-                centre_s, 0.985, band.label or "bridged", transform=axes.get_xaxis_transform(),
-                ha="center", va="top", fontsize=11, color=INK,
-            )  # fmt: skip
+                centre_s,
+                0.985,
+                band.label or "bridged",
+                transform=axes.get_xaxis_transform(),
+                ha="center",
+                va="top",
+                fontsize=11,
+                color=INK,
+            )

@@ -46,9 +46,12 @@ def write_figures(
     if reference is not None:
         difference = compare(result.trajectory, reference, association_gap_s)
         drawn["difference"] = draw_series(
-            result, difference.stamps_ns, difference.differences_m,
-            y_label="difference [m]", limit_m=_PAPER_DIFFERENCE_M,
-        )  # fmt: skip
+            result,
+            difference.stamps_ns,
+            difference.differences_m,
+            y_label="difference [m]",
+            limit_m=_PAPER_DIFFERENCE_M,
+        )
     return [
         look.save(figure, folder / f"{name}.png")
         for name, figure in drawn.items()
