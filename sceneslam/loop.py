@@ -76,10 +76,8 @@ class Loop:
         if not len(self._parts.atlas.trajectory) and not self.faults:
             self.faults.append(self._why_no_pose())
         self.faults += self._parts.source.faults
-        try:
-            self.truth = self._parts.source.ground_truth()
-        except InputError as error:
-            self.faults.append(f"no ground truth: {error}")
+        if self._observed_ns:  # else it may have to be rendered first, for nothing
+            self._read_truth()
         for key in list(self._sinks):
             self._close_sink(key)
         self._log.close()
@@ -149,6 +147,12 @@ class Loop:
                     sink.write_event(event)
             except Exception as error:
                 self._drop_sink(key, error)
+
+    def _read_truth(self) -> None:
+        try:
+            self.truth = self._parts.source.ground_truth()
+        except InputError as error:
+            self.faults.append(f"no ground truth: {error}")
 
     def _close_sink(self, key: str) -> None:
         try:

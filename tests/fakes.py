@@ -180,6 +180,16 @@ class SourceWithoutTruth(FakeSource):
         raise InputError("groundtruth.txt: line 3")
 
 
+class InterruptedSource(FakeSource):
+    """Is stopped while it renders; its truth would have to be rendered too."""
+
+    def __iter__(self):
+        raise KeyboardInterrupt
+
+    def ground_truth(self):
+        raise AssertionError
+
+
 class BuggySource(FakeSource):
     """Divides by zero half-way."""
 

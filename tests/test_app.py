@@ -149,6 +149,11 @@ def test_ground_truth_that_cannot_be_read_costs_no_result(tmp_path):
     assert finished.metrics["ate_rmse_m"] is None and len(finished.trajectory) == 100
 
 
+def test_ctrl_c_before_the_first_observation_ends_at_once(tmp_path):
+    finished = run(config(source___target_="fakes.InterruptedSource"), tmp_path)
+    assert finished.is_interrupted and "stopped after 0" in finished.faults[0]
+
+
 def test_unexpected_error_leaves_what_was_computed(tmp_path):
     finished = run(config(source___target_="fakes.BuggySource"), tmp_path)
     assert "unexpected ZeroDivisionError" in finished.faults[0]
