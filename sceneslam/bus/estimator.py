@@ -133,6 +133,7 @@ class Estimator:
         """Place the module so that its first pose is the pose that was handed over (Eq. 1)."""
         assert self.active is not None
         last_ns = self._atlas.last_stamp_ns
+        is_seamless = self._atlas.has_pose(observation.stamp_ns)
         self._bridge_to(observation)
         T_map_local = self._bridge.T_map_base @ se3.inverse(T_local_base)
         self.active.place(T_map_local)
@@ -144,6 +145,8 @@ class Estimator:
             module=self.active.key,
             kind=self._handover,
             T_map_local=T_map_local.tolist(),
+            jump_m=0.0 if is_seamless else None,  # it starts at the very pose of this instant
+            jump_rad=0.0 if is_seamless else None,
             gap_s=0.0 if last_ns is None else (observation.stamp_ns - last_ns) / 1e9,
         )
 

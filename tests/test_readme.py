@@ -1,0 +1,43 @@
+"""The README's commands compose, its files exist, and its two main commands are the Makefile's."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+
+
+def shell_lines():
+    blocks = "\n".join(re.findall(r"```sh\n(.*?)```", README, re.S)).replace("\\\n", " ")
+    return [line.split("#")[0].strip() for line in blocks.splitlines() if line.strip()]
+
+
+@pytest.mark.parametrize("line", [line for line in shell_lines() if "-m sceneslam +" in line])
+def test_command_composes(line):
+    words = [sys.executable, *shlex.split(line)[1:], "--cfg", "job"]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "policy:" in done.stdout
+
+
+def test_main_commands_are_targets_of_the_makefile():
+    assert {"make demo", "make test"} <= set(shell_lines())
+    makefile = (ROOT / "Makefile").read_text()
+    assert "\ndemo:" in makefile and "\ntest:" in makefile
+
+
+def test_everything_linked_is_there():
+    for target in re.findall(r"\]\(([^)]+)\)", README):
+        if not target.startswith("http"):
+            assert (ROOT / target).exists(), target
+
+
+def test_every_option_is_listed():
+    for group in ("scenario", "source", "effects", "detector", "slam"):
+        for path in (ROOT / "conf" / group).glob("*.yaml"):
+            assert path.stem == "none" or f"`{path.stem}`" in README, f"{group}={path.stem}"
