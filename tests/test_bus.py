@@ -190,6 +190,7 @@ def test_module_that_cannot_be_activated_leaves_the_old_one_running():
     assert len(atlas.trajectory) == 100 and bright.activations == 1
     path = [(e["from"], e["to"], e["reason"]) for e in events(log, "state")]
     assert ("switch", "run", "failure") in path
+    assert len(events(log, "decision")) == 1 and events(log, "refused")[0]["to"] == "dark"
 
 
 def test_run_terminates_when_no_module_is_left():

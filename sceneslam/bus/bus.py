@@ -218,16 +218,18 @@ class Bus:
         return lost_ns >= round(patience_s * 1e9)
 
     def _launch(self, key: str, observation: Observation) -> bool:
+        """Hand over to a module; log the decision, or that the module refused."""
         previous = self.active or None
+        self._candidates.use(key)
+        is_launched = self._estimator.launch(self.runners[key], observation, self.scene)
         self._log.add(
-            "decision",
+            "decision" if is_launched else "refused",
             observation.stamp_ns,
             scene=self.scene,
             **{"from": previous, "to": key},
             reason=self._reason,
         )
-        self._candidates.use(key)
-        return self._estimator.launch(self.runners[key], observation, self.scene)
+        return is_launched
 
     def _send(self, event: str, stamp_ns: int) -> None:
         """Send an event to the machine and log the state it leads to."""
