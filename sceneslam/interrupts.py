@@ -10,12 +10,12 @@ from typing import Any
 
 @contextmanager
 def termination_as_interrupt() -> Iterator[None]:
-    """Let SIGTERM end a run as Ctrl-C does."""
+    """Let SIGTERM end a run as Ctrl-C does, and SIGINT also where a shell's `&` left it ignored."""
 
     def interrupt(number: int, frame: object) -> None:
         raise KeyboardInterrupt
 
-    with _handler(signal.SIGTERM, interrupt):
+    with _handler(signal.SIGTERM, interrupt), _handler(signal.SIGINT, interrupt):
         yield
 
 
