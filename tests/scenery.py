@@ -25,16 +25,21 @@ RIG = Rig(sensors=frozenset(Sensor), camera=CAMERA, laser=Laser(), lidar=Lidar(r
 def room_observation(index: int, *, rate_hz: float = 30.0) -> Observation:
     """The robot drives a gentle arc at 0.3 m/s through the room."""
     t_s = index / rate_hz
-    T_room_base = se3.from_xy_yaw(-1.0 + 0.3 * t_s, 0.1 * t_s, 0.15 * t_s)
+    return observation_at(se3.from_xy_yaw(-1.0 + 0.3 * t_s, 0.1 * t_s, 0.15 * t_s), t_s)
+
+
+def observation_at(T_room_base, t_s: float) -> Observation:
+    """What all sensors measure at a pose in the room."""
     image_bgr, depth_m = _render(T_room_base)
     ranges_m = _hit(T_room_base, _fan())[0]
     cloud = _sphere() * _hit(T_room_base, _sphere())[0][:, None]
+    stamp_ns = START_NS + round(t_s * 1e9)
     return Observation(
-        stamp_ns=START_NS + round(t_s * 1e9),
+        stamp_ns=stamp_ns,
         image_bgr=image_bgr,
         depth_m=depth_m,
         scan=LaserScan(
-            stamp_ns=START_NS + round(t_s * 1e9),
+            stamp_ns=stamp_ns,
             ranges_m=ranges_m.astype(np.float32),
             angle_min_rad=-np.pi,
             angle_step_rad=np.pi / 180,

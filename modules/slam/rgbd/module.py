@@ -27,6 +27,7 @@ from .relocalizer import Relocalizer, appearance
 from .visual_map import VisualMap
 
 _KEYFRAME_FEATURES = 50  # with depth, that a keyframe needs
+_SEARCHED_IMAGES = 3  # looked for in the map before a new place is begun by odometry
 _START_VARIANCE = 1e-8  # the first pose is the origin by definition
 
 
@@ -119,6 +120,7 @@ class RgbdSlam:
         self._local_ids = np.zeros(0, np.int64)  # landmarks of the local map
         self._observations = 0
         self._is_lost = False
+        self._unknown_images = 0  # that showed enough, since the map was last seen
 
     def set_pose(self, T_map_local: Transform) -> None:
         """Place `local` in the map (Eq. 1)."""
@@ -139,9 +141,11 @@ class RgbdSlam:
         if not len(self._map.keyframes):
             return self._start(observation, gray, features, T_predicted)
         fix = self._locate(features, gray, T_predicted)
-        if fix is None:
-            return self._lose(observation, T_predicted)
-        return self._hold(observation, gray, features, fix)
+        if fix is not None:
+            return self._hold(observation, gray, features, fix, T_predicted)
+        if self._motion.is_reckoned and self._is_unknown_place(features):
+            return self._start(observation, gray, features, T_predicted)
+        return self._lose(observation, T_predicted)
 
     def get_pose(self) -> Transform:
         """Return T_map_base = T_map_local @ T_local_base of the last observation (Eq. 2)."""
@@ -162,6 +166,11 @@ class RgbdSlam:
             fix = self._localizer.anywhere(features, self._local_ids)
         return fix if fix is not None else self._relocalizer.find(features, gray)
 
+    def _is_unknown_place(self, features: Features) -> bool:
+        """Tell whether images that show enough were looked for in the map often enough."""
+        self._unknown_images += features.deep_count >= _KEYFRAME_FEATURES
+        return self._unknown_images > _SEARCHED_IMAGES
+
     def _start(
         self,
         observation: Observation,
@@ -169,35 +178,45 @@ class RgbdSlam:
         features: Features,
         T_predicted: Transform,
     ) -> Tracking:
-        """Make the first keyframe; wait, lost, for an image that has features with depth."""
+        """Hang a keyframe on the prediction; wait, lost, for an image with features and depth.
+
+        It is the map's first, or the first of a place that only odometry connects to the map.
+        """
         if features.deep_count < _KEYFRAME_FEATURES:
             return self._lose(observation, T_predicted)
         self._T_local_base = T_predicted
         self._motion.hold(observation, T_predicted)
         unseen = np.full(len(features), NO_LANDMARK)
         self._insert_keyframe(observation, gray, features, unseen, unseen[:0])
-        self._is_lost = False
+        self._is_lost, self._unknown_images = False, 0
         is_first = self._observations == 1
         return Tracking(
             stamp_ns=observation.stamp_ns,
             T_local_base=self._T_local_base.copy(),
-            # What the robot did before the first usable image is known from odometry at best.
+            # What the robot did before a usable image is known from odometry at best.
             status=TrackingStatus.TRACKING if is_first else TrackingStatus.DEGRADED,
             covariance=_START_VARIANCE * np.eye(6),
             inliers=features.deep_count,
         )
 
     def _hold(
-        self, observation: Observation, gray: NDArray[np.uint8], features: Features, fix: Fix
+        self,
+        observation: Observation,
+        gray: NDArray[np.uint8],
+        features: Features,
+        fix: Fix,
+        T_predicted: Transform,
     ) -> Tracking:
         """Accept a pose, and extend the map where it is due."""
+        status = self._health.judge(fix.estimate)
         T_local_base, covariance = fix.estimate.T_local_base, fix.estimate.covariance
-        self._T_local_base, self._is_lost = T_local_base, False
+        if status is TrackingStatus.DEGRADED and self._motion.is_reckoned:
+            T_local_base = T_predicted  # over a few frames odometry errs less than few landmarks
+        self._T_local_base, self._is_lost, self._unknown_images = T_local_base, False, 0
         self._motion.hold(observation, T_local_base)
         self._local_ids = fix.local_ids
         self._map.count_sightings(fix.expected_ids, fix.landmark_ids)
         count = len(fix.landmark_ids)
-        status = self._health.judge(fix.estimate)
         wanted = self._keyframe_rule.wants(T_local_base, fix, self._map.keyframes)
         can_extend = features.deep_count >= _KEYFRAME_FEATURES
         if wanted and can_extend and status is TrackingStatus.TRACKING:

@@ -20,6 +20,7 @@ class MotionModel:
         self._twist_per_s = np.zeros(6)
         self._stamp_ns: int | None = None
         self._T_odom_base: Transform | None = None
+        self.is_reckoned = False  # odometry has carried the pose since it was last measured
 
     def predict(self, observation: Observation) -> Transform:
         """Return the expected T_local_base at the observation."""
@@ -39,11 +40,13 @@ class MotionModel:
         T_prev_curr = se3.inverse(self._T_local_base) @ T_local_base
         self._twist_per_s = se3.log(T_prev_curr) / gap_s if gap_s > 0 else np.zeros(6)
         self._step(observation, T_local_base)
+        self.is_reckoned = observation.T_odom_base is not None
 
     def lose(self, observation: Observation, T_predicted: Transform) -> None:
         """Go on from a prediction; without odometry or gyro, as if at rest."""
         self._twist_per_s = np.zeros(6)
         self._step(observation, T_predicted)
+        self.is_reckoned = self.is_reckoned and observation.T_odom_base is not None
 
     def _step(self, observation: Observation, T_local_base: Transform) -> None:
         self._T_local_base, self._stamp_ns = T_local_base, observation.stamp_ns

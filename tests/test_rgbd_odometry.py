@@ -1,0 +1,50 @@
+"""What wheel odometry gives the RGB-D module: a way on where its map ends."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from scenery import RIG, observation_at, room_observation
+
+from sceneslam.types import se3
+from sceneslam.types.observation import TrackingStatus
+
+YAML = Path(__file__).parents[1] / "conf" / "slam" / "rgbd.yaml"
+
+
+def drive_away_in_the_dark(*, has_odometry):
+    """See one wall, turn round in the dark, and see another; return the answers."""
+    config = OmegaConf.merge({"seed": 0}, {"node": OmegaConf.load(YAML)}).node
+    module = instantiate(config, _convert_="all")
+    module.activate(RIG)
+    observations = [room_observation(index) for index in range(6)]
+    start = observations[-1].T_odom_base
+    for step in range(1, 11):
+        seen = observation_at(start @ se3.from_xy_yaw(0, 0, 0.2 * step), (5 + step) / 30)
+        observations.append(replace(seen, image_bgr=np.zeros_like(seen.image_bgr)))
+    turned = start @ se3.from_xy_yaw(0, 0, 2.0)
+    for step in range(8):
+        there = turned @ se3.from_xy_yaw(0.01 * step, 0, 0)
+        observations.append(observation_at(there, (16 + step) / 30))
+    if not has_odometry:
+        observations = [replace(o, T_odom_base=None, gyro_base=None) for o in observations]
+    return [module.track(observation) for observation in observations], turned
+
+
+def test_new_place_is_hung_on_odometry_after_it_was_looked_for_in_the_map():
+    answers, turned = drive_away_in_the_dark(has_odometry=True)
+    assert {answer.status for answer in answers[6:16]} == {TrackingStatus.LOST}
+    assert {answer.status for answer in answers[16:19]} == {TrackingStatus.LOST}
+    assert answers[19].status is TrackingStatus.DEGRADED
+    assert answers[-1].status is TrackingStatus.TRACKING
+    first = room_observation(0).T_odom_base
+    truth = se3.inverse(first) @ turned @ se3.from_xy_yaw(0.07, 0, 0)
+    error = se3.inverse(truth) @ answers[-1].T_local_base
+    assert np.linalg.norm(error[:3, 3]) < 0.05 and se3.rotation_angle_rad(error) < 0.03
+
+
+def test_new_place_stays_lost_without_odometry():
+    answers, _ = drive_away_in_the_dark(has_odometry=False)
+    assert {answer.status for answer in answers[6:]} == {TrackingStatus.LOST}
