@@ -24,6 +24,7 @@ from .localizer import Fix, Localizer
 from .motion import MotionModel
 from .pose_solver import PoseSolver
 from .relocalizer import Relocalizer, appearance
+from .view import View
 from .visual_map import VisualMap
 
 _KEYFRAME_FEATURES = 50  # with depth, that a keyframe needs
@@ -138,13 +139,12 @@ class RgbdSlam:
             return self._lose(observation, T_predicted)
         gray = np.asarray(cv2.cvtColor(observation.image_bgr, cv2.COLOR_BGR2GRAY), np.uint8)
         features = self._extractor.extract(gray, observation.depth_m)
-        if not len(self._map.keyframes):
-            return self._start(observation, gray, features, T_predicted)
-        fix = self._locate(features, gray, T_predicted)
+        view = View(observation=observation, gray=gray, features=features, T_predicted=T_predicted)
+        fix = self._locate(view) if len(self._map.keyframes) else None
         if fix is not None:
-            return self._hold(observation, gray, features, fix, T_predicted)
-        if self._motion.is_reckoned and self._is_unknown_place(features):
-            return self._start(observation, gray, features, T_predicted)
+            return self._hold(view, fix)
+        if not len(self._map.keyframes) or self._is_unknown_place(features):
+            return self._start(view)
         return self._lose(observation, T_predicted)
 
     def get_pose(self) -> Transform:
@@ -158,80 +158,65 @@ class RgbdSlam:
     def shutdown(self) -> None:
         """Stop; nothing but memory is held, and the map stays readable."""
 
-    def _locate(
-        self, features: Features, gray: NDArray[np.uint8], T_predicted: Transform
-    ) -> Fix | None:
-        fix = self._localizer.near(features, T_predicted, self._local_ids)
+    def _locate(self, view: View) -> Fix | None:
+        fix = self._localizer.near(view.features, view.T_predicted, self._local_ids)
         if fix is None and not self._is_lost:
-            fix = self._localizer.anywhere(features, self._local_ids)
-        return fix if fix is not None else self._relocalizer.find(features, gray)
+            fix = self._localizer.anywhere(view.features, self._local_ids)
+        return fix if fix is not None else self._relocalizer.find(view.features, view.gray)
 
     def _is_unknown_place(self, features: Features) -> bool:
-        """Tell whether images that show enough were looked for in the map often enough."""
+        """Tell whether odometry led to a place that was often enough looked for in the map."""
         self._unknown_images += features.deep_count >= _KEYFRAME_FEATURES
-        return self._unknown_images > _SEARCHED_IMAGES
+        return self._motion.is_reckoned and self._unknown_images > _SEARCHED_IMAGES
 
-    def _start(
-        self,
-        observation: Observation,
-        gray: NDArray[np.uint8],
-        features: Features,
-        T_predicted: Transform,
-    ) -> Tracking:
+    def _start(self, view: View) -> Tracking:
         """Hang a keyframe on the prediction; wait, lost, for an image with features and depth.
 
         It is the map's first, or the first of a place that only odometry connects to the map.
         """
-        if features.deep_count < _KEYFRAME_FEATURES:
-            return self._lose(observation, T_predicted)
-        self._T_local_base = T_predicted
-        self._motion.hold(observation, T_predicted)
-        unseen = np.full(len(features), NO_LANDMARK)
-        self._insert_keyframe(observation, gray, features, unseen, unseen[:0])
-        self._is_lost, self._unknown_images = False, 0
+        if view.features.deep_count < _KEYFRAME_FEATURES:
+            return self._lose(view.observation, view.T_predicted)
+        self._hold_pose(view.observation, view.T_predicted)
+        unseen = np.full(len(view.features), NO_LANDMARK)
+        self._insert_keyframe(view, unseen, unseen[:0])
+        # What the robot did before a usable image is known from odometry at best.
         is_first = self._observations == 1
         return Tracking(
-            stamp_ns=observation.stamp_ns,
+            stamp_ns=view.observation.stamp_ns,
             T_local_base=self._T_local_base.copy(),
-            # What the robot did before a usable image is known from odometry at best.
             status=TrackingStatus.TRACKING if is_first else TrackingStatus.DEGRADED,
-            covariance=_START_VARIANCE * np.eye(6),
-            inliers=features.deep_count,
+            covariance=_START_VARIANCE * np.eye(6) if is_first else None,
+            inliers=view.features.deep_count,
         )
 
-    def _hold(
-        self,
-        observation: Observation,
-        gray: NDArray[np.uint8],
-        features: Features,
-        fix: Fix,
-        T_predicted: Transform,
-    ) -> Tracking:
+    def _hold(self, view: View, fix: Fix) -> Tracking:
         """Accept a pose, and extend the map where it is due."""
         status = self._health.judge(fix.estimate)
-        T_local_base, covariance = fix.estimate.T_local_base, fix.estimate.covariance
-        if status is TrackingStatus.DEGRADED and self._motion.is_reckoned:
-            T_local_base = T_predicted  # over a few frames odometry errs less than few landmarks
-        self._T_local_base, self._is_lost, self._unknown_images = T_local_base, False, 0
-        self._motion.hold(observation, T_local_base)
+        # Over a few frames odometry errs less than few landmarks do.
+        is_reckoned = status is TrackingStatus.DEGRADED and self._motion.is_reckoned
+        T_local_base = view.T_predicted if is_reckoned else fix.estimate.T_local_base
+        self._hold_pose(view.observation, T_local_base)
         self._local_ids = fix.local_ids
         self._map.count_sightings(fix.expected_ids, fix.landmark_ids)
-        count = len(fix.landmark_ids)
         wanted = self._keyframe_rule.wants(T_local_base, fix, self._map.keyframes)
-        can_extend = features.deep_count >= _KEYFRAME_FEATURES
+        can_extend = view.features.deep_count >= _KEYFRAME_FEATURES
         if wanted and can_extend and status is TrackingStatus.TRACKING:
-            landmark_ids = np.full(len(features), NO_LANDMARK)
+            landmark_ids = np.full(len(view.features), NO_LANDMARK)
             landmark_ids[fix.feature_rows] = fix.landmark_ids
-            self._insert_keyframe(observation, gray, features, landmark_ids, fix.deep_rows)
-        possible = max(1, min(len(fix.expected_ids), len(features)))
+            self._insert_keyframe(view, landmark_ids, fix.deep_rows)
+        possible = max(1, min(len(fix.expected_ids), len(view.features)))
         return Tracking(
-            stamp_ns=observation.stamp_ns,
+            stamp_ns=view.observation.stamp_ns,
             T_local_base=T_local_base.copy(),
             status=status,
-            covariance=covariance,
-            quality_ratio=min(1.0, count / possible),
-            inliers=count,
+            covariance=None if is_reckoned else fix.estimate.covariance,
+            quality_ratio=min(1.0, len(fix.landmark_ids) / possible),
+            inliers=len(fix.landmark_ids),
         )
+
+    def _hold_pose(self, observation: Observation, T_local_base: Transform) -> None:
+        self._T_local_base, self._is_lost, self._unknown_images = T_local_base, False, 0
+        self._motion.hold(observation, T_local_base)
 
     def _lose(self, observation: Observation, T_predicted: Transform) -> Tracking:
         self._motion.lose(observation, T_predicted)
@@ -244,23 +229,19 @@ class RgbdSlam:
         )
 
     def _insert_keyframe(
-        self,
-        observation: Observation,
-        gray: NDArray[np.uint8],
-        features: Features,
-        landmark_ids: NDArray[np.int64],
-        deep_rows: NDArray[np.int64],
+        self, view: View, landmark_ids: NDArray[np.int64], deep_rows: NDArray[np.int64]
     ) -> None:
-        image_bgr, depth_m = observation.image_bgr, observation.depth_m
+        image_bgr, depth_m = view.observation.image_bgr, view.observation.depth_m
         if image_bgr is None or depth_m is None:
             return
+        stamp_ns = view.observation.stamp_ns
         keyframe = Keyframe(
-            stamp_ns=observation.stamp_ns,
+            stamp_ns=stamp_ns,
             T_local_base=self._T_local_base.copy(),
-            features=features,
+            features=view.features,
             landmark_ids=landmark_ids,
-            appearance=appearance(gray),
-            view=self._layers.view(depth_m, image_bgr, stamp_ns=observation.stamp_ns),
+            appearance=appearance(view.gray),
+            view=self._layers.view(depth_m, image_bgr, stamp_ns=stamp_ns),
         )
         self._map.insert(keyframe, deep_rows=deep_rows)
         self._keyframe_rule.restart()
