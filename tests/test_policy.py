@@ -3,10 +3,11 @@
 import itertools
 
 import pytest
+from driving import policy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sceneslam.bus.policy import Policy, SceneFilter
+from sceneslam.bus.policy import SceneFilter
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import UNSURE, SceneVote
 
@@ -75,14 +76,6 @@ def test_confirmed_scenes_alternate(scenes):
     ],
 )
 def test_impossible_policy_is_refused_with_its_key(key, value):
-    values = {
-        "handover": "cold",
-        "confirm_window_s": 2.0,
-        "first_confirm_window_s": 0.0,
-        "lost_patience_s": 0.3,
-        "blind_patience_s": 0.1,
-        "bridge_s": 0.5,
-    }
     with pytest.raises(ConfigError) as caught:
-        Policy(**(values | {key: value}))
+        policy(**{key: value})
     assert caught.value.key == key

@@ -1,0 +1,63 @@
+"""Drives the bus along a path on which every module knows its motion exactly."""
+
+import numpy as np
+from fakes import PERIOD_NS, RIG, ScriptedDetector, observation, true_pose
+
+from sceneslam.atlas.atlas import Atlas
+from sceneslam.bus.bus import Bus
+from sceneslam.bus.events import EventLog
+from sceneslam.bus.policy import Policy
+from sceneslam.types import se3
+
+TABLE = {"Bright": ["bright", "dark"], "Dark": ["dark", "bright"]}
+
+
+def policy(**changes):
+    values = {
+        "handover": "cold",
+        "confirm_window_s": 2.0,
+        "first_confirm_window_s": 0.0,
+        "lost_patience_s": 0.3,
+        "blind_patience_s": 0.1,
+        "bridge_s": 0.5,
+    }
+    return Policy(**(values | changes))
+
+
+def drive(modules, *, steps=100, scene_at=lambda i: "Bright", table=TABLE, **options):
+    """Run the bus over a straight drive; return it with its atlas, log and detector."""
+    has_odometry = options.pop("has_odometry", True)
+    feed = options.pop("feed", lambda index: observation(index, has_odometry=has_odometry))
+    atlas, log, detector = Atlas(voxel_m=0.05), EventLog(), ScriptedDetector(scene_at)
+    bus = Bus(
+        detector=detector,
+        modules=modules,
+        scenes=table,
+        policy=policy(**options),
+        rig=RIG,
+        atlas=atlas,
+        log=log,
+    )
+    for index in range(steps):
+        if bus.state == "terminate":
+            break
+        bus.step(feed(index))
+    bus.close(index * PERIOD_NS)
+    return bus, atlas, log, detector
+
+
+def events(log, kind):
+    return [event for event in log.events if event["event"] == kind]
+
+
+def dark_from(index):
+    return lambda i: "Dark" if i >= index else "Bright"
+
+
+def assert_exact(atlas):
+    T_first = true_pose(int(atlas.trajectory.stamps_ns[0]))
+    for stamp_ns, T_map_base in zip(
+        atlas.trajectory.stamps_ns.tolist(), atlas.trajectory.T_world_base, strict=True
+    ):
+        expected = se3.inverse(T_first) @ true_pose(stamp_ns)
+        np.testing.assert_allclose(T_map_base, expected, atol=1e-9)

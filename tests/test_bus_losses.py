@@ -1,0 +1,113 @@
+"""The bus: losses, silent sensors and improper answers cost no pose that could be told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from driving import assert_exact, dark_from, drive, events
+from fakes import PERIOD_NS, ExactModule, observation, true_pose
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sceneslam.types import se3
+from sceneslam.types.rig import Sensor
+
+
+def test_module_lost_right_after_the_switch_is_survived():
+    """Both modules gave the hand-over's instant a pose: no velocity can be told from these two."""
+    dark = ExactModule(lost={61, 62})
+    _, atlas, _, _ = drive(
+        {"bright": ExactModule(), "dark": dark}, scene_at=dark_from(40), has_odometry=False
+    )
+    assert len(atlas.trajectory) == 100
+    assert_exact(atlas)
+
+
+def test_fallback_that_never_tracks_gives_the_first_choice_another_chance():
+    bright, dark = ExactModule(lost=range(50, 56)), ExactModule(lost=range(0, 1000))
+    _, atlas, _, _ = drive({"bright": bright, "dark": dark}, steps=300, has_odometry=False)
+    assert atlas.pose_modules.count("bright") > 240
+
+
+def test_slow_sensor_is_not_a_lost_module():
+    """The module's sensor speaks with every fifth observation, as a 2 Hz laser beside a camera."""
+
+    class Slow(ExactModule):
+        requires = (frozenset({Sensor.POINTS}),)
+
+    def feed(index):
+        points = np.zeros((1, 3), np.float32) if index % 5 == 0 else None
+        return replace(observation(index), points_lidar=points)
+
+    modules = {"bright": Slow(), "dark": ExactModule()}
+    _, atlas, log, _ = drive(modules, lost_patience_s=0.3, feed=feed)
+    assert len(events(log, "decision")) == 1 and len(atlas.trajectory) == 100
+    assert_exact(atlas)
+
+
+def test_sensor_that_falls_silent_calls_in_the_fallback():
+    def feed(index):
+        return observation(index) if index < 50 else replace(observation(index), image_bgr=None)
+
+    class Blind(ExactModule):
+        requires = (frozenset({Sensor.ODOMETRY}),)
+
+    modules = {"bright": ExactModule(), "dark": Blind()}
+    _, atlas, log, _ = drive(modules, feed=feed)
+    assert events(log, "decision")[1]["reason"] == "lost"
+    assert_exact(atlas)
+
+
+@pytest.mark.parametrize("answer", [None, "pose", np.eye(3)])
+def test_answer_that_is_no_tracking_ends_the_module_not_the_run(answer):
+    class Wrong(ExactModule):
+        def track(self, observation):
+            if observation.stamp_ns != 50 * PERIOD_NS:
+                return super().track(observation)
+            if not isinstance(answer, np.ndarray):
+                return answer
+            return replace(super().track(observation), T_local_base=answer)
+
+    _, atlas, log, _ = drive({"bright": Wrong(), "dark": ExactModule()})
+    assert len(atlas.trajectory) == 100 and len(events(log, "fault")) == 1
+    assert_exact(atlas)
+
+
+def test_module_may_go_on_with_its_own_matrix():
+    class InPlace(ExactModule):
+        def activate(self, rig):
+            super().activate(rig)
+            self._mine = np.eye(4)
+
+        def track(self, observation):
+            self._mine[:] = super().track(observation).T_local_base
+            return replace(super().track(observation), T_local_base=self._mine)
+
+    _, atlas, _, _ = drive({"bright": InPlace(), "dark": ExactModule()})
+    assert_exact(atlas)
+    (session,) = atlas.sessions
+    np.testing.assert_allclose(
+        session.trajectory.T_world_base[10], true_pose(10 * PERIOD_NS), atol=1e-9
+    )
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    switch=st.integers(1, 60),
+    lost=st.sets(st.integers(1, 79), max_size=20),
+    twist=st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6).map(np.array),
+)
+def test_trajectory_is_continuous_wherever_the_switch_and_the_losses_fall(switch, lost, twist):
+    start = se3.exp(twist)
+
+    class Elsewhere(ExactModule):
+        """Its `local` begins anywhere, as that of a module that loaded a map."""
+
+        def track(self, observation):
+            tracking = super().track(observation)
+            return replace(tracking, T_local_base=start @ tracking.T_local_base)
+
+    modules = {"bright": ExactModule(lost=lost), "dark": Elsewhere(lost=lost)}
+    _, atlas, _, _ = drive(modules, steps=80, scene_at=dark_from(switch), confirm_window_s=0.5)
+    assert len(atlas.trajectory) == 80
+    assert_exact(atlas)
