@@ -183,7 +183,7 @@ class Bus:
             self._estimator.track(observation, by_velocity=self.candidate_left())
         except ModuleError as error:
             self._fault(observation.stamp_ns, str(error))
-            self._estimator.bridge(observation)
+            self._estimator.bridge(observation, by_velocity=True)
 
     def _reason_to_switch(self, observation: Observation) -> str | None:
         """Return why another module has to take over, None when the active one goes on."""

@@ -83,11 +83,7 @@ class Estimator:
         if tracking is None or tracking.status is TrackingStatus.LOST:
             if tracking is not None or self._is_overdue(observation.stamp_ns):
                 self._note_loss(observation.stamp_ns)
-            T_map_base = self._bridge.predict(
-                observation, by_velocity=by_velocity or tracking is None
-            )
-            if T_map_base is not None:
-                self._atlas.add(observation.stamp_ns, T_map_base, BRIDGED)
+            self.bridge(observation, by_velocity=by_velocity or tracking is None)
             return
         self._take(observation, tracking)
 
@@ -96,9 +92,9 @@ class Estimator:
         self._retire(self.active, self._session)
         self.active = None
 
-    def bridge(self, observation: Observation) -> None:
-        """Give the observation a bridged pose where its module just failed."""
-        T_map_base = self._bridge.predict(observation, by_velocity=True)
+    def bridge(self, observation: Observation, *, by_velocity: bool) -> None:
+        """Give the observation the pose that odometry tells, or constant velocity if allowed."""
+        T_map_base = self._bridge.predict(observation, by_velocity=by_velocity)
         if T_map_base is not None:
             self._atlas.add(observation.stamp_ns, T_map_base, BRIDGED)
 

@@ -12,10 +12,9 @@ from sceneslam.interfaces import Source
 from sceneslam.ros.pixels import locked
 from sceneslam.sources.dim_sensor import DimSensor
 from sceneslam.sources.light_schedule import LightSchedule, check_steps
-from sceneslam.sources.spanned import Span, Spanned
+from sceneslam.sources.wrapped import Wrapped
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Rig
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth, SceneChange
 
@@ -23,7 +22,7 @@ BRIGHT, DARK = "Bright", "Dark"
 _DARK_BELOW = 0.5  # of the recorded light: a mean grey of 130 becomes 95
 
 
-class LightsOut:
+class LightsOut(Wrapped):
     """Dims the colour images of a source by a schedule; depth, which brings its light, stays.
 
     `schedule` is a list of [time, level], the time in seconds from the first observation or, with
@@ -58,7 +57,7 @@ class LightsOut:
         steps = check_steps(schedule, is_ratio=schedule_unit == "ratio")
         if lights != "story":
             steps = [[0.0, 1.0 if lights == "on" else 0.0]]
-        self._source = source
+        super().__init__(source)
         self._ambient_ratio = ambient_ratio
         self._seed = seed
         self._sensor = DimSensor(
@@ -69,26 +68,6 @@ class LightsOut:
         is_ratio = schedule_unit == "ratio" and len(steps) > 1
         unit_s = self._duration_s() if is_ratio else 1.0
         self._schedule = LightSchedule.of_steps(steps, unit_s=unit_s, fade_s=fade_s)
-
-    @property
-    def rig(self) -> Rig:
-        """Return the source's rig."""
-        return self._source.rig
-
-    @property
-    def length(self) -> int | None:
-        """Return the source's length."""
-        return self._source.length
-
-    @property
-    def faults(self) -> Sequence[str]:
-        """Return the source's faults."""
-        return self._source.faults
-
-    @property
-    def span(self) -> Span | None:
-        """Return the source's span where it knows one."""
-        return self._source.span if isinstance(self._source, Spanned) else None
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the source's observations, dimmed."""

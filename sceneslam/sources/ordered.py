@@ -7,14 +7,13 @@ from collections.abc import Iterator, Sequence
 from sceneslam.interfaces import Source
 from sceneslam.sources.clean import cleaned
 from sceneslam.sources.faults import FaultLog, at_stamp
-from sceneslam.sources.spanned import Span, Spanned
+from sceneslam.sources.wrapped import Wrapped
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Rig
 from sceneslam.types.truth import GroundTruth
 
 
-class Ordered:
+class Ordered(Wrapped):
     """Leaves out observations whose stamps repeat or run backwards, and values that are NaN.
 
     A single stamp far ahead of its neighbours is left out too, rather than all that follow it. A
@@ -24,29 +23,14 @@ class Ordered:
     def __init__(self, source: Source, max_gap_s: float = 5.0) -> None:
         if not max_gap_s > 0:
             raise ConfigError("max_gap_s", max_gap_s, "a number above 0 [s]")
-        self._source = source
+        super().__init__(source)
         self._max_gap_ns = round(max_gap_s * 1e9)
         self._log = FaultLog()
-
-    @property
-    def rig(self) -> Rig:
-        """Return the source's rig."""
-        return self._source.rig
-
-    @property
-    def length(self) -> int | None:
-        """Return how many observations the source will give at most."""
-        return self._source.length
 
     @property
     def faults(self) -> Sequence[str]:
         """Return the source's faults and what was left out here."""
         return [*self._source.faults, *self._log.sentences()]
-
-    @property
-    def span(self) -> Span | None:
-        """Return the source's span where it knows one."""
-        return self._source.span if isinstance(self._source, Spanned) else None
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the source's observations by rising stamp."""

@@ -1,0 +1,36 @@
+"""A source around another: what it does not change is the inner one's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sceneslam.interfaces import Source
+from sceneslam.sources.spanned import Span, Spanned
+from sceneslam.types.rig import Rig
+
+
+class Wrapped:
+    """Passes on the rig, length, faults and span of its source."""
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+
+    @property
+    def rig(self) -> Rig:
+        """Return the source's rig."""
+        return self._source.rig
+
+    @property
+    def length(self) -> int | None:
+        """Return how many observations the source will give at most."""
+        return self._source.length
+
+    @property
+    def faults(self) -> Sequence[str]:
+        """Return the source's faults."""
+        return self._source.faults
+
+    @property
+    def span(self) -> Span | None:
+        """Return the source's span where it knows one."""
+        return self._source.span if isinstance(self._source, Spanned) else None
