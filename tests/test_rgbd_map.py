@@ -3,8 +3,9 @@
 import cv2
 import numpy as np
 import pytest
+from rgbd_features import features_at, random_descriptors
 
-from sceneslam.modules.slam.rgbd.features import FeatureExtractor, Features
+from sceneslam.modules.slam.rgbd.features import FeatureExtractor
 from sceneslam.modules.slam.rgbd.keyframes import DepthView, Keyframe, KeyframeStore
 from sceneslam.modules.slam.rgbd.landmarks import LandmarkTable, Looks
 from sceneslam.modules.slam.rgbd.layers import LayerBuilder
@@ -15,20 +16,6 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera
 
 CAMERA = Camera(size_wh=(640, 480), fx=525.0, fy=520.0, cx=319.0, cy=241.0)
-
-
-def features_at(uv_px, descriptors, levels=None, depth_m=None):
-    count = len(uv_px)
-    return Features(
-        uv_px=np.asarray(uv_px, float),
-        levels=np.zeros(count, np.int64) if levels is None else levels,
-        descriptors=descriptors,
-        depth_m=np.zeros(count) if depth_m is None else depth_m,
-    )
-
-
-def random_descriptors(rng, count):
-    return rng.integers(0, 256, (count, 32), dtype=np.uint8)
 
 
 def looks(count):

@@ -1,0 +1,19 @@
+"""Features made up for the tests of the rgbd module's parts."""
+
+import numpy as np
+
+from sceneslam.modules.slam.rgbd.features import Features
+
+
+def features_at(uv_px, descriptors, levels=None, depth_m=None):
+    count = len(uv_px)
+    return Features(
+        uv_px=np.asarray(uv_px, float),
+        levels=np.zeros(count, np.int64) if levels is None else levels,
+        descriptors=descriptors,
+        depth_m=np.zeros(count) if depth_m is None else depth_m,
+    )
+
+
+def random_descriptors(rng, count):
+    return rng.integers(0, 256, (count, 32), dtype=np.uint8)
