@@ -71,6 +71,7 @@ def _save(
     """Write the run's folder, what matters most first."""
     result, truth = loop.result(), loop.truth
     result.trajectory.write_tum(folder / "trajectory.tum")
+    result.online.write_tum(folder / "trajectory_online.tum")
     for session in result.sessions:
         name = f"trajectory_{session.index}_{session.module}.tum"
         session.trajectory.write_tum(folder / name)

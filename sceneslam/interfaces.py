@@ -17,6 +17,7 @@ from sceneslam.types.observation import Observation, SceneVote, Tracking
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import Event
 from sceneslam.types.se3 import Transform
+from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
 
@@ -118,6 +119,14 @@ class SlamModule(Protocol):
 
     def get_pose(self) -> Transform:
         """Return T_map_base = T_map_local @ T_local_base of the last observation (Eq. 2)."""
+        ...
+
+    def get_trajectory(self) -> Trajectory:
+        """Return T_local_base at every stamp that held a pose, as best known by now.
+
+        Empty where a module never revises what `track` told. Asked once, before `get_map`, when
+        the module is about to be shut down; a last optimisation belongs here. May be slow.
+        """
         ...
 
     def get_map(self) -> MapLayers:

@@ -73,7 +73,7 @@ class Loop:
         if self._bus.state == "terminate":
             self.faults.append(self._why_over())
         self._bus.close(self._last_ns())
-        if not len(self._parts.atlas.trajectory) and not self.faults:
+        if not len(self._parts.atlas.online) and not self.faults:
             self.faults.append(self._why_no_pose())
         self.faults += self._parts.source.faults
         if self._observed_ns:  # else it may have to be rendered first, for nothing
@@ -88,6 +88,7 @@ class Loop:
         return RunResult(
             observed_ns=np.array(self._observed_ns, np.int64),
             trajectory=atlas.trajectory,
+            online=atlas.online,
             modules=atlas.pose_modules,
             sessions=atlas.sessions,
             map=atlas.fuse_maps(),

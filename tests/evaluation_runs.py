@@ -131,6 +131,7 @@ def switched_run(count: int = 200, true_at: int = 80, decided_at: int = 100) -> 
     return RunResult(
         observed_ns=stamps(count),
         trajectory=shaken(loop(count), 0.001),
+        online=shaken(loop(count), 0.001),
         modules=["rgbd"] * decided_at + ["laser"] * (count - decided_at),
         sessions=[],
         map=hybrid_map(),
@@ -156,6 +157,7 @@ def poseless_run(observed: int = 0) -> RunResult:
     return RunResult(
         observed_ns=stamps(observed),
         trajectory=Trajectory.empty(),
+        online=Trajectory.empty(),
         modules=[],
         sessions=[],
         map=empty_map(),

@@ -109,6 +109,9 @@ class ExactModule:
     def get_pose(self):
         return self._T_map_local @ self._T_local_base
 
+    def get_trajectory(self):
+        return Trajectory.empty()
+
     def get_map(self):
         return MapLayers()
 

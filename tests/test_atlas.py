@@ -7,6 +7,7 @@ from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.save import save_map
 from sceneslam.types import se3
 from sceneslam.types.maps import GridLayer, MapLayers, PointLayer
+from sceneslam.types.trajectory import Trajectory
 
 
 def wall_grid(resolution_m=0.1):
@@ -19,7 +20,7 @@ def wall_grid(resolution_m=0.1):
 def atlas_of(*placed):
     atlas = Atlas(voxel_m=0.05)
     for module, T_map_local, layers in placed:
-        atlas.add_layers(atlas.begin_session(module, T_map_local), layers)
+        atlas.close_session(atlas.begin_session(module, T_map_local), layers, Trajectory.empty())
     return atlas
 
 

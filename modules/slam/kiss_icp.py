@@ -16,6 +16,7 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers, PointLayer
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
 
 from .clouds import CloudReader
 from .icp_map import IcpMap
@@ -128,6 +129,10 @@ class KissIcp:
     def get_pose(self) -> se3.Transform:
         """Return T_map_base of the last observation."""
         return self._T_map_local @ self._T_local_base
+
+    def get_trajectory(self) -> Trajectory:
+        """Return no poses: ICP against a map that moves along revises nothing."""
+        return Trajectory.empty()
 
     def get_map(self) -> MapLayers:
         """Return the voxel map in `local`: what lies within the sensor's range by now."""

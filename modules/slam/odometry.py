@@ -12,6 +12,7 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
 
 _DEVIATION_MIN = 1e-4  # m and rad, of any pose
 
@@ -74,6 +75,10 @@ class Odometry:
     def get_pose(self) -> se3.Transform:
         """Return T_map_base of the last observation."""
         return self._T_map_local @ self._T_local_base
+
+    def get_trajectory(self) -> Trajectory:
+        """Return no poses: dead reckoning revises nothing."""
+        return Trajectory.empty()
 
     def get_map(self) -> MapLayers:
         """Return no layers: dead reckoning sees nothing."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sceneslam.atlas.fusion import fuse
+from sceneslam.atlas.revision import Revised, Told, revise
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import HybridMap, MapLayers
 from sceneslam.types.run import Session
@@ -26,6 +27,13 @@ class _Open:
     stamps_ns: list[int] = field(default_factory=list)
     poses: list[Transform] = field(default_factory=list)  # T_local_base
     layers: MapLayers = field(default_factory=MapLayers)
+    revised: Trajectory = field(default_factory=Trajectory.empty)  # T_local_base
+
+    @property
+    def told(self) -> Told:
+        """Return its poses, as told and as revised."""
+        online = _trajectory(self.stamps_ns, self.poses)
+        return Told(T_map_local=self.T_map_local, online=online, revised=self.revised)
 
 
 class Atlas:
@@ -39,6 +47,7 @@ class Atlas:
         self._stamps_ns: list[int] = []
         self._poses: list[Transform] = []  # T_map_base
         self._modules: list[str] = []
+        self._pose_sessions: list[int] = []  # the session that was open, -1 before the first
 
     def begin_session(self, module: str, T_map_local: Transform) -> int:
         """Open a session of a module that was placed in the map (Eq. 1); return its number."""
@@ -56,10 +65,14 @@ class Atlas:
             self._stamps_ns.append(stamp_ns)
             self._poses.append(T_map_base)
             self._modules.append(module)
+            self._pose_sessions.append(len(self._sessions) - 1)
 
-    def add_layers(self, session: int, layers: MapLayers) -> None:
-        """Take the map that a session leaves behind."""
-        self._sessions[session].layers = layers
+    def close_session(self, session: int, layers: MapLayers, revised: Trajectory) -> None:
+        """Take the map that a session leaves behind, and its own poses (T_local_base) at the end.
+
+        `revised` is empty where the module stands by what it told.
+        """
+        self._sessions[session].layers, self._sessions[session].revised = layers, revised
 
     def has_pose(self, stamp_ns: int) -> bool:
         """Tell whether the newest pose is of this stamp."""
@@ -75,9 +88,17 @@ class Atlas:
         return self._stamps_ns[-1] if self._stamps_ns else None
 
     @property
-    def trajectory(self) -> Trajectory:
-        """Return T_map_base over time."""
+    def online(self) -> Trajectory:
+        """Return T_map_base over time as it was told at the time."""
         return _trajectory(self._stamps_ns, self._poses)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Return T_map_base over time with what the closed sessions revised."""
+        if not self._stamps_ns:
+            return Trajectory.empty()
+        stamps_ns = np.array(self._stamps_ns, np.int64)
+        return Trajectory(stamps_ns=stamps_ns, T_world_base=self._revise().T_map_base)
 
     @property
     def pose_modules(self) -> tuple[str, ...]:
@@ -86,21 +107,32 @@ class Atlas:
 
     @property
     def sessions(self) -> tuple[Session, ...]:
-        """Return every session so far."""
+        """Return every session so far, as revised."""
+        placed = self._revise().T_map_local
         return tuple(
             Session(
                 index=index,
                 module=session.module,
-                T_map_local=session.T_map_local,
-                trajectory=_trajectory(session.stamps_ns, session.poses),
+                T_map_local=T_map_local,
+                trajectory=session.revised if len(session.revised) else session.told.online,
             )
-            for index, session in enumerate(self._sessions)
+            for index, (session, T_map_local) in enumerate(zip(self._sessions, placed, strict=True))
         )
 
     def fuse_maps(self) -> HybridMap:
         """Return the one map of all sessions (the paper's hybrid map)."""
+        placed = zip(self._sessions, self._revise().T_map_local, strict=True)
         return fuse(
-            [(s.module, s.T_map_local, s.layers) for s in self._sessions], voxel_m=self._voxel_m
+            [(session.module, T_map_local, session.layers) for session, T_map_local in placed],
+            voxel_m=self._voxel_m,
+        )
+
+    def _revise(self) -> Revised:
+        return revise(
+            [session.told for session in self._sessions],
+            np.array(self._stamps_ns, np.int64),
+            np.array(self._poses).reshape(-1, 4, 4),
+            np.array(self._pose_sessions, np.int64),
         )
 
 

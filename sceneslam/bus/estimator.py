@@ -161,6 +161,6 @@ class Estimator:
     def _retire(self, runner: Runner | None, session: int | None) -> None:
         if runner is None:
             return
-        layers = runner.retire()
+        legacy = runner.retire()
         if session is not None:
-            self._atlas.add_layers(session, layers)
+            self._atlas.close_session(session, legacy.layers, legacy.trajectory)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from time import perf_counter_ns
 
 import numpy as np
@@ -15,8 +15,17 @@ from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
+from sceneslam.types.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Legacy:
+    """What a module leaves behind."""
+
+    layers: MapLayers
+    trajectory: Trajectory  # T_local_base as revised, empty where nothing was
 
 
 class Runner:
@@ -77,10 +86,15 @@ class Runner:
             self.track_ms.append(cost_ns / 1e6)
         return tracking
 
-    def retire(self) -> MapLayers:
-        """Shut the module down and return its map, empty layers when it cannot give one."""
-        layers = MapLayers()
+    def retire(self) -> Legacy:
+        """Shut the module down and return what it leaves, empty where it cannot give it."""
+        layers, trajectory = MapLayers(), Trajectory.empty()
         began_ns = perf_counter_ns()
+        try:
+            if self._is_active:
+                trajectory = _checked_trajectory(self._module.get_trajectory())
+        except Exception as error:
+            self._report("could not give its trajectory", error)
         try:
             if self._is_active:
                 layers = self._module.get_map()
@@ -92,7 +106,7 @@ class Runner:
             self._report("could not be shut down", error)
         self._is_active = False
         self.spent_ns += perf_counter_ns() - began_ns
-        return layers
+        return Legacy(layers=layers, trajectory=trajectory)
 
     def _failed(self, what: str, error: Exception) -> ModuleError:
         self.is_failed = True
@@ -117,3 +131,16 @@ def _checked(tracking: object) -> Tracking:
         raise ValueError("T_local_base: it is not finite")
     T_local_base.flags.writeable = False
     return replace(tracking, T_local_base=T_local_base)
+
+
+def _checked_trajectory(trajectory: object) -> Trajectory:
+    """Return a trajectory of finite poses by rising stamp; raises TypeError or ValueError."""
+    if not isinstance(trajectory, Trajectory):
+        raise TypeError(f"get_trajectory returned {type(trajectory).__name__}, expected Trajectory")
+    if trajectory.T_world_base.shape != (len(trajectory), 4, 4):
+        raise ValueError(f"T_world_base: expected (N, 4, 4), got {trajectory.T_world_base.shape}")
+    if not np.isfinite(trajectory.T_world_base).all():
+        raise ValueError("T_world_base: it is not finite")
+    if (np.diff(trajectory.stamps_ns) <= 0).any():
+        raise ValueError("stamps_ns: they do not rise")
+    return trajectory

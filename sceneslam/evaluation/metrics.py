@@ -98,6 +98,7 @@ def _accuracy(
     return {
         "ate_rmse_m": absolute.rmse_m,
         "ate_max_m": absolute.max_m,
+        "ate_online_m": absolute_errors(result.online, true, gap_s).rmse_m,
         "rpe_trans_m": root_mean_square(relative.trans_m),
         "rpe_rot_rad": root_mean_square(relative.rot_rad),
         "correct_rate": rate,

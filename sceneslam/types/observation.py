@@ -90,3 +90,4 @@ class Tracking:
     covariance: NDArray[np.float64] | None = None  # (6, 6) of se3.log order [m, rad], base frame
     quality_ratio: float = 1.0  # 0 (nothing matched) to 1
     inliers: int = 0  # measurements that agree with the pose
+    revision: int = 0  # rises when the module corrected its past: the pose then jumps unmoved

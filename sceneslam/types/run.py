@@ -22,8 +22,8 @@ class Session:
 
     index: int
     module: str  # its key in `slam`
-    T_map_local: Transform  # the paper's T_conversion
-    trajectory: Trajectory  # T_local_base
+    T_map_local: Transform  # the paper's T_conversion, as revised
+    trajectory: Trajectory  # T_local_base, as revised
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -41,7 +41,8 @@ class RunResult:
     """Everything the bus and the atlas produced."""
 
     observed_ns: NDArray[np.int64]  # stamps of all observations fed
-    trajectory: Trajectory  # T_map_base
+    trajectory: Trajectory  # T_map_base, with what modules corrected afterwards
+    online: Trajectory  # the same stamps, as told at the time
     modules: Sequence[str]  # per pose: key of the module that gave it, "" where it was bridged
     sessions: Sequence[Session]
     map: HybridMap

@@ -12,6 +12,7 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers, PointLayer
 from sceneslam.types.observation import LaserScan, Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
 
 from ..depth_scan import DepthScanner
 from ..grid import OccupancyGrid
@@ -127,6 +128,10 @@ class LaserSlam:
     def get_pose(self) -> se3.Transform:
         """Return T_map_base of the last observation."""
         return self._T_map_local @ self._T_local_base
+
+    def get_trajectory(self) -> Trajectory:
+        """Return no poses: nothing is revised."""
+        return Trajectory.empty()
 
     def get_map(self) -> MapLayers:
         """Return the grid of all keyframes, and their returns as points, in `local`."""

@@ -14,6 +14,7 @@ from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.se3 import Transform
+from sceneslam.types.trajectory import Trajectory
 
 from .features import FeatureExtractor, Features
 from .judgement import HealthRule, KeyframeRule
@@ -150,6 +151,10 @@ class RgbdSlam:
     def get_pose(self) -> Transform:
         """Return T_map_base = T_map_local @ T_local_base of the last observation (Eq. 2)."""
         return self._T_map_local @ self._T_local_base
+
+    def get_trajectory(self) -> Trajectory:
+        """Return no poses: nothing is revised."""
+        return Trajectory.empty()
 
     def get_map(self) -> MapLayers:
         """Return the keyframes' cloud and, for a robot in the plane, their grid, in `local`."""

@@ -1,0 +1,68 @@
+"""What modules correct afterwards reaches the whole trajectory."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sceneslam.atlas.atlas import BRIDGED, Atlas
+from sceneslam.types import se3
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.trajectory import Trajectory
+
+twists = st.lists(st.floats(-2, 2), min_size=6, max_size=6).map(np.array)
+
+
+def drive(steps: int, twist: np.ndarray) -> np.ndarray:
+    return np.stack([se3.exp(index * twist) for index in range(steps)])
+
+
+def add_session(atlas, module, T_map_local, stamps_ns, poses):
+    session = atlas.begin_session(module, T_map_local)
+    for stamp_ns, T_local_base in zip(stamps_ns, poses, strict=True):
+        atlas.add_local(stamp_ns, T_local_base)
+        atlas.add(stamp_ns, T_map_local @ T_local_base, module)
+    return session
+
+
+def test_a_run_that_nobody_revised_stays_as_it_was_told_to_the_bit():
+    atlas = Atlas(voxel_m=0.05)
+    T_map_local = se3.exp(np.array([1.0, 2.0, 0.3, 0.1, 0.2, 0.9]))
+    session = add_session(atlas, "a", T_map_local, range(5), drive(5, np.full(6, 0.1)))
+    atlas.close_session(session, MapLayers(), Trajectory.empty())
+    np.testing.assert_array_equal(atlas.trajectory.T_world_base, atlas.online.T_world_base)
+
+
+@given(twist=twists, error=twists, placed=twists)
+def test_a_revised_session_carries_the_next_one_with_it(twist, error, placed):
+    atlas = Atlas(voxel_m=0.05)
+    true, T_map_local = drive(8, 0.1 * twist), se3.exp(placed)
+    drifting = np.stack([T @ se3.exp(0.01 * i * error) for i, T in enumerate(true)])
+    first = add_session(atlas, "a", T_map_local, range(5), drifting[:5])
+    later = [se3.inverse(true[4]) @ T for T in true[5:]]
+    T_map_next = T_map_local @ drifting[4]
+    second = add_session(atlas, "b", T_map_next, range(5, 8), later)
+    revised = Trajectory(stamps_ns=np.arange(5), T_world_base=true[:5])
+    atlas.close_session(first, MapLayers(), revised)
+    atlas.close_session(second, MapLayers(), Trajectory.empty())
+    np.testing.assert_allclose(atlas.trajectory.T_world_base, T_map_local @ true, atol=1e-9)
+    np.testing.assert_allclose(atlas.sessions[1].T_map_local, T_map_local @ true[4], atol=1e-9)
+    np.testing.assert_allclose(atlas.online.T_world_base[:5], T_map_local @ drifting[:5])
+
+
+def test_a_bridged_pose_moves_with_the_revised_pose_before_it():
+    atlas = Atlas(voxel_m=0.05)
+    session = add_session(atlas, "a", se3.identity(), [0, 1], [se3.identity()] * 2)
+    atlas.add(2, se3.from_xy_yaw(1.0, 0.0, 0.0), BRIDGED)
+    turned = np.stack([se3.identity(), se3.from_xy_yaw(0.0, 0.0, np.pi / 2)])
+    revised = Trajectory(stamps_ns=np.arange(2), T_world_base=turned)
+    atlas.close_session(session, MapLayers(), revised)
+    np.testing.assert_allclose(atlas.trajectory.positions_m[2], [0.0, 1.0, 0.0], atol=1e-12)
+
+
+def test_poses_that_a_revision_leaves_out_move_with_the_one_before():
+    atlas = Atlas(voxel_m=0.05)
+    session = add_session(atlas, "a", se3.identity(), [0, 1, 2], drive(3, np.eye(6)[0]))
+    shifted = se3.from_xy_yaw(0.0, 3.0, 0.0)[None]
+    revised = Trajectory(stamps_ns=np.array([1]), T_world_base=shifted)
+    atlas.close_session(session, MapLayers(), revised)
+    np.testing.assert_allclose(atlas.trajectory.positions_m, [[0, 0, 0], [0, 3, 0], [1, 3, 0]])
