@@ -90,6 +90,28 @@ def test_map_stays_within_its_limits_and_forgets_only_redundant_keyframes():
     assert max(np.diff(positions)) < 0.8
 
 
+def test_corrected_keyframes_take_along_the_landmarks_that_they_saw_first():
+    visual_map = VisualMap(
+        CAMERA, sigma_px=1.0, inverse_depth_sigma_per_m=0.003, keyframe_limit=9, landmark_limit=9999
+    )
+    first, second = keyframe_at(0.5), keyframe_at(1.5)
+    visual_map.insert(first, deep_rows=np.zeros(0, np.int64))
+    second.landmark_ids[:20] = first.landmark_ids[:20]
+    visual_map.insert(second, deep_rows=np.zeros(0, np.int64))
+    table = visual_map.landmarks
+    before = visual_map.predict(second.T_local_base, second.landmark_ids[20:])
+    shared_m = table.points_local[second.landmark_ids[:20]]
+    moved = second.T_local_base @ se3.exp(np.array([0.3, -0.1, 0.2, 0.1, 0.2, -0.3]))
+    visual_map.correct({1: moved})
+    assert (second.T_local_base == moved).all()
+    assert (table.points_local[second.landmark_ids[:20]] == shared_m).all()
+    after = visual_map.predict(moved, second.landmark_ids[20:])
+    assert after.uv_px == pytest.approx(before.uv_px)
+    assert (after.levels == before.levels).all()
+    product = table.covariance[second.landmark_ids] @ table.information[second.landmark_ids]
+    assert product == pytest.approx(np.repeat(np.eye(3)[None], 60, axis=0), abs=1e-6)
+
+
 def test_landmarks_are_predicted_where_they_were_seen():
     visual_map = VisualMap(
         CAMERA, sigma_px=1.0, inverse_depth_sigma_per_m=0.003, keyframe_limit=9, landmark_limit=9999

@@ -92,6 +92,15 @@ class KeyframeStore:
         ids = np.unique(np.concatenate([*seen, np.array([NO_LANDMARK])]))
         return np.asarray(ids[ids != NO_LANDMARK])
 
+    def owned_landmarks(self) -> dict[int, NDArray[np.int64]]:
+        """Return for every keyframe the landmarks that it saw before any other did."""
+        taken, owned = np.zeros(self._id_limit + 1, bool), {}
+        taken[NO_LANDMARK] = True
+        for keyframe_id, keyframe in self._keyframes.items():
+            ids = keyframe.landmark_ids[~taken[keyframe.landmark_ids]]
+            owned[keyframe_id], taken[ids] = ids, True
+        return owned
+
     def forget_landmarks(self, landmark_ids: NDArray[np.int64]) -> None:
         """Let no keyframe refer to these landmarks any more."""
         gone = self._marked(landmark_ids)

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types import se3
+from sceneslam.types.se3 import Transform
+
 _FIRST_CAPACITY = 4096
 
 
@@ -69,6 +72,14 @@ class LandmarkTable:
         self.points_local[ids] += np.linalg.solve(total, pull)[:, :, 0]
         self.information[ids] = total
         self.covariance[ids] = np.linalg.inv(total)
+
+    def move(self, ids: NDArray[np.int64], T_new_old: Transform) -> None:
+        """Carry landmarks, with all that points somewhere, to where a transform takes them."""
+        rotation = T_new_old[:3, :3]
+        self.points_local[ids] = se3.apply(T_new_old, self.points_local[ids])
+        self.normals_local[ids] = self.normals_local[ids] @ rotation.T
+        self.information[ids] = rotation @ self.information[ids] @ rotation.T
+        self.covariance[ids] = rotation @ self.covariance[ids] @ rotation.T
 
     def describe(self, ids: NDArray[np.int64], looks: Looks) -> None:
         """Replace how landmarks look by how they look now."""

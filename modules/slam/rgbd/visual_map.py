@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -130,6 +131,18 @@ class VisualMap:
         )
         self.keyframes.insert(keyframe)
         self._keep_limits()
+
+    def correct(self, T_local_base: Mapping[int, Transform]) -> None:
+        """Give keyframes, by id, new poses; each landmark moves along with its first keyframe."""
+        T_new_old = {
+            keyframe_id: T_new @ se3.inverse(self.keyframes[keyframe_id].T_local_base)
+            for keyframe_id, T_new in T_local_base.items()
+        }
+        for keyframe_id, landmark_ids in self.keyframes.owned_landmarks().items():
+            if keyframe_id in T_new_old:
+                self.landmarks.move(landmark_ids, T_new_old[keyframe_id])
+        for keyframe_id, T_new in T_local_base.items():
+            self.keyframes[keyframe_id].T_local_base = T_new
 
     def _locate(
         self, keyframe: Keyframe, rows: NDArray[np.int64]
