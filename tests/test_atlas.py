@@ -6,7 +6,13 @@ import pytest
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.save import save_map
 from sceneslam.types import se3
-from sceneslam.types.maps import GridLayer, MapLayers, PointLayer
+from sceneslam.types.maps import (
+    GridLayer,
+    LandmarkLayer,
+    MapLayers,
+    PointLayer,
+    PoseGraphLayer,
+)
 from sceneslam.types.trajectory import Trajectory
 
 
@@ -91,3 +97,50 @@ def test_map_without_layers_is_saved_empty(tmp_path):
     save_map(Atlas(voxel_m=0.05).fuse_maps(), tmp_path)
     assert b"element vertex 0" in (tmp_path / "points.ply").read_bytes()
     assert not (tmp_path / "grid.pgm").exists()
+
+
+def two_keyframes(step_m=1.0):
+    """A pose graph of two keyframes, one ahead of the other, measured as they stand."""
+    T_local_base = np.stack([se3.identity(), se3.from_xy_yaw(step_m, 0.0, 0.0)])
+    return PoseGraphLayer(
+        stamps_ns=np.array([1, 2_000_000_003]),
+        T_world_base=T_local_base,
+        edges=np.array([[0, 1]]),
+        T_from_to=T_local_base[1:],
+        information=np.diag([1.0, 2, 3, 4, 5, 6])[None] + 0.5,
+        is_loop=np.array([False]),
+    )
+
+
+def test_pose_graphs_of_all_sessions_lie_in_the_map_one_after_the_other():
+    layers = MapLayers(pose_graph=two_keyframes())
+    turned = se3.from_xy_yaw(5.0, 0.0, np.pi / 2)
+    hybrid = atlas_of(("a", se3.identity(), layers), ("b", turned, layers)).fuse_maps()
+    graph = hybrid.pose_graph
+    np.testing.assert_allclose(graph.T_world_base[:, 0, 3], [0, 1, 5, 5], atol=1e-12)
+    np.testing.assert_array_equal(graph.edges, [[0, 1], [2, 3]])
+    assert [hybrid.modules[i] for i in hybrid.node_modules] == ["a", "a", "b", "b"]
+
+
+def test_saved_pose_graph_is_what_gtsam_reads(tmp_path):
+    gtsam = pytest.importorskip("gtsam")
+    layers = MapLayers(pose_graph=two_keyframes())
+    save_map(atlas_of(("a", se3.identity(), layers)).fuse_maps(), tmp_path)
+    graph, values = gtsam.readG2o(str(tmp_path / "pose_graph.g2o"), True)
+    np.testing.assert_allclose(values.atPose3(1).translation(), [1, 0, 0])
+    information = gtsam.BetweenFactorPose3.noiseModel(graph.at(0)).information()
+    np.testing.assert_allclose(np.diag(information), [4.5, 5.5, 6.5, 1.5, 2.5, 3.5])
+    assert Trajectory.read_tum(tmp_path / "pose_graph.tum").stamps_ns.tolist() == [1, 2_000_000_003]
+
+
+def test_saved_landmarks_say_where_they_come_from(tmp_path):
+    landmarks = LandmarkLayer(
+        points=np.array([[1, 2, 3]], np.float32),
+        first_stamps_ns=np.array([1_500_000_000]),
+        sightings=np.array([7]),
+    )
+    save_map(atlas_of(("a", se3.identity(), MapLayers(landmarks=landmarks))).fuse_maps(), tmp_path)
+    header, _, body = (tmp_path / "landmarks.ply").read_bytes().partition(b"end_header\n")
+    assert b"property double first_seen_s\nproperty int sightings" in header
+    row = np.frombuffer(body, "<f4,<f4,<f4,<f8,<i4,u1")[0]
+    assert row.tolist() == (1.0, 2.0, 3.0, 1.5, 7, 0)

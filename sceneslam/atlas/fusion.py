@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.atlas.graph import join_landmarks, join_pose_graphs
 from sceneslam.types import se3
 from sceneslam.types.maps import GridLayer, HybridMap, MapLayers, PointLayer
 from sceneslam.types.se3 import Transform
@@ -33,12 +34,28 @@ def fuse(placed: Sequence[Placed], *, voxel_m: float) -> HybridMap:
     cloud, color = np.concatenate(points), np.concatenate(colors)
     owner = np.concatenate([np.zeros(0, np.uint8), *owners])
     keep = _one_per_voxel(cloud, owner, voxel_m)
+    graphs = [(n, T, m.pose_graph) for n, T, m in placed if m.pose_graph is not None]
+    landmarks = [(n, T, m.landmarks) for n, T, m in placed if m.landmarks is not None]
     return HybridMap(
         points=PointLayer(points=cloud[keep], colors_bgr=color[keep]),
         point_modules=owner[keep],
         modules=modules,
         grid=_fuse_grids([(T, m.grid) for _, T, m in placed if m.grid is not None]),
+        pose_graph=join_pose_graphs([(T, graph) for _, T, graph in graphs]),
+        node_modules=_owners([(n, len(graph.stamps_ns)) for n, _, graph in graphs], modules),
+        landmarks=join_landmarks([(T, layer) for _, T, layer in landmarks]),
+        landmark_modules=_owners([(n, len(layer.points)) for n, _, layer in landmarks], modules),
     )
+
+
+def _owners(
+    counts: Sequence[tuple[str, int]], modules: tuple[str, ...]
+) -> NDArray[np.uint8] | None:
+    """Return per row the index of its module, from how many rows each module has in turn."""
+    if not counts:
+        return None
+    numbers = np.array([modules.index(name) for name, _ in counts], np.uint8)
+    return np.repeat(numbers, [count for _, count in counts])
 
 
 def _one_per_voxel(

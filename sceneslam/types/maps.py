@@ -26,18 +26,48 @@ class GridLayer:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseGraphLayer:
+    """Keyframes or submaps, and what was measured between them. Node i is row i, by rising stamp.
+
+    The information is the inverse covariance of se3.log(T_from_to) about the measurement.
+    """
+
+    stamps_ns: NDArray[np.int64]  # (N,)
+    T_world_base: NDArray[np.float64]  # (N, 4, 4), in the layer's frame
+    edges: NDArray[np.int64]  # (M, 2), nodes from and to
+    T_from_to: NDArray[np.float64]  # (M, 4, 4), as measured
+    information: NDArray[np.float64]  # (M, 6, 6) [1/m^2, 1/rad^2]
+    is_loop: NDArray[np.bool_]  # (M,): a place seen again, not the way from one to the next
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LandmarkLayer:
+    """Points that a module knows again when it sees them."""
+
+    points: NDArray[np.float32]  # (N, 3) [m]
+    first_stamps_ns: NDArray[np.int64]  # (N,), of the keyframe that saw it first
+    sightings: NDArray[np.int64]  # (N,), how often it was found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapLayers:
     """What one module knows of the world, in its `local` frame."""
 
     points: PointLayer | None = None
     grid: GridLayer | None = None
+    pose_graph: PoseGraphLayer | None = None
+    landmarks: LandmarkLayer | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HybridMap:
-    """The one map of a run, in `map`: every module's points and one grid."""
+    """The one map of a run, in `map`: what every module left behind, and one grid."""
 
     points: PointLayer
     point_modules: NDArray[np.uint8]  # (N,), index into `modules`: who saw the point
     modules: tuple[str, ...]  # keys in `slam`
     grid: GridLayer | None = None
+    pose_graph: PoseGraphLayer | None = None  # sessions one after the other, not connected
+    node_modules: NDArray[np.uint8] | None = None  # (N,), as `point_modules`, of the graph's nodes
+    landmarks: LandmarkLayer | None = None
+    landmark_modules: NDArray[np.uint8] | None = None  # (N,), as `point_modules`
