@@ -14,15 +14,31 @@ from scenery import RIG, room_observation
 from sceneslam.interfaces import SlamModule
 from sceneslam.types import se3
 from sceneslam.types.observation import TrackingStatus
+from sceneslam.types.trajectory import Trajectory
 
 COMPONENTS = sorted((Path(__file__).parents[1] / "conf" / "slam").glob("*.yaml"))
 STEPS = 20
 
 
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Give the trajectory file that a module may ask for: the room's true poses."""
+    path = tmp_path_factory.mktemp("recorded") / "room.tum"
+    seen = [room_observation(index) for index in range(STEPS)]
+    Trajectory(
+        stamps_ns=np.array([one.stamp_ns for one in seen]),
+        T_world_base=np.stack([one.T_odom_base for one in seen]),
+    ).write_tum(path)
+    return path
+
+
 @pytest.fixture(params=COMPONENTS, ids=lambda path: path.stem)
-def make(request):
+def make(request, recorded):
     """Give a function that builds the module anew from its YAML."""
-    config = OmegaConf.merge({"seed": 0}, {"node": OmegaConf.load(request.param)}).node
+    node = OmegaConf.load(request.param)
+    if OmegaConf.is_missing(node, "path"):
+        node.path = str(recorded)
+    config = OmegaConf.merge({"seed": 0}, {"node": node}).node
     return lambda: instantiate(config, _convert_="all")
 
 

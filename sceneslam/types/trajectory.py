@@ -47,7 +47,7 @@ class Trajectory:
             if not words or words[0].startswith("#"):
                 continue
             try:
-                stamps_ns.append(_stamp_ns(words[0]))
+                stamps_ns.append(parse_stamp_ns(words[0]))
                 rows.append([float(word) for word in words[1:8]])
             except ValueError:
                 rows.append([])
@@ -75,7 +75,7 @@ class Trajectory:
                 file.write(f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d} {numbers}\n")
 
 
-def _stamp_ns(text: str) -> int:
+def parse_stamp_ns(text: str) -> int:
     """Return a decimal number of seconds as whole nanoseconds, without a float's rounding."""
     if "e" in text.lower():
         return round(float(text) * 1e9)

@@ -1,0 +1,137 @@
+"""The `recorded` SLAM module: replays what another system put out, gaps and all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.recorded import RecordedTrajectory, read_recorded
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
+
+_BASE_FRAMES = ("", "base", "base_link")  # need no extrinsics
+
+
+class Recorded:
+    """Gives the recorded pose of every observation; `conf/slam/recorded.yaml` names the settings.
+
+    Between two recorded poses it interpolates, which looks ahead by less than one gap. LOST
+    before the recording begins, after it ends, in its gaps, and while it starts up.
+    """
+
+    def __init__(
+        self,
+        *,
+        path: str,
+        sequence: int | None,
+        T_base_frame: list[float] | None,
+        startup_s: float,
+        gap_periods: float,
+    ) -> None:
+        if not 0 <= startup_s < np.inf:
+            raise ConfigError("startup_s", startup_s, "seconds, 0 or more")
+        if not 1 <= gap_periods < np.inf:
+            raise ConfigError("gap_periods", gap_periods, "1 or more")
+        recorded = _chosen(read_recorded(Path(path)), sequence)
+        T_frame_base = se3.inverse(_extrinsics(T_base_frame, recorded.frame))
+        self._stamps_ns = recorded.trajectory.stamps_ns
+        self._T_world_base = recorded.trajectory.T_world_base @ T_frame_base
+        period_ns = float(np.median(np.diff(self._stamps_ns))) if len(self._stamps_ns) > 1 else 0.0
+        self._gap_ns = gap_periods * period_ns
+        self._startup_ns = round(startup_s * 1e9)
+        self._ready_ns: int | None = None  # from when on it gives poses
+        self._T_local_world: se3.Transform | None = None
+        self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
+
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return every sensor alone: a stamp is all it takes, whatever was measured."""
+        return tuple(frozenset({sensor}) for sensor in Sensor)
+
+    def activate(self, rig: Rig) -> None:
+        """Start anew: `local` at the first observation that has a recorded pose."""
+        self._ready_ns, self._T_local_world = None, None
+        self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
+
+    def set_pose(self, T_map_local: se3.Transform) -> None:
+        """Place `local` in the map."""
+        self._T_map_local = np.array(T_map_local, dtype=np.float64)
+
+    def set_scene(self, scene: str) -> None:
+        """Do nothing: what was recorded stands."""
+
+    def track(self, observation: Observation) -> Tracking:
+        """Return the recorded T_local_base; LOST where there is none, or not yet."""
+        if self._ready_ns is None:
+            self._ready_ns = observation.stamp_ns + self._startup_ns
+        T_world_base = self._pose_at(observation.stamp_ns)
+        if T_world_base is None or observation.stamp_ns < self._ready_ns:
+            return self._answer(observation.stamp_ns, TrackingStatus.LOST)
+        if self._T_local_world is None:
+            self._T_local_world = se3.inverse(T_world_base)
+        self._T_local_base = self._T_local_world @ T_world_base
+        return self._answer(observation.stamp_ns, TrackingStatus.TRACKING)
+
+    def get_pose(self) -> se3.Transform:
+        """Return T_map_base of the last observation that had a pose."""
+        return self._T_map_local @ self._T_local_base
+
+    def get_trajectory(self) -> Trajectory:
+        """Return no poses: a recording revises nothing."""
+        return Trajectory.empty()
+
+    def get_map(self) -> MapLayers:
+        """Return no layers: only poses were recorded."""
+        return MapLayers()
+
+    def shutdown(self) -> None:
+        """Do nothing: nothing was taken."""
+
+    def _pose_at(self, stamp_ns: int) -> se3.Transform | None:
+        """Return T_world_base at a stamp, None in a gap and outside of the recording."""
+        after = int(np.searchsorted(self._stamps_ns, stamp_ns))
+        if after == len(self._stamps_ns):
+            return None
+        after_ns = int(self._stamps_ns[after])
+        if after_ns == stamp_ns:
+            return np.asarray(self._T_world_base[after])
+        if after == 0:
+            return None
+        before_ns = int(self._stamps_ns[after - 1])
+        if after_ns - before_ns > self._gap_ns:
+            return None
+        ratio = (stamp_ns - before_ns) / (after_ns - before_ns)
+        return se3.interpolate(self._T_world_base[after - 1], self._T_world_base[after], ratio)
+
+    def _answer(self, stamp_ns: int, status: TrackingStatus) -> Tracking:
+        return Tracking(
+            stamp_ns=stamp_ns,
+            T_local_base=self._T_local_base.copy(),
+            status=status,
+            quality_ratio=0.0 if status is TrackingStatus.LOST else 1.0,
+        )
+
+
+def _chosen(found: tuple[RecordedTrajectory, ...], sequence: int | None) -> RecordedTrajectory:
+    """Return the sequence that is asked for, or the only one."""
+    matching = [one for one in found if sequence is None or one.sequence == sequence]
+    if len(matching) != 1:
+        held = ", ".join(str(one.sequence) for one in found) or "none"
+        raise ConfigError("sequence", sequence, f"a sequence of the file; it holds: {held}")
+    return matching[0]
+
+
+def _extrinsics(values: list[float] | None, frame: str) -> se3.Transform:
+    """Return T_base_frame of `x y z qx qy qz qw`; a frame other than base's has to have it."""
+    if values is None and frame in _BASE_FRAMES:
+        return se3.identity()
+    quat_is_zero = values is not None and not any(values[3:])
+    if values is None or len(values) != 7 or not np.isfinite(values).all() or quat_is_zero:
+        what = f"seven numbers x y z [m] qx qy qz qw: where {frame or 'the frame'} sits on base"
+        raise ConfigError("T_base_frame", values, what)
+    return se3.from_quat_xyzw(np.array(values[:3]), np.array(values[3:]))
