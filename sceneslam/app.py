@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,16 +43,16 @@ def run(
     Raises ConfigError or InputError where nothing could be run. What ends a run once it has begun
     (Ctrl-C, broken input, no module left) is in `faults`, and all that was computed is saved.
     """
-    parts = build(config)
-    folder.mkdir(parents=True, exist_ok=True)
-    _clear(folder)
-    cv2.setNumThreads(parts.run.threads)
-    loop = Loop(parts, folder, title)
-    with termination_as_interrupt():
-        loop.run()
-        with uninterrupted():
-            loop.close()
-            return _save(config, parts, folder, loop, reference)
+    with closing(build(config)) as parts:
+        folder.mkdir(parents=True, exist_ok=True)
+        _clear(folder)
+        cv2.setNumThreads(parts.run.threads)
+        loop = Loop(parts, folder, title)
+        with termination_as_interrupt():
+            loop.run()
+            with uninterrupted():
+                loop.close()
+                return _save(config, parts, folder, loop, reference)
 
 
 def _clear(folder: Path) -> None:

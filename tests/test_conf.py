@@ -80,6 +80,7 @@ ALLOWED = {  # package -> what of ours it may import
     "sceneslam/sources": {"types", "interfaces", "ros", "sources"},
     "sceneslam/sinks": {"types", "interfaces", "ros", "sinks"},
     "sceneslam/atlas": {"types", "interfaces", "atlas"},
+    "sceneslam/supervision": {"types", "interfaces", "supervision"},
     "sceneslam/bus": {"types", "interfaces", "atlas", "bus"},
     "sceneslam/evaluation": {"types", "interfaces", "evaluation"},
     "modules": {"types", "interfaces"},

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hydra.utils import instantiate
+from isolation import isolating
 from omegaconf import OmegaConf
 from scenery import RIG, room_observation
 
@@ -17,6 +19,7 @@ from sceneslam.types.observation import TrackingStatus
 from sceneslam.types.trajectory import Trajectory
 
 COMPONENTS = sorted((Path(__file__).parents[1] / "conf" / "slam").glob("*.yaml"))
+ISOLATED = Path("laser in its own process")
 STEPS = 20
 
 
@@ -32,14 +35,19 @@ def recorded(tmp_path_factory):
     return path
 
 
-@pytest.fixture(params=COMPONENTS, ids=lambda path: path.stem)
+@pytest.fixture(params=[*COMPONENTS, ISOLATED], ids=lambda path: path.stem)
 def make(request, recorded):
-    """Give a function that builds the module anew from its YAML."""
-    node = OmegaConf.load(request.param)
+    """Give a function that builds the module anew from its YAML; one in a process of its own."""
+    node = OmegaConf.load(COMPONENTS[0].parent / f"{request.param.stem.split(' ')[0]}.yaml")
     if OmegaConf.is_missing(node, "path"):
         node.path = str(recorded)
-    config = OmegaConf.merge({"seed": 0}, {"node": node}).node
-    return lambda: instantiate(config, _convert_="all")
+    config = OmegaConf.to_container(OmegaConf.merge({"seed": 0}, {"node": node}), resolve=True)
+    build = partial(instantiate, config["node"], _convert_="all")
+    if request.param is not ISOLATED:
+        yield build
+        return
+    with isolating() as isolated:
+        yield partial(isolated, build)
 
 
 def drive(module, steps=STEPS):

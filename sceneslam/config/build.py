@@ -5,22 +5,21 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar, cast
-
-from hydra.errors import InstantiationException
-from hydra.utils import instantiate
+from functools import partial
+from typing import Any
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.bus.policy import Policy
-from sceneslam.config.check import NOTHING, check_keys, check_node, first_line
+from sceneslam.config.check import NOTHING, check_keys
+from sceneslam.config.component import Builder
 from sceneslam.config.settings import RunSettings
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.interfaces import Detector, Sink, SlamModule, Source
 from sceneslam.sources.ordered import Ordered
-from sceneslam.types.errors import ConfigError, SceneSlamError
+from sceneslam.supervision.isolated import IsolatedModule
+from sceneslam.types.errors import ConfigError, ModuleError
 from sceneslam.types.rig import Rig, Sensor
 
-Part = TypeVar("Part")
 _log = logging.getLogger(__name__)
 
 
@@ -40,16 +39,23 @@ class Parts:
     run: RunSettings
     threshold: float | None  # of the detector, for the figures
 
+    def close(self) -> None:
+        """End the processes of the modules that have one."""
+        for module in self.modules.values():
+            if isinstance(module, IsolatedModule):
+                module.close()
+
 
 def build(config: Mapping[str, Any]) -> Parts:
     """Return all parts; raises ConfigError or InputError naming what does not fit."""
     check_keys(config)
-    builder = _Builder(config)
+    builder = Builder(config)
     run = builder.make("run", RunSettings)
     policy = builder.make("policy", Policy)
     detector = builder.make("detector", Detector)
     scenes = _table(config, detector)
-    modules = {key: builder.make(f"slam.{key}", SlamModule) for key in _used(scenes)}
+    modules = {key: _module(builder, run, key) for key in _used(scenes)}
+    requires = {key: _requires(module, f"slam.{key}") for key, module in modules.items()}
     atlas = builder.make("atlas", Atlas)
     evaluation = builder.make("evaluation", EvaluationSettings)
     sinks = {key: builder.make(f"sinks.{key}", Sink) for key in config.get("sinks") or {}}
@@ -59,8 +65,8 @@ def build(config: Mapping[str, Any]) -> Parts:
     source = Ordered(source)
     rig = source.rig
     _check_sensors("detector", config["detector"], detector.requires, rig)
-    for key, module in modules.items():
-        _check_sensors(f"slam.{key}", config["slam"][key], module.requires, rig)
+    for key in modules:
+        _check_sensors(f"slam.{key}", config["slam"][key], requires[key], rig)
     return Parts(
         source=source,
         rig=rig,
@@ -76,49 +82,20 @@ def build(config: Mapping[str, Any]) -> Parts:
     )
 
 
-class _Builder:
-    """Makes single components of one configuration."""
-
-    def __init__(self, config: Mapping[str, Any]) -> None:
-        self._config = config
-        allow = config.get("allow_targets") or []
-        if not isinstance(allow, list) or not all(isinstance(item, str) for item in allow):
-            raise ConfigError("allow_targets", allow, "a list of package names")
-        self._allow = allow
-
-    def make(self, key: str, kind: type[Part], *arguments: object) -> Part:
-        """Return the component at a dotted key; it must have all members of `kind`."""
-        node: Any = self._config
-        for name in key.split("."):
-            node = node.get(name) if isinstance(node, Mapping) else None
-        if node is None:
-            raise ConfigError(key, NOTHING, "a component: `_target_` and its arguments")
-        check_node(node, key, allow=self._allow, positional=len(arguments))
-        part = self._instantiate(node, key, arguments)
-        missing = [name for name in _members(kind) if name not in dir(part)]
-        if missing:
-            needs = f"a {kind.__name__}, which has: {', '.join(missing)}"
-            raise ConfigError(key, node["_target_"], needs)
-        return cast(Part, part)
-
-    def _instantiate(
-        self, node: Mapping[str, Any], key: str, arguments: tuple[object, ...]
-    ) -> object:
-        try:
-            return instantiate(node, *arguments, _convert_="all")
-        except InstantiationException as error:
-            cause = error.__cause__
-            if isinstance(cause, ConfigError):
-                raise cause.under(key) from error
-            if isinstance(cause, SceneSlamError):
-                raise cause from error
-            reason = first_line(cause or error)
-            raise ConfigError(key, node["_target_"], f"a target that builds ({reason})") from error
+def _module(builder: Builder, run: RunSettings, key: str) -> SlamModule:
+    """Return a module, or the process that builds it meanwhile."""
+    make = partial(builder.make, f"slam.{key}", SlamModule)
+    if run.isolation == "inline":
+        return make()
+    return IsolatedModule(f"slam.{key}", make, run.limits)
 
 
-def _members(kind: type) -> list[str]:
-    """Return the public names that a Protocol or class asks for."""
-    return [name for name in vars(kind) if not name.startswith("_")]
+def _requires(module: SlamModule, key: str) -> Sequence[frozenset[Sensor]]:
+    """Return what the module requires; raises ConfigError where its process could not build it."""
+    try:
+        return module.requires
+    except ModuleError as error:
+        raise ConfigError(key, "process", f"a target that builds (its process {error})") from error
 
 
 def _table(config: Mapping[str, Any], detector: Detector) -> dict[str, tuple[str, ...]]:

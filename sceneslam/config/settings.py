@@ -2,26 +2,44 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
+from sceneslam.supervision.limits import Limits
 from sceneslam.types.errors import ConfigError
 
 MODES = ("recording", "live")
+ISOLATIONS = ("inline", "process")
 
 
 @dataclass(slots=True, kw_only=True)
 class RunSettings:
-    """Mode, pace and limits of a run."""
+    """Mode, pace and limits of a run; durations are of the wall clock."""
 
     mode: str  # recording: in step with the data; live: paced by the clock, own thread
-    threads: int  # of OpenCV
+    isolation: str  # inline: modules in the bus's own process; process: each in one of its own ...
+    step_deadline_s: float  # ... which is ended when it takes longer to track an observation ...
+    start_deadline_s: float  # ... to be built, to be activated or to hand over its map ...
+    memory_limit_mb: int  # ... or uses more
+    restarts_max: int  # it is started again so many times ...
+    restart_window_s: float  # ... within any such time ...
+    restart_backoff_s: float  # ... waiting so long before the second time, then twice as long
+    threads: int  # of OpenCV, and of all libraries in a process of their own
     progress: bool  # show a progress bar
     max_observations: int | None  # stop after so many, null: all
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:
             raise ConfigError("mode", self.mode, " | ".join(MODES))
+        if self.isolation not in ISOLATIONS:
+            raise ConfigError("isolation", self.isolation, " | ".join(ISOLATIONS))
         if self.threads < 1:
             raise ConfigError("threads", self.threads, "1 or more")
+        _ = self.limits  # checks them
         if self.max_observations is not None and self.max_observations < 1:
             raise ConfigError("max_observations", self.max_observations, "1 or more, or null")
+
+    @property
+    def limits(self) -> Limits:
+        """Return the limits of a module's process; raises ConfigError where one makes no sense."""
+        names = (field.name for field in fields(Limits))
+        return Limits(**{name: getattr(self, name) for name in names})

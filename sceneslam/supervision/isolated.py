@@ -1,0 +1,178 @@
+"""A SLAM module that lives in a process of its own, and looks to the bus like any other."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from time import monotonic, sleep
+from typing import Any, cast
+
+from sceneslam.interfaces import SlamModule
+from sceneslam.supervision.limits import Limits, Restarts
+from sceneslam.supervision.process import Process, ProcessDeathError
+from sceneslam.types.errors import ConfigError, ModuleError
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.observation import Observation, Tracking
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.se3 import Transform
+from sceneslam.types.trajectory import Trajectory
+
+_log = logging.getLogger(__name__)
+
+
+class IsolatedModule:
+    """Fulfils `SlamModule` by a process that `make` builds the module in.
+
+    Whatever ends the process ends the session: the call raises ModuleError with the reason, a new
+    process is started as soon as its budget allows, and `activate` begins anew in it. Exceptions
+    of the module itself are raised here as they were there.
+    """
+
+    def __init__(self, name: str, make: Callable[[], SlamModule], limits: Limits) -> None:
+        """Start the process; whether the module can be built there, `requires` says."""
+        if not hasattr(os, "memfd_create"):
+            raise ConfigError("isolation", "process", "inline (processes need Linux)")
+        self._name, self._make, self._limits = name, make, limits
+        self._restarts = Restarts(limits)
+        self._requires: tuple[frozenset[Sensor], ...] | None = None
+        self._is_active = False
+        self._is_built = False
+        self._process: Process | None = None
+        self._start()
+
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return the module's; raises what its constructor raised, ConfigError among others."""
+        if self._requires is None:
+            self._await_built()
+        assert self._requires is not None
+        return self._requires
+
+    @property
+    def is_ready(self) -> bool:
+        """Tell whether `activate` would not have to wait, and start a process where it may be."""
+        self._bury()
+        if self._process is None and self._restarts.wait_s(monotonic()) == 0:
+            self._start()
+        if self._process is None:
+            return False
+        return self._is_built or self._process.has_reply()
+
+    @property
+    def is_spent(self) -> bool:
+        """Tell whether the process died too often to be started again for now."""
+        self._bury()
+        return self._process is None and self._restarts.is_spent(monotonic())
+
+    def activate(self, rig: Rig) -> None:
+        """Start anew, in a new process where the last one died; waits until it may be started."""
+        self._bury()
+        if self._process is None:
+            self._wait_for_budget()
+            self._start()
+        self._await_built()
+        self._is_active = True
+        self._call(self._limits.start_deadline_s, "activate", rig)
+
+    def set_pose(self, T_map_local: Transform) -> None:
+        """Place `local` in the map."""
+        self._call(self._limits.step_deadline_s, "set_pose", T_map_local)
+
+    def set_scene(self, scene: str) -> None:
+        """Tell the confirmed scene."""
+        self._call(self._limits.step_deadline_s, "set_scene", scene)
+
+    def track(self, observation: Observation) -> Tracking:
+        """Return T_local_base at the observation."""
+        self.submit(observation)
+        return self.collect()
+
+    def submit(self, observation: Observation) -> None:
+        """Let the module begin to track; others may be given work before `collect`."""
+        self._ask("track", observation)
+
+    def collect(self) -> Tracking:
+        """Return the answer to `submit`."""
+        return cast(Tracking, self._answer(self._limits.step_deadline_s))
+
+    def get_pose(self) -> Transform:
+        """Return T_map_base of the last observation."""
+        return cast(Transform, self._call(self._limits.step_deadline_s, "get_pose"))
+
+    def get_trajectory(self) -> Trajectory:
+        """Return T_local_base at every stamp."""
+        return cast(Trajectory, self._call(self._limits.start_deadline_s, "get_trajectory"))
+
+    def get_map(self) -> MapLayers:
+        """Return the map in `local`."""
+        return cast(MapLayers, self._call(self._limits.start_deadline_s, "get_map"))
+
+    def shutdown(self) -> None:
+        """Shut the module down; its process stays, with the map, for the next `activate`."""
+        if self._is_active:
+            self._call(self._limits.start_deadline_s, "shutdown")
+
+    def close(self) -> None:
+        """End the process for good. May be called twice."""
+        if self._process is not None:
+            self._process.end()
+        self._process, self._is_active = None, False
+
+    def _start(self) -> None:
+        """Start a process and let it build the module, without waiting."""
+        self._is_built = self._is_active = False
+        self._process = Process(self._limits)
+        level = logging.getLogger().getEffectiveLevel()
+        self._process.submit("build", self._make, level, self._limits.memory_limit_mb)
+
+    def _await_built(self) -> None:
+        if not self._is_built:
+            self._requires = self._answer(self._limits.start_deadline_s)
+            self._is_built = True
+
+    def _call(self, deadline_s: float, method: str, *arguments: object) -> Any:
+        self._ask(method, *arguments)
+        return self._answer(deadline_s)
+
+    def _ask(self, method: str, *arguments: object) -> None:
+        if self._process is None or not self._is_active:
+            raise ModuleError(f"{method}: its process ended, and the session with it")
+        try:
+            self._process.submit(method, *arguments)
+        except ProcessDeathError:
+            self._note_death()
+            raise
+
+    def _answer(self, deadline_s: float) -> Any:
+        if self._process is None:
+            raise ModuleError("its process ended")
+        try:
+            return self._process.collect(deadline_s)
+        except ProcessDeathError:
+            self._note_death()
+            raise
+
+    def _bury(self) -> None:
+        """Notice a process that died while nobody asked it for anything."""
+        if self._process is not None and not self._process.is_alive:
+            _log.warning("%s: its process died while it was idle", self._name)
+            self._process.end()
+            self._note_death()
+
+    def _note_death(self) -> None:
+        """Start the next process at once where that is allowed: it can be built meanwhile."""
+        self._process, self._is_active, self._is_built = None, False, False
+        self._restarts.note_death(monotonic())
+        if self._restarts.wait_s(monotonic()) == 0 and self._requires is not None:
+            self._start()
+
+    def _wait_for_budget(self) -> None:
+        """Sleep through the back-off; raises ModuleError where the budget is spent."""
+        wait_s = self._restarts.wait_s(monotonic())
+        if self._restarts.is_spent(monotonic()):
+            raise ModuleError(
+                f"its process died more than {self._limits.restarts_max} times within "
+                f"{self._limits.restart_window_s:g} s; not started again for {wait_s:.0f} s"
+            )
+        sleep(wait_s)

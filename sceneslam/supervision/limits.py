@@ -1,0 +1,63 @@
+"""How long a module's process may take, what it may use, and how often it is started again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from sceneslam.types.errors import ConfigError
+
+
+@dataclass(slots=True, kw_only=True)
+class Limits:
+    """Of one module's process; durations are of the wall clock."""
+
+    step_deadline_s: float  # to track one observation
+    start_deadline_s: float  # to be built, to be activated, to hand over its map
+    memory_limit_mb: int  # of its private memory
+    restarts_max: int  # within the window
+    restart_window_s: float
+    restart_backoff_s: float  # before the second start in the window, then twice as long each time
+    threads: int  # of its libraries
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name not in ("restarts_max", "restart_backoff_s") and not value > 0:
+                raise ConfigError(field.name, value, "a number above 0")
+            if not value >= 0:
+                raise ConfigError(field.name, value, "0 or more")
+
+
+class Restarts:
+    """Says when a process that died may be started again; pure but for the clock it is told."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._deaths_s: list[float] = []
+
+    def note_death(self, now_s: float) -> None:
+        """Take one death."""
+        self._forget(now_s)
+        self._deaths_s.append(now_s)
+
+    def is_spent(self, now_s: float) -> bool:
+        """Tell whether it died more often in the window than it may be started again."""
+        self._forget(now_s)
+        return len(self._deaths_s) > self._limits.restarts_max
+
+    def wait_s(self, now_s: float) -> float:
+        """Return how long to wait for the next start, 0 where it may be at once."""
+        self._forget(now_s)
+        deaths = len(self._deaths_s)
+        if self.is_spent(now_s):
+            due_s = self._deaths_s[-self._limits.restarts_max - 1] + self._limits.restart_window_s
+        elif deaths > 1:
+            due_s = self._deaths_s[-1] + self._limits.restart_backoff_s * 2 ** (deaths - 2)
+        else:
+            return 0.0
+        return max(due_s - now_s, 0.0)
+
+    def _forget(self, now_s: float) -> None:
+        """Drop the deaths that left the window."""
+        begin_s = now_s - self._limits.restart_window_s
+        self._deaths_s = [death_s for death_s in self._deaths_s if death_s > begin_s]

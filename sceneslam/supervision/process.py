@@ -1,0 +1,149 @@
+"""A module's process as its parent sees it: started, asked with a deadline, and ended."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import suppress
+from time import monotonic
+from typing import Any
+from weakref import finalize
+
+from sceneslam.supervision.limits import Limits
+from sceneslam.supervision.messages import Reply, Request
+from sceneslam.supervision.transport import Channel
+from sceneslam.types.errors import ModuleError
+
+_END_PATIENCE_S = 1.0  # for a process that hung up, or was hung up on, to be gone
+_THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+)
+
+
+class ProcessDeathError(ModuleError):
+    """The process is no more; the message says how it ended."""
+
+
+class Process:
+    """Sends requests to one process and takes its replies, in order.
+
+    Every failure of the process itself (gone, too slow, out of memory) ends it and raises
+    ProcessDeathError. It ends with this object, and with the parent, however that ends.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        lifeline, self._lifeline = os.pipe()
+        self._popen = subprocess.Popen(
+            [sys.executable, "-P", "-m", "sceneslam.supervision", str(far.fileno()), str(lifeline)],
+            env=_environment(limits.threads),
+            stdin=subprocess.DEVNULL,
+            pass_fds=(far.fileno(), lifeline),
+            process_group=0,  # a terminal's Ctrl-C is the parent's to handle
+        )
+        far.close()
+        os.close(lifeline)
+        self._channel = Channel(near)
+        self._number = 0
+        self._asked_s = 0.0
+        self._end = finalize(self, _end, self._popen, self._channel, self._lifeline)
+
+    @property
+    def is_alive(self) -> bool:
+        """Tell whether the process runs."""
+        return self._end.alive and self._popen.poll() is None
+
+    def submit(self, method: str, *arguments: object) -> None:
+        """Send a request, whose reply `collect` returns."""
+        self._number += 1
+        self._asked_s = monotonic()
+        request = Request(number=self._number, method=method, arguments=arguments)
+        try:
+            self._channel.send(request, self._limits.step_deadline_s)
+        except OSError as error:
+            raise self._died() from error
+
+    def has_reply(self) -> bool:
+        """Tell whether `collect` would return, or raise, at once."""
+        return self._channel.has_message()
+
+    def collect(self, deadline_s: float) -> Any:
+        """Return what the last request's method returned, or raise what it raised.
+
+        The deadline counts from the request on. What earlier requests brought, which an interrupt
+        kept from being collected, is passed over.
+        """
+        while True:
+            left_s = max(self._asked_s + deadline_s - monotonic(), 1e-3)
+            try:
+                reply: Reply = self._channel.receive(left_s)
+            except TimeoutError as error:
+                self._end()
+                raise ProcessDeathError(f"did not answer within {deadline_s:g} s") from error
+            except EOFError as error:
+                raise self._died() from error
+            for line in reply.log:
+                logging.getLogger(line.logger).log(line.level, "%s", line.text)
+            if reply.number == self._number:
+                return self._opened(reply)
+
+    def end(self) -> None:
+        """End the process; may be called twice."""
+        if self._end.alive:
+            self._channel.close()  # it ends by itself when it has nothing more to do
+            with suppress(subprocess.TimeoutExpired):
+                self._popen.wait(_END_PATIENCE_S)
+        self._end()
+
+    def _opened(self, reply: Reply) -> Any:
+        if isinstance(reply.error, MemoryError):
+            self._end()
+            raise ProcessDeathError(
+                f"used more than {self._limits.memory_limit_mb} MB"
+            ) from reply.error
+        if reply.error is not None:
+            raise reply.error from _Elsewhere(reply.traceback)
+        return reply.value
+
+    def _died(self) -> ProcessDeathError:
+        """Return how the process, which hung up, ended."""
+        with suppress(subprocess.TimeoutExpired):
+            self._popen.wait(_END_PATIENCE_S)
+        self._end()
+        code = self._popen.returncode
+        if code < 0:
+            return ProcessDeathError(f"was killed by signal {-code} ({signal.Signals(-code).name})")
+        return ProcessDeathError(f"ended by itself with exit code {code}")
+
+
+class _Elsewhere(Exception):  # noqa: N818 - not an error, but where one came from
+    """The traceback of an exception in a module's process."""
+
+    def __str__(self) -> str:
+        return f"\n{self.args[0]}"
+
+
+def _end(popen: subprocess.Popen[bytes], channel: Channel, lifeline: int) -> None:
+    """Kill a process with all that it started, and leave no zombie."""
+    with suppress(ProcessLookupError):
+        os.killpg(popen.pid, signal.SIGKILL)
+    popen.wait()
+    channel.close()
+    os.close(lifeline)
+
+
+def _environment(threads: int) -> dict[str, str]:
+    """Return the environment in which the process finds the same code, and so many threads."""
+    return {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(sys.path),
+        **dict.fromkeys(_THREAD_VARIABLES, str(threads)),
+    }
