@@ -13,7 +13,7 @@ from sceneslam.ros.pixels import locked
 from sceneslam.sources.carmen_lines import FLASER, ROBOTLASER, ScanLine, parse_scan, stamp_of
 from sceneslam.sources.faults import FaultLog
 from sceneslam.sources.intrinsics import checked_above_zero
-from sceneslam.sources.rising import rising_stamps
+from sceneslam.sources.rising import rising_order, rising_stamps
 from sceneslam.sources.spanned import Span
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
@@ -22,15 +22,17 @@ from sceneslam.types.rig import Laser, Rig, Sensor
 from sceneslam.types.truth import GroundTruth
 
 _LOG = logging.getLogger(__name__)
+_LATE_MAX_S = 2.0  # messages overtake each other by less; a clock that is set jumps farther
 _OFFSET = b"robot_frontlaser_offset"
 
 
 class Carmen:
     """Gives one observation per FLASER or ROBOTLASER1 line, stamped by its `ipc_timestamp`.
 
-    Odometry is that of the line; ODOM and RLASER lines are not used. The log's order is the order
-    in time: a scan whose stamp came late gets one between its neighbours', and a warning is logged.
-    Ranges of `range_max_m` and beyond are no return.
+    Odometry is that of the line; ODOM and RLASER lines are not used. Scans come in the order of
+    their stamps, which need not be the order of their lines: relations name a scan by its stamp.
+    Where the clock was set back or says nothing, the log's order is kept and the stamps are made
+    to rise. Ranges of `range_max_m` and beyond are no return.
     """
 
     def __init__(self, path: str, range_max_m: float) -> None:
@@ -43,8 +45,10 @@ class Carmen:
         if first is None:
             raise InputError(f"no scans, expected FLASER or ROBOTLASER1 lines: {path}")
         logged_ns = np.array([stamp_of(line) for line in self._lines], dtype=np.int64)
-        self._stamps_ns = rising_stamps(logged_ns)
-        self._warn_of_late(np.flatnonzero(self._stamps_ns != logged_ns))
+        order = rising_order(logged_ns, late_max_ns=round(_LATE_MAX_S * 1e9))
+        self._lines = [self._lines[place] for place in order]
+        self._stamps_ns = rising_stamps(logged_ns[order])
+        self._warn_of_changed(np.flatnonzero(self._stamps_ns != logged_ns[order]))
         T_base_laser = se3.from_xy_yaw(self._offset_m(), 0.0, 0.0)
         if first.T_base_laser is not None:
             T_base_laser = first.T_base_laser
@@ -75,7 +79,7 @@ class Carmen:
         return Span(start_ns=int(self._stamps_ns[0]), end_ns=int(self._stamps_ns[-1]))
 
     def __iter__(self) -> Iterator[Observation]:
-        """Yield the scans in the log's order."""
+        """Yield the scans by rising stamp."""
         self._faults.clear()
         for line, stamp_ns in zip(self._lines, self._stamps_ns.tolist(), strict=True):
             scan = parse_scan(line)
@@ -108,15 +112,15 @@ class Carmen:
             T_odom_base=locked(scan.T_odom_base),
         )
 
-    def _warn_of_late(self, late: NDArray[np.int64]) -> None:
+    def _warn_of_changed(self, changed: NDArray[np.int64]) -> None:
         """Tell of stamps that were set right: nothing is lost, so it is no fault."""
-        if len(late):
+        if len(changed):
             _LOG.warning(
-                "%d of %d scans, first at %.3f s, are stamped later than scans after them; they "
-                "were given stamps between their neighbours': %s",
-                len(late),
+                "%d of %d scans, first at %.3f s, have stamps that do not rise; they were given "
+                "stamps between their neighbours': %s",
+                len(changed),
                 len(self._lines),
-                self._stamps_ns[late[0]] * 1e-9,
+                self._stamps_ns[changed[0]] * 1e-9,
                 self._path,
             )
 

@@ -26,6 +26,14 @@ def longest_rising(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.array(kept[::-1], dtype=np.int64)
 
 
+def rising_order(stamps_ns: NDArray[np.int64], *, late_max_ns: int) -> NDArray[np.int64]:
+    """Return the order by stamp; the order as it is where a stamp is behind by more than that."""
+    behind_ns = np.maximum.accumulate(stamps_ns) - stamps_ns
+    if behind_ns.max(initial=0) > late_max_ns:
+        return np.arange(len(stamps_ns))
+    return np.argsort(stamps_ns, kind="stable")
+
+
 def rising_stamps(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return stamps that rise: those out of order are set evenly between their neighbours'.
 
