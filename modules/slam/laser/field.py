@@ -65,6 +65,22 @@ class LikelihoodField:
         found = np.take(self._likelihood.reshape(-1), row * columns + column)
         return np.asarray(found.mean(axis=-1))
 
+    def pooled(self, factor: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Return the best likelihood per `factor`^2 cells, and which of them is at the corner."""
+        before = self._origin % factor
+        rows, columns = self._likelihood.shape
+        behind = -(before + np.array([columns, rows])) % factor
+        grid = np.pad(
+            self._likelihood, ((int(before[1]), int(behind[1])), (int(before[0]), int(behind[0])))
+        )
+        blocks = grid.reshape(grid.shape[0] // factor, factor, grid.shape[1] // factor, factor)
+        return np.ascontiguousarray(blocks.max(axis=(1, 3))), self._origin // factor
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """Return the mean surface points (N, 2) [m] of all cells that have one."""
+        return self._points
+
     def _average(self, surfaces: SurfacePoints, index: NDArray[np.int64], count: int) -> None:
         weight = surfaces.weight
         total = np.bincount(index, weights=weight, minlength=count)

@@ -9,15 +9,18 @@ import numpy as np
 from sceneslam.types import se3
 from sceneslam.types.observation import LaserScan, Observation, TrackingStatus
 
+from .back_end import BackEnd
 from .field import LikelihoodField
+from .history import History
+from .keyframes import Keyframe, Keyframes
 from .matcher import Match, Matcher
 from .motion import Motion, MotionModel
-from .planar import Matrix, Planar, between, compose, propagate
-from .submaps import Submaps
+from .planar import Matrix, Planar, between, compose, propagate, turn
 from .surface import SurfacePoints, read_surfaces
 
 _OVERLAP_MIN_RATIO = 0.5  # with less, the map does not reach here yet
 _FAILURES_MAX = 10  # matches that fail in a row before the map goes on from dead reckoning
+_STEP_MIN = np.array([0.01, 0.01, 2e-3])  # m, m, rad: of the motion between two keyframes
 _DEVIATION_MIN = np.array([1e-3, 1e-3, 5e-4])  # m, m, rad: no pose is believed to be better
 
 
@@ -53,9 +56,12 @@ class FrontEnd:
     T_base_laser: se3.Transform
     matcher: Matcher
     motion: MotionModel
-    submaps: Submaps
+    keyframes: Keyframes
+    back_end: BackEnd
+    history: History
     _pose: Planar = field(default_factory=lambda: np.zeros(3), init=False)
     _covariance: Matrix = field(default_factory=lambda: np.diag(_DEVIATION_MIN**2), init=False)
+    _step: Matrix = field(default_factory=lambda: np.zeros((3, 3)), init=False)  # since a keyframe
     _stamp_ns: int | None = field(default=None, init=False)
     _held_pose: Planar = field(default_factory=lambda: np.zeros(3), init=False)
     _held_ns: int | None = field(default=None, init=False)
@@ -65,13 +71,20 @@ class FrontEnd:
 
     def track(self, observation: Observation, scan: LaserScan | None) -> Estimate:
         """Return the pose at the observation, corrected by its scan where it has one."""
+        estimate = self._track(observation, scan)
+        if estimate.status is not TrackingStatus.LOST:
+            self.history.add(observation.stamp_ns, self._pose)
+        return estimate
+
+    def _track(self, observation: Observation, scan: LaserScan | None) -> Estimate:
         before, before_ns = self._pose, self._stamp_ns
         motion = self.motion.step(observation)
         self._stamp_ns = observation.stamp_ns
         self._is_measured = self._is_measured and motion.is_measured
         predicted = compose(before, motion.T_prev_curr)
-        self._covariance = propagate(
-            self._covariance, before, motion.T_prev_curr, motion.covariance
+        self._covariance, self._step = (
+            propagate(known, before, motion.T_prev_curr, motion.covariance)
+            for known in (self._covariance, self._step)
         )
         surfaces = self._read(scan)
         if scan is None or surfaces is None:
@@ -81,14 +94,15 @@ class FrontEnd:
         predicted_then = compose(before, ratio * motion.T_prev_curr)
         T_then_now = between(predicted_then, predicted)
         if self._field is None:
-            self._extend(predicted_then, scan, surfaces)
+            self._extend(predicted_then, None, scan, surfaces)
             return self._hold(observation, predicted, None)
         match = self.matcher.match(surfaces, self._field, predicted_then, self._covariance)
         if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
-        if self.submaps.needs_keyframe(match.T_local_base):
-            self._extend(match.T_local_base, scan, surfaces)
-        return self._hold(observation, compose(match.T_local_base, T_then_now), match)
+        estimate = self._hold(observation, compose(match.T_local_base, T_then_now), match)
+        if self.keyframes.is_due(match.T_local_base):
+            self._extend(match.T_local_base, match, scan, surfaces)
+        return estimate
 
     def _read(self, scan: LaserScan | None) -> SurfacePoints | None:
         if scan is None:
@@ -153,8 +167,8 @@ class FrontEnd:
         if not (self._is_measured and motion.is_measured):
             return self._lose()
         unknown = match.overlap_ratio < _OVERLAP_MIN_RATIO or self._failures >= _FAILURES_MAX
-        if unknown and self.submaps.needs_keyframe(predicted):
-            self._extend(predicted, scan, surfaces)
+        if unknown and self.keyframes.is_due(predicted):
+            self._extend(predicted, None, scan, surfaces)
             self._failures = 0
         return self._guess(predicted, TrackingStatus.DEGRADED)
 
@@ -182,9 +196,37 @@ class FrontEnd:
             inliers=0,
         )
 
-    def _extend(self, T_local_base: Planar, scan: LaserScan, surfaces: SurfacePoints) -> None:
-        self.submaps.add(T_local_base, scan, surfaces)
-        self._field = LikelihoodField(self.submaps.surroundings(), self.settings.resolution_m)
+    def _extend(
+        self, T_local_base: Planar, match: Match | None, scan: LaserScan, surfaces: SurfacePoints
+    ) -> None:
+        """Make the scan a keyframe; where that closes a loop, go on from the corrected map."""
+        frames = self.keyframes.frames
+        covariance = self._step + np.diag(_STEP_MIN**2)
+        if match is not None:
+            information = match.information + np.linalg.inv(covariance)
+            covariance = np.linalg.inv(information) + np.diag(_STEP_MIN**2)
+        G = turn(-float(T_local_base[2]))
+        T_local_prev = frames[-1].T_local_base if frames else T_local_base
+        T_prev_curr = between(T_local_prev, T_local_base)
+        frames.append(
+            Keyframe(
+                stamp_ns=scan.stamp_ns,
+                T_local_base=T_local_base,
+                T_prev_curr=T_prev_curr,
+                covariance=np.asarray(G @ covariance @ G.T),
+                distance_m=float(np.hypot(*T_prev_curr[:2])),
+                scan=scan,
+                surfaces_base=surfaces,
+            )
+        )
+        self._step = np.zeros((3, 3))
+        if self.back_end.take():
+            corrected = frames[-1].T_local_base
+            self._pose = compose(corrected, between(T_local_base, self._pose))
+            self._held_pose = compose(corrected, between(T_local_base, self._held_pose))
+        self._field = LikelihoodField(
+            self.keyframes.surfaces(self.keyframes.latest), self.settings.resolution_m
+        )
 
 
 def _share(stamp_ns: int, before_ns: int | None, now_ns: int) -> float:

@@ -34,6 +34,7 @@ class Match:
     """A scan's pose in the local map."""
 
     T_local_base: Planar
+    information: Matrix  # of the laser alone, axes of local
     covariance: Matrix  # of the pose: laser and prior together, axes of local
     inliers: int
     inlier_ratio: float
@@ -58,6 +59,13 @@ class Matcher:
         candidates = [predicted] if np.array_equal(found, predicted) else [predicted, found]
         refined = [self._refine(scan_base, field, c, predicted, information) for c in candidates]
         return max(refined, key=lambda match: match.inlier_ratio)
+
+    def refine(
+        self, scan_base: SurfacePoints, field: LikelihoodField, start: Planar, prior: Matrix
+    ) -> Match:
+        """Return the pose of a scan at `start`, whose covariance is `prior`, without a search."""
+        information = np.asarray(np.linalg.inv(prior), dtype=np.float64)
+        return self._refine(scan_base, field, start, start, information)
 
     def _search(
         self, scan_base: SurfacePoints, field: LikelihoodField, predicted: Planar, prior: Matrix
@@ -111,6 +119,7 @@ class Matcher:
         count = max(len(scan_base), 1)
         return Match(
             T_local_base=pose,
+            information=H,
             covariance=np.asarray(np.linalg.inv(H + information), dtype=np.float64),
             inliers=int(inlier.sum()),
             inlier_ratio=float(inlier.sum() / count),

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.maps import MapLayers, PointLayer
+from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import LaserScan, Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
 from ..depth_scan import DepthScanner
-from ..grid import OccupancyGrid
+from .back_end import BackEnd
 from .frontend import Estimate, FrontEnd, ScanSettings
+from .history import History
+from .keyframes import Keyframes
+from .layers import covariance_6, map_layers
+from .loop_closure import LoopCloser
 from .matcher import Matcher
 from .motion import MotionModel
-from .planar import Planar, apply, to_transform, turn
-from .submaps import Submaps, thin
+from .places import Places
+from .planar import to_transform, turn
 
 _ABOVE_0 = (
     "resolution_m range_max_m laser_noise_m depth_noise_m window_m window_rad "
@@ -29,7 +33,6 @@ _ABOVE_0 = (
 _NOT_BELOW_0 = "depth_noise_per_m odometry_turn_rad_per_m predict_max_s"
 _AT_LEAST_1 = "beams_min submap_keyframes depth_beams depth_stride_px"
 _RATIO = "inlier_min_ratio degeneracy_ratio"
-_PLANAR_DEVIATION = 0.01  # m and rad: what a floor's z, roll and pitch are believed to vary by
 
 
 @dataclass(kw_only=True, eq=False)
@@ -123,6 +126,7 @@ class LaserSlam:
             covariance=_covariance_base(estimate),
             quality_ratio=estimate.quality_ratio,
             inliers=estimate.inliers,
+            revision=self._front_end.back_end.revision,
         )
 
     def get_pose(self) -> se3.Transform:
@@ -130,21 +134,22 @@ class LaserSlam:
         return self._T_map_local @ self._T_local_base
 
     def get_trajectory(self) -> Trajectory:
-        """Return no poses: nothing is revised."""
-        return Trajectory.empty()
+        """Return all poses with every loop closed."""
+        if self._front_end is None:
+            return Trajectory.empty()
+        return self._front_end.history.trajectory()
 
     def get_map(self) -> MapLayers:
-        """Return the grid of all keyframes, and their returns as points, in `local`."""
+        """Return the grid and points of all keyframes, and their pose graph, in `local`."""
         if self._front_end is None:
             return MapLayers()
-        grid = OccupancyGrid(self.resolution_m)
-        clouds = [np.zeros((0, 3), dtype=np.float32)]
-        for T_local_base, keyframe in self._front_end.submaps.placed():
-            T_local_laser = to_transform(T_local_base) @ self._T_base_laser
-            grid.insert(T_local_laser, self._cut(keyframe.scan))
-            clouds.append(_cloud(keyframe.surfaces_base.points, T_local_base, T_local_laser[2, 3]))
-        points = thin(np.concatenate(clouds), self.resolution_m)
-        return MapLayers(points=PointLayer(points=points), grid=grid.layer())
+        return map_layers(
+            self._front_end.keyframes,
+            self._front_end.back_end.graph.edges,
+            self._T_base_laser,
+            resolution_m=self.resolution_m,
+            range_max_m=self.range_max_m,
+        )
 
     def shutdown(self) -> None:
         """Free the depth tables; the map stays."""
@@ -155,14 +160,19 @@ class LaserSlam:
             return observation.scan
         return self._scanner.scan(observation.depth_m, stamp_ns=observation.stamp_ns)
 
-    def _cut(self, scan: LaserScan) -> LaserScan:
-        """Return the scan without what is too far to be believed."""
-        far = scan.ranges_m > self.range_max_m
-        ranges = np.where(far & np.isfinite(scan.ranges_m), np.inf, scan.ranges_m)
-        return replace(scan, ranges_m=ranges.astype(np.float32))
-
     def _make_front_end(self) -> FrontEnd:
         from_depth = self._scanner is not None
+        keyframes = Keyframes(
+            keyframe_distance_m=self.keyframe_distance_m,
+            keyframe_angle_rad=self.keyframe_angle_rad,
+            submap_keyframes=self.submap_keyframes,
+        )
+        matcher = Matcher(
+            window_m=self.window_m,
+            window_rad=self.window_rad,
+            degeneracy_ratio=self.degeneracy_ratio,
+        )
+        places = Places(keyframes, self.resolution_m)
         return FrontEnd(
             settings=ScanSettings(
                 resolution_m=self.resolution_m,
@@ -174,21 +184,15 @@ class LaserSlam:
                 predict_max_s=self.predict_max_s,
             ),
             T_base_laser=self._T_base_laser,
-            matcher=Matcher(
-                window_m=self.window_m,
-                window_rad=self.window_rad,
-                degeneracy_ratio=self.degeneracy_ratio,
-            ),
+            matcher=matcher,
             motion=MotionModel(
                 odometry_noise_ratio=self.odometry_noise_ratio,
                 odometry_turn_rad_per_m=self.odometry_turn_rad_per_m,
                 gyro_noise_rad_s=self.gyro_noise_rad_s,
             ),
-            submaps=Submaps(
-                keyframe_distance_m=self.keyframe_distance_m,
-                keyframe_angle_rad=self.keyframe_angle_rad,
-                submap_keyframes=self.submap_keyframes,
-            ),
+            keyframes=keyframes,
+            history=History(keyframes),
+            back_end=BackEnd(keyframes, LoopCloser(keyframes, places, matcher)),
         )
 
 
@@ -197,14 +201,4 @@ def _covariance_base(estimate: Estimate) -> NDArray[np.float64] | None:
     if estimate.status is TrackingStatus.LOST:
         return None
     G = turn(-float(estimate.T_local_base[2]))
-    full = np.eye(6) * _PLANAR_DEVIATION**2
-    planar = [0, 1, 5]
-    full[np.ix_(planar, planar)] = G @ estimate.covariance @ G.T
-    return full
-
-
-def _cloud(
-    points_base: NDArray[np.float64], T_local_base: Planar, height_m: float
-) -> NDArray[np.float32]:
-    points = apply(T_local_base, points_base)
-    return np.column_stack([points, np.full(len(points), height_m)]).astype(np.float32)
+    return covariance_6(G @ estimate.covariance @ G.T)

@@ -35,6 +35,27 @@ def between(T_a_b: Planar, T_a_c: Planar) -> Planar:
     return np.array([c * x + s * y, -s * x + c * y, wrap(T_a_c[2] - T_a_b[2])])
 
 
+def composed(T_a_b: NDArray[np.float64], T_b_c: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return T_a_c (N, 3) of stacks (N, 3)."""
+    c, s = np.cos(T_a_b[:, 2]), np.sin(T_a_b[:, 2])
+    x, y, yaw = T_b_c.T
+    return np.column_stack(
+        [T_a_b[:, 0] + c * x - s * y, T_a_b[:, 1] + s * x + c * y, wrapped(T_a_b[:, 2] + yaw)]
+    )
+
+
+def betweens(T_a_b: NDArray[np.float64], T_a_c: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return T_b_c (N, 3) of stacks (N, 3)."""
+    c, s = np.cos(T_a_b[:, 2]), np.sin(T_a_b[:, 2])
+    x, y = (T_a_c[:, :2] - T_a_b[:, :2]).T
+    return np.column_stack([c * x + s * y, c * y - s * x, wrapped(T_a_c[:, 2] - T_a_b[:, 2])])
+
+
+def wrapped(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return angles in [-pi, pi)."""
+    return np.asarray((angle_rad + np.pi) % (2 * np.pi) - np.pi)
+
+
 def wrap(angle_rad: float) -> float:
     """Return the angle in [-pi, pi)."""
     return float((angle_rad + np.pi) % (2 * np.pi) - np.pi)

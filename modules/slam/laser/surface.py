@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,6 +44,15 @@ class SurfacePoints:
             ]
         )
         return SurfacePoints(points=self.points @ R.T + T_a_b[:2], shape=shape, weight=self.weight)
+
+
+def joined(parts: Sequence[SurfacePoints]) -> SurfacePoints:
+    """Return the points of all parts."""
+    return SurfacePoints(
+        points=np.concatenate([part.points for part in parts]),
+        shape=np.concatenate([part.shape for part in parts]),
+        weight=np.concatenate([part.weight for part in parts]),
+    )
 
 
 def read_surfaces(

@@ -1,0 +1,58 @@
+"""Where the robot was at every stamp, told relative to keyframes, which may be corrected."""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sceneslam.types import se3
+from sceneslam.types.trajectory import Trajectory
+
+from .keyframes import Keyframes
+from .planar import Planar, between, betweens, composed
+
+_NONE = -1  # before the first keyframe: the pose is as it was told
+
+
+@dataclass(slots=True)
+class History:
+    """40 bytes per stamp."""
+
+    keyframes: Keyframes
+    _stamps_ns: array[int] = field(default_factory=lambda: array("q"))
+    _owners: array[int] = field(default_factory=lambda: array("q"))
+    _motions: array[float] = field(default_factory=lambda: array("d"))  # T_keyframe_base
+
+    def add(self, stamp_ns: int, T_local_base: Planar) -> None:
+        """Remember a pose relative to the newest keyframe."""
+        owner = len(self.keyframes) - 1
+        if owner != _NONE:
+            T_local_base = between(self.keyframes.frames[owner].T_local_base, T_local_base)
+        self._stamps_ns.append(stamp_ns)
+        self._owners.append(owner)
+        self._motions.extend(T_local_base.tolist())
+
+    def trajectory(self) -> Trajectory:
+        """Return T_local_base at every stamp, by the keyframes' poses as they are now.
+
+        What a correction changed between two keyframes is spread over the time between them.
+        """
+        if not self._stamps_ns:
+            return Trajectory.empty()
+        stamps_ns = np.array(self._stamps_ns, np.int64)
+        owners = np.array(self._owners, np.int64)
+        motions = np.array(self._motions).reshape(-1, 3)
+        frames = self.keyframes.frames
+        poses = np.vstack([self.keyframes.poses, np.zeros((1, 3))])  # the last one is for _NONE
+        told = composed(poses[owners], motions)
+        kept_ns = np.array([frame.stamp_ns for frame in frames], np.int64)
+        follows = np.flatnonzero((owners >= 0) & (owners + 1 < len(frames)))
+        own = owners[follows]
+        measured = np.array([frame.T_prev_curr for frame in frames]).reshape(-1, 3)
+        missed = betweens(composed(poses[own], measured[own + 1]), poses[own + 1])
+        share = (stamps_ns[follows] - kept_ns[own]) / (kept_ns[own + 1] - kept_ns[own])
+        told[follows] = composed(told[follows], np.clip(share, 0.0, 1.0)[:, None] * missed)
+        planar = np.stack([se3.from_xy_yaw(x, y, yaw) for x, y, yaw in told.tolist()])
+        return Trajectory(stamps_ns=stamps_ns, T_world_base=planar)

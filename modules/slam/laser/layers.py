@@ -1,0 +1,88 @@
+"""The map layers of a session: grid, points, pose graph."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.maps import MapLayers, PointLayer, PoseGraphLayer
+from sceneslam.types.observation import LaserScan
+
+from ..grid import OccupancyGrid
+from .keyframes import Keyframes
+from .planar import Matrix, apply, to_transform
+from .pose_graph import Edge
+
+_PLANAR = [0, 1, 5]  # x, y, yaw in se3.log's order
+_LEVEL_DEVIATION = 0.01  # m and rad: what a floor's z, roll and pitch are believed to vary by
+
+
+def map_layers(
+    keyframes: Keyframes,
+    edges: Sequence[Edge],
+    T_base_laser: se3.Transform,
+    *,
+    resolution_m: float,
+    range_max_m: float,
+) -> MapLayers:
+    """Return everything that the keyframes saw, in `local`."""
+    grid = OccupancyGrid(resolution_m)
+    clouds = [np.zeros((0, 2))]
+    for keyframe in keyframes.frames:
+        grid.insert(
+            to_transform(keyframe.T_local_base) @ T_base_laser, _cut(keyframe.scan, range_max_m)
+        )
+        clouds.append(apply(keyframe.T_local_base, keyframe.surfaces_base.points))
+    points = _thin(np.concatenate(clouds), resolution_m)
+    heights = np.full(len(points), T_base_laser[2, 3])
+    cloud = np.column_stack([points, heights]).astype(np.float32)
+    return MapLayers(
+        points=PointLayer(points=cloud),
+        grid=grid.layer(),
+        pose_graph=_graph(keyframes, edges),
+    )
+
+
+def covariance_6(covariance: Matrix) -> NDArray[np.float64]:
+    """Return the (6, 6) covariance of se3.log from that of (x, y, yaw), same axes."""
+    full = np.eye(6) * _LEVEL_DEVIATION**2
+    full[np.ix_(_PLANAR, _PLANAR)] = covariance
+    return full
+
+
+def _graph(keyframes: Keyframes, edges: Sequence[Edge]) -> PoseGraphLayer:
+    information = [np.linalg.inv(covariance_6(edge.covariance)) for edge in edges]
+    return PoseGraphLayer(
+        stamps_ns=np.array([frame.stamp_ns for frame in keyframes.frames], np.int64),
+        T_world_base=_stack([to_transform(pose) for pose in keyframes.poses]),
+        edges=np.array([(e.first, e.second) for e in edges], np.int64).reshape(-1, 2),
+        T_from_to=_stack([to_transform(edge.T_first_second) for edge in edges]),
+        information=np.array(information).reshape(-1, 6, 6),
+        is_loop=np.array([edge.is_loop for edge in edges], dtype=bool),
+    )
+
+
+def _stack(transforms: Sequence[se3.Transform]) -> NDArray[np.float64]:
+    return np.array(transforms).reshape(-1, 4, 4)
+
+
+def _cut(scan: LaserScan, range_max_m: float) -> LaserScan:
+    """Return the scan without what is too far to be believed."""
+    far = scan.ranges_m > range_max_m
+    ranges = np.where(far & np.isfinite(scan.ranges_m), np.inf, scan.ranges_m)
+    return replace(scan, ranges_m=ranges.astype(np.float32))
+
+
+def _thin(points: NDArray[np.float64], cell_m: float) -> NDArray[np.float64]:
+    """Return one point (the first) per square of `cell_m`, in their order."""
+    cells = np.floor(points / cell_m).astype(np.int64)
+    if not len(cells):
+        return points
+    columns = int(np.ptp(cells[:, 0])) + 1
+    flat = (cells[:, 1] - cells[:, 1].min()) * columns + cells[:, 0] - cells[:, 0].min()
+    _, first = np.unique(flat, return_index=True)
+    return np.asarray(points[np.sort(first)])

@@ -1,0 +1,58 @@
+"""Submaps as places to be found again: fields and searches, made when asked for."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, field
+
+from .field import LikelihoodField
+from .keyframes import Keyframes
+from .loop_search import LoopSearch
+from .planar import between
+from .surface import joined
+
+_KEPT = 24  # places in memory, about 2 MB each
+
+
+@dataclass(slots=True)
+class Place:
+    """One submap in the frame of its middle keyframe."""
+
+    anchor: int
+    field: LikelihoodField
+    _search: LoopSearch | None = None
+
+    @property
+    def search(self) -> LoopSearch:
+        """Return the wide search, made at first use."""
+        if self._search is None:
+            self._search = LoopSearch(self.field)
+        return self._search
+
+
+@dataclass(slots=True)
+class Places:
+    """The places of all finished submaps; the latest used are kept."""
+
+    keyframes: Keyframes
+    resolution_m: float
+    _places: OrderedDict[int, Place] = field(default_factory=OrderedDict)
+
+    def of(self, submap: int) -> Place:
+        """Return a submap's place."""
+        if submap not in self._places:
+            self._places[submap] = self._make(self.keyframes.of_submap(submap))
+            if len(self._places) > _KEPT:
+                self._places.popitem(last=False)
+        self._places.move_to_end(submap)
+        return self._places[submap]
+
+    def _make(self, numbers: range) -> Place:
+        anchor = numbers[len(numbers) // 2]
+        frames = self.keyframes.frames
+        T_local_anchor = frames[anchor].T_local_base
+        parts = [
+            frames[i].surfaces_base.moved(between(T_local_anchor, frames[i].T_local_base))
+            for i in numbers
+        ]
+        return Place(anchor=anchor, field=LikelihoodField(joined(parts), self.resolution_m))
