@@ -1,0 +1,244 @@
+"""The do-no-harm gate: did the robot move as a module says? Wheels, or another, bear witness.
+
+Wheels measure distance well and turns badly; cameras the other way round, and one without a
+metric sensor guesses its scale. So distance and turn are judged apart: a module whose scale is
+off still tells the turn better than the wheels (Borenstein and Feng's gyrodometry, ICRA 1996).
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass, fields
+from enum import Enum
+
+import numpy as np
+
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.se3 import Transform
+
+
+class Verdict(Enum):
+    """What the independent motion says of a module's."""
+
+    AGREE = "agree"
+    DISAGREE = "disagree"
+    PROBATION = "probation"  # no disagreement, but not for long enough yet
+    UNCHECKED = "unchecked"  # there is no independent motion
+
+
+@dataclass(slots=True, kw_only=True)
+class GateSettings:
+    """How far two honest motions may differ: `sigmas` deviations of the independent one.
+
+    Its deviations are those of wheels on a floor: they grow with the way and the turn, on top of
+    what slips and the sensors' clocks make of any motion. A module's own covariance does not
+    widen the bounds: where a module is less sure than the wheels are, theirs is the better motion.
+    """
+
+    sigmas: float
+    horizons_s: list[float]  # motions are compared over each; the shortest first
+    probation_s: float  # a module is trusted after agreeing for so long
+    distance_m: float  # standard deviation of any motion ...
+    distance_per_m: float  # ... and per metre driven
+    turn_rad: float  # the same of its turn ...
+    turn_per_rad: float  # ... per radian turned
+    turn_rad_per_m: float  # ... and per metre driven
+    broken_ratio: float  # off by more of the way than any wrong scale explains: not even the turn
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name != "horizons_s" and not 0 <= value < float("inf"):
+                raise ConfigError(field.name, value, "0 or more")
+        for name in ("sigmas", "distance_m", "turn_rad"):
+            if getattr(self, name) == 0:
+                raise ConfigError(name, 0, "a number above 0")
+        rising = sorted(set(self.horizons_s)) == list(self.horizons_s)
+        if not self.horizons_s or not rising or self.horizons_s[0] <= 0:
+            raise ConfigError("horizons_s", self.horizons_s, "seconds above 0, the shortest first")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judgement:
+    """How far a module is to be believed at one observation."""
+
+    distance: Verdict
+    turn: Verdict
+    distance_excess: float = 0.0  # the largest difference over its bound; above 1 is too much
+    turn_excess: float = 0.0
+    since_ns: int | None = None  # from when on the module was right, or may have been wrong
+
+    @property
+    def is_trusted(self) -> bool:
+        """Tell whether the module's pose may be taken."""
+        return self.distance in _GOOD and self.turn in _GOOD
+
+
+_GOOD = (Verdict.AGREE, Verdict.UNCHECKED)
+
+
+def bridged_motion(
+    T_prev_curr_odom: Transform, T_prev_curr_module: Transform | None, judgement: Judgement
+) -> Transform:
+    """Return the best motion since the previous observation while a module is not trusted.
+
+    The way is the odometry's; so is the turn, unless the module (None: it has no pose now or had
+    none then) is believed that.
+    """
+    if T_prev_curr_module is None or judgement.turn is not Verdict.AGREE:
+        return T_prev_curr_odom
+    return se3.from_parts(T_prev_curr_module[:3, :3], T_prev_curr_odom[:3, 3])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Sample:
+    stamp_ns: int
+    T_local_base: Transform
+    T_odom_base: Transform
+    way_m: float  # driven until then
+    turn_rad: float  # turned until then
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Excess:
+    """Differences of two motions over their bounds; above 1 is too much."""
+
+    distance: float
+    turn: float
+
+
+class Gate:
+    """Follows one activation of one module; what it says depends on what it was given alone."""
+
+    def __init__(self, settings: GateSettings) -> None:
+        self._settings = settings
+        self._horizons_ns = [round(horizon_s * 1e9) for horizon_s in settings.horizons_s]
+        self._probation_ns = round(settings.probation_s * 1e9)
+        self._samples: list[_Sample] = []  # by rising stamp, back to the longest horizon
+        self._T_odom_base: Transform | None = None
+        self._way_m, self._turn_rad = 0.0, 0.0
+        self._distance_since_ns: int | None = None  # since when it has not been too far off ...
+        self._turn_since_ns: int | None = None
+
+    def update(
+        self,
+        stamp_ns: int,
+        *,
+        T_local_base: Transform | None,
+        T_odom_base: Transform | None,
+        is_revised: bool = False,
+    ) -> Judgement:
+        """Return how far the module is to be believed at an observation.
+
+        `T_local_base` is None where the module is lost, `T_odom_base` where nothing else told the
+        motion. `is_revised`: the module corrected its past, and its pose jumps without motion.
+        """
+        if T_odom_base is None:
+            return Judgement(distance=Verdict.UNCHECKED, turn=Verdict.UNCHECKED)
+        T_prev_curr = self._drive(T_odom_base)
+        if T_local_base is None:
+            return Judgement(distance=Verdict.PROBATION, turn=Verdict.PROBATION)
+        if is_revised:
+            self._move_past(T_local_base, T_prev_curr)
+        now = _Sample(
+            stamp_ns=stamp_ns,
+            T_local_base=T_local_base,
+            T_odom_base=T_odom_base,
+            way_m=self._way_m,
+            turn_rad=self._turn_rad,
+        )
+        judgement = self._judge(now)
+        self._samples.append(now)
+        return judgement
+
+    def _drive(self, T_odom_base: Transform) -> Transform:
+        """Count the odometry's step; return it."""
+        T_prev_curr = se3.identity()
+        if self._T_odom_base is not None:
+            T_prev_curr = se3.inverse(self._T_odom_base) @ T_odom_base
+            self._way_m += float(np.linalg.norm(T_prev_curr[:3, 3]))
+            self._turn_rad += _angle_rad(T_prev_curr[:3, :3], np.eye(3))
+        self._T_odom_base = T_odom_base
+        return T_prev_curr
+
+    def _move_past(self, T_local_base: Transform, T_prev_curr: Transform) -> None:
+        """Bring the samples to where the module now has them; its last step is the odometry's."""
+        if not self._samples:
+            return
+        T_old_base = self._samples[-1].T_local_base @ T_prev_curr
+        T_new_old = T_local_base @ se3.inverse(T_old_base)
+        self._samples = [
+            _Sample(
+                stamp_ns=sample.stamp_ns,
+                T_local_base=T_new_old @ sample.T_local_base,
+                T_odom_base=sample.T_odom_base,
+                way_m=sample.way_m,
+                turn_rad=sample.turn_rad,
+            )
+            for sample in self._samples
+        ]
+
+    def _judge(self, now: _Sample) -> Judgement:
+        found = self._anchors(now.stamp_ns)
+        excesses = [_excess(then, now, self._settings) for then in found]
+        distance = max((excess.distance for excess in excesses), default=0.0)
+        turn = max((excess.turn for excess in excesses), default=0.0)
+        if self._distance_since_ns is None or max(distance, turn) > 1.0:
+            self._distance_since_ns = now.stamp_ns
+        if self._turn_since_ns is None or turn > 1.0:
+            self._turn_since_ns = now.stamp_ns
+        is_wrong = max(distance, turn) > 1.0
+        return Judgement(
+            distance=self._verdict(distance, self._distance_since_ns, now, bool(found)),
+            turn=self._verdict(turn, self._turn_since_ns, now, bool(found)),
+            distance_excess=distance,
+            turn_excess=turn,
+            since_ns=found[0].stamp_ns if is_wrong else self._distance_since_ns,
+        )
+
+    def _verdict(self, excess: float, since_ns: int, now: _Sample, is_known: bool) -> Verdict:
+        if excess > 1.0:
+            return Verdict.DISAGREE
+        is_long = now.stamp_ns - since_ns >= self._probation_ns
+        return Verdict.AGREE if is_known and is_long else Verdict.PROBATION
+
+    def _anchors(self, stamp_ns: int) -> list[_Sample]:
+        """Return, per horizon, the newest sample before it; none while the shortest is not filled.
+
+        The oldest sample stands in for a longer one that is not. Older samples are forgotten.
+        """
+        indices = [
+            bisect_right(self._samples, stamp_ns - horizon_ns, key=lambda one: one.stamp_ns) - 1
+            for horizon_ns in self._horizons_ns
+        ]
+        if indices[0] < 0:
+            return []
+        found = [self._samples[max(index, 0)] for index in indices]
+        del self._samples[: max(indices[-1], 0)]
+        return found
+
+
+def _excess(then: _Sample, now: _Sample, settings: GateSettings) -> _Excess:
+    """Return by how much the module's motion differs from the odometry's, over the bounds."""
+    T_module = se3.inverse(then.T_local_base) @ now.T_local_base
+    T_odom = se3.inverse(then.T_odom_base) @ now.T_odom_base
+    way_m, turned_rad = now.way_m - then.way_m, now.turn_rad - then.turn_rad
+    apart_m = float(np.linalg.norm(T_module[:3, 3] - T_odom[:3, 3]))
+    apart_rad = _angle_rad(T_module[:3, :3], T_odom[:3, :3])
+    floor_m = settings.sigmas * settings.distance_m
+    bound_m = floor_m + settings.sigmas * settings.distance_per_m * way_m
+    deviation_rad = (
+        settings.turn_rad + settings.turn_per_rad * turned_rad + settings.turn_rad_per_m * way_m
+    )
+    broken = apart_m / (floor_m + settings.broken_ratio * way_m)
+    return _Excess(
+        distance=apart_m / bound_m,
+        turn=max(apart_rad / (settings.sigmas * deviation_rad), broken),
+    )
+
+
+def _angle_rad(rotation_a: Transform, rotation_b: Transform) -> float:
+    """Return the angle between two rotations [rad], from the chord between them."""
+    chord = float(np.linalg.norm(rotation_a - rotation_b))
+    return 2.0 * float(np.arcsin(min(chord / np.sqrt(8.0), 1.0)))

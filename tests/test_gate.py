@@ -1,0 +1,163 @@
+"""The do-no-harm gate: what wheels say of a module's motion."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sceneslam.bus.gate import Gate, GateSettings, Verdict, bridged_motion
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+
+AGREE, DISAGREE = Verdict.AGREE, Verdict.DISAGREE
+PERIOD_S = 0.1
+SETTINGS = GateSettings(
+    sigmas=3.0,
+    horizons_s=[1.0, 5.0],
+    probation_s=1.0,
+    distance_m=0.03,
+    distance_per_m=0.02,
+    turn_rad=0.0175,
+    turn_per_rad=0.02,
+    turn_rad_per_m=0.01,
+    broken_ratio=0.5,
+)
+
+
+def arc(step, *, speed_m_s=0.5, turn_rad_s=0.2):
+    """The pose after so many steps along a circle."""
+    T_step = se3.exp(np.array([speed_m_s * PERIOD_S, 0, 0, 0, 0, turn_rad_s * PERIOD_S]))
+    return np.linalg.matrix_power(T_step, step)
+
+
+def judged(module, *, odometry=arc, steps=100, revised_at=None):
+    """Return the judgement at every step; `module` and `odometry` give a pose or None."""
+    gate = Gate(SETTINGS)
+    return [
+        gate.update(
+            round(step * PERIOD_S * 1e9),
+            T_local_base=module(step),
+            T_odom_base=odometry(step),
+            is_revised=step == revised_at,
+        )
+        for step in range(steps)
+    ]
+
+
+def scaled(ratio):
+    return lambda step: arc(step, speed_m_s=0.5 * ratio)
+
+
+def jumping(at_step, x_m):
+    def module(step):
+        return se3.from_xy_yaw(x_m, 0.0, 0.0) @ arc(step) if step >= at_step else arc(step)
+
+    return module
+
+
+def trusted(judgements):
+    return [judgement.is_trusted for judgement in judgements]
+
+
+def test_a_module_that_moves_like_the_wheels_is_trusted_after_its_probation():
+    judgements = judged(arc)
+    assert trusted(judgements) == [False] * 10 + [True] * 90
+    assert judgements[5].distance is Verdict.PROBATION
+    assert judgements[10].since_ns == 0  # it was right all along
+
+
+def test_a_scale_off_by_a_few_percent_is_what_wheels_have_themselves():
+    assert judged(scaled(1.05))[-1].is_trusted
+
+
+def test_a_wrong_scale_costs_the_trust_in_the_distance_but_not_in_the_turn():
+    last = judged(scaled(0.75))[-1]
+    assert last.distance is DISAGREE and last.turn is AGREE
+    assert not last.is_trusted and last.distance_excess > 1.0 > last.turn_excess
+
+
+def test_a_module_that_stands_still_while_the_robot_drives_is_not_even_believed_the_turn():
+    last = judged(lambda step: np.eye(4), odometry=lambda step: arc(step, turn_rad_s=0.0))[-1]
+    assert last.turn is DISAGREE
+
+
+def test_a_jump_is_seen_at_once_and_forgiven_when_both_horizons_have_passed_and_the_probation():
+    judgements = judged(jumping(30, 1.0), steps=110)
+    first = trusted(judgements).index(True, 30)
+    assert not judgements[30].is_trusted and judgements[30].since_ns == 2_000_000_000
+    assert first == 30 + 50 + 10 - 1
+    assert all(trusted(judgements)[first:])
+
+
+def test_a_slow_drift_at_standstill_is_seen_over_the_long_horizon():
+    drift = [
+        judged(lambda step, v=v: se3.from_xy_yaw(v * PERIOD_S * step, 0, 0), odometry=lambda _: EYE)
+        for v in (0.01, 0.05)
+    ]
+    assert drift[0][-1].is_trusted
+    assert drift[1][15].is_trusted and drift[1][-1].distance is DISAGREE
+
+
+EYE = np.eye(4)
+
+
+def test_a_wrong_turn_costs_all_trust():
+    last = judged(lambda step: arc(step, turn_rad_s=0.3))[-1]
+    assert last.turn is DISAGREE and not last.is_trusted
+
+
+def lost_between(module, first, last):
+    return lambda step: None if first <= step < last else module(step)
+
+
+def test_a_module_back_from_a_loss_where_the_wheels_are_is_trusted_at_once():
+    judgements = judged(lost_between(arc, 40, 70))
+    assert not judgements[50].is_trusted and judgements[70].is_trusted
+
+
+def test_a_module_back_from_a_loss_elsewhere_is_not():
+    judgements = judged(lost_between(jumping(70, 2.0), 40, 70), steps=140)
+    assert not any(trusted(judgements)[40:100]) and judgements[-1].is_trusted
+
+
+def test_without_odometry_nothing_is_held_against_a_module():
+    judgement = judged(jumping(30, 1.0), odometry=lambda step: None)[31]
+    assert judgement.distance is Verdict.UNCHECKED and judgement.is_trusted
+
+
+def test_a_corrected_past_is_no_motion():
+    assert not judged(jumping(30, 1.0))[30].is_trusted
+    assert all(trusted(judged(jumping(30, 1.0), revised_at=30))[10:])
+
+
+@given(st.lists(st.floats(-3, 3), min_size=12, max_size=12))
+def test_judgement_does_not_depend_on_where_the_frames_are(values):
+    T_a, T_b = se3.exp(np.array(values[:6])), se3.exp(np.array(values[6:]))
+    moved = judged(
+        lambda step: T_a @ scaled(0.9)(step), odometry=lambda step: T_b @ arc(step), steps=20
+    )
+    for one, other in zip(judged(scaled(0.9), steps=20), moved, strict=True):
+        assert one.distance is other.distance and one.turn is other.turn
+        assert one.distance_excess == pytest.approx(other.distance_excess, abs=1e-6)
+
+
+def test_bridging_takes_the_way_from_the_wheels_and_the_turn_from_a_module_believed_that():
+    T_odom, T_module = se3.from_xy_yaw(0.1, 0.0, 0.3), se3.from_xy_yaw(0.2, 0.0, 0.1)
+    off, wrong = judged(scaled(0.75))[-1], judged(jumping(30, 1.0))[30]
+    both = bridged_motion(T_odom, T_module, off)
+    assert se3.yaw_rad(both) == pytest.approx(0.1) and both[0, 3] == pytest.approx(0.1)
+    np.testing.assert_array_equal(bridged_motion(T_odom, T_module, wrong), T_odom)
+    np.testing.assert_array_equal(bridged_motion(T_odom, None, off), T_odom)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("sigmas", 0.0), ("distance_per_m", -1.0), ("horizons_s", []), ("horizons_s", [5.0, 1.0])],
+)
+def test_impossible_setting_is_named(name, value):
+    with pytest.raises(ConfigError, match=name):
+        GateSettings(**{**asdict(SETTINGS), name: value})
