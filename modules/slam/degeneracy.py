@@ -1,0 +1,77 @@
+"""How well the shape of what is seen holds a pose, per direction.
+
+Planes hold a pose along their normals only (Gelfand et al., "Geometrically Stable Sampling for the
+ICP Algorithm", 3DIM 2003). One wall leaves three directions open, a bare corridor one. There the
+registration follows noise, so its information along them is taken out, and what the motion tells
+remains ("solution remapping", Zhang, Kaess and Singh, ICRA 2016).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.se3 import Transform
+
+Doubles = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Localizability:
+    """Ratios between 0 (open) and about 1 (normals to all sides), and their directions.
+
+    A direction is a motion about the points' centre, turns times their spread: all in metres.
+    """
+
+    ratios: Doubles  # (6,), rising
+    directions: Doubles  # (6, 6), one per column: the motion [m, m] of the points
+    scale: Doubles  # (6, 6): takes a twist (se3.log order) of the points' frame to such a motion
+
+    def weak_twists(self, ratio_min: float) -> Doubles:
+        """Return the twists (K, 6) of the points' frame that lie below `ratio_min`."""
+        return np.asarray(
+            np.linalg.solve(self.scale, self.directions[:, self.ratios < ratio_min]).T
+        )
+
+    def held(self, ratio_min: float) -> Doubles:
+        """Return the (6, 6) projection of a twist on the directions that are not weak."""
+        strong = self.directions[:, self.ratios >= ratio_min]
+        return np.asarray(np.linalg.solve(self.scale, strong @ strong.T @ self.scale))
+
+
+def localizability(
+    points: NDArray[np.floating], normals: NDArray[np.floating], weights: NDArray[np.floating]
+) -> Localizability:
+    """Return how points (N, 3) [m] with unit normals hold a pose; `weights` (N,) say how much."""
+    total = max(float(weights.sum()), 1e-12)
+    centre = (weights @ points) / total
+    offsets = points - centre
+    spread_m = np.sqrt(float(weights @ np.einsum("ij,ij->i", offsets, offsets)) / total) + 1e-9
+    rows = np.concatenate([normals, np.cross(offsets, normals) / spread_m], axis=1)
+    rows = rows.astype(np.float64)
+    shape = 3.0 * rows.T @ (rows * weights[:, None]) / total
+    ratios, directions = np.linalg.eigh(shape)
+    return Localizability(
+        ratios=np.maximum(ratios, 0.0), directions=directions, scale=_motion_of(centre, spread_m)
+    )
+
+
+def adjoint(T_a_b: Transform) -> Doubles:
+    """Return the (6, 6) matrix that takes twists of b to a (translation first)."""
+    ad = np.zeros((6, 6))
+    ad[:3, :3] = ad[3:, 3:] = T_a_b[:3, :3]
+    ad[:3, 3:] = _hat(T_a_b[:3, 3]) @ T_a_b[:3, :3]
+    return ad
+
+
+def _motion_of(centre: NDArray[np.floating], spread_m: float) -> Doubles:
+    scale = np.eye(6)
+    scale[:3, 3:] = -_hat(centre)
+    scale[3:, 3:] *= spread_m
+    return scale
+
+
+def _hat(v: NDArray[np.floating]) -> Doubles:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

@@ -1,0 +1,36 @@
+"""The poses that were told, each tied to a keyframe, so that they follow when it is moved."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sceneslam.types import se3
+from sceneslam.types.trajectory import Trajectory
+
+from .keyframe_map import KeyframeMap
+
+
+class History:
+    """One entry per observation that held a pose; 150 bytes each."""
+
+    def __init__(self, keyframes: KeyframeMap) -> None:
+        self._map = keyframes
+        self._stamps_ns: list[int] = []
+        self._references: list[int] = []
+        self._T_key_base: list[se3.Transform] = []
+
+    def add(self, stamp_ns: int, reference: int, T_local_base: se3.Transform) -> None:
+        """Remember a pose as seen from the keyframe `reference`."""
+        self._stamps_ns.append(stamp_ns)
+        self._references.append(reference)
+        self._T_key_base.append(self._map[reference].T_cam_local @ T_local_base)
+
+    def trajectory(self) -> Trajectory:
+        """Return T_local_base at all stamps, by the keyframes' poses of now."""
+        if not self._stamps_ns:
+            return Trajectory.empty()
+        keys = np.array([keyframe.T_local_cam for keyframe in self._map.keyframes])
+        return Trajectory(
+            stamps_ns=np.array(self._stamps_ns, np.int64),
+            T_world_base=keys[self._references] @ np.array(self._T_key_base),
+        )

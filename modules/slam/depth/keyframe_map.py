@@ -1,0 +1,92 @@
+"""The keyframes, and which of them show what the camera sees."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+
+from .keyframe import Keyframe
+from .registration import Samples, compare
+from .surface import Floats, Grid, Surface
+
+_PROBES = 300  # points by which an overlap is measured
+_PROBE_GATE_M = 0.1
+_NEAREST = 8  # keyframes whose overlap is measured
+_IMAGES_MIN = 2  # a cell of the cloud was seen at least so often
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Overlap:
+    """A keyframe, by its number, and the share of the points that it shows too."""
+
+    index: int
+    ratio: float
+
+
+class KeyframeMap:
+    """All keyframes, in the order in which they were made."""
+
+    def __init__(self, grid: Grid) -> None:
+        self.grid = grid
+        self.keyframes: list[Keyframe] = []
+
+    def __len__(self) -> int:
+        return len(self.keyframes)
+
+    def __getitem__(self, index: int) -> Keyframe:
+        return self.keyframes[index]
+
+    def add(self, surface: Surface, T_local_cam: se3.Transform, *, stamp_ns: int) -> int:
+        """Keep a view; return its number."""
+        self.keyframes.append(Keyframe(surface, T_local_cam, stamp_ns=stamp_ns))
+        return len(self.keyframes) - 1
+
+    def overlaps(self, samples: Samples, T_local_cam: se3.Transform) -> Sequence[Overlap]:
+        """Return the keyframes that look at the same place, the best first."""
+        probes = samples.thinned(_PROBES)
+        found = []
+        for index in self._nearest(probes, T_local_cam):
+            keyframe = self.keyframes[index]
+            T_key_cam = keyframe.T_cam_local @ T_local_cam
+            same = compare(probes, keyframe, T_key_cam, _PROBE_GATE_M, self.grid)[3]
+            found.append(Overlap(int(index), float(same.mean())))
+        return sorted(found, key=lambda overlap: (-overlap.ratio, overlap.index))
+
+    def alike(self, surface: Surface, count: int) -> Sequence[int]:
+        """Return the keyframes whose view looks most like the surface, wherever they are."""
+        view = self._thumbnail(surface.disparity, surface.valid)
+        unlike = []
+        for keyframe in self.keyframes:
+            known = keyframe.surface()
+            other = self._thumbnail(known.disparity, known.valid)
+            both = (view > 0) & (other > 0)
+            far = np.abs(view - other)[both]
+            unlike.append(float(far.mean()) / float(both.mean()) if len(far) else np.inf)
+        order = np.argsort(unlike, kind="stable")[:count]
+        return [int(index) for index in order if unlike[index] < np.inf]
+
+    def cloud(self, voxel_m: float) -> Floats:
+        """Return the surfaces' points (N, 3) [m], local, one per voxel."""
+        if not self.keyframes:
+            return np.zeros((0, 3), np.float32)
+        points = np.vstack([one.points_local(self.grid, _IMAGES_MIN) for one in self.keyframes])
+        _, rows = np.unique(np.floor(points / voxel_m).astype(np.int32), axis=0, return_index=True)
+        return np.asarray(points[np.sort(rows)])
+
+    def _nearest(self, probes: Samples, T_local_cam: se3.Transform) -> NDArray[np.int64]:
+        """Return the keyframes whose view's middle is nearest to that of this view."""
+        depth_m = float(np.median(probes.points[:, 2]))
+        poses = np.array([keyframe.T_local_cam for keyframe in self.keyframes])
+        middles = poses[:, :3, 3] + depth_m * poses[:, :3, 2]
+        middle = T_local_cam[:3, 3] + depth_m * T_local_cam[:3, 2]
+        return np.argsort(np.linalg.norm(middles - middle, axis=1), kind="stable")[:_NEAREST]
+
+    def _thumbnail(self, disparity: Floats, valid: NDArray[np.bool_]) -> Floats:
+        """Return the disparity in every eighth row and column, 0 where there is no surface."""
+        image = np.where(valid, disparity, 0.0).reshape(self.grid.height, self.grid.width)
+        return image[::8, ::8].astype(np.float32)

@@ -1,0 +1,225 @@
+"""The `depth` SLAM module: a hand-held or driven depth camera in 6-DoF, in light or darkness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.maps import MapLayers, PointLayer
+from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
+
+from ..degeneracy import adjoint
+from .history import History
+from .keyframe_map import KeyframeMap
+from .motion import Motion, Prediction
+from .pose_graph import PoseGraph
+from .registration import Prior, Registration, Samples, register, samples_of
+from .surface import Surface, SurfaceReader
+
+_SAMPLES_MIN = 100
+_TOGETHER = 3  # keyframes that an image is registered with
+_USEFUL_OVERLAP = 0.2
+_ALIKE = 3  # keyframes that a lost camera is tried at
+_COAST_S = 0.5  # without depth for longer, a guessed pose is no pose
+_AT_START = 1e-8
+
+
+@dataclass(kw_only=True, eq=False)
+class DepthSlam:
+    """Registers depth images with keyframes; `conf/slam/depth.yaml` says what the settings are."""
+
+    keyframe_overlap_ratio: float
+    matched_min_ratio: float
+    weak_ratio: float
+    cloud_voxel_m: float
+    _T_map_local: se3.Transform = field(default_factory=se3.identity, init=False)
+    _motion: Motion = field(default_factory=Motion, init=False)
+    _map: KeyframeMap = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        for name in ("keyframe_overlap_ratio", "matched_min_ratio", "weak_ratio"):
+            if not 0 < getattr(self, name) < 1:
+                raise ConfigError(name, getattr(self, name), "between 0 and 1")
+        if not 0 < self.cloud_voxel_m < np.inf:
+            raise ConfigError("cloud_voxel_m", self.cloud_voxel_m, "above 0 [m]")
+
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return that depth suffices; odometry and gyro are used when present."""
+        return (frozenset({Sensor.DEPTH}),)
+
+    def activate(self, rig: Rig) -> None:
+        """Start anew with an empty map; raises InputError for a rig without a camera."""
+        if rig.camera is None:
+            raise InputError("rig: depth needs the camera's intrinsics, got none")
+        self._camera = rig.camera
+        self._reader = SurfaceReader(rig.camera)
+        self._map = KeyframeMap(self._reader.grid)
+        self._graph = PoseGraph(self._map, weak_ratio=self.weak_ratio)
+        self._history = History(self._map)
+        self._motion = Motion()
+        self._T_map_local = se3.identity()
+        self._reference, self._revision = 0, 0
+        self._seen_ns: int | None = None  # when depth last held the pose
+        self._is_lost = False
+
+    def set_pose(self, T_map_local: se3.Transform) -> None:
+        """Place `local` in the map (Eq. 1)."""
+        self._T_map_local = np.array(T_map_local, dtype=np.float64)
+
+    def set_scene(self, scene: str) -> None:
+        """Do nothing: depth is the same by day and by night."""
+
+    def track(self, observation: Observation) -> Tracking:
+        """Return T_local_base at the observation."""
+        prediction = self._motion.predict(observation)
+        if observation.depth_m is None:
+            return self._bridge(observation, prediction, can_coast=True)
+        width, height = self._camera.size_wh
+        if observation.depth_m.shape != (height, width):
+            raise InputError(
+                f"depth_m: expected ({height}, {width}), got {observation.depth_m.shape}"
+            )
+        surface = self._reader.read(observation.depth_m)
+        samples = samples_of(surface, self._reader.grid)
+        if len(samples) < _SAMPLES_MIN:
+            return self._bridge(observation, prediction, can_coast=False)
+        if not len(self._map):
+            return self._start(observation, surface, samples, prediction)
+        found = self._locate(samples, surface, prediction)
+        if found is None:
+            return self._bridge(observation, prediction, can_coast=False)
+        return self._hold(observation, surface, samples, prediction, found)
+
+    def get_pose(self) -> se3.Transform:
+        """Return T_map_base of the last observation."""
+        return self._T_map_local @ self._motion.T_local_base
+
+    def get_trajectory(self) -> Trajectory:
+        """Return all poses after a last optimisation."""
+        self._graph.finish()
+        return self._history.trajectory()
+
+    def get_map(self) -> MapLayers:
+        """Return the keyframes' cloud in `local`."""
+        return MapLayers(points=PointLayer(points=self._map.cloud(self.cloud_voxel_m)))
+
+    def shutdown(self) -> None:
+        """Do nothing: only memory is held, and the map stays readable."""
+
+    def _start(
+        self, observation: Observation, surface: Surface, samples: Samples, prediction: Prediction
+    ) -> Tracking:
+        """Make the first keyframe, or the first of a place that odometry alone leads to."""
+        T_local_cam = prediction.T_local_base @ self._camera.T_base_cam
+        self._add_keyframe(observation, surface, T_local_cam)
+        self._motion.coast(observation, prediction)
+        is_first = len(self._map) == 1 and not self._is_lost
+        status = TrackingStatus.TRACKING if is_first else TrackingStatus.DEGRADED
+        return self._answer(observation, status, 1.0, len(samples))
+
+    def _locate(
+        self, samples: Samples, surface: Surface, prediction: Prediction
+    ) -> Registration | None:
+        """Return where the camera is beside the keyframes around, else beside those alike."""
+        found = self._register(samples, self._prior(prediction))
+        if found is not None and found.matched_ratio >= self.matched_min_ratio:
+            return found
+        return None
+
+    def _register(self, samples: Samples, prior: Prior) -> Registration | None:
+        overlaps = self._map.overlaps(samples, prior.T_local_cam)
+        near = [o.index for o in overlaps[:_TOGETHER] if o.ratio > _USEFUL_OVERLAP]
+        keyframes = [self._map[index] for index in near or [self._reference]]
+        return register(samples, prior, keyframes, self._map.grid, weak_ratio=self.weak_ratio)
+
+    def _prior(self, prediction: Prediction) -> Prior:
+        T_cam_base = se3.inverse(self._camera.T_base_cam)
+        turned = adjoint(T_cam_base)
+        information = np.linalg.inv(turned @ prediction.covariance @ turned.T)
+        T_local_cam = prediction.T_local_base @ self._camera.T_base_cam
+        return Prior(T_local_cam, np.asarray(information, np.float64))
+
+    def _hold(
+        self,
+        observation: Observation,
+        surface: Surface,
+        samples: Samples,
+        prediction: Prediction,
+        found: Registration,
+    ) -> Tracking:
+        T_base_cam = self._camera.T_base_cam
+        turned = adjoint(T_base_cam)
+        covariance = np.linalg.inv(found.information + self._prior(prediction).information)
+        weak = found.localizability.weak_twists(self.weak_ratio) @ turned.T
+        T_local_base = found.T_local_cam @ se3.inverse(T_base_cam)
+        self._motion.hold(observation, T_local_base, turned @ covariance @ turned.T, weak)
+        self._seen_ns, self._is_lost = observation.stamp_ns, False
+        self._extend(observation, surface, samples, found.T_local_cam)
+        status = TrackingStatus.DEGRADED if len(weak) else TrackingStatus.TRACKING
+        return self._answer(observation, status, found.matched_ratio, found.matched)
+
+    def _extend(
+        self,
+        observation: Observation,
+        surface: Surface,
+        samples: Samples,
+        T_local_cam: se3.Transform,
+    ) -> None:
+        """Improve the map by the image: a new keyframe, or a better one."""
+        overlaps = self._map.overlaps(samples, T_local_cam)
+        best = overlaps[0]
+        self._reference = best.index
+        if best.ratio < self.keyframe_overlap_ratio:
+            self._add_keyframe(observation, surface, T_local_cam)
+            return
+        self._map[best.index].fuse(surface, T_local_cam, self._map.grid)
+        if self._graph.advance():
+            T_key_base = self._map[best.index].T_cam_local @ self._motion.T_local_base
+            self._graph.solve()
+            self._motion.jump(self._map[best.index].T_local_cam @ T_key_base)
+            self._revision += 1
+
+    def _add_keyframe(
+        self, observation: Observation, surface: Surface, T_local_cam: se3.Transform
+    ) -> None:
+        self._reference = self._map.add(surface, T_local_cam, stamp_ns=observation.stamp_ns)
+        self._graph.connect(self._reference)
+
+    def _bridge(
+        self, observation: Observation, prediction: Prediction, *, can_coast: bool
+    ) -> Tracking:
+        """Go on without depth: by odometry, for a moment as before, else not at all."""
+        since_ns = observation.stamp_ns - (self._seen_ns or 0)
+        is_brief = self._seen_ns is not None and since_ns <= _COAST_S * 1e9
+        if prediction.is_measured:
+            self._motion.coast(observation, prediction)
+            return self._answer(observation, TrackingStatus.DEGRADED, 0.0, 0)
+        if can_coast and is_brief:
+            self._motion.coast(observation, prediction)
+            return self._answer(observation, TrackingStatus.TRACKING, 0.0, 0)
+        self._motion.stop(observation)
+        self._is_lost = True
+        return self._answer(observation, TrackingStatus.LOST, 0.0, 0)
+
+    def _answer(
+        self, observation: Observation, status: TrackingStatus, quality_ratio: float, inliers: int
+    ) -> Tracking:
+        is_lost = status is TrackingStatus.LOST
+        if not is_lost and len(self._map):
+            self._history.add(observation.stamp_ns, self._reference, self._motion.T_local_base)
+        return Tracking(
+            stamp_ns=observation.stamp_ns,
+            T_local_base=self._motion.T_local_base.copy(),
+            status=status,
+            covariance=None if is_lost else self._motion.covariance.copy(),
+            quality_ratio=quality_ratio,
+            inliers=inliers,
+            revision=self._revision,
+        )

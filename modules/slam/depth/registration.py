@@ -1,0 +1,181 @@
+"""Point-to-plane registration of a depth image with keyframes, by projection.
+
+Gauss-Newton (Chen and Medioni 1991; projective data association as in KinectFusion, Newcombe et
+al. 2011): each point is compared with the plane that a keyframe shows in the cell where the point
+is seen. Several keyframes at once, so that the pose agrees with all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+
+from ..degeneracy import Localizability, localizability
+from .keyframe import FACING_COS, Keyframe
+from .surface import Doubles, Floats, Grid, Surface
+
+_ITERATIONS_MAX = 12
+_GATE_M = (0.15, 0.03)  # residuals beyond are of other surfaces: at first, and in the end
+_GATE_SHRINK = 0.7
+_KERNEL_SIGMAS = 12.0  # where a residual begins to count less
+_SURFACE_SIGMA_M = 0.001  # no surface is flatter than this
+_STEP_MIN = 1e-4  # m and rad: converged
+_CORRELATION = 100.0  # neighbouring planes share errors: so many points know as much as one
+_POINTS_MIN = 100
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Points of one depth image that are registered."""
+
+    points: Floats  # (N, 3) [m], cam
+    normals: Floats  # (N, 3), cam
+    sigmas_m: Floats  # (N,) standard deviation across the plane
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def localizability(self, rows: NDArray[np.bool_] | None = None) -> Localizability:
+        """Return how well the samples, or those of `rows`, hold the camera."""
+        chosen = slice(None) if rows is None else rows
+        return localizability(
+            self.points[chosen], self.normals[chosen], self.sigmas_m[chosen] ** np.float32(-2)
+        )
+
+    def thinned(self, count: int) -> Samples:
+        """Return about `count` of the samples, spread evenly."""
+        rows = slice(None, None, max(1, len(self) // count))
+        return Samples(self.points[rows], self.normals[rows], self.sigmas_m[rows])
+
+
+def samples_of(surface: Surface, grid: Grid, stride: int = 2) -> Samples:
+    """Return the surface's points in every stride-th row and column."""
+    valid = surface.valid.reshape(grid.height, grid.width)
+    chosen = np.zeros_like(valid)
+    chosen[stride // 2 :: stride, stride // 2 :: stride] = True
+    rows = np.flatnonzero(valid & chosen)
+    depth_m = 1.0 / surface.disparity[rows]
+    sigmas_m = depth_m * surface.planes[rows, 3] * np.float32(surface.noise_per_m)
+    return Samples(
+        grid.rays[rows] * depth_m[:, None],
+        surface.planes[rows, :3],
+        np.sqrt(sigmas_m**2 + np.float32(_SURFACE_SIGMA_M**2)),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """Where the camera should be by its motion."""
+
+    T_local_cam: se3.Transform
+    information: Doubles  # (6, 6) of se3.log order, cam
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """A pose and what holds it."""
+
+    T_local_cam: se3.Transform
+    information: Doubles  # (6, 6) of se3.log order, cam: of the image, none along weak directions
+    localizability: Localizability  # by the points that matched, cam
+    seen: int  # points that a keyframe shows
+    matched: int  # of these, the points that lie on its planes
+
+    @property
+    def matched_ratio(self) -> float:
+        """Return the share of what both show that agrees."""
+        return self.matched / max(self.seen, 1)
+
+
+def register(
+    samples: Samples, prior: Prior, keyframes: Sequence[Keyframe], grid: Grid, *, weak_ratio: float
+) -> Registration | None:
+    """Return the pose of the samples beside the keyframes; None where too few match."""
+    held = samples.localizability().held(weak_ratio)
+    T_local_cam, gate_m = prior.T_local_cam, _GATE_M[0]
+    for _ in range(_ITERATIONS_MAX):
+        system = _System(samples, keyframes, T_local_cam, gate_m=gate_m, grid=grid)
+        if system.matched < _POINTS_MIN:
+            return None
+        off = se3.log(se3.inverse(prior.T_local_cam) @ T_local_cam)
+        information = held.T @ system.information @ held + prior.information
+        pull = held.T @ system.pull - prior.information @ off
+        step = np.asarray(np.linalg.solve(information, pull), np.float64)
+        T_local_cam = T_local_cam @ se3.exp(step)
+        if gate_m == _GATE_M[1] and np.abs(step).max() < _STEP_MIN:
+            break
+        gate_m = max(_GATE_SHRINK * gate_m, _GATE_M[1])
+    matched = samples.localizability(system.is_matched)
+    held = matched.held(weak_ratio)
+    information = held.T @ system.information @ held
+    return Registration(T_local_cam, information, matched, system.seen, system.matched)
+
+
+class _System:
+    """The normal equations of the residuals at one pose, for a twist in cam."""
+
+    def __init__(
+        self,
+        samples: Samples,
+        keyframes: Sequence[Keyframe],
+        T_local_cam: se3.Transform,
+        *,
+        gate_m: float,
+        grid: Grid,
+    ) -> None:
+        self.information, self.pull = np.zeros((6, 6)), np.zeros(6)
+        self.seen, self.matched = 0, 0
+        self.is_matched = np.zeros(len(samples), np.bool_)
+        for keyframe in keyframes:
+            self._add(samples, keyframe, keyframe.T_cam_local @ T_local_cam, gate_m, grid)
+        self.information /= _CORRELATION
+        self.pull /= _CORRELATION
+
+    def _add(
+        self,
+        samples: Samples,
+        keyframe: Keyframe,
+        T_key_cam: se3.Transform,
+        gate_m: float,
+        grid: Grid,
+    ) -> None:
+        residuals, normals, seen, same = compare(samples, keyframe, T_key_cam, gate_m, grid)
+        rows = np.flatnonzero(same)
+        normals_cam = normals[rows] @ T_key_cam[:3, :3].astype(np.float32)
+        jacobian = np.concatenate([normals_cam, _cross(samples.points[rows], normals_cam)], axis=1)
+        sigmas_m, residuals = samples.sigmas_m[rows], residuals[rows]
+        kernel = 1.0 / (1.0 + (residuals / (_KERNEL_SIGMAS * sigmas_m)) ** 2) ** 2
+        weighted = jacobian * (kernel / sigmas_m**2)[:, None]
+        self.information += (jacobian.T @ weighted).astype(np.float64)
+        self.pull -= (weighted.T @ residuals).astype(np.float64)
+        self.is_matched |= same
+        self.seen += int(seen.sum())
+        self.matched += len(rows)
+
+
+def compare(
+    samples: Samples, keyframe: Keyframe, T_key_cam: se3.Transform, gate_m: float, grid: Grid
+) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return residuals [m], the keyframe's normals, who is seen, and who is on its surface."""
+    T = T_key_cam.astype(np.float32)
+    points = samples.points @ T[:3, :3].T + T[:3, 3]
+    cells, in_view = grid.index(points)
+    planes = keyframe.planes[cells]
+    normals = planes[:, :3]
+    residuals = np.einsum("ij,ij->i", normals, points) - planes[:, 3]
+    seen = in_view & (planes[:, 3] > 0)
+    facing = np.einsum("ij,ij->i", normals, samples.normals @ T[:3, :3].T)
+    return residuals, normals, seen, seen & (np.abs(residuals) < gate_m) & (facing > FACING_COS)
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    """Return the cross products of rows; np.cross takes several times as long."""
+    x = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
+    y = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
+    z = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return np.stack([x, y, z], axis=1)
