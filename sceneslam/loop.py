@@ -47,6 +47,7 @@ class Loop:
             rig=parts.rig,
             atlas=parts.atlas,
             log=self._log,
+            catch_up_steps=parts.run.catch_up_steps,
         )
         self._sinks: dict[str, Sink] = {}
         for key, sink in parts.sinks.items():

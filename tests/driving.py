@@ -14,12 +14,18 @@ TABLE = {"Bright": ["bright", "dark"], "Dark": ["dark", "bright"]}
 
 def policy(**changes):
     values = {
-        "handover": "cold",
+        "handover": "warm",
         "confirm_window_s": 2.0,
         "first_confirm_window_s": 0.0,
+        "dwell_s": 0.0,
         "lost_patience_s": 0.3,
         "blind_patience_s": 0.1,
         "bridge_s": 0.5,
+        "retry_s": 1e6,
+        "trial_s": 1.0,
+        "buffer_s": 12.0,
+        "buffer_mb": 256.0,
+        "startup_s": {},
     }
     return Policy(**(values | changes))
 
@@ -27,6 +33,7 @@ def policy(**changes):
 def drive(modules, *, steps=100, scene_at=lambda i: "Bright", table=TABLE, **options):
     """Run the bus over a straight drive; return it with its atlas, log and detector."""
     has_odometry = options.pop("has_odometry", True)
+    catch_up_steps = options.pop("catch_up_steps", None)
     feed = options.pop("feed", lambda index: observation(index, has_odometry=has_odometry))
     atlas, log, detector = Atlas(voxel_m=0.05), EventLog(), ScriptedDetector(scene_at)
     bus = Bus(
@@ -37,6 +44,7 @@ def drive(modules, *, steps=100, scene_at=lambda i: "Bright", table=TABLE, **opt
         rig=RIG,
         atlas=atlas,
         log=log,
+        catch_up_steps=catch_up_steps,
     )
     for index in range(steps):
         if bus.state == "terminate":

@@ -54,7 +54,7 @@ def test_sensor_that_falls_silent_calls_in_the_fallback():
 
     modules = {"bright": ExactModule(), "dark": Blind()}
     _, atlas, log, _ = drive(modules, feed=feed)
-    assert events(log, "decision")[1]["reason"] == "lost"
+    assert events(log, "decision")[1]["reason"] == "silent"
     assert_exact(atlas)
 
 

@@ -7,7 +7,7 @@ from driving import policy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sceneslam.bus.policy import SceneFilter
+from sceneslam.bus.scene_filter import SceneFilter
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import UNSURE, SceneVote
 

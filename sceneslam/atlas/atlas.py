@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -36,6 +37,31 @@ class _Open:
         return Told(T_map_local=self.T_map_local, online=online, revised=self.revised)
 
 
+@dataclass(slots=True)
+class _Path:
+    """Poses by rising stamp."""
+
+    stamps_ns: list[int] = field(default_factory=list)
+    poses: list[Transform] = field(default_factory=list)  # T_map_base
+    modules: list[str] = field(default_factory=list)
+    sessions: list[int] = field(default_factory=list)  # that was open, -1 before the first
+
+    def add(self, stamp_ns: int, T_map_base: Transform, module: str, session: int) -> None:
+        """Add a pose unless its stamp has one."""
+        if self.stamps_ns and stamp_ns <= self.stamps_ns[-1]:
+            return
+        self.stamps_ns.append(stamp_ns)
+        self.poses.append(T_map_base)
+        self.modules.append(module)
+        self.sessions.append(session)
+
+    def cut(self, stamp_ns: int) -> None:
+        """Forget the poses from an instant on."""
+        keep = bisect_left(self.stamps_ns, stamp_ns)
+        for values in (self.stamps_ns, self.poses, self.modules, self.sessions):
+            del values[keep:]
+
+
 class Atlas:
     """Keeps one trajectory and one map in `map` through every change of module."""
 
@@ -44,10 +70,8 @@ class Atlas:
             raise ConfigError("voxel_m", voxel_m, "metres above 0")
         self._voxel_m = voxel_m
         self._sessions: list[_Open] = []
-        self._stamps_ns: list[int] = []
-        self._poses: list[Transform] = []  # T_map_base
-        self._modules: list[str] = []
-        self._pose_sessions: list[int] = []  # the session that was open, -1 before the first
+        self._online = _Path()  # as told at the time
+        self._path = _Path()  # as known now
 
     def begin_session(self, module: str, T_map_local: Transform) -> int:
         """Open a session of a module that was placed in the map (Eq. 1); return its number."""
@@ -61,11 +85,13 @@ class Atlas:
 
     def add(self, stamp_ns: int, T_map_base: Transform, module: str) -> None:
         """Add a pose to the global trajectory; a stamp has one pose, the first."""
-        if not self.has_pose(stamp_ns):
-            self._stamps_ns.append(stamp_ns)
-            self._poses.append(T_map_base)
-            self._modules.append(module)
-            self._pose_sessions.append(len(self._sessions) - 1)
+        session = len(self._sessions) - 1
+        self._online.add(stamp_ns, T_map_base, module, session)
+        self._path.add(stamp_ns, T_map_base, module, session)
+
+    def rewind(self, stamp_ns: int) -> None:
+        """Take the poses from an instant on back, for better ones; `online` keeps them."""
+        self._path.cut(stamp_ns)
 
     def close_session(self, session: int, layers: MapLayers, revised: Trajectory) -> None:
         """Take the map that a session leaves behind, and its own poses (T_local_base) at the end.
@@ -74,36 +100,32 @@ class Atlas:
         """
         self._sessions[session].layers, self._sessions[session].revised = layers, revised
 
-    def has_pose(self, stamp_ns: int) -> bool:
-        """Tell whether the newest pose is of this stamp."""
-        return bool(self._stamps_ns) and self._stamps_ns[-1] == stamp_ns
-
     def pose_at(self, stamp_ns: int) -> Transform | None:
         """Return T_map_base at the newest stamp, None when it got no pose."""
-        return self._poses[-1] if self.has_pose(stamp_ns) else None
+        return self._path.poses[-1] if self.last_stamp_ns == stamp_ns else None
 
     @property
     def last_stamp_ns(self) -> int | None:
         """Return the stamp of the newest pose, None before the first."""
-        return self._stamps_ns[-1] if self._stamps_ns else None
+        return self._path.stamps_ns[-1] if self._path.stamps_ns else None
 
     @property
     def online(self) -> Trajectory:
         """Return T_map_base over time as it was told at the time."""
-        return _trajectory(self._stamps_ns, self._poses)
+        return _trajectory(self._online.stamps_ns, self._online.poses)
 
     @property
     def trajectory(self) -> Trajectory:
-        """Return T_map_base over time with what the closed sessions revised."""
-        if not self._stamps_ns:
+        """Return T_map_base over time as known now: after hand-overs in the past and revisions."""
+        if not self._path.stamps_ns:
             return Trajectory.empty()
-        stamps_ns = np.array(self._stamps_ns, np.int64)
+        stamps_ns = np.array(self._path.stamps_ns, np.int64)
         return Trajectory(stamps_ns=stamps_ns, T_world_base=self._revise().T_map_base)
 
     @property
     def pose_modules(self) -> tuple[str, ...]:
         """Return, per pose of the trajectory, the module that gave it, BRIDGED for none."""
-        return tuple(self._modules)
+        return tuple(self._path.modules)
 
     @property
     def sessions(self) -> tuple[Session, ...]:
@@ -130,9 +152,9 @@ class Atlas:
     def _revise(self) -> Revised:
         return revise(
             [session.told for session in self._sessions],
-            np.array(self._stamps_ns, np.int64),
-            np.array(self._poses).reshape(-1, 4, 4),
-            np.array(self._pose_sessions, np.int64),
+            np.array(self._path.stamps_ns, np.int64),
+            np.array(self._path.poses).reshape(-1, 4, 4),
+            np.array(self._path.sessions, np.int64),
         )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
@@ -10,7 +12,8 @@ from sceneslam.types.se3 import Transform
 class Bridge:
     """Predicts T_map_base from the last known pose on."""
 
-    def __init__(self, *, velocity_horizon_s: float) -> None:
+    def __init__(self, *, velocity_horizon_s: float, uses_odometry: bool) -> None:
+        self._uses_odometry = uses_odometry
         self._horizon_ns = round(velocity_horizon_s * 1e9)
         self._T_map_base: Transform | None = None
         self._T_odom_base: Transform | None = None
@@ -23,12 +26,21 @@ class Bridge:
         """Return the last pose, known or predicted; the identity before there is one."""
         return se3.identity() if self._T_map_base is None else self._T_map_base
 
+    def copy(self) -> Bridge:
+        """Return a bridge that knows the same; poses are never changed in place."""
+        return copy.copy(self)
+
     def update(self, observation: Observation, T_map_base: Transform) -> None:
         """Take a pose that a module gave."""
         if self._known is not None and self._known[0] < observation.stamp_ns:
             self._before = self._known  # at a hand-over both modules give the same instant a pose
         self._known = (observation.stamp_ns, T_map_base)
         self._move(observation, T_map_base)
+
+    def correct(self, observation: Observation, T_map_base: Transform) -> None:
+        """Take a pose that jumped because a module corrected its past, without a velocity."""
+        self._known, self._before = None, None
+        self.update(observation, T_map_base)
 
     def predict(self, observation: Observation, *, by_velocity: bool) -> Transform | None:
         """Return T_map_base at the observation and go on from there, None when nothing tells it.
@@ -38,8 +50,11 @@ class Bridge:
         """
         if self._T_map_base is None:
             return None
-        if observation.T_odom_base is not None and self._T_odom_base is not None:
-            T_prev_curr = se3.inverse(self._T_odom_base) @ observation.T_odom_base
+        if observation.stamp_ns == self._stamp_ns:
+            return self._T_map_base
+        T_odom_prev, T_odom_curr = self._T_odom_base, observation.T_odom_base
+        if self._uses_odometry and T_odom_prev is not None and T_odom_curr is not None:
+            T_prev_curr = se3.inverse(T_odom_prev) @ T_odom_curr
         elif by_velocity and self._within_horizon(observation.stamp_ns):
             T_prev_curr = self._at_constant_velocity(observation.stamp_ns - self._stamp_ns)
         else:

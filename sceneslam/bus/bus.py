@@ -4,35 +4,32 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from enum import Enum
 from time import perf_counter_ns
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.bus.candidates import Candidates
+from sceneslam.bus.changeover import Changeover, Outcome, Plan
+from sceneslam.bus.decision import Action, Health, Situation, Verdict, decide
+from sceneslam.bus.decision_log import DecisionLog
 from sceneslam.bus.estimator import Estimator
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.machine import BusMachine
-from sceneslam.bus.policy import Policy, SceneFilter
+from sceneslam.bus.policy import Policy
 from sceneslam.bus.runner import Runner
+from sceneslam.bus.scene_filter import SceneFilter
 from sceneslam.interfaces import Detector, SlamModule
 from sceneslam.types.errors import ModuleError
-from sceneslam.types.observation import Observation
+from sceneslam.types.observation import Observation, TrackingStatus
 from sceneslam.types.rig import Rig
 
 _log = logging.getLogger(__name__)
-
-
-class Outcome(Enum):
-    """What a state reports to the machine: the S and F of the paper."""
-
-    SUCCESS = "success"
-    FAILURE = "failure"
 
 
 class Bus:
     """Feeds observations to the detector and the active module, one `step` at a time.
 
     `scenes` maps every scene to keys of `modules`: the one to run, then its fallbacks.
+    `catch_up_steps`: remembered observations led through a new module per observation, None: all.
     """
 
     def __init__(
@@ -45,6 +42,7 @@ class Bus:
         rig: Rig,
         atlas: Atlas,
         log: EventLog,
+        catch_up_steps: int | None = None,
     ) -> None:
         self.runners = {key: Runner(key, module) for key, module in modules.items()}
         self.detector_us: list[float] = []
@@ -53,11 +51,21 @@ class Bus:
         self._filter = SceneFilter(
             window_s=policy.confirm_window_s, first_window_s=policy.first_confirm_window_s
         )
-        self._estimator = Estimator(policy=policy, rig=rig, atlas=atlas, log=log)
+        self._estimator = Estimator(
+            policy=policy, rig=rig, atlas=atlas, log=log, has_choice=len(modules) > 1
+        )
         self._machine = BusMachine(self)
         self._state = self._machine.state
-        self._candidates = Candidates(scenes, self.runners, policy.confirm_window_s)
-        self._reason = "first"  # why a module is chosen: first, scene, lost, failed
+        self._candidates = Candidates(scenes, self.runners, policy.retry_s)
+        self._changeover = Changeover(
+            runners=self.runners,
+            candidates=self._candidates,
+            estimator=self._estimator,
+            policy=policy,
+            log=log,
+            catch_up_steps=catch_up_steps,
+        )
+        self._decisions = DecisionLog(log)
         self._detector_works = True
         try:
             detector.activate(rig)
@@ -77,7 +85,7 @@ class Bus:
 
     @property
     def scene(self) -> str:
-        """Return the confirmed scene, "" before the first."""
+        """Return the scene that the active module serves, "" before the first."""
         return self._candidates.scene
 
     def step(self, observation: Observation) -> None:
@@ -85,7 +93,8 @@ class Bus:
         began_ns = perf_counter_ns()
         spent_ns = self._spent_ns()
         self._vote(observation)
-        outcome = self._init() if self._state == "init" else self._run(observation)
+        self._track(observation)
+        outcome = self._do(observation)
         while outcome is not None:
             self._send(outcome.value, observation.stamp_ns)
             outcome = self._enter(observation)
@@ -96,6 +105,7 @@ class Bus:
         """End the run: shut the module down, then the detector. May be called twice."""
         if self._state != "terminate":
             self._send("stop", stamp_ns)
+        self._changeover.close()
         self._estimator.retire()
         self._detector.shutdown()
 
@@ -111,48 +121,65 @@ class Bus:
 
     # The states.
 
-    def _init(self) -> Outcome | None:
+    def _do(self, observation: Observation) -> Outcome | None:
+        """Do what the state asks for at every observation; None while it goes on."""
+        if self._state == "init":
+            return self._init(observation.stamp_ns)
+        if self._state == "run":
+            return self._run(observation)
+        return self._changeover.go_on(observation.stamp_ns)
+
+    def _enter(self, observation: Observation) -> Outcome | None:
+        """Do what the state just entered does with the observation it was entered at."""
+        if self._state in ("start", "switch"):
+            return self._changeover.go_on(observation.stamp_ns)
+        return None
+
+    def _init(self, stamp_ns: int) -> Outcome | None:
         """Wait for the first confirmed scene."""
         if not self._detector_works:
             return Outcome.FAILURE
         if self._filter.scene is None:
             return None
-        self._candidates.begin(self._filter.scene)
+        self._candidates.serve(self._filter.scene)
+        keys = self._candidates.of(self._filter.scene)
+        self._changeover.begin(
+            Plan(keys=keys, reason="first", at_ns=stamp_ns, since_ns=None, held_ns=0)
+        )
         return Outcome.SUCCESS
 
-    def _enter(self, observation: Observation) -> Outcome | None:
-        """Do what the state just entered does with the observation it was entered at."""
-        if self._state == "start":
-            return self._start(observation)
-        if self._state == "switch":
-            return self._switch(observation)
+    def _run(self, observation: Observation) -> Outcome | None:
+        """Fail when the scene calls for another module or the active one is unhealthy."""
+        self._changeover.try_on(observation.stamp_ns)
+        situation = self._look(observation)
+        verdict = decide(self._policy, situation)
+        self._decisions.add(situation, verdict)
+        if verdict.action is Action.TELL:
+            self._candidates.serve(situation.scene)
+            self._candidates.limit((), 0)
+            self._tell_scene(observation.stamp_ns)
+        elif verdict.action is Action.TRY:
+            self._changeover.begin_trial(verdict.to[0], observation.stamp_ns)
+        elif verdict.action is Action.SWITCH:
+            self._change(situation, verdict)
+            return Outcome.FAILURE
         return None
 
-    def _start(self, observation: Observation) -> Outcome:
-        """Activate the next candidate."""
-        is_launched = self._launch(self._candidates.left()[0], observation)
-        return Outcome.SUCCESS if is_launched else Outcome.FAILURE
-
-    def _run(self, observation: Observation) -> Outcome | None:
-        """Track; fail when the scene calls for another module or the active one is unhealthy."""
-        self._track(observation)
-        reason = self._reason_to_switch(observation)
-        if reason is None:
-            return None
-        self._reason = reason
-        return Outcome.FAILURE
-
-    def _switch(self, observation: Observation) -> Outcome:
-        """Hand over to the first choice, else to the first fallback that can be activated."""
-        outcome = Outcome.SUCCESS
-        for key in self._candidates.left():
-            if key == self.active or self._launch(key, observation):
-                return outcome
-            outcome = Outcome.FAILURE
-        active = self._estimator.active
-        if active is not None and active.is_failed:
-            self._estimator.retire()
-        return Outcome.FAILURE
+    def _change(self, now: Situation, verdict: Verdict) -> None:
+        """Set out to carry a verdict out."""
+        is_scene = verdict.reason == "scene"
+        if is_scene:
+            self._candidates.serve(now.scene)
+        self._candidates.limit(verdict.to, verdict.rounds)
+        self._changeover.begin(
+            Plan(
+                keys=verdict.to,
+                reason=verdict.reason,
+                at_ns=now.stamp_ns,
+                since_ns=self._filter.since_ns if is_scene else None,
+                held_ns=now.held_ns,
+            )
+        )
 
     # What they are made of.
 
@@ -183,53 +210,42 @@ class Bus:
             self._estimator.track(observation, by_velocity=self.candidate_left())
         except ModuleError as error:
             self._fault(observation.stamp_ns, str(error))
-            self._estimator.bridge(observation, by_velocity=True)
 
-    def _reason_to_switch(self, observation: Observation) -> str | None:
-        """Return why another module has to take over, None when the active one goes on."""
-        active = self._estimator.active
+    def _look(self, observation: Observation) -> Situation:
+        """Return all that is known at an observation."""
+        hold, active = self._estimator.hold, self._estimator.active
         assert active is not None
-        if self._filter.scene is not None and self._filter.scene != self.scene:
-            self._candidates.begin(self._filter.scene)
-            if self._candidates.left()[:1] != [active.key]:
-                return "scene"
-            self._candidates.use(active.key)
-            self._tell_scene(active, observation.stamp_ns)
+        is_lost = hold.status is TrackingStatus.LOST
+        health = Health.HELD
         if active.is_failed:
-            return "failed"
-        return "lost" if self._is_out_of_patience(observation) and self.candidate_left() else None
+            health = Health.FAILED
+        elif hold.unheld_since_ns is not None:
+            health = Health.LOST if is_lost else Health.SILENT
+        scene = self._filter.scene or self.scene
+        return Situation(
+            stamp_ns=observation.stamp_ns,
+            scene=scene,
+            served_scene=self.scene,
+            active=active.key,
+            health=health,
+            unheld_since_ns=hold.unheld_since_ns or 0,
+            held_ns=hold.held_ns,
+            is_blind=health is Health.LOST and observation.T_odom_base is None,
+            choices=self._candidates.of(scene),
+            served_choices=self._candidates.of(self.scene),
+            tried=self._candidates.tried,
+            rounds=self._candidates.rounds,
+            switched_ns=self._changeover.switched_ns,
+            trial=self._changeover.trial,
+            retry_ns=self._candidates.retry_ns,
+        )
 
-    def _tell_scene(self, active: Runner, stamp_ns: int) -> None:
+    def _tell_scene(self, stamp_ns: int) -> None:
+        assert self._estimator.active is not None
         try:
-            active.set_scene(self.scene)
+            self._estimator.active.set_scene(self.scene)
         except ModuleError as error:
             self._fault(stamp_ns, str(error))
-
-    def _is_out_of_patience(self, observation: Observation) -> bool:
-        """Tell whether the active module has been lost for too long."""
-        lost_since_ns = self._estimator.lost_since_ns
-        if lost_since_ns is None:
-            return False
-        lost_ns = observation.stamp_ns - lost_since_ns
-        self._candidates.reconsider(self.active, held_ns=self._estimator.held_ns, lost_ns=lost_ns)
-        is_blind = self._estimator.is_lost and observation.T_odom_base is None
-        policy = self._policy
-        patience_s = policy.blind_patience_s if is_blind else policy.lost_patience_s
-        return lost_ns >= round(patience_s * 1e9)
-
-    def _launch(self, key: str, observation: Observation) -> bool:
-        """Hand over to a module; log the decision, or that the module refused."""
-        previous = self.active or None
-        self._candidates.use(key)
-        is_launched = self._estimator.launch(self.runners[key], observation, self.scene)
-        self._log.add(
-            "decision" if is_launched else "refused",
-            observation.stamp_ns,
-            scene=self.scene,
-            **{"from": previous, "to": key},
-            reason=self._reason,
-        )
-        return is_launched
 
     def _send(self, event: str, stamp_ns: int) -> None:
         """Send an event to the machine and log the state it leads to."""

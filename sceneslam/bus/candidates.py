@@ -8,40 +8,44 @@ from sceneslam.bus.runner import Runner
 
 
 class Candidates:
-    """Goes through the table's modules of one scene, in order, each once."""
+    """The table scene -> modules, and which of the served scene's modules were tried."""
 
     def __init__(
-        self, scenes: Mapping[str, Sequence[str]], runners: Mapping[str, Runner], window_s: float
+        self, scenes: Mapping[str, Sequence[str]], runners: Mapping[str, Runner], retry_s: float
     ) -> None:
-        self.scene = ""  # the confirmed scene that the active module answers to
+        self.scene = ""  # the confirmed scene that the active module serves
+        self.tried: frozenset[str] = frozenset()
+        self.rounds = 0  # how often all were tried in vain
+        self.retry_ns = 0  # when the first choice may be tried again
         self._scenes, self._runners = scenes, runners
-        self._window_ns = round(window_s * 1e9)
-        self._tried: set[str] = set()
-        self._rounds = 0  # how often all were tried since one held its pose
+        self._retry_ns, self._retries = round(retry_s * 1e9), 0
 
-    def begin(self, scene: str) -> None:
+    def of(self, scene: str) -> tuple[str, ...]:
+        """Return the modules of a scene that can run, in the table's order."""
+        keys = self._scenes.get(scene, ())
+        return tuple(key for key in keys if not self._runners[key].is_failed)
+
+    def serve(self, scene: str) -> None:
         """Start with all modules of a scene."""
-        self.scene, self._tried, self._rounds = scene, set(), 0
+        if scene != self.scene:
+            self.scene, self.rounds, self._retries = scene, 0, 0
+
+    def limit(self, keys: Sequence[str], rounds: int) -> None:
+        """Leave only some of the scene's modules to be tried."""
+        self.tried, self.rounds = frozenset(self._scenes[self.scene]) - frozenset(keys), rounds
 
     def use(self, key: str) -> None:
         """Note that a module is being tried."""
-        self._tried.add(key)
+        self.tried |= {key}
 
     def left(self) -> list[str]:
         """Return the modules that were not tried and have not failed, in the table's order."""
-        return [
-            key
-            for key in self._scenes[self.scene]
-            if key not in self._tried and not self._runners[key].is_failed
-        ]
+        return [key for key in self.of(self.scene) if key not in self.tried]
 
-    def reconsider(self, active: str, *, held_ns: int, lost_ns: int) -> None:
-        """Give the others a new chance when the active module has earned it by its loss.
+    def postpone(self, stamp_ns: int, *, is_in_vain: bool) -> None:
+        """Let the first choice be tried again after a while, longer after each vain trial."""
+        self._retries = self._retries + 1 if is_in_vain else 0
+        self.retry_ns = stamp_ns + (self._retry_ns << min(self._retries, _DOUBLINGS))
 
-        That is when it had held its pose for a window before, or when none is left and it has
-        been lost for a window, each time for twice as long, so that they do not take turns.
-        """
-        if held_ns >= self._window_ns:
-            self._tried, self._rounds = {active}, 0
-        elif not self.left() and lost_ns >= self._window_ns << self._rounds:
-            self._tried, self._rounds = {active}, self._rounds + 1
+
+_DOUBLINGS = 5

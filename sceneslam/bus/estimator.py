@@ -1,18 +1,22 @@
-"""The active module and its place in the map: tracking, bridging, and Eq. 1 at a hand-over."""
+"""The active module and its place in the map: tracking, bridging, and what a hand-over changes."""
 
 from __future__ import annotations
 
 import logging
-from time import perf_counter_ns
+
+import numpy as np
 
 from sceneslam.atlas.atlas import BRIDGED, Atlas
 from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.events import EventLog
+from sceneslam.bus.handover import Handover
+from sceneslam.bus.hold import Hold
+from sceneslam.bus.memory import Memory, Moment
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.runner import Runner
 from sceneslam.types import se3
 from sceneslam.types.errors import ModuleError
-from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.observation import Observation, TrackingStatus
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
 
@@ -22,141 +26,188 @@ _log = logging.getLogger(__name__)
 class Estimator:
     """Gives every observation one pose: the active module's, or a bridged one."""
 
-    def __init__(self, *, policy: Policy, rig: Rig, atlas: Atlas, log: EventLog) -> None:
+    def __init__(
+        self, *, policy: Policy, rig: Rig, atlas: Atlas, log: EventLog, has_choice: bool
+    ) -> None:
         self.active: Runner | None = None
-        self.lost_since_ns: int | None = None  # since when the active module gives no pose
-        self.held_ns = 0  # how long it gave poses without a break before that
-        self._handover, self._rig, self._atlas, self._log = policy.handover, rig, atlas, log
-        self._bridge = Bridge(velocity_horizon_s=policy.bridge_s)
+        self._policy, self._rig, self._atlas, self._log = policy, rig, atlas, log
+        self.hold = self._new_hold()  # of the active module
+        # The paper's hand-over knows the last pose of a module and nothing after it.
+        is_bridged = policy.handover != "cold"
+        horizon_s = policy.bridge_s if is_bridged else 0.0
+        self._bridge = Bridge(velocity_horizon_s=horizon_s, uses_odometry=is_bridged)
+        self._memory = Memory(
+            span_s=policy.buffer_s if policy.handover == "rewind" else 0.0,
+            limit_mb=policy.buffer_mb,
+            keeps_sensors=has_choice,
+        )
         self._session: int | None = None  # None until the active module is placed
-        self._status: TrackingStatus | None = None
-        self._held_since_ns: int | None = None
-        self._fed_ns: int | None = None  # when the active module's sensors last spoke ...
-        self._unknown_period_ns = round(policy.lost_patience_s * 1e9)
-        self._fed_period_ns = self._unknown_period_ns  # ... and how long after the time before
+        self._told: TrackingStatus | None = None  # what the log says of the active module
 
     @property
-    def is_lost(self) -> bool:
-        """Tell whether the active module's last word was that it is lost."""
-        return self._status is TrackingStatus.LOST
-
-    def launch(self, runner: Runner, observation: Observation, scene: str) -> bool:
-        """Hand over to a module; return whether it could be activated and fed.
-
-        The module that ran before goes on when the new one fails, and is shut down otherwise.
-        """
-        began_ns = perf_counter_ns()
-        before = (self.active, self._session, self.lost_since_ns, self._held_since_ns)
-        self._bridge_to(observation)
-        self.active, self._session, self._status = runner, None, None
-        self.lost_since_ns, self._held_since_ns, self.held_ns = None, None, 0
-        self._fed_ns, self._fed_period_ns = None, self._unknown_period_ns
-        try:
-            runner.activate(self._rig, scene)
-            self.track(observation, by_velocity=True)
-        except ModuleError as error:
-            _log.warning(str(error))
-            self._log.add("fault", observation.stamp_ns, what=str(error))
-            runner.retire()
-            self.active, self._session, self.lost_since_ns, self._held_since_ns = before
-            return False
-        cost_ms = (perf_counter_ns() - began_ns) / 1e6
-        self._log.add("cost", observation.stamp_ns, module=runner.key, handover_ms=cost_ms)
-        self._retire(before[0], before[1])
-        return True
+    def now_ns(self) -> int:
+        """Return the stamp of the newest observation."""
+        return self._memory.newest.stamp_ns
 
     def track(self, observation: Observation, *, by_velocity: bool) -> None:
         """Give the observation its pose; raises ModuleError when the module broke its promise.
 
-        Where the module gives none, odometry bridges, or constant velocity if `by_velocity`.
+        Where the module gives none, odometry bridges, or constant velocity if `by_velocity` or
+        while the module's sensors are silent. The pose is the robot's in either case.
         """
-        assert self.active is not None
-        tracking = self._ask(self.active, observation)
-        if tracking is not None and tracking.status is not self._status:
-            self._status = tracking.status
-            self._log.add(
-                "tracking",
-                observation.stamp_ns,
-                module=self.active.key,
-                status=tracking.status.value,
-            )
-        if tracking is None or tracking.status is TrackingStatus.LOST:
-            if tracking is not None or self._is_overdue(observation.stamp_ns):
-                self._note_loss(observation.stamp_ns)
-            self.bridge(observation, by_velocity=by_velocity or tracking is None)
-            return
-        self._take(observation, tracking)
+        module, is_trusted = BRIDGED, False
+        T_map_base: Transform | None = None
+        fault: ModuleError | None = None
+        try:
+            T_map_base = self._ask(observation)
+        except ModuleError as error:
+            fault = error
+        if T_map_base is not None and self.active is not None:
+            module, is_trusted = self.active.key, self.hold.status is TrackingStatus.TRACKING
+        else:
+            is_silent = self.hold.status is not TrackingStatus.LOST
+            T_map_base = self._predict(observation, by_velocity=by_velocity or is_silent)
+        if T_map_base is not None:
+            self._atlas.add(observation.stamp_ns, T_map_base, module)
+        moment = Moment(
+            observation=observation,
+            T_map_base=T_map_base,
+            module=module,
+            bridge=self._bridge.copy(),
+            is_trusted=is_trusted,
+        )
+        self._memory.add(moment)
+        if fault is not None:
+            raise fault
+
+    def begin(self, runner: Runner, scene: str, since_ns: int | None) -> Handover:
+        """Begin to hand over to a module; raises ModuleError when it cannot be activated.
+
+        `since_ns`: when the scene that calls for it began, None where it is not the scene.
+        """
+        anchor = self._memory.newest
+        if self._policy.handover == "rewind":
+            anchor = self._memory.anchor(since_ns)
+        hold = self._new_hold()
+        return Handover(runner, self._memory, anchor=anchor, hold=hold, scene=scene, rig=self._rig)
+
+    def begin_trial(self, runner: Runner, scene: str) -> Handover:
+        """Begin to lead a module along from now on; raises ModuleError as `begin`."""
+        anchor, hold = self._memory.newest, self._new_hold()
+        return Handover(runner, self._memory, anchor=anchor, hold=hold, scene=scene, rig=self._rig)
+
+    def settle(self, handover: Handover) -> None:
+        """Place a module that was on trial at the pose of now: what it gave before is not used."""
+        handover.settle(self._memory.newest)
+
+    def accept(self, handover: Handover) -> None:
+        """Make a module that has caught up the active one, and shut the old one down."""
+        old, old_session = self.active, self._session
+        self.active, self.hold, self._session = handover.runner, handover.hold, None
+        self._told = None
+        if handover.is_placed:
+            self._rewrite(handover)
+        self._tell(self._memory.newest.stamp_ns)
+        self._log_cost(handover)
+        self._retire(old, old_session)
 
     def retire(self) -> None:
         """Shut the active module down and keep its map."""
         self._retire(self.active, self._session)
-        self.active = None
+        self.active, self._session = None, None
 
-    def bridge(self, observation: Observation, *, by_velocity: bool) -> None:
-        """Give the observation the pose that odometry tells, or constant velocity if allowed."""
-        T_map_base = self._bridge.predict(observation, by_velocity=by_velocity)
-        if T_map_base is not None:
-            self._atlas.add(observation.stamp_ns, T_map_base, BRIDGED)
-
-    def _ask(self, runner: Runner, observation: Observation) -> Tracking | None:
-        """Return the module's answer, None when none of its sensors spoke."""
-        if not runner.can_use(observation):
+    def _ask(self, observation: Observation) -> Transform | None:
+        """Return the active module's pose in the map, None where it holds none."""
+        if self.active is None or self.active.is_failed:
             return None
-        if self._fed_ns is not None:
-            self._fed_period_ns = observation.stamp_ns - self._fed_ns
-        self._fed_ns = observation.stamp_ns
-        return runner.track(observation)
-
-    def _is_overdue(self, stamp_ns: int) -> bool:
-        """Tell whether the module's sensors have been silent for longer than they usually are."""
-        return self._fed_ns is None or stamp_ns - self._fed_ns > 2 * self._fed_period_ns
-
-    def _take(self, observation: Observation, tracking: Tracking) -> None:
-        """Put the module's pose into the map."""
-        assert self.active is not None
+        tracking = self.hold.ask(self.active, observation)
+        self._tell(observation.stamp_ns)
+        if tracking is None:
+            return None
         if self._session is None:
+            self._predict(observation, by_velocity=True)
             self._place(observation, tracking.T_local_base)
-        self.lost_since_ns = None
-        if self._held_since_ns is None:
-            self._held_since_ns = observation.stamp_ns
         assert self.active.T_map_local is not None
         T_map_base = self.active.T_map_local @ tracking.T_local_base
         self._bridge.update(observation, T_map_base)
         self._atlas.add_local(observation.stamp_ns, tracking.T_local_base)
-        self._atlas.add(observation.stamp_ns, T_map_base, self.active.key)
+        return T_map_base
+
+    def _predict(self, observation: Observation, *, by_velocity: bool) -> Transform | None:
+        return self._bridge.predict(observation, by_velocity=by_velocity)
 
     def _place(self, observation: Observation, T_local_base: Transform) -> None:
-        """Place the module so that its first pose is the pose that was handed over (Eq. 1)."""
+        """Place a module that was not held when it became active (Eq. 1)."""
         assert self.active is not None
+        self.active.place(self._bridge.T_map_base @ se3.inverse(T_local_base))
+        self._begin_session(observation.stamp_ns, observation.stamp_ns)
+
+    def _rewrite(self, handover: Handover) -> None:
+        """Put the poses of a module that has caught up in the place of the untrusted ones."""
+        newest = self._memory.newest
+        keeps_anchor = handover.anchor.T_map_base is not None
+        self._atlas.rewind(handover.anchor.stamp_ns + keeps_anchor)
+        self._begin_session(newest.stamp_ns, handover.tracked[0].stamp_ns)
+        for tracking in handover.tracked:
+            self._atlas.add_local(tracking.stamp_ns, tracking.T_local_base)
+        for moment in handover.trail:
+            if moment.T_map_base is not None:
+                self._atlas.add(moment.stamp_ns, moment.T_map_base, moment.module)
+        if handover.trail:
+            self._memory.rewrite(handover.trail)
+            self._log_revision(newest, handover)
+        self._bridge = self._memory.newest.bridge.copy()
+
+    def _begin_session(self, stamp_ns: int, from_ns: int) -> None:
+        """Open the active module's session, which begins at `from_ns`."""
+        assert self.active is not None and self.active.T_map_local is not None
+        T_map_local = self.active.T_map_local
         last_ns = self._atlas.last_stamp_ns
-        is_seamless = self._atlas.has_pose(observation.stamp_ns)
-        self._bridge_to(observation)
-        T_map_local = self._bridge.T_map_base @ se3.inverse(T_local_base)
-        self.active.place(T_map_local)
         self._session = self._atlas.begin_session(self.active.key, T_map_local)
         self._log.add(
             "handover",
-            observation.stamp_ns,
+            stamp_ns,
             session=self._session,
             module=self.active.key,
-            kind=self._handover,
+            kind=self._policy.handover,
+            from_ns=from_ns,
             T_map_local=T_map_local.tolist(),
-            jump_m=0.0 if is_seamless else None,  # it starts at the very pose of this instant
-            jump_rad=0.0 if is_seamless else None,
-            gap_s=0.0 if last_ns is None else (observation.stamp_ns - last_ns) / 1e9,
+            gap_s=0.0 if last_ns is None else (from_ns - last_ns) / 1e9,
         )
 
-    def _bridge_to(self, observation: Observation) -> None:
-        """Move the bridge to the observation unless its pose is known."""
-        if not self._atlas.has_pose(observation.stamp_ns):
-            self._bridge.predict(observation, by_velocity=True)
+    def _log_revision(self, before: Moment, handover: Handover) -> None:
+        """Say which poses, told at the time, are now other ones."""
+        after = handover.trail[-1].T_map_base
+        if before.T_map_base is None or after is None:
+            return
+        self._log.add(
+            "revised",
+            before.stamp_ns,
+            from_ns=handover.trail[0].stamp_ns,
+            poses=len(handover.trail),
+            shift_m=float(np.linalg.norm(after[:3, 3] - before.T_map_base[:3, 3])),
+        )
 
-    def _note_loss(self, stamp_ns: int) -> None:
-        if self.lost_since_ns is None:
-            self.lost_since_ns = stamp_ns
-            held_since_ns = self._held_since_ns
-            self.held_ns = stamp_ns - held_since_ns if held_since_ns is not None else 0
-            self._held_since_ns = None
+    def _log_cost(self, handover: Handover) -> None:
+        """Log what the hand-over took; never part of what is reproducible."""
+        newest_ns = self._memory.newest.stamp_ns
+        span_s = (newest_ns - handover.began_at.stamp_ns) / 1e9
+        self._log.add(
+            "cost",
+            newest_ns,
+            module=handover.runner.key,
+            handover_ms=handover.cost_ns / 1e6,
+            first_pose_ms=handover.first_cost_ns / 1e6,
+            catch_up_s=span_s,
+        )
+
+    def _tell(self, stamp_ns: int) -> None:
+        """Log the active module's status where it changed."""
+        status = self.hold.status
+        if status is None or status is self._told or self.active is None:
+            return
+        self._told = status
+        self._log.add("tracking", stamp_ns, module=self.active.key, status=status.value)
 
     def _retire(self, runner: Runner | None, session: int | None) -> None:
         if runner is None:
@@ -164,3 +215,6 @@ class Estimator:
         legacy = runner.retire()
         if session is not None:
             self._atlas.close_session(session, legacy.layers, legacy.trajectory)
+
+    def _new_hold(self) -> Hold:
+        return Hold(silence_ns=round(self._policy.lost_patience_s * 1e9))

@@ -26,6 +26,7 @@ class RunSettings:
     threads: int  # of OpenCV, and of all libraries in a process of their own
     progress: bool  # show a progress bar
     max_observations: int | None  # stop after so many, null: all
+    catch_up_steps: int | None  # remembered observations per new one, at a hand-over; null: all
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:
@@ -35,8 +36,12 @@ class RunSettings:
         if self.threads < 1:
             raise ConfigError("threads", self.threads, "1 or more")
         _ = self.limits  # checks them
-        if self.max_observations is not None and self.max_observations < 1:
-            raise ConfigError("max_observations", self.max_observations, "1 or more, or null")
+        for name in ("max_observations", "catch_up_steps"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ConfigError(name, value, "1 or more, or null")
+        if self.catch_up_steps == 1:
+            raise ConfigError("catch_up_steps", 1, "2 or more, or null: 1 never catches up")
 
     @property
     def limits(self) -> Limits:

@@ -11,7 +11,10 @@ _TOLD_SWITCHES = 8
 _WHY = {
     "scene": "the scene was confirmed to be {scene}",
     "lost": "“{from}” had lost track",
+    "silent": "the sensors of “{from}” had gone silent",
+    "suspect": "“{from}” moved otherwise than the robot",
     "failed": "“{from}” had failed",
+    "return": "it held its pose again beside “{from}”",
 }
 
 

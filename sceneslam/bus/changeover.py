@@ -1,0 +1,233 @@
+"""Carries a decision out: starts the candidates in turn until one of them can take over."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+from sceneslam.bus.candidates import Candidates
+from sceneslam.bus.decision import Trial
+from sceneslam.bus.estimator import Estimator
+from sceneslam.bus.events import EventLog
+from sceneslam.bus.handover import Handover
+from sceneslam.bus.policy import Policy
+from sceneslam.bus.runner import Runner
+from sceneslam.types.errors import ModuleError
+from sceneslam.types.observation import TrackingStatus
+
+_log = logging.getLogger(__name__)
+
+
+class Outcome(Enum):
+    """What a state reports to the machine: the S and F of the paper."""
+
+    SUCCESS = "success"
+    FAILURE = "failure"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """A decision to change the module."""
+
+    keys: tuple[str, ...]  # candidates, best first
+    reason: str
+    at_ns: int
+    since_ns: int | None  # when the scene that calls for it began, None where it is not the scene
+    held_ns: int  # how long the active module had held its pose
+
+
+@dataclass(slots=True, kw_only=True)
+class _Attempt:
+    """A candidate that is being started."""
+
+    key: str
+    ready_ns: int  # when its start is over
+    handover: Handover | None = None  # None until then
+
+
+class Changeover:
+    """Goes through the planned candidates; offline at once, live a few observations at a time."""
+
+    def __init__(
+        self,
+        *,
+        runners: Mapping[str, Runner],
+        candidates: Candidates,
+        estimator: Estimator,
+        policy: Policy,
+        log: EventLog,
+        catch_up_steps: int | None,
+    ) -> None:
+        self.switched_ns = 0
+        self._runners, self._candidates, self._estimator = runners, candidates, estimator
+        self._policy, self._log, self._limit = policy, log, catch_up_steps
+        self._run_began_ns: int | None = None
+        self._plan: Plan | None = None
+        self._queue: list[str] = []
+        self._attempt: _Attempt | None = None
+        self._trial: _Attempt | None = None
+
+    @property
+    def trial(self) -> Trial:
+        """Tell how the scene's first choice does beside the fallback."""
+        if self._trial is None:
+            return Trial.NONE
+        handover = self._trial.handover
+        is_tracking = handover is not None and handover.hold.status is TrackingStatus.TRACKING
+        if handover is None or not is_tracking or handover.hold.held_since_ns is None:
+            return Trial.RUNNING
+        held_ns = self._estimator.now_ns - handover.hold.held_since_ns
+        is_long = held_ns >= round(self._policy.trial_s * 1e9)
+        return Trial.PASSED if is_long else Trial.RUNNING
+
+    def begin(self, plan: Plan) -> None:
+        """Set out to change the module."""
+        if plan.reason != "return":
+            self._end_trial()
+        self._plan, self._queue = plan, list(plan.keys)
+
+    def go_on(self, stamp_ns: int) -> Outcome | None:
+        """Bring the change on: with the next candidate, or by one observation; None meanwhile."""
+        assert self._plan is not None
+        while self._attempt is not None or self._queue:
+            if self._attempt is None:
+                key = self._queue.pop(0)
+                if self._is_running(key):
+                    return Outcome.FAILURE  # it stays, as the fallback
+                self._attempt = self._start(key, stamp_ns)
+            is_accepted = self._lead(self._attempt, stamp_ns)
+            if is_accepted is None:
+                return None
+            key, self._attempt = self._attempt.key, None
+            is_start = self._plan.reason == "first"
+            if is_accepted:
+                is_best = is_start or key == self._plan.keys[0]
+                return Outcome.SUCCESS if is_best else Outcome.FAILURE
+            if is_start:
+                return Outcome.FAILURE  # to `start` again, with the next
+        if self._estimator.active is not None and self._estimator.active.is_failed:
+            self._estimator.retire()
+        return Outcome.FAILURE
+
+    def begin_trial(self, key: str, stamp_ns: int) -> None:
+        """Let the scene's first choice run beside the fallback, unseen, from now on."""
+        self._trial = _Attempt(key=key, ready_ns=self._ready_ns(key, stamp_ns))
+        self.try_on(stamp_ns)
+
+    def try_on(self, stamp_ns: int) -> None:
+        """Feed the module on trial, if there is one; it ends where it fails or is lost."""
+        trial = self._trial
+        if trial is None or stamp_ns < trial.ready_ns:
+            return
+        try:
+            if trial.handover is None:
+                trial.handover = self._estimator.begin_trial(self._runners[trial.key], self._scene)
+            trial.handover.advance(None)
+        except ModuleError as error:
+            self._fault(stamp_ns, str(error))
+            self._end_trial()
+            return
+        if trial.handover.is_lost:
+            self._end_trial()
+
+    def close(self) -> None:
+        """Shut down whatever was being started."""
+        self._end_trial()
+        if self._attempt is not None:
+            self._runners[self._attempt.key].retire()
+            self._attempt = None
+
+    @property
+    def _scene(self) -> str:
+        return self._candidates.scene
+
+    def _is_running(self, key: str) -> bool:
+        active = self._estimator.active
+        return active is not None and active.key == key and not active.is_failed
+
+    def _start(self, key: str, stamp_ns: int) -> _Attempt:
+        """Begin the start of a module, which may take a while."""
+        self._candidates.use(key)
+        if self._trial is not None and self._trial.key == key:
+            attempt, self._trial = self._trial, None
+            if attempt.handover is not None:
+                self._estimator.settle(attempt.handover)
+            return attempt
+        ready_ns = self._ready_ns(key, stamp_ns)
+        if self._policy.handover == "cold" and ready_ns > stamp_ns:
+            self._estimator.retire()  # the paper shuts one down before it starts the next
+        return _Attempt(key=key, ready_ns=ready_ns)
+
+    def _lead(self, attempt: _Attempt, stamp_ns: int) -> bool | None:
+        """Bring one candidate on; return whether it took over, None while that is open."""
+        assert self._plan is not None
+        if stamp_ns < attempt.ready_ns:
+            return None
+        runner, since_ns = self._runners[attempt.key], self._plan.since_ns
+        try:
+            if attempt.handover is None:
+                attempt.handover = self._estimator.begin(runner, self._scene, since_ns)
+            if not attempt.handover.advance(self._limit):
+                return None
+        except ModuleError as error:
+            self._fault(stamp_ns, str(error))
+            return self._refuse(runner, stamp_ns, "failed")
+        if attempt.handover.is_lost and self._can_refuse():
+            return self._refuse(runner, stamp_ns, "lost")
+        previous = self._estimator.active.key if self._estimator.active else None
+        self._estimator.accept(attempt.handover)
+        self.switched_ns = stamp_ns
+        is_in_vain = self._plan.held_ns < round(self._policy.confirm_window_s * 1e9)
+        self._candidates.postpone(stamp_ns, is_in_vain=is_in_vain)
+        self._log_choice("decision", stamp_ns, attempt.key, previous)
+        return True
+
+    def _can_refuse(self) -> bool:
+        """Tell whether something better than a lost module is left; the paper does not ask."""
+        if self._policy.handover == "cold":
+            return False
+        return bool(self._queue) or (
+            self._estimator.active is not None and self._estimator.hold.is_held
+        )
+
+    def _refuse(self, runner: Runner, stamp_ns: int, why: str) -> bool:
+        runner.retire()
+        previous = self._estimator.active.key if self._estimator.active else None
+        self._candidates.postpone(stamp_ns, is_in_vain=True)
+        self._log_choice("refused", stamp_ns, runner.key, previous, why=why)
+        return False
+
+    def _log_choice(
+        self, event: str, stamp_ns: int, key: str, previous: str | None, **more: str
+    ) -> None:
+        assert self._plan is not None
+        self._log.add(
+            event,
+            stamp_ns,
+            scene=self._scene,
+            **{"from": previous, "to": key},
+            reason=self._plan.reason,
+            decided_ns=self._plan.at_ns,
+            **more,
+        )
+
+    def _end_trial(self) -> None:
+        if self._trial is not None:
+            self._runners[self._trial.key].retire()
+            self._candidates.postpone(self._estimator.now_ns, is_in_vain=True)
+        self._trial = None
+
+    def _ready_ns(self, key: str, stamp_ns: int) -> int:
+        """Return when a module that is started now can take its first observation."""
+        if self._run_began_ns is None:
+            self._run_began_ns = stamp_ns
+        startup_ns = round(self._policy.startup_s.get(key, 0.0) * 1e9)
+        if self._policy.handover == "warm":
+            return max(stamp_ns, self._run_began_ns + startup_ns)  # loaded when the run began
+        return stamp_ns + startup_ns
+
+    def _fault(self, stamp_ns: int, what: str) -> None:
+        _log.warning(what)
+        self._log.add("fault", stamp_ns, what=what)

@@ -1,0 +1,123 @@
+"""Which module is to run: one pure function of what is known at an observation.
+
+Its inputs are logged whenever they change, so that a run's decisions can be made again from the
+log alone (`python -m sceneslam.evaluation decisions RUN`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from sceneslam.bus.policy import Policy
+
+
+class Health(Enum):
+    """What the active module's pose is worth."""
+
+    HELD = "held"
+    LOST = "lost"  # it says so itself
+    SILENT = "silent"  # its sensors have not spoken for longer than usual
+    SUSPECT = "suspect"  # its motion is not the robot's, by independent measurements
+    FAILED = "failed"  # it broke its promise and was stopped
+
+
+class Trial(Enum):
+    """How the scene's first choice does beside the fallback that runs in its place."""
+
+    NONE = "none"
+    RUNNING = "running"
+    PASSED = "passed"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Situation:
+    """All that a decision depends on."""
+
+    stamp_ns: int
+    scene: str  # as confirmed by the detector
+    served_scene: str  # that the active module was chosen for
+    active: str
+    health: Health
+    unheld_since_ns: int  # when health is not HELD
+    held_ns: int  # how long it had held its pose before that, without a break
+    is_blind: bool  # nothing but constant velocity bridges
+    choices: tuple[str, ...]  # modules of `scene` that can run, in the table's order
+    served_choices: tuple[str, ...]  # the same of `served_scene`
+    tried: frozenset[str]  # of these, since the scene was confirmed or one held its pose long
+    rounds: int  # how often all were tried in vain
+    switched_ns: int
+    trial: Trial
+    retry_ns: int  # when the first choice may be tried again
+
+
+class Action(Enum):
+    """What to do about the active module."""
+
+    GO_ON = "go on"
+    TELL = "tell"  # the scene changed, the module stays
+    SWITCH = "switch"
+    TRY = "try"  # let the first choice run beside the fallback
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """A decision and its reason."""
+
+    action: Action
+    to: tuple[str, ...] = ()  # candidates, best first
+    reason: str = ""
+    rounds: int = 0  # of vain tries, from now on
+
+
+GO_ON = Verdict(action=Action.GO_ON)
+
+
+def decide(policy: Policy, now: Situation) -> Verdict:
+    """Return what to do at an observation: the scene first, then the module's health."""
+    has_dwelt = now.stamp_ns - now.switched_ns >= round(policy.dwell_s * 1e9)
+    if now.scene != now.served_scene and has_dwelt and now.choices:
+        if now.choices[0] == now.active and now.health is not Health.FAILED:
+            return Verdict(action=Action.TELL, reason="scene")
+        return Verdict(action=Action.SWITCH, to=now.choices, reason="scene")
+    if now.health is Health.HELD:
+        return _decide_on_return(policy, now)
+    return _decide_on_loss(policy, now)
+
+
+def _decide_on_return(policy: Policy, now: Situation) -> Verdict:
+    """Return whether the first choice, once lost or refused, gets another chance."""
+    first = now.served_choices[:1]
+    if not first or first[0] == now.active or policy.handover == "cold":
+        return GO_ON
+    if now.trial is Trial.PASSED:
+        return Verdict(action=Action.SWITCH, to=first, reason="return")
+    if now.trial is Trial.NONE and now.stamp_ns >= now.retry_ns:
+        return Verdict(action=Action.TRY, to=first)
+    return GO_ON
+
+
+def _decide_on_loss(policy: Policy, now: Situation) -> Verdict:
+    """Return whether another module has to take over from one that gives no pose.
+
+    Modules that were tried get a new chance when the active one has earned it by its loss: it
+    held its pose for a window before, or none is left and it has been lost for a window, each
+    time for twice as long, so that they do not take turns.
+    """
+    lost_ns = now.stamp_ns - now.unheld_since_ns
+    window_ns = round(policy.confirm_window_s * 1e9)
+    others = tuple(key for key in now.served_choices if key != now.active)
+    left, rounds = tuple(key for key in others if key not in now.tried), now.rounds
+    if now.held_ns >= window_ns:
+        left, rounds = others, 0
+    elif not left and lost_ns >= window_ns << now.rounds:
+        left, rounds = others, now.rounds + 1
+    is_over = now.health is Health.FAILED or lost_ns >= _patience_ns(policy, now)
+    if not is_over or (not left and now.health is not Health.FAILED):
+        return GO_ON
+    return Verdict(action=Action.SWITCH, to=left, reason=now.health.value, rounds=rounds)
+
+
+def _patience_ns(policy: Policy, now: Situation) -> int:
+    patience_s = policy.blind_patience_s if now.is_blind else policy.lost_patience_s
+    return round(patience_s * 1e9)

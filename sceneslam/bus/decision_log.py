@@ -1,0 +1,78 @@
+"""Writes down what decisions are made of, and makes them again from the log alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, fields, replace
+from enum import Enum
+from typing import Any
+
+from sceneslam.bus.decision import GO_ON, Health, Situation, Trial, Verdict, decide
+from sceneslam.bus.events import EventLog
+from sceneslam.bus.policy import Policy
+from sceneslam.types.run import Event
+
+
+class DecisionLog:
+    """Logs a situation whenever more than the time changed, and every verdict but `go on`."""
+
+    def __init__(self, log: EventLog) -> None:
+        self._log = log
+        self._last: Situation | None = None
+
+    def add(self, now: Situation, verdict: Verdict) -> None:
+        """Take a decision with all that it was made of."""
+        before, self._last = self._last, now
+        is_known = before is not None and replace(before, stamp_ns=now.stamp_ns) == now
+        if is_known and verdict == GO_ON:
+            return
+        values = {key: _plain(value) for key, value in asdict(now).items() if key != "stamp_ns"}
+        told = {key: _plain(value) for key, value in asdict(verdict).items()}
+        self._log.add("situation", now.stamp_ns, **values, verdict=told)
+
+
+def decide_again(events: Iterable[Event], policy: Policy) -> list[str]:
+    """Return one sentence for every logged decision that the log does not lead to again.
+
+    Every observation has a vote in the log, and every change of situation; in the state `run`
+    each of them is decided on anew.
+    """
+    wrong: list[str] = []
+    state, pending, now = "init", None, None
+    for event in events:
+        kind, stamp_ns = event["event"], event["stamp_ns"]
+        if kind == "vote":
+            if pending is not None and now is not None:
+                wrong += _check(policy, replace(now, stamp_ns=pending), _plain(asdict(GO_ON)))
+            pending = stamp_ns if state == "run" else None
+        elif kind == "situation":
+            now, pending = _situation(event), None
+            wrong += _check(policy, now, event["verdict"])
+        elif kind == "state":
+            state = event["to"]
+    return wrong
+
+
+def _check(policy: Policy, now: Situation, logged: Any) -> list[str]:
+    verdict = _plain(asdict(decide(policy, now)))
+    if verdict == logged:
+        return []
+    return [f"at {now.stamp_ns}: logged {logged['action']}, decided {verdict['action']}"]
+
+
+def _situation(event: Event) -> Situation:
+    values = {field.name: event[field.name] for field in fields(Situation)}
+    values |= {"health": Health(values["health"]), "trial": Trial(values["trial"])}
+    values |= {key: tuple(values[key]) for key in ("choices", "served_choices")}
+    return Situation(**values | {"tried": frozenset(values["tried"])})
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON has it."""
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, frozenset):
+        return sorted(value)
+    return list(value) if isinstance(value, tuple) else value

@@ -1,0 +1,98 @@
+"""A module on its way to become the active one: started, placed (Eq. 1), and caught up."""
+
+from __future__ import annotations
+
+from time import perf_counter_ns
+
+from sceneslam.atlas.atlas import BRIDGED
+from sceneslam.bus.hold import Hold
+from sceneslam.bus.memory import Memory, Moment
+from sceneslam.bus.runner import Runner
+from sceneslam.types import se3
+from sceneslam.types.observation import Tracking, TrackingStatus
+from sceneslam.types.rig import Rig
+from sceneslam.types.se3 import Transform
+
+
+class Handover:
+    """Leads a module from a remembered moment to now; nothing is changed until it is accepted.
+
+    The module is placed at the pose of the last trusted moment at which it holds its own. From
+    there on its poses are the robot's, and what it does not hold is bridged as ever.
+    """
+
+    def __init__(
+        self, runner: Runner, memory: Memory, *, anchor: Moment, hold: Hold, scene: str, rig: Rig
+    ) -> None:
+        self.runner, self.anchor, self.hold = runner, anchor, hold
+        self.began_at = anchor
+        self.trail: list[Moment] = []  # all after the anchor, and itself if it had no pose
+        self.tracked: list[Tracking] = []  # what it said from the anchor on, where it holds
+        self.first_cost_ns = 0  # until its first pose
+        self._memory, self._bridge = memory, anchor.bridge.copy()
+        self._done_ns = anchor.stamp_ns - 1
+        self._began_ns = perf_counter_ns()
+        runner.activate(rig, scene)
+
+    @property
+    def is_placed(self) -> bool:
+        """Tell whether the module has given a pose."""
+        return self.runner.T_map_local is not None
+
+    @property
+    def is_lost(self) -> bool:
+        """Tell whether the module's last word is that it does not know where it is."""
+        return self.hold.status is TrackingStatus.LOST
+
+    @property
+    def cost_ns(self) -> int:
+        """Return the time since it began."""
+        return perf_counter_ns() - self._began_ns
+
+    def advance(self, limit: int | None) -> bool:
+        """Lead the module through up to `limit` moments; return whether it has caught up.
+
+        Raises ModuleError when the module breaks its promise.
+        """
+        ahead = self._memory.after(self._done_ns)
+        for moment in ahead[:limit]:
+            self._feed(moment)
+        return limit is None or len(ahead) <= limit
+
+    def settle(self, anchor: Moment) -> None:
+        """Place the module, which has caught up, anew: at the pose of another moment, now."""
+        last = self.tracked[-1]
+        self.anchor, self.trail, self.tracked = anchor, [], [last]
+        self._bridge = anchor.bridge.copy()
+        self.runner.place(self._bridge.T_map_base @ se3.inverse(last.T_local_base))
+
+    def _feed(self, moment: Moment) -> None:
+        if not self.is_placed and moment.is_trusted:
+            self.anchor, self._bridge, self.trail = moment, moment.bridge.copy(), []
+        tracking = self.hold.ask(self.runner, moment.observation)
+        if tracking is None:
+            T_map_base = self._bridge.predict(moment.observation, by_velocity=True)
+        else:
+            T_map_base = self._place(moment, tracking)
+        if moment is not self.anchor or moment.T_map_base is None:
+            self.trail.append(
+                Moment(
+                    observation=moment.observation,
+                    T_map_base=T_map_base,
+                    module=BRIDGED if tracking is None else self.runner.key,
+                    bridge=self._bridge.copy(),
+                    is_trusted=tracking is not None and tracking.status is TrackingStatus.TRACKING,
+                )
+            )
+        self._done_ns = moment.stamp_ns
+
+    def _place(self, moment: Moment, tracking: Tracking) -> Transform:
+        """Return the pose of a module that holds one; its first is the pose handed over (Eq. 1)."""
+        if self.runner.T_map_local is None:
+            self.first_cost_ns = self.cost_ns
+            self.runner.place(self._bridge.T_map_base @ se3.inverse(tracking.T_local_base))
+        assert self.runner.T_map_local is not None
+        T_map_base = self.runner.T_map_local @ tracking.T_local_base
+        self._bridge.update(moment.observation, T_map_base)
+        self.tracked.append(tracking)
+        return T_map_base

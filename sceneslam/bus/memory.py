@@ -1,0 +1,100 @@
+"""What was observed lately and what was known of the motion then, for a hand-over in the past."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+from sceneslam.bus.bridge import Bridge
+from sceneslam.types.observation import Observation
+from sceneslam.types.se3 import Transform
+
+_BULKY = ("image_bgr", "depth_m", "points_lidar", "point_times_s")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Moment:
+    """An observation with its pose, and all that later poses can be bridged from."""
+
+    observation: Observation
+    T_map_base: Transform | None  # None: it got no pose
+    module: str  # that gave it, BRIDGED for none
+    bridge: Bridge  # after the observation
+    is_trusted: bool  # a module that was not suspect said it was tracking
+
+    @property
+    def stamp_ns(self) -> int:
+        """Return when it was."""
+        return self.observation.stamp_ns
+
+
+class Memory:
+    """The moments of the last while, bounded in time and in bytes.
+
+    Where the bytes do not suffice, every second of the older moments loses its sensor data, so
+    that the span stays and a module that is led through it sees fewer images.
+    """
+
+    def __init__(self, *, span_s: float, limit_mb: float, keeps_sensors: bool) -> None:
+        self._span_ns, self._limit_bytes = round(span_s * 1e9), round(limit_mb * 1e6)
+        self._keeps_sensors = keeps_sensors
+        self._moments: deque[Moment] = deque()
+        self._bytes = 0
+
+    @property
+    def newest(self) -> Moment:
+        """Return the moment that was added last."""
+        return self._moments[-1]
+
+    def add(self, moment: Moment) -> None:
+        """Remember a moment; forget what is too old."""
+        self._moments.append(moment)
+        self._bytes += _size(moment)
+        while moment.stamp_ns - self._moments[0].stamp_ns > self._span_ns:
+            self._bytes -= _size(self._moments.popleft())
+        if not self._keeps_sensors and len(self._moments) > 1:
+            self._strip(len(self._moments) - 2)
+        elif self._bytes > self._limit_bytes:
+            self._thin()
+
+    def anchor(self, until_ns: int | None) -> Moment:
+        """Return the newest trusted moment, not after `until_ns` if that is given.
+
+        Where none is left, the oldest that has a pose; the very oldest where none has.
+        """
+        posed = [moment for moment in self._moments if moment.T_map_base is not None]
+        for moment in reversed(posed):
+            if moment.is_trusted and (until_ns is None or moment.stamp_ns <= until_ns):
+                return moment
+        return posed[0] if posed else self._moments[0]
+
+    def after(self, stamp_ns: int) -> list[Moment]:
+        """Return all moments after an instant."""
+        return [moment for moment in self._moments if moment.stamp_ns > stamp_ns]
+
+    def rewrite(self, moments: list[Moment]) -> None:
+        """Put moments that are now better known in the place of all from the first of them on."""
+        while self._moments and self._moments[-1].stamp_ns >= moments[0].stamp_ns:
+            self._bytes -= _size(self._moments.pop())
+        for moment in moments:
+            self._moments.append(moment)
+            self._bytes += _size(moment)
+
+    def _thin(self) -> None:
+        full = [i for i, moment in enumerate(self._moments) if _size(moment)]
+        for index in full[1 : len(full) // 2 : 2]:
+            self._strip(index)
+
+    def _strip(self, index: int) -> None:
+        moment = self._moments[index]
+        self._bytes -= _size(moment)
+        observation = replace(
+            moment.observation, image_bgr=None, depth_m=None, points_lidar=None, point_times_s=None
+        )
+        self._moments[index] = replace(moment, observation=observation)
+
+
+def _size(moment: Moment) -> int:
+    """Return the bytes of the sensor data that can be done without."""
+    arrays = (getattr(moment.observation, name) for name in _BULKY)
+    return sum(array.nbytes for array in arrays if array is not None)

@@ -1,0 +1,223 @@
+"""Hand-overs: in the past, after a slow start, on trial; and what they leave alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from driving import assert_exact, dark_from, drive, events, policy
+from fakes import PERIOD_NS, ExactModule, observation, true_pose
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sceneslam.atlas.atlas import BRIDGED
+from sceneslam.bus.decision_log import decide_again
+from sceneslam.types import se3
+
+SLIP = se3.exp(np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.01]))
+
+
+def slipping(index):
+    """Odometry that is off by some centimetres from step to step."""
+    T_odom_base = true_pose(index * PERIOD_NS)
+    for _ in range(index):
+        T_odom_base = T_odom_base @ SLIP
+    return replace(observation(index), T_odom_base=T_odom_base)
+
+
+def errors_m(trajectory):
+    T_first = true_pose(int(trajectory.stamps_ns[0]))
+    true = np.stack([se3.inverse(T_first) @ true_pose(ns) for ns in trajectory.stamps_ns.tolist()])
+    return np.linalg.norm(true[:, :3, 3] - trajectory.positions_m, axis=1)
+
+
+class Astray(ExactModule):
+    """Keeps saying that it tracks, but is off by more and more from an index on."""
+
+    def __init__(self, since):
+        super().__init__()
+        self.since = since
+
+    def track(self, observation):
+        tracking = super().track(observation)
+        off = max(0, observation.stamp_ns // PERIOD_NS - self.since)
+        shift = se3.from_xy_yaw(0.05 * off, 0.0, 0.0)
+        return replace(tracking, T_local_base=tracking.T_local_base @ shift)
+
+
+def test_rewind_replaces_what_was_bridged_since_the_last_trusted_pose():
+    bright = ExactModule(lost=range(50, 200))
+    _, atlas, log, _ = drive(
+        {"bright": bright, "dark": ExactModule()}, feed=slipping, handover="rewind"
+    )
+    assert_exact(atlas)
+    assert BRIDGED not in atlas.pose_modules and len(atlas.trajectory) == 100
+    assert errors_m(atlas.online)[50:53].max() > 0.02  # told at the time, and said to be revised
+    (revised,) = events(log, "revised")
+    assert revised["from_ns"] == 50 * PERIOD_NS and revised["poses"] == 4
+    assert events(log, "handover")[1]["gap_s"] == 0.0
+
+
+def test_rewind_begins_where_the_new_scene_did():
+    """The old module goes astray when the scene changes, two seconds before that is confirmed."""
+    _, atlas, log, _ = drive(
+        {"bright": Astray(40), "dark": ExactModule()}, scene_at=dark_from(40), handover="rewind"
+    )
+    assert_exact(atlas)
+    assert atlas.pose_modules[40:42] == ("bright", "dark")
+    assert events(log, "decision")[1]["stamp_ns"] == 60 * PERIOD_NS
+
+
+def test_online_trajectory_is_what_was_known_at_the_time():
+    modules = {"bright": Astray(40), "dark": ExactModule()}
+    _, atlas, _, _ = drive(modules, scene_at=dark_from(40), handover="rewind")
+    expected = 0.05 * np.arange(21)
+    np.testing.assert_allclose(errors_m(atlas.online)[40:61], expected, atol=1e-9)
+    assert errors_m(atlas.online)[61:].max() < 1e-9
+
+
+@pytest.mark.parametrize("lost_s", [0, 1, 2])
+@pytest.mark.parametrize("startup_s", [0.0, 1.0, 8.0])
+def test_rewind_has_no_gap_however_long_the_start_takes(startup_s, lost_s):
+    bright = ExactModule(lost=range(60 - 10 * lost_s, 500)) if lost_s else ExactModule()
+    _, atlas, log, _ = drive(
+        {"bright": bright, "dark": ExactModule()},
+        steps=200,
+        scene_at=dark_from(40),
+        feed=slipping,
+        handover="rewind",
+        lost_patience_s=100.0,
+        startup_s={"dark": startup_s},
+    )
+    assert len(atlas.trajectory) == 200
+    assert_exact(atlas)
+    decision = events(log, "decision")[1]
+    assert decision["stamp_ns"] - decision["decided_ns"] == startup_s * 1e9
+
+
+def test_cold_loses_the_motion_of_the_start():
+    _, atlas, log, _ = drive(
+        {"bright": ExactModule(), "dark": ExactModule()},
+        scene_at=dark_from(10),
+        handover="cold",
+        startup_s={"dark": 2.0},
+    )
+    gap = np.diff(atlas.trajectory.stamps_ns).argmax()
+    assert np.diff(atlas.trajectory.stamps_ns)[gap] == 2e9
+    np.testing.assert_allclose(*atlas.trajectory.T_world_base[[gap, gap + 1]], atol=1e-12)
+    assert events(log, "handover")[1]["gap_s"] == 2.0
+
+
+def test_cold_hands_over_the_last_pose_of_a_lost_module():
+    bright = ExactModule(lost=range(50, 200))
+    _, atlas, _, _ = drive({"bright": bright, "dark": ExactModule()}, handover="cold")
+    assert BRIDGED not in atlas.pose_modules
+    after = list(atlas.pose_modules).index("dark")
+    np.testing.assert_allclose(*atlas.trajectory.T_world_base[[after - 1, after]], atol=1e-12)
+
+
+def test_warm_waits_for_a_module_that_is_still_loading():
+    _, atlas, log, _ = drive(
+        {"bright": ExactModule(), "dark": ExactModule()},
+        scene_at=dark_from(10),
+        handover="warm",
+        startup_s={"dark": 5.0},
+    )
+    assert events(log, "decision")[1]["stamp_ns"] == 50 * PERIOD_NS
+    assert atlas.pose_modules[49:52] == ("bright", "bright", "dark")
+    assert_exact(atlas)
+
+
+def test_catching_up_bit_by_bit_gives_the_same_trajectory():
+    def run(steps):
+        modules = {"bright": Astray(40), "dark": ExactModule()}
+        options = {"scene_at": dark_from(40), "handover": "rewind", "catch_up_steps": steps}
+        return drive(modules, **options)[1:3]
+
+    (atlas, log), (slow, slow_log) = run(None), run(3)
+    np.testing.assert_array_equal(atlas.trajectory.T_world_base, slow.trajectory.T_world_base)
+    assert atlas.pose_modules == slow.pose_modules
+    late_ns = events(slow_log, "decision")[1]["stamp_ns"] - events(log, "decision")[1]["stamp_ns"]
+    assert late_ns == 9 * PERIOD_NS  # 21 moments, three at a time, while one more comes each time
+
+
+def test_module_that_is_lost_does_not_replace_one_that_holds():
+    modules = {"bright": ExactModule(), "dark": ExactModule(lost=range(1000))}
+    _, atlas, log, _ = drive(modules, scene_at=dark_from(40), handover="rewind")
+    assert set(atlas.pose_modules) == {"bright"}
+    assert events(log, "refused")[0]["why"] == "lost"
+    assert_exact(atlas)
+
+
+def test_first_choice_comes_back_when_it_holds_beside_the_fallback():
+    bright = ExactModule(lost=range(50, 70))
+    _, atlas, log, _ = drive(
+        {"bright": bright, "dark": ExactModule()}, handover="rewind", retry_s=2.0
+    )
+    back = events(log, "decision")[2]
+    assert (back["to"], back["reason"]) == ("bright", "return")
+    assert back["stamp_ns"] == (53 + 20 + 10) * PERIOD_NS
+    assert atlas.pose_modules[82:85] == ("dark", "dark", "bright")
+    assert_exact(atlas)
+
+
+def test_vain_trials_become_rare():
+    bright = ExactModule(lost=range(50, 5000))
+    _, _, log, _ = drive(
+        {"bright": bright, "dark": ExactModule()}, steps=1000, handover="rewind", retry_s=1.0
+    )
+    assert len(events(log, "decision")) == 2
+    assert bright.activations <= 8  # 1 + after 1, 2, 4, 8, 16, 32, 32 s
+
+
+def test_flapping_first_choice_is_given_more_and_more_time():
+    lost = [index for index in range(50, 3000) if index % 30 > 12]
+    _, atlas, log, _ = drive(
+        {"bright": ExactModule(lost=lost), "dark": ExactModule()},
+        steps=1200,
+        handover="rewind",
+        retry_s=1.0,
+    )
+    assert len(events(log, "decision")) < 16
+    assert_exact(atlas)
+
+
+def test_dwell_keeps_a_module_that_was_just_switched_to():
+    modules = {"bright": ExactModule(), "dark": ExactModule()}
+    options = {"confirm_window_s": 0.2, "dwell_s": 3.0}
+    options["scene_at"] = lambda index: "Dark" if 40 <= index < 45 else "Bright"
+    _, _, log, _ = drive(modules, **options)
+    stamps_ns = [event["stamp_ns"] for event in events(log, "decision")]
+    assert stamps_ns == [0, 42 * PERIOD_NS, 72 * PERIOD_NS]
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    lost=st.sets(st.integers(0, 119), max_size=60),
+    dark_lost=st.sets(st.integers(0, 119), max_size=60),
+    raises=st.sets(st.integers(0, 119), max_size=2),
+    flips=st.lists(st.integers(1, 119), max_size=4),
+    handover=st.sampled_from(["cold", "warm", "rewind"]),
+    startup_s=st.sampled_from([0.0, 1.5]),
+)
+def test_decisions_follow_from_the_log_alone(lost, dark_lost, raises, flips, handover, startup_s):
+    options = {"handover": handover, "confirm_window_s": 0.5, "retry_s": 1.0, "trial_s": 0.5}
+    options["startup_s"] = {"dark": startup_s}
+    _, atlas, log, _ = drive(
+        {"bright": ExactModule(lost=lost, raises=raises), "dark": ExactModule(lost=dark_lost)},
+        steps=120,
+        scene_at=lambda i: "Dark" if sum(flip <= i for flip in flips) % 2 else "Bright",
+        **options,
+    )
+    assert decide_again(log.events, policy(**options)) == []
+    if handover == "rewind" and len(atlas.trajectory):
+        assert_exact(atlas)
+        first_ns = atlas.trajectory.stamps_ns[0]
+        stamps_ns = [e["stamp_ns"] for e in events(log, "vote") if e["stamp_ns"] >= first_ns]
+        assert len(atlas.trajectory) == len(stamps_ns)
+
+
+def test_a_decision_that_the_log_does_not_lead_to_is_found():
+    modules = {"bright": ExactModule(lost=range(50, 200)), "dark": ExactModule()}
+    _, _, log, _ = drive(modules)
+    assert decide_again(log.events, policy()) == []
+    assert decide_again(log.events, policy(lost_patience_s=0.2))
