@@ -29,6 +29,12 @@ CONFIG = {
         "lost_patience_s": 0.3,
         "blind_patience_s": 0.1,
         "bridge_s": 0.5,
+        "dwell_s": 0.0,
+        "retry_s": 2.0,
+        "trial_s": 1.0,
+        "buffer_s": 12.0,
+        "buffer_mb": 256.0,
+        "startup_s": {},
     },
     "atlas": {"_target_": "sceneslam.atlas.atlas.Atlas", "voxel_m": 0.05},
     "evaluation": {
@@ -51,6 +57,7 @@ CONFIG = {
         "restart_backoff_s": 0.2,
         "progress": False,
         "max_observations": None,
+        "catch_up_steps": None,
     },
     "allow_targets": ["fakes"],
 }

@@ -52,7 +52,9 @@ def test_rewind_replaces_what_was_bridged_since_the_last_trusted_pose():
     assert_exact(atlas)
     assert BRIDGED not in atlas.pose_modules and len(atlas.trajectory) == 100
     assert errors_m(atlas.online)[50:53].max() > 0.02  # told at the time, and said to be revised
-    (revised,) = events(log, "revised")
+    revised = events(log, "revised")[-1]
+    jump_m = np.linalg.norm(atlas.online.positions_m[53] - atlas.trajectory.positions_m[53])
+    assert events(log, "handover")[1]["jump_m"] == pytest.approx(jump_m)
     assert revised["from_ns"] == 50 * PERIOD_NS and revised["poses"] == 4
     assert events(log, "handover")[1]["gap_s"] == 0.0
 

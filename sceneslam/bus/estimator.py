@@ -140,14 +140,16 @@ class Estimator:
         """Place a module that was not held when it became active (Eq. 1)."""
         assert self.active is not None
         self.active.place(self._bridge.T_map_base @ se3.inverse(T_local_base))
-        self._begin_session(observation.stamp_ns, observation.stamp_ns)
+        self._begin_session(observation.stamp_ns, observation.stamp_ns, jump=se3.identity())
 
     def _rewrite(self, handover: Handover) -> None:
         """Put the poses of a module that has caught up in the place of the untrusted ones."""
         newest = self._memory.newest
+        told, known = newest.T_map_base, handover.T_map_base
+        jump = se3.identity() if told is None or known is None else se3.inverse(told) @ known
         keeps_anchor = handover.anchor.T_map_base is not None
         self._atlas.rewind(handover.anchor.stamp_ns + keeps_anchor)
-        self._begin_session(newest.stamp_ns, handover.tracked[0].stamp_ns)
+        self._begin_session(newest.stamp_ns, handover.tracked[0].stamp_ns, jump=jump)
         for tracking in handover.tracked:
             self._atlas.add_local(tracking.stamp_ns, tracking.T_local_base)
         for moment in handover.trail:
@@ -155,11 +157,19 @@ class Estimator:
                 self._atlas.add(moment.stamp_ns, moment.T_map_base, moment.module)
         if handover.trail:
             self._memory.rewrite(handover.trail)
-            self._log_revision(newest, handover)
+            self._log.add(
+                "revised",
+                newest.stamp_ns,
+                from_ns=handover.trail[0].stamp_ns,
+                poses=len(handover.trail),
+            )
         self._bridge = self._memory.newest.bridge.copy()
 
-    def _begin_session(self, stamp_ns: int, from_ns: int) -> None:
-        """Open the active module's session, which begins at `from_ns`."""
+    def _begin_session(self, stamp_ns: int, from_ns: int, *, jump: Transform) -> None:
+        """Open the active module's session, which begins at `from_ns`.
+
+        `jump` is how the pose that was told at `stamp_ns` differs from the one now known.
+        """
         assert self.active is not None and self.active.T_map_local is not None
         T_map_local = self.active.T_map_local
         last_ns = self._atlas.last_stamp_ns
@@ -172,20 +182,9 @@ class Estimator:
             kind=self._policy.handover,
             from_ns=from_ns,
             T_map_local=T_map_local.tolist(),
+            jump_m=float(np.linalg.norm(jump[:3, 3])),
+            jump_rad=float(se3.rotation_angle_rad(jump)),
             gap_s=0.0 if last_ns is None else (from_ns - last_ns) / 1e9,
-        )
-
-    def _log_revision(self, before: Moment, handover: Handover) -> None:
-        """Say which poses, told at the time, are now other ones."""
-        after = handover.trail[-1].T_map_base
-        if before.T_map_base is None or after is None:
-            return
-        self._log.add(
-            "revised",
-            before.stamp_ns,
-            from_ns=handover.trail[0].stamp_ns,
-            poses=len(handover.trail),
-            shift_m=float(np.linalg.norm(after[:3, 3] - before.T_map_base[:3, 3])),
         )
 
     def _log_cost(self, handover: Handover) -> None:

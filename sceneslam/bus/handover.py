@@ -45,6 +45,11 @@ class Handover:
         return self.hold.status is TrackingStatus.LOST
 
     @property
+    def T_map_base(self) -> Transform | None:
+        """Return the newest pose, None when there is none."""
+        return self.trail[-1].T_map_base if self.trail else self.anchor.T_map_base
+
+    @property
     def cost_ns(self) -> int:
         """Return the time since it began."""
         return perf_counter_ns() - self._began_ns
@@ -90,6 +95,7 @@ class Handover:
         """Return the pose of a module that holds one; its first is the pose handed over (Eq. 1)."""
         if self.runner.T_map_local is None:
             self.first_cost_ns = self.cost_ns
+            self._bridge.predict(moment.observation, by_velocity=True)
             self.runner.place(self._bridge.T_map_base @ se3.inverse(tracking.T_local_base))
         assert self.runner.T_map_local is not None
         T_map_base = self.runner.T_map_local @ tracking.T_local_base

@@ -56,6 +56,9 @@ def build(config: Mapping[str, Any]) -> Parts:
     scenes = _table(config, detector)
     modules = {key: _module(builder, run, key) for key in _used(scenes)}
     requires = {key: _requires(module, f"slam.{key}") for key, module in modules.items()}
+    for key in set(policy.startup_s) - set(modules):
+        known = f"a key of slam that a scene names: {', '.join(modules)}"
+        raise ConfigError(f"policy.startup_s.{key}", policy.startup_s[key], known)
     atlas = builder.make("atlas", Atlas)
     evaluation = builder.make("evaluation", EvaluationSettings)
     sinks = {key: builder.make(f"sinks.{key}", Sink) for key in config.get("sinks") or {}}
