@@ -53,7 +53,6 @@ def keyframe_at(x_m, landmark_ids=(), count=60, camera=CAMERA):
             depth_m=np.full(count, 2.0),
         ),
         landmark_ids=ids,
-        appearance=np.zeros(1200, np.float32),
         view=DepthView(
             points_base=np.zeros((0, 3), np.float32),
             colors_bgr=np.zeros((0, 3), np.uint8),

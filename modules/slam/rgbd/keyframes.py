@@ -34,7 +34,6 @@ class Keyframe:
     T_local_base: Transform
     features: Features
     landmark_ids: NDArray[np.int64]  # (N,), per feature, or NO_LANDMARK
-    appearance: NDArray[np.float32]  # thumbnail, zero mean, unit length
     view: DepthView
 
 
@@ -80,12 +79,6 @@ class KeyframeStore:
         order = np.argsort(-shared, kind="stable")[:limit]
         return [int(keyframe_id) for keyframe_id in ids[order][shared[order] > 0]]
 
-    def alike(self, appearance: NDArray[np.float32], *, limit: int) -> list[int]:
-        """Return the keyframes whose thumbnails correlate best with this one, best first."""
-        ids = self.ids
-        scores = np.array([float(k.appearance @ appearance) for k in self.all()])
-        return [ids[row] for row in np.argsort(-scores, kind="stable")[:limit]]
-
     def landmarks_of(self, keyframe_ids: Iterable[int]) -> NDArray[np.int64]:
         """Return the ids of all landmarks that these keyframes saw, rising."""
         seen = [self._keyframes[keyframe_id].landmark_ids for keyframe_id in keyframe_ids]
@@ -106,6 +99,13 @@ class KeyframeStore:
         gone = self._marked(landmark_ids)
         for keyframe in self.all():
             keyframe.landmark_ids[gone[keyframe.landmark_ids]] = NO_LANDMARK
+
+    def rename_landmarks(self, old_ids: NDArray[np.int64], new_ids: NDArray[np.int64]) -> None:
+        """Let keyframes refer to other landmarks (N,) than these (N,)."""
+        names = np.arange(NO_LANDMARK, self._id_limit)
+        names[old_ids + 1] = new_ids
+        for keyframe in self.all():
+            keyframe.landmark_ids[:] = names[keyframe.landmark_ids + 1]
 
     def nearest(self, T_local_base: Transform, *, per_m: float, per_rad: float) -> float:
         """Return how far the nearest keyframe is, metres and radians weighed and added."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import cv2
@@ -22,9 +23,10 @@ from .keyframes import NO_LANDMARK, Keyframe
 from .layers import LayerBuilder
 from .limits import check_limits, check_sizes
 from .localizer import Fix, Localizer
+from .memory import Memory
 from .motion import MotionModel
 from .pose_solver import PoseSolver
-from .relocalizer import Relocalizer, appearance
+from .relocalizer import Relocalizer
 from .view import View
 from .visual_map import VisualMap
 
@@ -112,9 +114,8 @@ class RgbdSlam:
         self._extractor = self._make_extractor(rig.camera)
         self._map = self._make_map(rig.camera)
         self._localizer = self._make_localizer(self._map, self._make_solver(rig.camera))
-        self._relocalizer = Relocalizer(
-            self._map.keyframes, self._localizer, min_inliers=self._degraded_inliers
-        )
+        self._memory = Memory(self._map, self._localizer, min_inliers=self._degraded_inliers)
+        self._relocalizer = Relocalizer(self._map.keyframes, self._memory.recognizer)
         self._layers = self._make_layers(rig.camera)
         self._keyframe_rule = self._make_keyframe_rule()
         self._motion = MotionModel()
@@ -135,6 +136,7 @@ class RgbdSlam:
         """Return T_local_base at the observation; LOST where the image does not show the map."""
         check_sizes(observation, self._camera)
         self._observations += 1
+        self._recall()
         T_predicted = self._motion.predict(observation)
         if observation.image_bgr is None:
             return self._lose(observation, T_predicted)
@@ -153,21 +155,36 @@ class RgbdSlam:
         return self._T_map_local @ self._T_local_base
 
     def get_trajectory(self) -> Trajectory:
-        """Return no poses: nothing is revised."""
-        return Trajectory.empty()
+        """Return T_local_base of every frame that was held, with all that loops corrected."""
+        return self._memory.trajectory()
 
     def get_map(self) -> MapLayers:
-        """Return the keyframes' cloud and, for a robot in the plane, their grid, in `local`."""
-        return self._layers.build(list(self._map.keyframes.all()))
+        """Return in `local` the keyframes' cloud and, for a robot in the plane, their grid,
+        the pose graph and the landmarks.
+        """
+        layers = self._layers.build(list(self._map.keyframes.all()))
+        graph, landmarks = self._memory.pose_graph(), self._memory.landmarks()
+        return replace(layers, pose_graph=graph, landmarks=landmarks)
 
     def shutdown(self) -> None:
-        """Stop; nothing but memory is held, and the map stays readable."""
+        """Stop the workers; the map stays readable."""
+        self._memory.shutdown()
 
     def _locate(self, view: View) -> Fix | None:
         fix = self._localizer.near(view.features, view.T_predicted, self._local_ids)
         if fix is None and not self._is_lost:
             fix = self._localizer.anywhere(view.features, self._local_ids)
-        return fix if fix is not None else self._relocalizer.find(view.features, view.gray)
+        if fix is not None:
+            return fix
+        return self._relocalizer.find(view.features, view.observation.depth_m)
+
+    def _recall(self) -> None:
+        """Go on from where the map is, if a loop has moved it."""
+        T_new_old = self._memory.step()
+        if T_new_old is not None:
+            self._T_local_base = T_new_old @ self._T_local_base
+            self._motion.correct(T_new_old)
+            self._local_ids = self._map.around(self._local_ids)
 
     def _is_unknown_place(self, features: Features) -> bool:
         """Tell whether odometry led to a place that was often enough looked for in the map."""
@@ -183,7 +200,8 @@ class RgbdSlam:
             return self._lose(view.observation, view.T_predicted)
         self._hold_pose(view.observation, view.T_predicted)
         unseen = np.full(len(view.features), NO_LANDMARK)
-        self._insert_keyframe(view, unseen, unseen[:0])
+        self._insert_keyframe(view, unseen, unseen[:0], None)
+        self._memory.hold(view.observation.stamp_ns, self._T_local_base, unseen[:0])
         # What the robot did before a usable image is known from odometry at best.
         is_first = self._observations == 1
         return Tracking(
@@ -192,6 +210,7 @@ class RgbdSlam:
             status=TrackingStatus.TRACKING if is_first else TrackingStatus.DEGRADED,
             covariance=_START_VARIANCE * np.eye(6) if is_first else None,
             inliers=view.features.deep_count,
+            revision=self._memory.revision,
         )
 
     def _hold(self, view: View, fix: Fix) -> Tracking:
@@ -208,7 +227,8 @@ class RgbdSlam:
         if wanted and can_extend and status is TrackingStatus.TRACKING:
             landmark_ids = np.full(len(view.features), NO_LANDMARK)
             landmark_ids[fix.feature_rows] = fix.landmark_ids
-            self._insert_keyframe(view, landmark_ids, fix.deep_rows)
+            self._insert_keyframe(view, landmark_ids, fix.deep_rows, fix)
+        self._memory.hold(view.observation.stamp_ns, T_local_base, fix.landmark_ids)
         possible = max(1, min(len(fix.expected_ids), len(view.features)))
         return Tracking(
             stamp_ns=view.observation.stamp_ns,
@@ -217,6 +237,7 @@ class RgbdSlam:
             covariance=None if is_reckoned else fix.estimate.covariance,
             quality_ratio=min(1.0, len(fix.landmark_ids) / possible),
             inliers=len(fix.landmark_ids),
+            revision=self._memory.revision,
         )
 
     def _hold_pose(self, observation: Observation, T_local_base: Transform) -> None:
@@ -231,10 +252,15 @@ class RgbdSlam:
             T_local_base=self._T_local_base.copy(),
             status=TrackingStatus.LOST,
             quality_ratio=0.0,
+            revision=self._memory.revision,
         )
 
     def _insert_keyframe(
-        self, view: View, landmark_ids: NDArray[np.int64], deep_rows: NDArray[np.int64]
+        self,
+        view: View,
+        landmark_ids: NDArray[np.int64],
+        deep_rows: NDArray[np.int64],
+        fix: Fix | None,
     ) -> None:
         image_bgr, depth_m = view.observation.image_bgr, view.observation.depth_m
         if image_bgr is None or depth_m is None:
@@ -245,9 +271,9 @@ class RgbdSlam:
             T_local_base=self._T_local_base.copy(),
             features=view.features,
             landmark_ids=landmark_ids,
-            appearance=appearance(view.gray),
             view=self._layers.view(depth_m, image_bgr, stamp_ns=stamp_ns),
         )
         self._map.insert(keyframe, deep_rows=deep_rows)
+        self._memory.insert(fix, depth_m)
         self._keyframe_rule.restart()
         self._local_ids = self._map.around(keyframe.landmark_ids)

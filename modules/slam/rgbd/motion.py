@@ -42,6 +42,10 @@ class MotionModel:
         self._step(observation, T_local_base)
         self.is_reckoned = observation.T_odom_base is not None
 
+    def correct(self, T_new_old: Transform) -> None:
+        """Hear that the map around the last pose was moved."""
+        self._T_local_base = T_new_old @ self._T_local_base
+
     def lose(self, observation: Observation, T_predicted: Transform) -> None:
         """Go on from a prediction; without odometry or gyro, as if at rest."""
         self._twist_per_s = np.zeros(6)

@@ -54,7 +54,7 @@ class VisualMap:
         landmark_limit: int,
     ) -> None:
         self.landmarks, self.keyframes = LandmarkTable(), KeyframeStore()
-        self._camera = camera
+        self.camera = camera
         self._sigma_px, self.inverse_depth_sigma_per_m = sigma_px, inverse_depth_sigma_per_m
         self._keyframe_limit, self._landmark_limit = keyframe_limit, landmark_limit
 
@@ -64,7 +64,7 @@ class VisualMap:
 
     def doubts(self, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> Doubts:
         """Return the landmarks' own uncertainty as the camera sees it from a pose."""
-        T_cam_local = se3.inverse(T_local_base @ self._camera.T_base_cam)
+        T_cam_local = se3.inverse(T_local_base @ self.camera.T_base_cam)
         points_cam = se3.apply(T_cam_local, self.landmarks.points_local[landmark_ids])
         z = np.maximum(points_cam[:, 2], _NEAREST_M)
         # Moves of a landmark: across the ray (two ways) and along the optical axis.
@@ -76,7 +76,7 @@ class VisualMap:
         variances = ((rows @ covariance) * rows).sum(axis=2)
         across_m = np.sqrt(0.5 * variances[:, :2].sum(axis=1))
         return Doubts(
-            across_px=self._camera.fx * across_m / z,
+            across_px=self.camera.fx * across_m / z,
             inverse_depth_per_m=np.sqrt(variances[:, 2]) / z**2,
         )
 
@@ -86,7 +86,7 @@ class VisualMap:
 
     def predict(self, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> Prediction:
         """Return which of these landmarks the image should show from a pose, and where."""
-        camera = self._camera
+        camera = self.camera
         T_local_cam = T_local_base @ camera.T_base_cam
         points_local = self.landmarks.points_local[landmark_ids]
         points_cam = se3.apply(se3.inverse(T_local_cam), points_local)
@@ -148,7 +148,7 @@ class VisualMap:
         self, keyframe: Keyframe, rows: NDArray[np.int64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return positions (N, 3) of features in `local` and their information (N, 3, 3)."""
-        camera, features = self._camera, keyframe.features
+        camera, features = self.camera, keyframe.features
         z = features.depth_m[rows]
         rays = (features.uv_px[rows] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
         points_cam = np.column_stack([rays, np.ones(len(rows))]) * z[:, None]
@@ -163,7 +163,7 @@ class VisualMap:
     def _looks(
         self, keyframe: Keyframe, rows: NDArray[np.int64], points_local: NDArray[np.float64]
     ) -> Looks:
-        viewer_local = (keyframe.T_local_base @ self._camera.T_base_cam)[:3, 3]
+        viewer_local = (keyframe.T_local_base @ self.camera.T_base_cam)[:3, 3]
         to_viewer = viewer_local - points_local
         distance_m = np.maximum(np.linalg.norm(to_viewer, axis=1), _NEAREST_M)
         return Looks(

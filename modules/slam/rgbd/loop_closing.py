@@ -1,0 +1,113 @@
+"""Closes loops: a little work per image; the pose graph in a worker, merged at a fixed image."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+
+from sceneslam.types import se3
+from sceneslam.types.se3 import Transform
+
+from .loop_detection import Loop, LoopDetector, Query
+from .loop_fusion import fuse_duplicates
+from .pose_graph import PoseGraph, solve
+from .visual_map import VisualMap
+
+_MERGE_IMAGES = 10  # that the worker has; then it is waited for, so that a run can be repeated
+_QUEUE = 3  # keyframes that wait to be looked up; older ones are let go
+
+Poses = Mapping[int, Transform]
+
+
+class LoopCloser:
+    """Looks new keyframes up, and corrects the map where two of them say that it drifted."""
+
+    def __init__(self, visual_map: VisualMap, detector: LoopDetector, graph: PoseGraph) -> None:
+        self._map, self._detector, self._graph = visual_map, detector, graph
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="pose_graph")
+        self._queries: deque[Query] = deque(maxlen=_QUEUE)
+        self._candidate: int | None = None  # of the first query, once it was looked up
+        self._solution: Future[dict[int, Transform]] | None = None
+        self._before: Poses = {}  # the poses that the worker began with
+        self._loops: list[Loop] = []
+        self._images_left = 0
+
+    def insert(self, query: Query) -> None:
+        """Take a new keyframe to look up."""
+        if len(self._queries) == _QUEUE:
+            self._candidate = None
+        self._queries.append(query)
+
+    def step(self) -> dict[int, Transform]:
+        """Do one image's share of the work; return T_new_old per keyframe that was moved."""
+        if self._solution is not None:
+            self._images_left -= 1
+            return {} if self._images_left else self._merge(self._solution)
+        if self._candidate is not None:
+            self._check(self._queries.popleft(), self._candidate)
+            self._candidate = None
+        elif self._queries:
+            self._look_up(self._queries[0])
+        return {}
+
+    def shutdown(self) -> None:
+        """End the worker."""
+        self._worker.shutdown(wait=True, cancel_futures=True)
+
+    def _look_up(self, query: Query) -> None:
+        if query.keyframe_id in self._graph:
+            self._candidate = self._detector.candidate(query)
+        if self._candidate is None:
+            self._queries.popleft()
+
+    def _check(self, query: Query, candidate: int) -> None:
+        if query.keyframe_id not in self._graph or candidate not in self._graph:
+            return
+        loops = self._detector.check(query, candidate)
+        if not loops:
+            return
+        is_news = any(self._detector.is_news(loop) for loop in loops)
+        if is_news:
+            self._graph.remeasure(self._poses())
+        for loop in loops:
+            self._graph.connect(loop.edge)
+        if is_news:
+            self._begin(loops)
+        else:
+            self._fuse(loops)
+
+    def _begin(self, loops: list[Loop]) -> None:
+        """Set the worker on the part of the graph that the loops are in."""
+        part = self._graph.connected(loops[0].keyframe_id)
+        self._before = {k: T for k, T in self._poses().items() if k in part}
+        edges = [edge for edge in self._graph.edges if edge.start in part]
+        self._loops, self._images_left = loops, _MERGE_IMAGES
+        self._solution = self._worker.submit(solve, self._before, edges, held=min(part))
+
+    def _merge(self, solution: Future[dict[int, Transform]]) -> dict[int, Transform]:
+        """Move the keyframes, those that are newer along with the one they hang on."""
+        solved = solution.result()
+        T_new_old = {k: T @ se3.inverse(self._before[k]) for k, T in solved.items()}
+        for keyframe_id in self._graph.ids:
+            if keyframe_id not in T_new_old:
+                anchor = next(
+                    (k for k in self._graph.neighbours(keyframe_id) if k in T_new_old), None
+                )
+                if anchor is not None:
+                    T_new_old[keyframe_id] = T_new_old[anchor]
+        T_new_old = {k: T for k, T in T_new_old.items() if k in self._graph}
+        poses = self._poses()
+        self._map.correct({k: T @ poses[k] for k, T in T_new_old.items()})
+        self._fuse(self._loops)
+        self._solution, self._loops = None, []
+        return T_new_old
+
+    def _fuse(self, loops: list[Loop]) -> None:
+        for loop in loops:
+            if loop.edge.start in self._graph and loop.edge.end in self._graph:
+                fuse_duplicates(self._map, old=loop.edge.start, new=loop.edge.end)
+
+    def _poses(self) -> dict[int, Transform]:
+        keyframes = self._map.keyframes
+        return {keyframe_id: keyframes[keyframe_id].T_local_base for keyframe_id in keyframes.ids}

@@ -1,0 +1,163 @@
+"""What the module remembers of its past: places, the pose graph, and where every frame was."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.maps import LandmarkLayer, PoseGraphLayer
+from sceneslam.types.se3 import Transform
+from sceneslam.types.trajectory import Trajectory
+
+from .frame_log import FrameLog
+from .keyframes import Keyframe
+from .localizer import Fix, Localizer
+from .loop_closing import LoopCloser
+from .loop_detection import LoopDetector, Query
+from .pose_graph import Edge, PoseGraph, motion_covariance
+from .recognition import PlaceRecognizer
+from .visual_map import VisualMap
+
+_MIN_SHARE = 0.1  # of a pose's landmarks, for the keyframe they come from to have an edge
+_RECKONED_VARIANCE = 0.05**2  # [m^2] and [rad^2], of a keyframe that only odometry leads to
+_NEVER_SAW = -1
+
+
+class Memory:
+    """Follows the map as it grows and shrinks, and corrects it where a loop closes."""
+
+    def __init__(self, visual_map: VisualMap, localizer: Localizer, *, min_inliers: int) -> None:
+        self._map = visual_map
+        self._graph, self._frames = PoseGraph(), FrameLog()
+        self._keyframes: dict[int, Keyframe] = {}  # also those that the map has just let go
+        self.recognizer = PlaceRecognizer(visual_map, localizer, min_inliers=min_inliers)
+        detector = LoopDetector(visual_map, self.recognizer, self._graph)
+        self._closer = LoopCloser(visual_map, detector, self._graph)
+        self._reference = _NEVER_SAW  # the keyframe that the newest frame hangs on
+        self.revision = 0  # rises with every correction
+
+    def hold(self, stamp_ns: int, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> None:
+        """Remember where a frame was, by the keyframe that shares most landmarks with it."""
+        keyframes = self._map.keyframes
+        near = [self._reference, keyframes.ids[-1], *self._graph.neighbours(self._reference)]
+        shared = [_shared(keyframes[k].landmark_ids, landmark_ids) for k in near]
+        self._reference = near[int(np.argmax(shared))]
+        T_local_keyframe = keyframes[self._reference].T_local_base
+        self._frames.add(stamp_ns, self._reference, se3.inverse(T_local_keyframe) @ T_local_base)
+
+    def insert(self, fix: Fix | None, depth_m: NDArray[np.float32]) -> None:
+        """Take the map's newest keyframe; `fix` is what placed it there, None for odometry."""
+        self._follow_removals()
+        keyframe_id = self._map.keyframes.ids[-1]
+        keyframe = self._map.keyframes[keyframe_id]
+        self._graph.insert(keyframe_id)
+        for edge in self._edges(keyframe_id, fix):
+            self._graph.connect(edge)
+        self._keyframes[keyframe_id] = keyframe
+        self.recognizer.places.insert(keyframe_id, keyframe.features.descriptors)
+        self._closer.insert(Query(keyframe_id=keyframe_id, depth_m=depth_m))
+        self._reference = keyframe_id
+
+    def step(self) -> Transform | None:
+        """Do an image's share of closing loops; return T_new_old of here when the map moved."""
+        self._follow_removals()
+        moved = self._closer.step()
+        if not moved:
+            return None
+        self.revision += 1
+        return moved.get(self._reference, se3.identity())
+
+    def trajectory(self) -> Trajectory:
+        """Return T_local_base of all frames that were held, as best known now."""
+        return self._frames.trajectory({k: v.T_local_base for k, v in self._keyframes.items()})
+
+    def pose_graph(self) -> PoseGraphLayer | None:
+        """Return the keyframes and what was measured between them."""
+        if not self._keyframes:
+            return None
+        rows = {keyframe_id: row for row, keyframe_id in enumerate(self._keyframes)}
+        keyframes, edges = list(self._keyframes.values()), self._graph.edges
+        return PoseGraphLayer(
+            stamps_ns=np.array([k.stamp_ns for k in keyframes]),
+            T_world_base=np.stack([k.T_local_base for k in keyframes]),
+            edges=np.array([(rows[e.start], rows[e.end]) for e in edges], int).reshape(-1, 2),
+            T_from_to=np.array([e.T_start_end for e in edges]).reshape(-1, 4, 4),
+            information=np.array([np.linalg.inv(e.covariance) for e in edges]).reshape(-1, 6, 6),
+            is_loop=np.array([e.is_loop for e in edges], bool),
+        )
+
+    def landmarks(self) -> LandmarkLayer | None:
+        """Return the landmarks with the stamp of the first keyframe that still shows them."""
+        owned = self._map.keyframes.owned_landmarks()
+        if not owned:
+            return None
+        table, ids = self._map.landmarks, np.concatenate(list(owned.values()))
+        counts = [len(landmark_ids) for landmark_ids in owned.values()]
+        stamps_ns = np.array([self._keyframes[keyframe_id].stamp_ns for keyframe_id in owned])
+        return LandmarkLayer(
+            points=table.points_local[ids].astype(np.float32),
+            first_stamps_ns=np.repeat(stamps_ns, counts),
+            sightings=table.found[ids],
+        )
+
+    def shutdown(self) -> None:
+        """End the worker; what is remembered stays readable."""
+        self._closer.shutdown()
+
+    def _edges(self, keyframe_id: int, fix: Fix | None) -> list[Edge]:
+        """Return what a new keyframe's pose was measured against.
+
+        A landmark belongs to the keyframe that saw it first; every such keyframe gets the share
+        of the information that its landmarks have, so that nothing is counted twice.
+        """
+        earlier = self._keyframes
+        if not earlier:
+            return []
+        T_local_base = self._map.keyframes[keyframe_id].T_local_base
+        if fix is None:
+            last = max(earlier)
+            T_last_new = se3.inverse(earlier[last].T_local_base) @ T_local_base
+            reckoned = _RECKONED_VARIANCE * np.eye(6)
+            return [_edge(last, keyframe_id, T_last_new, reckoned)]
+        counts = self._origins(fix.landmark_ids)
+        total = sum(counts.values())
+        return [
+            _edge(
+                k,
+                keyframe_id,
+                se3.inverse(earlier[k].T_local_base) @ T_local_base,
+                fix.estimate.covariance * (total / count),
+            )
+            for k, count in counts.items()
+            if k in earlier and count > _MIN_SHARE * total
+        ]
+
+    def _origins(self, landmark_ids: NDArray[np.int64]) -> dict[int, int]:
+        """Return how many of these landmarks each keyframe saw before any other did."""
+        owned = self._map.keyframes.owned_landmarks()
+        owners = np.repeat(list(owned), [len(ids) for ids in owned.values()])
+        wanted = np.isin(np.concatenate(list(owned.values())), landmark_ids)
+        keyframe_ids, counts = np.unique(owners[wanted], return_counts=True)
+        return dict(zip(keyframe_ids.tolist(), counts.tolist(), strict=True))
+
+    def _follow_removals(self) -> None:
+        """Let what hung on keyframes that the map has let go hang on others."""
+        for keyframe_id in sorted(set(self._keyframes) - set(self._map.keyframes.ids)):
+            edge = self._graph.remove(keyframe_id)
+            if edge is not None:
+                gone, heir = self._keyframes[keyframe_id], self._keyframes[edge.start]
+                T_heir_gone = se3.inverse(heir.T_local_base) @ gone.T_local_base
+                self._frames.hand_over(keyframe_id, edge.start, T_heir_gone)
+                self._reference = edge.start if self._reference == keyframe_id else self._reference
+            del self._keyframes[keyframe_id]
+            self.recognizer.places.remove(keyframe_id)
+
+
+def _edge(start: int, end: int, T_start_end: Transform, covariance: NDArray[np.float64]) -> Edge:
+    covariance = motion_covariance(T_start_end, covariance)
+    return Edge(start=start, end=end, T_start_end=T_start_end, covariance=covariance)
+
+
+def _shared(landmark_ids: NDArray[np.int64], others: NDArray[np.int64]) -> int:
+    return int(np.isin(others, landmark_ids).sum())

@@ -1,0 +1,219 @@
+"""The pose graph: keyframes, what was measured between them, and the poses that fit it best."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from heapq import heappop, heappush
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.se3 import Transform
+
+_MODEL_ERROR_RATIO = 0.03  # of a motion: what no noise explains, wrong intrinsics before all
+_HUBER_SIGMAS = 1.345  # 95 % as efficient as least squares where there is no outlier
+_HELD_SIGMA = 1e-6  # [m] and [rad] of the pose that stays
+_ROTATION_FIRST = [3, 4, 5, 0, 1, 2]  # gtsam's order
+_RADIAN_M = 1.0  # what a radian counts as in the length of a way
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Edge:
+    """A measured motion from one keyframe to another."""
+
+    start: int
+    end: int
+    T_start_end: Transform
+    covariance: NDArray[np.float64]  # (6, 6), of se3.log order, in the frame of the end
+    is_loop: bool = False
+
+    def turned(self) -> Edge:
+        """Return the same measurement from the end to the start."""
+        adjoint = _adjoint(self.T_start_end)
+        return Edge(
+            start=self.end,
+            end=self.start,
+            T_start_end=se3.inverse(self.T_start_end),
+            covariance=adjoint @ self.covariance @ adjoint.T,
+            is_loop=self.is_loop,
+        )
+
+    def then(self, after: Edge) -> Edge:
+        """Return the motion along this edge and one that begins where it ends."""
+        adjoint = _adjoint(se3.inverse(after.T_start_end))
+        return Edge(
+            start=self.start,
+            end=after.end,
+            T_start_end=self.T_start_end @ after.T_start_end,
+            covariance=adjoint @ self.covariance @ adjoint.T + after.covariance,
+            is_loop=self.is_loop or after.is_loop,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Way:
+    """A way through the graph: what was moved on it, and how exactly that was measured."""
+
+    length_m: float
+    turned_rad: float
+    reach_m: float  # from its end to the farthest keyframe on it
+    sigma_m: float  # of all steps, without what turns make of it farther on
+    sigma_rad: float
+
+
+class PoseGraph:
+    """Keyframes by id, and the edges between them."""
+
+    def __init__(self) -> None:
+        self._edges: dict[int, dict[int, Edge]] = {}  # at both ends, each turned to begin there
+
+    def __contains__(self, keyframe_id: int) -> bool:
+        return keyframe_id in self._edges
+
+    @property
+    def ids(self) -> list[int]:
+        """Return the keyframes' ids, in the order of their insertion."""
+        return list(self._edges)
+
+    @property
+    def edges(self) -> list[Edge]:
+        """Return every edge once, from the lower to the higher id."""
+        return [e for near in self._edges.values() for e in near.values() if e.start < e.end]
+
+    def insert(self, keyframe_id: int) -> None:
+        """Add a keyframe, connected to none."""
+        self._edges[keyframe_id] = {}
+
+    def connect(self, edge: Edge) -> None:
+        """Add an edge between two keyframes; it replaces the one that they had."""
+        self._edges[edge.start][edge.end] = edge
+        self._edges[edge.end][edge.start] = edge.turned()
+
+    def neighbours(self, keyframe_id: int) -> list[int]:
+        """Return the ids of the keyframes that an edge leads to."""
+        return list(self._edges[keyframe_id])
+
+    def remove(self, keyframe_id: int) -> Edge | None:
+        """Forget a keyframe, whose other neighbours its surest one takes over.
+
+        Returns the edge from that neighbour to the keyframe, None where it had none.
+        """
+        near = self._edges.pop(keyframe_id)
+        for other in near:
+            del self._edges[other][keyframe_id]
+        if not near:
+            return None
+        heir = min(near.values(), key=lambda edge: float(np.trace(edge.covariance)))
+        to_gone = heir.turned()
+        for other, edge in near.items():
+            if other != heir.end and other not in self._edges[heir.end]:
+                self.connect(to_gone.then(edge))
+        return to_gone
+
+    def remeasure(self, T_local_base: Mapping[int, Transform]) -> None:
+        """Measure the edges along the way anew from poses that were adjusted since."""
+        for edge in self.edges:
+            if not edge.is_loop:
+                T_start_end = se3.inverse(T_local_base[edge.start]) @ T_local_base[edge.end]
+                self.connect(_moved(edge, T_start_end))
+
+    def connected(self, keyframe_id: int) -> set[int]:
+        """Return the keyframes that some way leads to, this one with them."""
+        found, queue = {keyframe_id}, [keyframe_id]
+        while queue:
+            for other in self._edges[queue.pop()]:
+                if other not in found:
+                    found.add(other)
+                    queue.append(other)
+        return found
+
+    def way(self, start: int, end: int) -> Way | None:
+        """Return the shortest way (Dijkstra), None where the two are not connected."""
+        heap: list[tuple[float, int, int]] = [(0.0, start, start)]
+        before: dict[int, int] = {}
+        while heap:
+            length, keyframe_id, previous = heappop(heap)
+            if keyframe_id in before:
+                continue
+            before[keyframe_id] = previous
+            if keyframe_id == end:
+                return self._measure(before, end)
+            for other, edge in self._edges[keyframe_id].items():
+                if other not in before:
+                    heappush(heap, (length + _length(edge), other, keyframe_id))
+        return None
+
+    def _measure(self, before: Mapping[int, int], end: int) -> Way:
+        length_m = turned_rad = reach_m = 0.0
+        variances = np.zeros(6)
+        T_end_here, here = se3.identity(), end
+        while before[here] != here:
+            edge = self._edges[here][before[here]]
+            step = edge.T_start_end
+            variances += np.diag(edge.covariance)
+            length_m += float(np.linalg.norm(step[:3, 3]))
+            turned_rad += float(se3.rotation_angle_rad(step))
+            T_end_here, here = T_end_here @ step, before[here]
+            reach_m = max(reach_m, float(np.linalg.norm(T_end_here[:3, 3])))
+        return Way(
+            length_m=length_m,
+            turned_rad=turned_rad,
+            reach_m=reach_m,
+            sigma_m=float(np.sqrt(variances[:3].sum())),
+            sigma_rad=float(np.sqrt(variances[3:].sum())),
+        )
+
+
+def solve(
+    T_local_base: Mapping[int, Transform], edges: Iterable[Edge], *, held: int
+) -> dict[int, Transform]:
+    """Return the poses that fit the edges best (Levenberg-Marquardt, Huber's kernel on loops).
+
+    `held` is the id of the pose that stays as it is.
+    """
+    import gtsam
+
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for keyframe_id, T in T_local_base.items():
+        values.insert(keyframe_id, gtsam.Pose3(T))
+    for edge in edges:
+        covariance = edge.covariance[np.ix_(_ROTATION_FIRST, _ROTATION_FIRST)]
+        noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        if edge.is_loop:
+            huber = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER_SIGMAS)
+            noise = gtsam.noiseModel.Robust.Create(huber, noise)
+        T_start_end = gtsam.Pose3(edge.T_start_end)
+        graph.add(gtsam.BetweenFactorPose3(edge.start, edge.end, T_start_end, noise))
+    stays = gtsam.noiseModel.Isotropic.Sigma(6, _HELD_SIGMA)
+    graph.add(gtsam.PriorFactorPose3(held, gtsam.Pose3(T_local_base[held]), stays))
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    return {keyframe_id: found.atPose3(keyframe_id).matrix() for keyframe_id in T_local_base}
+
+
+def motion_covariance(T_start_end: Transform, measured: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a measured covariance (6, 6) with the share of the motion that no noise explains."""
+    moved = np.full(3, np.linalg.norm(T_start_end[:3, 3]))
+    turned = np.full(3, se3.rotation_angle_rad(T_start_end))
+    sigmas = _MODEL_ERROR_RATIO * np.concatenate([moved, turned])
+    return np.asarray(measured + np.diag(sigmas**2))
+
+
+def _moved(edge: Edge, T_start_end: Transform) -> Edge:
+    return Edge(start=edge.start, end=edge.end, T_start_end=T_start_end, covariance=edge.covariance)
+
+
+def _length(edge: Edge) -> float:
+    T = edge.T_start_end
+    return float(np.linalg.norm(T[:3, 3]) + _RADIAN_M * se3.rotation_angle_rad(T))
+
+
+def _adjoint(T_a_b: Transform) -> NDArray[np.float64]:
+    """Return (6, 6): what a twist (translation, rotation) at b is at a."""
+    rotation, (x, y, z) = T_a_b[:3, :3], T_a_b[:3, 3]
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    adjoint = np.zeros((6, 6))
+    adjoint[:3, :3] = adjoint[3:, 3:] = rotation
+    adjoint[:3, 3:] = cross @ rotation
+    return adjoint
