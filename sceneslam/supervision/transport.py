@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import marshal
 import mmap
 import os
 import pickle
@@ -14,9 +15,13 @@ from weakref import finalize
 
 import numpy as np
 
+from sceneslam.supervision.packing import packed
+
 _PACKET_BYTES = 1 << 15  # what travels in the packet itself: a socket's buffer holds several
-_PACKET_MAX_BYTES = 1 << 17
+_PACKET_MAX_BYTES = 1 << 16
 _LINE_BYTES = 64  # of a cache line: where each array begins
+
+_Place = tuple[int, int, list[tuple[int, int]]]  # a block, its capacity, where its parts are
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -44,20 +49,18 @@ class Channel:
 
     def send(self, message: object, timeout_s: float | None = None) -> None:
         """Send a message; raises OSError where the other end is gone or its line is full."""
-        buffers: list[pickle.PickleBuffer] = []
-        head = pickle.dumps(message, protocol=5, buffer_callback=buffers.append)
-        parts = [memoryview(head), *(buffer.raw() for buffer in buffers)]
-        spans = _layout(parts)
-        returned, self._returned = self._returned, []
+        head, arrays = packed(message)
         self._line.settimeout(timeout_s)
-        if spans[-1][1] <= _PACKET_BYTES:
-            self._line.send(pickle.dumps((returned, None, list(map(bytes, parts)))))
+        if not arrays and len(head) <= _PACKET_BYTES:
+            self._line.send(self._packet(head, None))
             return
+        parts = [memoryview(head), *arrays]
+        spans = _layout(parts)
         index = self._borrow(spans[-1][1])
         block = self._blocks[index]
         for part, (start, stop) in zip(parts, spans, strict=True):
             block.memory[start:stop] = part
-        packet = pickle.dumps((returned, (index, len(block.memory)), spans))
+        packet = self._packet(None, (index, len(block.memory), spans))
         socket.send_fds(self._line, [packet], [] if block.fd is None else [block.fd])
         self._forget_fd(block)
 
@@ -70,10 +73,12 @@ class Channel:
             raise EOFError from error
         if not packet:
             raise EOFError
-        returned, block, content = pickle.loads(packet)
+        returned, head, place = marshal.loads(packet)
         self._free += returned
-        parts = content if block is None else self._look_at(block[0], block[1], content, fds)
-        return pickle.loads(parts[0], buffers=parts[1:])
+        arrays: list[Any] = []
+        if place is not None:
+            head, *arrays = self._look_at(place, fds)
+        return pickle.loads(head, buffers=arrays)
 
     def has_message(self) -> bool:
         """Tell whether `receive` would return, or raise, at once."""
@@ -86,6 +91,11 @@ class Channel:
         self._line.close()
         for block in self._blocks:
             self._forget_fd(block)
+
+    def _packet(self, head: bytes | None, place: _Place | None) -> bytes:
+        """Return what goes over the socket, with the blocks that the other end has back."""
+        returned, self._returned = self._returned, []
+        return marshal.dumps((returned, head, place))
 
     def _borrow(self, size: int) -> int:
         """Return the smallest free block that holds `size` bytes, a new one where there is none."""
@@ -100,10 +110,9 @@ class Channel:
         self._blocks.append(_Block(memory=mmap.mmap(fd, capacity), fd=fd))
         return len(self._blocks) - 1
 
-    def _look_at(
-        self, index: int, capacity: int, spans: Sequence[tuple[int, int]], fds: Sequence[int]
-    ) -> list[Any]:
+    def _look_at(self, place: _Place, fds: Sequence[int]) -> list[Any]:
         """Return the parts in a block of the other end, which has it back when they are gone."""
+        index, capacity, spans = place
         for fd in fds:
             self._borrowed[index] = mmap.mmap(fd, capacity, prot=mmap.PROT_READ)
             os.close(fd)
