@@ -86,18 +86,19 @@ def _save(
         reference=reference,
     )
     write_metrics(folder / "metrics.json", metrics)
-    write_report(
-        folder,
-        result,
-        truth,
-        metrics,
-        threshold=parts.threshold,
-        config_yaml=(folder / "config.yaml").read_text(),
-        versions=versions,
-        faults=loop.faults,
-        reference=reference,
-        value_label=parts.detector.quantity,
-    )
+    if parts.run.report:
+        write_report(
+            folder,
+            result,
+            truth,
+            metrics,
+            threshold=parts.threshold,
+            config_yaml=(folder / "config.yaml").read_text(),
+            versions=versions,
+            faults=loop.faults,
+            reference=reference,
+            value_label=parts.detector.quantity,
+        )
     return Finished(
         metrics=metrics,
         trajectory=result.trajectory,

@@ -17,7 +17,10 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from sceneslam.app import Finished, run
+from sceneslam.config.resolve import resolved
 from sceneslam.evaluation.summary import summary_lines
+from sceneslam.evaluation.verdict import verdict_lines
+from sceneslam.experiment import run_experiment
 from sceneslam.types.errors import ConfigError, SceneSlamError
 from sceneslam.types.trajectory import Trajectory
 
@@ -43,6 +46,10 @@ def _job(config: DictConfig) -> int:
     """Run one job; return its exit code."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     try:
+        if config.get("experiment"):
+            verdict = run_experiment(config, folder)
+            print("\n".join([*verdict_lines(verdict), f"verdict  {_short(folder)}/verdict.json"]))
+            return OK
         finished = _run(config, folder)
     except SceneSlamError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -68,7 +75,7 @@ def _run(config: DictConfig, folder: Path) -> Finished:
             faults = tuple(f"reference: {fault}" for fault in finished.faults)
             return replace(finished, faults=faults)
         reference = finished.trajectory
-    return run(_resolved(config), folder, title=title, reference=reference)
+    return run(resolved(config), folder, title=title, reference=reference)
 
 
 def _reference(config: DictConfig) -> dict[str, Any]:
@@ -81,18 +88,7 @@ def _reference(config: DictConfig) -> dict[str, Any]:
     except OmegaConfBaseException as error:
         key = f"reference.{getattr(error, 'full_key', '') or ''}".rstrip(".")
         raise ConfigError(key, OmegaConf.to_container(config.reference), allowed) from error
-    return _resolved(cast(DictConfig, other))
-
-
-def _resolved(config: DictConfig) -> dict[str, Any]:
-    """Return the configuration as plain values."""
-    try:
-        resolved = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
-    except OmegaConfBaseException as error:
-        key = str(getattr(error, "full_key", "") or "configuration")
-        reason = str(error).splitlines()[0]
-        raise ConfigError(key, "an interpolation", f"one that resolves ({reason})") from error
-    return cast("dict[str, Any]", resolved)
+    return resolved(cast(DictConfig, other))
 
 
 def _short(folder: Path) -> Path:

@@ -1,4 +1,4 @@
-"""The contracts: what a source, detector, SLAM module and sink must do.
+"""The contracts: what a source, detector, SLAM module, sink and experiment must do.
 
 All poses are (4, 4) float64, metres, REP-103 axes. Calls never overlap and come in the order
 `activate`, then the rest, then `shutdown`; in live mode not all of them from one thread. An
@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+from sceneslam.types.experiment import RunTrials, Verdict
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, SceneVote, Tracking
 from sceneslam.types.rig import Rig, Sensor
@@ -135,6 +136,19 @@ class SlamModule(Protocol):
 
     def shutdown(self) -> None:
         """Free what `activate` took. The map stays readable. May be called twice."""
+        ...
+
+
+@runtime_checkable
+class Experiment(Protocol):
+    """Asks a question of many runs."""
+
+    def run(self, run_trials: RunTrials, folder: Path) -> Verdict:
+        """Return what was found; figures and files of its own go into `folder`.
+
+        `run_trials` runs in order. All trials handed to it at once are composed before the first
+        is run, so that a mistake in any of them is found at once.
+        """
         ...
 
 

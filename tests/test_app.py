@@ -56,6 +56,7 @@ CONFIG = {
         "restart_window_s": 60.0,
         "restart_backoff_s": 0.2,
         "progress": False,
+        "report": True,
         "max_observations": None,
         "catch_up_steps": None,
     },

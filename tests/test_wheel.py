@@ -13,7 +13,7 @@ from scenery import RIG, room_observation
 from sceneslam.ros.writer import ObservationWriter
 
 ROOT = Path(__file__).parents[1]
-SOURCES = ("pyproject.toml", "README.md", "LICENSE", "conf", "modules", "sceneslam")
+SOURCES = ("pyproject.toml", "README.md", "LICENSE", "conf", "modules", "experiments", "sceneslam")
 MY_SCENARIO = """\
 # @package _global_
 defaults:

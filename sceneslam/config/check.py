@@ -21,6 +21,7 @@ TOP_LEVEL = (
     "detector",
     "effects",
     "evaluation",
+    "experiment",
     "lights",
     "policy",
     "reference",
@@ -51,7 +52,7 @@ def check_keys(config: Mapping[str, Any]) -> None:
             close = difflib.get_close_matches(key, (*TOP_LEVEL, "scenario", "experiment"), n=1)
             hint = f" (did you mean {close[0]}?)" if close else ""
             raise ConfigError(key, config[key], f"{', '.join(TOP_LEVEL)}{hint}")
-    _check_given(config, "")
+    check_given(config, "")
 
 
 def check_node(node: object, key: str, *, allow: Sequence[str], positional: int = 0) -> None:
@@ -110,10 +111,11 @@ def _hints(target: Callable[..., object]) -> dict[str, Any]:
         return {}
 
 
-def _check_given(value: object, key: str) -> None:
+def check_given(value: object, key: str) -> None:
+    """Raise ConfigError for a value at any depth that was not given (`???`)."""
     if isinstance(value, Mapping):
         for name, item in value.items():
-            _check_given(item, f"{key}.{name}" if key else str(name))
+            check_given(item, f"{key}.{name}" if key else str(name))
     elif value == "???":
         raise ConfigError(key, NOTHING, f"a value, as in {key}=...")
 

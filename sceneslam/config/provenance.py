@@ -61,7 +61,7 @@ def _code_sha256() -> str:
         root = Path(str(files(package)))
         for file in sorted([*root.rglob("*.py"), *root.rglob("*.yaml")]):
             name = file.relative_to(root)
-            if package != "sceneslam" or name.parts[0] not in ("modules", "conf"):
+            if package != "sceneslam" or name.parts[0] not in ("modules", "conf", "experiments"):
                 digest.update(f"{package}/{name}".encode() + file.read_bytes())
     return digest.hexdigest()
 

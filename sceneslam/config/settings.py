@@ -25,6 +25,7 @@ class RunSettings:
     restart_backoff_s: float  # ... waiting so long before the second time, then twice as long
     threads: int  # of OpenCV, and of all libraries in a process of their own
     progress: bool  # show a progress bar
+    report: bool  # draw figures and write report.html
     max_observations: int | None  # stop after so many, null: all
     catch_up_steps: int | None  # remembered observations per new one, at a hand-over; null: all
 

@@ -1,0 +1,1 @@
+"""Whether the policy ever does harm to what real systems put out."""

@@ -1,0 +1,56 @@
+"""An experiment's verdict as files: `verdict.json`, `table.csv`, `table.md`."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+from sceneslam.types.experiment import Figure, Table, Verdict
+
+
+def write_verdict(folder: Path, experiment: str, verdict: Verdict) -> None:
+    """Write the verdict and its table into a folder."""
+    content = {
+        "experiment": experiment,
+        "holds": verdict.holds,
+        "figures": [_plain(figure) for figure in verdict.figures],
+    }
+    (folder / "verdict.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    with (folder / "table.csv").open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerows([verdict.table.columns, *verdict.table.rows])
+    (folder / "table.md").write_text(markdown(verdict.table))
+
+
+def markdown(table: Table) -> str:
+    """Return the table in Markdown, numbers with one decimal."""
+    rows = [table.columns, ["---"] * len(table.columns), *table.rows]
+    return "".join(f"| {' | '.join(map(_cell, row))} |\n" for row in rows)
+
+
+def verdict_lines(verdict: Verdict) -> list[str]:
+    """Return one line per figure, for the command line."""
+    return [
+        f"{'holds' if figure.holds else 'FAILS'}  {figure.name}: {figure.value:.4g} {figure.unit} "
+        f"({figure.relation.value} {figure.bound:.4g})"
+        for figure in verdict.figures
+    ]
+
+
+def _plain(figure: Figure) -> dict[str, str | float | bool | None]:
+    return {
+        "name": figure.name,
+        "value": figure.value if math.isfinite(figure.value) else None,
+        "unit": figure.unit,
+        "relation": figure.relation.value,
+        "bound": figure.bound,
+        "holds": figure.holds,
+    }
+
+
+def _cell(value: str | float | None) -> str:
+    if value is None:
+        return "-"
+    return value if isinstance(value, str) else f"{value:.1f}"

@@ -1,0 +1,81 @@
+"""What an experiment asks of many runs, and what it finds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from sceneslam.types.trajectory import Trajectory
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """One run: how it differs from the experiment's own configuration."""
+
+    name: str  # of its folder
+    overrides: Sequence[str] = ()  # as on the command line, after the user's: "+scenario=flicker"
+    values: Mapping[str, Any] = field(default_factory=dict)  # laid over what is composed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Outcome:
+    """What a trial gave; its folder holds the rest."""
+
+    trial: Trial
+    folder: Path
+    metrics: Mapping[str, Any]
+    trajectory: Trajectory  # T_map_base, as revised
+    online: Trajectory  # as told at the time
+    faults: Sequence[str]
+
+
+RunTrials = Callable[[Iterable[Trial]], Iterator[Outcome]]
+
+
+class Relation(Enum):
+    """On which side of its bound a figure has to be."""
+
+    AT_LEAST = ">="
+    AT_MOST = "<="
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Figure:
+    """A number that was promised."""
+
+    name: str
+    value: float
+    relation: Relation
+    bound: float
+    unit: str = ""
+
+    @property
+    def holds(self) -> bool:
+        """Tell whether the promise is kept; a figure that could not be had (NaN) keeps none."""
+        if self.relation is Relation.AT_LEAST:
+            return self.value >= self.bound
+        return self.value <= self.bound
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """The numbers behind the figures; a cell is text, a number or None."""
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str | float | None]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """What an experiment found."""
+
+    figures: Sequence[Figure]
+    table: Table
+
+    @property
+    def holds(self) -> bool:
+        """Tell whether every promise is kept."""
+        return all(figure.holds for figure in self.figures)

@@ -1,0 +1,164 @@
+"""Experiments: many runs, one verdict."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sceneslam.evaluation.verdict import verdict_lines, write_verdict
+from sceneslam.experiments.openloris.dataset import Dataset
+from sceneslam.experiments.openloris.rates import Rates, mean
+from sceneslam.types.errors import InputError
+from sceneslam.types.experiment import Figure, Relation, Table, Verdict
+
+ROOT = Path(__file__).parents[1]
+AT_LEAST, AT_MOST = Relation.AT_LEAST, Relation.AT_MOST
+VINS = "vins_mono_color_imu_with_loop"  # of which a rate is promised
+EXTRINSICS = "home_cafe:\n  imu: [0.2, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]\n"
+
+
+def figure(value, relation, bound):
+    return Figure(name="some error", value=value, relation=relation, bound=bound, unit="m")
+
+
+@pytest.mark.parametrize(
+    ("value", "relation", "bound", "holds"),
+    [
+        (1.0, AT_LEAST, 1.0, True),
+        (0.9, AT_LEAST, 1.0, False),
+        (1.0, AT_MOST, 1.0, True),
+        (1.1, AT_MOST, 1.0, False),
+        (float("nan"), AT_MOST, 1.0, False),
+    ],
+)
+def test_a_figure_holds_on_its_side_of_the_bound(value, relation, bound, holds):
+    assert figure(value, relation, bound).holds is holds
+
+
+def test_verdict_is_written_beside_its_table(tmp_path):
+    figures = [figure(0.5, AT_MOST, 1.0), figure(float("nan"), AT_MOST, 1.0)]
+    table = Table(columns=("run", "error [m]"), rows=[("one, two", 0.25), ("three", None)])
+    verdict = Verdict(figures=figures, table=table)
+    write_verdict(tmp_path, "trial", verdict)
+    content = json.loads((tmp_path / "verdict.json").read_text())
+    assert content["experiment"] == "trial" and content["holds"] is False
+    assert content["figures"][0] == {
+        "name": "some error",
+        "value": 0.5,
+        "unit": "m",
+        "relation": "<=",
+        "bound": 1.0,
+        "holds": True,
+    }
+    assert content["figures"][1]["value"] is None and not content["figures"][1]["holds"]
+    with (tmp_path / "table.csv").open() as file:
+        assert list(csv.reader(file))[1] == ["one, two", "0.25"]
+    assert (tmp_path / "table.md").read_text().splitlines()[3] == "| three | - |"
+    assert [line.split()[0] for line in verdict_lines(verdict)] == ["holds", "FAILS"]
+
+
+def rates(duration_s, together):
+    return Rates(
+        system="slam",
+        scene="home",
+        name="home-1-1",
+        duration_s=duration_s,
+        alone=50.0,
+        odometry=80.0,
+        together=together,
+        told=0.0,
+    )
+
+
+def test_long_sequences_weigh_more():
+    both = mean([rates(300.0, 90.0), rates(100.0, 50.0)], "home")
+    assert both.together == pytest.approx(80.0) and both.margin == pytest.approx(0.0)
+    assert both.duration_s == 400.0
+
+
+def straight(name, *, frame="base_link", scale=1.0, seconds=range(0, 61)):
+    """Poses along x at 0.5 m/s."""
+    lines = "".join(f"{t_s:.1f} {0.5 * t_s * scale} 0 0 0 0 0 1\n" for t_s in seconds)
+    return f"scene: {name}\nframe: {frame}\nseq: 1\n{lines}"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Give two scenes: the system is three times too fast in home, and failed in cafe."""
+    files = {
+        "gt/gt_home_1.txt": straight("home"),
+        "gt/gt_cafe_1.txt": straight("cafe"),
+        "recorded/odom/home.txt": straight("home"),
+        "recorded/odom/cafe.txt": straight("cafe"),
+        f"recorded/{VINS}/home.txt": straight("home", frame="imu", scale=3.0),
+        "extrinsics.yaml": EXTRINSICS,
+    }
+    for name, text in files.items():
+        (tmp_path / "data" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "data" / name).write_text(text)
+    return tmp_path
+
+
+def test_recordings_are_told_apart_by_their_headers_and_brought_to_base(folder):
+    data = Dataset(folder / "data")
+    assert [key.name for key in data.sequences] == ["cafe-1-1", "home-1-1"]
+    (recorded,) = data.systems[VINS].values()
+    assert recorded.T_base_frame == [0.2, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]
+    assert recorded.trajectory.positions_m[0].tolist() == [-0.2, 0.0, -0.5]
+
+
+def test_a_frame_without_extrinsics_is_named(folder):
+    (folder / "data" / "extrinsics.yaml").write_text(EXTRINSICS.replace("imu", "camera"))
+    with pytest.raises(InputError, match="no extrinsics of imu in scene home"):
+        Dataset(folder / "data")
+
+
+def call(folder, *overrides):
+    words = [sys.executable, "-m", "sceneslam", "+experiment=openloris", *overrides]
+    return subprocess.run(
+        [*words, "hydra.run.dir=out"],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+def test_openloris_says_for_every_system_and_scene_whether_harm_was_done(folder):
+    done = call(folder, "openloris.path=data")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "verdict  out/verdict.json"
+    verdict = json.loads((folder / "out" / "verdict.json").read_text())
+    values = {entry["name"]: entry["value"] for entry in verdict["figures"]}
+    # Nothing was recorded in cafe: odometry alone is all there is, and right.
+    assert values[f"{VINS}, cafe: together above the better of the two"] == pytest.approx(
+        0.0, abs=0.1
+    )
+    assert len(values) == 4 and (folder / "out" / "rates.png").stat().st_size > 5000
+    with (folder / "out" / "table.csv").open() as file:
+        rows = {row["sequences"]: row for row in csv.DictReader(file)}
+    assert float(rows["home-1-1"]["odometry [%]"]) == 100.0
+    assert float(rows["home-1-1"]["alone [%]"]) < 30.0
+    assert (folder / "out" / "runs" / VINS / "home-1-1" / "trajectory.tum").is_file()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        ((), "openloris.path: got nothing"),
+        (("openloris.path=nowhere",), "expected a folder: nowhere"),
+        (("openloris.path=data", "openloris.limits_m=null"), "openloris.limits_m: got None"),
+        (("openloris.path=data", "policy.confirm_window_s=-1"), "policy.confirm_window_s: got -1"),
+    ],
+)
+def test_a_mistake_is_one_sentence(folder, overrides, sentence):
+    done = call(folder, *overrides)
+    assert done.returncode == 2 and sentence in done.stderr
+    assert "Traceback" not in done.stderr
