@@ -25,6 +25,7 @@ def policy(**changes):
         "trial_s": 1.0,
         "buffer_s": 12.0,
         "buffer_mb": 256.0,
+        "gate": None,
         "startup_s": {},
     }
     return Policy(**(values | changes))

@@ -34,6 +34,7 @@ CONFIG = {
         "trial_s": 1.0,
         "buffer_s": 12.0,
         "buffer_mb": 256.0,
+        "gate": None,
         "startup_s": {},
     },
     "atlas": {"_target_": "sceneslam.atlas.atlas.Atlas", "voxel_m": 0.05},

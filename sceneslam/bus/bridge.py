@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import copy
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
@@ -30,23 +33,29 @@ class Bridge:
         """Return a bridge that knows the same; poses are never changed in place."""
         return copy.copy(self)
 
-    def update(self, observation: Observation, T_map_base: Transform) -> None:
-        """Take a pose that a module gave."""
+    def update(
+        self, observation: Observation, T_map_base: Transform, *, is_jump: bool = False
+    ) -> None:
+        """Take a pose that a module gave; from a jump, a correction, no velocity can be told."""
+        if is_jump:
+            self._before, self._known = None, None
         if self._known is not None and self._known[0] < observation.stamp_ns:
             self._before = self._known  # at a hand-over both modules give the same instant a pose
         self._known = (observation.stamp_ns, T_map_base)
         self._move(observation, T_map_base)
 
-    def correct(self, observation: Observation, T_map_base: Transform) -> None:
-        """Take a pose that jumped because a module corrected its past, without a velocity."""
-        self._known, self._before = None, None
-        self.update(observation, T_map_base)
-
-    def predict(self, observation: Observation, *, by_velocity: bool) -> Transform | None:
+    def predict(
+        self,
+        observation: Observation,
+        *,
+        by_velocity: bool,
+        turn: NDArray[np.float64] | None = None,
+    ) -> Transform | None:
         """Return T_map_base at the observation and go on from there, None when nothing tells it.
 
-        Odometry bridges any gap. Constant velocity is allowed by `by_velocity` and only within
-        the horizon after the last known pose.
+        Odometry bridges any gap; `turn` (3, 3) is a better rotation since the last observation.
+        Constant velocity is allowed by `by_velocity` and only within the horizon after the last
+        known pose.
         """
         if self._T_map_base is None:
             return None
@@ -55,6 +64,8 @@ class Bridge:
         T_odom_prev, T_odom_curr = self._T_odom_base, observation.T_odom_base
         if self._uses_odometry and T_odom_prev is not None and T_odom_curr is not None:
             T_prev_curr = se3.inverse(T_odom_prev) @ T_odom_curr
+            if turn is not None:
+                T_prev_curr = se3.from_parts(turn, T_prev_curr[:3, 3])
         elif by_velocity and self._within_horizon(observation.stamp_ns):
             T_prev_curr = self._at_constant_velocity(observation.stamp_ns - self._stamp_ns)
         else:

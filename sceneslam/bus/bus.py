@@ -219,6 +219,8 @@ class Bus:
         health = Health.HELD
         if active.is_failed:
             health = Health.FAILED
+        elif hold.unheld_since_ns is not None and hold.is_suspect:
+            health = Health.SUSPECT
         elif hold.unheld_since_ns is not None:
             health = Health.LOST if is_lost else Health.SILENT
         scene = self._filter.scene or self.scene

@@ -16,6 +16,7 @@ from sceneslam.bus.policy import Policy
 from sceneslam.bus.runner import Runner
 from sceneslam.types import se3
 from sceneslam.types.errors import ModuleError
+from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, TrackingStatus
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
@@ -41,7 +42,8 @@ class Estimator:
             limit_mb=policy.buffer_mb,
             keeps_sensors=has_choice,
         )
-        self._session: int | None = None  # None until the active module is placed
+        self._sessions: list[int] = []  # of the active module, one for every time it was placed
+        self._is_placed = False
         self._told: TrackingStatus | None = None  # what the log says of the active module
 
     @property
@@ -55,18 +57,19 @@ class Estimator:
         Where the module gives none, odometry bridges, or constant velocity if `by_velocity` or
         while the module's sensors are silent. The pose is the robot's in either case.
         """
-        module, is_trusted = BRIDGED, False
         T_map_base: Transform | None = None
         fault: ModuleError | None = None
         try:
             T_map_base = self._ask(observation)
         except ModuleError as error:
             fault = error
-        if T_map_base is not None and self.active is not None:
-            module, is_trusted = self.active.key, self.hold.status is TrackingStatus.TRACKING
-        else:
+        is_told = T_map_base is not None
+        if not is_told:
             is_silent = self.hold.status is not TrackingStatus.LOST
-            T_map_base = self._predict(observation, by_velocity=by_velocity or is_silent)
+            T_map_base = self._bridge.predict(
+                observation, by_velocity=by_velocity or is_silent, turn=self.hold.turn
+            )
+        module = self.active.key if is_told and self.active is not None else BRIDGED
         if T_map_base is not None:
             self._atlas.add(observation.stamp_ns, T_map_base, module)
         moment = Moment(
@@ -74,7 +77,8 @@ class Estimator:
             T_map_base=T_map_base,
             module=module,
             bridge=self._bridge.copy(),
-            is_trusted=is_trusted,
+            turn=self.hold.turn,
+            is_trusted=is_told and self.hold.status is TrackingStatus.TRACKING,
         )
         self._memory.add(moment)
         if fault is not None:
@@ -102,19 +106,19 @@ class Estimator:
 
     def accept(self, handover: Handover) -> None:
         """Make a module that has caught up the active one, and shut the old one down."""
-        old, old_session = self.active, self._session
-        self.active, self.hold, self._session = handover.runner, handover.hold, None
-        self._told = None
+        old, old_sessions = self.active, self._sessions
+        self.active, self.hold, self._told = handover.runner, handover.hold, None
+        self._sessions, self._is_placed = [], False
         if handover.is_placed:
             self._rewrite(handover)
         self._tell(self._memory.newest.stamp_ns)
         self._log_cost(handover)
-        self._retire(old, old_session)
+        self._retire(old, old_sessions)
 
     def retire(self) -> None:
         """Shut the active module down and keep its map."""
-        self._retire(self.active, self._session)
-        self.active, self._session = None, None
+        self._retire(self.active, self._sessions)
+        self.active, self._sessions, self._is_placed = None, [], False
 
     def _ask(self, observation: Observation) -> Transform | None:
         """Return the active module's pose in the map, None where it holds none."""
@@ -122,19 +126,45 @@ class Estimator:
             return None
         tracking = self.hold.ask(self.active, observation)
         self._tell(observation.stamp_ns)
+        if self.hold.suspect_since_ns is not None:
+            self._distrust(self.hold.suspect_since_ns, observation.stamp_ns)
         if tracking is None:
             return None
-        if self._session is None:
-            self._predict(observation, by_velocity=True)
+        if not self._is_placed:
+            self._bridge.predict(observation, by_velocity=True)
             self._place(observation, tracking.T_local_base)
         assert self.active.T_map_local is not None
         T_map_base = self.active.T_map_local @ tracking.T_local_base
-        self._bridge.update(observation, T_map_base)
+        self._bridge.update(observation, T_map_base, is_jump=self.hold.is_revised)
         self._atlas.add_local(observation.stamp_ns, tracking.T_local_base)
         return T_map_base
 
-    def _predict(self, observation: Observation, *, by_velocity: bool) -> Transform | None:
-        return self._bridge.predict(observation, by_velocity=by_velocity)
+    def _distrust(self, since_ns: int, stamp_ns: int) -> None:
+        """Bridge what a module told since it may have been wrong; it is placed anew later."""
+        self._is_placed = False
+        self._log.add("suspect", stamp_ns, module=self.active.key if self.active else "")
+        untrusted = self._memory.after(since_ns)
+        before = self._memory.last_until(since_ns)
+        if before is None or not untrusted:
+            return
+        bridge, bridged = before.bridge.copy(), []
+        for moment in untrusted:
+            T_map_base = bridge.predict(moment.observation, by_velocity=False, turn=moment.turn)
+            bridged.append(moment.bridged(T_map_base, bridge.copy()))
+        self._atlas.rewind(untrusted[0].stamp_ns)
+        self._put(bridged, stamp_ns)
+
+    def _put(self, moments: list[Moment], stamp_ns: int) -> None:
+        """Put moments that are better known now in the place of those that were told."""
+        for moment in moments:
+            if moment.T_map_base is not None:
+                self._atlas.add(moment.stamp_ns, moment.T_map_base, moment.module)
+        if moments:
+            self._memory.rewrite(moments)
+        if len(moments) > 1:
+            from_ns = moments[0].stamp_ns
+            self._log.add("revised", stamp_ns, from_ns=from_ns, poses=len(moments))
+        self._bridge = self._memory.newest.bridge.copy()
 
     def _place(self, observation: Observation, T_local_base: Transform) -> None:
         """Place a module that was not held when it became active (Eq. 1)."""
@@ -152,18 +182,7 @@ class Estimator:
         self._begin_session(newest.stamp_ns, handover.tracked[0].stamp_ns, jump=jump)
         for tracking in handover.tracked:
             self._atlas.add_local(tracking.stamp_ns, tracking.T_local_base)
-        for moment in handover.trail:
-            if moment.T_map_base is not None:
-                self._atlas.add(moment.stamp_ns, moment.T_map_base, moment.module)
-        if handover.trail:
-            self._memory.rewrite(handover.trail)
-            self._log.add(
-                "revised",
-                newest.stamp_ns,
-                from_ns=handover.trail[0].stamp_ns,
-                poses=len(handover.trail),
-            )
-        self._bridge = self._memory.newest.bridge.copy()
+        self._put(handover.trail, newest.stamp_ns)
 
     def _begin_session(self, stamp_ns: int, from_ns: int, *, jump: Transform) -> None:
         """Open the active module's session, which begins at `from_ns`.
@@ -173,11 +192,13 @@ class Estimator:
         assert self.active is not None and self.active.T_map_local is not None
         T_map_local = self.active.T_map_local
         last_ns = self._atlas.last_stamp_ns
-        self._session = self._atlas.begin_session(self.active.key, T_map_local)
+        session = self._atlas.begin_session(self.active.key, T_map_local)
+        self._sessions.append(session)
+        self._is_placed = True
         self._log.add(
             "handover",
             stamp_ns,
-            session=self._session,
+            session=session,
             module=self.active.key,
             kind=self._policy.handover,
             from_ns=from_ns,
@@ -208,12 +229,15 @@ class Estimator:
         self._told = status
         self._log.add("tracking", stamp_ns, module=self.active.key, status=status.value)
 
-    def _retire(self, runner: Runner | None, session: int | None) -> None:
+    def _retire(self, runner: Runner | None, sessions: list[int]) -> None:
+        """Shut a module down; its map lies where it was placed last."""
         if runner is None:
             return
         legacy = runner.retire()
-        if session is not None:
-            self._atlas.close_session(session, legacy.layers, legacy.trajectory)
+        for session in sessions:
+            layers = legacy.layers if session == sessions[-1] else MapLayers()
+            self._atlas.close_session(session, layers, legacy.trajectory)
 
     def _new_hold(self) -> Hold:
-        return Hold(silence_ns=round(self._policy.lost_patience_s * 1e9))
+        gate = self._policy.gate if self._policy.handover != "cold" else None
+        return Hold(silence_ns=round(self._policy.lost_patience_s * 1e9), gate=gate)

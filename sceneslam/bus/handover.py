@@ -31,18 +31,14 @@ class Handover:
         self.first_cost_ns = 0  # until its first pose
         self._memory, self._bridge = memory, anchor.bridge.copy()
         self._done_ns = anchor.stamp_ns - 1
+        self.is_placed = False
         self._began_ns = perf_counter_ns()
         runner.activate(rig, scene)
 
     @property
-    def is_placed(self) -> bool:
-        """Tell whether the module has given a pose."""
-        return self.runner.T_map_local is not None
-
-    @property
     def is_lost(self) -> bool:
-        """Tell whether the module's last word is that it does not know where it is."""
-        return self.hold.status is TrackingStatus.LOST
+        """Tell whether the module's last word was of no use."""
+        return self.hold.status is TrackingStatus.LOST or self.hold.is_suspect
 
     @property
     def T_map_base(self) -> Transform | None:
@@ -76,7 +72,10 @@ class Handover:
             self.anchor, self._bridge, self.trail = moment, moment.bridge.copy(), []
         tracking = self.hold.ask(self.runner, moment.observation)
         if tracking is None:
-            T_map_base = self._bridge.predict(moment.observation, by_velocity=True)
+            T_map_base = self._bridge.predict(
+                moment.observation, by_velocity=True, turn=self.hold.turn
+            )
+            self.is_placed = self.is_placed and not self.hold.is_suspect
         else:
             T_map_base = self._place(moment, tracking)
         if moment is not self.anchor or moment.T_map_base is None:
@@ -86,6 +85,7 @@ class Handover:
                     T_map_base=T_map_base,
                     module=BRIDGED if tracking is None else self.runner.key,
                     bridge=self._bridge.copy(),
+                    turn=self.hold.turn,
                     is_trusted=tracking is not None and tracking.status is TrackingStatus.TRACKING,
                 )
             )
@@ -93,12 +93,13 @@ class Handover:
 
     def _place(self, moment: Moment, tracking: Tracking) -> Transform:
         """Return the pose of a module that holds one; its first is the pose handed over (Eq. 1)."""
-        if self.runner.T_map_local is None:
+        if not self.is_placed:
             self.first_cost_ns = self.cost_ns
             self._bridge.predict(moment.observation, by_velocity=True)
             self.runner.place(self._bridge.T_map_base @ se3.inverse(tracking.T_local_base))
+            self.tracked, self.is_placed = [], True
         assert self.runner.T_map_local is not None
         T_map_base = self.runner.T_map_local @ tracking.T_local_base
-        self._bridge.update(moment.observation, T_map_base)
+        self._bridge.update(moment.observation, T_map_base, is_jump=self.hold.is_revised)
         self.tracked.append(tracking)
         return T_map_base

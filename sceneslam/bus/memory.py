@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.atlas.atlas import BRIDGED
 from sceneslam.bus.bridge import Bridge
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
@@ -20,12 +24,17 @@ class Moment:
     T_map_base: Transform | None  # None: it got no pose
     module: str  # that gave it, BRIDGED for none
     bridge: Bridge  # after the observation
+    turn: NDArray[np.float64] | None  # (3, 3) since the moment before, as a believed module says
     is_trusted: bool  # a module that was not suspect said it was tracking
 
     @property
     def stamp_ns(self) -> int:
         """Return when it was."""
         return self.observation.stamp_ns
+
+    def bridged(self, T_map_base: Transform | None, bridge: Bridge) -> Moment:
+        """Return the moment with a pose that no module gave."""
+        return replace(self, T_map_base=T_map_base, module=BRIDGED, bridge=bridge, is_trusted=False)
 
 
 class Memory:
@@ -71,6 +80,11 @@ class Memory:
     def after(self, stamp_ns: int) -> list[Moment]:
         """Return all moments after an instant."""
         return [moment for moment in self._moments if moment.stamp_ns > stamp_ns]
+
+    def last_until(self, stamp_ns: int) -> Moment | None:
+        """Return the newest moment up to an instant, None where it is forgotten."""
+        until = (moment for moment in reversed(self._moments) if moment.stamp_ns <= stamp_ns)
+        return next(until, None)
 
     def rewrite(self, moments: list[Moment]) -> None:
         """Put moments that are now better known in the place of all from the first of them on."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
+from sceneslam.bus.gate import GateSettings
 from sceneslam.types.errors import ConfigError
 
 HANDOVERS = ("cold", "warm", "rewind")
@@ -25,6 +26,7 @@ class Policy:
     trial_s: float  # it has to hold its pose this long, beside the fallback, to come back
     buffer_s: float  # observations are remembered this long, for `rewind` ...
     buffer_mb: float  # ... and up to this much; beyond it every second old one is thinned out
+    gate: GateSettings | None  # how far a module's motion may differ from odometry's, None: any
     startup_s: dict[str, float]  # slam key -> time its start takes on the recording's clock
 
     def __post_init__(self) -> None:
@@ -34,7 +36,7 @@ class Policy:
             value = getattr(self, field.name)
             if field.name == "startup_s":
                 _check_startups(value)
-            elif field.name != "handover" and not 0 <= value < float("inf"):
+            elif field.name not in ("handover", "gate") and not 0 <= value < float("inf"):
                 unit = "megabytes" if field.name.endswith("_mb") else "seconds"
                 raise ConfigError(field.name, value, f"{unit}, 0 or more")
 

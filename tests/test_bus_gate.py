@@ -1,0 +1,94 @@
+"""A module that moves otherwise than the robot does no harm, and is taken back when it agrees."""
+
+from dataclasses import replace
+
+import numpy as np
+from driving import drive, events
+from fakes import PERIOD_NS, ExactModule, true_pose
+
+from sceneslam.atlas.atlas import BRIDGED
+from sceneslam.bus.gate import GateSettings
+from sceneslam.types import se3
+
+GATE = GateSettings(
+    sigmas=3.0,
+    horizons_s=[1.0, 5.0],
+    probation_s=1.0,
+    distance_m=0.03,
+    distance_per_m=0.02,
+    turn_rad=0.0175,
+    turn_per_rad=0.02,
+    turn_rad_per_m=0.01,
+    broken_ratio=0.5,
+)
+ONE = {"Bright": ["bright"], "Dark": ["bright"]}
+
+
+class Sliding(ExactModule):
+    """Says that it tracks, but slides sideways at 1 m/s from one index to another."""
+
+    def __init__(self, first, last):
+        super().__init__()
+        self.first, self.last = first, last
+
+    def track(self, observation):
+        tracking = super().track(observation)
+        index = observation.stamp_ns // PERIOD_NS
+        slid_m = 0.1 * (min(max(index, self.first), self.last) - self.first)
+        shift = se3.from_xy_yaw(0.0, slid_m, 0.0)
+        return replace(tracking, T_local_base=shift @ tracking.T_local_base)
+
+
+def errors_m(trajectory):
+    T_first = true_pose(int(trajectory.stamps_ns[0]))
+    true = np.stack([se3.inverse(T_first) @ true_pose(ns) for ns in trajectory.stamps_ns.tolist()])
+    return np.linalg.norm(true[:, :3, 3] - trajectory.positions_m, axis=1)
+
+
+def test_sliding_module_is_bridged_from_before_it_slid_and_chained_when_it_agrees():
+    modules = {"bright": Sliding(40, 60)}
+    _, atlas, log, _ = drive(modules, steps=150, table=ONE, gate=GATE, handover="rewind")
+    assert errors_m(atlas.trajectory).max() < 1e-9  # odometry is exact here
+    assert 0.05 < errors_m(atlas.online).max() < 0.5  # what was told until it was noticed
+    assert len(events(log, "suspect")) == 1
+    assert set(atlas.pose_modules[40:70]) == {BRIDGED} and atlas.pose_modules[-1] == "bright"
+    assert [session.module for session in atlas.sessions] == ["bright", "bright"]
+
+
+def test_sliding_module_without_the_gate_does_harm():
+    _, atlas, _, _ = drive({"bright": Sliding(40, 60)}, steps=150, table=ONE)
+    assert errors_m(atlas.trajectory).max() > 1.9
+
+
+def test_module_that_keeps_sliding_is_replaced():
+    modules = {"bright": Sliding(40, 1000), "dark": ExactModule()}
+    _, atlas, log, _ = drive(modules, gate=GATE, handover="rewind")
+    decision = events(log, "decision")[1]
+    assert (decision["to"], decision["reason"]) == ("dark", "suspect")
+    assert errors_m(atlas.trajectory).max() < 1e-9 and atlas.pose_modules[-1] == "dark"
+
+
+def test_candidate_that_slides_is_refused_while_the_old_module_holds():
+    modules = {"bright": ExactModule(), "dark": Sliding(10, 1000)}
+    _, atlas, log, _ = drive(
+        modules,
+        gate=GATE,
+        handover="rewind",
+        scene_at=lambda index: "Dark" if index >= 40 else "Bright",
+    )
+    assert events(log, "refused")[0]["to"] == "dark"
+    assert set(atlas.pose_modules) == {"bright"}
+
+
+def test_jump_that_the_module_announces_is_a_correction_and_not_a_motion():
+    class Closing(ExactModule):
+        def track(self, observation):
+            tracking = super().track(observation)
+            if observation.stamp_ns < 50 * PERIOD_NS:
+                return tracking
+            shift = se3.from_xy_yaw(0.5, 0.0, 0.0)
+            return replace(tracking, T_local_base=shift @ tracking.T_local_base, revision=1)
+
+    _, atlas, log, _ = drive({"bright": Closing()}, table=ONE, gate=GATE, handover="rewind")
+    assert not events(log, "suspect") and set(atlas.pose_modules) == {"bright"}
+    np.testing.assert_allclose(errors_m(atlas.trajectory)[50:], 0.5, atol=1e-9)
