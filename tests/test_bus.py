@@ -56,7 +56,7 @@ def test_lost_module_is_bridged_by_odometry_then_replaced():
     _, atlas, log, _ = drive({"bright": bright, "dark": ExactModule()})
     assert len(atlas.trajectory) == 100
     assert_exact(atlas)
-    assert atlas.pose_modules[49:55] == ("bright", BRIDGED, BRIDGED, BRIDGED, BRIDGED, "dark")
+    assert atlas.pose_modules[49:55] == ("bright", BRIDGED, BRIDGED, BRIDGED, "dark", "dark")
     assert events(log, "decision")[1]["reason"] == "lost"
 
 
@@ -71,7 +71,7 @@ def test_patience_is_shorter_where_the_pose_is_guessed():
     bright = ExactModule(lost=range(50, 200))
     _, atlas, log, _ = drive({"bright": bright, "dark": ExactModule()}, has_odometry=False)
     assert events(log, "decision")[1]["stamp_ns"] == 51 * PERIOD_NS
-    assert atlas.pose_modules[49:53] == ("bright", BRIDGED, BRIDGED, "dark")
+    assert atlas.pose_modules[49:53] == ("bright", BRIDGED, "dark", "dark")
 
 
 def test_lost_module_without_a_fallback_invents_no_pose():

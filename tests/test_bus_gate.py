@@ -92,3 +92,10 @@ def test_jump_that_the_module_announces_is_a_correction_and_not_a_motion():
     _, atlas, log, _ = drive({"bright": Closing()}, table=ONE, gate=GATE, handover="rewind")
     assert not events(log, "suspect") and set(atlas.pose_modules) == {"bright"}
     np.testing.assert_allclose(errors_m(atlas.trajectory)[50:], 0.5, atol=1e-9)
+
+
+def test_map_begins_with_the_odometry_where_the_module_holds_its_pose_later():
+    bright = ExactModule(lost=range(30))
+    _, atlas, _, _ = drive({"bright": bright}, table=ONE, gate=GATE, handover="rewind")
+    assert len(atlas.trajectory) == 100 and errors_m(atlas.trajectory).max() < 1e-9
+    assert atlas.pose_modules[0] == BRIDGED and atlas.pose_modules[-1] == "bright"

@@ -53,12 +53,14 @@ class Bridge:
     ) -> Transform | None:
         """Return T_map_base at the observation and go on from there, None when nothing tells it.
 
-        Odometry bridges any gap; `turn` (3, 3) is a better rotation since the last observation.
-        Constant velocity is allowed by `by_velocity` and only within the horizon after the last
-        known pose.
+        Odometry bridges any gap, and begins the map where nothing else does; `turn` (3, 3) is a
+        better rotation since the last observation. Constant velocity is allowed by `by_velocity`
+        and only within the horizon after the last known pose.
         """
         if self._T_map_base is None:
-            return None
+            if not self._uses_odometry or observation.T_odom_base is None:
+                return None
+            self._move(observation, se3.identity())  # the map begins where odometry does
         if observation.stamp_ns == self._stamp_ns:
             return self._T_map_base
         T_odom_prev, T_odom_curr = self._T_odom_base, observation.T_odom_base

@@ -177,7 +177,7 @@ class Estimator:
         newest = self._memory.newest
         told, known = newest.T_map_base, handover.T_map_base
         jump = se3.identity() if told is None or known is None else se3.inverse(told) @ known
-        keeps_anchor = handover.anchor.T_map_base is not None
+        keeps_anchor = handover.anchor.module != BRIDGED
         self._atlas.rewind(handover.anchor.stamp_ns + keeps_anchor)
         self._begin_session(newest.stamp_ns, handover.tracked[0].stamp_ns, jump=jump)
         for tracking in handover.tracked:

@@ -26,7 +26,7 @@ class Handover:
     ) -> None:
         self.runner, self.anchor, self.hold = runner, anchor, hold
         self.began_at = anchor
-        self.trail: list[Moment] = []  # all after the anchor, and itself if it had no pose
+        self.trail: list[Moment] = []  # all after the anchor, and itself if no module gave its pose
         self.tracked: list[Tracking] = []  # what it said from the anchor on, where it holds
         self.first_cost_ns = 0  # until its first pose
         self._memory, self._bridge = memory, anchor.bridge.copy()
@@ -78,7 +78,7 @@ class Handover:
             self.is_placed = self.is_placed and not self.hold.is_suspect
         else:
             T_map_base = self._place(moment, tracking)
-        if moment is not self.anchor or moment.T_map_base is None:
+        if moment is not self.anchor or moment.module == BRIDGED:
             self.trail.append(
                 Moment(
                     observation=moment.observation,
