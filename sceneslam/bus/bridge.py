@@ -72,7 +72,7 @@ class Bridge:
             T_prev_curr = self._at_constant_velocity(observation.stamp_ns - self._stamp_ns)
         else:
             return None
-        self._move(observation, self._T_map_base @ T_prev_curr)
+        self._move(observation, self.T_map_base @ T_prev_curr)
         return self._T_map_base
 
     def _within_horizon(self, stamp_ns: int) -> bool:
