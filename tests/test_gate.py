@@ -150,6 +150,8 @@ def test_bridging_takes_the_way_from_the_wheels_and_the_turn_from_a_module_belie
     off, wrong = judged(scaled(0.75))[-1], judged(jumping(30, 1.0))[30]
     both = bridged_motion(T_odom, T_module, off)
     assert se3.yaw_rad(both) == pytest.approx(0.1) and both[0, 3] == pytest.approx(0.1)
+    tilted = T_module @ se3.exp(np.array([0, 0, 0, 0.1, 0.0, 0.0]))
+    np.testing.assert_allclose(bridged_motion(T_odom, tilted, off), both, atol=1e-12)
     np.testing.assert_array_equal(bridged_motion(T_odom, T_module, wrong), T_odom)
     np.testing.assert_array_equal(bridged_motion(T_odom, None, off), T_odom)
 

@@ -83,12 +83,13 @@ def bridged_motion(
 ) -> Transform:
     """Return the best motion since the previous observation while a module is not trusted.
 
-    The way is the odometry's; so is the turn, unless the module (None: it has no pose now or had
-    none then) is believed that.
+    The way is the odometry's; so is the heading, unless the module (None: it has no pose now or
+    had none then) is believed the turn. Wheels stay on the floor: roll and pitch are theirs.
     """
     if T_prev_curr_module is None or judgement.turn is not Verdict.AGREE:
         return T_prev_curr_odom
-    return se3.from_parts(T_prev_curr_module[:3, :3], T_prev_curr_odom[:3, 3])
+    apart_rad = se3.yaw_rad(T_prev_curr_module) - se3.yaw_rad(T_prev_curr_odom)
+    return T_prev_curr_odom @ se3.from_xy_yaw(0.0, 0.0, apart_rad)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
