@@ -140,6 +140,25 @@ class SlamModule(Protocol):
 
 
 @runtime_checkable
+class Restartable(Protocol):
+    """A SLAM module that can be activated again after it failed, as it is then built anew."""
+
+    @property
+    def is_ready(self) -> bool:
+        """Tell whether `activate` would not have to wait."""
+        ...
+
+    @property
+    def is_spent(self) -> bool:
+        """Tell whether it failed too often to be activated, for now."""
+        ...
+
+    def note_failure(self) -> None:
+        """Take that its session was stopped because it failed."""
+        ...
+
+
+@runtime_checkable
 class Experiment(Protocol):
     """Asks a question of many runs."""
 

@@ -56,7 +56,8 @@ class Bus:
         )
         self._machine = BusMachine(self)
         self._state = self._machine.state
-        self._candidates = Candidates(scenes, self.runners, policy.retry_s)
+        waits = catch_up_steps is None  # a recording does, a robot does not
+        self._candidates = Candidates(scenes, self.runners, policy.retry_s, waits=waits)
         self._changeover = Changeover(
             runners=self.runners,
             candidates=self._candidates,
@@ -116,8 +117,8 @@ class Bus:
         return bool(self._candidates.left())
 
     def fallback_active(self) -> bool:
-        """Tell whether a module runs, though not the first choice."""
-        return self._estimator.active is not None
+        """Tell whether a module runs, though not the first choice, or will again."""
+        return self._estimator.active is not None or bool(self._candidates.returning(self.scene))
 
     # The states.
 
@@ -214,10 +215,9 @@ class Bus:
     def _look(self, observation: Observation) -> Situation:
         """Return all that is known at an observation."""
         hold, active = self._estimator.hold, self._estimator.active
-        assert active is not None
         is_lost = hold.status is TrackingStatus.LOST
         health = Health.HELD
-        if active.is_failed:
+        if active is None or active.is_failed:
             health = Health.FAILED
         elif hold.unheld_since_ns is not None and hold.is_suspect:
             health = Health.SUSPECT
@@ -228,7 +228,7 @@ class Bus:
             stamp_ns=observation.stamp_ns,
             scene=scene,
             served_scene=self.scene,
-            active=active.key,
+            active=self.active,
             health=health,
             unheld_since_ns=hold.unheld_since_ns or 0,
             held_ns=hold.held_ns,
@@ -240,6 +240,7 @@ class Bus:
             switched_ns=self._changeover.switched_ns,
             trial=self._changeover.trial,
             retry_ns=self._candidates.retry_ns,
+            may_return=bool(self._candidates.returning(self.scene)),
         )
 
     def _tell_scene(self, stamp_ns: int) -> None:

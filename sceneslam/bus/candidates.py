@@ -11,19 +11,32 @@ class Candidates:
     """The table scene -> modules, and which of the served scene's modules were tried."""
 
     def __init__(
-        self, scenes: Mapping[str, Sequence[str]], runners: Mapping[str, Runner], retry_s: float
+        self,
+        scenes: Mapping[str, Sequence[str]],
+        runners: Mapping[str, Runner],
+        retry_s: float,
+        *,
+        waits: bool,
     ) -> None:
         self.scene = ""  # the confirmed scene that the active module serves
         self.tried: frozenset[str] = frozenset()
         self.rounds = 0  # how often all were tried in vain
         self.retry_ns = 0  # when the first choice may be tried again
-        self._scenes, self._runners = scenes, runners
+        self._scenes, self._runners, self._waits = scenes, runners, waits
         self._retry_ns, self._retries = round(retry_s * 1e9), 0
 
     def of(self, scene: str) -> tuple[str, ...]:
-        """Return the modules of a scene that can run, in the table's order."""
+        """Return the modules of a scene that can run, in the table's order.
+
+        Where none can at once, those that are worth waiting for, if that is allowed.
+        """
         keys = self._scenes.get(scene, ())
-        return tuple(key for key in keys if not self._runners[key].is_failed)
+        ready = tuple(key for key in keys if self._runners[key].can_run)
+        return ready or (self.returning(scene) if self._waits else ())
+
+    def returning(self, scene: str) -> tuple[str, ...]:
+        """Return the modules of a scene that can run, at once or later."""
+        return tuple(key for key in self._scenes.get(scene, ()) if self._runners[key].may_return)
 
     def serve(self, scene: str) -> None:
         """Start with all modules of a scene."""

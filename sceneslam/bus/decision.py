@@ -37,7 +37,7 @@ class Situation:
     stamp_ns: int
     scene: str  # as confirmed by the detector
     served_scene: str  # that the active module was chosen for
-    active: str
+    active: str  # "" where none is left for now
     health: Health
     unheld_since_ns: int  # when health is not HELD
     held_ns: int  # how long it had held its pose before that, without a break
@@ -49,6 +49,7 @@ class Situation:
     switched_ns: int
     trial: Trial
     retry_ns: int  # when the first choice may be tried again
+    may_return: bool  # a module that failed will be there again: going on without any is worth it
 
 
 class Action(Enum):
@@ -108,12 +109,13 @@ def _decide_on_loss(policy: Policy, now: Situation) -> Verdict:
     window_ns = round(policy.confirm_window_s * 1e9)
     others = tuple(key for key in now.served_choices if key != now.active)
     left, rounds = tuple(key for key in others if key not in now.tried), now.rounds
-    if now.held_ns >= window_ns:
+    if now.held_ns >= window_ns or (now.health is Health.FAILED and not left):
         left, rounds = others, 0
     elif not left and lost_ns >= window_ns << now.rounds:
         left, rounds = others, now.rounds + 1
     is_over = now.health is Health.FAILED or lost_ns >= _patience_ns(policy, now)
-    if not is_over or (not left and now.health is not Health.FAILED):
+    is_waiting = not left and not now.active and now.may_return
+    if not is_over or is_waiting or (not left and now.health is not Health.FAILED):
         return GO_ON
     return Verdict(action=Action.SWITCH, to=left, reason=now.health.value, rounds=rounds)
 

@@ -9,7 +9,7 @@ from time import perf_counter_ns
 
 import numpy as np
 
-from sceneslam.interfaces import SlamModule
+from sceneslam.interfaces import Restartable, SlamModule
 from sceneslam.types.errors import ModuleError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking
@@ -41,9 +41,21 @@ class Runner:
         self._module = module
         self._sensors = frozenset[Sensor]().union(*module.requires)
 
+    @property
+    def can_run(self) -> bool:
+        """Tell whether the module can be activated at once."""
+        module = self._module
+        return not self.is_failed or (isinstance(module, Restartable) and module.is_ready)
+
+    @property
+    def may_return(self) -> bool:
+        """Tell whether the module can be activated, at once or after a wait."""
+        module = self._module
+        return not self.is_failed or (isinstance(module, Restartable) and not module.is_spent)
+
     def activate(self, rig: Rig, scene: str) -> None:
         """Start the module anew; raises ModuleError when it cannot."""
-        self.T_map_local = None
+        self.T_map_local, self.is_failed = None, False
         began_ns = perf_counter_ns()
         try:
             self._module.activate(rig)
@@ -110,6 +122,8 @@ class Runner:
 
     def _failed(self, what: str, error: Exception) -> ModuleError:
         self.is_failed = True
+        if isinstance(self._module, Restartable):
+            self._module.note_failure()
         return ModuleError(self._sentence(what, error))
 
     def _report(self, what: str, error: Exception) -> None:

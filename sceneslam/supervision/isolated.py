@@ -22,11 +22,12 @@ _log = logging.getLogger(__name__)
 
 
 class IsolatedModule:
-    """Fulfils `SlamModule` by a process that `make` builds the module in.
+    """Fulfils `SlamModule` and `Restartable` by a process that `make` builds the module in.
 
     Whatever ends the process ends the session: the call raises ModuleError with the reason, a new
     process is started as soon as its budget allows, and `activate` begins anew in it. Exceptions
-    of the module itself are raised here as they were there.
+    of the module itself are raised here as they were there. Who stops a session because it failed
+    says so by `note_failure`.
     """
 
     def __init__(self, name: str, make: Callable[[], SlamModule], limits: Limits) -> None:
@@ -53,23 +54,27 @@ class IsolatedModule:
     def is_ready(self) -> bool:
         """Tell whether `activate` would not have to wait, and start a process where it may be."""
         self._bury()
-        if self._process is None and self._restarts.wait_s(monotonic()) == 0:
-            self._start()
-        if self._process is None:
+        if self._restarts.wait_s(monotonic()) > 0:
             return False
-        return self._is_built or self._process.has_reply()
+        if self._process is None:
+            self._start()
+        return self._is_built or (self._process is not None and self._process.has_reply())
 
     @property
     def is_spent(self) -> bool:
-        """Tell whether the process died too often to be started again for now."""
-        self._bury()
-        return self._process is None and self._restarts.is_spent(monotonic())
+        """Tell whether it failed too often to be started again, for now."""
+        return self._restarts.is_spent(monotonic())
+
+    def note_failure(self) -> None:
+        """Take that a session failed: the next may begin after a while, longer each time."""
+        if not self.is_spent:  # else it was refused for that, which is no failure
+            self._restarts.note_failure(monotonic())
 
     def activate(self, rig: Rig) -> None:
         """Start anew, in a new process where the last one died; waits until it may be started."""
         self._bury()
+        self._wait_for_budget()
         if self._process is None:
-            self._wait_for_budget()
             self._start()
         self._await_built()
         self._is_active = True
@@ -141,7 +146,7 @@ class IsolatedModule:
         try:
             self._process.submit(method, *arguments)
         except ProcessDeathError:
-            self._note_death()
+            self._replace()
             raise
 
     def _answer(self, deadline_s: float) -> Any:
@@ -150,7 +155,7 @@ class IsolatedModule:
         try:
             return self._process.collect(deadline_s)
         except ProcessDeathError:
-            self._note_death()
+            self._replace()
             raise
 
     def _bury(self) -> None:
@@ -158,12 +163,12 @@ class IsolatedModule:
         if self._process is not None and not self._process.is_alive:
             _log.warning("%s: its process died while it was idle", self._name)
             self._process.end()
-            self._note_death()
+            self.note_failure()
+            self._replace()
 
-    def _note_death(self) -> None:
+    def _replace(self) -> None:
         """Start the next process at once where that is allowed: it can be built meanwhile."""
         self._process, self._is_active, self._is_built = None, False, False
-        self._restarts.note_death(monotonic())
         if self._restarts.wait_s(monotonic()) == 0 and self._requires is not None:
             self._start()
 
@@ -172,7 +177,7 @@ class IsolatedModule:
         wait_s = self._restarts.wait_s(monotonic())
         if self._restarts.is_spent(monotonic()):
             raise ModuleError(
-                f"its process died more than {self._limits.restarts_max} times within "
+                f"it failed more than {self._limits.restarts_max} times within "
                 f"{self._limits.restart_window_s:g} s; not started again for {wait_s:.0f} s"
             )
         sleep(wait_s)

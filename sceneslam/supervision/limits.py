@@ -29,35 +29,35 @@ class Limits:
 
 
 class Restarts:
-    """Says when a process that died may be started again; pure but for the clock it is told."""
+    """Says when a module that failed may be started again; pure but for the clock it is told."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
-        self._deaths_s: list[float] = []
+        self._failures_s: list[float] = []
 
-    def note_death(self, now_s: float) -> None:
-        """Take one death."""
+    def note_failure(self, now_s: float) -> None:
+        """Take one failure."""
         self._forget(now_s)
-        self._deaths_s.append(now_s)
+        self._failures_s.append(now_s)
 
     def is_spent(self, now_s: float) -> bool:
-        """Tell whether it died more often in the window than it may be started again."""
+        """Tell whether it failed more often in the window than it may be started again."""
         self._forget(now_s)
-        return len(self._deaths_s) > self._limits.restarts_max
+        return len(self._failures_s) > self._limits.restarts_max
 
     def wait_s(self, now_s: float) -> float:
         """Return how long to wait for the next start, 0 where it may be at once."""
         self._forget(now_s)
-        deaths = len(self._deaths_s)
+        failures = len(self._failures_s)
         if self.is_spent(now_s):
-            due_s = self._deaths_s[-self._limits.restarts_max - 1] + self._limits.restart_window_s
-        elif deaths > 1:
-            due_s = self._deaths_s[-1] + self._limits.restart_backoff_s * 2 ** (deaths - 2)
+            due_s = self._failures_s[-self._limits.restarts_max - 1] + self._limits.restart_window_s
+        elif failures > 1:
+            due_s = self._failures_s[-1] + self._limits.restart_backoff_s * 2 ** (failures - 2)
         else:
             return 0.0
         return max(due_s - now_s, 0.0)
 
     def _forget(self, now_s: float) -> None:
-        """Drop the deaths that left the window."""
+        """Drop the failures that left the window."""
         begin_s = now_s - self._limits.restart_window_s
-        self._deaths_s = [death_s for death_s in self._deaths_s if death_s > begin_s]
+        self._failures_s = [time_s for time_s in self._failures_s if time_s > begin_s]

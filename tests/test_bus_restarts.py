@@ -1,0 +1,75 @@
+"""Modules that can be started again after they failed: the bus goes on without, and with them."""
+
+import numpy as np
+from driving import assert_exact, drive, events
+from fakes import PERIOD_NS, ExactModule
+
+
+class Phoenix(ExactModule):
+    """Fails at the indices in `raises`, once each; is ready again when asked often enough."""
+
+    def __init__(self, *, asked=0, budget=100, **options):
+        super().__init__(**options)
+        self.failures, self._asked, self._budget, self._left = 0, asked, budget, 0
+
+    @property
+    def is_ready(self):
+        self._left -= 1
+        return self._left < 0 and not self.is_spent
+
+    @property
+    def is_spent(self):
+        return self.failures > self._budget
+
+    def note_failure(self):
+        self.failures, self._left = self.failures + 1, self._asked
+
+    def track(self, observation):
+        index = observation.stamp_ns // PERIOD_NS
+        try:
+            return super().track(observation)
+        finally:
+            self.raises.discard(index)
+
+
+ALONE = {"Bright": ["only"], "Dark": ["only"]}
+
+
+def test_the_only_module_is_started_again_at_once():
+    only = Phoenix(raises={30, 60})
+    bus, atlas, log, _ = drive({"only": only}, table=ALONE, has_odometry=False)
+    assert bus.state == "terminate" and only.activations == 3 and only.failures == 2
+    assert len(atlas.trajectory) == 100 and len(events(log, "fault")) == 2
+    assert_exact(atlas)
+
+
+def test_live_the_bus_goes_on_without_any_module_until_one_is_ready():
+    only = Phoenix(raises={30}, asked=50)
+    _, atlas, log, _ = drive({"only": only}, table=ALONE, catch_up_steps=4)
+    assert only.activations == 2 and len(atlas.trajectory) == 100
+    assert "" in {event["active"] for event in events(log, "situation")}
+    assert [event["to"] for event in events(log, "state")].count("terminate") == 1
+    assert_exact(atlas)
+
+
+def test_both_modules_may_fail_and_come_back():
+    bright, dark = Phoenix(raises={30, 33}), Phoenix(raises={30, 31, 32})
+    _, atlas, _, _ = drive({"bright": bright, "dark": dark}, has_odometry=False)
+    assert len(atlas.trajectory) == 100
+    assert_exact(atlas)
+
+
+def test_a_module_that_came_back_to_the_scene_it_is_first_for_is_used_again():
+    bright = Phoenix(raises={30})
+    modules = {"bright": bright, "dark": ExactModule()}
+    _, atlas, _, _ = drive(modules, handover="rewind", retry_s=2.0, steps=200)
+    assert atlas.pose_modules[35] == "dark" and atlas.pose_modules[-1] == "bright"
+    assert_exact(atlas)
+
+
+def test_a_module_whose_budget_is_spent_ends_the_run_as_one_that_cannot_be_restarted():
+    only = Phoenix(raises={30, 31}, budget=1)
+    bus, atlas, log, _ = drive({"only": only}, table=ALONE, has_odometry=False)
+    assert only.failures == 2 and bus.state == "terminate"
+    assert len(atlas.trajectory) < 40 and np.isfinite(atlas.trajectory.T_world_base).all()
+    assert [event["from"] for event in events(log, "state")][-1] == "switch"
