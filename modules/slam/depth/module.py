@@ -26,7 +26,8 @@ _TOGETHER = 3  # keyframes that an image is registered with
 _USEFUL_OVERLAP = 0.2
 _ALIKE = 3  # keyframes that a lost camera is tried at
 _COAST_S = 0.5  # without depth for longer, a guessed pose is no pose
-_AT_START = 1e-8
+_SURE_RATIO = 0.6  # of the points that agree, for a place that motion did not lead to
+_FAR = 100.0  # squared deviations from where motion led to, ten in one direction
 
 
 @dataclass(kw_only=True, eq=False)
@@ -131,7 +132,25 @@ class DepthSlam:
         found = self._register(samples, self._prior(prediction))
         if found is not None and found.matched_ratio >= self.matched_min_ratio:
             return found
+        return self._relocalize(samples, surface, prediction)
+
+    def _relocalize(
+        self, samples: Samples, surface: Surface, prediction: Prediction
+    ) -> Registration | None:
+        """Return where the camera is by a keyframe that looks alike, where that is possible."""
+        expected = self._prior(prediction)
+        for index in self._map.alike(surface, _ALIKE):
+            start = Prior(self._map[index].T_local_cam, np.eye(6))
+            there = self._register(samples, start)
+            if there is None or there.matched_ratio < _SURE_RATIO or not self._is_held(there):
+                continue
+            off = se3.log(se3.inverse(expected.T_local_cam) @ there.T_local_cam)
+            if there.seen > _SURE_RATIO * len(samples) and off @ expected.information @ off < _FAR:
+                return there
         return None
+
+    def _is_held(self, found: Registration) -> bool:
+        return bool(found.localizability.ratios[0] >= self.weak_ratio)
 
     def _register(self, samples: Samples, prior: Prior) -> Registration | None:
         overlaps = self._map.overlaps(samples, prior.T_local_cam)
@@ -204,7 +223,7 @@ class DepthSlam:
         if can_coast and is_brief:
             self._motion.coast(observation, prediction)
             return self._answer(observation, TrackingStatus.TRACKING, 0.0, 0)
-        self._motion.stop(observation)
+        self._motion.stop()
         self._is_lost = True
         return self._answer(observation, TrackingStatus.LOST, 0.0, 0)
 

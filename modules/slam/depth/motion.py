@@ -21,6 +21,7 @@ _ODOMETRY_SHARE = np.array([0.05, 0.05])  # of the way [m] and the turn [rad], a
 _ODOMETRY_STEP = np.array([5e-4, 5e-4])  # m, rad: the least per step
 _GYRO_RATE = 0.01  # rad/s
 _GYRO_SHARE = 0.02  # of the turn
+_GYRO_REACH_S = 0.05  # that a sample stands for, before and after it
 _FADE_S = 0.5  # in which a velocity that nothing confirms is forgotten
 
 
@@ -91,11 +92,9 @@ class Motion:
         """Go on from a prediction."""
         self._step(observation, prediction.T_local_base, prediction.covariance)
 
-    def stop(self, observation: Observation) -> None:
-        """Stay where the base was last seen; only the doubt grows."""
+    def stop(self) -> None:
+        """Stay where the base was last seen: predictions go on from there, in growing doubt."""
         self._twist_s = None
-        covariance = self.predict(observation).covariance
-        self._step(observation, self.T_local_base, covariance)
 
     def jump(self, T_local_base: Transform) -> None:
         """Hear that the map, and the pose with it, was corrected."""
@@ -114,6 +113,8 @@ def _odometry(observation: Observation) -> Transform | None:
 def _turn(observation: Observation, gap_s: float) -> Doubles | None:
     """Return the gyro's turn [rad] over the gap, None where it was silent."""
     gyro = observation.gyro_base
-    if gyro is None or not len(gyro) or not np.isfinite(gyro).all() or gap_s <= 0:
+    if gyro is None or not len(gyro) or not np.isfinite(gyro).all():
+        return None
+    if not 0 < gap_s <= 2.0 * _GYRO_REACH_S - float(gyro[0, 0]):
         return None
     return np.asarray(gyro[:, 1:4].mean(axis=0) * gap_s)

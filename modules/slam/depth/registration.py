@@ -34,7 +34,7 @@ class Samples:
     """Points of one depth image that are registered."""
 
     points: Floats  # (N, 3) [m], cam
-    normals: Floats  # (N, 3), cam
+    normals: Floats  # (N, 3), cam, smooth
     sigmas_m: Floats  # (N,) standard deviation across the plane
 
     def __len__(self) -> int:
@@ -63,7 +63,7 @@ def samples_of(surface: Surface, grid: Grid, stride: int = 2) -> Samples:
     sigmas_m = depth_m * surface.planes[rows, 3] * np.float32(surface.noise_per_m)
     return Samples(
         grid.rays[rows] * depth_m[:, None],
-        surface.planes[rows, :3],
+        surface.smooth_normals(grid)[rows],
         np.sqrt(sigmas_m**2 + np.float32(_SURFACE_SIGMA_M**2)),
     )
 

@@ -20,6 +20,7 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
 _COLUMNS = 160  # of the grid; finer ones cost more and gave no better poses
+_SMOOTH = (5, 5)  # cells
 _OUTLIER_SIGMAS = 3.0
 _GRAZING_COS = 0.17  # between ray and normal: 80 degrees
 _NOISE_MIN_PER_M = 2e-4  # of disparity [1/m]: 0.2 mm at 1 m
@@ -59,6 +60,13 @@ class Surface:
     planes: Floats  # (N, 4) normal (away from the camera) and offset [m]: n @ X = d; else 0
     valid: NDArray[np.bool_]  # (N,)
     noise_per_m: float  # standard deviation of a cell's disparity [1/m]
+
+    def smooth_normals(self, grid: Grid) -> Floats:
+        """Return normals (N, 3) averaged over neighbours: noise in them feigns other walls."""
+        image = self.planes[:, :3].reshape(grid.height, grid.width, 3)
+        total = np.asarray(cv2.blur(image, _SMOOTH, borderType=cv2.BORDER_CONSTANT)).reshape(-1, 3)
+        length = np.linalg.norm(total, axis=1, keepdims=True)
+        return np.asarray(total / np.maximum(length, 1e-6), np.float32)
 
 
 class SurfaceReader:

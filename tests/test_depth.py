@@ -1,0 +1,215 @@
+"""The depth module: what it finds in the dark, and what it says where nothing holds it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from depth_views import CAMERA, CORRIDOR, RIG, ROOM, WALL, handheld, observe
+
+from sceneslam.evaluation.accuracy import absolute_errors
+from sceneslam.modules.slam.depth.module import DepthSlam
+from sceneslam.sources.tum_rgbd import TumRgbd
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.observation import TrackingStatus
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+SETTINGS = yaml.safe_load((CONF / "slam/depth.yaml").read_text())
+SETTINGS.pop("_target_")
+
+
+def active(rig=RIG, **settings):
+    module = DepthSlam(**{**SETTINGS, **settings})
+    module.activate(rig)
+    return module
+
+
+def track(module, planes, poses, *, first=0, odometry=None):
+    """Return what the module tells along the poses; `odometry` gives T_odom_base of a pose."""
+    return [
+        module.track(
+            observe(planes, T, first + i, odometry=None if odometry is None else odometry(T))
+        )
+        for i, T in enumerate(poses)
+    ]
+
+
+def errors_m(trackings, poses):
+    return [
+        np.linalg.norm((se3.inverse(poses[0]) @ T)[:3, 3] - tracking.T_local_base[:3, 3])
+        for tracking, T in zip(trackings, poses, strict=True)
+    ]
+
+
+def along_x(count, step_m):
+    return [se3.from_xy_yaw(step_m * i, 0.0, 0.0) for i in range(count)]
+
+
+def test_hand_held_motion_is_found_without_any_light():
+    poses = [handheld(index) for index in range(60)]
+    module = active()
+    trackings = track(module, ROOM, poses)
+    assert {tracking.status for tracking in trackings} == {TrackingStatus.TRACKING}
+    assert max(errors_m(trackings, poses)) < 0.01
+    turned = se3.inverse(se3.inverse(poses[0]) @ poses[-1]) @ trackings[-1].T_local_base
+    assert se3.rotation_angle_rad(turned) < 0.005
+    assert trackings[-1].quality_ratio > 0.9
+
+
+def test_covariance_promises_neither_too_much_nor_nothing():
+    poses = [handheld(0.5 * index) for index in range(40)]
+    trackings = track(active(), ROOM, poses)
+    squares = []
+    for tracking, T in list(zip(trackings, poses, strict=True))[1:]:
+        off = se3.log(se3.inverse(se3.inverse(poses[0]) @ T) @ tracking.T_local_base)
+        squares.append(off @ np.linalg.solve(tracking.covariance, off) / 6.0)
+    assert np.mean(squares) < 1.0  # far below: neighbouring pixels here do not err alike
+    assert np.sqrt(np.diag(trackings[-1].covariance)).max() < 0.005
+
+
+def test_facing_one_wall_is_degraded_but_its_distance_is_held():
+    poses = along_x(30, 0.01)
+    trackings = track(active(), WALL, poses)
+    assert {tracking.status for tracking in trackings[1:]} == {TrackingStatus.DEGRADED}
+    off = [T[0, 3] - t.T_local_base[0, 3] for t, T in zip(trackings, poses, strict=True)]
+    assert np.abs(off).max() < 0.005
+    deviation = np.sqrt(np.diag(trackings[-1].covariance)[:3])
+    assert min(deviation[1:]) > 5 * deviation[0]
+
+
+def test_bare_corridor_is_degraded_along_its_axis_and_odometry_fills_it():
+    poses = along_x(40, 0.02)
+    trackings = track(active(), CORRIDOR, poses, odometry=lambda T: T)
+    assert {tracking.status for tracking in trackings[1:]} == {TrackingStatus.DEGRADED}
+    values, directions = np.linalg.eigh(trackings[-1].covariance[:3, :3])
+    assert abs(directions[0, -1]) > 0.95
+    assert values[-1] > 9 * values[-2]
+    assert max(errors_m(trackings, poses)) < 0.01
+
+
+def test_without_odometry_a_corridor_does_not_carry_the_pose_away():
+    poses = [se3.identity()] * 40
+    trackings = track(active(), CORRIDOR, poses)
+    assert trackings[-1].status is TrackingStatus.DEGRADED
+    assert max(errors_m(trackings, poses)) < 0.05
+
+
+def test_unknown_view_is_lost_and_the_known_one_is_found_again():
+    poses = [handheld(index) for index in range(20)]
+    module = active()
+    held = track(module, ROOM, poses)[-1]
+    alien = [
+        (-0.5, 0.7, 0.5, 0.6),
+        (0.3, -0.9, 0.3, 0.5),
+        (1, 0, 0.2, 0.55),
+        (0.4, 0.1, -0.9, 0.45),
+    ]
+    lost = track(module, alien, [se3.identity()] * 5, first=20)
+    assert {tracking.status for tracking in lost} == {TrackingStatus.LOST}
+    np.testing.assert_array_equal(lost[-1].T_local_base, held.T_local_base)
+    back = [handheld(5.0 + 0.2 * index) for index in range(10)]
+    found = track(module, ROOM, back, first=25)
+    assert {tracking.status for tracking in found} == {TrackingStatus.TRACKING}
+    expected = (se3.inverse(poses[0]) @ back[-1])[:3, 3]
+    assert np.linalg.norm(found[-1].T_local_base[:3, 3] - expected) < 0.01
+
+
+def test_blind_camera_is_lost_without_odometry_and_degraded_with_it():
+    poses = along_x(20, 0.02)
+    blind = np.zeros((CAMERA.size_wh[1], CAMERA.size_wh[0]), np.float32)
+    for odometry, status in ((None, TrackingStatus.LOST), (lambda T: T, TrackingStatus.DEGRADED)):
+        module = active()
+        track(module, ROOM, poses[:10], odometry=odometry)
+        for index in range(10, 20):
+            observation = observe(
+                ROOM, poses[index], index, odometry=odometry and odometry(poses[index])
+            )
+            tracking = module.track(replace(observation, depth_m=blind))
+        assert tracking.status is status
+    assert np.linalg.norm(tracking.T_local_base[:3, 3] - poses[-1][:3, 3]) < 0.01
+
+
+def test_turning_round_once_closes_and_the_past_is_revised():
+    poses = [se3.from_xy_yaw(0.0, 0.0, 2 * np.pi * index / 80) for index in range(100)]
+    module = active()
+    trackings = track(module, ROOM, poses)
+    revisions = [tracking.revision for tracking in trackings]
+    assert revisions == sorted(revisions) and revisions[-1] > 0
+    revised = module.get_trajectory()
+    np.testing.assert_array_equal(revised.stamps_ns, [tracking.stamp_ns for tracking in trackings])
+    truth = np.array([se3.inverse(poses[0]) @ T for T in poses])
+    assert np.linalg.norm(revised.positions_m - truth[:, :3, 3], axis=1).max() < 0.015
+
+
+def test_standing_still_needs_no_more_memory():
+    module = active()
+    track(module, ROOM, [se3.identity()] * 20)
+    assert len(module._map) == 1
+
+
+def test_map_lies_on_the_walls():
+    module = active()
+    track(module, ROOM, [handheld(index) for index in range(30)])
+    points = module.get_map().points.points
+    room = se3.apply(handheld(0), points.astype(np.float64))
+    gaps = np.min([d - room @ np.array(n) for *n, d in ROOM], axis=0)
+    assert len(points) > 3000
+    assert np.quantile(np.abs(gaps), 0.95) < 0.02
+
+
+def test_two_runs_are_identical_to_the_bit():
+    poses = [handheld(index) for index in range(20)]
+    runs = [[t.T_local_base for t in track(active(), ROOM, poses)] for _ in range(2)]
+    np.testing.assert_array_equal(runs[0], runs[1])
+
+
+def test_mounted_camera_gives_the_motion_of_base():
+    mounted = se3.from_parts(se3.so3_exp(np.array([0.1, 0.2, 0.3])), np.array([0.2, 0.1, 0.3]))
+    camera = replace(CAMERA, T_base_cam=mounted @ CAMERA.T_base_cam)
+    poses = [handheld(index) for index in range(30)]
+    module = active(Rig(sensors=RIG.sensors, camera=camera))
+    trackings = track(module, ROOM, [T @ mounted for T in poses])
+    assert max(errors_m(trackings, poses)) < 0.01
+
+
+def test_settings_and_images_out_of_range_are_named():
+    for name, value in (("weak_ratio", 0.0), ("cloud_voxel_m", -1.0), ("matched_min_ratio", 2.0)):
+        with pytest.raises(ConfigError, match=name):
+            active(**{name: value})
+    with pytest.raises(InputError, match=r"depth_m: expected \(240, 320\), got \(4, 4\)"):
+        active().track(
+            replace(observe(ROOM, se3.identity(), 0), depth_m=np.zeros((4, 4), np.float32))
+        )
+    with pytest.raises(InputError, match="camera"):
+        active(Rig(sensors=frozenset({Sensor.DEPTH})))
+
+
+@pytest.mark.parametrize(
+    ("folder", "camera", "scale", "bound_m"),
+    [
+        ("tum_fr1_rpy", {}, 5000.0, 0.04),
+        ("7scenes_redkitchen", {"fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0}, 1000.0, 0.03),
+    ],
+)
+def test_start_of_a_real_recording_is_followed_by_depth_alone(
+    shared_data, folder, camera, scale, bound_m
+):
+    source = TumRgbd(str(shared_data / folder), camera, scale, [0.3, 8.0], 0.02)
+    module = active(source.rig)
+    told = []
+    for observation in source:
+        told.append(module.track(replace(observation, image_bgr=None)))
+        if len(told) == 80:
+            break
+    assert {tracking.status for tracking in told} == {TrackingStatus.TRACKING}
+    estimate = Trajectory(
+        stamps_ns=np.array([tracking.stamp_ns for tracking in told]),
+        T_world_base=np.array([tracking.T_local_base for tracking in told]),
+    )
+    errors = absolute_errors(estimate, source.ground_truth().trajectory, 0.02)
+    assert len(errors.errors_m) == 80
+    assert errors.rmse_m < bound_m
