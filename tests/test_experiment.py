@@ -73,6 +73,8 @@ def rates(duration_s, together):
         odometry=80.0,
         together=together,
         told=0.0,
+        ate_odometry_m=0.0,
+        ate_together_m=0.0,
     )
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sceneslam.bus.gate import Gate, GateSettings, Verdict, bridged_motion
+from sceneslam.bus.gate import Gate, GateSettings, Verdict, with_heading
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 
@@ -145,15 +145,12 @@ def test_judgement_does_not_depend_on_where_the_frames_are(values):
         assert one.distance_excess == pytest.approx(other.distance_excess, abs=1e-6)
 
 
-def test_bridging_takes_the_way_from_the_wheels_and_the_turn_from_a_module_believed_that():
-    T_odom, T_module = se3.from_xy_yaw(0.1, 0.0, 0.3), se3.from_xy_yaw(0.2, 0.0, 0.1)
-    off, wrong = judged(scaled(0.75))[-1], judged(jumping(30, 1.0))[30]
-    both = bridged_motion(T_odom, T_module, off)
-    assert se3.yaw_rad(both) == pytest.approx(0.1) and both[0, 3] == pytest.approx(0.1)
-    tilted = T_module @ se3.exp(np.array([0, 0, 0, 0.1, 0.0, 0.0]))
-    np.testing.assert_allclose(bridged_motion(T_odom, tilted, off), both, atol=1e-12)
-    np.testing.assert_array_equal(bridged_motion(T_odom, T_module, wrong), T_odom)
-    np.testing.assert_array_equal(bridged_motion(T_odom, None, off), T_odom)
+def test_bridging_takes_the_way_and_the_tilt_from_the_wheels_and_the_heading_from_the_module():
+    T_odom = se3.from_xy_yaw(0.1, 0.0, 0.3)
+    rotation = se3.from_xy_yaw(0.2, 0.0, 0.1)[:3, :3] @ se3.so3_exp(np.array([0.1, 0.0, 0.0]))
+    np.testing.assert_allclose(
+        with_heading(T_odom, rotation), se3.from_xy_yaw(0.1, 0.0, 0.1), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.evaluation.correctness import correct_rate
 from sceneslam.experiments.openloris.dataset import Dataset, Sequence
 from sceneslam.experiments.openloris.figure import draw_rates
@@ -17,6 +18,7 @@ from sceneslam.types.experiment import Figure, Outcome, Relation, RunTrials, Tri
 from sceneslam.types.trajectory import Trajectory
 
 _ALL = "all scenes"
+_MATCH_S = 0.02  # truth is published at 10 Hz and more, odometry at 20 Hz
 
 
 class OpenLorisExperiment:
@@ -75,6 +77,8 @@ class OpenLorisExperiment:
             odometry=self._rate(key, self._data.odometry[key].trajectory),
             together=self._rate(key, outcome.trajectory),
             told=self._rate(key, outcome.online),
+            ate_odometry_m=self._ate_m(key, self._data.odometry[key].trajectory),
+            ate_together_m=self._ate_m(key, outcome.trajectory),
         )
 
     def _rate(self, key: Sequence, trajectory: Trajectory) -> float:
@@ -82,6 +86,9 @@ class OpenLorisExperiment:
         truth, limit_m = self._data.truth[key], self._limits_m[key.scene]
         rate = correct_rate(trajectory, truth, limit_m=limit_m, limit_rad=self._limit_rad)
         return 100.0 * rate
+
+    def _ate_m(self, key: Sequence, trajectory: Trajectory) -> float:
+        return absolute_errors(trajectory, self._data.truth[key], _MATCH_S).rmse_m
 
     def _figures(self, means: list[Rates]) -> list[Figure]:
         """Return what was promised: no harm anywhere, and the rates of some systems."""

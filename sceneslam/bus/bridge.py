@@ -7,6 +7,7 @@ import copy
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.bus.gate import with_heading
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
@@ -54,8 +55,8 @@ class Bridge:
         """Return T_map_base at the observation and go on from there, None when nothing tells it.
 
         Odometry bridges any gap, and begins the map where nothing else does; `turn` (3, 3) is a
-        better rotation since the last observation. Constant velocity is allowed by `by_velocity`
-        and only within the horizon after the last known pose.
+        rotation since the last observation whose heading is better. Constant velocity is allowed
+        by `by_velocity` and only within the horizon after the last known pose.
         """
         if self._T_map_base is None:
             if not self._uses_odometry or observation.T_odom_base is None:
@@ -67,7 +68,7 @@ class Bridge:
         if self._uses_odometry and T_odom_prev is not None and T_odom_curr is not None:
             T_prev_curr = se3.inverse(T_odom_prev) @ T_odom_curr
             if turn is not None:
-                T_prev_curr = se3.from_parts(turn, T_prev_curr[:3, 3])
+                T_prev_curr = with_heading(T_prev_curr, turn)
         elif by_velocity and self._within_horizon(observation.stamp_ns):
             T_prev_curr = self._at_constant_velocity(observation.stamp_ns - self._stamp_ns)
         else:

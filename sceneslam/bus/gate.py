@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 from enum import Enum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
@@ -78,17 +79,14 @@ class Judgement:
 _GOOD = (Verdict.AGREE, Verdict.UNCHECKED)
 
 
-def bridged_motion(
-    T_prev_curr_odom: Transform, T_prev_curr_module: Transform | None, judgement: Judgement
-) -> Transform:
-    """Return the best motion since the previous observation while a module is not trusted.
+def with_heading(T_prev_curr_odom: Transform, rotation: NDArray[np.float64]) -> Transform:
+    """Return the odometry's motion with the heading of a module that is believed the turn.
 
-    The way is the odometry's; so is the heading, unless the module (None: it has no pose now or
-    had none then) is believed the turn. Wheels stay on the floor: roll and pitch are theirs.
+    `rotation` (3, 3) is the module's over the same time. Wheels stay on the floor: the way is
+    theirs, and so are roll and pitch, which a module's tilt would turn into a climb.
     """
-    if T_prev_curr_module is None or judgement.turn is not Verdict.AGREE:
-        return T_prev_curr_odom
-    apart_rad = se3.yaw_rad(T_prev_curr_module) - se3.yaw_rad(T_prev_curr_odom)
+    module_rad = np.arctan2(rotation[1, 0], rotation[0, 0])
+    apart_rad = float(module_rad) - se3.yaw_rad(T_prev_curr_odom)
     return T_prev_curr_odom @ se3.from_xy_yaw(0.0, 0.0, apart_rad)
 
 

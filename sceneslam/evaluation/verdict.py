@@ -25,7 +25,7 @@ def write_verdict(folder: Path, experiment: str, verdict: Verdict) -> None:
 
 
 def markdown(table: Table) -> str:
-    """Return the table in Markdown, numbers with one decimal."""
+    """Return the table in Markdown, numbers with four digits."""
     rows = [table.columns, ["---"] * len(table.columns), *table.rows]
     return "".join(f"| {' | '.join(map(_cell, row))} |\n" for row in rows)
 
@@ -53,4 +53,4 @@ def _plain(figure: Figure) -> dict[str, str | float | bool | None]:
 def _cell(value: str | float | None) -> str:
     if value is None:
         return "-"
-    return value if isinstance(value, str) else f"{value:.1f}"
+    return value if isinstance(value, str) else f"{value:.4g}"
