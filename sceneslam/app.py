@@ -20,6 +20,15 @@ from sceneslam.interrupts import termination_as_interrupt, uninterrupted
 from sceneslam.loop import Loop
 from sceneslam.types.trajectory import Trajectory
 
+_WRITTEN = (
+    "trajectory*.tum",
+    "groundtruth.tum",
+    "figures/*.png",
+    "map/*",
+    "metrics.json",
+    "report.html",
+)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finished:
@@ -57,7 +66,14 @@ def run(
 
 def _clear(folder: Path) -> None:
     """Remove what an earlier run left in the folder, so that nothing old stands beside the new."""
-    for pattern in ("trajectory*.tum", "figures/*.png", "map/*", "metrics.json", "report.html"):
+    for pattern in (
+        "trajectory*.tum",
+        "groundtruth.tum",
+        "figures/*.png",
+        "map/*",
+        "metrics.json",
+        "report.html",
+    ):
         for path in folder.glob(pattern):
             path.unlink()
 
@@ -73,6 +89,8 @@ def _save(
     result, truth = loop.result(), loop.truth
     result.trajectory.write_tum(folder / "trajectory.tum")
     result.online.write_tum(folder / "trajectory_online.tum")
+    if truth is not None and len(truth.trajectory):
+        truth.trajectory.write_tum(folder / "groundtruth.tum")
     for session in result.sessions:
         name = f"trajectory_{session.index}_{session.module}.tum"
         session.trajectory.write_tum(folder / name)

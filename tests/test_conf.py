@@ -89,6 +89,7 @@ ALLOWED = {  # package -> what of ours it may import
     "sceneslam/evaluation": {"types", "interfaces", "evaluation"},
     "modules": {"types", "interfaces"},
     "experiments/openloris": {"types", "evaluation", "experiments"},
+    "experiments/handover": {"types", "evaluation", "experiments"},
 }
 
 

@@ -13,6 +13,7 @@ from sceneslam.bus.bridge import Bridge
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
+_THINNED_RATIO = 0.95  # of the limit is left, so that not every moment has to thin
 _BULKY = ("image_bgr", "depth_m", "points_lidar", "point_times_s")
 
 
@@ -40,8 +41,9 @@ class Moment:
 class Memory:
     """The moments of the last while, bounded in time and in bytes.
 
-    Where the bytes do not suffice, every second of the older moments loses its sensor data, so
-    that the span stays and a module that is led through it sees fewer images.
+    Where the bytes do not suffice, older moments lose their sensor data, so that those left lie
+    apart in proportion to their age: a module that is led through them sees fewer images of long
+    ago, and every moment still gets its pose.
     """
 
     def __init__(self, *, span_s: float, limit_mb: float, keeps_sensors: bool) -> None:
@@ -95,9 +97,14 @@ class Memory:
             self._bytes += _size(moment)
 
     def _thin(self) -> None:
-        full = [i for i, moment in enumerate(self._moments) if _size(moment)]
-        for index in full[1 : len(full) // 2 : 2]:
-            self._strip(index)
+        """Take the data of the moment that is missed least, until the rest fits."""
+        full = [index for index, moment in enumerate(self._moments) if _size(moment)]
+        stamps_ns = np.array([self._moments[index].stamp_ns for index in full], np.float64)
+        while self._bytes > _THINNED_RATIO * self._limit_bytes and len(full) > 2:
+            ages_ns = stamps_ns[-1] - stamps_ns[1:-1]
+            missed = int(np.argmin((stamps_ns[2:] - stamps_ns[:-2]) / ages_ns)) + 1
+            self._strip(full.pop(missed))
+            stamps_ns = np.delete(stamps_ns, missed)
 
     def _strip(self, index: int) -> None:
         moment = self._moments[index]

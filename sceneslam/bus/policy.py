@@ -25,7 +25,7 @@ class Policy:
     retry_s: float  # a fallback runs this long before the scene's first choice is tried again
     trial_s: float  # it has to hold its pose this long, beside the fallback, to come back
     buffer_s: float  # observations are remembered this long, for `rewind` ...
-    buffer_mb: float  # ... and up to this much; beyond it every second old one is thinned out
+    buffer_mb: float  # ... and up to this much; beyond it the older, the thinner
     gate: GateSettings | None  # how far a module's motion may differ from odometry's, None: any
     startup_s: dict[str, float]  # slam key -> time its start takes on the recording's clock
 

@@ -1,0 +1,1 @@
+"""What a hand-over between two modules loses."""
