@@ -68,5 +68,7 @@ def _error_m(estimate: Trajectory, truth: Trajectory, from_ns: int, until_ns: in
 
 
 def _gap_s(trajectory: Trajectory) -> float:
+    """Return the longest step beyond the usual one [s]; half a period is no gap."""
     steps_ns = np.diff(trajectory.stamps_ns)
-    return max(0.0, float(steps_ns.max() - np.median(steps_ns)) * 1e-9)
+    period_ns, longest_ns = float(np.median(steps_ns)), float(steps_ns.max())
+    return (longest_ns - period_ns) * 1e-9 if longest_ns > 1.5 * period_ns else 0.0
