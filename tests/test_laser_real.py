@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from ros_recordings import make_source
 
 from sceneslam.modules.slam.laser.module import LaserSlam
 from sceneslam.types import se3
@@ -53,12 +54,16 @@ def relation_errors(path, T_world_base):
     return np.array(errors)
 
 
-def test_real_corridors_are_tracked_far_better_than_by_odometry(shared_data):
-    folder = shared_data / "carmen_intel"
+def make_module():
     conf = Path(__file__).resolve().parent.parent / "conf/slam/laser.yaml"
     settings = yaml.safe_load(conf.read_text())
     settings.pop("_target_")
-    module = LaserSlam(**settings)
+    return LaserSlam(**settings)
+
+
+def test_real_corridors_are_tracked_far_better_than_by_odometry(shared_data):
+    folder = shared_data / "carmen_intel"
+    module = make_module()
     module.activate(Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser()))
     log = read_log(folder / "intel.clf")
     trackings = {stamp: module.track(observation) for stamp, observation in log}
@@ -69,3 +74,19 @@ def test_real_corridors_are_tracked_far_better_than_by_odometry(shared_data):
     assert len(laser) > 100
     assert laser[:, 0].mean() < 0.03
     assert laser[:, 1].mean() < 0.5 * odometry[:, 1].mean()
+
+
+def test_slice_of_a_lidar_is_a_laser_too(shared_data):
+    source = make_source("kitti", shared_data / "kitti_raw_2011_09_26_drive_0001")
+    module = make_module()
+    module.activate(source.rig)
+    truth = source.ground_truth().trajectory
+    observations = list(source)[:30]
+    trackings = [module.track(observation) for observation in observations]
+    assert TrackingStatus.LOST not in {tracking.status for tracking in trackings}
+    T_gt_local = truth.T_world_base[0]
+    off = [
+        np.hypot(*(T_gt_local @ t.T_local_base - T_true)[:2, 3])
+        for t, T_true in zip(trackings, truth.T_world_base, strict=False)
+    ]
+    assert max(off) < 0.3

@@ -11,8 +11,9 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import GridLayer
 from sceneslam.types.observation import LaserScan
 
-_HIT, _MISS = 0.85, -0.4  # log odds per measurement
-_LIMIT = 3.5  # so that a door that opens is believed after some scans
+_LIMIT = 3.5  # log odds; so that a door that opens is believed after some scans
+_STEP = _LIMIT / 127  # cells are int8: saturation is the limit
+_HIT, _MISS = round(0.85 / _STEP), round(0.4 / _STEP)  # per measurement
 _GROWTH_CELLS = 128  # rows and columns are added in blocks, since growing copies the grid
 _SHIFT = 4  # cv2 polygons with sub-cell corners, in 1/16 cells
 
@@ -37,7 +38,7 @@ class OccupancyGrid:
             raise ConfigError("cells_max", cells_max, f"{_GROWTH_CELLS**2} or more")
         self.resolution_m = resolution_m
         self._clear_max_m, self._cells_max = clear_max_m, cells_max
-        self._log_odds = np.zeros((0, 0), dtype=np.float32)
+        self._cells = np.zeros((0, 0), dtype=np.int8)  # log odds in steps
         self._origin = np.zeros(2, dtype=np.int64)  # cell (column, row) of the array's corner
 
     def insert(self, T_local_laser: se3.Transform, scan: LaserScan) -> None:
@@ -58,52 +59,51 @@ class OccupancyGrid:
         hits_xy = _ends(T_local_laser, angles[hit], ranges[hit])
         seen = np.vstack([corners, hits_xy, origin_xy[None]])
         self._grow(seen)
-        if self._log_odds.size == 0:
+        if self._cells.size == 0:
             return
         self._add(np.vstack([corners, origin_xy[None]]), hits_xy)
 
     def layer(self) -> GridLayer:
         """Return a copy of the grid in `local`."""
         x_m, y_m = (self._origin * self.resolution_m).tolist()
-        log_odds = self._log_odds.copy()
+        log_odds = np.maximum(self._cells, -127) * np.float32(_STEP)
         log_odds.flags.writeable = False
         return GridLayer(log_odds=log_odds, resolution_m=self.resolution_m, origin_xy_m=(x_m, y_m))
 
     def _add(self, free_xy: NDArray[np.float64], hits_xy: NDArray[np.float64]) -> None:
-        rows, columns = self._log_odds.shape
+        rows, columns = self._cells.shape
         polygon = free_xy / self.resolution_m - self._origin - 0.5  # cell centres at whole numbers
         lowest = np.clip(np.floor(polygon.min(axis=0)), 0, (columns - 1, rows - 1)).astype(int)
         highest = np.clip(np.ceil(polygon.max(axis=0)), 0, (columns - 1, rows - 1)).astype(int)
         width, height = highest - lowest + 1
-        free = np.zeros((height, width), dtype=np.uint8)
+        free = np.zeros((height, width), dtype=np.int8)
         corners = np.round((polygon - lowest) * 2**_SHIFT).astype(np.int32)
-        cv2.fillPoly(free, [corners], 1, lineType=cv2.LINE_8, shift=_SHIFT)
-        window = self._log_odds[lowest[1] : lowest[1] + height, lowest[0] : lowest[0] + width]
+        cv2.fillPoly(free, [corners], _MISS, lineType=cv2.LINE_8, shift=_SHIFT)
         cells = np.floor(hits_xy / self.resolution_m).astype(np.int64) - self._origin
         cells = cells[np.all((cells >= 0) & (cells < (columns, rows)), axis=1)]
-        was = self._log_odds[cells[:, 1], cells[:, 0]]
-        window += np.float32(_MISS) * free
-        np.maximum(window, -_LIMIT, out=window)
+        was = self._cells[cells[:, 1], cells[:, 0]].astype(np.int16)
+        window = self._cells[lowest[1] : lowest[1] + height, lowest[0] : lowest[0] + width]
+        cv2.subtract(window, free, dst=window)
         # A cell that was hit is not free, and one scan is one measurement of it.
-        self._log_odds[cells[:, 1], cells[:, 0]] = np.minimum(was + np.float32(_HIT), _LIMIT)
+        self._cells[cells[:, 1], cells[:, 0]] = np.minimum(was + _HIT, 127)
 
     def _grow(self, seen_xy: NDArray[np.float64]) -> None:
         cells = np.floor(seen_xy / self.resolution_m)
         lowest = (np.floor((cells.min(axis=0) - 1) / _GROWTH_CELLS) * _GROWTH_CELLS).astype(int)
         end = (np.ceil((cells.max(axis=0) + 2) / _GROWTH_CELLS) * _GROWTH_CELLS).astype(int)
-        rows, columns = self._log_odds.shape
-        if self._log_odds.size:
+        rows, columns = self._cells.shape
+        if self._cells.size:
             lowest = np.minimum(lowest, self._origin)
             end = np.maximum(end, self._origin + np.array([columns, rows]))
         size = end - lowest
-        unchanged = self._log_odds.size and tuple(size) == (columns, rows)
+        unchanged = self._cells.size and tuple(size) == (columns, rows)
         if unchanged or int(size[0]) * int(size[1]) > self._cells_max:
             return
-        grown = np.zeros((size[1], size[0]), dtype=np.float32)
-        if self._log_odds.size:
+        grown = np.zeros((size[1], size[0]), dtype=np.int8)
+        if self._cells.size:
             column, row = self._origin - lowest
-            grown[row : row + rows, column : column + columns] = self._log_odds
-        self._log_odds, self._origin = grown, lowest
+            grown[row : row + rows, column : column + columns] = self._cells
+        self._cells, self._origin = grown, lowest
 
 
 def _ends(

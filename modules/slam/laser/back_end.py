@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from .keyframes import Keyframes
 from .loop_closure import LoopCloser
-from .pose_graph import Edge, PoseGraph
+from .pose_graph import Edge, PoseGraph, optimise
 
 
 @dataclass(slots=True)
@@ -39,7 +37,11 @@ class BackEnd:
             self.graph.add(edge)
         if not loops:
             return False
-        for frame, pose in zip(frames, self.graph.smooth(self.keyframes.poses), strict=True):
-            frame.T_local_base = np.asarray(pose)
+        self.keyframes.move(self.graph.smooth(self.keyframes.poses))
         self.revision += 1
         return True
+
+    def finish(self) -> None:
+        """Fit all edges once more, from the poses as they are."""
+        if self.revision:
+            self.keyframes.move(optimise(self.graph.edges, self.keyframes.poses))

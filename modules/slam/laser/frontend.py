@@ -6,21 +6,22 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sceneslam.types import se3
 from sceneslam.types.observation import LaserScan, Observation, TrackingStatus
 
 from .back_end import BackEnd
 from .field import LikelihoodField
 from .history import History
 from .keyframes import Keyframe, Keyframes
+from .loop_search import LoopSearch
 from .matcher import Match, Matcher
 from .motion import Motion, MotionModel
 from .planar import Matrix, Planar, between, compose, propagate, turn
-from .surface import SurfacePoints, read_surfaces
+from .surface import SurfacePoints
 
 _OVERLAP_MIN_RATIO = 0.5  # with less, the map does not reach here yet
 _FAILURES_MAX = 10  # matches that fail in a row before the map goes on from dead reckoning
-_STEP_MIN = np.array([0.01, 0.01, 2e-3])  # m, m, rad: of the motion between two keyframes
+_LOST_WINDOW_M, _LOST_WINDOW_RAD, _LOST_SCORE_MIN = 3.0, 0.8, 0.5
+_STEP_MIN = np.array([5e-3, 5e-3, 2e-3])  # m, m, rad: of the motion between two keyframes
 _DEVIATION_MIN = np.array([1e-3, 1e-3, 5e-4])  # m, m, rad: no pose is believed to be better
 
 
@@ -37,12 +38,9 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScanSettings:
-    """How scans are read, and when a match is believed."""
+    """Which scans are matched, and when a match is believed."""
 
     resolution_m: float
-    range_max_m: float
-    noise_m: float
-    noise_per_m: float
     beams_min: int
     inlier_min_ratio: float
     predict_max_s: float
@@ -53,7 +51,6 @@ class FrontEnd:
     """One activation's estimate, from the first observation on."""
 
     settings: ScanSettings
-    T_base_laser: se3.Transform
     matcher: Matcher
     motion: MotionModel
     keyframes: Keyframes
@@ -97,6 +94,9 @@ class FrontEnd:
             self._extend(predicted_then, None, scan, surfaces)
             return self._hold(observation, predicted, None)
         match = self.matcher.match(surfaces, self._field, predicted_then, self._covariance)
+        is_measured = self._is_measured and motion.is_measured
+        if not is_measured and not self._believes(match):
+            match = self._find_again(surfaces, self._field, predicted_then) or match
         if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
         estimate = self._hold(observation, compose(match.T_local_base, T_then_now), match)
@@ -107,14 +107,24 @@ class FrontEnd:
     def _read(self, scan: LaserScan | None) -> SurfacePoints | None:
         if scan is None:
             return None
-        surfaces = read_surfaces(
-            scan,
-            self.T_base_laser,
-            range_max_m=self.settings.range_max_m,
-            noise_m=self.settings.noise_m,
-            noise_per_m=self.settings.noise_per_m,
-        )
+        surfaces = self.keyframes.reader.read(scan)
         return surfaces if len(surfaces) >= self.settings.beams_min else None
+
+    def _find_again(
+        self, surfaces: SurfacePoints, field: LikelihoodField, predicted: Planar
+    ) -> Match | None:
+        """Return the match of a wide search: where nothing measures motion, any may have been."""
+        found = LoopSearch(field).find(
+            surfaces.points,
+            predicted,
+            window_m=_LOST_WINDOW_M,
+            window_rad=_LOST_WINDOW_RAD,
+            score_min=_LOST_SCORE_MIN,
+        )
+        if found is None or not found.is_unique:
+            return None
+        prior = np.diag(np.array([_LOST_WINDOW_M, _LOST_WINDOW_M, _LOST_WINDOW_RAD]) ** 2)
+        return self.matcher.refine(surfaces, field, found.T_submap_base, prior)
 
     def _believes(self, match: Match) -> bool:
         return (
@@ -208,7 +218,7 @@ class FrontEnd:
         G = turn(-float(T_local_base[2]))
         T_local_prev = frames[-1].T_local_base if frames else T_local_base
         T_prev_curr = between(T_local_prev, T_local_base)
-        frames.append(
+        self.keyframes.add(
             Keyframe(
                 stamp_ns=scan.stamp_ns,
                 T_local_base=T_local_base,
@@ -216,8 +226,8 @@ class FrontEnd:
                 covariance=np.asarray(G @ covariance @ G.T),
                 distance_m=float(np.hypot(*T_prev_curr[:2])),
                 scan=scan,
-                surfaces_base=surfaces,
-            )
+            ),
+            surfaces,
         )
         self._step = np.zeros((3, 3))
         if self.back_end.take():

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sceneslam.types.observation import LaserScan
 
 from .planar import Matrix, Planar, wrap
-from .surface import SurfacePoints, joined
+from .surface import SurfacePoints, SurfaceReader, joined
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -23,7 +23,6 @@ class Keyframe:
     covariance: Matrix  # of T_prev_curr, axes of curr
     distance_m: float  # driven from the keyframe before
     scan: LaserScan
-    surfaces_base: SurfacePoints
 
 
 @dataclass(slots=True)
@@ -32,13 +31,16 @@ class Keyframes:
 
     A submap is `submap_keyframes` of them in a row. Scans are matched with the latest two
     submaps, the last being built, as in Cartographer (Hess et al., "Real-time loop closure in 2D
-    LIDAR SLAM", ICRA 2016).
+    LIDAR SLAM", ICRA 2016). The surfaces of older keyframes are read from the scan when asked
+    for: a scan is a tenth of their size.
     """
 
+    reader: SurfaceReader
     keyframe_distance_m: float
     keyframe_angle_rad: float
     submap_keyframes: int
     frames: list[Keyframe] = field(default_factory=list)
+    _surfaces: dict[int, SurfacePoints] = field(default_factory=dict, init=False)  # of the latest
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -51,6 +53,18 @@ class Keyframes:
         moved_m = float(np.hypot(*(T_local_base[:2] - last[:2])))
         turned_rad = abs(wrap(T_local_base[2] - last[2]))
         return moved_m > self.keyframe_distance_m or turned_rad > self.keyframe_angle_rad
+
+    def add(self, frame: Keyframe, surfaces_base: SurfacePoints) -> None:
+        """Append a keyframe and what was read from its scan."""
+        self._surfaces[len(self.frames)] = surfaces_base
+        self.frames.append(frame)
+        for number in [number for number in self._surfaces if number < self.latest.start]:
+            del self._surfaces[number]
+
+    def surfaces_base(self, number: int) -> SurfacePoints:
+        """Return what a keyframe saw, in its base."""
+        kept = self._surfaces.get(number)
+        return self.reader.read(self.frames[number].scan) if kept is None else kept
 
     @property
     def latest(self) -> range:
@@ -70,9 +84,12 @@ class Keyframes:
 
     def surfaces(self, numbers: range) -> SurfacePoints:
         """Return the surfaces (local) that these keyframes saw."""
-        return joined(
-            [self.frames[i].surfaces_base.moved(self.frames[i].T_local_base) for i in numbers]
-        )
+        return joined([self.surfaces_base(i).moved(self.frames[i].T_local_base) for i in numbers])
+
+    def move(self, poses: NDArray[np.float64]) -> None:
+        """Give all keyframes new poses (N, 3)."""
+        for frame, T_local_base in zip(self.frames, poses, strict=True):
+            frame.T_local_base = np.asarray(T_local_base)
 
     @property
     def poses(self) -> NDArray[np.float64]:

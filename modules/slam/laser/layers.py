@@ -21,24 +21,17 @@ _PLANAR = [0, 1, 5]  # x, y, yaw in se3.log's order
 _LEVEL_DEVIATION = 0.01  # m and rad: what a floor's z, roll and pitch are believed to vary by
 
 
-def map_layers(
-    keyframes: Keyframes,
-    edges: Sequence[Edge],
-    T_base_laser: se3.Transform,
-    *,
-    resolution_m: float,
-    range_max_m: float,
-) -> MapLayers:
+def map_layers(keyframes: Keyframes, edges: Sequence[Edge], *, resolution_m: float) -> MapLayers:
     """Return everything that the keyframes saw, in `local`."""
+    reader = keyframes.reader
     grid = OccupancyGrid(resolution_m)
     clouds = [np.zeros((0, 2))]
-    for keyframe in keyframes.frames:
-        grid.insert(
-            to_transform(keyframe.T_local_base) @ T_base_laser, _cut(keyframe.scan, range_max_m)
-        )
-        clouds.append(apply(keyframe.T_local_base, keyframe.surfaces_base.points))
+    for number, keyframe in enumerate(keyframes.frames):
+        T_local_laser = to_transform(keyframe.T_local_base) @ reader.T_base_laser
+        grid.insert(T_local_laser, _cut(keyframe.scan, reader.range_max_m))
+        clouds.append(apply(keyframe.T_local_base, keyframes.surfaces_base(number).points))
     points = _thin(np.concatenate(clouds), resolution_m)
-    heights = np.full(len(points), T_base_laser[2, 3])
+    heights = np.full(len(points), reader.T_base_laser[2, 3])
     cloud = np.column_stack([points, heights]).astype(np.float32)
     return MapLayers(
         points=PointLayer(points=cloud),

@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from .keyframes import Keyframe, Keyframes
+from .keyframes import Keyframes
 from .matcher import Match, Matcher
 from .places import Place, Places
-from .planar import Planar, apply, between, compose, turn
+from .planar import Planar, apply, between, compose, from_transform, turn
 from .pose_graph import Edge
+from .surface import SurfacePoints
 
 _NEAR_M = 3.0  # a submap is seen well from so near its keyframes
 _DRIFT_M = 0.05  # per metre driven since: half width of the search
@@ -21,9 +22,10 @@ _WINDOW_MAX_M, _WINDOW_MAX_RAD = 6.0, 0.6
 _WIDE_M, _WIDE_RAD = 0.5, 0.2  # wider windows are searched, and need a second witness
 _SUBMAPS_MAX = 2  # tried per keyframe
 _PAUSE = 4  # keyframes between two loops into the same submap
-_SCORE_MIN = 0.55
-_INLIER_MIN_RATIO = 0.6
-_THROUGH_MAX_RATIO = 0.15
+_SCORE_MIN = 0.6
+_INLIER_MIN_RATIO = 0.65
+_THROUGH_M, _THROUGH_MAX_RATIO = 0.3, 0.1  # points so far before the scan's returns
+_BESIDE_RAD = 0.02  # a beam passes a point so near
 _AGREE_M, _AGREE_RAD = 0.25, 0.05
 _FLOOR = np.diag(np.array([0.02, 0.02, 0.005]) ** 2)  # m, m, rad: no loop is believed to be better
 
@@ -83,12 +85,13 @@ class LoopCloser:
 
     def _match(self, number: int, submap: int, window_m: float, window_rad: float) -> Edge | None:
         place = self.places.of(submap)
-        frame = self.keyframes.frames[number]
-        predicted = between(self.keyframes.frames[place.anchor].T_local_base, frame.T_local_base)
+        surfaces = self.keyframes.surfaces_base(number)
+        frames = self.keyframes.frames
+        predicted = between(frames[place.anchor].T_local_base, frames[number].T_local_base)
         start = predicted
         if window_m > _WIDE_M or window_rad > _WIDE_RAD:
             found = place.search.find(
-                frame.surfaces_base.points,
+                surfaces.points,
                 predicted,
                 window_m=window_m,
                 window_rad=window_rad,
@@ -98,8 +101,8 @@ class LoopCloser:
                 return None
             start = found.T_submap_base
         prior = np.diag(np.array([window_m, window_m, window_rad]) ** 2)
-        match = self.matcher.refine(frame.surfaces_base, place.field, start, prior)
-        if not self._believes(match, place, frame):
+        match = self.matcher.refine(surfaces, place.field, start, prior)
+        if not self._believes(match, place, surfaces):
             return None
         G = turn(-float(match.T_local_base[2]))
         return Edge(
@@ -110,11 +113,11 @@ class LoopCloser:
             is_loop=True,
         )
 
-    def _believes(self, match: Match, place: Place, frame: Keyframe) -> bool:
+    def _believes(self, match: Match, place: Place, surfaces: SurfacePoints) -> bool:
         return (
             match.inlier_ratio >= _INLIER_MIN_RATIO
             and match.weak_directions == 0
-            and seen_through_ratio(frame, place.field.points, match.T_local_base)
+            and self._seen_through_ratio(surfaces, place.field.points, match.T_local_base)
             <= _THROUGH_MAX_RATIO
         )
 
@@ -166,28 +169,29 @@ class LoopCloser:
                 far_m[other] = min(far_m[other], far_m[nearest] + metres)
         return far_m
 
+    def _seen_through_ratio(
+        self, scan_base: SurfacePoints, points_submap: NDArray[np.float64], T_submap_base: Planar
+    ) -> float:
+        """Return the share of the submap's points in view that the scan looked through.
 
-def seen_through_ratio(
-    frame: Keyframe, points_submap: NDArray[np.float64], T_submap_base: Planar
-) -> float:
-    """Return the share of the submap's points in view that the scan looked through.
+        What stands behind the scan's returns is not in view. Beams graze corners: a point counts
+        as looked through when the beams beside its own went on, too.
+        """
+        T_base_laser = from_transform(self.keyframes.reader.T_base_laser)
+        T_laser_submap = between(compose(T_submap_base, T_base_laser), np.zeros(3))
+        bearing, reach = _polar(apply(between(T_base_laser, np.zeros(3)), scan_base.points))
+        order = np.argsort(bearing, kind="stable")
+        bearing, reach = bearing[order], reach[order]
+        angle, away = _polar(apply(T_laser_submap, points_submap))
+        at = np.clip(np.searchsorted(bearing, angle), 1, len(bearing) - 2)
+        beside = np.minimum(np.abs(bearing[at] - angle), np.abs(bearing[at - 1] - angle))
+        in_view = beside < _BESIDE_RAD
+        least = np.minimum(np.minimum(reach[at - 1], reach[at]), reach[at + 1])
+        through = in_view & (away < least - _THROUGH_M)
+        agrees = in_view & (np.abs(away - reach[at]) < _THROUGH_M)
+        return float(through.sum() / max(through.sum() + agrees.sum(), 1))
 
-    What stands behind the scan's returns is not in view. Beams graze corners: a point counts as
-    looked through when the beams beside its own went on too.
-    """
-    surfaces = frame.surfaces_base
-    T_base_submap = between(T_submap_base, np.zeros(3))
-    x, y = apply(T_base_submap, points_submap).T
-    sx, sy = surfaces.points.T
-    bearing, order = np.arctan2(sy, sx), None
-    order = np.argsort(bearing, kind="stable")
-    bearing, reach = bearing[order], np.hypot(sx, sy)[order]
-    if len(bearing) < 3:
-        return 1.0
-    angle, away = np.arctan2(y, x), np.hypot(x, y)
-    at = np.clip(np.searchsorted(bearing, angle), 1, len(bearing) - 2)
-    near = np.minimum(np.abs(bearing[at] - angle), np.abs(bearing[at - 1] - angle)) < 0.02
-    least = np.minimum(np.minimum(reach[at - 1], reach[at]), reach[at + 1])
-    through = near & (away < least - 0.3)
-    agrees = near & (np.abs(away - reach[at]) < 0.3)
-    return float(through.sum() / max(through.sum() + agrees.sum(), 1))
+
+def _polar(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    x, y = points.T
+    return np.arctan2(y, x), np.hypot(x, y)

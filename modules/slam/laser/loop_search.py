@@ -21,7 +21,7 @@ _LEVELS = 4  # shifts of 0.1, 0.2, 0.4, 0.8 m
 _POINTS = 100  # of the scan; more do not change what is found
 _BEAM = 32  # nodes of the first descent, whose score is the bound of the second
 _NODES_MAX = 20_000  # per level: a corridor looks alike in all of them
-_ALIKE_RATIO = 0.92  # a second place that fits as well as this share of the best ...
+_ALIKE_RATIO = 0.85  # a second place that fits as well as this share of the best ...
 _APART_M, _APART_RAD = 0.5, 0.15  # ... and is so far from it makes the answer ambiguous
 
 
@@ -97,8 +97,7 @@ class LoopSearch:
 
     def _roots(self, cells: NDArray[np.int32], window_m: float) -> _Nodes:
         size = 2 ** (_LEVELS - 1)
-        half = int(np.ceil(window_m / self._cell_m / size)) * size
-        shifts = np.arange(-half, half + 1, size)
+        shifts = np.arange(-int(window_m / self._cell_m), int(window_m / self._cell_m) + 1, size)
         turn, x, y = (
             part.ravel()
             for part in np.meshgrid(np.arange(len(cells)), shifts, shifts, indexing="ij")

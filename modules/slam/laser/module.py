@@ -15,6 +15,7 @@ from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
 from ..depth_scan import DepthScanner
+from ..lidar_scan import LidarScanner
 from .back_end import BackEnd
 from .frontend import Estimate, FrontEnd, ScanSettings
 from .history import History
@@ -25,19 +26,20 @@ from .matcher import Matcher
 from .motion import MotionModel
 from .places import Places
 from .planar import to_transform, turn
+from .surface import SurfaceReader
 
 _ABOVE_0 = (
     "resolution_m range_max_m laser_noise_m depth_noise_m window_m window_rad "
     "keyframe_distance_m keyframe_angle_rad odometry_noise_ratio gyro_noise_rad_s"
 )
 _NOT_BELOW_0 = "depth_noise_per_m odometry_turn_rad_per_m predict_max_s"
-_AT_LEAST_1 = "beams_min submap_keyframes depth_beams depth_stride_px"
+_AT_LEAST_1 = "beams_min submap_keyframes depth_beams depth_stride_px lidar_beams"
 _RATIO = "inlier_min_ratio degeneracy_ratio"
 
 
 @dataclass(kw_only=True, eq=False)
 class LaserSlam:
-    """2D SLAM from a laser, or from depth seen as one: x, y and yaw in `local`.
+    """2D SLAM from a laser, or a lidar or depth seen as one: x, y and yaw in `local`.
 
     The fields are the settings; `conf/slam/laser.yaml` says what each one is.
     """
@@ -63,7 +65,8 @@ class LaserSlam:
     height_max_m: float | None
     depth_beams: int
     depth_stride_px: int
-    _scanner: DepthScanner | None = field(default=None, init=False)
+    lidar_beams: int
+    _scanner: DepthScanner | LidarScanner | None = field(default=None, init=False)
     _front_end: FrontEnd | None = field(default=None, init=False)
     _T_base_laser: se3.Transform = field(default_factory=se3.identity, init=False)
     _T_map_local: se3.Transform = field(default_factory=se3.identity, init=False)
@@ -84,24 +87,19 @@ class LaserSlam:
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
         """Return the sensors, one of which suffices; odometry and gyro are used when present."""
-        return (frozenset({Sensor.SCAN}), frozenset({Sensor.DEPTH}))
+        return (
+            frozenset({Sensor.SCAN}),
+            frozenset({Sensor.POINTS}),
+            frozenset({Sensor.DEPTH}),
+        )
 
     def activate(self, rig: Rig) -> None:
-        """Start anew, with the laser where there is one, else with the depth camera."""
-        self._scanner = None
-        self._T_base_laser = se3.identity()
-        if Sensor.SCAN in rig.sensors or rig.camera is None:
-            if rig.laser is not None:
-                self._T_base_laser = rig.laser.T_base_laser
-        else:
-            self._scanner = DepthScanner(
-                rig.camera,
-                height_min_m=self.height_min_m,
-                height_max_m=self.height_max_m,
-                beams=self.depth_beams,
-                stride_px=self.depth_stride_px,
-            )
+        """Start anew, with the laser where there is one, else a lidar's slice, else depth."""
+        self._scanner = self._make_scanner(rig)
+        if self._scanner is not None:
             self._T_base_laser = self._scanner.T_base_laser
+        else:
+            self._T_base_laser = se3.identity() if rig.laser is None else rig.laser.T_base_laser
         self._front_end = self._make_front_end()
         self._T_map_local = se3.identity()
         self._T_local_base = se3.identity()
@@ -137,6 +135,7 @@ class LaserSlam:
         """Return all poses with every loop closed."""
         if self._front_end is None:
             return Trajectory.empty()
+        self._front_end.back_end.finish()
         return self._front_end.history.trajectory()
 
     def get_map(self) -> MapLayers:
@@ -146,9 +145,7 @@ class LaserSlam:
         return map_layers(
             self._front_end.keyframes,
             self._front_end.back_end.graph.edges,
-            self._T_base_laser,
             resolution_m=self.resolution_m,
-            range_max_m=self.range_max_m,
         )
 
     def shutdown(self) -> None:
@@ -156,13 +153,42 @@ class LaserSlam:
         self._scanner = None
 
     def _scan(self, observation: Observation) -> LaserScan | None:
-        if self._scanner is None or observation.depth_m is None:
-            return observation.scan
-        return self._scanner.scan(observation.depth_m, stamp_ns=observation.stamp_ns)
+        stamp_ns = observation.stamp_ns
+        if isinstance(self._scanner, LidarScanner) and observation.points_lidar is not None:
+            return self._scanner.scan(observation.points_lidar, stamp_ns=stamp_ns)
+        if isinstance(self._scanner, DepthScanner) and observation.depth_m is not None:
+            return self._scanner.scan(observation.depth_m, stamp_ns=stamp_ns)
+        return observation.scan
+
+    def _make_scanner(self, rig: Rig) -> DepthScanner | LidarScanner | None:
+        if Sensor.SCAN in rig.sensors:
+            return None
+        if rig.lidar is not None and Sensor.POINTS in rig.sensors:
+            return LidarScanner(
+                rig.lidar,
+                height_min_m=self.height_min_m,
+                height_max_m=self.height_max_m,
+                beams=self.lidar_beams,
+            )
+        if rig.camera is None:
+            return None
+        return DepthScanner(
+            rig.camera,
+            height_min_m=self.height_min_m,
+            height_max_m=self.height_max_m,
+            beams=self.depth_beams,
+            stride_px=self.depth_stride_px,
+        )
 
     def _make_front_end(self) -> FrontEnd:
-        from_depth = self._scanner is not None
+        from_depth = isinstance(self._scanner, DepthScanner)
         keyframes = Keyframes(
+            reader=SurfaceReader(
+                T_base_laser=self._T_base_laser,
+                range_max_m=self.range_max_m,
+                noise_m=self.depth_noise_m if from_depth else self.laser_noise_m,
+                noise_per_m=self.depth_noise_per_m if from_depth else 0.0,
+            ),
             keyframe_distance_m=self.keyframe_distance_m,
             keyframe_angle_rad=self.keyframe_angle_rad,
             submap_keyframes=self.submap_keyframes,
@@ -176,14 +202,10 @@ class LaserSlam:
         return FrontEnd(
             settings=ScanSettings(
                 resolution_m=self.resolution_m,
-                range_max_m=self.range_max_m,
-                noise_m=self.depth_noise_m if from_depth else self.laser_noise_m,
-                noise_per_m=self.depth_noise_per_m if from_depth else 0.0,
                 beams_min=self.beams_min,
                 inlier_min_ratio=self.inlier_min_ratio,
                 predict_max_s=self.predict_max_s,
             ),
-            T_base_laser=self._T_base_laser,
             matcher=matcher,
             motion=MotionModel(
                 odometry_noise_ratio=self.odometry_noise_ratio,

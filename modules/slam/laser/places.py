@@ -52,7 +52,7 @@ class Places:
         frames = self.keyframes.frames
         T_local_anchor = frames[anchor].T_local_base
         parts = [
-            frames[i].surfaces_base.moved(between(T_local_anchor, frames[i].T_local_base))
+            self.keyframes.surfaces_base(i).moved(between(T_local_anchor, frames[i].T_local_base))
             for i in numbers
         ]
         return Place(anchor=anchor, field=LikelihoodField(joined(parts), self.resolution_m))

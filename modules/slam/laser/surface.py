@@ -55,31 +55,33 @@ def joined(parts: Sequence[SurfacePoints]) -> SurfacePoints:
     )
 
 
-def read_surfaces(
-    scan: LaserScan,
-    T_base_laser: se3.Transform,
-    *,
-    range_max_m: float,
-    noise_m: float,
-    noise_per_m: float,
-) -> SurfacePoints:
-    """Return a scan's returns in base's xy plane, in the order of the beams.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SurfaceReader:
+    """Reads the scans of one laser.
 
     A range's standard deviation is noise_m + noise_per_m * range^2 (0 for a laser; that of a
     triangulating camera grows so).
     """
-    ranges = scan.ranges_m.astype(np.float64)
-    limit = min(range_max_m, scan.range_max_m)
-    beam = np.flatnonzero(np.isfinite(ranges) & (ranges > scan.range_min_m) & (ranges <= limit))
-    r, angle = ranges[beam], scan.angles_rad[beam].astype(np.float64)
-    points_laser = np.column_stack([r * np.cos(angle), r * np.sin(angle)])
-    points_base = points_laser @ T_base_laser[:2, :2].T + T_base_laser[:2, 3]
-    spacing = np.maximum(r * abs(scan.angle_step_rad), 1e-4)
-    return SurfacePoints(
-        points=points_base,
-        shape=_shape(points_base, spacing),
-        weight=1.0 / (noise_m + noise_per_m * r * r) ** 2,
-    )
+
+    T_base_laser: se3.Transform
+    range_max_m: float
+    noise_m: float
+    noise_per_m: float
+
+    def read(self, scan: LaserScan) -> SurfacePoints:
+        """Return a scan's returns in base's xy plane, in the order of the beams."""
+        ranges = scan.ranges_m.astype(np.float64)
+        limit = min(self.range_max_m, scan.range_max_m)
+        beam = np.flatnonzero(np.isfinite(ranges) & (ranges > scan.range_min_m) & (ranges <= limit))
+        r, angle = ranges[beam], scan.angles_rad[beam].astype(np.float64)
+        points_laser = np.column_stack([r * np.cos(angle), r * np.sin(angle)])
+        points_base = points_laser @ self.T_base_laser[:2, :2].T + self.T_base_laser[:2, 3]
+        spacing = np.maximum(r * abs(scan.angle_step_rad), 1e-4)
+        return SurfacePoints(
+            points=points_base,
+            shape=_shape(points_base, spacing),
+            weight=1.0 / (self.noise_m + self.noise_per_m * r * r) ** 2,
+        )
 
 
 def _shape(points: Array, spacing_m: Array) -> Array:

@@ -1,0 +1,76 @@
+"""A planar laser scan made of a lidar's points: the slice of the world at the lidar's height.
+
+The scan's frame `laser` lies in base's z = 0 plane below (or above) the lidar and looks along the
+lidar's x: T_base_laser = (lidar x, lidar y, yaw of its x axis). Heights are base's, so that a
+tilted lidar gives a level slice.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.observation import LaserScan
+from sceneslam.types.rig import Lidar
+
+
+class LidarScanner:
+    """Makes scans of one lidar's clouds: the nearest return per beam within a band of heights."""
+
+    def __init__(
+        self,
+        lidar: Lidar,
+        *,
+        height_min_m: float | None,
+        height_max_m: float | None,
+        beams: int,
+    ) -> None:
+        """Place the scans' frame.
+
+        The band [height_min_m, height_max_m] is above base. None: 0.15 m below (above) the lidar.
+        `beams` cover the full turn.
+        """
+        T_base_lidar = lidar.T_base_lidar
+        height_m = float(T_base_lidar[2, 3])
+        self.band_m = (
+            height_m - 0.15 if height_min_m is None else height_min_m,
+            height_m + 0.15 if height_max_m is None else height_max_m,
+        )
+        if self.band_m[0] >= self.band_m[1]:
+            raise ConfigError("height_max_m", self.band_m[1], f"above {self.band_m[0]:g} m")
+        if beams < 2:
+            raise ConfigError("beams", beams, "2 or more")
+        x_m, y_m = T_base_lidar[:2, 3]
+        self.T_base_laser = se3.from_xy_yaw(x_m, y_m, se3.yaw_rad(T_base_lidar))
+        self._T_laser_lidar = se3.inverse(self.T_base_laser) @ T_base_lidar
+        self._range_m, self._beams = lidar.range_m, beams
+
+    def scan(self, points_lidar: NDArray[np.float32], *, stamp_ns: int) -> LaserScan:
+        """Return the slice of a cloud (N, 3) [m], lidar frame.
+
+        A beam without a return in the band is NaN: most of a lidar's beams point elsewhere.
+        Raises InputError when the cloud has another shape.
+        """
+        if points_lidar.ndim != 2 or points_lidar.shape[1] != 3:
+            raise InputError(f"points_lidar: expected (N, 3), got {points_lidar.shape}")
+        x, y, z = se3.apply(self._T_laser_lidar, points_lidar).T
+        away = np.hypot(x, y)
+        nearest_m, farthest_m = self._range_m
+        valid = (z >= self.band_m[0]) & (z <= self.band_m[1])
+        valid &= (away >= nearest_m) & (away <= farthest_m)  # false for NaN and for infinity
+        step_rad = 2 * np.pi / self._beams
+        beam = np.floor((np.arctan2(y[valid], x[valid]) + np.pi) / step_rad).astype(np.int64)
+        ranges = np.full(self._beams, np.inf, dtype=np.float32)
+        np.minimum.at(ranges, np.minimum(beam, self._beams - 1), away[valid].astype(np.float32))
+        ranges[np.isinf(ranges)] = np.nan
+        ranges.flags.writeable = False
+        return LaserScan(
+            stamp_ns=stamp_ns,
+            ranges_m=ranges,
+            angle_min_rad=-np.pi + 0.5 * step_rad,
+            angle_step_rad=step_rad,
+            range_min_m=nearest_m,
+            range_max_m=farthest_m,
+        )
