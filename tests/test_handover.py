@@ -107,6 +107,7 @@ def test_cold_loses_the_motion_of_the_start():
     assert np.diff(atlas.trajectory.stamps_ns)[gap] == 2e9
     np.testing.assert_allclose(*atlas.trajectory.T_world_base[[gap, gap + 1]], atol=1e-12)
     assert events(log, "handover")[1]["gap_s"] == 2.0
+    assert events(log, "decision")[1]["from"] == "bright"
 
 
 def test_cold_hands_over_the_last_pose_of_a_lost_module():

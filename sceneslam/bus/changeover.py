@@ -66,6 +66,7 @@ class Changeover:
         self._run_began_ns: int | None = None
         self._plan: Plan | None = None
         self._queue: list[str] = []
+        self._replaced: str | None = None  # the module that the plan is to replace
         self._attempt: _Attempt | None = None
         self._trial: _Attempt | None = None
 
@@ -87,6 +88,8 @@ class Changeover:
         if plan.reason != "return":
             self._end_trial()
         self._plan, self._queue = plan, list(plan.keys)
+        active = self._estimator.active
+        self._replaced = active.key if active is not None else None
 
     def go_on(self, stamp_ns: int) -> Outcome | None:
         """Bring the change on: with the next candidate, or by one observation; None meanwhile."""
@@ -176,12 +179,11 @@ class Changeover:
             return self._refuse(runner, stamp_ns, "failed")
         if attempt.handover.is_lost and self._can_refuse():
             return self._refuse(runner, stamp_ns, "lost")
-        previous = self._estimator.active.key if self._estimator.active else None
         self._estimator.accept(attempt.handover)
         self.switched_ns = stamp_ns
         is_in_vain = self._plan.held_ns < round(self._policy.confirm_window_s * 1e9)
         self._candidates.postpone(stamp_ns, is_in_vain=is_in_vain)
-        self._log_choice("decision", stamp_ns, attempt.key, previous)
+        self._log_choice("decision", stamp_ns, attempt.key)
         return True
 
     def _can_refuse(self) -> bool:
@@ -194,20 +196,17 @@ class Changeover:
 
     def _refuse(self, runner: Runner, stamp_ns: int, why: str) -> bool:
         runner.retire()
-        previous = self._estimator.active.key if self._estimator.active else None
         self._candidates.postpone(stamp_ns, is_in_vain=True)
-        self._log_choice("refused", stamp_ns, runner.key, previous, why=why)
+        self._log_choice("refused", stamp_ns, runner.key, why=why)
         return False
 
-    def _log_choice(
-        self, event: str, stamp_ns: int, key: str, previous: str | None, **more: str
-    ) -> None:
+    def _log_choice(self, event: str, stamp_ns: int, key: str, **more: str) -> None:
         assert self._plan is not None
         self._log.add(
             event,
             stamp_ns,
             scene=self._scene,
-            **{"from": previous, "to": key},
+            **{"from": self._replaced, "to": key},
             reason=self._plan.reason,
             decided_ns=self._plan.at_ns,
             **more,
