@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from .keyframes import Keyframes
 from .loop_closure import LoopCloser
+from .planar import between
 from .pose_graph import Edge, PoseGraph, optimise
+
+_FELT = np.array([5e-3, 5e-3, 2e-3])  # m, m, rad: less is within the noise of the pose itself
 
 
 @dataclass(slots=True)
@@ -14,7 +19,7 @@ class BackEnd:
     """Takes keyframes one by one, and moves all of them when a loop closes."""
 
     keyframes: Keyframes
-    closer: LoopCloser
+    closer: LoopCloser | None  # None: odometry by laser alone
     graph: PoseGraph = field(default_factory=PoseGraph)
     revision: int = field(default=0, init=False)
 
@@ -32,16 +37,18 @@ class BackEnd:
                     is_loop=False,
                 )
             )
-        loops = self.closer.close(number)
+        loops = [] if self.closer is None else self.closer.close(number)
         for edge in loops:
             self.graph.add(edge)
         if not loops:
             return False
+        told = frames[-1].T_local_base
         self.keyframes.move(self.graph.smooth(self.keyframes.poses))
-        self.revision += 1
+        moved = np.abs(between(told, frames[-1].T_local_base))
+        self.revision += bool((moved > _FELT).any())
         return True
 
     def finish(self) -> None:
         """Fit all edges once more, from the poses as they are."""
-        if self.revision:
+        if any(edge.is_loop for edge in self.graph.edges):
             self.keyframes.move(optimise(self.graph.edges, self.keyframes.poses))

@@ -57,6 +57,7 @@ class LaserSlam:
     keyframe_distance_m: float
     keyframe_angle_rad: float
     submap_keyframes: int
+    close_loops: bool
     odometry_noise_ratio: float
     odometry_turn_rad_per_m: float
     gyro_noise_rad_s: float
@@ -198,7 +199,7 @@ class LaserSlam:
             window_rad=self.window_rad,
             degeneracy_ratio=self.degeneracy_ratio,
         )
-        places = Places(keyframes, self.resolution_m)
+        closer = LoopCloser(keyframes, Places(keyframes, self.resolution_m), matcher)
         return FrontEnd(
             settings=ScanSettings(
                 resolution_m=self.resolution_m,
@@ -214,7 +215,7 @@ class LaserSlam:
             ),
             keyframes=keyframes,
             history=History(keyframes),
-            back_end=BackEnd(keyframes, LoopCloser(keyframes, places, matcher)),
+            back_end=BackEnd(keyframes, closer if self.close_loops else None),
         )
 
 

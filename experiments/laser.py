@@ -1,0 +1,188 @@
+"""Print what the 2D laser module makes of a CARMEN log with relations, beside wheel odometry.
+
+    python experiments/laser.py LOG RELATIONS                     # odometry, no loops, loops
+    python experiments/laser.py LOG RELATIONS harder              # the same log made harder
+    python experiments/laser.py LOG RELATIONS profile             # where the time goes
+    python experiments/laser.py LOG RELATIONS maps FOLDER         # pictures of the map
+
+Errors are over all relations (Kuemmerle et al., 2009), time is CPU time of the whole run.
+"""
+
+from __future__ import annotations
+
+import cProfile
+import pstats
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
+from time import process_time
+
+import cv2
+import numpy as np
+import yaml
+
+from sceneslam.evaluation.relations import Relations, relation_errors
+from sceneslam.modules.slam.laser.module import LaserSlam
+from sceneslam.sources.carmen import Carmen
+from sceneslam.types.maps import GridLayer
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig
+from sceneslam.types.trajectory import Trajectory
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+HEAD = "| run | trans [m] | rot [deg] | told: trans, rot | x real time | ms: median, p99, max |"
+
+
+def settings(path: str) -> dict[str, object]:
+    """Return a component's values."""
+    values: dict[str, object] = yaml.safe_load((CONF / path).read_text())
+    values.pop("_target_")
+    return values
+
+
+def backwards(observations: list[Observation]) -> Iterator[Observation]:
+    """Yield the log from its end; stamps are mirrored, and mirrored back by `unmirror`."""
+    last_ns = observations[-1].stamp_ns
+    for observation in reversed(observations):
+        yield restamped(observation, 2 * last_ns - observation.stamp_ns)
+
+
+def restamped(observation: Observation, stamp_ns: int) -> Observation:
+    """Return an observation at another stamp."""
+    return replace(
+        observation, stamp_ns=stamp_ns, scan=replace(observation.scan, stamp_ns=stamp_ns)
+    )
+
+
+def seen_by_less(observations: Iterable[Observation], fov_deg: float, range_m: float):
+    """Yield scans of a narrower and shorter view."""
+    for observation in observations:
+        ranges_m = observation.scan.ranges_m.copy()
+        outside = np.abs(observation.scan.angles_rad) > np.radians(fov_deg / 2)
+        ranges_m[outside | (ranges_m > range_m)] = np.nan
+        yield replace(observation, scan=replace(observation.scan, ranges_m=ranges_m))
+
+
+class Run:
+    """One pass of the laser module over a log."""
+
+    def __init__(self, rig: Rig, observations: Iterable[Observation], **changes: object) -> None:
+        self.module = LaserSlam(**{**settings("slam/laser.yaml"), **changes})
+        self.module.activate(rig)
+        self.costs_ms, poses, stamps = [], [], []
+        began_s = process_time()
+        for observation in observations:
+            before_s = process_time()
+            tracking = self.module.track(observation)
+            self.costs_ms.append((process_time() - before_s) * 1e3)
+            poses.append(tracking.T_local_base)
+            stamps.append(observation.stamp_ns)
+        self.online = Trajectory(stamps_ns=np.array(stamps), T_world_base=np.stack(poses))
+        self.revised = self.module.get_trajectory()
+        self.map = self.module.get_map()
+        self.cpu_s = process_time() - began_s
+
+    def row(self, name: str, relations: Relations, mirror_ns: int = 0) -> str:
+        """Return a line of the table."""
+        revised, online = (
+            relation_errors(unmirrored(one, mirror_ns), relations)
+            for one in (self.revised, self.online)
+        )
+        span_s = np.ptp(self.online.stamps_ns) * 1e-9
+        costs = np.array(self.costs_ms)
+        return (
+            f"| {name} | {spread(revised, 'trans', 'm')} | {spread(revised, 'rot', 'deg')} "
+            f"| {online['trans_mean_m']:.3f}, {online['rot_mean_deg']:.2f} "
+            f"| {span_s / self.cpu_s:.0f} "
+            f"| {np.median(costs):.1f}, {np.percentile(costs, 99):.1f}, {costs.max():.0f} |"
+        )
+
+
+def unmirrored(trajectory: Trajectory, mirror_ns: int) -> Trajectory:
+    """Return a trajectory with the stamps of the log."""
+    if not mirror_ns:
+        return trajectory
+    return Trajectory(
+        stamps_ns=2 * mirror_ns - trajectory.stamps_ns[::-1],
+        T_world_base=trajectory.T_world_base[::-1],
+    )
+
+
+def spread(errors: dict[str, float], kind: str, unit: str) -> str:
+    """Return mean and deviation."""
+    return f"{errors[f'{kind}_mean_{unit}']:.4f} +- {errors[f'{kind}_std_{unit}']:.4f}"
+
+
+def draw(grid: GridLayer, path: Path) -> None:
+    """Write a grid as a picture at two cells per pixel."""
+    shade = np.where(grid.log_odds > 0, 0, np.where(grid.log_odds < 0, 255, 205)).astype(np.uint8)
+    rows, columns = np.nonzero(grid.log_odds)
+    shade = shade[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1][::-1]
+    half = cv2.erode(shade, np.ones((2, 2), np.uint8))[::2, ::2]
+    cv2.imwrite(str(path), half, [cv2.IMWRITE_PNG_COMPRESSION, 9, cv2.IMWRITE_PNG_BILEVEL, 0])
+
+
+def compare(source: Carmen, relations: Relations) -> None:
+    """Print odometry, the laser without loops, and with them; and what memory it took."""
+    observations = list(source)
+    odometry = relation_errors(
+        Trajectory(
+            stamps_ns=np.array([one.stamp_ns for one in observations]),
+            T_world_base=np.stack([one.T_odom_base for one in observations]),
+        ),
+        relations,
+    )
+    print(f"{HEAD}\n|---|---|---|---|---|---|")
+    print(
+        f"| wheel odometry | {spread(odometry, 'trans', 'm')} "
+        f"| {spread(odometry, 'rot', 'deg')} | | | |"
+    )
+    print(Run(source.rig, observations, close_loops=False).row("no loops", relations))
+    before_mb = getrusage(RUSAGE_SELF).ru_maxrss / 1e3
+    run = Run(source.rig, observations)
+    print(run.row("with loops", relations))
+    graph = run.map.pose_graph
+    print(
+        f"\n{odometry['matched']} of {odometry['total']} relations matched; "
+        f"{len(graph.stamps_ns)} keyframes, {graph.is_loop.sum()} loops, "
+        f"{run.module.track(observations[-1]).revision} corrections; peak memory "
+        f"{getrusage(RUSAGE_SELF).ru_maxrss / 1e3:.0f} MB, {before_mb:.0f} MB before closing loops"
+    )
+
+
+def harder(source: Carmen, relations: Relations) -> None:
+    """Print how the module does where it sees less, or the same from the other end."""
+    observations = list(source)
+    last_ns = observations[-1].stamp_ns
+    print(f"{HEAD}\n|---|---|---|---|---|---|")
+    print(Run(source.rig, backwards(observations)).row("backwards", relations, last_ns), flush=True)
+    print(Run(source.rig, observations[::3]).row("every third scan", relations), flush=True)
+    for fov_deg, range_m in ((180, 5), (90, 8), (57, 4)):
+        view = seen_by_less(observations, fov_deg, range_m)
+        print(Run(source.rig, view).row(f"{fov_deg} deg, {range_m} m", relations), flush=True)
+
+
+def main() -> None:
+    """Run one of the commands above."""
+    cv2.setNumThreads(1)
+    log, relations_path, *words = sys.argv[1:]
+    source = Carmen(log, **{"range_max_m": settings("source/carmen.yaml")["range_max_m"]})
+    relations = Relations.read(Path(relations_path))
+    if words == ["harder"]:
+        harder(source, relations)
+    elif words == ["profile"]:
+        with cProfile.Profile() as profile:
+            Run(source.rig, source)
+        pstats.Stats(profile).sort_stats("tottime").print_stats(20)
+    elif words[:1] == ["maps"]:
+        for name, closes in (("laser_loops", True), ("laser_no_loops", False)):
+            grid = Run(source.rig, source, close_loops=closes).map.grid
+            draw(grid, Path(words[1]) / f"{name}.png")
+    else:
+        compare(source, relations)
+
+
+if __name__ == "__main__":
+    main()
