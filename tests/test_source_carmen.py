@@ -75,6 +75,14 @@ def test_new_lines_say_their_angles_and_mount(tmp_path: Path) -> None:
     np.testing.assert_allclose(source.rig.laser.T_base_laser[:2, 3], [0.25, 0.0])
 
 
+def test_a_scan_that_is_told_in_both_ways_is_read_once(tmp_path: Path) -> None:
+    new = (
+        "ROBOTLASER1 0 -1.0 2.0 0.5 30.0 0.01 0 2 1.0 2.0 0 0 0 0 0 0 0 0 0 0.1 0.1 0 7.5 host 0.1"
+    )
+    (one,) = make_source("carmen", write(tmp_path / "a.log", new, flaser([2.0] * 180, "7.5")))
+    assert len(one.scan.ranges_m) == 2
+
+
 def test_a_cut_off_line_is_passed_over_and_told(tmp_path: Path) -> None:
     whole = flaser([2.0] * 180, "1.0")
     path = write(tmp_path / "a.log", whole, whole[:200], flaser([2.0] * 180, "3.0"))

@@ -125,8 +125,10 @@ class Carmen:
             )
 
     def _scan_lines(self) -> Sequence[bytes]:
-        data = self._path.read_bytes()
-        return [line for line in data.splitlines() if line.startswith((FLASER, ROBOTLASER))]
+        """Return the lines of the kind there is more of: some logs tell each scan in both ways."""
+        lines = self._path.read_bytes().splitlines()
+        new, old = ([one for one in lines if one.startswith(kind)] for kind in (ROBOTLASER, FLASER))
+        return new if len(new) >= len(old) else old
 
     def _offset_m(self) -> float:
         """Return how far the laser sits before the robot's centre, 0 where the log is silent."""

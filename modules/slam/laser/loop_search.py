@@ -20,7 +20,7 @@ _CELL_M = 0.1  # or a little more: the finest shift; the refinement goes on from
 _LEVELS = 4  # shifts of 0.1, 0.2, 0.4, 0.8 m
 _POINTS = 100  # of the scan; more do not change what is found
 _BEAM = 32  # nodes of the first descent, whose score is the bound of the second
-_NODES_MAX = 20_000  # per level: a corridor looks alike in all of them
+_NODES_MAX = 4000  # per level, the best: where more are as good, the answer is ambiguous
 _ALIKE_RATIO = 0.85  # a second place that fits as well as this share of the best ...
 _APART_M, _APART_RAD = 0.5, 0.15  # ... and is so far from it makes the answer ambiguous
 
