@@ -1,1 +1,1 @@
-"""Every story under every strategy: does switching ever do worse than one module alone?"""
+"""Every story of the simulator under every strategy."""
