@@ -247,3 +247,58 @@ def test_start_of_a_real_drive_is_followed(shared_data):
     driven = np.linalg.norm(positions[-1])
     expected = np.linalg.norm(truth.positions_m[15] - truth.positions_m[2])
     assert driven == pytest.approx(expected, abs=0.4)
+
+
+def bare(T_world_lidar, *, seed, ends):
+    """Return a cloud of a corridor along x, 3 m wide, without ends or with walls at +-12 m."""
+    rng = np.random.default_rng(seed)
+    x, face = rng.uniform(-25, 25, 8000), rng.integers(0, 4, 8000)
+    across = rng.uniform(-1.5, 1.5, 8000)
+    y = np.choose(face, [-1.5, 1.5, across, across])
+    z = np.choose(face, [across, across, -1.2, 1.3])
+    walls = np.column_stack([x + T_world_lidar[0, 3], y, z])
+    if ends:
+        walls = walls[np.abs(walls[:, 0]) < 12]
+        sides = rng.uniform(-1.2, 1.2, (2, 800, 2))
+        for end, side in zip((-12.0, 12.0), sides, strict=True):
+            walls = np.vstack([walls, np.column_stack([np.full(800, end), side])])
+    return seen(walls, T_world_lidar, seed=seed)
+
+
+def walk(module, *, ends, odometry, count=20):
+    """Return what the module tells of 0.1 m per cloud along the corridor."""
+    poses = [se3.from_xy_yaw(0.1 * index, 0.0, 0.0) for index in range(count)]
+    return [
+        module.track(
+            Observation(
+                stamp_ns=index * 100_000_000,
+                points_lidar=bare(T, seed=index, ends=ends),
+                T_odom_base=T if odometry else None,
+            )
+        )
+        for index, T in enumerate(poses)
+    ], poses
+
+
+def test_bare_corridor_is_degraded_along_its_axis_and_odometry_fills_it():
+    trackings, poses = walk(active(), ends=False, odometry=True)
+    assert {tracking.status for tracking in trackings} == {TrackingStatus.DEGRADED}
+    _, directions = np.linalg.eigh(trackings[-1].covariance[:3, :3])
+    assert abs(directions[0, -1]) > 0.99
+    assert worst_error_m(trackings, poses) < 0.05
+
+
+def test_noise_does_not_move_the_pose_along_what_is_not_seen():
+    trackings, _ = walk(active(), ends=False, odometry=False)
+    assert {tracking.status for tracking in trackings} == {TrackingStatus.DEGRADED}
+    assert abs(trackings[-1].T_local_base[0, 3]) < 0.1
+    dragged, _ = walk(active(weak_ratio=0.0), ends=False, odometry=False)
+    assert abs(dragged[-1].T_local_base[0, 3]) > 0.3  # neither at rest nor the 1.9 m walked
+    deviations = [np.sqrt(tracking.covariance[0, 0]) for tracking in trackings]
+    assert deviations == sorted(deviations) and deviations[-1] > 2 * deviations[1]
+
+
+def test_ends_of_the_corridor_hold_it():
+    trackings, poses = walk(active(), ends=True, odometry=True)
+    assert {tracking.status for tracking in trackings} == {TrackingStatus.TRACKING}
+    assert worst_error_m(trackings, poses) < 0.06

@@ -76,8 +76,11 @@ class CloudReader:
         """Tell which points are measurements; a camera's range is its depth."""
         near_m, far_m = self.range_m
         with np.errstate(invalid="ignore", over="ignore"):
-            reach = points_sensor[:, 2] if self.is_depth else np.linalg.norm(points_sensor, axis=1)
-        return np.asarray((reach >= near_m) & (reach <= far_m))  # false for NaN
+            if self.is_depth:
+                reach = points_sensor[:, 2]
+                return np.asarray((reach >= near_m) & (reach <= far_m))  # false for NaN
+            square = np.einsum("ij,ij->i", points_sensor, points_sensor)
+            return np.asarray((square >= near_m**2) & (square <= far_m**2))
 
 
 def _moved(points: Cloud, times_s: NDArray[np.float64], twist_s: NDArray[np.float64]) -> Cloud:

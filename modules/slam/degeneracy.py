@@ -22,7 +22,7 @@ Doubles = NDArray[np.float64]
 class Localizability:
     """Ratios between 0 (open) and about 1 (normals to all sides), and their directions.
 
-    A direction is a motion about the points' centre, turns times their spread: all in metres.
+    A direction is a motion about the points' centre, by the way that the points make in it.
     """
 
     ratios: Doubles  # (6,), rising
@@ -47,14 +47,17 @@ def localizability(
     """Return how points (N, 3) [m] with unit normals hold a pose; `weights` (N,) say how much."""
     total = max(float(weights.sum()), 1e-12)
     centre = (weights @ points) / total
-    offsets = points - centre
-    spread_m = np.sqrt(float(weights @ np.einsum("ij,ij->i", offsets, offsets)) / total) + 1e-9
-    rows = np.concatenate([normals, np.cross(offsets, normals) / spread_m], axis=1)
-    rows = rows.astype(np.float64)
+    offsets = (points - centre).astype(np.float64)
+    moments = offsets.T @ (offsets * weights[:, None]) / total
+    inertia = np.trace(moments) * np.eye(3) - moments
+    squares, axes = np.linalg.eigh(inertia)
+    turn_m = axes @ np.diag(np.sqrt(np.maximum(squares, 1e-12))) @ axes.T  # [m/rad], symmetric
+    turns = np.linalg.solve(turn_m, np.cross(offsets, normals).T).T
+    rows = np.concatenate([normals, turns], axis=1)
     shape = 3.0 * rows.T @ (rows * weights[:, None]) / total
     ratios, directions = np.linalg.eigh(shape)
     return Localizability(
-        ratios=np.maximum(ratios, 0.0), directions=directions, scale=_motion_of(centre, spread_m)
+        ratios=np.maximum(ratios, 0.0), directions=directions, scale=_motion_of(centre, turn_m)
     )
 
 
@@ -66,10 +69,10 @@ def adjoint(T_a_b: Transform) -> Doubles:
     return ad
 
 
-def _motion_of(centre: NDArray[np.floating], spread_m: float) -> Doubles:
+def _motion_of(centre: NDArray[np.floating], turn_m: Doubles) -> Doubles:
     scale = np.eye(6)
     scale[:3, 3:] = -_hat(centre)
-    scale[3:, 3:] *= spread_m
+    scale[3:, 3:] = turn_m
     return scale
 
 

@@ -9,7 +9,12 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 
+from .cloud_shape import cloud_localizability
 from .clouds import Cloud
+from .degeneracy import Localizability
+
+_SLOTS = 1 << 20
+_SHAPE_POINTS = 10_000  # suffice for the shape of a cloud
 
 
 class IcpMap:
@@ -45,7 +50,9 @@ class IcpMap:
             ),
         )
         self._odometry: Any = KissICP(config)
-        self._voxel_m = voxel_m
+        self._voxel_m, self._range_max_m = voxel_m, range_max_m
+        self._known = np.zeros(_SLOTS, np.bool_)
+        self._marked_at = np.zeros(3)
 
     def register(self, cloud: Cloud, T_local_guess: se3.Transform) -> se3.Transform:
         """Return T_local_base of a cloud (N, 3) in base."""
@@ -62,25 +69,31 @@ class IcpMap:
 
     def overlap(self, T_local_base: se3.Transform) -> tuple[float, int]:
         """Return the share and the number of points whose voxel the map knows."""
-        known = _voxel_keys(self.points(), self._voxel_m)
-        keys = _voxel_keys(se3.apply(T_local_base, self._source), self._voxel_m)
-        inliers = int(np.isin(keys, known).sum())
-        return inliers / max(len(keys), 1), inliers
+        inliers = int(self._known[self._slots(se3.apply(T_local_base, self._source))].sum())
+        return inliers / max(len(self._source), 1), inliers
+
+    def localizability(self) -> Localizability:
+        """Return how well the last cloud's shape holds the pose, in base."""
+        thinned = self._dense[:: max(1, round(len(self._dense) / _SHAPE_POINTS))]
+        return cloud_localizability(thinned, 2.0 * self._voxel_m)
 
     def accept(self, T_local_guess: se3.Transform, T_local_base: se3.Transform) -> None:
         """Add the last cloud to the map, and learn how good guesses are."""
         deviation = se3.inverse(T_local_guess) @ T_local_base
         self._odometry.adaptive_threshold.update_model_deviation(deviation)
         self._odometry.local_map.update(self._dense, T_local_base)
+        if np.linalg.norm(T_local_base[:3, 3] - self._marked_at) > 0.5 * self._range_max_m:
+            self._known[:] = False  # the library forgets what is out of range
+            self._known[self._slots(self.points())] = True
+            self._marked_at = T_local_base[:3, 3]
+        self._known[self._slots(se3.apply(T_local_base, self._dense))] = True
 
     def points(self) -> NDArray[np.float64]:
         """Return the map's points (N, 3) [m], local."""
         return np.asarray(self._odometry.local_map.point_cloud()).reshape(-1, 3)
 
-
-def _voxel_keys(points: NDArray[Any], voxel_m: float) -> NDArray[np.int64]:
-    """Return one number per point that names its voxel."""
-    cells = np.floor(points / voxel_m).astype(np.int64)
-    return np.asarray(
-        (cells[:, 0] * 73856093) ^ (cells[:, 1] * 19349669) ^ (cells[:, 2] * 83492791)
-    )
+    def _slots(self, points: NDArray[Any]) -> NDArray[np.int64]:
+        """Return each point's place in the table of known voxels; few share one."""
+        cells = np.floor(points / self._voxel_m).astype(np.int64)
+        keys = (cells[:, 0] * 73856093) ^ (cells[:, 1] * 19349669) ^ (cells[:, 2] * 83492791)
+        return np.asarray(keys & (_SLOTS - 1))

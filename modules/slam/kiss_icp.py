@@ -19,6 +19,7 @@ from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
 from .clouds import CloudReader
+from .degeneracy import Localizability, adjoint
 from .icp_map import IcpMap
 
 _POINTS_MIN = 50  # fewer do not hold six degrees of freedom
@@ -30,6 +31,8 @@ _POSITIVE = (
     "speed_max_m_s turn_max_rad_s"
 )
 _STEP_DEVIATION = np.array([2e-4, 2e-4])  # m, rad: floor of odometry's per step
+_JERKED = np.array([3.0, 3.0])  # m/s^2, rad/s^2: how fast an unmeasured velocity changes
+_DIFFUSE = 1e6  # variances of a cloud: a prediction that ICP alone decides against
 
 
 @dataclass(kw_only=True, eq=False)
@@ -48,6 +51,7 @@ class KissIcp:
     noise_rad: float
     odometry_noise_ratio: float
     overlap_min_ratio: float
+    weak_ratio: float
     speed_max_m_s: float | None
     turn_max_rad_s: float
     _reader: CloudReader | None = field(default=None, init=False)
@@ -63,6 +67,8 @@ class KissIcp:
                 raise ConfigError(name, value, "above 0")
         if not 0 <= self.overlap_min_ratio <= 1:
             raise ConfigError("overlap_min_ratio", self.overlap_min_ratio, "0 to 1")
+        if not 0 <= self.weak_ratio < 1:
+            raise ConfigError("weak_ratio", self.weak_ratio, "0 (never weak) to below 1")
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
@@ -86,8 +92,9 @@ class KissIcp:
             iterations_max=self.iterations_max,
         )
         self._speed_max_m_s = self.speed_max_m_s or 0.5 * range_max_m
-        self._noise = np.array([self.noise_m or 0.2 * voxel_m, self.noise_rad]) ** 2
-        self._doubt = np.zeros(2)  # variance of position and rotation, by cloud and odometry
+        noise = np.array([self.noise_m or 0.2 * voxel_m, self.noise_rad]) ** 2
+        self._noise = np.repeat(noise, 3)  # variances of a registration
+        self._covariance = 1e-8 * np.eye(6)  # of the pose in base, beside the map around
         self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
         self._T_local_held = se3.identity()  # by the latest good cloud
         self._held_ns: int | None = None
@@ -121,10 +128,13 @@ class KissIcp:
             and self._is_plausible(observation.stamp_ns, T_local_guess, T_local_base)
         ):
             return self._bridge(observation, T_local_guess, can_coast=False)
-        T_local_base = self._fuse(T_local_guess, T_local_base)
+        shape = self._icp.localizability()
+        T_local_base = self._fuse(T_local_guess, T_local_base, shape)
         self._icp.accept(T_local_guess, T_local_base)
         self._hold(observation.stamp_ns, T_local_base)
-        return self._answer(observation, TrackingStatus.TRACKING, overlap_ratio, inliers)
+        is_held = bool(shape.ratios[0] >= self.weak_ratio)
+        status = TrackingStatus.TRACKING if is_held else TrackingStatus.DEGRADED
+        return self._answer(observation, status, overlap_ratio, inliers)
 
     def get_pose(self) -> se3.Transform:
         """Return T_map_base of the last observation."""
@@ -156,27 +166,40 @@ class KissIcp:
             return se3.identity()
         if T_odom_base is not None and T_odom_prev is not None:
             T_prev_curr = se3.inverse(T_odom_prev) @ T_odom_base
-            moved = np.array(
-                [np.linalg.norm(T_prev_curr[:3, 3]), se3.rotation_angle_rad(T_prev_curr)]
-            )
-            moved[1] += moved[0]  # a wheel's error per metre turns as many radians
-            self._doubt = self._doubt + (self.odometry_noise_ratio * moved + _STEP_DEVIATION) ** 2
-            return T_prev_curr
-        self._is_measured = False
-        return se3.exp(self._twist_s * (observation.stamp_ns - before_ns) * 1e-9)
+            moved = float(np.linalg.norm(T_prev_curr[:3, 3]))
+            # A wheel's error per metre turns as many radians.
+            turned = float(se3.rotation_angle_rad(T_prev_curr)) + moved
+            deviation = self.odometry_noise_ratio * np.array([moved, turned]) + _STEP_DEVIATION
+        else:
+            gap_s = (observation.stamp_ns - before_ns) * 1e-9
+            self._is_measured = False
+            T_prev_curr = se3.exp(self._twist_s * gap_s)
+            deviation = 0.5 * _JERKED * gap_s**2 + _STEP_DEVIATION
+        carry = adjoint(se3.inverse(T_prev_curr))
+        grown = np.diag(np.repeat(deviation**2, 3))
+        self._covariance = carry @ self._covariance @ carry.T + grown
+        return T_prev_curr
 
-    def _fuse(self, T_local_guess: se3.Transform, T_local_icp: se3.Transform) -> se3.Transform:
+    def _fuse(
+        self, T_local_guess: se3.Transform, T_local_icp: se3.Transform, shape: Localizability
+    ) -> se3.Transform:
         """Return the pose between odometry's and ICP's, by the doubt in each.
 
-        Point-to-point registration drags along smooth planes; without odometry its answer stands.
+        Point-to-point registration drags along smooth planes. Without odometry its answer stands,
+        but for the directions that the cloud's shape leaves open: there the prediction does.
         """
-        if not self._is_measured or self._held_ns is None:
-            self._doubt = self._noise
+        held = shape.held(self.weak_ratio)
+        information = held.T @ np.diag(1.0 / self._noise) @ held
+        predicted = self._covariance
+        fused = np.linalg.inv(np.linalg.inv(predicted) + information)
+        self._covariance = np.asarray(fused, np.float64)
+        if self._held_ns is None:
             return T_local_icp
-        gain = self._doubt / (self._doubt + self._noise)
-        self._doubt = (1.0 - gain) * self._doubt
-        step = se3.log(se3.inverse(T_local_guess) @ T_local_icp) * np.repeat(gain, 3)
-        return np.asarray(T_local_guess @ se3.exp(step))
+        if not self._is_measured:
+            predicted = _DIFFUSE * np.diag(self._noise)
+        gain = np.linalg.solve(np.linalg.inv(predicted) + information, information)
+        off = se3.log(se3.inverse(T_local_guess) @ T_local_icp)
+        return np.asarray(T_local_guess @ se3.exp(gain @ off))
 
     def _is_plausible(
         self, stamp_ns: int, T_local_guess: se3.Transform, T_local_base: se3.Transform
@@ -222,9 +245,7 @@ class KissIcp:
             stamp_ns=observation.stamp_ns,
             T_local_base=self._T_local_base.copy(),
             status=status,
-            covariance=None
-            if status is TrackingStatus.LOST
-            else np.diag(np.repeat(self._doubt + 1e-8, 3)),
+            covariance=None if status is TrackingStatus.LOST else self._covariance.copy(),
             quality_ratio=quality_ratio,
             inliers=inliers,
         )
