@@ -72,6 +72,17 @@ def test_one_stamp_far_ahead_does_not_cost_the_rest() -> None:
     assert seconds(Ordered(at(900, 1, 2, 3))) == [1, 2, 3]
 
 
+@pytest.mark.parametrize("wrong", [1.4, 2.0, 5.0, 90.0])
+def test_one_stamp_somewhat_ahead_does_not_cost_those_it_overtakes(wrong: float) -> None:
+    times = [0.1 * index for index in range(10)]
+    assert seconds(Ordered(at(*times, wrong, 1.0, 1.1))) == pytest.approx([*times, 1.0, 1.1])
+
+
+def test_frames_that_are_missing_are_no_wrong_stamps() -> None:
+    times = [0.0, 0.1, 0.2, 0.9, 1.0, 1.01, 1.1, 1.11, 3.0, 3.1]
+    assert seconds(Ordered(at(*times))) == times
+
+
 def test_a_gap_is_told_and_nothing_is_left_out() -> None:
     ordered = Ordered(at(1, 2, 10, 11), max_gap_s=5.0)
     assert seconds(ordered) == [1, 2, 10, 11]

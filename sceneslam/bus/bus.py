@@ -208,9 +208,13 @@ class Bus:
 
     def _track(self, observation: Observation) -> None:
         try:
-            self._estimator.track(observation, by_velocity=self.candidate_left())
+            self._estimator.track(observation, by_velocity=self._has_other())
         except ModuleError as error:
             self._fault(observation.stamp_ns, str(error))
+
+    def _has_other(self) -> bool:
+        """Tell whether another module could take over, or the failed one could be back."""
+        return any(key != self.active for key in self._candidates.of(self.scene))
 
     def _look(self, observation: Observation) -> Situation:
         """Return all that is known at an observation."""

@@ -28,11 +28,11 @@ class Candidates:
     def of(self, scene: str) -> tuple[str, ...]:
         """Return the modules of a scene that can run, in the table's order.
 
-        Where none can at once, those that are worth waiting for, if that is allowed.
+        Those that must be waited for are among them where that is allowed.
         """
-        keys = self._scenes.get(scene, ())
-        ready = tuple(key for key in keys if self._runners[key].can_run)
-        return ready or (self.returning(scene) if self._waits else ())
+        if self._waits:
+            return self.returning(scene)
+        return tuple(key for key in self._scenes.get(scene, ()) if self._runners[key].can_run)
 
     def returning(self, scene: str) -> tuple[str, ...]:
         """Return the modules of a scene that can run, at once or later."""

@@ -12,12 +12,14 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
 from sceneslam.types.truth import GroundTruth
 
+_PERIODS = 4  # one or two frames lost in a row are common
+
 
 class Ordered(Wrapped):
     """Leaves out observations whose stamps repeat or run backwards, and values that are NaN.
 
-    A single stamp far ahead of its neighbours is left out too, rather than all that follow it. A
-    gap longer than `max_gap_s` is reported.
+    A single stamp ahead of its neighbours, by more than a few of the source's own periods, is left
+    out too, rather than all that follow it. A gap longer than `max_gap_s` is reported.
     """
 
     def __init__(self, source: Source, max_gap_s: float = 5.0) -> None:
@@ -36,11 +38,12 @@ class Ordered(Wrapped):
         """Yield the source's observations by rising stamp."""
         self._log.clear()
         last_ns: int | None = None
+        period_ns = self._max_gap_ns // _PERIODS  # the longest of late
         held: Observation | None = None  # after a jump: it may be the jump that is wrong
         for observation in self._source:
             stamp_ns = observation.stamp_ns
             if held is not None:
-                is_back = stamp_ns < held.stamp_ns - self._max_gap_ns
+                is_back = stamp_ns < held.stamp_ns
                 if is_back and (last_ns is None or stamp_ns > last_ns):
                     self._skip(held)
                 else:
@@ -50,9 +53,10 @@ class Ordered(Wrapped):
                 held = None
             if last_ns is not None and stamp_ns <= last_ns:
                 self._skip(observation)
-            elif last_ns is None or stamp_ns - last_ns > self._max_gap_ns:
+            elif last_ns is None or stamp_ns - last_ns > _PERIODS * period_ns:
                 held = observation
             else:
+                period_ns = max(stamp_ns - last_ns, period_ns // 2)
                 last_ns = stamp_ns
                 yield cleaned(observation, self._log)
         if held is not None:
@@ -68,7 +72,7 @@ class Ordered(Wrapped):
         self._log.add(kind, at_stamp(observation.stamp_ns))
 
     def _note_gap(self, last_ns: int | None, stamp_ns: int) -> None:
-        if last_ns is not None:
+        if last_ns is not None and stamp_ns - last_ns > self._max_gap_ns:
             self._log.add(
                 f"no observation for {(stamp_ns - last_ns) * 1e-9:.1f} s", at_stamp(last_ns)
             )

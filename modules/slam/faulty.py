@@ -1,0 +1,134 @@
+"""Any SLAM module, made to fail on purpose: for experiments on what the bus survives."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+from dataclasses import replace
+from pathlib import Path
+from time import sleep
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.interfaces import SlamModule
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.fault_plan import FaultPlan
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
+
+IN_ANY_PROCESS = ("raise", "nan", "jump", "silence")
+IN_ITS_OWN_PROCESS = ("hang", "kill", "memory")  # run.isolation=process: else the bus is struck
+FAULTS = (*IN_ANY_PROCESS, *IN_ITS_OWN_PROCESS)
+_HANG_S = 3600.0
+_GULP = 1 << 22  # numbers of 8 bytes
+
+
+class Faulty:
+    """Passes everything on to `module`, but strikes at random observations.
+
+    `silence`: it says that it is lost for `lasting_s`. `jump`: its poses are off by `jump_m` in a
+    random direction until it is activated again, and it does not say so.
+    """
+
+    def __init__(
+        self,
+        module: SlamModule,
+        faults: list[str],
+        rate_ratio: float,
+        lasting_s: float,
+        jump_m: float,
+        seed: int,
+        record: Path,
+    ) -> None:
+        for fault in faults:
+            if fault not in FAULTS:
+                raise ConfigError("faults", fault, ", ".join(FAULTS))
+        for name, value in (("lasting_s", lasting_s), ("jump_m", jump_m)):
+            if not 0 <= value < np.inf:
+                raise ConfigError(name, value, "0 or more")
+        self._module, self._jump_m = module, jump_m
+        self._lasting_ns = round(lasting_s * 1e9)
+        self._plan = FaultPlan(
+            kinds=tuple(faults), rate_ratio=rate_ratio, seed=seed, record=Path(record)
+        )
+        self._silent_until_ns: int | None = None
+        self._T_wrong_local = se3.identity()
+
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return what the module requires."""
+        return self._module.requires
+
+    def activate(self, rig: Rig) -> None:
+        """Start anew, without the faults that last."""
+        self._silent_until_ns, self._T_wrong_local = None, se3.identity()
+        self._module.activate(rig)
+
+    def set_pose(self, T_map_local: se3.Transform) -> None:
+        """Place `local` in the map."""
+        self._module.set_pose(T_map_local)
+
+    def set_scene(self, scene: str) -> None:
+        """Tell the scene."""
+        self._module.set_scene(scene)
+
+    def track(self, observation: Observation) -> Tracking:
+        """Return the module's answer, unless a fault strikes or one lasts."""
+        fault = self._plan.strike(observation.stamp_ns)
+        if fault in ("raise", "hang", "kill", "memory"):
+            getattr(self, f"_{fault}")()
+        if fault == "silence":
+            self._silent_until_ns = observation.stamp_ns + self._lasting_ns
+        if fault == "jump":
+            self._T_wrong_local = self._off(observation.stamp_ns)
+        tracking = self._module.track(observation)
+        T_local_base = self._T_wrong_local @ tracking.T_local_base
+        if fault == "nan":
+            T_local_base = np.full((4, 4), np.nan)
+        is_silent = (
+            self._silent_until_ns is not None and observation.stamp_ns < self._silent_until_ns
+        )
+        status = TrackingStatus.LOST if is_silent else tracking.status
+        return replace(tracking, T_local_base=T_local_base, status=status)
+
+    def get_pose(self) -> se3.Transform:
+        """Return T_map_base of the last observation."""
+        return self._module.get_pose()
+
+    def get_trajectory(self) -> Trajectory:
+        """Return the module's trajectory, right again."""
+        return self._module.get_trajectory()
+
+    def get_map(self) -> MapLayers:
+        """Return the module's map."""
+        return self._module.get_map()
+
+    def shutdown(self) -> None:
+        """Shut the module down."""
+        self._module.shutdown()
+
+    def _off(self, stamp_ns: int) -> se3.Transform:
+        direction = np.random.default_rng([stamp_ns % 2**64]).normal(size=3)
+        shift = self._jump_m * direction / np.linalg.norm(direction)
+        return se3.from_parts(np.eye(3), shift)
+
+    def _raise(self) -> None:
+        raise RuntimeError("a fault on purpose")
+
+    def _hang(self) -> None:
+        sleep(_HANG_S)
+
+    def _kill(self) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def _memory(self) -> None:
+        """Take memory until the process's limit; where there is none, say so at once."""
+        hoard: list[NDArray[np.float64]] = []
+        while resource.getrlimit(resource.RLIMIT_DATA)[0] != resource.RLIM_INFINITY:
+            hoard.append(np.ones(_GULP))
+        raise MemoryError("a fault on purpose, without a limit to reach")

@@ -1,0 +1,118 @@
+"""Any source, made to fail on purpose: for experiments on what the bus survives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sceneslam.interfaces import Source
+from sceneslam.sources.wrapped import Wrapped
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.fault_plan import FaultPlan
+from sceneslam.types.observation import Observation
+from sceneslam.types.truth import GroundTruth
+
+SENSORS = ("image_bgr", "depth_m", "scan", "points_lidar", "T_odom_base", "gyro_base")
+FAULTS = ("dropout", "blackout", "nan", "clock", "duplicate", "disorder")
+
+
+class Faulty(Wrapped):
+    """Passes a source's observations on, but strikes at random ones.
+
+    `dropout`: one sensor says nothing for `lasting_s`; `blackout`: none but odometry does. `nan`:
+    one sensor's numbers are none. `clock`: one stamp is off by up to `clock_jump_s`. `duplicate`:
+    the observation comes twice. `disorder`: it comes after the next one.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        faults: list[str],
+        rate_ratio: float,
+        lasting_s: float,
+        clock_jump_s: float,
+        seed: int,
+        record: Path,
+    ) -> None:
+        for fault in faults:
+            if fault not in FAULTS:
+                raise ConfigError("faults", fault, ", ".join(FAULTS))
+        for name, value in (("lasting_s", lasting_s), ("clock_jump_s", clock_jump_s)):
+            if not 0 <= value < np.inf:
+                raise ConfigError(name, value, "0 or more [s]")
+        super().__init__(source)
+        self._seed = seed
+        self._lasting_ns = round(lasting_s * 1e9)
+        self._clock_jump_ns = round(clock_jump_s * 1e9)
+        self._plan = FaultPlan(
+            kinds=tuple(faults), rate_ratio=rate_ratio, seed=seed, record=Path(record)
+        )
+
+    def __iter__(self) -> Iterator[Observation]:
+        """Yield the source's observations, struck."""
+        late: Observation | None = None
+        silent: dict[str, int] = {}  # sensor -> until when
+        for observation in self._source:
+            stamp_ns = observation.stamp_ns
+            rng = np.random.default_rng([self._seed, 1, stamp_ns % 2**64])
+            fault = self._plan.strike(stamp_ns)
+            silent |= dict.fromkeys(
+                self._silenced(fault, observation, rng), stamp_ns + self._lasting_ns
+            )
+            struck = self._struck(fault, observation, rng)
+            quiet = {name: None for name, until_ns in silent.items() if stamp_ns < until_ns}
+            struck = replace(struck, **quiet)  # type: ignore[arg-type]
+            if fault == "disorder" and late is None:
+                late = struck
+                continue
+            yield struck
+            if fault == "duplicate":
+                yield struck
+            if late is not None:
+                yield late
+                late = None
+        if late is not None:
+            yield late
+
+    def ground_truth(self) -> GroundTruth | None:
+        """Return the source's ground truth."""
+        return self._source.ground_truth()
+
+    def _silenced(
+        self, fault: str | None, observation: Observation, rng: np.random.Generator
+    ) -> list[str]:
+        """Return the sensors that a fault silences."""
+        if fault == "blackout":
+            return [name for name in SENSORS if name != "T_odom_base"]
+        return [_any_sensor(observation, rng)] if fault == "dropout" else []
+
+    def _struck(
+        self, fault: str | None, observation: Observation, rng: np.random.Generator
+    ) -> Observation:
+        if fault == "clock":
+            off_ns = int(rng.integers(-self._clock_jump_ns, self._clock_jump_ns + 1))
+            return replace(observation, stamp_ns=observation.stamp_ns + off_ns)
+        if fault == "nan":
+            return _without_numbers(observation, _any_sensor(observation, rng))
+        return observation
+
+
+def _any_sensor(observation: Observation, rng: np.random.Generator) -> str:
+    """Return one of the sensors that the observation has, at random."""
+    present = [name for name in SENSORS if getattr(observation, name) is not None]
+    return present[int(rng.integers(len(present)))] if present else SENSORS[0]
+
+
+def _without_numbers(observation: Observation, name: str) -> Observation:
+    """Return the observation with NaN in one sensor; an image, which has none, is black."""
+    value = getattr(observation, name)
+    if name == "scan":
+        blind = replace(value, ranges_m=np.full_like(value.ranges_m, np.nan))
+        return replace(observation, scan=blind)
+    if name == "image_bgr" or value is None:
+        blind = None if value is None else np.zeros_like(value)
+        return replace(observation, image_bgr=blind)
+    return replace(observation, **{name: np.full_like(value, np.nan)})
