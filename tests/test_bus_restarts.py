@@ -2,7 +2,7 @@
 
 import numpy as np
 from driving import assert_exact, drive, events
-from fakes import PERIOD_NS, ExactModule
+from fakes import PERIOD_NS, ExactModule, observation
 
 
 class Phoenix(ExactModule):
@@ -73,3 +73,12 @@ def test_a_module_whose_budget_is_spent_ends_the_run_as_one_that_cannot_be_resta
     assert only.failures == 2 and bus.state == "terminate"
     assert len(atlas.trajectory) < 40 and np.isfinite(atlas.trajectory.T_world_base).all()
     assert [event["from"] for event in events(log, "state")][-1] == "switch"
+
+
+def test_a_short_silence_of_the_wheels_while_they_bridge_costs_no_pose():
+    def feed(index):
+        return observation(index, has_odometry=not 40 <= index < 44)
+
+    lost = ExactModule(lost=range(30, 60))
+    _, atlas, _, _ = drive({"bright": lost, "dark": ExactModule(lost=range(1000))}, feed=feed)
+    assert len(atlas.online) == 100

@@ -23,7 +23,7 @@ class Bridge:
         self._T_odom_base: Transform | None = None
         self._stamp_ns = 0
         self._before: tuple[int, Transform] | None = None  # the pose before the last known one
-        self._known: tuple[int, Transform] | None = None  # the last pose that a module gave
+        self._known: tuple[int, Transform] | None = None  # the last that was measured
 
     @property
     def T_map_base(self) -> Transform:
@@ -40,9 +40,7 @@ class Bridge:
         """Take a pose that a module gave; from a jump, a correction, no velocity can be told."""
         if is_jump:
             self._before, self._known = None, None
-        if self._known is not None and self._known[0] < observation.stamp_ns:
-            self._before = self._known  # at a hand-over both modules give the same instant a pose
-        self._known = (observation.stamp_ns, T_map_base)
+        self._note(observation.stamp_ns, T_map_base)
         self._move(observation, T_map_base)
 
     def predict(
@@ -69,12 +67,19 @@ class Bridge:
             T_prev_curr = se3.inverse(T_odom_prev) @ T_odom_curr
             if turn is not None:
                 T_prev_curr = with_heading(T_prev_curr, turn)
+            self._note(observation.stamp_ns, self.T_map_base @ T_prev_curr)
         elif by_velocity and self._within_horizon(observation.stamp_ns):
             T_prev_curr = self._at_constant_velocity(observation.stamp_ns - self._stamp_ns)
         else:
             return None
         self._move(observation, self.T_map_base @ T_prev_curr)
         return self._T_map_base
+
+    def _note(self, stamp_ns: int, T_map_base: Transform) -> None:
+        """Take a pose that was measured: it tells the velocity."""
+        if self._known is not None and self._known[0] < stamp_ns:
+            self._before = self._known  # at a hand-over both modules give the same instant a pose
+        self._known = (stamp_ns, T_map_base)
 
     def _within_horizon(self, stamp_ns: int) -> bool:
         return self._known is not None and stamp_ns - self._known[0] <= self._horizon_ns
