@@ -12,6 +12,7 @@ def features_at(uv_px, descriptors, levels=None, depth_m=None):
         levels=np.zeros(count, np.int64) if levels is None else levels,
         descriptors=descriptors,
         depth_m=np.zeros(count) if depth_m is None else depth_m,
+        depth_slope_m_per_px=np.zeros(count),
     )
 
 

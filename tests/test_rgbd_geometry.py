@@ -1,10 +1,13 @@
 """How the rgbd module matches descriptors and solves for the pose."""
 
+from dataclasses import replace
+
 import numpy as np
 from rgbd_features import features_at, random_descriptors
 
 from sceneslam.modules.slam.rgbd.matching import match_anywhere, match_near
 from sceneslam.modules.slam.rgbd.pose_solver import Measurements, PoseSolver
+from sceneslam.modules.slam.rgbd.residuals import Sightings
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 
@@ -26,17 +29,19 @@ def scene(rng, count=200):
     points_cam = np.column_stack([rays, np.ones(count)]) * depth_m[:, None]
     measured = Measurements(
         points_local=se3.apply(T_local_base @ CAMERA.T_base_cam, points_cam),
-        uv_px=uv_px,
-        sigma_px=np.ones(count),
-        depth_m=depth_m,
-        inverse_depth_sigma_per_m=np.full(count, 0.003),
+        seen=Sightings(
+            uv_px=uv_px,
+            sigma_px=np.ones(count),
+            depth_m=depth_m,
+            inverse_depth_sigma_per_m=np.full(count, 0.003),
+        ),
     )
     return T_local_base, measured
 
 
 def changed(measured, **fields):
-    names = ("points_local", "uv_px", "sigma_px", "depth_m", "inverse_depth_sigma_per_m")
-    return Measurements(**{name: getattr(measured, name) for name in names} | fields)
+    points_local = fields.pop("points_local", measured.points_local)
+    return Measurements(points_local=points_local, seen=replace(measured.seen, **fields))
 
 
 def test_match_near_finds_every_landmark_close_to_its_prediction():
@@ -91,7 +96,7 @@ def test_unrelated_descriptors_do_not_match_anywhere():
 def test_pose_is_found_despite_a_third_of_outliers():
     rng = np.random.default_rng(0)
     T_local_base, measured = scene(rng)
-    uv_px = measured.uv_px + rng.normal(0, 0.5, (200, 2))
+    uv_px = measured.seen.uv_px + rng.normal(0, 0.5, (200, 2))
     uv_px[:66] = rng.uniform([0, 0], CAMERA.size_wh, (66, 2))
     measured = changed(measured, uv_px=uv_px)
     solver = PoseSolver(CAMERA, seed=0)
@@ -118,9 +123,9 @@ def test_covariance_is_the_spread_of_the_estimates():
     rng = np.random.default_rng(5)
     T_local_base, exact = scene(rng)
     for _ in range(150):
-        inverse_depth = 1 / exact.depth_m + rng.normal(0, 0.003, 200)
+        inverse_depth = 1 / exact.seen.depth_m + rng.normal(0, 0.003, 200)
         measured = changed(
-            exact, uv_px=exact.uv_px + rng.normal(0, 1, (200, 2)), depth_m=1 / inverse_depth
+            exact, uv_px=exact.seen.uv_px + rng.normal(0, 1, (200, 2)), depth_m=1 / inverse_depth
         )
         estimate = solver.refine(measured, T_local_base)
         assert estimate is not None

@@ -16,6 +16,7 @@ SCALE = 1.2  # between two levels of the pyramid
 _CELL_PX = 40  # side of the cells that share out the features
 _SURPLUS = 3  # corners detected per corner kept
 _FAST_THRESHOLD_MAX = 20  # ORB's own default, right for a bright and clean image
+_DEPTH_REACH_PX = 2  # of a corner, that should lie on the same surface
 _DEPTH_SPREAD_RATIO = 0.03  # neighbours further apart than this lie across an edge
 
 
@@ -27,6 +28,7 @@ class Features:
     levels: NDArray[np.int64]  # (N,), of the pyramid
     descriptors: NDArray[np.uint8]  # (N, 32)
     depth_m: NDArray[np.float64]  # (N,), along the optical axis, 0 = missing
+    depth_slope_m_per_px: NDArray[np.float64]  # (N,), how steeply it changes around there
 
     def __len__(self) -> int:
         return len(self.levels)
@@ -55,11 +57,13 @@ class FeatureExtractor:
         if not corners:
             return _none_found()
         uv_image = np.asarray(cv2.KeyPoint.convert(corners), dtype=np.float64)
+        depths_m, slopes = self._depths(uv_image, depth_m)
         return Features(
             uv_px=self._undistort(uv_image),
             levels=np.array([corner.octave for corner in corners], dtype=np.int64),
             descriptors=np.asarray(descriptors, dtype=np.uint8),
-            depth_m=self._depths(uv_image, depth_m),
+            depth_m=depths_m,
+            depth_slope_m_per_px=slopes,
         )
 
     def fast_threshold(self, gray: NDArray[np.uint8]) -> int:
@@ -79,20 +83,26 @@ class FeatureExtractor:
 
     def _depths(
         self, uv_image: NDArray[np.float64], depth_m: NDArray[np.float32] | None
-    ) -> NDArray[np.float64]:
-        """Return the depth at each corner; missing at depth edges, where it may be either."""
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the depth at each corner, and its slope [m/px].
+
+        At depth edges, where it may be either, it is missing.
+        """
         if depth_m is None:
-            return np.zeros(len(uv_image))
+            return np.zeros(len(uv_image)), np.zeros(len(uv_image))
         height, width = depth_m.shape
         column, row = np.rint(uv_image).astype(np.int64).T
-        columns = np.clip(column + np.array([[0], [-2], [2], [0], [0]]), 0, width - 1)
-        rows = np.clip(row + np.array([[0], [0], [0], [-2], [2]]), 0, height - 1)
+        columns = np.clip(
+            column + _DEPTH_REACH_PX * np.array([[0], [-1], [1], [0], [0]]), 0, width - 1
+        )
+        rows = np.clip(row + _DEPTH_REACH_PX * np.array([[0], [0], [0], [-1], [1]]), 0, height - 1)
         depths = depth_m[rows, columns].astype(np.float64)  # (5, N), the corner's own first
         low_m, high_m = self._camera.depth_range_m
         usable = (depths >= low_m) & (depths <= high_m)  # False for NaN
         depth = np.where(usable[0], depths[0], 0.0)
         step = np.where(usable, np.abs(depths - depth), 0.0).max(axis=0)
-        return np.where(step <= _DEPTH_SPREAD_RATIO * depth * np.maximum(depth, 1.0), depth, 0.0)
+        is_smooth = step <= _DEPTH_SPREAD_RATIO * depth * np.maximum(depth, 1.0)
+        return np.where(is_smooth, depth, 0.0), step / _DEPTH_REACH_PX
 
 
 def _spread(corners: Any, count: int) -> Any:
@@ -116,4 +126,5 @@ def _none_found() -> Features:
         levels=np.zeros(0, np.int64),
         descriptors=np.zeros((0, 32), np.uint8),
         depth_m=np.zeros(0),
+        depth_slope_m_per_px=np.zeros(0),
     )

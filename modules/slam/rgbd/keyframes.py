@@ -107,6 +107,14 @@ class KeyframeStore:
         for keyframe in self.all():
             keyframe.landmark_ids[:] = names[keyframe.landmark_ids + 1]
 
+    def show_both(self, some: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return for pairs of landmarks (N,) whether any keyframe shows both."""
+        both = np.zeros(len(some), bool)
+        for keyframe in self.all():
+            marks = self._marked(keyframe.landmark_ids)
+            both |= marks[some] & marks[others]
+        return both
+
     def nearest(self, T_local_base: Transform, *, per_m: float, per_rad: float) -> float:
         """Return how far the nearest keyframe is, metres and radians weighed and added."""
         T_keyframes = np.stack([keyframe.T_local_base for keyframe in self.all()])

@@ -39,6 +39,8 @@ class LandmarkTable:
         self.alive = np.zeros(_FIRST_CAPACITY, bool)
         self.expected = np.zeros(_FIRST_CAPACITY, np.int64)  # images that should show it
         self.found = np.zeros(_FIRST_CAPACITY, np.int64)  # images that did
+        self.births = np.zeros(_FIRST_CAPACITY, np.int64)  # rises with every call of `add`
+        self._born = 0
 
     def __len__(self) -> int:
         return int(self.alive.sum())
@@ -53,8 +55,8 @@ class LandmarkTable:
         """Store N landmarks and return their ids (N,)."""
         self._reserve(len(points_local))
         ids = np.flatnonzero(~self.alive)[: len(points_local)]
-        self.points_local[ids], self.information[ids] = points_local, information
-        self.covariance[ids] = np.linalg.inv(information)
+        self.settle(ids, points_local=points_local, information=information)
+        self.births[ids], self._born = self._born, self._born + 1
         self.describe(ids, looks)
         self.alive[ids], self.expected[ids], self.found[ids] = True, 1, 1
         return ids
@@ -72,6 +74,17 @@ class LandmarkTable:
         self.points_local[ids] += np.linalg.solve(total, pull)[:, :, 0]
         self.information[ids] = total
         self.covariance[ids] = np.linalg.inv(total)
+
+    def settle(
+        self,
+        ids: NDArray[np.int64],
+        *,
+        points_local: NDArray[np.float64],
+        information: NDArray[np.float64],
+    ) -> None:
+        """Replace where landmarks are, and how exactly that is known."""
+        self.points_local[ids], self.information[ids] = points_local, information
+        self.covariance[ids] = np.linalg.inv(information)
 
     def move(self, ids: NDArray[np.int64], T_new_old: Transform) -> None:
         """Carry landmarks, with all that points somewhere, to where a transform takes them."""
@@ -95,7 +108,8 @@ class LandmarkTable:
         if count <= capacity - len(self):
             return
         extra = max(capacity, count)
-        for name in vars(self):
-            rows = getattr(self, name)
+        for name, rows in vars(self).items():
+            if not isinstance(rows, np.ndarray):
+                continue
             grown = np.concatenate([rows, np.zeros((extra, *rows.shape[1:]), rows.dtype)])
             setattr(self, name, grown)

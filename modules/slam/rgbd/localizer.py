@@ -13,9 +13,10 @@ from sceneslam.types.se3 import Transform
 from .features import Features
 from .matching import Matches, match_anywhere, match_near
 from .pose_solver import Measurements, PoseEstimate, PoseSolver
+from .residuals import Sightings
 from .visual_map import VisualMap
 
-_RADIUS_REFINED_PX = 6.0
+_RADIUS_REFINED_PX = 10.0
 _WIDER = 2.5  # second try of a guided search
 _MIN_INLIER_RATIO = 0.4  # of the matches around a pose that is right
 
@@ -125,10 +126,12 @@ class Localizer:
         doubts = self._map.doubts(T_local_base, ids)
         return Measurements(
             points_local=self._map.landmarks.points_local[ids],
-            uv_px=features.uv_px[rows],
-            sigma_px=np.hypot(self._map.sigma_px(features.levels[rows]), doubts.across_px),
-            depth_m=features.depth_m[rows],
-            inverse_depth_sigma_per_m=np.hypot(
-                self._map.inverse_depth_sigma_per_m, doubts.inverse_depth_per_m
+            seen=Sightings(
+                uv_px=features.uv_px[rows],
+                sigma_px=np.hypot(self._map.sigma_px(features.levels[rows]), doubts.across_px),
+                depth_m=features.depth_m[rows],
+                inverse_depth_sigma_per_m=np.hypot(
+                    self._map.inverse_depth_sigmas_per_m(features)[rows], doubts.inverse_depth_per_m
+                ),
             ),
         )

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from .features import Features
 
-_MAX_HAMMING = 64  # of 256 bits; unrelated descriptors differ in about 128
+_MAX_HAMMING = 64
 _MAX_HAMMING_ANYWHERE = 50
-_RATIO = 0.85  # best to second best, near a predicted pixel
+_RATIO = 1.0
 _RATIO_ANYWHERE = 0.75
 _LEVEL_TOLERANCE = 1
 _ROW_BITS = 32  # of a sort key that holds a distance above and a row below

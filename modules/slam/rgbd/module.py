@@ -18,10 +18,12 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
 from .features import FeatureExtractor, Features
+from .fusion import join_duplicates
 from .judgement import HealthRule, KeyframeRule
 from .keyframes import NO_LANDMARK, Keyframe
 from .layers import LayerBuilder
 from .limits import check_limits, check_sizes
+from .local_mapping import LocalMapping
 from .localizer import Fix, Localizer
 from .memory import Memory
 from .motion import MotionModel
@@ -31,6 +33,7 @@ from .view import View
 from .visual_map import VisualMap
 
 _KEYFRAME_FEATURES = 50  # with depth, that a keyframe needs
+_MERGE_IMAGES = 5  # that the worker has for one bundle adjustment
 _SEARCHED_IMAGES = 3  # looked for in the map before a new place is begun by odometry
 _START_VARIANCE = 1e-8  # the first pose is the origin by definition
 
@@ -116,6 +119,7 @@ class RgbdSlam:
         self._localizer = self._make_localizer(self._map, self._make_solver(rig.camera))
         self._memory = Memory(self._map, self._localizer, min_inliers=self._degraded_inliers)
         self._relocalizer = Relocalizer(self._map.keyframes, self._memory.recognizer)
+        self._mapping = LocalMapping(rig.camera, self._map, every_images=_MERGE_IMAGES)
         self._layers = self._make_layers(rig.camera)
         self._keyframe_rule = self._make_keyframe_rule()
         self._motion = MotionModel()
@@ -168,6 +172,7 @@ class RgbdSlam:
 
     def shutdown(self) -> None:
         """Stop the workers; the map stays readable."""
+        self._mapping.shutdown()
         self._memory.shutdown()
 
     def _locate(self, view: View) -> Fix | None:
@@ -179,7 +184,8 @@ class RgbdSlam:
         return self._relocalizer.find(view.features, view.observation.depth_m)
 
     def _recall(self) -> None:
-        """Go on from where the map is, if a loop has moved it."""
+        """Go on from where the map is, if bundle adjustment or a loop has moved it."""
+        self._motion.correct(self._mapping.step())
         T_new_old = self._memory.step()
         if T_new_old is not None:
             self._T_local_base = T_new_old @ self._T_local_base
@@ -274,6 +280,7 @@ class RgbdSlam:
             view=self._layers.view(depth_m, image_bgr, stamp_ns=stamp_ns),
         )
         self._map.insert(keyframe, deep_rows=deep_rows)
+        join_duplicates(self._map, keyframe)
         self._memory.insert(fix, depth_m)
         self._keyframe_rule.restart()
         self._local_ids = self._map.around(keyframe.landmark_ids)

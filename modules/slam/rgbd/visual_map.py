@@ -12,16 +12,17 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
-from .features import LEVELS, SCALE
+from .features import LEVELS, SCALE, Features
 from .keyframes import NO_LANDMARK, Keyframe, KeyframeStore
 from .landmarks import LandmarkTable, Looks
 
-_COVISIBLE = 12  # keyframes whose landmarks make the local map
+_COVISIBLE = 12
 _MIN_COS_VIEW = 0.5  # a landmark looks like itself within 60 degrees of where it was seen from
 _MIN_FOUND_RATIO = 0.25
 _PROBATION = 8  # images that should show a landmark before it is judged
 _NEAREST_M = 0.1
 _FEWEST_KEYFRAMES = 3
+_SHIFT_PX = 2.0  # of the depth image against the colours, by calibration and time
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -57,10 +58,20 @@ class VisualMap:
         self.camera = camera
         self._sigma_px, self.inverse_depth_sigma_per_m = sigma_px, inverse_depth_sigma_per_m
         self._keyframe_limit, self._landmark_limit = keyframe_limit, landmark_limit
+        self.corrections = 0  # how often keyframes were moved
 
     def sigma_px(self, levels: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return how exactly features of these pyramid levels are located [px]."""
         return np.asarray(self._sigma_px * SCALE ** levels.astype(np.float64))
+
+    def inverse_depth_sigmas_per_m(self, features: Features) -> NDArray[np.float64]:
+        """Return how exactly the features' depths are known [1/m].
+
+        What the sensor adds, and what a shift of the depth against the image does on a slope.
+        """
+        z = np.where(features.depth_m > 0, features.depth_m, 1.0)
+        by_shift = _SHIFT_PX * features.depth_slope_m_per_px / z**2
+        return np.asarray(np.hypot(self.inverse_depth_sigma_per_m, by_shift))
 
     def doubts(self, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> Doubts:
         """Return the landmarks' own uncertainty as the camera sees it from a pose."""
@@ -143,6 +154,7 @@ class VisualMap:
                 self.landmarks.move(landmark_ids, T_new_old[keyframe_id])
         for keyframe_id, T_new in T_local_base.items():
             self.keyframes[keyframe_id].T_local_base = T_new
+        self.corrections += 1
 
     def _locate(
         self, keyframe: Keyframe, rows: NDArray[np.int64]
@@ -154,7 +166,7 @@ class VisualMap:
         points_cam = np.column_stack([rays, np.ones(len(rows))]) * z[:, None]
         T_local_cam = keyframe.T_local_base @ camera.T_base_cam
         across_m = self.sigma_px(features.levels[rows]) * z / camera.fx
-        along_m = self.inverse_depth_sigma_per_m * z**2
+        along_m = self.inverse_depth_sigmas_per_m(features)[rows] * z**2
         weights = np.stack([across_m, across_m, np.maximum(along_m, across_m)], axis=1) ** -2.0
         rotation = T_local_cam[:3, :3]
         information = np.einsum("ik,nk,jk->nij", rotation, weights, rotation)
@@ -176,16 +188,21 @@ class VisualMap:
         """Drop landmarks that are seldom found again, and keyframes beyond the limits."""
         table = self.landmarks
         judged = table.alive & (table.expected >= _PROBATION)
-        self._drop(judged & (table.found < _MIN_FOUND_RATIO * table.expected))
+        self.drop(np.flatnonzero(judged & (table.found < _MIN_FOUND_RATIO * table.expected)))
         while len(self.keyframes) > self._keyframe_limit or (
             len(table) > self._landmark_limit and len(self.keyframes) > _FEWEST_KEYFRAMES
         ):
             self.keyframes.remove(self.keyframes.most_redundant())
             orphans = table.alive.copy()
             orphans[self.keyframes.landmarks_of(self.keyframes.ids)] = False
-            self._drop(orphans)
+            self.drop(np.flatnonzero(orphans))
 
-    def _drop(self, doomed: NDArray[np.bool_]) -> None:
-        landmark_ids = np.flatnonzero(doomed)
+    def join(self, kept_ids: NDArray[np.int64], gone_ids: NDArray[np.int64]) -> None:
+        """Let the kept landmarks (N,) take the places of those that go (N,)."""
+        self.keyframes.rename_landmarks(gone_ids, kept_ids)
+        self.landmarks.remove(gone_ids)
+
+    def drop(self, landmark_ids: NDArray[np.int64]) -> None:
+        """Forget landmarks."""
         self.keyframes.forget_landmarks(landmark_ids)
         self.landmarks.remove(landmark_ids)

@@ -1,0 +1,57 @@
+"""Landmarks that are one: what a keyframe shows again, but was mapped anew, is joined."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .keyframes import NO_LANDMARK, Keyframe
+from .matching import match_near
+from .visual_map import VisualMap
+
+_RADIUS_PX = 10.0
+_MIN_FOUND = 4  # of landmarks that were mapped together
+_MIN_FOUND_RATIO = 0.1
+_MAX_GAP_M = 0.1  # between two landmarks that are one
+
+
+def join_duplicates(visual_map: VisualMap, keyframe: Keyframe) -> None:
+    """Join landmarks that should show where the keyframe shows others that look the same."""
+    table = visual_map.landmarks
+    others = np.setdiff1d(np.flatnonzero(table.alive), keyframe.landmark_ids)
+    expected = visual_map.predict(keyframe.T_local_base, others)
+    matches = match_near(
+        expected.uv_px,
+        expected.levels,
+        table.descriptors[expected.ids],
+        keyframe.features,
+        radius_px=_RADIUS_PX,
+    )
+    matches = matches.only(_are_many(table.births[expected.ids], matches.landmark_rows))
+    here, there = keyframe.landmark_ids[matches.feature_rows], expected.ids[matches.landmark_rows]
+    known = here != NO_LANDMARK
+    matches = matches.only(_are_many(table.births[expected.ids], matches.landmark_rows))
+    here, there = here[known], there[known]
+    older = table.births[there] < table.births[here]
+    keep, drop = np.where(older, there, here), np.where(older, here, there)
+    same = _are_near(visual_map, keep, drop) & ~visual_map.keyframes.show_both(keep, drop)
+    visual_map.join(keep[same], drop[same])
+
+
+def _are_many(groups: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return for the rows found (N,) whether much of what should show of their group was found.
+
+    Few are chance, or a part of the map that has drifted away: a matter for loop closure.
+    """
+    size = int(groups.max(initial=0)) + 1
+    expected, found = np.bincount(groups, minlength=size), np.bincount(groups[rows], minlength=size)
+    are_many = (found >= _MIN_FOUND) & (found >= _MIN_FOUND_RATIO * expected)
+    return np.asarray(are_many[groups[rows]])
+
+
+def _are_near(
+    visual_map: VisualMap, some: NDArray[np.int64], others: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    table = visual_map.landmarks
+    gaps_m = table.points_local[some] - table.points_local[others]
+    return np.asarray(np.linalg.norm(gaps_m, axis=1) < _MAX_GAP_M)
