@@ -1,7 +1,7 @@
 """Which module is to run: one pure function of what is known at an observation.
 
 Its inputs are logged whenever they change, so that a run's decisions can be made again from the
-log alone (`python -m sceneslam.evaluation decisions RUN`).
+log alone (`python -m sceneslam.decisions RUN`).
 """
 
 from __future__ import annotations

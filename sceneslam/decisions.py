@@ -1,0 +1,72 @@
+"""Make a run's decisions again from its log alone: `python -m sceneslam.decisions RUN`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from sceneslam.bus.decision_log import decide_again
+from sceneslam.bus.policy import Policy
+from sceneslam.config.component import Builder
+from sceneslam.types.errors import InputError, SceneSlamError
+from sceneslam.types.run import Event
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compare; return the exit code: 0 the same, 1 another decision, 2 nothing to compare."""
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if len(words) != 1:
+        print("usage: python -m sceneslam.decisions RUN (the folder of a run)", file=sys.stderr)
+        return 2
+    try:
+        events, policy = _read_events(Path(words[0])), _read_policy(Path(words[0]))
+        wrong = _decide_again(events, policy)
+    except SceneSlamError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    for sentence in wrong:
+        print(sentence)
+    made = [e for e in events if e["event"] == "situation" and e["verdict"]["action"] != "go on"]
+    print(f"{len(made)} decisions logged, {len(wrong)} that the log does not lead to")
+    return 1 if wrong else 0
+
+
+def _decide_again(events: Sequence[Event], policy: Policy) -> list[str]:
+    try:
+        return decide_again(events, policy)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"the log is of another version: {error!r} in a situation") from error
+
+
+def _read_events(folder: Path) -> list[Event]:
+    path = folder / "events.jsonl"
+    if not path.is_file():
+        raise InputError(f"no event log: {path}")
+    events: list[Event] = []
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        try:
+            events.append(json.loads(line))
+        except ValueError as error:
+            raise InputError(f"line {number}: expected JSON, got {line[:60]!r}: {path}") from error
+    return events
+
+
+def _read_policy(folder: Path) -> Policy:
+    path = folder / "config.yaml"
+    if not path.is_file():
+        raise InputError(f"no configuration: {path}")
+    try:
+        config: Any = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+    except (OmegaConfBaseException, ValueError) as error:
+        raise InputError(f"not a configuration ({error}): {path}") from error
+    return Builder(config).make("policy", Policy)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
