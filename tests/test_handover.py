@@ -151,6 +151,16 @@ def test_module_that_is_lost_does_not_replace_one_that_holds():
     assert_exact(atlas)
 
 
+def test_poses_told_at_the_time_are_kept_where_nothing_better_is_known():
+    """The new module is lost for a second in the past; there is no odometry, the old one held."""
+    modules = {"bright": ExactModule(), "dark": ExactModule(lost=range(45, 58))}
+    options = {"scene_at": dark_from(40), "handover": "rewind", "has_odometry": False}
+    _, atlas, _, _ = drive(modules, **options)
+    assert len(atlas.trajectory) == 100
+    assert atlas.pose_modules[44:46] == ("dark", BRIDGED)
+    assert_exact(atlas)
+
+
 def test_first_choice_comes_back_when_it_holds_beside_the_fallback():
     bright = ExactModule(lost=range(50, 70))
     _, atlas, log, _ = drive(

@@ -81,6 +81,11 @@ class Bridge:
             self._before = self._known  # at a hand-over both modules give the same instant a pose
         self._known = (stamp_ns, T_map_base)
 
+    def follow(self, observation: Observation, T_prev_curr: Transform) -> Transform:
+        """Return T_map_base after a motion that something else told since the last observation."""
+        self._move(observation, self.T_map_base @ T_prev_curr)
+        return self.T_map_base
+
     def _within_horizon(self, stamp_ns: int) -> bool:
         return self._known is not None and stamp_ns - self._known[0] <= self._horizon_ns
 

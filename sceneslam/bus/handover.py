@@ -32,6 +32,7 @@ class Handover:
         self._memory, self._bridge = memory, anchor.bridge.copy()
         self._done_ns = anchor.stamp_ns - 1
         self.is_placed = False
+        self._told: Transform | None = None  # the pose of the moment before, as told at the time
         self._began_ns = perf_counter_ns()
         runner.activate(rig, scene)
 
@@ -72,9 +73,7 @@ class Handover:
             self.anchor, self._bridge, self.trail = moment, moment.bridge.copy(), []
         tracking = self.hold.ask(self.runner, moment.observation)
         if tracking is None:
-            T_map_base = self._bridge.predict(
-                moment.observation, by_velocity=True, turn=self.hold.turn
-            )
+            T_map_base = self._bridge_to(moment)
             self.is_placed = self.is_placed and not self.hold.is_suspect
         else:
             T_map_base = self._place(moment, tracking)
@@ -89,7 +88,16 @@ class Handover:
                     is_trusted=tracking is not None and tracking.status is TrackingStatus.TRACKING,
                 )
             )
-        self._done_ns = moment.stamp_ns
+        self._done_ns, self._told = moment.stamp_ns, moment.T_map_base
+
+    def _bridge_to(self, moment: Moment) -> Transform | None:
+        """Return a pose that the module did not give: the old one's motion is better than none."""
+        observation = moment.observation
+        T_map_base = self._bridge.predict(observation, by_velocity=True, turn=self.hold.turn)
+        if T_map_base is None and self._told is not None and moment.T_map_base is not None:
+            T_prev_curr = se3.inverse(self._told) @ moment.T_map_base
+            T_map_base = self._bridge.follow(observation, T_prev_curr)
+        return T_map_base
 
     def _place(self, moment: Moment, tracking: Tracking) -> Transform:
         """Return the pose of a module that holds one; its first is the pose handed over (Eq. 1)."""
