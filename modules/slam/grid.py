@@ -22,13 +22,13 @@ class OccupancyGrid:
     """Log odds of cells: hits at the ends of beams, misses along them."""
 
     def __init__(
-        self, resolution_m: float, *, clear_max_m: float = 10.0, cells_max: int = 64_000_000
+        self, resolution_m: float, *, clear_max_m: float = 3.0, cells_max: int = 64_000_000
     ) -> None:
         """Make an empty grid.
 
-        A beam without a return (inf) clears up to `clear_max_m` only: black or slanted surfaces
-        give no return either. The grid never has more than `cells_max` cells; what lies outside
-        then is left out.
+        A beam without a return (inf) clears up to `clear_max_m` only: black surfaces, glass and
+        grazed walls give none either. The grid never has more than `cells_max` cells; what lies
+        outside then is left out.
         """
         if not resolution_m > 0:
             raise ConfigError("resolution_m", resolution_m, "above 0")
