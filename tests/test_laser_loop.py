@@ -1,5 +1,6 @@
 """Loops of the laser module: driven round a ring of corridors with wheels that turn too much."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -218,6 +219,17 @@ def test_pose_graph_of_the_map_holds_every_keyframe_and_edge():
     T_to = graph.T_world_base[chain[:, 0]] @ graph.T_from_to[~graph.is_loop]
     np.testing.assert_allclose(T_to, graph.T_world_base[chain[:, 1]], atol=0.05)
     assert (np.linalg.eigvalsh(graph.information) > 0).all()
+
+
+def test_scan_that_comes_twice_leaves_the_revised_poses_finite():
+    path = loop_path(60)
+    observations = drive(room(), path, odometry=path, rng=np.random.default_rng(4))
+    stale = [replace(one, scan=observations[i - i % 3].scan) for i, one in enumerate(observations)]
+    module = LaserSlam(**{**settings(), "keyframe_distance_m": 0.01})
+    module.activate(Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser()))
+    for observation in stale:
+        module.track(observation)
+    assert np.isfinite(module.get_trajectory().T_world_base).all()
 
 
 def test_composing_undoes_what_between_does():

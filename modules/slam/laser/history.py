@@ -52,7 +52,8 @@ class History:
         own = owners[follows]
         measured = np.array([frame.T_prev_curr for frame in frames]).reshape(-1, 3)
         missed = betweens(composed(poses[own], measured[own + 1]), poses[own + 1])
-        share = (stamps_ns[follows] - kept_ns[own]) / (kept_ns[own + 1] - kept_ns[own])
+        between_ns = np.maximum(kept_ns[own + 1] - kept_ns[own], 1)  # a scan may come twice
+        share = (stamps_ns[follows] - kept_ns[own]) / between_ns
         told[follows] = composed(told[follows], np.clip(share, 0.0, 1.0)[:, None] * missed)
         planar = np.stack([se3.from_xy_yaw(x, y, yaw) for x, y, yaw in told.tolist()])
         return Trajectory(stamps_ns=stamps_ns, T_world_base=planar)
