@@ -91,15 +91,24 @@ def _damage(folder: Path, observations: int) -> list[str]:
         poses = len(Trajectory.read_tum(folder / name))
         if poses > observations or (folder / name).read_bytes()[-1:] != b"\n":
             damage.append(f"{name}: {poses} poses of {observations} observations")
-    votes = 0
-    for line in (folder / "events.jsonl").read_text().splitlines():
-        votes += json.loads(line)["event"] == "vote"
+    votes = _count_votes(folder / "events.jsonl")
     if votes != observations:
         damage.append(f"events.jsonl: {votes} votes of {observations} observations")
     metrics = json.loads((folder / "metrics.json").read_text())
     if round(metrics["coverage"] * observations) != len(Trajectory.read_tum(folder / name)):
         damage.append("metrics.json: its coverage is not that of the trajectory")
     return damage + _damage_of_map(folder / "map")
+
+
+def _count_votes(path: Path) -> int:
+    """Return how many votes, one per observation, are in the log before the first torn line."""
+    votes = 0
+    for line in path.read_text().splitlines():
+        try:
+            votes += json.loads(line)["event"] == "vote"
+        except json.JSONDecodeError:
+            break
+    return votes
 
 
 def _damage_of_map(folder: Path) -> list[str]:
