@@ -9,9 +9,10 @@ from .keyframes import NO_LANDMARK, Keyframe
 from .matching import match_near
 from .visual_map import VisualMap
 
-_RADIUS_PX = 10.0
-_MIN_FOUND = 4  # of landmarks that were mapped together
-_MIN_FOUND_RATIO = 0.1
+_RADIUS_PX = 25.0
+_RATIO = 0.85
+_MIN_FOUND = 8  # of landmarks that were mapped together
+_MIN_FOUND_RATIO = 0.2
 _MAX_GAP_M = 0.1  # between two landmarks that are one
 
 
@@ -26,6 +27,7 @@ def join_duplicates(visual_map: VisualMap, keyframe: Keyframe) -> None:
         table.descriptors[expected.ids],
         keyframe.features,
         radius_px=_RADIUS_PX,
+        ratio=_RATIO,
     )
     matches = matches.only(_are_many(table.births[expected.ids], matches.landmark_rows))
     here, there = keyframe.landmark_ids[matches.feature_rows], expected.ids[matches.landmark_rows]

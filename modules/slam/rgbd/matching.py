@@ -12,7 +12,6 @@ from .features import Features
 
 _MAX_HAMMING = 64
 _MAX_HAMMING_ANYWHERE = 50
-_RATIO = 1.0
 _RATIO_ANYWHERE = 0.75
 _LEVEL_TOLERANCE = 1
 _ROW_BITS = 32  # of a sort key that holds a distance above and a row below
@@ -41,6 +40,7 @@ def match_near(
     features: Features,
     *,
     radius_px: float,
+    ratio: float = 1.0,
 ) -> Matches:
     """Return the features that look like the landmarks expected within `radius_px` of them.
 
@@ -53,7 +53,7 @@ def match_near(
         return _no_matches()
     bits = descriptors.view(np.uint64)[rows] ^ features.descriptors.view(np.uint64)[candidates]
     distances = np.bitwise_count(bits).sum(axis=1, dtype=np.int64)
-    return _clear_winners(rows, candidates, distances)
+    return _clear_winners(rows, candidates, distances, ratio)
 
 
 def match_anywhere(descriptors: NDArray[np.uint8], features: Features) -> Matches:
@@ -101,7 +101,10 @@ def _pairs_within(
 
 
 def _clear_winners(
-    rows: NDArray[np.int64], candidates: NDArray[np.int64], distances: NDArray[np.int64]
+    rows: NDArray[np.int64],
+    candidates: NDArray[np.int64],
+    distances: NDArray[np.int64],
+    ratio: float,
 ) -> Matches:
     """Return each row's best candidate where it is near and clearly better than the next."""
     starts = np.flatnonzero(np.concatenate([[True], np.diff(rows) != 0]))
@@ -111,7 +114,7 @@ def _clear_winners(
     keys_but_best = np.where(keys == np.repeat(best, lengths), _NO_RIVAL, keys)
     second = np.minimum.reduceat(keys_but_best, starts) >> _ROW_BITS
     pair, best = best & ((1 << _ROW_BITS) - 1), best >> _ROW_BITS
-    clear = (best <= _MAX_HAMMING) & (best < _RATIO * second)
+    clear = (best <= _MAX_HAMMING) & (best <= ratio * second)
     return _one_to_one(rows[pair[clear]], candidates[pair[clear]], best[clear])
 
 
