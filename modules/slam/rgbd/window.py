@@ -15,8 +15,8 @@ from .keyframes import NO_LANDMARK
 from .residuals import Sightings
 from .visual_map import VisualMap
 
-_FREE = 10
-_HELD = 10
+_FREE = 5
+_HELD = 15
 _MAX_SIGMA_M = 1.0  # of a landmark that is worth keeping
 
 
