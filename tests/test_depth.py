@@ -148,7 +148,7 @@ def test_turning_round_once_closes_and_the_past_is_revised():
 def test_standing_still_needs_no_more_memory():
     module = active()
     track(module, ROOM, [se3.identity()] * 20)
-    assert len(module._map) == 1
+    assert module.keyframe_count == 1
 
 
 def test_map_lies_on_the_walls():

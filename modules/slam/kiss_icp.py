@@ -1,8 +1,8 @@
 """The `kiss_icp` SLAM module: an adapter over KISS-ICP, for lidars and depth cameras.
 
 Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023. The library registers and
-keeps the voxel map; motion compensation, the prediction and the judgement of its answer are here,
-since it takes empty clouds and NaN in silence, and stops the process where all stamps are equal.
+keeps the voxel map; deskewing, prediction and the judgement of its answer are here, since it
+takes empty clouds and NaN in silence, and stops the process where all stamps are equal.
 """
 
 from __future__ import annotations
@@ -132,8 +132,8 @@ class KissIcp:
         T_local_base = self._fuse(T_local_guess, T_local_base, shape)
         self._icp.accept(T_local_guess, T_local_base)
         self._hold(observation.stamp_ns, T_local_base)
-        is_held = bool(shape.ratios[0] >= self.weak_ratio)
-        status = TrackingStatus.TRACKING if is_held else TrackingStatus.DEGRADED
+        is_open = shape.ratios[0] < self.weak_ratio
+        status = TrackingStatus.DEGRADED if is_open else TrackingStatus.TRACKING
         return self._answer(observation, status, overlap_ratio, inliers)
 
     def get_pose(self) -> se3.Transform:
@@ -188,9 +188,8 @@ class KissIcp:
         Point-to-point registration drags along smooth planes. Without odometry its answer stands,
         but for the directions that the cloud's shape leaves open: there the prediction does.
         """
-        held = shape.held(self.weak_ratio)
+        held, predicted = shape.held(self.weak_ratio), self._covariance
         information = held.T @ np.diag(1.0 / self._noise) @ held
-        predicted = self._covariance
         fused = np.linalg.inv(np.linalg.inv(predicted) + information)
         self._covariance = np.asarray(fused, np.float64)
         if self._held_ns is None:
@@ -207,7 +206,7 @@ class KissIcp:
         """Tell whether a robot can have moved so, in the time since the last good cloud."""
         if not np.isfinite(T_local_base).all():
             return False
-        # Odometry knows the motion: then it is the difference that has to be small.
+        # Of a motion that odometry knows, the difference has to be small.
         T_before = T_local_guess if self._is_measured else self._T_local_held
         moved = se3.inverse(T_before) @ T_local_base
         share = 0.2 if self._is_measured else 1.0

@@ -16,18 +16,14 @@ from sceneslam.types.trajectory import Trajectory
 from ..degeneracy import adjoint
 from .history import History
 from .keyframe_map import KeyframeMap
+from .localizer import Localizer
 from .motion import Motion, Prediction
 from .pose_graph import PoseGraph
-from .registration import Prior, Registration, Samples, register, samples_of
+from .registration import Prior, Registration, Samples, samples_of
 from .surface import Surface, SurfaceReader
 
 _SAMPLES_MIN = 100
-_TOGETHER = 3  # keyframes that an image is registered with
-_USEFUL_OVERLAP = 0.2
-_ALIKE = 3  # keyframes that a lost camera is tried at
 _COAST_S = 0.5  # without depth for longer, a guessed pose is no pose
-_SURE_RATIO = 0.6  # of the points that agree, for a place that motion did not lead to
-_FAR = 100.0  # squared deviations from where motion led to, ten in one direction
 
 
 @dataclass(kw_only=True, eq=False)
@@ -55,6 +51,11 @@ class DepthSlam:
         """Return that depth suffices; odometry and gyro are used when present."""
         return (frozenset({Sensor.DEPTH}),)
 
+    @property
+    def keyframe_count(self) -> int:
+        """Return how many views are kept; each takes 0.5 MB."""
+        return len(self._map)
+
     def activate(self, rig: Rig) -> None:
         """Start anew with an empty map; raises InputError for a rig without a camera."""
         if rig.camera is None:
@@ -63,6 +64,9 @@ class DepthSlam:
         self._reader = SurfaceReader(rig.camera)
         self._map = KeyframeMap(self._reader.grid)
         self._graph = PoseGraph(self._map, weak_ratio=self.weak_ratio)
+        self._localizer = Localizer(
+            self._map, matched_min_ratio=self.matched_min_ratio, weak_ratio=self.weak_ratio
+        )
         self._history = History(self._map)
         self._motion = Motion()
         self._T_map_local = se3.identity()
@@ -128,35 +132,12 @@ class DepthSlam:
     def _locate(
         self, samples: Samples, surface: Surface, prediction: Prediction
     ) -> Registration | None:
-        """Return where the camera is beside the keyframes around, else beside those alike."""
-        found = self._register(samples, self._prior(prediction))
-        if found is not None and found.matched_ratio >= self.matched_min_ratio:
-            return found
-        return self._relocalize(samples, surface, prediction)
-
-    def _relocalize(
-        self, samples: Samples, surface: Surface, prediction: Prediction
-    ) -> Registration | None:
-        """Return where the camera is by a keyframe that looks alike, where that is possible."""
-        expected = self._prior(prediction)
-        for index in self._map.alike(surface, _ALIKE):
-            start = Prior(self._map[index].T_local_cam, np.eye(6))
-            there = self._register(samples, start)
-            if there is None or there.matched_ratio < _SURE_RATIO or not self._is_held(there):
-                continue
-            off = se3.log(se3.inverse(expected.T_local_cam) @ there.T_local_cam)
-            if there.seen > _SURE_RATIO * len(samples) and off @ expected.information @ off < _FAR:
-                return there
-        return None
-
-    def _is_held(self, found: Registration) -> bool:
-        return bool(found.localizability.ratios[0] >= self.weak_ratio)
-
-    def _register(self, samples: Samples, prior: Prior) -> Registration | None:
-        overlaps = self._map.overlaps(samples, prior.T_local_cam)
-        near = [o.index for o in overlaps[:_TOGETHER] if o.ratio > _USEFUL_OVERLAP]
-        keyframes = [self._map[index] for index in near or [self._reference]]
-        return register(samples, prior, keyframes, self._map.grid, weak_ratio=self.weak_ratio)
+        prior = self._prior(prediction)
+        before = None
+        if not prediction.is_measured:
+            before = self._motion.T_local_base @ self._camera.T_base_cam
+        found = self._localizer.near(samples, prior, before)
+        return found or self._localizer.alike(samples, surface, prior)
 
     def _prior(self, prediction: Prediction) -> Prior:
         T_cam_base = se3.inverse(self._camera.T_base_cam)

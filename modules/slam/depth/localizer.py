@@ -1,0 +1,65 @@
+"""Where the camera is beside the keyframes: near where it should be, else where it looks alike."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sceneslam.types import se3
+
+from .keyframe_map import KeyframeMap
+from .registration import Prior, Registration, Samples, register
+from .surface import Surface
+
+_TOGETHER = 3  # keyframes that an image is registered with
+_USEFUL_OVERLAP = 0.2
+_ALIKE = 3  # keyframes that a lost camera is tried at
+_GOOD_RATIO = 0.8  # of the points that agree; with less, another start is tried as well
+_SURE_RATIO = 0.6  # of the points that agree, for a place that motion did not lead to
+_FAR = 100.0  # squared deviations from where motion led to, ten in one direction
+
+
+class Localizer:
+    """Registers images with the keyframes of a map."""
+
+    def __init__(
+        self, keyframes: KeyframeMap, *, matched_min_ratio: float, weak_ratio: float
+    ) -> None:
+        self._map = keyframes
+        self._matched_min_ratio, self._weak_ratio = matched_min_ratio, weak_ratio
+
+    def near(
+        self, samples: Samples, prior: Prior, T_local_cam_before: se3.Transform | None
+    ) -> Registration | None:
+        """Return the camera's pose around the prior; where that fits badly, around the last pose.
+
+        A hand that stopped, or turned back, is nearer to where it was than to where it went.
+        """
+        found = self._register(samples, prior)
+        is_good = found is not None and found.matched_ratio >= _GOOD_RATIO
+        again = None
+        if not is_good and T_local_cam_before is not None:
+            again = self._register(samples, Prior(T_local_cam_before, prior.information))
+        both = [one for one in (found, again) if one is not None]
+        best = max(both, key=lambda one: one.matched_ratio, default=None)
+        return best if best and best.matched_ratio >= self._matched_min_ratio else None
+
+    def alike(self, samples: Samples, surface: Surface, expected: Prior) -> Registration | None:
+        """Return the camera's pose by a keyframe that looks alike, where motion can lead to it."""
+        for index in self._map.alike(surface, _ALIKE):
+            there = self._register(samples, Prior(self._map[index].T_local_cam, np.eye(6)))
+            if there is None or there.localizability.ratios[0] < self._weak_ratio:
+                continue
+            off = se3.log(se3.inverse(expected.T_local_cam) @ there.T_local_cam)
+            if (
+                there.matched_ratio >= _SURE_RATIO
+                and there.seen > _SURE_RATIO * len(samples)
+                and off @ expected.information @ off < _FAR
+            ):
+                return there
+        return None
+
+    def _register(self, samples: Samples, prior: Prior) -> Registration | None:
+        overlaps = self._map.overlaps(samples, prior.T_local_cam)
+        near = [o.index for o in overlaps[:_TOGETHER] if o.ratio > _USEFUL_OVERLAP]
+        keyframes = [self._map[index] for index in near or [overlaps[0].index]]
+        return register(samples, prior, keyframes, self._map.grid, weak_ratio=self._weak_ratio)
