@@ -206,3 +206,13 @@ def test_only_a_robot_in_the_plane_gets_a_grid(height_m, has_grid):
     assert (built.grid is not None) == has_grid
     assert built.points.points[:, 0] == pytest.approx(2.0)
     assert layers.build([]).points is None
+
+
+def test_nearest_keyframe_can_be_asked_for_among_the_old_ones_alone():
+    store = KeyframeStore()
+    for x_m in (0.0, 1.0, 2.0):
+        store.insert(keyframe_at(x_m))
+    here = se3.from_xy_yaw(2.0, 0.0, 0.0)
+    assert store.nearest(here, per_m=1.0, per_rad=1.0) == 0.0
+    assert store.nearest(here, per_m=1.0, per_rad=1.0, but_latest=1) == pytest.approx(1.0)
+    assert store.nearest(here, per_m=1.0, per_rad=1.0, but_latest=3) == np.inf

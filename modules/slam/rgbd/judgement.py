@@ -13,6 +13,9 @@ from .pose_solver import PoseEstimate
 
 _MIN_DEPTH_AGREEMENT_RATIO = 0.2  # below, image and depth do not show the same place
 
+_RECENT = 20  # keyframes that belong to the way here
+_KNOWN_RATIO = 0.2  # of the step: a way taken before, of which there is nothing more to keep
+
 
 class HealthRule:
     """Calls a pose degraded that few landmarks hold, or that some direction is unsure of,
@@ -50,6 +53,11 @@ class KeyframeRule:
         """Tell whether the view from T_local_base should become a keyframe."""
         count = len(fix.landmark_ids)
         self._most_inliers = max(self._most_inliers, count)
-        if count < self._inlier_ratio * self._most_inliers:
-            return True
-        return keyframes.nearest(T_local_base, per_m=self._per_m, per_rad=self._per_rad) > 1.0
+        is_running_out = count < self._inlier_ratio * self._most_inliers
+        distance = keyframes.nearest(
+            T_local_base,
+            per_m=self._per_m,
+            per_rad=self._per_rad,
+            but_latest=_RECENT if is_running_out else 0,
+        )
+        return distance > (_KNOWN_RATIO if is_running_out else 1.0)

@@ -115,9 +115,17 @@ class KeyframeStore:
             both |= marks[some] & marks[others]
         return both
 
-    def nearest(self, T_local_base: Transform, *, per_m: float, per_rad: float) -> float:
-        """Return how far the nearest keyframe is, metres and radians weighed and added."""
-        T_keyframes = np.stack([keyframe.T_local_base for keyframe in self.all()])
+    def nearest(
+        self, T_local_base: Transform, *, per_m: float, per_rad: float, but_latest: int = 0
+    ) -> float:
+        """Return how far the nearest keyframe is, metres and radians weighed and added.
+
+        Infinitely far where there are none but the `but_latest`.
+        """
+        asked = list(self.all())[: len(self) - but_latest]
+        if not asked:
+            return float("inf")
+        T_keyframes = np.stack([keyframe.T_local_base for keyframe in asked])
         T_keyframe_base = se3.inverse(T_keyframes) @ T_local_base
         distances_m = np.linalg.norm(T_keyframe_base[:, :3, 3], axis=1)
         return float(

@@ -1,0 +1,233 @@
+"""Print how well the rgbd module remembers: places, loops, ways back, and what a map grows by.
+
+    python experiments/rgbd_loop.py WHAT [OVERRIDES]
+
+WHAT is `places`, `loops`, `kidnap` or `twice`; the overrides choose a recording as for a run:
+
+    python experiments/rgbd_loop.py loops story=there_and_back lights=on
+    python experiments/rgbd_loop.py kidnap source=tum_rgbd source.path=FOLDER
+
+The result is one line of a Markdown table. Times are CPU time of all threads.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from itertools import chain, islice
+from typing import Any, cast
+
+import numpy as np
+from hydra import compose, initialize_config_module
+from numpy.typing import NDArray
+from omegaconf import OmegaConf
+
+from sceneslam.config.component import Builder
+from sceneslam.evaluation.accuracy import absolute_errors
+from sceneslam.evaluation.association import interpolated
+from sceneslam.interfaces import SlamModule, Source
+from sceneslam.modules.slam.rgbd.module import RgbdSlam
+from sceneslam.modules.slam.rgbd.places import PlaceIndex
+from sceneslam.sources.ordered import Ordered
+from sceneslam.types import se3
+from sceneslam.types.maps import PoseGraphLayer
+from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.trajectory import Trajectory
+
+MAX_GAP_S = 0.02
+WRONG_M, WRONG_RAD = 0.3, 0.2  # a loop that is off by more joins two different places
+JUMPS, JUMP_IMAGES, GAP_NS = 20, 15, 2_000_000_000
+MAPPED_IMAGES = 440  # before the kidnapping; the ones in between are kept for afterwards
+KNOWN_AFTER_NS = 3_000_000_000  # a place seen longer ago than this counts as seen again
+SAME_PLACE_M, SAME_PLACE_RAD = 0.4, 0.35
+
+Row = Mapping[str, object]
+
+
+def build(overrides: Iterable[str]) -> tuple[Source, RgbdSlam, Trajectory]:
+    """Return a source, the module made ready for it, and the true poses."""
+    words = ["+scenario=single", "slam@slam.only=rgbd", *overrides]
+    with initialize_config_module("sceneslam.conf", version_base="1.3"):
+        config = OmegaConf.to_container(compose("config", overrides=words), resolve=True)
+    builder = Builder(cast(dict[str, Any], config))
+    source = Ordered(builder.make("source", Source))
+    module = cast(RgbdSlam, builder.make("slam.only", SlamModule))
+    module.activate(source.rig)
+    truth = source.ground_truth()
+    return source, module, Trajectory.empty() if truth is None else truth.trajectory
+
+
+def follow(module: RgbdSlam, observations: Iterable[Observation]) -> tuple[list[Tracking], Row]:
+    """Return the module's answers, and what they cost."""
+    answers, cost_ms = [], []
+    for observation in observations:
+        start = time.process_time()
+        answers.append(module.track(observation))
+        cost_ms.append(1e3 * (time.process_time() - start))
+    median, p95 = np.percentile(cost_ms, [50, 95])
+    return answers, {"median [ms]": f"{median:.1f}", "p95 [ms]": f"{p95:.1f}"}
+
+
+def loops(overrides: list[str]) -> Row:
+    """Return what loops were closed, how many of them wrongly, and what it did."""
+    source, module, truth = build(overrides)
+    answers, cost = follow(module, source)
+    revised, graph = module.get_trajectory(), module.get_map().pose_graph
+    module.shutdown()
+    held = [answer for answer in answers if answer.status is not TrackingStatus.LOST]
+    told = Trajectory(
+        stamps_ns=np.array([answer.stamp_ns for answer in held]),
+        T_world_base=np.stack([answer.T_local_base for answer in held]),
+    )
+    errors = loop_errors(graph, truth) if graph else np.zeros((0, 2))
+    wrong = (errors[:, 0] > WRONG_M) | (errors[:, 1] > WRONG_RAD)
+    return {
+        "lost": len(answers) - len(held),
+        "loop edges": len(errors),
+        "wrong": int(wrong.sum()),
+        "worst edge [m]": f"{errors[:, 0].max(initial=0):.3f}",
+        "corrections": answers[-1].revision,
+        "ATE told [m]": f"{absolute_errors(told, truth, MAX_GAP_S).rmse_m:.4f}",
+        "ATE revised [m]": f"{absolute_errors(revised, truth, MAX_GAP_S).rmse_m:.4f}",
+        **cost,
+    }
+
+
+def loop_errors(graph: PoseGraphLayer, truth: Trajectory) -> NDArray[np.float64]:
+    """Return how far each loop edge is from the true motion (N, 2) [m, rad]."""
+    edges = graph.edges[graph.is_loop]
+    T_gt_base = interpolated(truth, graph.stamps_ns).T_world_base
+    T_true = se3.inverse(T_gt_base[edges[:, 0]]) @ T_gt_base[edges[:, 1]]
+    T_error = se3.inverse(T_true) @ graph.T_from_to[graph.is_loop]
+    gaps_m = np.linalg.norm(T_error[:, :3, 3], axis=1)
+    return np.column_stack([gaps_m, se3.rotation_angle_rad(T_error)])
+
+
+def kidnap(overrides: list[str]) -> Row:
+    """Return how a camera finds itself that is put back, 2 s later, at a place it has seen.
+
+    Every second image makes the map; the camera is put back to the images in between. The error
+    is against where the map itself had the camera then.
+    """
+    source, module, _ = build(overrides)
+    images = [camera_only(image) for image in islice(source, MAPPED_IMAGES)]
+    mapped, _ = follow(module, images[::2])
+    others, rng = images[1::2], np.random.default_rng(0)
+    stamp_ns, delays, first_m, worst_m = images[-1].stamp_ns, [], [], []
+    for start in rng.integers(0, len(others) - JUMP_IMAGES - 1, JUMPS).tolist():
+        stamp_ns += GAP_NS
+        errors_m: list[float] = []
+        for step in range(JUMP_IMAGES):
+            stamp_ns += images[2].stamp_ns - images[0].stamp_ns
+            answer = module.track(replace(others[start + step], stamp_ns=stamp_ns))
+            around = mapped[start + step : start + step + 2]
+            if answer.status is not TrackingStatus.LOST:
+                expected = se3.interpolate(around[0].T_local_base, around[1].T_local_base, 0.5)
+                gap_m = answer.T_local_base[:3, 3] - expected[:3, 3]
+                errors_m.append(float(np.linalg.norm(gap_m)))
+            if len(errors_m) == 1:
+                delays.append(step)
+        first_m += errors_m[:1]
+        worst_m.append(max(errors_m, default=float("nan")))
+    module.shutdown()
+    return {
+        "put back": JUMPS,
+        "found": len(first_m),
+        "images until found, at most": max(delays, default=-1),
+        "first error, worst [m]": f"{max(first_m):.3f}",
+        "any error within a second, 90 % [m]": f"{np.nanpercentile(worst_m, 90):.3f}",
+        "worst [m]": f"{np.nanmax(worst_m):.3f}",
+    }
+
+
+def camera_only(observation: Observation) -> Observation:
+    """Return the observation without what could tell of a motion in the dark."""
+    return replace(observation, T_odom_base=None, gyro_base=None, scan=None)
+
+
+def twice(overrides: list[str]) -> Row:
+    """Return what the map grows by when the same path, a round trip, is driven again."""
+    source, module, _ = build(overrides)
+    sizes = []
+    for lap in (shifted(source, 0), shifted(source, 1)):
+        follow(module, lap)
+        layers = module.get_map()
+        assert layers.pose_graph is not None and layers.landmarks is not None
+        sizes.append((len(layers.pose_graph.stamps_ns), len(layers.landmarks.points)))
+    module.shutdown()
+    first, second = np.array(sizes)
+    growth = second / first - 1.0
+    return {
+        "keyframes": f"{first[0]} -> {second[0]} ({growth[0]:+.0%})",
+        "landmarks": f"{first[1]} -> {second[1]} ({growth[1]:+.0%})",
+    }
+
+
+def shifted(source: Source, lap: int) -> Iterator[Observation]:
+    """Yield a lap's observations, each lap beginning 33 ms after the one before it ended."""
+    observations = iter(source)
+    first = next(observations)
+    end_ns = first.stamp_ns
+    if lap:
+        for last in source:
+            end_ns = last.stamp_ns
+    offset_ns = lap * (end_ns - first.stamp_ns + 33_000_000)
+    for observation in chain([first], observations):
+        yield replace(camera_only(observation), stamp_ns=observation.stamp_ns + offset_ns)
+
+
+def places(overrides: list[str]) -> Row:
+    """Return how often the keyframe most alike shows the place of an image seen longer ago."""
+    source, module, truth = build(overrides)
+    index, stamps, hits, asked, cost_ms = PlaceIndex(), {}, 0, 0, []
+    for observation in source:
+        module.track(observation)
+        keyframes = module._map.keyframes
+        newest = keyframes.ids[-1] if len(keyframes) else -1
+        if newest in stamps or newest < 0:
+            continue
+        keyframe = keyframes[newest]
+        old = [k for k, ns in stamps.items() if ns < keyframe.stamp_ns - KNOWN_AFTER_NS]
+        same = same_place(truth, keyframe.stamp_ns, [stamps[k] for k in old])
+        if same.any():
+            start = time.process_time()
+            best = index.alike(keyframe.features.descriptors, old)[0].place_id
+            cost_ms.append(1e3 * (time.process_time() - start))
+            hits, asked = hits + int(same[old.index(best)]), asked + 1
+        index.insert(newest, keyframe.features.descriptors)
+        stamps[newest] = keyframe.stamp_ns
+    module.shutdown()
+    mean_ms = float(np.mean(cost_ms)) if cost_ms else float("nan")
+    return {"keyframes": len(stamps), "asked": asked, "right": hits, "mean [ms]": f"{mean_ms:.1f}"}
+
+
+def same_place(truth: Trajectory, stamp_ns: int, others_ns: list[int]) -> NDArray[np.bool_]:
+    """Tell which of the other stamps saw, by the true poses, about the same view."""
+    if not others_ns:
+        return np.zeros(0, bool)
+    T_gt_base = interpolated(truth, np.array([stamp_ns, *others_ns])).T_world_base
+    T_one_other = se3.inverse(T_gt_base[0]) @ T_gt_base[1:]
+    is_near = np.linalg.norm(T_one_other[:, :3, 3], axis=1) < SAME_PLACE_M
+    return np.asarray(is_near & (se3.rotation_angle_rad(T_one_other) < SAME_PLACE_RAD))
+
+
+WHAT: Mapping[str, Callable[[list[str]], Row]] = {
+    "places": places,
+    "loops": loops,
+    "kidnap": kidnap,
+    "twice": twice,
+}
+
+
+def main() -> None:
+    """Run what the first word says on the recording that the others choose."""
+    row = WHAT[sys.argv[1]](sys.argv[2:])
+    print("| " + " | ".join(row) + " |")
+    print("|---" * len(row) + "|")
+    print("| " + " | ".join(str(value) for value in row.values()) + " |")
+
+
+if __name__ == "__main__":
+    main()
