@@ -114,7 +114,7 @@ def _clear_winners(
     keys_but_best = np.where(keys == np.repeat(best, lengths), _NO_RIVAL, keys)
     second = np.minimum.reduceat(keys_but_best, starts) >> _ROW_BITS
     pair, best = best & ((1 << _ROW_BITS) - 1), best >> _ROW_BITS
-    clear = (best <= _MAX_HAMMING) & (best <= ratio * second)
+    clear = (best <= _MAX_HAMMING) & (best < ratio * second)
     return _one_to_one(rows[pair[clear]], candidates[pair[clear]], best[clear])
 
 
