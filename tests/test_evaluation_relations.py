@@ -27,15 +27,16 @@ def test_relations_measure_the_motion_between_two_stamps(tmp_path):
     x, y = T_1_2[:2, 3]
     relations = relations_of(
         [
-            f"1.001 2.0 {x} {y} 0 0 0 0.2",  # exact, its stamp off by 1 ms
+            f"1.0004 2.0 {x} {y} 0 0 0 0.2",  # exact, its stamp rounded
             f"2.0 1.0 0 0 0 0 0 {-0.2 - np.radians(2)}",  # backwards in time, 2 degrees off
             "1.0 9.0 0 0 0 0 0 0",  # no pose at 9 s
+            "1.0 2.002 0 0 0 0 0 0",  # the scan of that stamp has no pose
         ],
         tmp_path / "x.relations",
     )
     errors = relation_errors(four_poses(), relations)
     assert errors["matched"] == 2
-    assert errors["total"] == 3
+    assert errors["total"] == 4
     assert errors["rot_mean_deg"] == pytest.approx(1.0)
     assert errors["rot_std_deg"] == pytest.approx(1.0)
     assert errors["rot_sq_mean"] == pytest.approx(2.0)

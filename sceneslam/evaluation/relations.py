@@ -13,7 +13,7 @@ from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.trajectory import Trajectory
 
-_SAME_STAMP_S = 0.005  # files print stamps with few decimals; scans are further apart
+_SAME_STAMP_S = 0.0005  # files print stamps with three decimals or more; few scans are nearer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,7 +49,7 @@ class Relations:
 def relation_errors(trajectory: Trajectory, relations: Relations) -> dict[str, float | int]:
     """Return mean and deviation of the motions' errors, and of their squares.
 
-    A relation is matched when the trajectory has a pose within 5 ms of both its instants. The
+    A relation is matched when the trajectory has a pose within 0.5 ms of both its instants. The
     translation error is the length, the rotation error the angle of inv(true) @ estimated.
     Raises InputError when no relation is matched.
     """
