@@ -16,10 +16,10 @@ from sceneslam.bus.events import EventLog
 from sceneslam.bus.machine import BusMachine
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.runner import Runner
-from sceneslam.bus.scene_filter import SceneFilter
+from sceneslam.bus.watch import Watch
 from sceneslam.interfaces import Detector, SlamModule
 from sceneslam.types.errors import ModuleError
-from sceneslam.types.observation import Observation, TrackingStatus
+from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 
 _log = logging.getLogger(__name__)
@@ -45,11 +45,14 @@ class Bus:
         catch_up_steps: int | None = None,
     ) -> None:
         self.runners = {key: Runner(key, module) for key, module in modules.items()}
-        self.detector_us: list[float] = []
         self.bus_us: list[float] = []
-        self._detector, self._policy, self._log = detector, policy, log
-        self._filter = SceneFilter(
-            window_s=policy.confirm_window_s, first_window_s=policy.first_confirm_window_s
+        self._policy, self._log = policy, log
+        self._watch = Watch(
+            detector,
+            rig,
+            log,
+            window_s=policy.confirm_window_s,
+            first_window_s=policy.first_confirm_window_s,
         )
         self._estimator = Estimator(
             policy=policy, rig=rig, atlas=atlas, log=log, has_choice=len(modules) > 1
@@ -67,12 +70,11 @@ class Bus:
             catch_up_steps=catch_up_steps,
         )
         self._decisions = DecisionLog(log)
-        self._detector_works = True
-        try:
-            detector.activate(rig)
-        except Exception as error:
-            what = f"detector could not be activated: {type(error).__name__}: {error}"
-            raise ModuleError(what) from error
+
+    @property
+    def detector_us(self) -> list[float]:
+        """Return what each vote cost."""
+        return self._watch.spent_us
 
     @property
     def state(self) -> str:
@@ -93,14 +95,14 @@ class Bus:
         """Take one observation: vote, track, and change state where that is called for."""
         began_ns = perf_counter_ns()
         spent_ns = self._spent_ns()
-        self._vote(observation)
+        self._watch.look(observation)
         self._track(observation)
         outcome = self._do(observation)
         while outcome is not None:
             self._send(outcome.value, observation.stamp_ns)
             outcome = self._enter(observation)
         own_ns = perf_counter_ns() - began_ns - (self._spent_ns() - spent_ns)
-        self.bus_us.append(own_ns / 1e3 - self.detector_us[-1])
+        self.bus_us.append(own_ns / 1e3 - self._watch.spent_us[-1])
 
     def close(self, stamp_ns: int) -> None:
         """End the run: shut the module down, then the detector. May be called twice."""
@@ -108,7 +110,7 @@ class Bus:
             self._send("stop", stamp_ns)
         self._changeover.close()
         self._estimator.retire()
-        self._detector.shutdown()
+        self._watch.close()
 
     # What the machine asks before it takes a failure's way out.
 
@@ -138,12 +140,12 @@ class Bus:
 
     def _init(self, stamp_ns: int) -> Outcome | None:
         """Wait for the first confirmed scene."""
-        if not self._detector_works:
+        if not self._watch.is_working:
             return Outcome.FAILURE
-        if self._filter.scene is None:
+        if self._watch.scene is None:
             return None
-        self._candidates.serve(self._filter.scene)
-        keys = self._candidates.of(self._filter.scene)
+        self._candidates.serve(self._watch.scene)
+        keys = self._candidates.of(self._watch.scene)
         self._changeover.begin(
             Plan(keys=keys, reason="first", at_ns=stamp_ns, since_ns=None, held_ns=0)
         )
@@ -177,34 +179,12 @@ class Bus:
                 keys=verdict.to,
                 reason=verdict.reason,
                 at_ns=now.stamp_ns,
-                since_ns=self._filter.since_ns if is_scene else None,
+                since_ns=self._watch.since_ns if is_scene else None,
                 held_ns=now.held_ns,
             )
         )
 
     # What they are made of.
-
-    def _vote(self, observation: Observation) -> None:
-        """Ask the detector; log a scene that its vote confirms."""
-        began_ns = perf_counter_ns()
-        try:
-            vote = self._detector.get_scene(observation) if self._detector_works else None
-        except Exception as error:
-            self._detector_works, vote = False, None
-            self._fault(observation.stamp_ns, f"the detector failed: {error}")
-        self.detector_us.append((perf_counter_ns() - began_ns) / 1e3)
-        if vote is None:
-            return
-        self._log.add("vote", vote.stamp_ns, scene=vote.scene, value=vote.value)
-        confirmed = self._filter.update(vote)
-        if confirmed is not None:
-            self._log.add(
-                "scene",
-                confirmed.stamp_ns,
-                scene=confirmed.scene,
-                previous=confirmed.previous,
-                since_ns=confirmed.since_ns,
-            )
 
     def _track(self, observation: Observation) -> None:
         try:
@@ -218,16 +198,8 @@ class Bus:
 
     def _look(self, observation: Observation) -> Situation:
         """Return all that is known at an observation."""
-        hold, active = self._estimator.hold, self._estimator.active
-        is_lost = hold.status is TrackingStatus.LOST
-        health = Health.HELD
-        if active is None or active.is_failed:
-            health = Health.FAILED
-        elif hold.unheld_since_ns is not None and hold.is_suspect:
-            health = Health.SUSPECT
-        elif hold.unheld_since_ns is not None:
-            health = Health.LOST if is_lost else Health.SILENT
-        scene = self._filter.scene or self.scene
+        hold, health = self._estimator.hold, self._estimator.health
+        scene = self._watch.scene or self.scene
         return Situation(
             stamp_ns=observation.stamp_ns,
             scene=scene,

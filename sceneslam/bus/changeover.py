@@ -126,7 +126,9 @@ class Changeover:
             return
         try:
             if trial.handover is None:
-                trial.handover = self._estimator.begin_trial(self._runners[trial.key], self._scene)
+                trial.handover = self._estimator.begin(
+                    self._runners[trial.key], self._scene, None, is_trial=True
+                )
             trial.handover.advance(None)
         except ModuleError as error:
             self._fault(stamp_ns, str(error))

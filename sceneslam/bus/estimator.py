@@ -8,6 +8,7 @@ import numpy as np
 
 from sceneslam.atlas.atlas import BRIDGED, Atlas
 from sceneslam.bus.bridge import Bridge
+from sceneslam.bus.decision import Health
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.handover import Handover
 from sceneslam.bus.hold import Hold
@@ -47,6 +48,17 @@ class Estimator:
         self._told: TrackingStatus | None = None  # what the log says of the active module
 
     @property
+    def health(self) -> Health:
+        """Return what the active module's pose is worth; FAILED where there is none."""
+        if self.active is None or self.active.is_failed:
+            return Health.FAILED
+        if self.hold.unheld_since_ns is None:
+            return Health.HELD
+        if self.hold.is_suspect:
+            return Health.SUSPECT
+        return Health.LOST if self.hold.status is TrackingStatus.LOST else Health.SILENT
+
+    @property
     def now_ns(self) -> int:
         """Return the stamp of the newest observation."""
         return self._memory.newest.stamp_ns
@@ -84,20 +96,18 @@ class Estimator:
         if fault is not None:
             raise fault
 
-    def begin(self, runner: Runner, scene: str, since_ns: int | None) -> Handover:
+    def begin(
+        self, runner: Runner, scene: str, since_ns: int | None, *, is_trial: bool = False
+    ) -> Handover:
         """Begin to hand over to a module; raises ModuleError when it cannot be activated.
 
-        `since_ns`: when the scene that calls for it began, None where it is not the scene.
+        `since_ns`: when the scene that calls for it began, None where it is not the scene. A
+        trial begins now, whatever the kind of hand-over.
         """
         anchor = self._memory.newest
-        if self._policy.handover == "rewind":
+        if self._policy.handover == "rewind" and not is_trial:
             anchor = self._memory.anchor(since_ns)
         hold = self._new_hold()
-        return Handover(runner, self._memory, anchor=anchor, hold=hold, scene=scene, rig=self._rig)
-
-    def begin_trial(self, runner: Runner, scene: str) -> Handover:
-        """Begin to lead a module along from now on; raises ModuleError as `begin`."""
-        anchor, hold = self._memory.newest, self._new_hold()
         return Handover(runner, self._memory, anchor=anchor, hold=hold, scene=scene, rig=self._rig)
 
     def settle(self, handover: Handover) -> None:
