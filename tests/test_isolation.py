@@ -200,6 +200,14 @@ def test_no_process_is_left_behind(isolated):
     assert process_ids() == before
 
 
+def test_a_file_of_the_users_does_not_shadow_what_python_starts_with(
+    isolated, tmp_path, monkeypatch
+):
+    (tmp_path / "re.py").write_text("raise AssertionError")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert isolated(ExactModule).requires == ExactModule.requires
+
+
 PARENT = """
 import sys, time
 from functools import partial

@@ -25,6 +25,13 @@ _THREAD_VARIABLES = (
     "MKL_NUM_THREADS",
     "OPENCV_FOR_THREADS_NUM",
 )
+# The path is set when the interpreter is up: what lies in a user's folder must not shadow its own.
+_MAIN = """
+import sys
+line, lifeline, *sys.path = sys.argv[1:]
+from sceneslam.supervision.worker import main
+main(int(line), int(lifeline))
+"""
 
 
 class ProcessDeathError(ModuleError):
@@ -43,8 +50,8 @@ class Process:
         near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         lifeline, self._lifeline = os.pipe()
         self._popen = subprocess.Popen(
-            [sys.executable, "-P", "-m", "sceneslam.supervision", str(far.fileno()), str(lifeline)],
-            env=_environment(limits.threads),
+            [sys.executable, "-P", "-c", _MAIN, str(far.fileno()), str(lifeline), *sys.path],
+            env={**os.environ, **dict.fromkeys(_THREAD_VARIABLES, str(limits.threads))},
             stdin=subprocess.DEVNULL,
             pass_fds=(far.fileno(), lifeline),
             process_group=0,  # a terminal's Ctrl-C is the parent's to handle
@@ -138,12 +145,3 @@ def _end(popen: subprocess.Popen[bytes], channel: Channel, lifeline: int) -> Non
     popen.wait()
     channel.close()
     os.close(lifeline)
-
-
-def _environment(threads: int) -> dict[str, str]:
-    """Return the environment in which the process finds the same code, and so many threads."""
-    return {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join(sys.path),
-        **dict.fromkeys(_THREAD_VARIABLES, str(threads)),
-    }
