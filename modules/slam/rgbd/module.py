@@ -29,6 +29,7 @@ from .memory import Memory
 from .motion import MotionModel
 from .pose_solver import PoseSolver
 from .relocalizer import Relocalizer
+from .shutter import RollingShutter
 from .view import View
 from .visual_map import VisualMap
 
@@ -123,6 +124,7 @@ class RgbdSlam:
         self._layers = self._make_layers(rig.camera)
         self._keyframe_rule = self._make_keyframe_rule()
         self._motion = MotionModel()
+        self._shutter = RollingShutter(rig.camera)
         self._T_local_base = se3.identity()
         self._local_ids = np.zeros(0, np.int64)  # landmarks of the local map
         self._observations = 0
@@ -146,9 +148,13 @@ class RgbdSlam:
             return self._lose(observation, T_predicted)
         gray = np.asarray(cv2.cvtColor(observation.image_bgr, cv2.COLOR_BGR2GRAY), np.uint8)
         features = self._extractor.extract(gray, observation.depth_m)
+        rate_cam = self._camera.T_base_cam[:3, :3].T @ self._motion.turn_rate(observation)
+        features = self._shutter.straighten(features, rate_cam)
         view = View(observation=observation, gray=gray, features=features, T_predicted=T_predicted)
         fix = self._locate(view) if len(self._map.keyframes) else None
         if fix is not None:
+            uv_px = features.uv_px[fix.feature_rows]
+            self._shutter.learn(fix.estimate.linearised, uv_px, rate_cam)
             return self._hold(view, fix)
         if not len(self._map.keyframes) or self._is_unknown_place(features):
             return self._start(view)

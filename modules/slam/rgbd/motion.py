@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
@@ -24,15 +25,18 @@ class MotionModel:
 
     def predict(self, observation: Observation) -> Transform:
         """Return the expected T_local_base at the observation."""
-        gap_s = self._gap_s(observation)
         if self._T_odom_base is not None and observation.T_odom_base is not None:
             T_prev_curr = se3.inverse(self._T_odom_base) @ observation.T_odom_base
             return self._T_local_base @ T_prev_curr
-        twist = self._twist_per_s * gap_s
+        twist = np.concatenate([self._twist_per_s[:3], self.turn_rate(observation)])
+        return self._T_local_base @ se3.exp(twist * self._gap_s(observation))
+
+    def turn_rate(self, observation: Observation) -> NDArray[np.float64]:
+        """Return how fast the base should turn (3,) [rad/s], by the gyro if there is one."""
         gyro = observation.gyro_base
         if gyro is not None and len(gyro) and np.isfinite(gyro[:, 1:4]).all():
-            twist[3:] = gyro[:, 1:4].mean(axis=0) * gap_s
-        return self._T_local_base @ se3.exp(twist)
+            return np.asarray(gyro[:, 1:4].mean(axis=0))
+        return self._twist_per_s[3:]
 
     def hold(self, observation: Observation, T_local_base: Transform) -> None:
         """Go on from a pose that was measured."""

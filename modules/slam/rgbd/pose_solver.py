@@ -39,6 +39,15 @@ class Consensus:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Linearised:
+    """The pixels that agree with a pose, and what moves they would follow."""
+
+    residuals: NDArray[np.float64]  # (2 N,) in sigmas, all u before all v
+    jacobian: NDArray[np.float64]  # (6, 2 N), by a twist of the base
+    sigma_px: NDArray[np.float64]  # (N,)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PoseEstimate:
     """A pose with its covariance and the measurements that agree with it."""
 
@@ -47,6 +56,7 @@ class PoseEstimate:
     inliers: NDArray[np.bool_]  # (N,), pixels agree
     depth_inliers: NDArray[np.bool_]  # (N,), depths agree too
     depth_agreement_ratio: float  # of the inliers that have a depth; 1 where none has
+    linearised: Linearised  # of the inliers
 
 
 class PoseSolver:
@@ -101,7 +111,7 @@ class PoseSolver:
                 T_local_base = T_local_base @ se3.exp(step)
                 if np.abs(step).max() < _SMALL_STEP:
                     break
-            found, _ = self._linearise(measured, T_local_base)
+            found, jacobian = self._linearise(measured, T_local_base)
             inliers = found.pixels_agree()
             depth_inliers = inliers & measures_depth & found.depths_agree()
             if inliers.sum() < 4:
@@ -115,6 +125,11 @@ class PoseSolver:
             inliers=inliers,
             depth_inliers=depth_inliers,
             depth_agreement_ratio=_share(depth_inliers, inliers & measures_depth),
+            linearised=Linearised(
+                residuals=found.of[:2, inliers].ravel(),
+                jacobian=jacobian[:, :2, inliers].reshape(6, -1),
+                sigma_px=measured.seen.sigma_px[inliers],
+            ),
         )
 
     def _linearise(

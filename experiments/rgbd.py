@@ -1,0 +1,179 @@
+"""Print how well and how fast the RGB-D module follows recordings in the TUM layout.
+
+    python experiments/rgbd.py FOLDER [FX FY CX CY DEPTH_SCALE]  # the table below
+    python experiments/rgbd.py FOLDER [...] sweep  # seeds and feature counts
+    python experiments/rgbd.py FOLDER [...] honest  # errors in claimed sigmas
+    python experiments/rgbd.py FOLDER [...] profile  # where the time goes
+
+Every recording is also run backwards and with every second image, since one ATE says little.
+`told` is what `track` returned, `revised` what `get_trajectory` did. Times are CPU times of all
+threads, per image, reading excluded.
+"""
+
+from __future__ import annotations
+
+import cProfile
+import pstats
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
+from time import perf_counter, process_time
+
+import cv2
+import numpy as np
+import yaml
+
+from sceneslam.evaluation.accuracy import absolute_errors, relative_errors
+from sceneslam.modules.slam.rgbd.module import RgbdSlam
+from sceneslam.sources.tum_rgbd import TumRgbd
+from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.rig import Rig
+from sceneslam.types.trajectory import Trajectory
+
+CONF = Path(__file__).resolve().parents[1] / "conf" / "slam" / "rgbd.yaml"
+GAP_S = 0.01  # between a pose and its truth
+HEAD = (
+    "| run | ATE told (max) [mm] | revised [mm] | no pose | keyframes "
+    "| CPU ms: median, p95 | wall ms: median, p95 | CPU in all [s] |"
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Run:
+    """What one pass over a recording gave."""
+
+    answers: list[Tracking]
+    told: Trajectory
+    revised: Trajectory
+    keyframes: int
+    cpu_ms: list[float]
+    wall_ms: list[float]
+
+
+def recording(words: list[str]) -> TumRgbd:
+    """Return the recording that the command line names."""
+    numbers = [float(word) for word in words[1:6]]
+    known = dict.fromkeys(("fx", "fy", "cx", "cy", "distortion"))
+    camera = dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=False)) | {"distortion": None}
+    return TumRgbd(
+        path=words[0],
+        camera=camera if numbers else known,
+        depth_scale=numbers[4] if numbers else 5000.0,
+        depth_range_m=[0.3, 8.0],
+        sync_tolerance_s=0.02,
+    )
+
+
+def follow(rig: Rig, observations: Iterator[Observation] | list[Observation], **changes) -> Run:
+    """Run the module over observations."""
+    settings = yaml.safe_load(CONF.read_text()) | {"seed": 0} | changes
+    del settings["_target_"]
+    module = RgbdSlam(**settings)
+    module.activate(rig)
+    answers, cpu_ms, wall_ms = [], [], []
+    for observation in observations:
+        cpu_s, wall_s = process_time(), perf_counter()
+        answers.append(module.track(observation))
+        cpu_ms.append(1e3 * (process_time() - cpu_s))
+        wall_ms.append(1e3 * (perf_counter() - wall_s))
+    held = [answer for answer in answers if answer.status is not TrackingStatus.LOST]
+    told = Trajectory(
+        stamps_ns=np.array([answer.stamp_ns for answer in held]),
+        T_world_base=np.stack([answer.T_local_base for answer in held]),
+    )
+    revised, graph = module.get_trajectory(), module.get_map().pose_graph
+    module.shutdown()
+    return Run(
+        answers=answers,
+        told=told,
+        revised=revised,
+        keyframes=0 if graph is None else len(graph.stamps_ns),
+        cpu_ms=cpu_ms,
+        wall_ms=wall_ms,
+    )
+
+
+def row(name: str, run: Run, truth: Trajectory) -> str:
+    """Return one line of the table."""
+    told = absolute_errors(run.told, truth, GAP_S)
+    revised = absolute_errors(run.revised, truth, GAP_S)
+    cpu, wall = ([np.percentile(ms, q) for q in (50, 95)] for ms in (run.cpu_ms, run.wall_ms))
+    return (
+        f"| {name} | {1e3 * told.rmse_m:.1f} ({1e3 * told.max_m:.0f}) | {1e3 * revised.rmse_m:.1f}"
+        f" | {len(run.answers) - len(run.told)} of {len(run.answers)} | {run.keyframes}"
+        f" | {cpu[0]:.1f}, {cpu[1]:.1f} | {wall[0]:.1f}, {wall[1]:.1f}"
+        f" | {sum(run.cpu_ms) / 1e3:.1f} |"
+    )
+
+
+def backwards(observations: list[Observation], truth: Trajectory):
+    """Return the recording from its end, with stamps that rise."""
+    turn_ns = observations[0].stamp_ns + observations[-1].stamp_ns
+    turned = [replace(o, stamp_ns=turn_ns - o.stamp_ns) for o in reversed(observations)]
+    return turned, Trajectory(
+        stamps_ns=(turn_ns - truth.stamps_ns)[::-1].copy(),
+        T_world_base=truth.T_world_base[::-1].copy(),
+    )
+
+
+def table(source: TumRgbd, truth: Trajectory) -> None:
+    """Print the recording as it is, backwards, and with every second image."""
+    print(HEAD + "\n" + "|---" * 8 + "|")
+    print(row("as it is", follow(source.rig, iter(source)), truth), flush=True)
+    peak_mb = getrusage(RUSAGE_SELF).ru_maxrss / 1024
+    observations = list(source)
+    turned, turned_truth = backwards(observations, truth)
+    print(row("backwards", follow(source.rig, turned), turned_truth), flush=True)
+    print(row("every second image", follow(source.rig, observations[::2]), truth))
+    print(f"\npeak memory of the first, reading included: {peak_mb:.0f} MB")
+
+
+def sweep(source: TumRgbd, truth: Trajectory) -> None:
+    """Print what seeds and feature counts change."""
+    print(HEAD + "\n" + "|---" * 8 + "|")
+    for changes in [{"seed": s} for s in range(3)] + [{"feature_count": c} for c in (700, 1500)]:
+        name = ", ".join(f"{key} {value}" for key, value in changes.items())
+        print(row(name, follow(source.rig, iter(source), **changes), truth), flush=True)
+
+
+def honest(source: TumRgbd, truth: Trajectory) -> None:
+    """Print the motion's error from image to image beside the sigma that was claimed."""
+    run = follow(source.rig, iter(source))
+    sigma_mm = {
+        a.stamp_ns: 1e3 * np.sqrt(np.trace(a.covariance[:3, :3]))
+        for a in run.answers
+        if a.covariance is not None
+    }
+    error = relative_errors(run.told, truth, GAP_S, 1.0)
+    print(
+        f"claimed sigma, median: {np.median(list(sigma_mm.values())):.1f} mm; "
+        f"error over 1 s, median: {1e3 * np.median(error.trans_m):.1f} mm, "
+        f"{np.degrees(np.median(error.rot_rad)):.2f} deg"
+    )
+
+
+def profile(source: TumRgbd, truth: Trajectory) -> None:
+    """Print the functions that take most time of their own, of all but the worker."""
+    profiler = cProfile.Profile()
+    observations = list(source)
+    profiler.runcall(follow, source.rig, observations)
+    pstats.Stats(profiler).sort_stats("tottime").print_stats(25)
+
+
+def main() -> None:
+    """Run the command in the first lines of this file."""
+    cv2.setNumThreads(1)
+    words = sys.argv[1:]
+    modes = {"sweep": sweep, "honest": honest, "profile": profile}
+    mode = modes.get(words[-1], table)
+    source = recording([word for word in words if word not in modes])
+    truth = source.ground_truth()
+    if truth is None:
+        raise SystemExit(f"no groundtruth.txt: {words[0]}")
+    mode(source, truth.trajectory)
+
+
+if __name__ == "__main__":
+    main()

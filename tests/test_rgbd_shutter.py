@@ -1,0 +1,86 @@
+"""The rgbd module learns from its residuals that the camera's rows are read one by one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rgbd_features import features_at, random_descriptors
+
+from sceneslam.modules.slam.rgbd.pose_solver import Measurements, PoseSolver
+from sceneslam.modules.slam.rgbd.residuals import Sightings
+from sceneslam.modules.slam.rgbd.shutter import RollingShutter
+from sceneslam.types import se3
+from sceneslam.types.rig import Camera
+
+CAMERA = Camera(size_wh=(640, 480), fx=525.0, fy=520.0, cx=319.0, cy=241.0, T_base_cam=np.eye(4))
+LANDMARKS = 300
+
+
+def pixels(points_cam):
+    focal_px, centre_px = np.array([CAMERA.fx, CAMERA.fy]), np.array([CAMERA.cx, CAMERA.cy])
+    return points_cam[:, :2] / points_cam[:, 2:] * focal_px + centre_px
+
+
+def rolled(points_cam, rate_cam, readout_s):
+    """Return where a camera at the identity sees points while it turns and reads."""
+    uv_px = pixels(points_cam)
+    for _ in range(5):  # when a row is read depends on where its point then is
+        late_s = readout_s * (uv_px[:, 1] / CAMERA.size_wh[1] - 0.5)
+        turned = [se3.so3_exp(-rate_cam * s) @ p for s, p in zip(late_s, points_cam, strict=True)]
+        uv_px = pixels(np.stack(turned))
+    return uv_px
+
+
+def scene(rng):
+    uv_px = rng.uniform([20, 20], [620, 460], (LANDMARKS, 2))
+    z = rng.uniform(1.0, 4.0, LANDMARKS)
+    rays = (uv_px - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy]
+    return np.column_stack([rays, np.ones(LANDMARKS)]) * z[:, None]
+
+
+def after_watching(readout_s, *, images=60):
+    """Return a shutter that saw a camera turn about changing axes, and the last image."""
+    rng = np.random.default_rng(0)
+    shutter, solver, points = RollingShutter(CAMERA), PoseSolver(CAMERA, seed=0), scene(rng)
+    for _ in range(images):
+        rate_cam = rng.normal(0, 1.0, 3)
+        uv_px = rolled(points, rate_cam, readout_s) + rng.normal(0, 0.5, (LANDMARKS, 2))
+        features = features_at(uv_px, random_descriptors(rng, LANDMARKS))
+        straight = shutter.straighten(features, rate_cam)
+        seen = Sightings(
+            uv_px=straight.uv_px,
+            sigma_px=np.ones(LANDMARKS),
+            depth_m=points[:, 2],
+            inverse_depth_sigma_per_m=np.full(LANDMARKS, 0.003),
+        )
+        estimate = solver.refine(Measurements(points_local=points, seen=seen), np.eye(4))
+        shutter.learn(estimate.linearised, straight.uv_px[estimate.inliers], rate_cam)
+    return shutter, points
+
+
+@pytest.mark.parametrize("readout_s", [0.026, 0.012, -0.02])
+def test_readout_is_learnt_with_its_sign(readout_s):
+    shutter, _ = after_watching(readout_s)
+    assert shutter.readout_s == pytest.approx(readout_s, abs=0.002)
+
+
+def test_features_are_put_where_the_middle_row_would_have_seen_them():
+    shutter, points = after_watching(0.026)
+    rate_cam = np.array([0.5, -1.0, 0.8])
+    uv_px = rolled(points, rate_cam, 0.026)
+    features = features_at(uv_px, np.zeros((LANDMARKS, 32), np.uint8))
+    straight = shutter.straighten(features, rate_cam).uv_px
+    wrong_px = np.linalg.norm(uv_px - pixels(points), axis=1)
+    left_px = np.linalg.norm(straight - pixels(points), axis=1)
+    assert np.median(wrong_px) > 3.0
+    assert np.median(left_px) < 0.15 * np.median(wrong_px)
+
+
+def test_global_shutter_and_camera_at_rest_are_left_alone():
+    shutter, points = after_watching(0.0)
+    features = features_at(pixels(points), np.zeros((LANDMARKS, 32), np.uint8))
+    assert abs(shutter.readout_s) < 0.001
+    learnt, _ = after_watching(0.026)
+    assert np.array_equal(learnt.straighten(features, np.zeros(3)).uv_px, features.uv_px)
+    none = replace(features, uv_px=features.uv_px[:0], levels=features.levels[:0])
+    assert len(learnt.straighten(none, np.ones(3))) == 0
