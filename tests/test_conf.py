@@ -91,6 +91,7 @@ ALLOWED = {  # package -> what of ours it may import
     "modules": {"types", "interfaces"},
     "experiments/openloris": {"types", "evaluation", "experiments"},
     "experiments/handover": {"types", "evaluation", "experiments"},
+    "experiments/mutants": {"types", "ros", "config", "experiments"},
     "experiments/matrix": {"types", "evaluation", "bus", "experiments"},
 }
 

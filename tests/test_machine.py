@@ -75,3 +75,16 @@ def test_an_error_in_a_guard_is_raised_and_the_state_stays():
     with pytest.raises(RuntimeError, match="broken guard"):
         machine.send("failure")
     assert machine.state == "start"
+
+
+def test_every_state_is_reached_and_has_an_unguarded_way_to_terminate():
+    machine = BusMachine(Answers(False))
+    ways = {state.id: state.transitions for state in machine.states}
+    reached, left = set(), ["init"]
+    while left:
+        name = left.pop()
+        reached.add(name)
+        left += [way.target.id for way in ways[name] if way.target.id not in reached]
+    assert reached == set(ways)
+    for name in reached - {"terminate"}:
+        assert any(way.target.id == "terminate" and not list(way.cond) for way in ways[name]), name

@@ -29,7 +29,8 @@ class Manual:
     def __init__(
         self, schedule: list[list[float | str]], operator: bool, scenes: list[str] | None
     ) -> None:
-        if not schedule or any(len(entry) != 2 for entry in schedule):
+        is_pair = [len(entry) == 2 and isinstance(entry[1], str) for entry in schedule]
+        if not is_pair or not all(is_pair):
             raise ConfigError("schedule", schedule, _SCHEDULE)
         try:
             self._starts_s = [float(entry[0]) for entry in schedule]

@@ -61,7 +61,7 @@ def build(config: Mapping[str, Any]) -> Parts:
         raise ConfigError(f"policy.startup_s.{key}", policy.startup_s[key], known)
     atlas = builder.make("atlas", Atlas)
     evaluation = builder.make("evaluation", EvaluationSettings)
-    sinks = {key: builder.make(f"sinks.{key}", Sink) for key in config.get("sinks") or {}}
+    sinks = {key: builder.make(f"sinks.{key}", Sink) for key in _group(config, "sinks")}
     source = builder.make("source", Source)
     if config.get("effects"):
         source = builder.make("effects", Source, source)
@@ -103,11 +103,11 @@ def _requires(module: SlamModule, key: str) -> Sequence[frozenset[Sensor]]:
 
 def _table(config: Mapping[str, Any], detector: Detector) -> dict[str, tuple[str, ...]]:
     """Return scene -> module keys after checking it against the detector and `slam`."""
-    modules = [key for key, node in (config.get("slam") or {}).items() if node is not None]
+    modules = [key for key, node in _group(config, "slam").items() if node is not None]
     if not modules:
         raise ConfigError("slam", NOTHING, "SLAM modules; choose a scenario: +scenario=single")
     known = f"a list of keys of slam: {', '.join(modules)}"
-    table = config.get("scenes") or {}
+    table = _group(config, "scenes")
     for scene in detector.scenes:
         if scene not in table:
             raise ConfigError(f"scenes.{scene}", NOTHING, known)
@@ -119,7 +119,26 @@ def _table(config: Mapping[str, Any], detector: Detector) -> dict[str, tuple[str
     for key in modules:
         if key not in _used(scenes):
             _log.warning("slam.%s: no scene names it, so it does not run", key)
+    _tell_of_rows(table, scenes)
     return scenes
+
+
+def _tell_of_rows(table: Mapping[str, Any], scenes: Mapping[str, Sequence[str]]) -> None:
+    """Say which rows of the table have no fallback, and which are never asked for."""
+    for scene in table:
+        if scene not in scenes:
+            _log.warning("scenes.%s: the detector does not report this scene", scene)
+        elif len(scenes[scene]) == 1:
+            (key,) = scenes[scene]
+            _log.warning("scenes.%s: %s has no fallback; without it the run ends", scene, key)
+
+
+def _group(config: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    """Return a table of the top level, empty where there is none."""
+    value = config.get(key)
+    if value is not None and not isinstance(value, Mapping):
+        raise ConfigError(key, value, "a table of keys")
+    return value or {}
 
 
 def _used(scenes: Mapping[str, Sequence[str]]) -> list[str]:

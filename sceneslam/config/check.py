@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import math
+import pkgutil
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-from hydra.utils import get_object
 
 from sceneslam.types.errors import ConfigError
 
@@ -63,7 +63,7 @@ def check_node(node: object, key: str, *, allow: Sequence[str], positional: int 
     """
     if not isinstance(node, Mapping) or "_target_" not in node:
         raise ConfigError(key, node, "a component: `_target_` and its arguments")
-    target = _locate(node["_target_"], f"{key}._target_", allow)
+    target = locate(node["_target_"], f"{key}._target_", allow)
     for name in node:
         if name.startswith("_") and name != "_target_":
             raise ConfigError(f"{key}.{name}", node[name], "no key of Hydra's but _target_")
@@ -81,12 +81,12 @@ def check_node(node: object, key: str, *, allow: Sequence[str], positional: int 
         )
         if is_required and parameter.name not in arguments:
             raise ConfigError(f"{key}.{parameter.name}", NOTHING, "a value; it has no default")
-    hints = _hints(target)
+    hints = hints_of(target)
     for name, value in arguments.items():
         if not _check_inner(value, f"{key}.{name}", allow):
             continue
-        if name in hints and not _fits(value, hints[name]):
-            raise ConfigError(f"{key}.{name}", value, _describe(hints[name]))
+        if name in hints and not fits(value, hints[name]):
+            raise ConfigError(f"{key}.{name}", value, describe(hints[name]))
 
 
 def _check_inner(value: object, key: str, allow: Sequence[str]) -> bool:
@@ -100,10 +100,12 @@ def _check_inner(value: object, key: str, allow: Sequence[str]) -> bool:
     elif isinstance(value, list):
         for index, item in enumerate(value):
             _check_inner(item, f"{key}[{index}]", allow)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(key, value, "a finite number")
     return True
 
 
-def _hints(target: Callable[..., object]) -> dict[str, Any]:
+def hints_of(target: Callable[..., object]) -> dict[str, Any]:
     """Return the types of a target's arguments, nothing where they cannot be told at run time."""
     try:
         return typing.get_type_hints(target.__init__ if inspect.isclass(target) else target)
@@ -120,7 +122,8 @@ def check_given(value: object, key: str) -> None:
         raise ConfigError(key, NOTHING, f"a value, as in {key}=...")
 
 
-def _locate(target: object, key: str, allow: Sequence[str]) -> Callable[..., object]:
+def locate(target: object, key: str, allow: Sequence[str]) -> Callable[..., object]:
+    """Return the class or function that a `_target_` names; raises ConfigError for any other."""
     prefixes = (OWN_PREFIX, *(f"{prefix.rstrip('.')}." for prefix in allow))
     if not isinstance(target, str) or not target.startswith(prefixes):
         package = str(target).partition(".")[0]
@@ -131,7 +134,7 @@ def _locate(target: object, key: str, allow: Sequence[str]) -> Callable[..., obj
             f"(a target is code: allow your own by allow_targets=[{package}])",
         )
     try:
-        found = get_object(target)
+        found = pkgutil.resolve_name(target)
     except Exception as error:
         reason = first_line(error)
         raise ConfigError(key, target, f"a class that can be imported ({reason})") from error
@@ -148,11 +151,14 @@ def first_line(error: BaseException) -> str:
     return next(iter(str(error).strip().splitlines()), type(error).__name__)
 
 
-def _fits(value: object, hint: Any) -> bool:
-    """Tell whether a YAML value can stand for an annotated argument; unknown hints accept all."""
+def fits(value: object, hint: Any) -> bool:
+    """Tell whether a value, or a part that was built, can stand for an annotated argument.
+
+    Hints that are not known accept all.
+    """
     origin = typing.get_origin(hint)
     if origin in (typing.Union, types.UnionType):
-        return any(_fits(value, part) for part in typing.get_args(hint))
+        return any(fits(value, part) for part in typing.get_args(hint))
     if hint is float:
         return isinstance(value, int | float) and not isinstance(value, bool)
     if hint is int:
@@ -165,14 +171,24 @@ def _fits(value: object, hint: Any) -> bool:
         return isinstance(value, list) and _items_fit(value, origin, typing.get_args(hint))
     if origin in (dict, Mapping):
         part = typing.get_args(hint)[1]
-        return isinstance(value, dict) and all(_fits(item, part) for item in value.values())
-    return True
+        return isinstance(value, dict) and all(fits(item, part) for item in value.values())
+    if origin is typing.Literal:
+        return value in typing.get_args(hint)
+    if getattr(hint, "_is_protocol", False):
+        return not missing_members(value, hint)
+    return hint is Any or not inspect.isclass(hint) or isinstance(value, hint)
+
+
+def missing_members(part: object, kind: type) -> list[str]:
+    """Return the public names that a Protocol or class asks for and a part does not have."""
+    has = dir(part)
+    return [name for name in vars(kind) if not name.startswith("_") and name not in has]
 
 
 def _items_fit(value: list[object], origin: Any, parts: tuple[Any, ...]) -> bool:
     if origin is tuple and not (len(parts) == 2 and parts[1] is Ellipsis):
-        return len(value) == len(parts) and all(map(_fits, value, parts))
-    return all(_fits(item, parts[0]) for item in value)
+        return len(value) == len(parts) and all(map(fits, value, parts))
+    return all(fits(item, parts[0]) for item in value)
 
 
 _WORDS = {
@@ -185,17 +201,17 @@ _WORDS = {
 }
 
 
-def _describe(hint: Any) -> str:
+def describe(hint: Any) -> str:
     """Return in words what an annotation accepts."""
     if hint in _WORDS:
         return _WORDS[hint]
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
-        return " or ".join(_describe(part) for part in parts)
+        return " or ".join(describe(part) for part in parts)
     if origin is tuple and Ellipsis not in parts:
-        return f"a list of {len(parts)}: {', '.join(_describe(part) for part in parts)}"
+        return f"a list of {len(parts)}: {', '.join(describe(part) for part in parts)}"
     if origin in (list, tuple, Sequence):
-        return f"a list, each {_describe(parts[0])}"
+        return f"a list, each {describe(parts[0])}"
     if origin in (dict, Mapping):
-        return f"a table, each value {_describe(parts[1])}"
-    return str(hint)
+        return f"a table, each value {describe(parts[1])}"
+    return f"a {hint.__name__}" if inspect.isclass(hint) else str(hint)

@@ -5,10 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, TypeVar, cast
 
-from hydra.errors import InstantiationException
-from hydra.utils import instantiate
-
-from sceneslam.config.check import NOTHING, check_node, first_line
+from sceneslam.config.check import (
+    NOTHING,
+    check_node,
+    describe,
+    first_line,
+    fits,
+    hints_of,
+    locate,
+    missing_members,
+)
 from sceneslam.types.errors import ConfigError, SceneSlamError
 
 Part = TypeVar("Part")
@@ -32,28 +38,41 @@ class Builder:
         if node is None:
             raise ConfigError(key, NOTHING, "a component: `_target_` and its arguments")
         check_node(node, key, allow=self._allow, positional=len(arguments))
-        part = self._instantiate(node, key, arguments)
-        missing = [name for name in _members(kind) if name not in dir(part)]
+        part = self._build(node, key, arguments)
+        missing = missing_members(part, kind)
         if missing:
             needs = f"a {kind.__name__}, which has: {', '.join(missing)}"
             raise ConfigError(key, node["_target_"], needs)
         return cast(Part, part)
 
-    def _instantiate(
-        self, node: Mapping[str, Any], key: str, arguments: tuple[object, ...]
+    def _build(
+        self, node: Mapping[str, Any], key: str, arguments: tuple[object, ...] = ()
     ) -> object:
+        """Return what a node's target makes of the arguments, inner components first."""
+        target = locate(node["_target_"], f"{key}._target_", self._allow)
+        hints = hints_of(target)
+        values = {name: value for name, value in node.items() if name != "_target_"}
+        for name, value in values.items():
+            values[name] = self._built(value, f"{key}.{name}")
+            is_part = isinstance(value, Mapping) and "_target_" in value
+            if is_part and name in hints and not fits(values[name], hints[name]):
+                raise ConfigError(f"{key}.{name}", value["_target_"], describe(hints[name]))
         try:
-            return instantiate(node, *arguments, _convert_="all")
-        except InstantiationException as error:
-            cause = error.__cause__
-            if isinstance(cause, ConfigError):
-                raise cause.under(key) from error
-            if isinstance(cause, SceneSlamError):
-                raise cause from error
-            reason = first_line(cause or error)
+            return target(*arguments, **values)
+        except ConfigError as error:
+            raise error.under(key) from error
+        except SceneSlamError:
+            raise
+        except Exception as error:
+            reason = first_line(error)
             raise ConfigError(key, node["_target_"], f"a target that builds ({reason})") from error
 
-
-def _members(kind: type) -> list[str]:
-    """Return the public names that a Protocol or class asks for."""
-    return [name for name in vars(kind) if not name.startswith("_")]
+    def _built(self, value: Any, key: str) -> Any:
+        """Return a copy of a value with the components in it built."""
+        if isinstance(value, Mapping):
+            if "_target_" in value:
+                return self._build(value, key)
+            return {name: self._built(item, f"{key}.{name}") for name, item in value.items()}
+        if isinstance(value, list):
+            return [self._built(item, f"{key}[{index}]") for index, item in enumerate(value)]
+        return value

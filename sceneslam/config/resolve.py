@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
+from hydra import compose
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from sceneslam.types.errors import ConfigError
 
 
-def resolved(config: DictConfig) -> dict[str, Any]:
+def composed(overrides: Sequence[str]) -> dict[str, Any]:
+    """Return the configuration that a command line would give, its `${...}` left as they are."""
+    config = compose("config", overrides=list(overrides))
+    return cast("dict[str, Any]", OmegaConf.to_container(config, resolve=False))
+
+
+def resolved(config: DictConfig | Mapping[str, Any]) -> dict[str, Any]:
     """Return the configuration as plain values; raises ConfigError for a dead interpolation."""
     try:
-        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+        whole = config if isinstance(config, DictConfig) else OmegaConf.create(dict(config))
+        plain = OmegaConf.to_container(whole, resolve=True, throw_on_missing=False)
     except OmegaConfBaseException as error:
         key = str(getattr(error, "full_key", "") or "configuration")
         reason = str(error).splitlines()[0]

@@ -98,7 +98,7 @@ def _check_given(recording: Recording, need: str, name: str | None) -> None:
         raise ConfigError(key, name, f"a topic for one of {', '.join(_TYPES)}")
     if name in (None, NONE):
         return
-    if name not in recording.topics:
+    if not isinstance(name, str) or name not in recording.topics:
         raise ConfigError(key, name, f"{NONE}, null (find it) or one of {describe(recording)}")
     msgtype = recording.topics[name].msgtype
     if msgtype not in _TYPES[need]:

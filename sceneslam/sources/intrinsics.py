@@ -38,9 +38,10 @@ def given_intrinsics(camera: Mapping[str, Any]) -> Intrinsics | None:
         if distortion is not None:
             raise ConfigError("camera.fx", None, "a number [px], as camera.distortion is given")
         return None
-    for key, value in values.items():
-        least = 0 if key in ("fx", "fy") else -np.inf
-        if not isinstance(value, int | float) or not least < value < np.inf:
+    for key in sorted(values, key=lambda key: values[key] is None):  # what is given comes first
+        value, least = values[key], 0 if key in ("fx", "fy") else -np.inf
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if value is None or not is_number or not least < value < np.inf:
             allowed = "a number above 0 [px]" if key in ("fx", "fy") else "a number [px]"
             raise ConfigError(
                 f"camera.{key}", value, f"{allowed}, as another of fx fy cx cy is given"

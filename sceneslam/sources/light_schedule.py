@@ -67,7 +67,7 @@ def check_steps(steps: object, *, is_ratio: bool) -> Sequence[Sequence[float]]:
     last = -1.0
     for step in steps:
         is_pair = isinstance(step, list | tuple) and len(step) == 2
-        if not is_pair or not all(isinstance(value, int | float) for value in step):
+        if not is_pair or any(type(value) not in (int, float) for value in step):
             raise ConfigError("schedule", steps, allowed)
         time, level = step
         if not last < time < np.inf or time < 0 or not 0 <= level <= 1:

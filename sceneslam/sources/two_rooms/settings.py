@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import typing
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
@@ -134,13 +135,26 @@ def read(kind: type[_T], key: str, values: Mapping[str, Any]) -> _T:
     for name in names:
         if name not in values:
             raise ConfigError(f"{key}.{name}", None, "a value")
+    for entry in fields(kind):  # type: ignore[arg-type]
+        value = values[entry.name]
+        is_pair = str(entry.type).startswith("tuple")
+        if not (_is_pair(value) if is_pair else _is_number(value)):
+            allowed = "a list of two numbers" if is_pair else "a number"
+            raise ConfigError(f"{key}.{entry.name}", value, allowed)
     plain = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
     try:
         return kind(**plain)
     except ConfigError as err:
         raise err.under(key) from None
-    except (TypeError, ValueError) as err:
-        raise ConfigError(key, dict(values), f"numbers of the right kind ({err})") from err
+
+
+def _is_pair(value: object) -> bool:
+    is_list = isinstance(value, list | tuple) and len(value) == 2
+    return is_list and all(map(_is_number, typing.cast("Sequence[object]", value)))
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _require(name: str, value: object, allowed: str, is_met: bool) -> None:
