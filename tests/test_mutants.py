@@ -112,11 +112,12 @@ def test_a_table_of_the_top_level_is_a_table(changes, key):
         ("slam.bright.cloud_voxel_m=nan", "slam.bright.cloud_voxel_m"),
         ("source.camera.fov_deg=wide", "source.camera.fov_deg"),
         ("source.camera.rate_hz=true", "source.camera.rate_hz"),
+        ("slam.dark.height_min_m=0.5 slam.dark.height_max_m=0.4", "slam.dark.height_max_m"),
     ],
 )
 def test_a_mistake_deep_inside_is_named_by_its_full_key(change, key):
     with pytest.raises(ConfigError) as caught:
-        build(config(change))
+        build(config(*change.split()))
     assert caught.value.key == key
 
 

@@ -84,6 +84,9 @@ class LaserSlam:
             for name in names.split():
                 if not least <= getattr(self, name) <= most:
                     raise ConfigError(name, getattr(self, name), allowed)
+        low_m, high_m = self.height_min_m, self.height_max_m
+        if low_m is not None and high_m is not None and not low_m < high_m:
+            raise ConfigError("height_max_m", high_m, f"above height_min_m ({low_m:g} m)")
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
