@@ -74,7 +74,7 @@ class Process:
         self._asked_s = monotonic()
         request = Request(number=self._number, method=method, arguments=arguments)
         try:
-            self._channel.send(request, self._limits.step_deadline_s)
+            self._channel.send(request)
         except OSError as error:
             raise self._died() from error
 

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import array
 import marshal
 import mmap
 import os
-import pickle
 import select
 import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
-from weakref import finalize
+from weakref import ref
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sceneslam.supervision.packing import packed
+from sceneslam.supervision.packing import put_together, take_apart
 
 _PACKET_BYTES = 1 << 15  # what travels in the packet itself: a socket's buffer holds several
 _PACKET_MAX_BYTES = 1 << 16
+_FD_BYTES = socket.CMSG_SPACE(4)
 _LINE_BYTES = 64  # of a cache line: where each array begins
-
 _Place = tuple[int, int, list[tuple[int, int]]]  # a block, its capacity, where its parts are
 
 
@@ -42,49 +43,52 @@ class Channel:
 
     def __init__(self, line: socket.socket) -> None:
         self._line = line
+        self._arrivals = select.poll()
+        self._arrivals.register(line, select.POLLIN)
         self._blocks: list[_Block] = []
         self._free: list[int] = []  # of the blocks
         self._borrowed: dict[int, mmap.mmap] = {}  # the other end's blocks
-        self._returned: list[int] = []  # those of them that nothing here looks at any more
+        self._looked_at: dict[int, ref[NDArray[np.uint8]]] = {}  # those of them in use here
+        self._returned: list[int] = []  # those that nothing here looks at any more
 
-    def send(self, message: object, timeout_s: float | None = None) -> None:
+    def send(self, message: object) -> None:
         """Send a message; raises OSError where the other end is gone or its line is full."""
-        head, arrays = packed(message)
-        self._line.settimeout(timeout_s)
-        if not arrays and len(head) <= _PACKET_BYTES:
-            self._line.send(self._packet(head, None))
+        large: list[memoryview] = []
+        head = marshal.dumps(take_apart(message, large))
+        if not large and len(head) <= _PACKET_BYTES:
+            self._line.send(self._packet(head, None), socket.MSG_DONTWAIT)
             return
-        parts = [memoryview(head), *arrays]
+        parts = [memoryview(head), *large]
         spans = _layout(parts)
         index = self._borrow(spans[-1][1])
         block = self._blocks[index]
         for part, (start, stop) in zip(parts, spans, strict=True):
             block.memory[start:stop] = part
         packet = self._packet(None, (index, len(block.memory), spans))
-        socket.send_fds(self._line, [packet], [] if block.fd is None else [block.fd])
+        fds = [] if block.fd is None else [_as_message(block.fd)]
+        self._line.sendmsg([packet], fds, socket.MSG_DONTWAIT)
         self._forget_fd(block)
 
     def receive(self, timeout_s: float | None = None) -> Any:
         """Return the next message; raises TimeoutError, or EOFError where the other end is gone."""
-        self._line.settimeout(timeout_s)
+        if timeout_s is not None and not self._arrivals.poll(1000.0 * timeout_s):
+            raise TimeoutError
         try:
-            packet, fds, _, _ = socket.recv_fds(self._line, _PACKET_MAX_BYTES, 1)
+            packet, extra, _, _ = self._line.recvmsg(_PACKET_MAX_BYTES, _FD_BYTES)
         except ConnectionError as error:
             raise EOFError from error
         if not packet:
             raise EOFError
         returned, head, place = marshal.loads(packet)
         self._free += returned
-        arrays: list[Any] = []
+        large: list[Any] = []
         if place is not None:
-            head, *arrays = self._look_at(place, fds)
-        return pickle.loads(head, buffers=arrays)
+            head, *large = self._look_at(place, extra)
+        return put_together(marshal.loads(head), large)
 
     def has_message(self) -> bool:
         """Tell whether `receive` would return, or raise, at once."""
-        waiting = select.poll()
-        waiting.register(self._line, select.POLLIN)
-        return bool(waiting.poll(0))
+        return bool(self._arrivals.poll(0))
 
     def close(self) -> None:
         """Hang up; what was received stays readable."""
@@ -110,14 +114,16 @@ class Channel:
         self._blocks.append(_Block(memory=mmap.mmap(fd, capacity), fd=fd))
         return len(self._blocks) - 1
 
-    def _look_at(self, place: _Place, fds: Sequence[int]) -> list[Any]:
+    def _look_at(self, place: _Place, extra: Sequence[Any]) -> list[NDArray[np.uint8]]:
         """Return the parts in a block of the other end, which has it back when they are gone."""
         index, capacity, spans = place
-        for fd in fds:
+        if extra:
+            fd = int.from_bytes(extra[0][2], "little")
             self._borrowed[index] = mmap.mmap(fd, capacity, prot=mmap.PROT_READ)
             os.close(fd)
         memory = np.frombuffer(self._borrowed[index], np.uint8)
-        finalize(memory, self._give_back, index)
+        returned = self._give_back
+        self._looked_at[index] = ref(memory, lambda _: returned(index))
         return [memory[start:stop] for start, stop in spans]
 
     def _give_back(self, index: int) -> None:
@@ -127,6 +133,10 @@ class Channel:
         if block.fd is not None:
             os.close(block.fd)
             block.fd = None
+
+
+def _as_message(fd: int) -> tuple[int, int, array.array[int]]:
+    return (socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", [fd]))
 
 
 def _layout(parts: Sequence[memoryview]) -> list[tuple[int, int]]:
