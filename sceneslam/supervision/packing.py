@@ -24,7 +24,7 @@ _KINDS: tuple[Any, ...] = (
     Observation,
     LaserScan,
     Tracking,
-)  # taken apart into their fields
+)
 _FIELDS = {kind: (place, kind.__slots__) for place, kind in enumerate(_KINDS)}
 _PICKLE, _TUPLE, _STATUS, _SMALL, _LARGE = range(-5, 0)
 
