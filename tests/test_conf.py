@@ -62,6 +62,11 @@ def test_every_module_can_run_alone(module):
     check_node(node, "slam.only", allow=[])
 
 
+def test_a_module_alone_is_not_held_against_odometry():
+    assert composed("+scenario=single")["policy"]["gate"] is None
+    assert composed("+scenario=bright_to_dark")["policy"]["gate"] is not None
+
+
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_experiment_composes(experiment):
     scenario = ["+scenario=bright_to_dark"] if experiment == "unswitched" else []  # any other too
