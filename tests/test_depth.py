@@ -176,6 +176,17 @@ def test_mounted_camera_gives_the_motion_of_base():
     assert max(errors_m(trackings, poses)) < 0.01
 
 
+def test_missing_depth_is_missing_also_where_the_range_begins_at_0():
+    poses = [handheld(index) for index in range(5)]
+    module = active(Rig(sensors=RIG.sensors, camera=replace(CAMERA, depth_range_m=(0.0, 8.0))))
+    holes = np.random.default_rng(0).random((240, 320)) < 0.1
+    for index, T in enumerate(poses):
+        observation = observe(ROOM, T, index)
+        depth_m = np.where(holes, 0, observation.depth_m).astype(np.float32)
+        tracking = module.track(replace(observation, depth_m=depth_m))
+        assert tracking.status is TrackingStatus.TRACKING
+
+
 def test_settings_and_images_out_of_range_are_named():
     for name, value in (("weak_ratio", 0.0), ("cloud_voxel_m", -1.0), ("matched_min_ratio", 2.0)):
         with pytest.raises(ConfigError, match=name):

@@ -211,7 +211,8 @@ def test_sweep_is_undone_to_the_stamp():
 
 
 def test_depth_becomes_points_of_base():
-    rig = Rig(sensors=frozenset({Sensor.DEPTH}), camera=CAMERA)
+    camera = replace(CAMERA, depth_range_m=(0.0, 8.0))
+    rig = Rig(sensors=frozenset({Sensor.DEPTH}), camera=camera)
     reader = CloudReader(rig, depth_range_max_m=5.0, depth_stride_px=4)
     depth = np.full((48, 64), 2.0, np.float32)
     depth[:, :32] = [[0.0], [np.nan], [np.inf], [6.0]] * 12

@@ -95,7 +95,7 @@ class DepthScanner:
         depths = depth_m[:: self._stride_px, :: self._stride_px].ravel()[self._pixels]
         z_min_m, z_max_m = self._camera.depth_range_m
         heights = self._camera_height_m + self._height_ratio * depths
-        valid = (depths >= z_min_m) & (depths <= z_max_m)  # false for NaN and for infinity
+        valid = (depths > 0) & (depths >= z_min_m) & (depths <= z_max_m)  # false for NaN
         valid &= (heights >= self.band_m[0]) & (heights <= self.band_m[1])
         beam = self._beam[valid]
         ranges = self._nearest(beam, (self._range_ratio * depths)[valid])

@@ -59,7 +59,7 @@ class LidarScanner:
         away = np.hypot(x, y)
         nearest_m, farthest_m = self._range_m
         valid = (z >= self.band_m[0]) & (z <= self.band_m[1])
-        valid &= (away >= nearest_m) & (away <= farthest_m)  # false for NaN and for infinity
+        valid &= (away > 0) & (away >= nearest_m) & (away <= farthest_m)  # false for NaN
         step_rad = 2 * np.pi / self._beams
         beam = np.floor((np.arctan2(y[valid], x[valid]) + np.pi) / step_rad).astype(np.int64)
         ranges = np.full(self._beams, np.inf, dtype=np.float32)

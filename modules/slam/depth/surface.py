@@ -19,6 +19,7 @@ from sceneslam.types.rig import Camera
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
+_NEAR_M = 0.05  # no camera sees nearer
 _COLUMNS = 160  # of the grid; finer ones cost more and gave no better poses
 _SMOOTH = (5, 5)  # cells
 _OUTLIER_SIGMAS = 3.0
@@ -41,14 +42,14 @@ class Grid:
     def index(self, points_cam: Floats) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
         """Return the cell (N,) that each point (N, 3) is seen in, and whether it is in view."""
         z = points_cam[:, 2]
-        scale = 1.0 / np.maximum(z, np.float32(0.05))
+        scale = 1.0 / np.maximum(z, np.float32(_NEAR_M))
         u = (points_cam[:, 0] * scale * np.float32(self.fx) + np.float32(self.cx + 0.5)).astype(
             np.int32
         )
         v = (points_cam[:, 1] * scale * np.float32(self.fy) + np.float32(self.cy + 0.5)).astype(
             np.int32
         )
-        seen = (z > 0.05) & (u >= 0) & (v >= 0) & (u < self.width) & (v < self.height)
+        seen = (z > _NEAR_M) & (u >= 0) & (v >= 0) & (u < self.width) & (v < self.height)
         return np.where(seen, v * self.width + u, 0), seen
 
 
@@ -85,7 +86,8 @@ class SurfaceReader:
         rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3).astype(np.float32)
         self.grid = Grid(columns, rows, fx, fy, cx, cy, rays)
         self._reach = np.linalg.norm(rays, axis=1)
-        self._range_m = camera.depth_range_m
+        near_m, far_m = camera.depth_range_m
+        self._range_m = (max(near_m, _NEAR_M), far_m)  # 0 is missing, whatever the range says
         self._crop = (slice(rows * self._factor), slice(columns * self._factor))
         self._undistort = None
         if any(camera.distortion):
