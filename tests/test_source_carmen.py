@@ -75,6 +75,22 @@ def test_new_lines_say_their_angles_and_mount(tmp_path: Path) -> None:
     np.testing.assert_allclose(source.rig.laser.T_base_laser[:2, 3], [0.25, 0.0])
 
 
+@pytest.mark.parametrize(
+    ("start", "step", "x"), [("nan", 0.5, 1.25), (-2.0, "nan", 1.25), (-2.0, 0.5, "nan")]
+)
+def test_a_line_whose_angles_or_mount_are_no_numbers_is_passed_over(
+    tmp_path: Path, start: object, step: object, x: object
+) -> None:
+    form = (
+        "ROBOTLASER1 0 {} 4.0 {} 30.0 0.01 0 4 1.0 2.0 31.0 0.0 0 "
+        "{} 2.0 0.0 1.0 2.0 0.0 0 0 0.1 0.1 0 {} host 0.1"
+    )
+    lines = form.format(-2.0, 0.5, 1.25, 77.5), form.format(start, step, x, 78.5)
+    source = make_source("carmen", write(tmp_path / "a.log", *lines))
+    assert [one.stamp_ns for one in source] == [77_500000000]
+    assert len(source.faults) == 1
+
+
 def test_a_scan_that_is_told_in_both_ways_is_read_once(tmp_path: Path) -> None:
     new = (
         "ROBOTLASER1 0 -1.0 2.0 0.5 30.0 0.01 0 2 1.0 2.0 0 0 0 0 0 0 0 0 0 0.1 0.1 0 7.5 host 0.1"

@@ -32,7 +32,7 @@ def parse_scan(line: bytes) -> ScanLine | None:
         scan = _flaser(line) if line.startswith(FLASER) else _robotlaser(line)
     except (ValueError, IndexError, OverflowError):
         return None
-    return scan if np.isfinite(scan.T_odom_base).all() else None
+    return scan if _is_finite(scan) else None
 
 
 def stamp_of(line: bytes) -> int:
@@ -43,6 +43,13 @@ def stamp_of(line: bytes) -> int:
         return int(whole) * 10**9 + int((fraction + b"0" * 9)[:9])
     except ValueError:
         return 0
+
+
+def _is_finite(scan: ScanLine) -> bool:
+    """Tell whether all that is not a range is a number (a range that is none is no return)."""
+    T_base_laser = scan.T_odom_base if scan.T_base_laser is None else scan.T_base_laser
+    angles_rad = (scan.angle_min_rad, scan.angle_step_rad)
+    return all(np.isfinite(values).all() for values in (scan.T_odom_base, T_base_laser, angles_rad))
 
 
 def _flaser(line: bytes) -> ScanLine:
