@@ -231,3 +231,31 @@ def test_depth_is_the_laser_where_there_is_none():
 def test_settings_out_of_range_are_named(name, value):
     with pytest.raises(ConfigError, match=name):
         LaserSlam(**{**SETTINGS, name: value})
+
+
+@pytest.mark.parametrize("jump_m", [20.0, 3000.0])
+def test_odometry_that_was_reset_is_not_taken_for_motion(jump_m):
+    path = np.array(loop_path(160))[:80]
+    observations = drive(room(), path, odometry=path, rng=np.random.default_rng(1))
+    reset = se3.from_xy_yaw(jump_m, -jump_m, 1.0)
+    observations[40:] = [replace(o, T_odom_base=reset @ o.T_odom_base) for o in observations[40:]]
+    module = active()
+    trackings = [module.track(observation) for observation in observations]
+    assert errors(path, trackings)[:, 0].max() < 0.03
+
+
+def test_map_to_match_with_ends_where_no_scan_can_reach():
+    observations = drive(room(), np.zeros((40, 3)), rng=np.random.default_rng(1))
+    places = [se3.from_xy_yaw(24.0 * index, 0.0, 0.0) for index in range(40)]
+    observations = [replace(o, T_odom_base=T) for o, T in zip(observations, places, strict=True)]
+    observations = [replace(o, stamp_ns=10 * o.stamp_ns) for o in observations]
+    module = active(range_max_m=25.0)
+    for observation in observations:
+        module.track(observation)
+    keyframes = module._front_end.keyframes
+    last = len(keyframes) - 1
+    near = keyframes.around(last, keyframes.latest)
+    away_m = [np.hypot(*(pose - keyframes.poses[last])[:2]) for pose in keyframes.poses]
+    assert len(keyframes.latest) > 10
+    assert near == [i for i in keyframes.latest if away_m[i] <= 50.0]
+    assert 1 < len(near) < 5

@@ -234,9 +234,8 @@ class FrontEnd:
             corrected = frames[-1].T_local_base
             self._pose = compose(corrected, between(T_local_base, self._pose))
             self._held_pose = compose(corrected, between(T_local_base, self._held_pose))
-        self._field = LikelihoodField(
-            self.keyframes.surfaces(self.keyframes.latest), self.settings.resolution_m
-        )
+        near = self.keyframes.around(len(frames) - 1, self.keyframes.latest)
+        self._field = LikelihoodField(self.keyframes.surfaces(near), self.settings.resolution_m)
 
 
 def _share(stamp_ns: int, before_ns: int | None, now_ns: int) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -82,7 +83,17 @@ class Keyframes:
         start = submap * self.submap_keyframes
         return range(start, min(start + self.submap_keyframes, len(self.frames)))
 
-    def surfaces(self, numbers: range) -> SurfacePoints:
+    def around(self, number: int, numbers: range) -> Sequence[int]:
+        """Return those of `numbers` that may have seen what keyframe `number` sees.
+
+        Others share no surface with it: a jump of the pose must not make a map as large as it.
+        """
+        reach_m = 2.0 * self.reader.range_max_m
+        centre = self.frames[number].T_local_base
+        away = [np.hypot(*(self.frames[i].T_local_base - centre)[:2]) for i in numbers]
+        return [i for i, away_m in zip(numbers, away, strict=True) if away_m <= reach_m]
+
+    def surfaces(self, numbers: Sequence[int]) -> SurfacePoints:
         """Return the surfaces (local) that these keyframes saw."""
         return joined([self.surfaces_base(i).moved(self.frames[i].T_local_base) for i in numbers])
 

@@ -215,6 +215,7 @@ class LaserSlam:
                 odometry_noise_ratio=self.odometry_noise_ratio,
                 odometry_turn_rad_per_m=self.odometry_turn_rad_per_m,
                 gyro_noise_rad_s=self.gyro_noise_rad_s,
+                speed_max_m_s=self.range_max_m,  # no robot leaves in a second all that it sees
             ),
             keyframes=keyframes,
             history=History(keyframes),

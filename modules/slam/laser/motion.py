@@ -14,6 +14,7 @@ from .planar import Matrix, Planar, compose, from_transform, wrap
 
 _STEP_NOISE = np.array([0.003, 0.003, 0.003])  # m, m, rad: floor of any motion's deviation
 _LEVER_M = 0.1
+_LATE_M = 1.0  # what stamps out of order feign
 _COAST_NOISE_M_S2 = 1.5  # a robot's acceleration that nothing measures
 _COAST_NOISE_RAD_S2 = 4.0
 _COAST_MAX_S = 0.5  # no velocity is kept for longer
@@ -35,6 +36,7 @@ class MotionModel:
     odometry_noise_ratio: float  # standard deviation per metre and per radian of motion
     odometry_turn_rad_per_m: float
     gyro_noise_rad_s: float
+    speed_max_m_s: float  # faster odometry has jumped: it was reset, or the robot was carried
     _stamp_ns: int | None = field(default=None, init=False)
     _T_odom_base: se3.Transform | None = field(default=None, init=False)
     _velocity: Planar = field(default_factory=lambda: np.zeros(3), init=False)
@@ -54,10 +56,11 @@ class MotionModel:
                 T_prev_curr=np.zeros(3), covariance=np.zeros((3, 3)), is_measured=is_measured
             )
         duration_s = max((observation.stamp_ns - before_ns) * 1e-9, 0.0)
+        motion = self._by_velocity(duration_s)
         if T_odom_base is not None and T_odom_prev is not None:
-            motion = self._by_odometry(from_transform(se3.inverse(T_odom_prev) @ T_odom_base))
-        else:
-            motion = self._by_velocity(duration_s)
+            T_prev_curr = from_transform(se3.inverse(T_odom_prev) @ T_odom_base)
+            if np.hypot(*T_prev_curr[:2]) <= _LATE_M + self.speed_max_m_s * duration_s:
+                motion = self._by_odometry(T_prev_curr)
         motion = self._turn(motion, _integrate(observation, duration_s), duration_s)
         self._turned_rad += float(motion.T_prev_curr[2])
         return motion

@@ -53,6 +53,6 @@ class Places:
         T_local_anchor = frames[anchor].T_local_base
         parts = [
             self.keyframes.surfaces_base(i).moved(between(T_local_anchor, frames[i].T_local_base))
-            for i in numbers
+            for i in self.keyframes.around(anchor, numbers)
         ]
         return Place(anchor=anchor, field=LikelihoodField(joined(parts), self.resolution_m))
