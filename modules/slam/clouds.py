@@ -78,9 +78,8 @@ class CloudReader:
         with np.errstate(invalid="ignore", over="ignore"):
             if self.is_depth:
                 reach = points_sensor[:, 2]
-                return np.asarray(
-                    (reach > 0) & (reach >= near_m) & (reach <= far_m)
-                )  # false for NaN
+                # False for NaN.
+                return np.asarray((reach > 0) & (reach >= near_m) & (reach <= far_m))
             square = np.einsum("ij,ij->i", points_sensor, points_sensor)
             return np.asarray((square > 0) & (square >= near_m**2) & (square <= far_m**2))
 
