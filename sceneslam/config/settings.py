@@ -23,7 +23,7 @@ class RunSettings:
     restarts_max: int  # it is started again so many times ...
     restart_window_s: float  # ... within any such time ...
     restart_backoff_s: float  # ... waiting so long before the second time, then twice as long
-    threads: int  # of OpenCV, and of all libraries in a process of their own
+    threads: int  # of OpenCV
     progress: bool  # show a progress bar
     report: bool  # draw figures and write report.html
     max_observations: int | None  # stop after so many, null: all

@@ -17,7 +17,7 @@ class Limits:
     restarts_max: int  # within the window
     restart_window_s: float
     restart_backoff_s: float  # before the second start in the window, then twice as long each time
-    threads: int  # of its libraries
+    threads: int  # of OpenCV
 
     def __post_init__(self) -> None:
         for field in fields(self):

@@ -19,12 +19,6 @@ from sceneslam.supervision.transport import Channel
 from sceneslam.types.errors import ModuleError
 
 _END_PATIENCE_S = 1.0  # for a process that hung up, or was hung up on, to be gone
-_THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "OPENCV_FOR_THREADS_NUM",
-)
 # The path is set when the interpreter is up: what lies in a user's folder must not shadow its own.
 _MAIN = """
 import sys
@@ -51,7 +45,8 @@ class Process:
         lifeline, self._lifeline = os.pipe()
         self._popen = subprocess.Popen(
             [sys.executable, "-P", "-c", _MAIN, str(far.fileno()), str(lifeline), *sys.path],
-            env={**os.environ, **dict.fromkeys(_THREAD_VARIABLES, str(limits.threads))},
+            # All else about threads is the parent's: with more of BLAS's, sums differ in a bit.
+            env={**os.environ, "OPENCV_FOR_THREADS_NUM": str(limits.threads)},
             stdin=subprocess.DEVNULL,
             pass_fds=(far.fileno(), lifeline),
             process_group=0,  # a terminal's Ctrl-C is the parent's to handle
