@@ -161,6 +161,24 @@ def test_poses_told_at_the_time_are_kept_where_nothing_better_is_known():
     assert_exact(atlas)
 
 
+def test_poses_that_the_module_was_unusually_unsure_of_are_not_handed_over():
+    class Fading(ExactModule):
+        """Errs, and says so, for the last 10 images before it is lost."""
+
+        def track(self, observation):
+            tracking = super().track(observation)
+            off = max(0, observation.stamp_ns // PERIOD_NS - 40)
+            shift = se3.from_xy_yaw(0.02 * off, 0.0, 0.0)
+            T_local_base = tracking.T_local_base @ shift
+            covariance = (0.01 + 0.1 * off) ** 2 * np.eye(6)
+            return replace(tracking, T_local_base=T_local_base, covariance=covariance)
+
+    modules = {"bright": Fading(lost=range(50, 200)), "dark": ExactModule()}
+    _, atlas, _, _ = drive(modules, handover="rewind", has_odometry=False)
+    assert_exact(atlas)
+    assert atlas.pose_modules[40:42] == ("bright", "dark")
+
+
 def test_first_choice_comes_back_when_it_holds_beside_the_fallback():
     bright = ExactModule(lost=range(50, 70))
     _, atlas, log, _ = drive(

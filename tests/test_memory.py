@@ -7,6 +7,7 @@ from fakes import PERIOD_NS, observation
 
 from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.memory import Memory, Moment
+from sceneslam.bus.sureness import Sureness
 from sceneslam.types import se3
 
 
@@ -60,3 +61,10 @@ def test_anchor_falls_back_on_the_oldest_pose_then_on_the_oldest_moment():
     late = filled(9, is_trusted=never, has_pose=lambda index: index >= 4)
     assert late.anchor(None).stamp_ns == 4 * PERIOD_NS
     assert filled(9, is_trusted=never, has_pose=never).anchor(None).stamp_ns == 0
+
+
+def test_what_lasts_becomes_usual():
+    sureness = Sureness()
+    assert sureness.is_usual(1e-6 * np.eye(6))
+    answers = [sureness.is_usual(1e-2 * np.eye(6)) for _ in range(300)]
+    assert not any(answers[:20]) and all(answers[200:])

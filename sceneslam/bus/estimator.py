@@ -90,7 +90,7 @@ class Estimator:
             module=module,
             bridge=self._bridge.copy(),
             turn=self.hold.turn,
-            is_trusted=is_told and self.hold.status is TrackingStatus.TRACKING,
+            is_trusted=is_told and self.hold.is_trusted,
         )
         self._memory.add(moment)
         if fault is not None:

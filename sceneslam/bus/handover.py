@@ -85,7 +85,7 @@ class Handover:
                     module=BRIDGED if tracking is None else self.runner.key,
                     bridge=self._bridge.copy(),
                     turn=self.hold.turn,
-                    is_trusted=tracking is not None and tracking.status is TrackingStatus.TRACKING,
+                    is_trusted=self.hold.is_trusted,
                 )
             )
         self._done_ns, self._told = moment.stamp_ns, moment.T_map_base

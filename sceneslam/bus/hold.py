@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from sceneslam.bus.gate import Gate, GateSettings, Verdict
 from sceneslam.bus.runner import Runner
+from sceneslam.bus.sureness import Sureness
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.se3 import Transform
 
@@ -18,6 +19,7 @@ class Hold:
         self.status: TrackingStatus | None = None  # None until it was fed
         self.is_suspect = False  # from a disagreement on until it has agreed for long enough
         self.suspect_since_ns: int | None = None  # from when on it may have been wrong
+        self.is_trusted = False  # another module may start from its last pose
         self.is_revised = False  # its last pose jumped, for it corrected its past
         self.unheld_since_ns: int | None = None
         self.held_since_ns: int | None = None
@@ -25,6 +27,7 @@ class Hold:
         self.turn: NDArray[np.float64] | None = None  # its last (3, 3) rotation, where believed
         self.T_local_base: Transform | None = None  # at the last observation, where it told one
         self._gate = Gate(gate) if gate is not None else None
+        self._sureness = Sureness()
         self._revision = 0
         self._fed_ns: int | None = None  # when its sensors last spoke ...
         self._period_ns = silence_ns  # ... and how long after the time before; at first a guess
@@ -36,6 +39,7 @@ class Hold:
 
     def ask(self, runner: Runner, observation: Observation) -> Tracking | None:
         """Return a module's answer where its pose may be used; raises ModuleError as the runner."""
+        self.is_trusted = False
         if not runner.can_use(observation):
             self._judge(observation, None)
             self._wait(observation.stamp_ns)
@@ -47,6 +51,8 @@ class Hold:
         if is_lost or self.is_suspect:
             self._lose(tracking.stamp_ns)
             return None
+        is_sure = self._sureness.is_usual(tracking.covariance)
+        self.is_trusted = is_sure and tracking.status is TrackingStatus.TRACKING
         self.unheld_since_ns = None
         if self.held_since_ns is None:
             self.held_since_ns = tracking.stamp_ns

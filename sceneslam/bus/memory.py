@@ -26,7 +26,7 @@ class Moment:
     module: str  # that gave it, BRIDGED for none
     bridge: Bridge  # after the observation
     turn: NDArray[np.float64] | None  # (3, 3) since the moment before, as a believed module says
-    is_trusted: bool  # a module that was not suspect said it was tracking
+    is_trusted: bool  # a module that was not suspect said it was tracking, as sure as usual
 
     @property
     def stamp_ns(self) -> int:
