@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,26 +15,17 @@ from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
-from .features import FeatureExtractor, Features
+from .answers import held, lost, started
+from .features import Features
 from .fusion import join_duplicates
-from .judgement import HealthRule, KeyframeRule
 from .keyframes import NO_LANDMARK, Keyframe
-from .layers import LayerBuilder
 from .limits import check_limits, check_sizes
-from .local_mapping import LocalMapping
-from .localizer import Fix, Localizer
-from .memory import Memory
-from .motion import MotionModel
-from .pose_solver import PoseSolver
-from .relocalizer import Relocalizer
-from .shutter import RollingShutter
+from .localizer import Fix
+from .parts import Parts
 from .view import View
-from .visual_map import VisualMap
 
 _KEYFRAME_FEATURES = 50  # with depth, that a keyframe needs
-_MERGE_IMAGES = 5  # that the worker has for one bundle adjustment
 _SEARCHED_IMAGES = 3  # looked for in the map before a new place is begun by odometry
-_START_VARIANCE = 1e-8  # the first pose is the origin by definition
 
 
 class RgbdSlam:
@@ -68,40 +57,8 @@ class RgbdSlam:
         grid_resolution_m: float,
         seed: int,
     ) -> None:
-        check_limits(locals())
-        self._degraded_inliers = degraded_inliers
-        self._make_extractor = partial(
-            FeatureExtractor,
-            count=feature_count,
-            fast_threshold_min=fast_threshold_min,
-            fast_noise_ratio=fast_noise_ratio,
-        )
-        self._make_map = partial(
-            VisualMap,
-            sigma_px=sigma_px,
-            inverse_depth_sigma_per_m=inverse_depth_sigma_per_m,
-            keyframe_limit=keyframe_limit,
-            landmark_limit=landmark_limit,
-        )
-        self._make_solver = partial(PoseSolver, seed=seed)
-        self._make_localizer = partial(
-            Localizer, radius_px=search_radius_px, min_inliers=min_inliers
-        )
-        self._make_layers = partial(
-            LayerBuilder,
-            cloud_stride_px=cloud_stride_px,
-            cloud_voxel_m=cloud_voxel_m,
-            grid_resolution_m=grid_resolution_m,
-        )
-        self._make_keyframe_rule = partial(
-            KeyframeRule,
-            step_m=keyframe_step_m,
-            turn_rad=keyframe_turn_rad,
-            inlier_ratio=keyframe_inlier_ratio,
-        )
-        self._health = HealthRule(
-            degraded_inliers=degraded_inliers, degraded_sigma_m=degraded_sigma_m
-        )
+        self._arguments = {name: value for name, value in locals().items() if name != "self"}
+        check_limits(self._arguments)
         self._T_map_local = se3.identity()
         self._T_local_base = se3.identity()
 
@@ -115,16 +72,11 @@ class RgbdSlam:
         if rig.camera is None:
             raise InputError("rig: rgbd needs the camera's intrinsics, got none")
         self._camera: Camera = rig.camera
-        self._extractor = self._make_extractor(rig.camera)
-        self._map = self._make_map(rig.camera)
-        self._localizer = self._make_localizer(self._map, self._make_solver(rig.camera))
-        self._memory = Memory(self._map, self._localizer, min_inliers=self._degraded_inliers)
-        self._relocalizer = Relocalizer(self._map.keyframes, self._memory.recognizer)
-        self._mapping = LocalMapping(rig.camera, self._map, every_images=_MERGE_IMAGES)
-        self._layers = self._make_layers(rig.camera)
-        self._keyframe_rule = self._make_keyframe_rule()
-        self._motion = MotionModel()
-        self._shutter = RollingShutter(rig.camera)
+        parts = Parts(self._arguments, rig.camera)
+        self._eye, self._motion, self._health = parts.eye, parts.motion, parts.health
+        self._localizer, self._relocalizer = parts.localizer, parts.relocalizer
+        self._map, self._mapping, self._memory = parts.map, parts.mapping, parts.memory
+        self._layers, self._keyframe_rule = parts.layers, parts.keyframe_rule
         self._T_local_base = se3.identity()
         self._local_ids = np.zeros(0, np.int64)  # landmarks of the local map
         self._observations = 0
@@ -146,17 +98,17 @@ class RgbdSlam:
         T_predicted = self._motion.predict(observation)
         if observation.image_bgr is None:
             return self._lose(observation, T_predicted)
-        gray = np.asarray(cv2.cvtColor(observation.image_bgr, cv2.COLOR_BGR2GRAY), np.uint8)
-        features = self._extractor.extract(gray, observation.depth_m)
-        rate_cam = self._camera.T_base_cam[:3, :3].T @ self._motion.turn_rate(observation)
-        features = self._shutter.straighten(features, rate_cam)
-        view = View(observation=observation, gray=gray, features=features, T_predicted=T_predicted)
+        view = self._eye.look(
+            observation,
+            observation.image_bgr,
+            T_predicted=T_predicted,
+            rate_base=self._motion.turn_rate(observation),
+        )
         fix = self._locate(view) if len(self._map.keyframes) else None
         if fix is not None:
-            uv_px = features.uv_px[fix.feature_rows]
-            self._shutter.learn(fix.estimate.linearised, uv_px, rate_cam)
+            self._eye.learn(view, fix)
             return self._hold(view, fix)
-        if not len(self._map.keyframes) or self._is_unknown_place(features):
+        if not len(self._map.keyframes) or self._is_unknown_place(view.features):
             return self._start(view)
         return self._lose(observation, T_predicted)
 
@@ -214,16 +166,8 @@ class RgbdSlam:
         unseen = np.full(len(view.features), NO_LANDMARK)
         self._insert_keyframe(view, unseen, unseen[:0], None)
         self._memory.hold(view.observation.stamp_ns, self._T_local_base, unseen[:0])
-        # What the robot did before a usable image is known from odometry at best.
-        is_first = self._observations == 1
-        return Tracking(
-            stamp_ns=view.observation.stamp_ns,
-            T_local_base=self._T_local_base.copy(),
-            status=TrackingStatus.TRACKING if is_first else TrackingStatus.DEGRADED,
-            covariance=_START_VARIANCE * np.eye(6) if is_first else None,
-            inliers=view.features.deep_count,
-            revision=self._memory.revision,
-        )
+        is_first, revision = self._observations == 1, self._memory.revision
+        return started(view, self._T_local_base, is_first=is_first, revision=revision)
 
     def _hold(self, view: View, fix: Fix) -> Tracking:
         """Accept a pose, and extend the map where it is due."""
@@ -241,14 +185,12 @@ class RgbdSlam:
             landmark_ids[fix.feature_rows] = fix.landmark_ids
             self._insert_keyframe(view, landmark_ids, fix.deep_rows, fix)
         self._memory.hold(view.observation.stamp_ns, T_local_base, fix.landmark_ids)
-        possible = max(1, min(len(fix.expected_ids), len(view.features)))
-        return Tracking(
-            stamp_ns=view.observation.stamp_ns,
-            T_local_base=T_local_base.copy(),
+        return held(
+            view,
+            fix,
+            T_local_base,
             status=status,
-            covariance=None if is_reckoned else fix.estimate.covariance,
-            quality_ratio=min(1.0, len(fix.landmark_ids) / possible),
-            inliers=len(fix.landmark_ids),
+            is_reckoned=is_reckoned,
             revision=self._memory.revision,
         )
 
@@ -259,13 +201,7 @@ class RgbdSlam:
     def _lose(self, observation: Observation, T_predicted: Transform) -> Tracking:
         self._motion.lose(observation, T_predicted)
         self._is_lost = True
-        return Tracking(
-            stamp_ns=observation.stamp_ns,
-            T_local_base=self._T_local_base.copy(),
-            status=TrackingStatus.LOST,
-            quality_ratio=0.0,
-            revision=self._memory.revision,
-        )
+        return lost(observation.stamp_ns, self._T_local_base, revision=self._memory.revision)
 
     def _insert_keyframe(
         self,

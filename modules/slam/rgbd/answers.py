@@ -1,0 +1,61 @@
+"""What the module tells of an observation: where it held a pose, began one, or has none."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sceneslam.types.observation import Tracking, TrackingStatus
+from sceneslam.types.se3 import Transform
+
+from .localizer import Fix
+from .view import View
+
+_START_VARIANCE = 1e-8  # the first pose is the origin by definition
+
+
+def started(view: View, T_local_base: Transform, *, is_first: bool, revision: int) -> Tracking:
+    """Return the answer where a keyframe was hung on a prediction, not on the map.
+
+    What the robot did before the first usable image is known from odometry at best.
+    """
+    return Tracking(
+        stamp_ns=view.observation.stamp_ns,
+        T_local_base=T_local_base.copy(),
+        status=TrackingStatus.TRACKING if is_first else TrackingStatus.DEGRADED,
+        covariance=_START_VARIANCE * np.eye(6) if is_first else None,
+        inliers=view.features.deep_count,
+        revision=revision,
+    )
+
+
+def held(
+    view: View,
+    fix: Fix,
+    T_local_base: Transform,
+    *,
+    status: TrackingStatus,
+    is_reckoned: bool,
+    revision: int,
+) -> Tracking:
+    """Return the answer where the map was seen; a reckoned pose has no covariance."""
+    possible = max(1, min(len(fix.expected_ids), len(view.features)))
+    return Tracking(
+        stamp_ns=view.observation.stamp_ns,
+        T_local_base=T_local_base.copy(),
+        status=status,
+        covariance=None if is_reckoned else fix.estimate.covariance,
+        quality_ratio=min(1.0, len(fix.landmark_ids) / possible),
+        inliers=len(fix.landmark_ids),
+        revision=revision,
+    )
+
+
+def lost(stamp_ns: int, T_local_base: Transform, *, revision: int) -> Tracking:
+    """Return the answer where no pose can be told: the last one that was held."""
+    return Tracking(
+        stamp_ns=stamp_ns,
+        T_local_base=T_local_base.copy(),
+        status=TrackingStatus.LOST,
+        quality_ratio=0.0,
+        revision=revision,
+    )

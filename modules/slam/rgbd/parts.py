@@ -1,0 +1,64 @@
+"""Builds what the module works with, from its arguments and the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sceneslam.types.rig import Camera
+
+from .eye import Eye
+from .features import FeatureExtractor
+from .judgement import HealthRule, KeyframeRule
+from .layers import LayerBuilder
+from .local_mapping import LocalMapping
+from .localizer import Localizer
+from .memory import Memory
+from .motion import MotionModel
+from .pose_solver import PoseSolver
+from .relocalizer import Relocalizer
+from .visual_map import VisualMap
+
+_MERGE_IMAGES = 5  # that the worker has for one bundle adjustment
+
+
+class Parts:
+    """An empty map, and all that looks, locates, maps, judges and remembers."""
+
+    def __init__(self, arguments: Mapping[str, Any], camera: Camera) -> None:
+        def chosen(**names: str) -> dict[str, Any]:
+            return {name: arguments[argument] for name, argument in names.items()}
+
+        def same(*names: str) -> dict[str, Any]:
+            return {name: arguments[name] for name in names}
+
+        extractor = FeatureExtractor(
+            camera,
+            **chosen(count="feature_count"),
+            **same("fast_threshold_min", "fast_noise_ratio"),
+        )
+        self.eye = Eye(camera, extractor)
+        self.map = VisualMap(
+            camera,
+            **same("sigma_px", "inverse_depth_sigma_per_m", "keyframe_limit", "landmark_limit"),
+        )
+        self.localizer = Localizer(
+            self.map,
+            PoseSolver(camera, **same("seed")),
+            **chosen(radius_px="search_radius_px", min_inliers="min_inliers"),
+        )
+        self.memory = Memory(self.map, self.localizer, **chosen(min_inliers="degraded_inliers"))
+        self.relocalizer = Relocalizer(self.map.keyframes, self.memory.recognizer)
+        self.mapping = LocalMapping(camera, self.map, every_images=_MERGE_IMAGES)
+        self.layers = LayerBuilder(
+            camera, **same("cloud_stride_px", "cloud_voxel_m", "grid_resolution_m")
+        )
+        self.keyframe_rule = KeyframeRule(
+            **chosen(
+                step_m="keyframe_step_m",
+                turn_rad="keyframe_turn_rad",
+                inlier_ratio="keyframe_inlier_ratio",
+            )
+        )
+        self.health = HealthRule(**same("degraded_inliers", "degraded_sigma_m"))
+        self.motion = MotionModel()
