@@ -19,6 +19,7 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
+_DYING_S = 0.5  # a death so soon after the first request came before it
 
 
 class IsolatedModule:
@@ -73,12 +74,15 @@ class IsolatedModule:
     def activate(self, rig: Rig) -> None:
         """Start anew, in a new process where the last one died; waits until it may be started."""
         self._bury()
-        self._wait_for_budget()
-        if self._process is None:
-            self._start()
-        self._await_built()
-        self._is_active = True
-        self._call(self._limits.start_deadline_s, "activate", rig)
+        was_idle, asked_s = self._process is not None and self._is_built, monotonic()
+        try:
+            self._begin(rig)
+        except ProcessDeathError:
+            # A process with threads may still look alive when it was killed while it was idle.
+            if not was_idle or monotonic() - asked_s > _DYING_S:
+                raise
+            self.note_failure()
+            self._begin(rig)
 
     def set_pose(self, T_map_local: Transform) -> None:
         """Place `local` in the map."""
@@ -123,6 +127,14 @@ class IsolatedModule:
         if self._process is not None:
             self._process.end()
         self._process, self._is_active = None, False
+
+    def _begin(self, rig: Rig) -> None:
+        self._wait_for_budget()
+        if self._process is None:
+            self._start()
+        self._await_built()
+        self._is_active = True
+        self._call(self._limits.start_deadline_s, "activate", rig)
 
     def _start(self) -> None:
         """Start a process and let it build the module, without waiting."""
