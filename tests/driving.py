@@ -6,9 +6,21 @@ from fakes import PERIOD_NS, RIG, ScriptedDetector, observation, true_pose
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.bus.bus import Bus
 from sceneslam.bus.events import EventLog
+from sceneslam.bus.gate import GateSettings
 from sceneslam.bus.policy import Policy
 from sceneslam.types import se3
 
+GATE = GateSettings(
+    sigmas=3.0,
+    horizons_s=[1.0, 5.0],
+    probation_s=1.0,
+    distance_m=0.03,
+    distance_per_m=0.02,
+    turn_rad=0.0175,
+    turn_per_rad=0.02,
+    turn_rad_per_m=0.01,
+    broken_ratio=0.5,
+)
 TABLE = {"Bright": ["bright", "dark"], "Dark": ["dark", "bright"]}
 
 

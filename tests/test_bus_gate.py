@@ -3,24 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
-from driving import drive, events
+from driving import GATE, drive, events
 from fakes import PERIOD_NS, ExactModule, true_pose
 
 from sceneslam.atlas.atlas import BRIDGED
-from sceneslam.bus.gate import GateSettings
 from sceneslam.types import se3
 
-GATE = GateSettings(
-    sigmas=3.0,
-    horizons_s=[1.0, 5.0],
-    probation_s=1.0,
-    distance_m=0.03,
-    distance_per_m=0.02,
-    turn_rad=0.0175,
-    turn_per_rad=0.02,
-    turn_rad_per_m=0.01,
-    broken_ratio=0.5,
-)
 ONE = {"Bright": ["bright"], "Dark": ["bright"]}
 
 

@@ -6,6 +6,7 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
+from driving import GATE
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,17 +16,6 @@ from sceneslam.types.errors import ConfigError
 
 AGREE, DISAGREE = Verdict.AGREE, Verdict.DISAGREE
 PERIOD_S = 0.1
-SETTINGS = GateSettings(
-    sigmas=3.0,
-    horizons_s=[1.0, 5.0],
-    probation_s=1.0,
-    distance_m=0.03,
-    distance_per_m=0.02,
-    turn_rad=0.0175,
-    turn_per_rad=0.02,
-    turn_rad_per_m=0.01,
-    broken_ratio=0.5,
-)
 
 
 def arc(step, *, speed_m_s=0.5, turn_rad_s=0.2):
@@ -36,7 +26,7 @@ def arc(step, *, speed_m_s=0.5, turn_rad_s=0.2):
 
 def judged(module, *, odometry=arc, steps=100, revised_at=None):
     """Return the judgement at every step; `module` and `odometry` give a pose or None."""
-    gate = Gate(SETTINGS)
+    gate = Gate(GATE)
     return [
         gate.update(
             round(step * PERIOD_S * 1e9),
@@ -159,4 +149,4 @@ def test_bridging_takes_the_way_and_the_tilt_from_the_wheels_and_the_heading_fro
 )
 def test_impossible_setting_is_named(name, value):
     with pytest.raises(ConfigError, match=name):
-        GateSettings(**{**asdict(SETTINGS), name: value})
+        GateSettings(**{**asdict(GATE), name: value})
