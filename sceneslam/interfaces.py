@@ -159,6 +159,24 @@ class Restartable(Protocol):
 
 
 @runtime_checkable
+class Concurrent(Protocol):
+    """A SLAM module that tracks while its caller does something else: in its own process.
+
+    Give every such module its observation first and collect the answers then: they run on as many
+    cores as there are. Between `submit` and `collect` nothing else is asked of the module; both
+    raise what `track` would.
+    """
+
+    def submit(self, observation: Observation) -> None:
+        """Begin to track, and return at once."""
+        ...
+
+    def collect(self) -> Tracking:
+        """Return what `track` would have returned for the observation submitted last."""
+        ...
+
+
+@runtime_checkable
 class Experiment(Protocol):
     """Asks a question of many runs."""
 

@@ -23,7 +23,7 @@ _DYING_S = 0.5  # a death so soon after the first request came before it
 
 
 class IsolatedModule:
-    """Fulfils `SlamModule` and `Restartable` by a process that `make` builds the module in.
+    """Fulfils `SlamModule`, `Restartable`, `Concurrent` by a process that `make` builds it in.
 
     Whatever ends the process ends the session: the call raises ModuleError with the reason, a new
     process is started as soon as its budget allows, and `activate` begins anew in it. Exceptions
