@@ -12,6 +12,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sceneslam.types.experiment import RunTrials, Verdict
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, SceneVote, Tracking
@@ -82,6 +85,28 @@ class Detector(Protocol):
 
     def shutdown(self) -> None:
         """Free what `activate` took. May be called twice."""
+        ...
+
+
+@runtime_checkable
+class FeatureDetector(Detector, Protocol):
+    """A detector that votes by a few numbers per observation alone.
+
+    `get_scene` is `decide` on `get_features`: the numbers can be kept, and other settings tried on
+    them without the images (`run=detect_only`).
+    """
+
+    feature_settings: tuple[str, ...]  # constructor arguments that the features depend on
+
+    def get_features(self, observation: Observation) -> NDArray[np.float64] | None:
+        """Return (F,) numbers, F the same for all; None when it holds nothing to vote on.
+
+        They depend on nothing but the observation and the `feature_settings`.
+        """
+        ...
+
+    def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
+        """Return the vote on an observation's features; called by rising stamp."""
         ...
 
 

@@ -7,7 +7,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from scenery import RIG, room_observation
 
-from sceneslam.interfaces import Detector
+from sceneslam.interfaces import Detector, FeatureDetector
 from sceneslam.types.observation import UNSURE, Observation
 
 COMPONENTS = sorted((Path(__file__).parents[1] / "conf" / "detector").glob("*.yaml"))
@@ -42,3 +42,16 @@ def test_same_observation_gets_the_same_vote(detector):
 
 def test_empty_observation_is_survived(detector):
     assert detector.get_scene(Observation(stamp_ns=1)).scene in (*detector.scenes, UNSURE)
+
+
+def test_vote_follows_from_features_that_can_be_kept(detector):
+    """What holds for a detector with features holds for all that are shipped."""
+    assert isinstance(detector, FeatureDetector)
+    observations = [room_observation(index) for index in range(3)]
+    observations.insert(2, Observation(stamp_ns=observations[1].stamp_ns + 1))
+    kept = [(one.stamp_ns, detector.get_features(one)) for one in observations]
+    told = [detector.get_scene(one) for one in observations]
+    detector.shutdown()
+    detector.activate(RIG)
+    again = [detector.decide(stamp_ns, features) for stamp_ns, features in kept]
+    assert [repr(vote) for vote in again] == [repr(vote) for vote in told]

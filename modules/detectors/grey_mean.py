@@ -19,6 +19,7 @@ class GreyMean:
     quantity = "mean of grey"
     scenes = (BRIGHT, DARK)
     requires = (frozenset({Sensor.IMAGE}),)
+    feature_settings: tuple[str, ...] = ()
 
     def __init__(self, threshold: float) -> None:
         if not 0 <= threshold <= 255:
@@ -30,11 +31,21 @@ class GreyMean:
 
     def get_scene(self, observation: Observation) -> SceneVote:
         """Return Bright or Dark with the mean of grey, UNSURE without an image."""
+        return self.decide(observation.stamp_ns, self.get_features(observation))
+
+    def get_features(self, observation: Observation) -> NDArray[np.float64] | None:
+        """Return (1,): the mean of grey."""
         if observation.image_bgr is None:
-            return SceneVote(stamp_ns=observation.stamp_ns, scene=UNSURE)
-        mean = grey_mean(observation.image_bgr)
+            return None
+        return np.array([grey_mean(observation.image_bgr)])
+
+    def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
+        """Return on which side of the threshold the mean is."""
+        if features is None:
+            return SceneVote(stamp_ns=stamp_ns, scene=UNSURE)
+        mean = float(features[0])
         scene = BRIGHT if mean > self._threshold else DARK
-        return SceneVote(stamp_ns=observation.stamp_ns, scene=scene, value=mean)
+        return SceneVote(stamp_ns=stamp_ns, scene=scene, value=mean)
 
     def shutdown(self) -> None:
         """Do nothing: there is nothing to free."""

@@ -7,6 +7,9 @@ import sys
 import threading
 from bisect import bisect_right
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation, SceneVote
 from sceneslam.types.rig import Rig, Sensor
@@ -25,6 +28,7 @@ class Manual:
 
     quantity = ""
     requires = (frozenset[Sensor](),)
+    feature_settings: tuple[str, ...] = ()
 
     def __init__(
         self, schedule: list[list[float | str]], operator: bool, scenes: list[str] | None
@@ -52,12 +56,19 @@ class Manual:
 
     def get_scene(self, observation: Observation) -> SceneVote:
         """Return the scene that holds at the observation's stamp."""
+        return self.decide(observation.stamp_ns, None)
+
+    def get_features(self, observation: Observation) -> NDArray[np.float64] | None:
+        """Return None: it looks at nothing."""
+
+    def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
+        """Return the scene that holds at the stamp."""
         if self._first_ns is None:
-            self._first_ns = observation.stamp_ns
-        elapsed_s = (observation.stamp_ns - self._first_ns) / 1e9
+            self._first_ns = stamp_ns
+        elapsed_s = (stamp_ns - self._first_ns) / 1e9
         index = max(bisect_right(self._starts_s, elapsed_s) - 1, 0)
         scene = self._typed or self._names[index]
-        return SceneVote(stamp_ns=observation.stamp_ns, scene=scene)
+        return SceneVote(stamp_ns=stamp_ns, scene=scene)
 
     def shutdown(self) -> None:
         """Do nothing: the listening thread ends with the process."""
