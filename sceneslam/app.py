@@ -61,19 +61,12 @@ def run(
             loop.run()
             with uninterrupted():
                 loop.close()
-                return _save(config, parts, folder, loop, reference)
+                return _save(config, parts, folder, loop, title, reference)
 
 
 def _clear(folder: Path) -> None:
     """Remove what an earlier run left in the folder, so that nothing old stands beside the new."""
-    for pattern in (
-        "trajectory*.tum",
-        "groundtruth.tum",
-        "figures/*.png",
-        "map/*",
-        "metrics.json",
-        "report.html",
-    ):
+    for pattern in _WRITTEN:
         for path in folder.glob(pattern):
             path.unlink()
 
@@ -83,6 +76,7 @@ def _save(
     parts: Parts,
     folder: Path,
     loop: Loop,
+    title: str,
     reference: Trajectory | None,
 ) -> Finished:
     """Write the run's folder, what matters most first."""
@@ -110,6 +104,8 @@ def _save(
             result,
             truth,
             metrics,
+            title=title,
+            config=config,
             threshold=parts.threshold,
             config_yaml=(folder / "config.yaml").read_text(),
             versions=versions,

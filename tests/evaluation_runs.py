@@ -64,6 +64,7 @@ def switch_events(
     handover = {
         "session": 1,
         "kind": "cold",
+        "from_ns": stamp_ns,
         "T_map_local": np.eye(4).tolist(),
         "jump_m": 0.5,
         "jump_rad": 0.25,

@@ -9,6 +9,7 @@ from evaluation_runs import (
     PERIOD_NS,
     SETTINGS,
     START_NS,
+    empty_map,
     happened,
     hybrid_map,
     loop,
@@ -30,14 +31,16 @@ LIMIT_BYTES = 150_000
 
 
 def draw(folder, run, truth, **more):
-    paths = write_figures(folder, run, truth, threshold=100.0, **more)
-    assert all(path.stat().st_size < LIMIT_BYTES for path in paths)
-    return [path.stem for path in paths]
+    drawn = write_figures(folder, run, truth, threshold=100.0, **more)
+    assert all(figure.png.stat().st_size < LIMIT_BYTES for figure in drawn)
+    assert all(len(figure.svg) < 3 * LIMIT_BYTES for figure in drawn)
+    return [figure.name for figure in drawn]
 
 
 def report(folder, run, truth, **more) -> str:
     metrics = evaluate(run, truth, settings=SETTINGS, reference=more.get("reference"))
-    given = {"threshold": 100.0, "config_yaml": "a: 1\n", "versions": {}, "faults": []}
+    given = {"title": "a run", "config": {}, "threshold": 100.0, "value_label": "mean of grey"}
+    given |= {"config_yaml": "a: 1\n", "versions": {}, "faults": []}
     path = write_report(folder, run, truth, metrics, **{**given, **more})
     return path.read_text(encoding="utf-8")
 
@@ -49,16 +52,17 @@ def single_pose() -> RunResult:
 
 def test_all_figures_of_a_switched_run_are_drawn(tmp_path):
     names = draw(tmp_path, switched_run(), true_loop(), reference=loop(200))
-    assert names == ["grey_mean", "map", "timeline", "error", "difference"]
+    assert names == ["map", "timeline", "grey_mean", "error", "difference"]
 
 
 def test_map_has_equal_axes(tmp_path):
-    draw(tmp_path, switched_run(), None)
+    run, grid_alone = switched_run(), replace(empty_map(), grid=hybrid_map().grid)
+    draw(tmp_path, replace(run, map=grid_alone), None)
     image = cv2.imread(str(tmp_path / "map.png"))
     assert image.shape[1] == 900
-    walls = np.all(np.abs(image.astype(int) - 105) < 6, axis=2)  # 5 m long, 3 m apart
+    walls = np.all(np.abs(image.astype(int) - 117) < 6, axis=2)  # 5 m long, 3 m apart
     rows = np.flatnonzero(walls.sum(axis=1) > 300)
-    length_px = np.flatnonzero(walls[rows].any(axis=0))
+    length_px = np.flatnonzero(walls[rows].sum(axis=0) > 5)
     ratio = (length_px[-1] - length_px[0]) / (rows[-1] - rows[0])
     assert ratio == pytest.approx(5.0 / 3.0, abs=0.03)
 
@@ -87,12 +91,12 @@ def test_figures_are_the_same_bytes_each_time(tmp_path):
 
 
 def test_figures_without_truth_leave_out_the_error(tmp_path):
-    assert draw(tmp_path, switched_run(), None) == ["grey_mean", "map", "timeline"]
+    assert draw(tmp_path, switched_run(), None) == ["map", "timeline", "grey_mean"]
 
 
 def test_figures_with_truth_of_another_time_leave_out_the_error(tmp_path):
     late = GroundTruth(trajectory=loop(200, START_NS + 10**12))
-    assert draw(tmp_path, switched_run(), late) == ["grey_mean", "map", "timeline"]
+    assert draw(tmp_path, switched_run(), late) == ["map", "timeline", "grey_mean"]
 
 
 def test_run_without_images_has_no_grey_mean(tmp_path):
@@ -105,7 +109,7 @@ def test_run_without_images_has_no_grey_mean(tmp_path):
 
 def test_figures_survive_a_single_pose(tmp_path):
     names = draw(tmp_path, single_pose(), true_loop(), reference=loop(200))
-    assert names == ["grey_mean", "map", "timeline", "error", "difference"]
+    assert names == ["map", "timeline", "grey_mean", "error", "difference"]
 
 
 def test_figures_survive_no_poses_and_no_observations(tmp_path):
@@ -117,16 +121,36 @@ def test_figures_survive_two_million_points_and_14_thousand_poses(tmp_path):
     count = 14_000
     run = replace(switched_run(count, 6000, 7000), map=hybrid_map(2_000_000))
     names = draw(tmp_path, run, true_loop(count, 6000))
-    assert names == ["grey_mean", "map", "timeline", "error"]
+    assert names == ["map", "timeline", "grey_mean", "error"]
 
 
 def test_report_opens_alone_and_embeds_every_figure(tmp_path):
     html = report(tmp_path, switched_run(), true_loop(), reference=loop(200))
-    assert html.count("data:image/png;base64,") == 5
-    links = re.findall(r"(?:src|href)=\"(?!data:)", html)
+    assert html.count("<svg ") == 5
+    links = re.findall(r"(?:src|href)=\"(?!data:|#)", html)
     assert not links
     assert "http" not in re.sub(r"base64,[^\"]*", "", html)
-    assert "url(" not in html
+    assert set(re.findall(r"url\((.)", html)) == {"#"}
+
+
+def test_figures_of_a_page_refer_to_nothing_of_each_other(tmp_path):
+    html = report(tmp_path, switched_run(), true_loop(), reference=loop(200))
+    owners: dict[str, set[int]] = {}
+    for number, svg in enumerate(html.split("<svg ")[1:]):
+        for name in re.findall(r"(?:url\(|href=\")#(\w+)", svg.split("</svg>")[0]):
+            assert f'id="{name}"' in svg, name
+            owners.setdefault(name, set()).add(number)
+    assert len(owners) > 10
+    assert all(len(numbers) == 1 for numbers in owners.values())
+
+
+def test_figures_take_the_colours_of_the_page(tmp_path):
+    html = report(tmp_path, switched_run(), true_loop())
+    drawn = html[html.index("<svg") : html.rindex("</svg>")]
+    assert not re.search(r"#(?:222222|000000|ffffff|fbf3d0)", drawn, re.I)
+    used = set(re.findall(r"var\((--[\w-]+)\)", html))
+    defined = set(re.findall(r"(--[\w-]+):", html))
+    assert used <= defined
 
 
 def test_report_is_well_formed_html(tmp_path):
@@ -138,6 +162,9 @@ def test_report_is_well_formed_html(tmp_path):
         def handle_starttag(self, tag, attrs):
             if tag not in ("meta", "img", "br"):
                 self.open.append(tag)
+
+        def handle_startendtag(self, tag, attrs):
+            pass
 
         def handle_endtag(self, tag):
             assert self.open.pop() == tag

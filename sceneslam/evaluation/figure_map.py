@@ -16,6 +16,7 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import GroundTruth
 
 _CELLS = 420  # along the longer side of the drawn area
+_UNKNOWN, _OCCUPIED = 0.55, 0.4  # greys that are seen on white and on black
 
 
 def draw_map(result: RunResult, truth: GroundTruth | None, T_map_gt: Transform | None) -> Any:
@@ -40,7 +41,7 @@ def draw_map(result: RunResult, truth: GroundTruth | None, T_map_gt: Transform |
         axes.plot(
             true_m[:, 0],
             true_m[:, 1],
-            color="black",
+            color=look.INK,
             linewidth=0.9,
             dashes=(4, 4),
             label="ground truth",
@@ -80,15 +81,14 @@ def _bounds(result: RunResult) -> NDArray[np.float64] | None:
 
 
 def _draw_grid(axes: Any, grid: GridLayer) -> None:
-    occupied = 1.0 / (1.0 + np.exp(-grid.log_odds.astype(float)))
-    shade = np.where(grid.log_odds == 0, 0.88, 1.0 - 0.65 * np.maximum(occupied - 0.5, 0.0) * 2)
-    rows, columns = shade.shape
+    """Draw what is occupied in a grey, and what is unknown in a faint one, on any paper."""
+    occupied = np.maximum(np.tanh(grid.log_odds.astype(float) / 2.0), 0.0)  # 2 p - 1
+    alpha = np.where(grid.log_odds == 0, 0.22, np.round(occupied, 1))
+    shade = np.where(grid.log_odds == 0, _UNKNOWN, _OCCUPIED)
+    rows, columns = alpha.shape
     x_m, y_m = grid.origin_xy_m
     axes.imshow(
-        shade,
-        cmap="gray",
-        vmin=0.0,
-        vmax=1.0,
+        np.dstack([shade, shade, shade, alpha]),
         origin="lower",
         interpolation="nearest",
         zorder=1,
@@ -129,7 +129,7 @@ def _draw_trajectory(axes: Any, result: RunResult, colors: dict[str, str]) -> No
 
     path = result.trajectory.positions_m
     modules = np.array(result.modules, dtype=object)
-    casing = [Stroke(linewidth=3.8, foreground="white"), Normal()]
+    casing = [Stroke(linewidth=3.8, foreground=look.PAPER), Normal()]
     for key in dict.fromkeys(result.modules):
         # A step belongs to the module that gave the pose it leads to.
         mine = modules == key
@@ -157,7 +157,7 @@ def _draw_trajectory(axes: Any, result: RunResult, colors: dict[str, str]) -> No
             at[:, 1],
             "D",
             markersize=7,
-            markerfacecolor="white",
+            markerfacecolor=look.PAPER,
             markeredgecolor=look.INK,
             markeredgewidth=1.6,
             label="switch",

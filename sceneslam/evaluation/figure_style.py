@@ -1,9 +1,15 @@
-"""How all figures look: size, colours that the colour-blind can tell apart, bands of time."""
+"""How all figures look: size, colours that the colour-blind can tell apart, bands of time.
+
+A figure is drawn once and written twice: as PNG for papers, and as SVG for the report, where its
+neutral colours become the page's own, so that it follows light and dark and prints sharply.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +22,15 @@ from sceneslam.types.truth import GroundTruth
 # Okabe and Ito's palette, darkest first; yellow is left out, it vanishes on paper.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 BRIDGED = "#777777"
-INK = "#222222"
+INK, MUTED, LINE, PAPER = "#222222", "#666666", "#DDDDDD", "#FFFFFF"
+_STRETCHES = 900  # of a curve; the PNG has as many pixels
 WIDTH_IN = 6.0  # small, so that 11 pt stay legible when a phone shrinks the figure
-MUTED = "#666666"
 SCENE_TINTS = ("#FBF3D0", "#CFD6E4", "#DDEBDD", "#EFDCE6", "#E3E3E3")
 _TINT_OF = {"Bright": SCENE_TINTS[0], "Dark": SCENE_TINTS[1]}
+_PAGE_COLORS = {  # CSS variables of report.html
+    **{INK: "--ink", "#000000": "--ink", MUTED: "--muted", LINE: "--line", PAPER: "--paper"},
+    **{tint: f"--scene-{number}" for number, tint in enumerate(SCENE_TINTS)},
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +47,7 @@ def new_figure(width_in: float = WIDTH_IN, height_in: float = 3.6) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
+    figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor=PAPER)
     FigureCanvasAgg(figure)
     return figure
 
@@ -47,7 +57,7 @@ def style(axes: Any, *, x_label: str = "time [s]", y_label: str = "") -> None:
     axes.set_xlabel(x_label, fontsize=12, color=INK)
     axes.set_ylabel(y_label, fontsize=12, color=INK)
     axes.tick_params(labelsize=11, colors=INK)
-    axes.grid(visible=True, color="#DDDDDD", linewidth=0.6)
+    axes.grid(visible=True, color=LINE, linewidth=0.6)
     axes.set_axisbelow(True)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
@@ -69,6 +79,25 @@ def save(figure: Any, path: Path) -> Path:
     return path
 
 
+def to_svg(figure: Any, name: str) -> str:
+    """Return a figure as an SVG element for an HTML page that has the colours' variables.
+
+    `name` keeps its inner references apart from those of other figures on the page.
+    """
+    from matplotlib import rc_context
+
+    text = StringIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+        figure.savefig(text, format="svg", metadata={"Date": None})
+    svg = text.getvalue()
+    svg = re.sub(r"<(metadata|style).*?</\1>\s*", "", svg[svg.index("<svg") :], flags=re.S)
+    svg = re.sub(r'^<svg [^>]*?viewBox="([^"]*)"[^>]*>', r'<svg viewBox="\1">', svg)
+    for color, variable in _PAGE_COLORS.items():
+        svg = re.sub(color, f"var({variable})", svg, flags=re.I)
+    svg = re.sub(r"(\.\d\d)\d+", r"\1", svg)  # a hundredth of a point is finer than any screen
+    return re.sub(r"font-family: [^;\"]*;? ?", "", svg)
+
+
 def module_colors(result: RunResult) -> dict[str, str]:
     """Return a colour for every module: in the map's order, then by first appearance."""
     keys = dict.fromkeys([*result.map.modules, *(key for key in result.modules if key)])
@@ -86,6 +115,17 @@ def elapsed_s(result: RunResult, stamps_ns: NDArray[np.int64]) -> NDArray[np.flo
     """Return stamps as seconds since the first observation."""
     origin_ns = result.observed_ns[0] if len(result.observed_ns) else np.int64(0)
     return np.asarray((stamps_ns - origin_ns) * 1e-9)
+
+
+def thinned(
+    times_s: NDArray[np.float64], values: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return a long curve as the lowest and highest value of equal stretches; it looks the same."""
+    if len(values) <= 2 * _STRETCHES:
+        return times_s, values
+    starts = np.linspace(0, len(values), _STRETCHES, endpoint=False).astype(int)
+    ends = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
+    return np.repeat(times_s[starts], 2), np.column_stack(ends).ravel()
 
 
 def duration_s(result: RunResult) -> float:

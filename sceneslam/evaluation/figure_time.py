@@ -28,7 +28,8 @@ def draw_votes(
     axes = figure.add_subplot()
     bands = look.true_scene_spans(result, truth)
     look.draw_bands(axes, bands, look.scene_tints(b.label for b in bands), 0.9)
-    axes.plot(times_s, values, color=look.PALETTE[0], linewidth=1.4, label=value_label)
+    curve = look.thinned(times_s, values)
+    axes.plot(*curve, color=look.PALETTE[0], linewidth=1.4, label=value_label)
     if threshold is not None:
         axes.axhline(
             threshold,
@@ -52,8 +53,12 @@ def draw_series(
     *,
     y_label: str,
     limit_m: float | None = None,
+    online_m: NDArray[np.float64] | None = None,
 ) -> Any:
-    """Return a distance over time with a band per module, None when there is none."""
+    """Return a distance over time with a band per module, None when there is none.
+
+    `online_m` is the same of what was told at the time, at the same stamps.
+    """
     if not len(values_m):
         return None
     figure = look.new_figure()
@@ -63,7 +68,11 @@ def draw_series(
     rms_m = float(np.sqrt(np.mean(values_m**2)))
     label = f"RMS {rms_m:.3f} m, max {values_m.max():.3f} m"
     marker = "o" if len(values_m) == 1 else None
-    axes.plot(times_s, values_m, color=look.INK, linewidth=1.3, marker=marker, label=label)
+    if online_m is not None:
+        told = look.thinned(times_s, online_m)
+        axes.plot(*told, color=look.MUTED, linewidth=1.1, dashes=(3, 1), label="as told online")
+    curve = look.thinned(times_s, values_m)
+    axes.plot(*curve, color=look.INK, linewidth=1.3, marker=marker, label=label)
     if limit_m is not None:
         axes.axhline(limit_m, color=look.MUTED, linestyle=":", label=f"limit {limit_m:g} m")
     switches = [event for event in result.events if is_switch(event)]
@@ -140,7 +149,7 @@ def _mark_confirmed(axes: Any, result: RunResult) -> None:
                 va="center",
                 fontsize=10,
                 color=look.INK,
-                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5},
+                bbox={"facecolor": look.PAPER, "edgecolor": "none", "alpha": 0.8, "pad": 1.5},
             )
 
 

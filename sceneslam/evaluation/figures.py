@@ -1,11 +1,15 @@
-"""All figures of a run, written as PNG files."""
+"""All figures of a run: written as PNG files, and kept as SVG for the report."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sceneslam.evaluation import figure_style as look
-from sceneslam.evaluation.accuracy import absolute_errors
+from sceneslam.evaluation.accuracy import AbsoluteErrors, absolute_errors
 from sceneslam.evaluation.comparison import compare
 from sceneslam.evaluation.figure_map import draw_map
 from sceneslam.evaluation.figure_time import draw_series, draw_timeline, draw_votes
@@ -15,6 +19,16 @@ from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
 _PAPER_DIFFERENCE_M = 0.10  # "less than 10 cm" between the switched and the unswitched run
+_ONLINE_DIFFERS_M = 1e-3  # below, what was told online is not drawn apart
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drawn:
+    """One figure, twice."""
+
+    name: str
+    png: Path
+    svg: str  # an element for the report's page
 
 
 def write_figures(
@@ -26,21 +40,26 @@ def write_figures(
     value_label: str = "detector value",
     reference: Trajectory | None = None,
     association_gap_s: float = 0.01,
-) -> list[Path]:
-    """Write what can be drawn of a run; return the files, in the order of the story.
+) -> list[Drawn]:
+    """Write what can be drawn of a run; return the figures, in the order of the story.
 
-    `grey_mean`, `map`, `timeline`, `error` (with ground truth), `difference` (with a reference).
+    `map`, `timeline`, `grey_mean`, `error` (with ground truth), `difference` (with a reference).
     """
     folder.mkdir(parents=True, exist_ok=True)
     true = truth.trajectory if truth else Trajectory.empty()
     errors = absolute_errors(result.trajectory, true, association_gap_s)
+    online = absolute_errors(result.online, true, association_gap_s)
     T_map_gt = se3.inverse(errors.T_gt_map) if len(errors.errors_m) else None
     drawn = {
-        "grey_mean": draw_votes(result, truth, threshold, value_label),
         "map": draw_map(result, truth, T_map_gt),
         "timeline": draw_timeline(result, truth),
+        "grey_mean": draw_votes(result, truth, threshold, value_label),
         "error": draw_series(
-            result, errors.stamps_ns, errors.errors_m, y_label="position error [m]"
+            result,
+            errors.stamps_ns,
+            errors.errors_m,
+            y_label="position error [m]",
+            online_m=_online(errors, online),
         ),
     }
     if reference is not None:
@@ -53,7 +72,17 @@ def write_figures(
             limit_m=_PAPER_DIFFERENCE_M,
         )
     return [
-        look.save(figure, folder / f"{name}.png")
+        Drawn(
+            name=name, png=look.save(figure, folder / f"{name}.png"), svg=look.to_svg(figure, name)
+        )
         for name, figure in drawn.items()
         if figure is not None
     ]
+
+
+def _online(errors: AbsoluteErrors, online: AbsoluteErrors) -> NDArray[np.float64] | None:
+    """Return the online errors at the stamps of the revised ones, None where they are the same."""
+    if not np.array_equal(errors.stamps_ns, online.stamps_ns):
+        return None
+    differs = np.abs(errors.errors_m - online.errors_m) > _ONLINE_DIFFERS_M
+    return online.errors_m if differs.any() else None

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import base64
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from pathlib import Path
 from string import Template
+from typing import Any
 
+from sceneslam.evaluation import markup
+from sceneslam.evaluation.chronicle import Entry, chronicle
 from sceneslam.evaluation.figures import write_figures
 from sceneslam.evaluation.metrics import Metrics
 from sceneslam.evaluation.story import tell
@@ -18,14 +20,15 @@ from sceneslam.types.run import RunResult
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
-_SHOWN_FAULTS = 20
+_SHOWN_FAULTS, _SHOWN_ENTRIES = 20, 80
 _CAPTIONS = {
-    "grey_mean": "What the detector measured. Shading: the true scene, where it is known; "
-    "dash-dotted: the instant at which a change of scene was confirmed.",
     "map": "The map from above: occupancy grid in grey, points and trajectory in the colour of "
     "the module that gave them, ground truth dashed.",
     "timeline": "Which module gave the poses, and when it was in trouble.",
-    "error": "Distance from the true position after one rigid alignment of the whole trajectory.",
+    "grey_mean": "What the detector measured. Shading: the true scene, where it is known; "
+    "dash-dotted: the instant at which a change of scene was confirmed.",
+    "error": "Distance from the true position after one rigid alignment of the whole trajectory. "
+    "Shading: who gave the pose; dash-dotted: a change of module.",
     "difference": "Distance from the reference run over the same path, without any alignment.",
 }
 
@@ -36,8 +39,10 @@ def write_report(
     truth: GroundTruth | None,
     metrics: Metrics,
     *,
-    threshold: float | None,
+    title: str,
+    config: Mapping[str, Any],
     config_yaml: str,
+    threshold: float | None,
     versions: Mapping[str, str],
     faults: Sequence[str],
     reference: Trajectory | None = None,
@@ -47,7 +52,7 @@ def write_report(
 
     `threshold` is drawn with the detector's values, `faults` are sentences about the input.
     """
-    images = write_figures(
+    figures = write_figures(
         folder / "figures",
         result,
         truth,
@@ -56,54 +61,86 @@ def write_report(
         reference=reference,
         association_gap_s=metrics["association_gap_s"],
     )
+    entries = chronicle(result, metrics["switches"], value_label=value_label)
     told = {
         **_told(metrics),
+        "title": escape(title),
+        "made_of": markup.bullets(_made_of(config)),
         "faults": _faults([*faults, *metrics["faults"], *metrics["notes"]]),
-        "figures": "".join(_figure(image) for image in images),
-        "versions": _table(["part", "version"], [[*item] for item in versions.items()]),
+        "figures": "".join(markup.figure(f.svg, _CAPTIONS[f.name]) for f in figures),
+        "chronicle": _chronicle(entries),
+        "modules": _modules(metrics, config.get("slam") or {}),
+        "versions": markup.table(["part", "version"], [[*item] for item in versions.items()]),
         "config": escape(config_yaml),
     }
-    page = files("sceneslam.evaluation").joinpath("report.html").read_text("utf-8")
-    path = folder / "report.html"
-    path.write_text(Template(page).substitute(told), encoding="utf-8")
+    return write_page(folder / "report.html", "report.html", told)
+
+
+def write_page(path: Path, template: str, told: Mapping[str, str]) -> Path:
+    """Fill a template of this package, which is given the style as well; return its path."""
+    package = files("sceneslam.evaluation")
+    page = Template(package.joinpath(template).read_text("utf-8"))
+    style = package.joinpath("page.css").read_text("utf-8")
+    path.write_text(page.substitute(told, style=style), encoding="utf-8")
     return path
 
 
 def _told(metrics: Metrics) -> dict[str, str]:
     """Return the parts of the page that say what the metrics say."""
     return {
-        "story": "".join(f"<p>{escape(paragraph)}</p>\n" for paragraph in tell(metrics)),
+        "story": markup.paragraphs(tell(metrics)),
         "numbers": _numbers(metrics),
         "switches": _switches(metrics),
-        "modules": _modules(metrics),
         "metrics": escape(json.dumps(metrics, indent=2)),
     }
 
 
+def _made_of(config: Mapping[str, Any]) -> list[str]:
+    """Return what was put together: one line per part."""
+    source, detector = config.get("source") or {}, config.get("detector") or {}
+    given = [str(source[key]) for key in ("path", "story") if source.get(key)]
+    parts = {
+        "source": " ".join([_kind(source), *given]),
+        "effects": _kind(config.get("effects") or {}),
+        "detector": _kind(detector) + _plain_values(detector),
+        "policy": str((config.get("policy") or {}).get("handover", "")),
+    }
+    scenes = config.get("scenes") or {}
+    table = "; ".join(f"{scene} → {', then '.join(keys)}" for scene, keys in scenes.items())
+    lines = [f"{name}: {value}" for name, value in (parts | {"scenes": table}).items() if value]
+    modules = (config.get("slam") or {}).items()
+    return [*lines, *(f"“{key}”: {_kind(node)}" for key, node in modules if node)]
+
+
+def _kind(node: Mapping[str, Any]) -> str:
+    return str(node.get("_target_", "")).rpartition(".")[2]
+
+
+def _plain_values(node: Mapping[str, Any]) -> str:
+    """Return a component's numbers, which are its settings that matter most."""
+    told = [f"{key} {value:g}" for key, value in node.items() if isinstance(value, float)]
+    return f" ({', '.join(told)})" if told else ""
+
+
 def _numbers(metrics: Metrics) -> str:
-    bus, detector = metrics["bus_overhead_us"], metrics["detector_us"]
+    online_m = metrics["ate_online_m"]
     entries = {
-        "coverage": percent(metrics["coverage"]),
-        "ATE (RMSE)": number(metrics["ate_rmse_m"], 4, " m"),
+        "position error, root mean square (ATE)": number(metrics["ate_rmse_m"], 4, " m"),
+        "the same, as told online": number(online_m, 4, " m"),
         "largest error": number(metrics["ate_max_m"], 3, " m"),
-        "RPE over 1 s": number(metrics["rpe_trans_m"], 4, " m"),
-        "RPE over 1 s, rotation": degrees(metrics["rpe_rot_rad"]),
-        "Correct Rate": percent(metrics["correct_rate"]),
+        "error of the motion over 1 s": number(metrics["rpe_trans_m"], 4, " m"),
+        "turn's error over 1 s": degrees(metrics["rpe_rot_rad"]),
+        "of the time correct": percent(metrics["correct_rate"]),
+        "of observations with a pose": percent(metrics["coverage"]),
         "switches": str(len(metrics["switches"])),
         "false switches": number(metrics["false_switches"], 0),
         "speed, times real time": number(metrics["realtime_factor"], 2, " ×"),
-        "bus, median per observation": number(bus["median"], 0, " µs"),
-        "detector, median": number(detector["median"], 0, " µs"),
         "peak memory": number(metrics["peak_rss_mb"], 0, " MB"),
     }
     if "reference" in metrics:
         largest_m = metrics["reference"]["max_difference_m"]
         entries["largest difference from the reference"] = number(largest_m, 3, " m")
-    known = {name: value for name, value in entries.items() if value != "–"}
-    return "".join(
-        f"<li><b>{escape(value)}</b><span>{escape(name)}</span></li>"
-        for name, value in known.items()
-    )
+    return markup.tiles(entries)
 
 
 def _faults(faults: Sequence[str]) -> str:
@@ -113,8 +150,22 @@ def _faults(faults: Sequence[str]) -> str:
     shown = sentences[:_SHOWN_FAULTS]
     if len(sentences) > len(shown):
         shown.append(f"and {len(sentences) - len(shown)} more (see events.jsonl)")
-    items = "".join(f"<li>{escape(fault)}</li>" for fault in shown)
-    return f'<h2>Faults</h2><div class="faults"><ul>{items}</ul></div>'
+    return f'<h2>Faults</h2><div class="faults">{markup.bullets(shown)}</div>'
+
+
+def _chronicle(entries: Sequence[Entry]) -> str:
+    if not entries:
+        return '<p class="muted">Nothing happened.</p>'
+    weighty = [entry for entry in entries if entry.kind != "trouble"]
+    shown = (entries if len(entries) <= _SHOWN_ENTRIES else weighty)[:_SHOWN_ENTRIES]
+    items = "".join(
+        f'<li class="{entry.kind}"><time>{entry.at_s:.2f} s</time><div><b>{escape(entry.what)}</b>'
+        f"<p>{escape(' '.join(entry.details))}</p></div></li>"
+        for entry in shown
+    )
+    left = len(entries) - len(shown)
+    more = f'<p class="muted">And {left} more in events.jsonl.</p>' if left else ""
+    return f'<ol class="chronicle">{items}</ol>{more}'
 
 
 def _switches(metrics: Metrics) -> str:
@@ -137,13 +188,15 @@ def _switches(metrics: Metrics) -> str:
         for switch in metrics["switches"]
     ]
     note = "Delay: from the true change. Jump and turn: error of the motion across the hand-over."
-    return _table(heads, rows) + f'<p class="muted">{note}</p>'
+    return markup.table(heads, rows) + f'<p class="muted">{note}</p>'
 
 
-def _modules(metrics: Metrics) -> str:
+def _modules(metrics: Metrics, slam: Mapping[str, Any]) -> str:
+    """Return what every part cost per observation, and who gave how many poses."""
     rows = [
         [
             key,
+            _kind(slam.get(key) or {}),
             str(module["poses"]),
             percent(module["share"]),
             number(module["frame_ms"]["median"], 1, " ms"),
@@ -151,23 +204,10 @@ def _modules(metrics: Metrics) -> str:
         ]
         for key, module in metrics["modules"].items()
     ]
-    rows.append(["(bridged)", str(metrics["bridged"]), "", "", ""])
-    return _table(["module", "poses", "share", "median per frame", "95 % within"], rows)
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    head = "".join(f"<th>{escape(name)}</th>" for name in heads)
-    body = "".join(
-        "<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows
-    )
-    table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-    return f'<div class="scroll">{table}</div>'
-
-
-def _figure(image: Path) -> str:
-    data = base64.b64encode(image.read_bytes()).decode("ascii")
-    caption = escape(_CAPTIONS[image.stem])
-    return (
-        f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
-        f"<figcaption>{caption}</figcaption></figure>\n"
-    )
+    if metrics["bridged"]:
+        share = percent(metrics["bridged"] / max(metrics["poses"], 1))
+        rows.append(["(bridged)", "", str(metrics["bridged"]), share, "", ""])
+    for name, key in (("(detector)", "detector_us"), ("(bus)", "bus_overhead_us")):
+        spent = [number(metrics[key][at], 2, " ms", 1e-3) for at in ("median", "p95")]
+        rows.append([name, "", "", "", *spent])
+    return markup.table(["module", "kind", "poses", "share", "median per frame", "95 %"], rows)

@@ -1,0 +1,158 @@
+"""A run's event log as an account that a person reads: what happened, when, and why."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sceneslam.evaluation.reasons import why_chosen
+from sceneslam.types.run import Event, RunResult
+
+_SHORT_S = 0.5  # trouble that passes sooner is counted, not told
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Entry:
+    """One thing that happened; `details` are sentences."""
+
+    at_s: float  # since the first observation
+    kind: str  # scene | decision | trouble | fault
+    what: str
+    details: tuple[str, ...] = ()
+
+
+def chronicle(
+    result: RunResult, switches: Sequence[Mapping[str, Any]], *, value_label: str
+) -> list[Entry]:
+    """Return what happened in a run, by time; `switches` are those of its metrics."""
+    origin_ns = int(result.observed_ns[0]) if len(result.observed_ns) else 0
+    return _Writer(result.events, switches, origin_ns, value_label).write()
+
+
+class _Writer:
+    """Goes through the log once, keeping what later lines refer to."""
+
+    def __init__(
+        self,
+        events: Sequence[Event],
+        switches: Sequence[Mapping[str, Any]],
+        origin_ns: int,
+        value_label: str,
+    ) -> None:
+        self._events, self._origin_ns, self._label = events, origin_ns, value_label
+        self._switches = {(s["stamp_ns"], s["to"]): s for s in switches}
+        self._entries: list[Entry] = []
+        self._situation: Event | None = None  # the last that led to a change of module
+        self._values: list[tuple[int, float]] = []
+        self._trouble: Event | None = None
+        self._passing = 0
+
+    def write(self) -> list[Entry]:
+        """Return all entries."""
+        tellers: Mapping[str, Callable[[Event], None]] = {
+            "vote": self._keep_value,
+            "scene": self._tell_scene,
+            "situation": self._tell_situation,
+            "refused": self._tell_refusal,
+            "decision": self._tell_decision,
+            "tracking": self._tell_tracking,
+            "suspect": self._tell_suspicion,
+            "fault": self._tell_fault,
+            "dropped": self._tell_dropped,
+        }
+        for event in self._events:
+            if event["event"] in tellers:
+                tellers[event["event"]](event)
+        self._end_trouble(self._events[-1]["stamp_ns"] if self._events else 0)
+        if self._passing:
+            times = "once" if self._passing == 1 else f"{self._passing} times"
+            what = f"Besides, a module was in trouble {times} for less than {_SHORT_S:g} s"
+            self._add(self._events[-1]["stamp_ns"], "trouble", what)
+        return sorted(self._entries, key=lambda entry: entry.at_s)
+
+    def _add(self, stamp_ns: int, kind: str, what: str, *details: str) -> None:
+        at_s = self._seconds(stamp_ns)
+        told = tuple(detail for detail in details if detail)
+        self._entries.append(Entry(at_s=at_s, kind=kind, what=what, details=told))
+
+    def _seconds(self, stamp_ns: int) -> float:
+        return (stamp_ns - self._origin_ns) * 1e-9
+
+    def _keep_value(self, event: Event) -> None:
+        value = event.get("value")
+        if value is not None and math.isfinite(value):
+            self._values.append((event["stamp_ns"], value))
+
+    def _tell_scene(self, event: Event) -> None:
+        since_ns = event.get("since_ns", event["stamp_ns"])
+        seen = [value for stamp_ns, value in self._values if stamp_ns >= since_ns]
+        values = f"{self._label} {_range(seen)}" if seen and self._label else ""
+        if event["previous"] is None:
+            what, agreed = f"First scene: {event['scene']}", ""
+        else:
+            what = f"The scene changed from {event['previous']} to {event['scene']}"
+            agreed = f"All images since {self._seconds(since_ns):.2f} s agree"
+        why = ", ".join(filter(None, [agreed, values]))
+        self._add(event["stamp_ns"], "scene", what, f"{why}." if why else "")
+
+    def _tell_situation(self, event: Event) -> None:
+        action = event["verdict"]["action"]
+        if action == "switch":
+            self._situation = event
+        elif action == "try":
+            first = event["verdict"]["to"][0]
+            waited = f"“{event['active']}” runs in its place and holds its pose."
+            self._add(event["stamp_ns"], "decision", f"“{first}” is tried again", waited)
+        elif action == "tell":
+            what = f"“{event['active']}” stays for {event['scene']}"
+            self._add(event["stamp_ns"], "decision", what, "It is the table's choice there, too.")
+
+    def _tell_refusal(self, event: Event) -> None:
+        why = {"lost": "it was lost itself", "failed": "it failed"}.get(event["why"], event["why"])
+        self._add(event["stamp_ns"], "decision", f"“{event['to']}” was not taken: {why}")
+
+    def _tell_decision(self, event: Event) -> None:
+        self._end_trouble(event["stamp_ns"])
+        replaced = event.get("from")
+        what = f"“{event['to']}” takes over from “{replaced}”" if replaced else ""
+        switch = self._switches.get((event["stamp_ns"], event["to"]), {})
+        mine = [e for e in self._events if e["stamp_ns"] == event["stamp_ns"]]
+        details = why_chosen(event, self._situation, mine, switch, self._origin_ns)
+        self._add(event["stamp_ns"], "decision", what or f"“{event['to']}” begins", *details)
+        self._situation = None
+
+    def _tell_tracking(self, event: Event) -> None:
+        self._end_trouble(event["stamp_ns"])
+        if event["status"] != "tracking":
+            self._trouble = event
+
+    def _end_trouble(self, stamp_ns: int) -> None:
+        event, self._trouble = self._trouble, None
+        if event is None:
+            return
+        lasted_s = (stamp_ns - event["stamp_ns"]) * 1e-9
+        if lasted_s < _SHORT_S:
+            self._passing += 1
+            return
+        what = f"“{event['module']}” is {event['status']} for {lasted_s:.1f} s"
+        self._add(event["stamp_ns"], "trouble", what)
+
+    def _tell_suspicion(self, event: Event) -> None:
+        what = f"“{event['module']}” is not believed"
+        why = "It moved otherwise than the wheels; its motion is bridged until they agree again."
+        self._add(event["stamp_ns"], "trouble", what, why)
+
+    def _tell_fault(self, event: Event) -> None:
+        self._add(event["stamp_ns"], "fault", str(event["what"]))
+
+    def _tell_dropped(self, event: Event) -> None:
+        if event["count"]:
+            what = f"{event['count']} observations were dropped in all, for newer ones had come"
+            self._add(event["stamp_ns"], "fault", what)
+
+
+def _range(values: Sequence[float]) -> str:
+    low, high = f"{min(values):.3g}", f"{max(values):.3g}"
+    return low if low == high else f"{low} to {high}"

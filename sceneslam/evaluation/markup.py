@@ -1,0 +1,43 @@
+"""The few pieces of HTML that pages are made of. Whatever is given is escaped."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+
+
+def paragraphs(sentences: Iterable[str]) -> str:
+    """Return a paragraph per text."""
+    return "".join(f"<p>{escape(sentence)}</p>\n" for sentence in sentences)
+
+
+def tiles(numbers: Mapping[str, str]) -> str:
+    """Return numbers under their names, as tiles; a dash is not known and left out."""
+    items = "".join(
+        f"<li><b>{escape(value)}</b><span>{escape(name)}</span></li>"
+        for name, value in numbers.items()
+        if value != "–"
+    )
+    return f'<ul class="numbers">{items}</ul>'
+
+
+def bullets(sentences: Iterable[str]) -> str:
+    """Return an unordered list."""
+    return f"<ul>{''.join(f'<li>{escape(sentence)}</li>' for sentence in sentences)}</ul>"
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a table that scrolls by itself where the page is too narrow for it."""
+    head = "".join(f"<th>{escape(name)}</th>" for name in heads)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows
+    )
+    whole = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    return f'<div class="scroll">{whole}</div>'
+
+
+def figure(svg: str, caption: str) -> str:
+    """Return a figure from an SVG element that is safe, with its caption."""
+    told = escape(caption)
+    labelled = svg.replace("<svg ", f'<svg role="img" aria-label="{told}" ', 1)
+    return f"<figure>{labelled}<figcaption>{told}</figcaption></figure>\n"

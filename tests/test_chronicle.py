@@ -1,0 +1,109 @@
+from dataclasses import replace
+
+from evaluation_runs import (
+    PERIOD_NS,
+    SETTINGS,
+    happened,
+    poseless_run,
+    stamps,
+    switched_run,
+    true_loop,
+)
+
+from sceneslam.evaluation.chronicle import chronicle
+from sceneslam.evaluation.metrics import evaluate
+
+
+def tell(run, truth=None):
+    metrics = evaluate(run, truth, settings=SETTINGS)
+    return chronicle(run, metrics["switches"], value_label="mean of grey")
+
+
+def situation(index, action="switch", **changed):
+    values = {
+        "scene": "Dark", "served_scene": "Bright", "active": "rgbd", "health": "held",
+        "unheld_since_ns": 0, "is_blind": False,
+        "verdict": {"action": action, "to": ["laser", "rgbd"], "reason": "scene"},
+    }  # fmt: skip
+    return happened("situation", int(stamps(200)[index]), **values | changed)
+
+
+def run_with(*events, before=None):
+    """A switched run with more events, in the order of their stamps, before the decision."""
+    run = switched_run()
+    at = next(k for k, e in enumerate(run.events) if e["event"] == "decision" and e["from"])
+    told = [*run.events[:at], *events, *run.events[at:]]
+    return replace(run, events=sorted(told, key=lambda event: event["stamp_ns"]))
+
+
+def test_chronicle_of_a_switch_tells_scene_choice_and_change_by_time():
+    entries = tell(switched_run(), true_loop())
+    assert [entry.what for entry in entries] == [
+        "First scene: Bright",
+        "“rgbd” begins",
+        "The scene changed from Bright to Dark",
+        "“laser” takes over from “rgbd”",
+    ]
+    assert [entry.at_s for entry in entries] == [0.0, 0.0, 10.0, 10.0]
+    assert entries[2].details == ("All images since 8.00 s agree, mean of grey 30 to 80.",)
+
+
+def test_chronicle_says_what_a_switch_was_decided_on_and_what_it_cost():
+    entries = tell(run_with(situation(100)), true_loop())
+    told = " ".join(entries[-1].details)
+    assert "The scene asks for it; “rgbd” held its pose." in told
+    assert "Candidates, best first: laser, rgbd." in told
+    assert "Error of the motion across it: 0.00" in told
+    assert "Cost: 4 ms" in told
+
+
+def test_chronicle_says_for_how_long_a_lost_module_was_bridged_and_by_what():
+    lost = situation(100, health="lost", unheld_since_ns=int(stamps(200)[90]), is_blind=True)
+    run = run_with(lost)
+    events = [{**e, "reason": "lost"} if e["event"] == "decision" else e for e in run.events]
+    told = tell(replace(run, events=events))[-1].details
+    assert told[0] == "“rgbd” had been lost for 1.00 s; constant velocity bridged meanwhile."
+
+
+def test_chronicle_says_what_was_revised_at_a_hand_over():
+    at = int(stamps(200)[100])
+    revised = happened("revised", at, from_ns=at - 20 * PERIOD_NS, poses=21)
+    entries = tell(run_with(situation(100), revised))
+    assert any("21 poses told since then were replaced" in text for text in entries[-1].details)
+
+
+def test_chronicle_tells_long_trouble_and_counts_short():
+    changes = [(20, "lost"), (30, "tracking"), (40, "degraded"), (42, "tracking")]
+    events = [
+        happened("tracking", int(stamps(200)[k]), module="rgbd", status=status)
+        for k, status in changes
+    ]
+    whats = [entry.what for entry in tell(run_with(*events))]
+    assert "“rgbd” is lost for 1.0 s" in whats
+    assert "Besides, a module was in trouble once for less than 0.5 s" in whats
+    assert not any("degraded" in what for what in whats)
+
+
+def test_chronicle_tells_trials_refusals_and_faults():
+    at = int(stamps(200)[50])
+    choice = {"scene": "Bright", "from_": "rgbd", "to": "laser", "reason": "lost"}
+    events = [
+        situation(50, "try", active="laser"),
+        situation(51, "tell", active="rgbd"),
+        happened("refused", at, why="lost", **choice),
+        happened("fault", at, what="the wheels fell off"),
+        happened("suspect", at, module="rgbd"),
+        happened("dropped", at, count=0),
+        happened("dropped", at, count=3),
+    ]
+    kinds = {entry.what: entry.kind for entry in tell(run_with(*events))}
+    assert kinds["“laser” is tried again"] == "decision"
+    assert kinds["“rgbd” stays for Dark"] == "decision"
+    assert kinds["“laser” was not taken: it was lost itself"] == "decision"
+    assert kinds["the wheels fell off"] == "fault"
+    assert kinds["“rgbd” is not believed"] == "trouble"
+    assert sum("dropped" in what for what in kinds) == 1
+
+
+def test_nothing_happened_in_a_run_without_events():
+    assert tell(poseless_run(3)) == []
