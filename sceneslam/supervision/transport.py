@@ -10,6 +10,7 @@ import select
 import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
+from time import monotonic_ns
 from typing import Any
 from weakref import ref
 
@@ -21,6 +22,8 @@ from sceneslam.supervision.packing import put_together, take_apart
 _PACKET_BYTES = 1 << 15  # what travels in the packet itself: a socket's buffer holds several
 _PACKET_MAX_BYTES = 1 << 16
 _FD_BYTES = socket.CMSG_SPACE(4)
+_WRITTEN, _VOID = b"w", b"v"  # what follows an announced message
+_AWAKE_NS = 200_000  # several times what falling asleep and being woken takes
 _LINE_BYTES = 64  # of a cache line: where each array begins
 _Place = tuple[int, int, list[tuple[int, int]]]  # a block, its capacity, where its parts are
 
@@ -52,7 +55,10 @@ class Channel:
         self._returned: list[int] = []  # those that nothing here looks at any more
 
     def send(self, message: object) -> None:
-        """Send a message; raises OSError where the other end is gone or its line is full."""
+        """Send a message; raises OSError where the other end is gone or its line is full.
+
+        Arrays are announced before they are written: the other end wakes up meanwhile.
+        """
         large: list[memoryview] = []
         head = marshal.dumps(take_apart(message, large))
         if not large and len(head) <= _PACKET_BYTES:
@@ -62,29 +68,56 @@ class Channel:
         spans = _layout(parts)
         index = self._borrow(spans[-1][1])
         block = self._blocks[index]
-        for part, (start, stop) in zip(parts, spans, strict=True):
-            block.memory[start:stop] = part
         packet = self._packet(None, (index, len(block.memory), spans))
         fds = [] if block.fd is None else [_as_message(block.fd)]
-        self._line.sendmsg([packet], fds, socket.MSG_DONTWAIT)
+        end = _VOID
+        try:
+            self._line.sendmsg([packet], fds, socket.MSG_DONTWAIT)
+            for part, (start, stop) in zip(parts, spans, strict=True):
+                block.memory[start:stop] = part
+            end = _WRITTEN
+        finally:
+            self._line.send(end, socket.MSG_DONTWAIT)
         self._forget_fd(block)
 
     def receive(self, timeout_s: float | None = None) -> Any:
-        """Return the next message; raises TimeoutError, or EOFError where the other end is gone."""
-        if timeout_s is not None and not self._arrivals.poll(1000.0 * timeout_s):
-            raise TimeoutError
-        try:
-            packet, extra, _, _ = self._line.recvmsg(_PACKET_MAX_BYTES, _FD_BYTES)
-        except ConnectionError as error:
-            raise EOFError from error
-        if not packet:
-            raise EOFError
-        returned, head, place = marshal.loads(packet)
-        self._free += returned
-        large: list[Any] = []
-        if place is not None:
-            head, *large = self._look_at(place, extra)
-        return put_together(marshal.loads(head), large)
+        """Return the next message; raises TimeoutError, or EOFError where the other end is gone.
+
+        Who waits for so long at most stays awake at first: an answer may be near.
+        """
+        awake_ns = 0 if timeout_s is None else _AWAKE_NS
+        while True:
+            packet, extra = self._arrival(timeout_s, awake_ns)
+            if packet in (_WRITTEN, _VOID):
+                continue  # its message was given up before it was announced
+            returned, head, place = marshal.loads(packet)
+            self._free += returned
+            if place is None:
+                return put_together(marshal.loads(head), [])
+            parts: list[Any] = self._look_at(place, extra)
+            if self._arrival(timeout_s, _AWAKE_NS)[0] == _WRITTEN:
+                head, *large = parts
+                return put_together(marshal.loads(head), large)
+
+    def _arrival(self, timeout_s: float | None, awake_ns: int) -> tuple[bytes, Sequence[Any]]:
+        """Return the next packet and what came along with it; sleep only after `awake_ns`."""
+        asleep_ns = monotonic_ns() + awake_ns
+        while True:
+            try:
+                packet, extra, _, _ = self._line.recvmsg(
+                    _PACKET_MAX_BYTES, _FD_BYTES, socket.MSG_DONTWAIT
+                )
+            except BlockingIOError:
+                if monotonic_ns() < asleep_ns:
+                    os.sched_yield()
+                elif not self._arrivals.poll(None if timeout_s is None else 1000.0 * timeout_s):
+                    raise TimeoutError from None
+                continue
+            except ConnectionError as error:
+                raise EOFError from error
+            if not packet:
+                raise EOFError
+            return packet, extra
 
     def has_message(self) -> bool:
         """Tell whether `receive` would return, or raise, at once."""
