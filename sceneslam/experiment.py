@@ -48,7 +48,7 @@ class _Trials:
     def run(self, trials: Iterable[Trial]) -> Iterator[Outcome]:
         """Yield the outcomes in order; all trials are composed before the first is run."""
         configs = [(trial, self._compose(trial)) for trial in trials]
-        for trial, config in tqdm(configs, desc=self._key, unit="run"):
+        for trial, config in tqdm(configs, desc=self._key, unit="run", leave=False):
             folder = self._folder / trial.name
             finished = run(config, folder, title=trial.name)
             if finished.is_interrupted:

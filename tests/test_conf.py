@@ -98,6 +98,9 @@ ALLOWED = {  # package -> what of ours it may import
     "experiments/handover": {"types", "evaluation", "experiments"},
     "experiments/mutants": {"types", "ros", "config", "experiments"},
     "experiments/matrix": {"types", "evaluation", "bus", "experiments"},
+    "experiments/paper": {"types", "interfaces", "evaluation", "config", "experiments"},
+    "experiments/table": {"types", "evaluation", "experiments"},
+    "experiments/tune": {"types", "evaluation", "experiments"},
 }
 
 

@@ -52,6 +52,16 @@ class Figure:
     bound: float
     unit: str = ""
 
+    @classmethod
+    def at_most(cls, name: str, value: float, bound: float, unit: str = "") -> Figure:
+        """Return the promise that a value does not exceed its bound."""
+        return cls(name=name, value=value, relation=Relation.AT_MOST, bound=bound, unit=unit)
+
+    @classmethod
+    def at_least(cls, name: str, value: float, bound: float, unit: str = "") -> Figure:
+        """Return the promise that a value reaches its bound."""
+        return cls(name=name, value=value, relation=Relation.AT_LEAST, bound=bound, unit=unit)
+
     @property
     def holds(self) -> bool:
         """Tell whether the promise is kept; a figure that could not be had (NaN) keeps none."""

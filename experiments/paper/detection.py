@@ -1,0 +1,64 @@
+"""IV-A: the mean of grey from light into dark and back, and what is confirmed when (Fig. 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sceneslam.experiments.paper.runs import events_of, keep_figure, number
+from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+
+Row = tuple[str, float, float, float | None, float, float]
+
+
+class DetectionExperiment:
+    """Runs the detector alone; every module is dead reckoning, which costs nothing."""
+
+    def __init__(self, *, window_s: float, late_max_s: float, vote_max_ms: float) -> None:
+        self._window_s, self._late_max_s, self._vote_max_ms = window_s, late_max_s, vote_max_ms
+
+    def run(self, run_trials: RunTrials, folder: Path) -> Verdict:
+        """Return when every change was confirmed, how late, and what a vote costs."""
+        (outcome,) = run_trials([Trial(name="detection")])
+        keep_figure(outcome, "grey_mean", folder / "grey_mean.png")
+        columns = ("confirmed", "first image [s]", "confirmed at [s]", "after the true change [s]")
+        grey = (f"grey {self._window_s:g} s before", "grey when confirmed")
+        return Verdict(
+            figures=list(self._figures(outcome)),
+            table=Table(columns=(*columns, *grey), rows=self._rows(outcome)),
+        )
+
+    def _figures(self, outcome: Outcome) -> Iterator[Figure]:
+        switches, cost_us = outcome.metrics["switches"], outcome.metrics["detector_us"]
+        for switch in switches:
+            delay_s = number(switch["confirm_delay_s"])
+            name = f"{switch['scene']} confirmed after the true change"
+            yield Figure.at_most(name, delay_s, self._window_s + self._late_max_s, "s")
+        yield Figure.at_most("false switches", number(outcome.metrics["false_switches"]), 0.0)
+        for share in ("median", "p95"):
+            value_ms = number(cost_us[share]) / 1e3
+            yield Figure.at_most(f"detection per frame, {share}", value_ms, self._vote_max_ms, "ms")
+
+    def _rows(self, outcome: Outcome) -> Sequence[Row]:
+        votes = list(events_of(outcome, "vote"))
+        stamps_ns = np.array([vote["stamp_ns"] for vote in votes])
+        values = np.array([vote["value"] for vote in votes], float)
+        delays_s = {s["stamp_ns"]: s["confirm_delay_s"] for s in outcome.metrics["switches"]}
+
+        def grey(stamp_ns: int) -> float:
+            return float(values[np.searchsorted(stamps_ns, stamp_ns, side="right") - 1])
+
+        return [
+            (
+                f"{event['previous']} -> {event['scene']}",
+                (event["since_ns"] - int(stamps_ns[0])) / 1e9,
+                (event["stamp_ns"] - int(stamps_ns[0])) / 1e9,
+                delays_s.get(event["stamp_ns"]),
+                grey(event["since_ns"] - round(self._window_s * 1e9)),
+                grey(event["stamp_ns"]),
+            )
+            for event in events_of(outcome, "scene")
+            if event["previous"] is not None
+        ]

@@ -1,0 +1,67 @@
+"""IV-D: the same path with and without switching, and how far the two are apart (Fig. 8)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.evaluation import figure_style as look
+from sceneslam.evaluation.comparison import Difference, compare
+from sceneslam.experiments.paper.runs import number
+from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+
+
+class DifferenceExperiment:
+    """Compares each story's switched run with one module that has all lights on."""
+
+    def __init__(self, *, stories: Sequence[str], lit_module: str, difference_max_m: float) -> None:
+        self._stories, self._lit_module = stories, lit_module
+        self._difference_max_m = difference_max_m
+
+    def run(self, run_trials: RunTrials, folder: Path) -> Verdict:
+        """Return the largest difference of every story."""
+        table = f"scenes={{Bright: [{self._lit_module}], Dark: [{self._lit_module}]}}"
+        outcomes = run_trials(
+            Trial(name=f"{story}/{name}", overrides=(f"story={story}", *overrides))
+            for story in self._stories
+            for name, overrides in (("switched", ()), ("unswitched", ("lights=on", table)))
+        )
+        pairs = dict(zip(self._stories, zip(outcomes, outcomes, strict=True), strict=True))
+        found = {name: compare(a.trajectory, b.trajectory) for name, (a, b) in pairs.items()}
+        draw_differences(folder / "difference.png", found)
+        figures = [
+            Figure.at_most(f"{name}: largest difference", one.max_m, self._difference_max_m, "m")
+            for name, one in found.items()
+        ]
+        columns = ("story", "largest difference [cm]", "RMS [cm]", "poses compared")
+        errors = ("ATE switched [cm]", "ATE unswitched [cm]")
+        rows = [_row(name, one, *pairs[name]) for name, one in found.items()]
+        return Verdict(figures=figures, table=Table(columns=(*columns, *errors), rows=rows))
+
+
+def draw_differences(path: Path, found: Mapping[str, Difference]) -> None:
+    """Write a PNG: the distance between the two runs over time, a line per story."""
+    figure = look.new_figure()
+    axes = figure.add_subplot()
+    for number_, (name, one) in enumerate(found.items()):
+        if len(one.stamps_ns):
+            color = look.PALETTE[number_ % len(look.PALETTE)]
+            axes.plot(_elapsed_s(one), 100 * one.differences_m, color=color, label=name)
+    look.style(axes, y_label="difference [cm]")
+    axes.set_ylim(bottom=0.0)
+    figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=11)
+    look.save(figure, path)
+
+
+def _elapsed_s(one: Difference) -> NDArray[np.float64]:
+    return np.asarray((one.stamps_ns - one.stamps_ns[0]) * 1e-9)
+
+
+def _row(
+    name: str, one: Difference, switched: Outcome, unswitched: Outcome
+) -> tuple[str | float, ...]:
+    ates = (100 * number(run.metrics["ate_rmse_m"]) for run in (switched, unswitched))
+    return (name, 100 * one.max_m, 100 * one.rms_m, float(len(one.stamps_ns)), *ates)

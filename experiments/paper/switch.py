@@ -1,0 +1,70 @@
+"""IV-C: one switch, with the hybrid map and the global trajectory (Fig. 7)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from sceneslam.experiments.paper.runs import keep_figure, number
+from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+
+
+class SwitchExperiment:
+    """Drives once with every kind of hand-over; the first named has to keep the bounds."""
+
+    def __init__(
+        self,
+        *,
+        handovers: Sequence[str],
+        startup_s: Mapping[str, float],
+        ate_max_m: float,
+    ) -> None:
+        self._handovers, self._startup_s, self._ate_max_m = handovers, startup_s, ate_max_m
+
+    def run(self, run_trials: RunTrials, folder: Path) -> Verdict:
+        """Return what each kind gives; the map of the first is kept as a figure."""
+        outcomes = list(run_trials([self._trial(kind) for kind in self._handovers]))
+        keep_figure(outcomes[0], "map", folder / "map.png")
+        metrics = outcomes[0].metrics
+        figures = [
+            Figure.at_most(
+                "switches, off the one that is due", abs(len(metrics["switches"]) - 1), 0.0
+            ),
+            Figure.at_least("coverage", number(metrics["coverage"]), 1.0),
+            Figure.at_most("ATE RMSE", number(metrics["ate_rmse_m"]), self._ate_max_m, "m"),
+        ]
+        columns = ("hand-over", "switches", "coverage [%]", "gap [s]", "seam [cm]", "ATE [cm]")
+        rows = [_row(*pair) for pair in zip(self._handovers, outcomes, strict=True)]
+        return Verdict(
+            figures=figures, table=Table(columns=(*columns, "max [cm]", "points"), rows=rows)
+        )
+
+    def _trial(self, kind: str) -> Trial:
+        """Return a run; only the paper's own hand-over waits for the module to start."""
+        waits = self._startup_s.items() if kind == "cold" else ()
+        starts = [f"++policy.startup_s.{key}={time_s}" for key, time_s in waits]
+        return Trial(name=kind, overrides=(f"policy.handover={kind}", *starts))
+
+
+def _row(kind: str, outcome: Outcome) -> tuple[str | float, ...]:
+    metrics = outcome.metrics
+    switches = metrics["switches"]
+    return (
+        kind,
+        float(len(switches)),
+        100 * number(metrics["coverage"]),
+        max((number(switch["gap_s"]) for switch in switches), default=0.0),
+        100 * max((number(switch["jump_m"]) for switch in switches), default=0.0),
+        100 * number(metrics["ate_rmse_m"]),
+        100 * number(metrics["ate_max_m"]),
+        _points(outcome.folder / "map" / "points.ply"),
+    )
+
+
+def _points(path: Path) -> float:
+    """Return how many points a PLY file says it holds."""
+    with path.open("rb") as file:
+        for line in file:
+            if line.startswith(b"element vertex"):
+                return float(line.split()[-1])
+    return 0.0

@@ -1,0 +1,1 @@
+"""Searches the values of keys that serve an objective best."""
