@@ -1,8 +1,10 @@
 """The bus: states, hand-over, fallbacks, and modules that break their promise."""
 
+import weakref
+
 import numpy as np
 from driving import assert_exact, dark_from, drive, events
-from fakes import PERIOD_NS, ExactModule, true_pose
+from fakes import PERIOD_NS, ExactModule, observation, true_pose
 
 from sceneslam.atlas.atlas import BRIDGED
 
@@ -163,3 +165,16 @@ def test_modules_and_detector_are_shut_down_at_the_end():
     _, _, _, detector = drive(modules, scene_at=dark_from(40))
     assert [module.shutdowns for module in modules.values()] == [1, 1]
     assert detector.is_shut_down
+
+
+def test_a_run_that_is_over_holds_no_image():
+    images = []
+
+    def feed(index):
+        one = observation(index)
+        images.append(weakref.ref(one.image_bgr))
+        return one
+
+    modules = {"bright": ExactModule(), "dark": ExactModule()}
+    held = drive(modules, feed=feed, scene_at=dark_from(10), handover="rewind")
+    assert held[0].state == "terminate" and not any(image() is not None for image in images)

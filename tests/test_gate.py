@@ -150,3 +150,8 @@ def test_bridging_takes_the_way_and_the_tilt_from_the_wheels_and_the_heading_fro
 def test_impossible_setting_is_named(name, value):
     with pytest.raises(ConfigError, match=name):
         GateSettings(**{**asdict(GATE), name: value})
+
+
+def test_a_past_corrected_at_the_end_of_a_loss_is_no_motion():
+    module = lost_between(jumping(70, 2.0), 40, 70)
+    assert all(trusted(judged(module, revised_at=70))[70:])

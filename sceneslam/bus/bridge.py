@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,7 +30,9 @@ class Bridge:
 
     def copy(self) -> Bridge:
         """Return a bridge that knows the same; poses are never changed in place."""
-        return copy.copy(self)
+        twin = Bridge.__new__(Bridge)
+        twin.__dict__.update(self.__dict__)
+        return twin
 
     def update(
         self, observation: Observation, T_map_base: Transform, *, is_jump: bool = False

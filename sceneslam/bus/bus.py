@@ -109,7 +109,7 @@ class Bus:
         if self._state != "terminate":
             self._send("stop", stamp_ns)
         self._changeover.close()
-        self._estimator.retire()
+        self._estimator.close()
         self._watch.close()
 
     # What the machine asks before it takes a failure's way out.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import asdict, fields, replace
 from enum import Enum
+from operator import attrgetter
 from typing import Any
 
 from sceneslam.bus.decision import GO_ON, Health, Situation, Trial, Verdict, decide
@@ -12,18 +13,20 @@ from sceneslam.bus.events import EventLog
 from sceneslam.bus.policy import Policy
 from sceneslam.types.run import Event
 
+_FACTS = attrgetter(*(field.name for field in fields(Situation) if field.name != "stamp_ns"))
+
 
 class DecisionLog:
     """Logs a situation whenever more than the time changed, and every verdict but `go on`."""
 
     def __init__(self, log: EventLog) -> None:
         self._log = log
-        self._last: Situation | None = None
+        self._last: tuple[Any, ...] | None = None
 
     def add(self, now: Situation, verdict: Verdict) -> None:
         """Take a decision with all that it was made of."""
-        before, self._last = self._last, now
-        is_known = before is not None and replace(before, stamp_ns=now.stamp_ns) == now
+        facts = _FACTS(now)
+        is_known, self._last = facts == self._last, facts
         if is_known and verdict == GO_ON:
             return
         values = {key: _plain(value) for key, value in asdict(now).items() if key != "stamp_ns"}

@@ -130,6 +130,11 @@ class Estimator:
         self._retire(self.active, self._sessions)
         self.active, self._sessions, self._is_placed = None, [], False
 
+    def close(self) -> None:
+        """Shut the active module down for good, and forget what was observed."""
+        self.retire()
+        self._memory.clear()
+
     def _ask(self, observation: Observation) -> Transform | None:
         """Return the active module's pose in the map, None where it holds none."""
         if self.active is None or self.active.is_failed:

@@ -9,6 +9,8 @@ from typing import Any, TextIO
 
 from sceneslam.types.run import Event
 
+_WAITING_MAX = 64  # votes, which are written together
+
 
 class EventLog:
     """Collects events in memory and writes them to `events.jsonl` as they come.
@@ -18,6 +20,7 @@ class EventLog:
 
     def __init__(self, path: Path | None = None) -> None:
         self._events: list[Event] = []
+        self._written = 0  # how many of them are in the file
         self._file: TextIO | None = path.open("w") if path else None
 
     @property
@@ -35,13 +38,20 @@ class EventLog:
         for key, value in fields.items():
             line[key] = None if isinstance(value, float) and not math.isfinite(value) else value
         self._events.append(line)
-        if self._file:
-            self._file.write(json.dumps(line) + "\n")
-            if event != "vote":
-                self._file.flush()
+        if event != "vote" or len(self._events) - self._written >= _WAITING_MAX:
+            self._write()
 
     def close(self) -> None:
         """Close the file. May be called twice."""
+        self._write()
         if self._file:
             self._file.close()
             self._file = None
+
+    def _write(self) -> None:
+        """Write the events that wait."""
+        if self._file:
+            lines = [json.dumps(line) + "\n" for line in self._events[self._written :]]
+            self._file.write("".join(lines))
+            self._file.flush()
+        self._written = len(self._events)

@@ -7,6 +7,7 @@ off still tells the turn better than the wheels (Borenstein and Feng's gyrodomet
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from dataclasses import dataclass, fields
 from enum import Enum
@@ -90,11 +91,12 @@ def with_heading(T_prev_curr_odom: Transform, rotation: NDArray[np.float64]) -> 
     return T_prev_curr_odom @ se3.from_xy_yaw(0.0, 0.0, apart_rad)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(slots=True, kw_only=True, eq=False)
 class _Sample:
     stamp_ns: int
-    T_local_base: Transform
-    T_odom_base: Transform
+    R_local_odom: NDArray[np.float64]  # (3, 3), constant while both turn alike
+    position_local: NDArray[np.float64]  # (3,) [m]
+    position_odom: NDArray[np.float64]  # (3,) [m]
     way_m: float  # driven until then
     turn_rad: float  # turned until then
 
@@ -115,7 +117,9 @@ class Gate:
         self._horizons_ns = [round(horizon_s * 1e9) for horizon_s in settings.horizons_s]
         self._probation_ns = round(settings.probation_s * 1e9)
         self._samples: list[_Sample] = []  # by rising stamp, back to the longest horizon
+        self._stamps_ns: list[int] = []  # theirs
         self._T_odom_base: Transform | None = None
+        self._held: tuple[Transform, Transform] | None = None  # T_local_base, T_odom_base then
         self._way_m, self._turn_rad = 0.0, 0.0
         self._distance_since_ns: int | None = None  # since when it has not been too far off ...
         self._turn_since_ns: int | None = None
@@ -135,48 +139,41 @@ class Gate:
         """
         if T_odom_base is None:
             return Judgement(distance=Verdict.UNCHECKED, turn=Verdict.UNCHECKED)
-        T_prev_curr = self._drive(T_odom_base)
+        T_odom_prev, self._T_odom_base = self._T_odom_base, T_odom_base
+        if T_odom_prev is not None:
+            self._way_m += _norm(T_odom_base[:3, 3] - T_odom_prev[:3, 3])
+            self._turn_rad += _angle_rad(T_odom_base[:3, :3] - T_odom_prev[:3, :3])
         if T_local_base is None:
             return Judgement(distance=Verdict.PROBATION, turn=Verdict.PROBATION)
-        if is_revised:
-            self._move_past(T_local_base, T_prev_curr)
+        if is_revised and self._held is not None:
+            self._move_past(T_local_base, T_odom_base, *self._held)
         now = _Sample(
             stamp_ns=stamp_ns,
-            T_local_base=T_local_base,
-            T_odom_base=T_odom_base,
+            R_local_odom=T_local_base[:3, :3] @ T_odom_base[:3, :3].T,
+            position_local=T_local_base[:3, 3],
+            position_odom=T_odom_base[:3, 3],
             way_m=self._way_m,
             turn_rad=self._turn_rad,
         )
+        self._held = (T_local_base, T_odom_base)
         judgement = self._judge(now)
         self._samples.append(now)
+        self._stamps_ns.append(stamp_ns)
         return judgement
 
-    def _drive(self, T_odom_base: Transform) -> Transform:
-        """Count the odometry's step; return it."""
-        T_prev_curr = se3.identity()
-        if self._T_odom_base is not None:
-            T_prev_curr = se3.inverse(self._T_odom_base) @ T_odom_base
-            self._way_m += float(np.linalg.norm(T_prev_curr[:3, 3]))
-            self._turn_rad += _angle_rad(T_prev_curr[:3, :3], np.eye(3))
-        self._T_odom_base = T_odom_base
-        return T_prev_curr
-
-    def _move_past(self, T_local_base: Transform, T_prev_curr: Transform) -> None:
-        """Bring the samples to where the module now has them; its last step is the odometry's."""
-        if not self._samples:
-            return
-        T_old_base = self._samples[-1].T_local_base @ T_prev_curr
-        T_new_old = T_local_base @ se3.inverse(T_old_base)
-        self._samples = [
-            _Sample(
-                stamp_ns=sample.stamp_ns,
-                T_local_base=T_new_old @ sample.T_local_base,
-                T_odom_base=sample.T_odom_base,
-                way_m=sample.way_m,
-                turn_rad=sample.turn_rad,
-            )
-            for sample in self._samples
-        ]
+    def _move_past(
+        self,
+        T_local_base: Transform,
+        T_odom_base: Transform,
+        T_local_then: Transform,
+        T_odom_then: Transform,
+    ) -> None:
+        """Bring the samples to where the module now has them; since the last, odometry moved."""
+        T_local_old = T_local_then @ se3.inverse(T_odom_then) @ T_odom_base
+        T_new_old = T_local_base @ se3.inverse(T_local_old)
+        for sample in self._samples:
+            sample.R_local_odom = T_new_old[:3, :3] @ sample.R_local_odom
+            sample.position_local = T_new_old[:3, :3] @ sample.position_local + T_new_old[:3, 3]
 
     def _judge(self, now: _Sample) -> Judgement:
         found = self._anchors(now.stamp_ns)
@@ -208,23 +205,24 @@ class Gate:
         The oldest sample stands in for a longer one that is not. Older samples are forgotten.
         """
         indices = [
-            bisect_right(self._samples, stamp_ns - horizon_ns, key=lambda one: one.stamp_ns) - 1
+            bisect_right(self._stamps_ns, stamp_ns - horizon_ns) - 1
             for horizon_ns in self._horizons_ns
         ]
         if indices[0] < 0:
             return []
         found = [self._samples[max(index, 0)] for index in indices]
-        del self._samples[: max(indices[-1], 0)]
+        old = max(indices[-1], 0)
+        del self._samples[:old], self._stamps_ns[:old]
         return found
 
 
 def _excess(then: _Sample, now: _Sample, settings: GateSettings) -> _Excess:
     """Return by how much the module's motion differs from the odometry's, over the bounds."""
-    T_module = se3.inverse(then.T_local_base) @ now.T_local_base
-    T_odom = se3.inverse(then.T_odom_base) @ now.T_odom_base
+    moved_local = now.position_local - then.position_local
+    moved_odom = now.position_odom - then.position_odom
+    apart_m = _norm(moved_local - then.R_local_odom @ moved_odom)
+    apart_rad = _angle_rad(now.R_local_odom - then.R_local_odom)
     way_m, turned_rad = now.way_m - then.way_m, now.turn_rad - then.turn_rad
-    apart_m = float(np.linalg.norm(T_module[:3, 3] - T_odom[:3, 3]))
-    apart_rad = _angle_rad(T_module[:3, :3], T_odom[:3, :3])
     floor_m = settings.sigmas * settings.distance_m
     bound_m = floor_m + settings.sigmas * settings.distance_per_m * way_m
     deviation_rad = (
@@ -237,7 +235,10 @@ def _excess(then: _Sample, now: _Sample, settings: GateSettings) -> _Excess:
     )
 
 
-def _angle_rad(rotation_a: Transform, rotation_b: Transform) -> float:
-    """Return the angle between two rotations [rad], from the chord between them."""
-    chord = float(np.linalg.norm(rotation_a - rotation_b))
-    return 2.0 * float(np.arcsin(min(chord / np.sqrt(8.0), 1.0)))
+def _norm(vector: NDArray[np.float64]) -> float:
+    return math.sqrt(vector @ vector)
+
+
+def _angle_rad(difference: NDArray[np.float64]) -> float:
+    """Return the angle between two rotations [rad] from their difference (3, 3): its chord."""
+    return 2.0 * math.asin(min(_norm(difference.ravel()) / math.sqrt(8.0), 1.0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,11 +13,10 @@ from sceneslam.bus.bridge import Bridge
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
-_THINNED_RATIO = 0.95  # of the limit is left, so that not every moment has to thin
 _BULKY = ("image_bgr", "depth_m", "points_lidar", "point_times_s")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(slots=True, kw_only=True, eq=False)
 class Moment:
     """An observation with its pose, and all that later poses can be bridged from."""
 
@@ -49,8 +48,10 @@ class Memory:
     def __init__(self, *, span_s: float, limit_mb: float, keeps_sensors: bool) -> None:
         self._span_ns, self._limit_bytes = round(span_s * 1e9), round(limit_mb * 1e6)
         self._keeps_sensors = keeps_sensors
-        self._moments: deque[Moment] = deque()
-        self._bytes = 0
+        self._moments: list[Moment] = []  # by rising stamp
+        self._full_ns: list[int] = []  # the stamps of those that still have their sensor data ...
+        self._sizes: list[int] = []  # ... and its bytes
+        self._bytes = 0  # in all
 
     @property
     def newest(self) -> Moment:
@@ -59,14 +60,15 @@ class Memory:
 
     def add(self, moment: Moment) -> None:
         """Remember a moment; forget what is too old."""
-        self._moments.append(moment)
-        self._bytes += _size(moment)
-        while moment.stamp_ns - self._moments[0].stamp_ns > self._span_ns:
-            self._bytes -= _size(self._moments.popleft())
-        if not self._keeps_sensors and len(self._moments) > 1:
-            self._strip(len(self._moments) - 2)
-        elif self._bytes > self._limit_bytes:
-            self._thin()
+        self._append(moment)
+        old = self._count(moment.stamp_ns - self._span_ns - 1)
+        if old:
+            del self._moments[:old]
+            self._drop(slice(0, bisect_left(self._full_ns, self._moments[0].stamp_ns)))
+        if not self._keeps_sensors and len(self._full_ns) > 1:
+            self._strip(-2)
+        while self._bytes > self._limit_bytes and len(self._full_ns) > 2:
+            self._strip(self._least_missed())
 
     def anchor(self, until_ns: int | None) -> Moment:
         """Return the newest trusted moment, not after `until_ns` if that is given.
@@ -81,41 +83,71 @@ class Memory:
 
     def after(self, stamp_ns: int) -> list[Moment]:
         """Return all moments after an instant."""
-        return [moment for moment in self._moments if moment.stamp_ns > stamp_ns]
+        return self._moments[self._count(stamp_ns) :]
 
     def last_until(self, stamp_ns: int) -> Moment | None:
         """Return the newest moment up to an instant, None where it is forgotten."""
-        until = (moment for moment in reversed(self._moments) if moment.stamp_ns <= stamp_ns)
-        return next(until, None)
+        count = self._count(stamp_ns)
+        return self._moments[count - 1] if count else None
 
     def rewrite(self, moments: list[Moment]) -> None:
         """Put moments that are now better known in the place of all from the first of them on."""
-        while self._moments and self._moments[-1].stamp_ns >= moments[0].stamp_ns:
-            self._bytes -= _size(self._moments.pop())
+        from_ns = moments[0].stamp_ns
+        del self._moments[self._count(from_ns - 1) :]
+        self._drop(slice(bisect_left(self._full_ns, from_ns), None))
         for moment in moments:
-            self._moments.append(moment)
-            self._bytes += _size(moment)
+            self._append(moment)
 
-    def _thin(self) -> None:
-        """Take the data of the moment that is missed least, until the rest fits."""
-        full = [index for index, moment in enumerate(self._moments) if _size(moment)]
-        stamps_ns = np.array([self._moments[index].stamp_ns for index in full], np.float64)
-        while self._bytes > _THINNED_RATIO * self._limit_bytes and len(full) > 2:
-            ages_ns = stamps_ns[-1] - stamps_ns[1:-1]
-            missed = int(np.argmin((stamps_ns[2:] - stamps_ns[:-2]) / ages_ns)) + 1
-            self._strip(full.pop(missed))
-            stamps_ns = np.delete(stamps_ns, missed)
+    def clear(self) -> None:
+        """Forget everything: a run that is over may live on in its results."""
+        self._moments, self._bytes = [], 0
+        self._full_ns, self._sizes = [], []
 
-    def _strip(self, index: int) -> None:
-        moment = self._moments[index]
-        self._bytes -= _size(moment)
-        observation = replace(
-            moment.observation, image_bgr=None, depth_m=None, points_lidar=None, point_times_s=None
-        )
-        self._moments[index] = replace(moment, observation=observation)
+    def _count(self, stamp_ns: int) -> int:
+        """Return how many moments there are up to an instant."""
+        return bisect_right(self._moments, stamp_ns, key=_stamp_ns)
+
+    def _append(self, moment: Moment) -> None:
+        self._moments.append(moment)
+        size = _size(moment.observation)
+        if size:
+            self._full_ns.append(moment.stamp_ns)
+            self._sizes.append(size)
+            self._bytes += size
+
+    def _drop(self, full: slice) -> None:
+        """Forget the sizes of moments that are forgotten."""
+        self._bytes -= sum(self._sizes[full])
+        del self._full_ns[full], self._sizes[full]
+
+    def _least_missed(self) -> int:
+        """Return which of the moments with sensor data is best done without."""
+        stamps_ns = np.array(self._full_ns, np.float64)
+        ages_ns = stamps_ns[-1] - stamps_ns[1:-1]
+        return int(np.argmin((stamps_ns[2:] - stamps_ns[:-2]) / ages_ns)) + 1
+
+    def _strip(self, full: int) -> None:
+        """Take the sensor data of one of the moments that have theirs."""
+        index = self._count(self._full_ns[full]) - 1
+        self._bytes -= self._sizes.pop(full)
+        del self._full_ns[full]
+        self._moments[index].observation = _stripped(self._moments[index].observation)
 
 
-def _size(moment: Moment) -> int:
+def _stamp_ns(moment: Moment) -> int:
+    return moment.observation.stamp_ns
+
+
+def _size(observation: Observation) -> int:
     """Return the bytes of the sensor data that can be done without."""
-    arrays = (getattr(moment.observation, name) for name in _BULKY)
+    arrays = (getattr(observation, name) for name in _BULKY)
     return sum(array.nbytes for array in arrays if array is not None)
+
+
+def _stripped(observation: Observation) -> Observation:
+    return Observation(
+        stamp_ns=observation.stamp_ns,
+        scan=observation.scan,
+        T_odom_base=observation.T_odom_base,
+        gyro_base=observation.gyro_base,
+    )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,17 +19,19 @@ class Sureness:
     """
 
     def __init__(self) -> None:
-        self._usual: NDArray[np.float64] | None = None  # position [m], rotation [rad]
+        self._usual: tuple[float, float] | None = None  # position [m], rotation [rad]
 
     def is_usual(self, covariance: NDArray[np.float64] | None) -> bool:
         """Tell whether a pose's (6, 6) covariance is nothing unusual; unknown ones are not."""
         if covariance is None:
             return True
-        variances = covariance.diagonal()
-        deviations = np.sqrt([variances[:3].sum(), variances[3:].sum()])
-        if self._usual is None:
-            self._usual = deviations
-        limits = _UNUSUAL * self._usual
+        variances = covariance.diagonal().tolist()
+        deviations = (math.sqrt(sum(variances[:3])), math.sqrt(sum(variances[3:])))
+        usual = self._usual or deviations
         # What lasts becomes usual: a module may be surer at its first pose than ever after.
-        self._usual = self._usual + _GAIN * (np.minimum(deviations, limits) - self._usual)
-        return bool((deviations <= limits).all())
+        self._usual = (_follow(usual[0], deviations[0]), _follow(usual[1], deviations[1]))
+        return all(now <= _UNUSUAL * then for now, then in zip(deviations, usual, strict=True))
+
+
+def _follow(usual: float, now: float) -> float:
+    return usual + _GAIN * (min(now, _UNUSUAL * usual) - usual)
