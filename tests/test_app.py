@@ -14,6 +14,7 @@ CONFIG = {
     "source": {"_target_": "fakes.FakeSource", "steps": 100, "dark_from": 40},
     "detector": {
         "_target_": "sceneslam.modules.detectors.grey_mean.GreyMean",
+        "scenes": ["Bright", "Dark"],
         "threshold": 100.0,
     },
     "slam": {

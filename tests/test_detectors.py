@@ -10,6 +10,7 @@ from sceneslam.types.observation import UNSURE, Observation
 from sceneslam.types.rig import Rig
 
 RIG = Rig(sensors=frozenset())
+NAMES = ("Bright", "Dark")
 
 
 def image_of(grey):
@@ -38,7 +39,7 @@ def test_mean_of_a_view_is_that_of_its_copy():
 
 @pytest.mark.parametrize(("grey", "scene"), [(101, "Bright"), (100, "Dark"), (99, "Dark")])
 def test_bright_is_above_the_threshold(grey, scene):
-    detector = GreyMean(threshold=100.0)
+    detector = GreyMean(threshold=100.0, scenes=NAMES)
     detector.activate(RIG)
     vote = detector.get_scene(Observation(stamp_ns=5, image_bgr=image_of(grey)))
     assert (vote.scene, vote.stamp_ns) == (scene, 5)
@@ -46,15 +47,28 @@ def test_bright_is_above_the_threshold(grey, scene):
 
 
 def test_no_image_is_an_unsure_vote():
-    vote = GreyMean(threshold=100.0).get_scene(Observation(stamp_ns=5))
+    vote = GreyMean(threshold=100.0, scenes=NAMES).get_scene(Observation(stamp_ns=5))
     assert vote.scene == UNSURE
 
 
 @pytest.mark.parametrize("threshold", [-1.0, 256.0, float("nan")])
 def test_threshold_out_of_range_is_refused(threshold):
     with pytest.raises(ConfigError) as caught:
-        GreyMean(threshold=threshold)
+        GreyMean(threshold=threshold, scenes=NAMES)
     assert caught.value.key == "threshold"
+
+
+def test_scenes_have_the_names_that_they_are_given():
+    detector = GreyMean(threshold=100.0, scenes=["Hall", "Tunnel"])
+    bright, dark = (Observation(stamp_ns=0, image_bgr=image_of(grey)) for grey in (200, 20))
+    assert [detector.get_scene(bright).scene, detector.get_scene(dark).scene] == ["Hall", "Tunnel"]
+
+
+@pytest.mark.parametrize("names", [["Hall"], ["Hall", "Hall"], ["Hall", UNSURE], ["a", "b", "c"]])
+def test_scenes_are_two_different_names(names):
+    with pytest.raises(ConfigError) as caught:
+        GreyMean(threshold=100.0, scenes=names)
+    assert caught.value.key == "scenes"
 
 
 def test_schedule_counts_from_the_first_observation():

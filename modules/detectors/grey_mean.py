@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -10,27 +12,31 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import UNSURE, Observation, SceneVote
 from sceneslam.types.rig import Rig, Sensor
 
-BRIGHT, DARK = "Bright", "Dark"
-
 
 class GreyMean:
-    """Votes Bright where the mean of S = 0.299 R + 0.587 G + 0.114 B is above the threshold."""
+    """Votes the first scene where the mean of S = .299 R + .587 G + .114 B is above the threshold.
+
+    Else it votes the second; the paper calls them Bright and Dark.
+    """
 
     quantity = "mean of grey"
-    scenes = (BRIGHT, DARK)
     requires = (frozenset({Sensor.IMAGE}),)
     feature_settings: tuple[str, ...] = ()
 
-    def __init__(self, threshold: float) -> None:
+    def __init__(self, threshold: float, scenes: Sequence[str]) -> None:
         if not 0 <= threshold <= 255:
             raise ConfigError("threshold", threshold, "a grey value from 0 to 255")
+        if len(scenes) != 2 or scenes[0] == scenes[1] or UNSURE in scenes:
+            allowed = f"two names, of above and below the threshold, other than {UNSURE}"
+            raise ConfigError("scenes", list(scenes), allowed)
         self._threshold = threshold
+        self.scenes = (scenes[0], scenes[1])
 
     def activate(self, rig: Rig) -> None:
         """Do nothing: the detector has no state."""
 
     def get_scene(self, observation: Observation) -> SceneVote:
-        """Return Bright or Dark with the mean of grey, UNSURE without an image."""
+        """Return the scene with the mean of grey, UNSURE without an image."""
         return self.decide(observation.stamp_ns, self.get_features(observation))
 
     def get_features(self, observation: Observation) -> NDArray[np.float64] | None:
@@ -44,7 +50,7 @@ class GreyMean:
         if features is None:
             return SceneVote(stamp_ns=stamp_ns, scene=UNSURE)
         mean = float(features[0])
-        scene = BRIGHT if mean > self._threshold else DARK
+        scene = self.scenes[0 if mean > self._threshold else 1]
         return SceneVote(stamp_ns=stamp_ns, scene=scene, value=mean)
 
     def shutdown(self) -> None:

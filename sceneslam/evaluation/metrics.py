@@ -38,11 +38,12 @@ def evaluate(
     `notes` says in sentences why a number is missing although it could be expected.
     """
     switches = list_switches(result, truth)
+    told = {str(e["scene"]) for e in result.events if e["event"] == "scene"}
     metrics: Metrics = {
         **_accuracy(result, truth, settings),
         "coverage": coverage(result),
         "switches": switches,
-        "false_switches": count_false(switches, truth),
+        "false_switches": count_false(switches, truth, told),
         **_extent(result),
         **_costs(result),
         "modules": _per_module(result),

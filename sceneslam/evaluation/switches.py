@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,9 +37,15 @@ def list_switches(result: RunResult, truth: GroundTruth | None) -> list[dict[str
     return [_describe(decision, result, truth) for decision in decisions]
 
 
-def count_false(switches: Sequence[dict[str, Any]], truth: GroundTruth | None) -> int | None:
-    """Return how many switches followed a scene that was not the true one; None without truth."""
-    if truth is None or not truth.scenes:
+def count_false(
+    switches: Sequence[dict[str, Any]], truth: GroundTruth | None, told: Collection[str]
+) -> int | None:
+    """Return how many switches followed a scene that was not the true one; None without truth.
+
+    `told` are the scenes that the detector found. Where the truth knows none of their names it
+    speaks of other scenes, and says nothing about these.
+    """
+    if truth is None or not {change.scene for change in truth.scenes} & {*told}:
         return None
     by_scene = [switch for switch in switches if switch["reason"] == "scene"]
     false = [s for s in by_scene if true_scene(truth, s["stamp_ns"]) != s["scene"]]
