@@ -39,7 +39,9 @@ class Runner:
         self.spent_ns = 0  # in all calls together
         self._is_active = False
         self._module = module
-        self._sensors = frozenset[Sensor]().union(*module.requires)
+        # What every set holds is what it works on; without such, any of them may be.
+        common = frozenset[Sensor].intersection(*module.requires)
+        self._sensors = common or frozenset[Sensor]().union(*module.requires)
 
     @property
     def can_run(self) -> bool:
@@ -82,7 +84,7 @@ class Runner:
             raise self._failed("could not take the scene", error) from error
 
     def can_use(self, observation: Observation) -> bool:
-        """Tell whether the observation holds any sensor that the module asks for."""
+        """Tell whether the observation holds any sensor that the module works on."""
         return any(observation.has(sensor) for sensor in self._sensors)
 
     def track(self, observation: Observation) -> Tracking:

@@ -37,7 +37,13 @@ class Eye:
         features = self._extractor.extract(gray, observation.depth_m)
         self._rate_cam = self._rotation_cam_base @ rate_base
         features = self._shutter.straighten(features, self._rate_cam)
-        return View(observation=observation, gray=gray, features=features, T_predicted=T_predicted)
+        return View(
+            observation=observation,
+            image_bgr=image_bgr,
+            gray=gray,
+            features=features,
+            T_predicted=T_predicted,
+        )
 
     def learn(self, view: View, fix: Fix) -> None:
         """Hear of the pose that the last view led to."""

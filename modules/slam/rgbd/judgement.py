@@ -53,11 +53,17 @@ class KeyframeRule:
         """Tell whether the view from T_local_base should become a keyframe."""
         count = len(fix.landmark_ids)
         self._most_inliers = max(self._most_inliers, count)
-        is_running_out = count < self._inlier_ratio * self._most_inliers
-        distance = keyframes.nearest(
-            T_local_base,
-            per_m=self._per_m,
-            per_rad=self._per_rad,
-            but_latest=_RECENT if is_running_out else 0,
+        if count < self._inlier_ratio * self._most_inliers:
+            return self._steps_away(T_local_base, keyframes, but_latest=_RECENT) > _KNOWN_RATIO
+        return self.is_far(T_local_base, keyframes)
+
+    def is_far(self, T_local_base: Transform, keyframes: KeyframeStore) -> bool:
+        """Tell whether T_local_base is more than a step from every keyframe."""
+        return self._steps_away(T_local_base, keyframes, but_latest=0) > 1.0
+
+    def _steps_away(
+        self, T_local_base: Transform, keyframes: KeyframeStore, *, but_latest: int
+    ) -> float:
+        return keyframes.nearest(
+            T_local_base, per_m=self._per_m, per_rad=self._per_rad, but_latest=but_latest
         )
-        return distance > (_KNOWN_RATIO if is_running_out else 1.0)

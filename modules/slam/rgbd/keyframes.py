@@ -26,6 +26,13 @@ class DepthView:
     scan: LaserScan | None  # None where the camera does not see the scan's band
 
 
+def nothing_seen() -> DepthView:
+    """Return what is kept where there is no depth image."""
+    nothing = np.zeros((0, 3))
+    points_base, colors_bgr = nothing.astype(np.float32), nothing.astype(np.uint8)
+    return DepthView(points_base=points_base, colors_bgr=colors_bgr, scan=None)
+
+
 @dataclass(slots=True, kw_only=True, eq=False)
 class Keyframe:
     """One image that the map is built of. Pose and landmarks may be corrected later."""
@@ -66,6 +73,13 @@ class KeyframeStore:
         self._keyframes[keyframe_id] = keyframe
         self._id_limit = max(self._id_limit, int(keyframe.landmark_ids.max(initial=0)) + 1)
         return keyframe_id
+
+    def show(
+        self, keyframe_id: int, rows: NDArray[np.int64], landmark_ids: NDArray[np.int64]
+    ) -> None:
+        """Let features of a keyframe, by row, refer to landmarks."""
+        self._keyframes[keyframe_id].landmark_ids[rows] = landmark_ids
+        self._id_limit = max(self._id_limit, int(landmark_ids.max(initial=0)) + 1)
 
     def remove(self, keyframe_id: int) -> None:
         """Forget a keyframe."""

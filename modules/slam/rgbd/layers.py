@@ -15,7 +15,7 @@ from sceneslam.types.rig import Camera
 
 from ..depth_scan import DepthScanner
 from ..grid import OccupancyGrid
-from .keyframes import DepthView, Keyframe
+from .keyframes import DepthView, Keyframe, nothing_seen
 
 _LOG = logging.getLogger(__name__)
 _BEAMS = 180
@@ -41,9 +41,11 @@ class LayerBuilder:
         self._scanner = _make_scanner(camera)
 
     def view(
-        self, depth_m: NDArray[np.float32], image_bgr: NDArray[np.uint8], *, stamp_ns: int
+        self, depth_m: NDArray[np.float32] | None, image_bgr: NDArray[np.uint8], *, stamp_ns: int
     ) -> DepthView:
         """Return what the layers will need of a depth image, every stride-th pixel of it."""
+        if depth_m is None:
+            return nothing_seen()
         camera, step = self._camera, self._stride_px
         depth = depth_m[step // 2 :: step, step // 2 :: step]
         low_m, high_m = camera.depth_range_m

@@ -27,7 +27,7 @@ class Query:
     """A new keyframe, and the depth image that it was made of."""
 
     keyframe_id: int
-    depth_m: NDArray[np.float32]
+    depth_m: NDArray[np.float32] | None  # None: it has none
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

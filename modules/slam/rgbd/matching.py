@@ -48,10 +48,21 @@ def match_near(
     """
     rows, candidates = _pairs_within(uv_px, features.uv_px, radius_px)
     near = np.abs(levels[rows] - features.levels[candidates]) <= _LEVEL_TOLERANCE
-    rows, candidates = rows[near], candidates[near]
+    return match_pairs(rows[near], candidates[near], descriptors, features.descriptors, ratio=ratio)
+
+
+def match_pairs(
+    rows: NDArray[np.int64],
+    candidates: NDArray[np.int64],
+    descriptors: NDArray[np.uint8],
+    others: NDArray[np.uint8],
+    *,
+    ratio: float,
+) -> Matches:
+    """Return the pairs that look alike, of those given (P,): by rising row of `descriptors`."""
     if not len(rows):
         return _no_matches()
-    bits = descriptors.view(np.uint64)[rows] ^ features.descriptors.view(np.uint64)[candidates]
+    bits = descriptors.view(np.uint64)[rows] ^ others.view(np.uint64)[candidates]
     distances = np.bitwise_count(bits).sum(axis=1, dtype=np.int64)
     return _clear_winners(rows, candidates, distances, ratio)
 

@@ -46,7 +46,7 @@ class Memory:
         T_local_keyframe = keyframes[self._reference].T_local_base
         self._frames.add(stamp_ns, self._reference, se3.inverse(T_local_keyframe) @ T_local_base)
 
-    def insert(self, fix: Fix | None, depth_m: NDArray[np.float32]) -> None:
+    def insert(self, fix: Fix | None, depth_m: NDArray[np.float32] | None) -> None:
         """Take the map's newest keyframe; `fix` is what placed it there, None for odometry."""
         self._follow_removals()
         keyframe_id = self._map.keyframes.ids[-1]

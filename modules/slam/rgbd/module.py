@@ -16,28 +16,29 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
 from .answers import held, lost, started
-from .features import Features
 from .fusion import join_duplicates
 from .keyframes import NO_LANDMARK, Keyframe
 from .limits import check_limits, check_sizes
 from .localizer import Fix
 from .parts import Parts
+from .triangulation import triangulate
 from .view import View
 
-_KEYFRAME_FEATURES = 50  # with depth, that a keyframe needs
 _SEARCHED_IMAGES = 3  # looked for in the map before a new place is begun by odometry
 
 
 class RgbdSlam:
-    """Tracks a camera with depth; without depth for a while, on what the map knows.
+    """Tracks a camera, with depth or without: the map and its scale stay when depth ends.
 
     After ORB-SLAM2's front end (Mur-Artal and Tardos 2017): corners, a guided search in the local
-    map, PnP, motion-only least squares; keyframes where the view has changed.
+    map, PnP, motion-only least squares; keyframes where the view has changed. Without depth, new
+    landmarks are triangulated, and odometry or the map that is there tells the scale.
     """
 
     def __init__(
         self,
         *,
+        monocular_scenes: list[str],
         feature_count: int,
         fast_threshold_min: int,
         fast_noise_ratio: float,
@@ -59,13 +60,18 @@ class RgbdSlam:
     ) -> None:
         self._arguments = {name: value for name, value in locals().items() if name != "self"}
         check_limits(self._arguments)
+        self._monocular_scenes = frozenset(monocular_scenes)
+        self._ignores_depth = False
         self._T_map_local = se3.identity()
         self._T_local_base = se3.identity()
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return that colour and depth together suffice."""
-        return (frozenset({Sensor.IMAGE, Sensor.DEPTH}),)
+        """Return that colour suffices with anything that tells how large the scene is."""
+        return (
+            frozenset({Sensor.IMAGE, Sensor.DEPTH}),
+            frozenset({Sensor.IMAGE, Sensor.ODOMETRY}),
+        )
 
     def activate(self, rig: Rig) -> None:
         """Start anew with an empty map; raises InputError for a rig without a camera."""
@@ -88,11 +94,14 @@ class RgbdSlam:
         self._T_map_local = T_map_local.copy()
 
     def set_scene(self, scene: str) -> None:
-        """Hear of the scene; there is one mode only."""
+        """Hear of the scene; in some of them depth is not to be trusted."""
+        self._ignores_depth = scene in self._monocular_scenes
 
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base at the observation; LOST where the image does not show the map."""
         check_sizes(observation, self._camera)
+        if self._ignores_depth:
+            observation = replace(observation, depth_m=None)
         self._observations += 1
         self._recall()
         T_predicted = self._motion.predict(observation)
@@ -108,7 +117,7 @@ class RgbdSlam:
         if fix is not None:
             self._eye.learn(view, fix)
             return self._hold(view, fix)
-        if not len(self._map.keyframes) or self._is_unknown_place(view.features):
+        if not len(self._map.keyframes) or self._is_unknown_place(view):
             return self._start(view)
         return self._lose(observation, T_predicted)
 
@@ -139,7 +148,7 @@ class RgbdSlam:
             fix = self._localizer.anywhere(view.features, self._local_ids)
         if fix is not None:
             return fix
-        return self._relocalizer.find(view.features, view.observation.depth_m)
+        return self._relocalizer.find(view.features, view.depth_m)
 
     def _recall(self) -> None:
         """Go on from where the map is, if bundle adjustment or a loop has moved it."""
@@ -150,17 +159,25 @@ class RgbdSlam:
             self._motion.correct(T_new_old)
             self._local_ids = self._map.around(self._local_ids)
 
-    def _is_unknown_place(self, features: Features) -> bool:
-        """Tell whether odometry led to a place that was often enough looked for in the map."""
-        self._unknown_images += features.deep_count >= _KEYFRAME_FEATURES
-        return self._motion.is_reckoned and self._unknown_images > _SEARCHED_IMAGES
+    def _is_unknown_place(self, view: View) -> bool:
+        """Tell whether odometry led to a place that was often enough looked for in the map.
+
+        Without depth it takes some way from the last such view to see anything in two.
+        """
+        self._unknown_images += view.shows_enough
+        if not self._motion.is_reckoned or self._unknown_images <= _SEARCHED_IMAGES:
+            return False
+        return not view.is_monocular or self._keyframe_rule.is_far(
+            view.T_predicted, self._map.keyframes
+        )
 
     def _start(self, view: View) -> Tracking:
-        """Hang a keyframe on the prediction; wait, lost, for an image with features and depth.
+        """Hang a keyframe on the prediction; wait, lost, for features with depth or odometry.
 
         It is the map's first, or the first of a place that only odometry connects to the map.
         """
-        if view.features.deep_count < _KEYFRAME_FEATURES:
+        is_scaled = not view.is_monocular or view.observation.T_odom_base is not None
+        if not (view.shows_enough and is_scaled):
             return self._lose(view.observation, view.T_predicted)
         self._hold_pose(view.observation, view.T_predicted)
         unseen = np.full(len(view.features), NO_LANDMARK)
@@ -179,8 +196,7 @@ class RgbdSlam:
         self._local_ids = fix.local_ids
         self._map.count_sightings(fix.expected_ids, fix.landmark_ids)
         wanted = self._keyframe_rule.wants(T_local_base, fix, self._map.keyframes)
-        can_extend = view.features.deep_count >= _KEYFRAME_FEATURES
-        if wanted and can_extend and status is TrackingStatus.TRACKING:
+        if wanted and status is TrackingStatus.TRACKING:
             landmark_ids = np.full(len(view.features), NO_LANDMARK)
             landmark_ids[fix.feature_rows] = fix.landmark_ids
             self._insert_keyframe(view, landmark_ids, fix.deep_rows, fix)
@@ -210,19 +226,18 @@ class RgbdSlam:
         deep_rows: NDArray[np.int64],
         fix: Fix | None,
     ) -> None:
-        image_bgr, depth_m = view.observation.image_bgr, view.observation.depth_m
-        if image_bgr is None or depth_m is None:
-            return
         stamp_ns = view.observation.stamp_ns
         keyframe = Keyframe(
             stamp_ns=stamp_ns,
             T_local_base=self._T_local_base.copy(),
             features=view.features,
             landmark_ids=landmark_ids,
-            view=self._layers.view(depth_m, image_bgr, stamp_ns=stamp_ns),
+            view=self._layers.view(view.depth_m, view.image_bgr, stamp_ns=stamp_ns),
         )
-        self._map.insert(keyframe, deep_rows=deep_rows)
+        keyframe_id = self._map.insert(keyframe, deep_rows=deep_rows)
+        if view.is_monocular:
+            triangulate(self._map, keyframe_id)
         join_duplicates(self._map, keyframe)
-        self._memory.insert(fix, depth_m)
+        self._memory.insert(fix, view.depth_m)
         self._keyframe_rule.restart()
         self._local_ids = self._map.around(keyframe.landmark_ids)

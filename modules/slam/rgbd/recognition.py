@@ -64,8 +64,13 @@ class PlaceRecognizer:
     def _shows(
         self, keyframe: Keyframe, T_local_base: Transform, depth_m: NDArray[np.float32]
     ) -> bool:
-        """Tell whether a depth image from a pose has a keyframe's surfaces where they should be."""
+        """Tell whether a depth image from a pose has a keyframe's surfaces where they should be.
+
+        True for a keyframe that was made without depth: there is nothing to hold it against.
+        """
         camera = self._map.camera
+        if not len(keyframe.view.points_base):
+            return True
         T_cam_keyframe = se3.inverse(T_local_base @ camera.T_base_cam) @ keyframe.T_local_base
         points_cam = se3.apply(T_cam_keyframe, keyframe.view.points_base)
         points_cam = points_cam[points_cam[:, 2] > camera.depth_range_m[0]]

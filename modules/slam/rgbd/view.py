@@ -12,12 +12,30 @@ from sceneslam.types.se3 import Transform
 
 from .features import Features
 
+_FEWEST = 50  # features, with a depth where one is asked for, that a keyframe can be made of
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
     """An observation with what was found in its image."""
 
     observation: Observation
+    image_bgr: NDArray[np.uint8]  # (H, W, 3)
     gray: NDArray[np.uint8]  # (H, W)
     features: Features
     T_predicted: Transform  # T_local_base, before the image was asked
+
+    @property
+    def shows_enough(self) -> bool:
+        """Tell whether there is enough in the image to begin a map with."""
+        return len(self.features) >= _FEWEST
+
+    @property
+    def is_monocular(self) -> bool:
+        """Tell whether the image has to do without depth."""
+        return self.features.deep_count < _FEWEST
+
+    @property
+    def depth_m(self) -> NDArray[np.float32] | None:
+        """Return the depth image (H, W) [m], None where it is worth nothing."""
+        return None if self.is_monocular else self.observation.depth_m

@@ -123,10 +123,10 @@ class VisualMap:
         self.landmarks.expected[expected_ids] += 1
         self.landmarks.found[found_ids] += 1
 
-    def insert(self, keyframe: Keyframe, *, deep_rows: NDArray[np.int64]) -> None:
+    def insert(self, keyframe: Keyframe, *, deep_rows: NDArray[np.int64]) -> int:
         """Add a keyframe: sharpen the landmarks it saw, make new ones of its other features.
 
-        `deep_rows` are the features whose depth agrees with their landmark.
+        Returns its id. `deep_rows` are the features whose depth agrees with their landmark.
         """
         features, ids = keyframe.features, keyframe.landmark_ids
         known = np.flatnonzero(ids != NO_LANDMARK)
@@ -134,14 +134,15 @@ class VisualMap:
         points_local, information = self._locate(keyframe, deep_rows)
         self.landmarks.fuse(ids[deep_rows], points_local=points_local, information=information)
         points_local = self.landmarks.points_local[ids[known]]
-        self.landmarks.describe(ids[known], self._looks(keyframe, known, points_local))
+        self.landmarks.describe(ids[known], self.looks(keyframe, known, points_local))
         points_local, information = self._locate(keyframe, fresh)
-        looks = self._looks(keyframe, fresh, points_local)
+        looks = self.looks(keyframe, fresh, points_local)
         ids[fresh] = self.landmarks.add(
             points_local=points_local, information=information, looks=looks
         )
-        self.keyframes.insert(keyframe)
+        keyframe_id = self.keyframes.insert(keyframe)
         self._keep_limits()
+        return keyframe_id
 
     def correct(self, T_local_base: Mapping[int, Transform]) -> None:
         """Give keyframes, by id, new poses; each landmark moves along with its first keyframe."""
@@ -172,9 +173,10 @@ class VisualMap:
         information = np.einsum("ik,nk,jk->nij", rotation, weights, rotation)
         return points_cam @ rotation.T + T_local_cam[:3, 3], information
 
-    def _looks(
+    def looks(
         self, keyframe: Keyframe, rows: NDArray[np.int64], points_local: NDArray[np.float64]
     ) -> Looks:
+        """Return how landmarks (N, 3) look that features of a keyframe show."""
         viewer_local = (keyframe.T_local_base @ self.camera.T_base_cam)[:3, 3]
         to_viewer = viewer_local - points_local
         distance_m = np.maximum(np.linalg.norm(to_viewer, axis=1), _NEAREST_M)

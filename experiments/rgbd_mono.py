@@ -1,0 +1,81 @@
+"""Print how the rgbd module bridges a stretch without depth, on what it knows of the scene's size.
+
+    python experiments/rgbd_mono.py [OVERRIDES]
+
+The overrides choose a recording as for a run. Depth is taken away for 1, 3 and 10 s, from the
+middle on outwards, and all along but the first second. One line of a Markdown table each. The
+scale is that of the way within the gap against the true one, after a similarity alignment.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+from rgbd_loop import MAX_GAP_S, build, camera_only, follow
+
+from sceneslam.evaluation.accuracy import absolute_errors
+from sceneslam.evaluation.association import interpolated
+from sceneslam.sources.depth_gap import DepthGap
+from sceneslam.types.observation import TrackingStatus
+from sceneslam.types.trajectory import Trajectory
+
+LENGTHS_S = (0.0, 1.0, 3.0, 10.0, float("inf"))
+MAPPED_S = 1.0  # with depth, before a gap that never ends
+
+
+def gap_of(length_s: float, duration_s: float) -> list[float]:
+    """Return the gap [from, to] in seconds."""
+    if not np.isfinite(length_s):
+        return [MAPPED_S, duration_s + 1.0]
+    since_s = max(MAPPED_S, 0.5 * (duration_s - length_s))
+    return [since_s, since_s + max(length_s, 1e-9)]
+
+
+def scale_of(told: Trajectory, truth: Trajectory) -> float:
+    """Return by how much the way told is longer than the true one (Umeyama 1991)."""
+    true_m = interpolated(truth, told.stamps_ns).positions_m
+    told_m = told.positions_m - told.positions_m.mean(axis=0)
+    true_m = true_m - true_m.mean(axis=0)
+    singular = np.linalg.svd(true_m.T @ told_m, compute_uv=False)
+    return float((told_m**2).sum() / singular.sum())
+
+
+def bridge(overrides: list[str], length_s: float) -> str:
+    """Return one line: a run with one gap."""
+    source, module, truth = build(overrides)
+    stamps_ns = [observation.stamp_ns for observation in source]
+    gap_s = gap_of(length_s, (stamps_ns[-1] - stamps_ns[0]) * 1e-9)
+    blind = DepthGap(source, [gap_s])
+    answers, cost = follow(module, (camera_only(observation) for observation in blind))
+    revised = module.get_trajectory()
+    module.shutdown()
+    held = [answer for answer in answers if answer.status is not TrackingStatus.LOST]
+    told = Trajectory(
+        stamps_ns=np.array([answer.stamp_ns for answer in held]),
+        T_world_base=np.stack([answer.T_local_base for answer in held]),
+    )
+    times_s = (told.stamps_ns - stamps_ns[0]) * 1e-9
+    inside = (times_s >= gap_s[0]) & (times_s < gap_s[1])
+    within = Trajectory(stamps_ns=told.stamps_ns[inside], T_world_base=told.T_world_base[inside])
+    degraded = sum(answer.status is TrackingStatus.DEGRADED for answer in answers)
+    scale = f"{scale_of(within, truth):.3f}" if inside.sum() > 10 else "-"
+    errors = absolute_errors(told, truth, MAX_GAP_S)
+    return (
+        f"| {gap_s[0]:.1f} to {min(gap_s[1], times_s[-1]):.1f} s | {len(answers) - len(held)} "
+        f"| {degraded} | {1e3 * errors.rmse_m:.1f} ({1e3 * errors.max_m:.0f}) "
+        f"| {1e3 * absolute_errors(revised, truth, MAX_GAP_S).rmse_m:.1f} | {scale} "
+        f"| {cost['median [ms]']}, {cost['p95 [ms]']} |"
+    )
+
+
+def main() -> None:
+    """Print the table."""
+    head = "gap | lost | degraded | ATE told (max) [mm] | revised [mm] | scale in it | CPU ms"
+    print(f"| {head} |\n" + "|---" * 7 + "|")
+    for length_s in LENGTHS_S:
+        print(bridge(sys.argv[1:], length_s), flush=True)
+
+
+if __name__ == "__main__":
+    main()
