@@ -1,6 +1,6 @@
 """What a process of its own costs a module, and what two of them gain on two cores.
 
-    python experiments/isolation.py
+    OPENBLAS_NUM_THREADS=1 python experiments/isolation.py
 
 Colour and depth of 640x480 from the simulator, each observation made anew (as a source does) just
 before it is tracked, inline and isolated in turn. Run it on a machine that is otherwise idle.
@@ -8,7 +8,7 @@ before it is tracked, inline and isolated in turn. Run it on a machine that is o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import islice
@@ -29,13 +29,15 @@ from sceneslam.types.rig import Rig
 
 FRAMES, ROUNDS = 90, 5
 BOUND_MS = 0.2
+MODULES = ("odometry", "rgbd", "depth", "laser")
+PAIRS = (("depth", "depth"), ("rgbd", "depth"), ("rgbd", "laser"))
 
 
 def main() -> None:
     """Print the table of costs, the speed-up of two modules, and the time of a start."""
     cv2.setNumThreads(1)
     with initialize_config_module("sceneslam.conf", version_base="1.3"):
-        overrides = ["+scenario=bright_to_dark", "+slam@slam.odometry=odometry"]
+        overrides = ["+scenario=bright_to_dark", *(f"+slam@slam.{key}={key}" for key in MODULES)]
         config: Any = OmegaConf.to_container(compose("config", overrides=overrides), resolve=True)
     source = instantiate(config["source"], _convert_="all")
     frames = list(islice(source, FRAMES))
@@ -44,7 +46,7 @@ def main() -> None:
     }
     limits = _limits(config["run"])
     print_costs(makes["odometry"], frames, source.rig, limits)
-    print_speed_up([makes["bright"], makes["dark"]], frames, source.rig, limits)
+    print_speed_ups(makes, frames, source.rig, limits)
 
 
 def print_costs(
@@ -69,35 +71,42 @@ def print_costs(
     print(f"\nextra, median: {extra_ms:.3f} ms (bound {BOUND_MS} ms): {holds}")
 
 
-def print_speed_up(
-    makes: Sequence[Callable[[], SlamModule]],
+def print_speed_ups(
+    makes: Mapping[str, Callable[[], SlamModule]],
     frames: Sequence[Observation],
     rig: Rig,
     limits: Limits,
 ) -> None:
     """Print how much sooner two modules are done with the same frames side by side."""
-    inline = [make() for make in makes]
-    isolated = [IsolatedModule("slam.isolated", make, limits) for make in makes]
-    for module in [*inline, *isolated]:
+    print(f"\n| two modules, {len(frames)} frames | first [s] | second [s] | both at once [s] | |")
+    print("|---|---|---|---|---|")
+    for pair in PAIRS:
+        one_s, other_s = [_seconds([makes[key]], frames, rig, limits) for key in pair]
+        both_s = _seconds([makes[key] for key in pair], frames, rig, limits)
+        gain = (one_s + other_s) / both_s
+        print(f"| {' + '.join(pair)} | {one_s:.2f} | {other_s:.2f} | {both_s:.2f} | {gain:.2f} x |")
+
+
+def _seconds(
+    makes: Sequence[Callable[[], SlamModule]],
+    frames: Sequence[Observation],
+    rig: Rig,
+    limits: Limits,
+) -> float:
+    """Return how long isolated modules take for the frames, each frame given to all at once."""
+    modules = [IsolatedModule("slam.isolated", make, limits) for make in makes]
+    for module in modules:
         module.activate(rig)
     began_s = perf_counter()
     for frame in frames:
-        for module in inline:
-            module.track(frame)
-    inline_s = perf_counter() - began_s
-    began_s = perf_counter()
-    for frame in frames:
-        for worker in isolated:
-            worker.submit(frame)
-        for worker in isolated:
-            worker.collect()
-    process_s = perf_counter() - began_s
-    for worker in isolated:
-        worker.close()
-    print(
-        f"\nrgbd and laser on the same {len(frames)} frames: {inline_s:.2f} s inline, "
-        f"{process_s:.2f} s side by side, {inline_s / process_s:.2f} times as fast"
-    )
+        for module in modules:
+            module.submit(frame)
+        for module in modules:
+            module.collect()
+    took_s = perf_counter() - began_s
+    for module in modules:
+        module.close()
+    return took_s
 
 
 def _track(module: SlamModule, frames: Sequence[Observation], rig: Rig) -> list[float]:
