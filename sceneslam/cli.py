@@ -7,7 +7,7 @@ saved; 2 nothing was run because the configuration or the input cannot be used.
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,6 +18,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from sceneslam.app import Finished, run
 from sceneslam.config.resolve import resolved
+from sceneslam.config.settings import DETECT_ONLY
+from sceneslam.detection.run import detect
 from sceneslam.evaluation.summary import summary_lines
 from sceneslam.evaluation.verdict import verdict_lines
 from sceneslam.experiment import run_experiment
@@ -25,15 +27,27 @@ from sceneslam.types.errors import ConfigError, SceneSlamError
 from sceneslam.types.trajectory import Trajectory
 
 OK, INCOMPLETE, UNUSABLE = 0, 1, 2
+CONFIG = "pkg://sceneslam.conf"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ended:
+    """How a job ended: its exit code, and what was wrong in one sentence each."""
+
+    code: int
+    errors: tuple[str, ...] = ()
 
 
 def main() -> None:
     """Run `python -m sceneslam` and exit."""
-    codes: list[int] = []
+    from sceneslam.sweep.plugin import register
 
-    @hydra.main(version_base="1.3", config_path="pkg://sceneslam.conf", config_name="config")
+    codes: list[int] = []
+    register()
+
+    @hydra.main(version_base="1.3", config_path=CONFIG, config_name="config")
     def job(config: DictConfig) -> None:
-        codes.append(_job(config))
+        codes.append(carry_out(config).code)
 
     try:
         job()
@@ -42,27 +56,30 @@ def main() -> None:
     sys.exit(max(codes, default=OK))
 
 
-def _job(config: DictConfig) -> int:
-    """Run one job; return its exit code."""
+def carry_out(config: DictConfig) -> Ended:
+    """Run one job, say how it went and return how it ended; raises KeyboardInterrupt if stopped."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     try:
         if config.get("experiment"):
             verdict = run_experiment(config, folder)
             print("\n".join([*verdict_lines(verdict), f"verdict  {_short(folder)}/verdict.json"]))
-            return OK
+            return Ended(code=OK)
+        if OmegaConf.select(config, "run.mode") == DETECT_ONLY:
+            print("\n".join(detect(resolved(config), folder)))
+            return Ended(code=OK)
         finished = _run(config, folder)
     except SceneSlamError as error:
         print(f"error: {error}", file=sys.stderr)
-        return UNUSABLE
+        return Ended(code=UNUSABLE, errors=(str(error),))
     except KeyboardInterrupt:
         print("error: stopped before the first observation", file=sys.stderr)
-        return INCOMPLETE
+        raise
     for fault in finished.faults:
         print(f"error: {fault}", file=sys.stderr)
     print("\n".join([*summary_lines(finished.metrics), f"report   {_short(folder)}/report.html"]))
     if finished.is_interrupted:
         raise KeyboardInterrupt
-    return INCOMPLETE if finished.faults else OK
+    return Ended(code=INCOMPLETE if finished.faults else OK, errors=finished.faults)
 
 
 def _run(config: DictConfig, folder: Path) -> Finished:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -16,6 +16,17 @@ def termination_as_interrupt() -> Iterator[None]:
         raise KeyboardInterrupt
 
     with _handler(signal.SIGTERM, interrupt), _handler(signal.SIGINT, interrupt):
+        yield
+
+
+@contextmanager
+def termination_noted(note: Callable[[], None]) -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM do no more than `note`."""
+
+    def handle(number: int, frame: object) -> None:
+        note()
+
+    with _handler(signal.SIGTERM, handle), _handler(signal.SIGINT, handle):
         yield
 
 

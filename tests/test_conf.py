@@ -93,6 +93,8 @@ ALLOWED = {  # package -> what of ours it may import
     "sceneslam/supervision": {"types", "interfaces", "supervision"},
     "sceneslam/bus": {"types", "interfaces", "atlas", "bus"},
     "sceneslam/evaluation": {"types", "interfaces", "evaluation"},
+    "sceneslam/detection": {"types", "interfaces", "bus", "config", "evaluation", "detection"},
+    "sceneslam/collect": {"types", "evaluation", "collect", "sweep"},
     "modules": {"types", "interfaces"},
     "experiments/openloris": {"types", "evaluation", "experiments"},
     "experiments/handover": {"types", "evaluation", "experiments"},

@@ -6,15 +6,17 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.bus.policy import Policy
 from sceneslam.config.check import NOTHING, check_keys
 from sceneslam.config.component import Builder
-from sceneslam.config.settings import RunSettings
+from sceneslam.config.settings import DETECT_ONLY, RunSettings
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.interfaces import Detector, Sink, SlamModule, Source
+from sceneslam.sources.made_once import MadeOnce
 from sceneslam.sources.ordered import Ordered
 from sceneslam.supervision.isolated import IsolatedModule
 from sceneslam.types.errors import ConfigError, ModuleError
@@ -51,6 +53,8 @@ def build(config: Mapping[str, Any]) -> Parts:
     check_keys(config)
     builder = Builder(config)
     run = builder.make("run", RunSettings)
+    if run.mode == DETECT_ONLY:
+        raise ConfigError("run.mode", run.mode, "recording | live, where modules run")
     policy = builder.make("policy", Policy)
     detector = builder.make("detector", Detector)
     scenes = _table(config, detector)
@@ -62,12 +66,9 @@ def build(config: Mapping[str, Any]) -> Parts:
     atlas = builder.make("atlas", Atlas)
     evaluation = builder.make("evaluation", EvaluationSettings)
     sinks = {key: builder.make(f"sinks.{key}", Sink) for key in _group(config, "sinks")}
-    source = builder.make("source", Source)
-    if config.get("effects"):
-        source = builder.make("effects", Source, source)
-    source = Ordered(source)
+    source = make_source(config, builder)
     rig = source.rig
-    _check_sensors("detector", config["detector"], detector.requires, rig)
+    check_detector(config, detector, rig)
     for key in modules:
         _check_sensors(f"slam.{key}", config["slam"][key], requires[key], rig)
     return Parts(
@@ -83,6 +84,21 @@ def build(config: Mapping[str, Any]) -> Parts:
         run=run,
         threshold=config["detector"].get("threshold"),
     )
+
+
+def make_source(config: Mapping[str, Any], builder: Builder) -> Source:
+    """Return the source with its effects; one that is made first is made by one process only."""
+    source = builder.make("source", Source)
+    if config["source"].get("cache_dir"):
+        source = MadeOnce(source, Path(config["source"]["cache_dir"]))
+    if config.get("effects"):
+        source = builder.make("effects", Source, source)
+    return Ordered(source)
+
+
+def check_detector(config: Mapping[str, Any], detector: Detector, rig: Rig) -> None:
+    """Raise ConfigError when the source lacks the sensors that the detector needs."""
+    _check_sensors("detector", config["detector"], detector.requires, rig)
 
 
 def _module(builder: Builder, run: RunSettings, key: str) -> SlamModule:

@@ -21,8 +21,8 @@ def save_config(config: Mapping[str, Any], path: Path) -> dict[str, str]:
     """Write the resolved configuration with its provenance; return the provenance."""
     provenance = {
         "config_sha256": _sha256(OmegaConf.to_yaml(OmegaConf.create(dict(config))).encode()),
-        "code_sha256": _code_sha256(),
-        "input_sha256": _input_sha256(config.get("source") or {}),
+        "code_sha256": code_sha256(),
+        "input_sha256": input_sha256(config.get("source") or {}),
         "sceneslam": sceneslam.__version__,
         "python": platform.python_version(),
         **_dependencies(),
@@ -54,7 +54,7 @@ def _is_installed() -> bool:
     return True
 
 
-def _code_sha256() -> str:
+def code_sha256() -> str:
     """Return the hash of the package's Python and YAML files, the same in checkout and wheel."""
     digest = hashlib.sha256()
     for package in ("sceneslam", "sceneslam.modules", "sceneslam.conf"):
@@ -66,7 +66,7 @@ def _code_sha256() -> str:
     return digest.hexdigest()
 
 
-def _input_sha256(source: Mapping[str, Any]) -> str:
+def input_sha256(source: Mapping[str, Any]) -> str:
     """Return a hash of the input's names, sizes and contents; "none" without a `path`.
 
     Of files above 64 MiB it takes the first and last 32, so that a long recording does not wait.

@@ -28,3 +28,8 @@ def resolved(config: DictConfig | Mapping[str, Any]) -> dict[str, Any]:
         reason = str(error).splitlines()[0]
         raise ConfigError(key, "an interpolation", f"one that resolves ({reason})") from error
     return cast("dict[str, Any]", plain)
+
+
+def without_hydra(config: DictConfig) -> DictConfig:
+    """Return a job's own configuration, as Hydra gives it to a job."""
+    return OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])

@@ -7,7 +7,8 @@ from dataclasses import dataclass, fields
 from sceneslam.supervision.limits import Limits
 from sceneslam.types.errors import ConfigError
 
-MODES = ("recording", "live")
+DETECT_ONLY = "detect_only"
+MODES = ("recording", "live", DETECT_ONLY)
 ISOLATIONS = ("inline", "process")
 
 
@@ -15,7 +16,8 @@ ISOLATIONS = ("inline", "process")
 class RunSettings:
     """Mode, pace and limits of a run; durations are of the wall clock."""
 
-    mode: str  # recording: in step with the data; live: paced by the clock, own thread
+    mode: str  # recording: in step with the data; live: paced by the clock, own thread;
+    # detect_only: no SLAM
     isolation: str  # inline: modules in the bus's own process; process: each in one of its own ...
     step_deadline_s: float  # ... which is ended when it takes longer to track an observation ...
     start_deadline_s: float  # ... to be built, to be activated or to hand over its map ...

@@ -15,6 +15,7 @@ from sceneslam.evaluation.accuracy import absolute_errors, relative_errors, root
 from sceneslam.evaluation.association import clip
 from sceneslam.evaluation.comparison import compare
 from sceneslam.evaluation.correctness import correct_rate_observed
+from sceneslam.evaluation.detection import score_detection
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.evaluation.switches import count_false, list_switches
 from sceneslam.types.run import RunResult
@@ -44,6 +45,7 @@ def evaluate(
         "coverage": coverage(result),
         "switches": switches,
         "false_switches": count_false(switches, truth, told),
+        "detection": _detection(result, truth),
         **_extent(result),
         **_costs(result),
         "modules": _per_module(result),
@@ -106,6 +108,12 @@ def _accuracy(
         "truth_matched": len(absolute.errors_m),
         "association_gap_s": gap_s,
     }
+
+
+def _detection(result: RunResult, truth: GroundTruth | None) -> Metrics:
+    confirmed = [event for event in result.events if event["event"] == "scene"]
+    end_ns = int(result.observed_ns[-1]) if len(result.observed_ns) else 0
+    return score_detection(confirmed, truth, end_ns)
 
 
 def _extent(result: RunResult) -> Metrics:

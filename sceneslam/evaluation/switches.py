@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,7 @@ def is_switch(event: Event) -> bool:
 
 def true_scene(truth: GroundTruth, stamp_ns: int) -> str | None:
     """Return the true scene at an instant, None before the first that is known."""
-    change = _change_in_force(truth.scenes, stamp_ns)
+    change = _change_in_force(truth, stamp_ns)
     return change.scene if change else None
 
 
@@ -135,21 +136,21 @@ def _confirm_delay_s(decision: Event, truth: GroundTruth | None) -> float | None
     """Return the time since the true change that a switch answers, None when it answers none."""
     if truth is None or decision["reason"] != "scene":
         return None
-    change = _change_in_force(truth.scenes, decision["stamp_ns"])
+    change = _change_in_force(truth, decision["stamp_ns"])
     if change is None or change is truth.scenes[0] or change.scene != decision["scene"]:
         return None
     return float(decision["stamp_ns"] - change.stamp_ns) * 1e-9
 
 
-def _change_in_force(changes: Sequence[SceneChange], stamp_ns: int) -> SceneChange | None:
+def true_changes(truth: GroundTruth) -> list[SceneChange]:
+    """Return the first scene and the changes that really changed it."""
+    return [next(group) for _, group in groupby(truth.scenes, key=lambda change: change.scene)]
+
+
+def _change_in_force(truth: GroundTruth, stamp_ns: int) -> SceneChange | None:
     """Return the last change up to an instant that really changed the scene (or is the first)."""
-    in_force: SceneChange | None = None
-    for change in changes:
-        if change.stamp_ns > stamp_ns:
-            break
-        if in_force is None or change.scene != in_force.scene:
-            in_force = change
-    return in_force
+    changes = [change for change in true_changes(truth) if change.stamp_ns <= stamp_ns]
+    return changes[-1] if changes else None
 
 
 def _jump(

@@ -1,0 +1,121 @@
+"""What is drawn of a sweep: error, delay and false switches against every swept number."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from sceneslam.collect.chart import Line, Point, draw_front, draw_lines
+from sceneslam.collect.rows import Value
+from sceneslam.collect.summary import SEED, Group, mean_of
+from sceneslam.evaluation.figure_style import PALETTE
+from sceneslam.evaluation.markup import figure
+
+_SHOWN = {  # metric -> name of the axis
+    "ate_rmse_m": "ATE RMSE [m]",
+    "detection.delay_s": "detection delay [s]",
+    "detection.false": "false detections",
+    "detection.missed": "missed changes",
+}
+_LINES_MAX = len(PALETTE)  # colours that can be told apart
+_POINTS_MAX = 600
+
+
+def charts(groups: Sequence[Group]) -> Iterator[str]:
+    """Yield the charts as SVG, each with its caption."""
+    front = _front(groups)
+    if front:
+        yield front
+    numeric = [key for key in groups[0].keys if _is_numeric(groups, key)]
+    for key in numeric:
+        for metric, name in _SHOWN.items():
+            lines = list(_lines(groups, key, metric))
+            if any(len(line.points) > 1 for line in lines):
+                drawn = draw_lines(lines, x_label=key, y_label=name)
+                yield figure(drawn, _caption(groups, key, name))
+
+
+def _front(groups: Sequence[Group]) -> str:
+    points = []
+    for group in groups:
+        delay, false = group.mean("detection.delay_s"), group.mean("detection.false")
+        missed = group.mean("detection.missed")
+        if delay and false and not (missed and missed.mean):
+            label = ", ".join(f"{key}={value}" for key, value in group.keys.items())
+            points.append(Point(x=delay.mean, y=false.mean, label=label))
+    if len({(point.x, point.y) for point in points}) < 2:
+        return ""
+    drawn = draw_front(
+        points, x_label=_SHOWN["detection.delay_s"], y_label=_SHOWN["detection.false"]
+    )
+    return figure(
+        drawn,
+        "Every setting that found all true changes: how late it found them, and how many it saw "
+        "that were none. The line joins those that no other is better than.",
+    )
+
+
+def _lines(groups: Sequence[Group], key: str, metric: str) -> Iterator[Line]:
+    """Yield a line per value of the other key, averaged over everything else."""
+    other = _other(groups, key)
+    values = _few(_values(groups, other)) if other else [None]
+    for value, color in zip(values, PALETTE, strict=False):
+        chosen = [group for group in groups if other is None or group.keys[other] == value]
+        points = [_point(chosen, key, x, metric) for x in _values(chosen, key)]
+        known = [point for point in points if point is not None]
+        if known:
+            yield Line(
+                name=f"{other}={value}", color=color, points=sorted(known, key=lambda p: p.x)
+            )
+
+
+def _point(groups: Sequence[Group], key: str, x: Value, metric: str) -> Point | None:
+    """Return the mean over the groups; its interval where they differ by the seed alone."""
+    at = [group for group in groups if group.keys[key] == x]
+    numbers = [row.metrics.get(metric) for group in at for row in group.rows]
+    mean = mean_of([float(y) for y in numbers if isinstance(y, int | float)])
+    if mean is None or not isinstance(x, int | float):
+        return None
+    half_width = mean.half_width if len(at) == 1 else None
+    label = f"{x:g}: {mean.mean:.4g}"
+    if half_width is not None:
+        label += f" ± {half_width:.2g} ({mean.count} runs)"
+    return Point(x=float(x), y=mean.mean, half_width=half_width, label=label)
+
+
+def _caption(groups: Sequence[Group], key: str, name: str) -> str:
+    other = _other(groups, key)
+    rest = [one for one in groups[0].keys if one not in (key, other)]
+    has_seeds = any(len(group.rows) > 1 for group in groups)
+    told = f"{name} against {key}"
+    if other and len(_values(groups, other)) > _LINES_MAX:
+        told += f", for some values of {other}"
+    if rest or has_seeds:
+        told += f"; mean over {', '.join([*rest, *([SEED] if has_seeds else [])])}"
+    if has_seeds and not rest:
+        told += ", bars: its 95 % confidence interval"
+    return f"{told}."
+
+
+def _other(groups: Sequence[Group], key: str) -> str | None:
+    """Return the other key with the most values, of those whose values have all a line if any."""
+    counts = {name: len(_values(groups, name)) for name in groups[0].keys if name != key}
+    few = {name: count for name, count in counts.items() if count <= _LINES_MAX}
+    return max(few or counts, key=lambda name: counts[name], default=None)
+
+
+def _few(values: Sequence[Value]) -> list[Value]:
+    """Return as many values as can be told apart, from the first to the last."""
+    if len(values) <= _LINES_MAX:
+        return list(values)
+    steps = [round(k * (len(values) - 1) / (_LINES_MAX - 1)) for k in range(_LINES_MAX)]
+    return [values[step] for step in steps]
+
+
+def _is_numeric(groups: Sequence[Group], key: str) -> bool:
+    values = _values(groups, key)
+    is_number = all(isinstance(value, int | float) for value in values)
+    return is_number and 1 < len(values) <= _POINTS_MAX
+
+
+def _values(groups: Sequence[Group], key: str) -> list[Value]:
+    return list(dict.fromkeys(group.keys[key] for group in groups))

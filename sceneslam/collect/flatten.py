@@ -1,0 +1,41 @@
+"""A run's metrics as single numbers under dotted names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+Number = float | None
+
+# What is told of all switches of a run: name, of which entry, by what.
+_OF_SWITCHES: Sequence[tuple[str, str, Callable[[Sequence[float]], float]]] = (
+    ("confirm_delay_s", "confirm_delay_s", lambda values: sum(values) / len(values)),
+    ("confirm_delay_max_s", "confirm_delay_s", max),
+    ("switch_gap_max_s", "gap_s", max),
+    ("switch_jump_max_m", "jump_m", max),
+    ("switch_jump_max_rad", "jump_rad", max),
+    ("switch_cost_ms", "cost_ms", max),
+)
+
+
+def flat(metrics: Mapping[str, object]) -> dict[str, Number]:
+    """Return every number of `metrics.json`; of a list how long it is, of switches also how bad."""
+    found: dict[str, Number] = {}
+    for name, value in metrics.items():
+        if isinstance(value, Mapping):
+            found |= {f"{name}.{inner}": number for inner, number in flat(value).items()}
+        elif isinstance(value, list):
+            found[name] = len(value)
+            if name == "switches":
+                found |= _switches(value)
+        elif value is None or isinstance(value, int | float):
+            found[name] = value
+    return found
+
+
+def _switches(switches: Sequence[Mapping[str, object]]) -> dict[str, Number]:
+    found: dict[str, Number] = {}
+    for name, entry, summary in _OF_SWITCHES:
+        values = [switch.get(entry) for switch in switches]
+        known = [float(value) for value in values if isinstance(value, int | float)]
+        found[name] = summary(known) if known else None
+    return found

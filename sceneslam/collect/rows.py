@@ -1,0 +1,125 @@
+"""The runs below a folder, one row each: what was swept, how it ended, and its metrics."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import yaml
+
+from sceneslam.collect.flatten import flat
+from sceneslam.sweep.status import State, Status
+from sceneslam.types.errors import InputError
+
+ROWS = "rows.jsonl"  # rows that are no runs of their own: settings that were tried in one go
+Value = str | float | None
+_COSTS = ("_us", "_ms", "realtime_factor", "peak_rss_mb", "wall_s")  # ends of a metric's name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """One run; its numbers are split by whether they depend on input and configuration alone."""
+
+    name: str  # its folder, from the collected one
+    status: str
+    error: str = ""
+    keys: Mapping[str, Value]  # what the command line gave it
+    metrics: Mapping[str, Value] = field(default_factory=dict)
+    costs: Mapping[str, Value] = field(default_factory=dict)  # by the clock: never twice the same
+
+
+def read_rows(folder: Path) -> list[Row]:
+    """Return a row for every run below a folder, numbered ones in order.
+
+    Raises InputError where there is none.
+    """
+    found = sorted((path for path in _runs(folder)), key=lambda path: _order(folder, path))
+    rows = [_row(folder, path) for path in found]
+    if (folder / ROWS).is_file():
+        rows += [Row(**json.loads(line)) for line in (folder / ROWS).read_text().splitlines()]
+    if not rows:
+        raise InputError(f"no run in the folder: {folder}")
+    return rows
+
+
+def swept_keys(rows: Sequence[Row]) -> list[str]:
+    """Return the keys of which not all rows have the same value, in the order given."""
+    keys = dict.fromkeys(key for row in rows for key in row.keys)
+    return [key for key in keys if len({row.keys.get(key) for row in rows}) > 1]
+
+
+def _runs(folder: Path) -> Iterator[Path]:
+    """Yield the folders of runs; what a run keeps inside its own (a reference) is none."""
+    is_run = (folder / "job.json").is_file() or (folder / ".hydra" / "overrides.yaml").is_file()
+    if is_run:
+        yield folder
+        return
+    for inner in folder.iterdir():
+        if inner.is_dir() and not inner.name.startswith("."):
+            yield from _runs(inner)
+
+
+def _row(root: Path, folder: Path) -> Row:
+    status = Status.read(folder)
+    path = folder / "metrics.json"
+    if status is None:  # a run of Hydra's own launchers, or a single one
+        state = State.DONE if path.is_file() else State.FAILED
+        status = Status(state=state, overrides=_overrides(folder))
+    costs: dict[str, Value] = {}
+    metrics: dict[str, Value] = {}
+    if status.is_finished and path.is_file():
+        for name, value in flat(_json(path)).items():
+            (costs if _is_cost(name) else metrics)[name] = value
+    if status.wall_s is not None:
+        costs["job.wall_s"] = status.wall_s
+    return Row(
+        name=folder.relative_to(root).as_posix(),
+        status=status.state.value,
+        error=status.error,
+        keys=dict(map(parsed, status.overrides)),
+        metrics=metrics,
+        costs=costs,
+    )
+
+
+def _is_cost(name: str) -> bool:
+    return any(part.endswith(_COSTS) for part in name.split("."))
+
+
+def _overrides(folder: Path) -> Sequence[str]:
+    path = folder / ".hydra" / "overrides.yaml"
+    words = yaml.safe_load(path.read_text()) if path.is_file() else None
+    return words if isinstance(words, list) else ()
+
+
+def parsed(override: str) -> tuple[str, Value]:
+    """Return key and value of an override: `+scenario=flicker` sets `scenario`."""
+    key, _, text = override.partition("=")
+    if key.startswith("~"):
+        return key[1:], "(left out)"
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        value = text
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return key.lstrip("+"), text
+    return key.lstrip("+"), value
+
+
+def _json(path: Path) -> Mapping[str, object]:
+    try:
+        values = json.loads(path.read_text())
+    except ValueError as error:
+        raise InputError(f"expected JSON ({error}): {path}") from error
+    if not isinstance(values, dict):
+        raise InputError(f"expected a table of metrics, got {type(values).__name__}: {path}")
+    return values
+
+
+def _order(root: Path, folder: Path) -> list[tuple[int, str]]:
+    """Sort by the folders' numbers where they are numbered, else by name."""
+    parts = folder.relative_to(root).parts
+    return [(int(part), "") if part.isdecimal() else (sys.maxsize, part) for part in parts]

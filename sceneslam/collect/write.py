@@ -1,0 +1,97 @@
+"""The table of a sweep as files: CSV, Parquet, and a page to look at."""
+
+from __future__ import annotations
+
+import csv
+import logging
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sceneslam.collect.page import write_page
+from sceneslam.collect.rows import Row, Value, read_rows, swept_keys
+from sceneslam.collect.summary import Group, groups_of
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """Columns of equal length."""
+
+    columns: Mapping[str, Sequence[Value]]
+
+    @property
+    def rows(self) -> Iterable[Sequence[Value]]:
+        """Return the rows."""
+        return zip(*self.columns.values(), strict=True)
+
+
+def collect(folder: Path) -> Path:
+    """Make the table of all runs below a folder; return its page. Raises InputError for none."""
+    return write_rows(folder, read_rows(folder))
+
+
+def write_rows(folder: Path, rows: Sequence[Row]) -> Path:
+    """Write the tables and the page of some runs; return the page.
+
+    `table` holds what input and configuration decide: the same for every launcher, to the bit.
+    What the clock tells is in `costs`.
+    """
+    keys = swept_keys(rows)
+    _write_csv(folder / "table.csv", _table(rows, keys, metrics=True))
+    _write_csv(folder / "costs.csv", _table(rows, keys, metrics=False))
+    groups = groups_of(rows)
+    _write_csv(folder / "summary.csv", _summary(groups))
+    _write_parquet(folder / "table.parquet", _table(rows, keys, metrics=True))
+    return write_page(folder, rows, groups)
+
+
+def _table(rows: Sequence[Row], keys: Sequence[str], *, metrics: bool) -> Table:
+    numbers = [row.metrics if metrics else row.costs for row in rows]
+    columns: dict[str, Sequence[Value]] = {"job": [row.name for row in rows]}
+    columns |= {key: [row.keys.get(key) for row in rows] for key in keys}
+    columns |= {"status": [row.status for row in rows], "error": [row.error for row in rows]}
+    for name in dict.fromkeys(name for one in numbers for name in one):
+        columns[name] = [one.get(name) for one in numbers]
+    return Table(columns=columns)
+
+
+def _summary(groups: Sequence[Group]) -> Table:
+    """Return one row per setting: how many runs, each metric's mean and its 95 % interval."""
+    columns: dict[str, Sequence[Value]] = {
+        key: [group.keys[key] for group in groups] for key in groups[0].keys
+    }
+    columns["runs"] = [len(group.rows) for group in groups]
+    rows = [row for group in groups for row in group.rows]
+    for name in dict.fromkeys(name for row in rows for name in row.metrics):
+        means = [group.mean(name) for group in groups]
+        columns[name] = [one.mean if one else None for one in means]
+        columns[f"{name} ±"] = [one.half_width if one else None for one in means]
+    return Table(columns=columns)
+
+
+def _write_csv(path: Path, table: Table) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(table.columns)
+        writer.writerows(table.rows)
+
+
+def _write_parquet(path: Path, table: Table) -> None:
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError:
+        _log.warning("%s is not written: pip install 'sceneslam[sweep]'", path.name)
+        return
+    columns = {name: _of_one_type(values) for name, values in table.columns.items()}
+    parquet.write_table(pyarrow.table(columns), path)
+
+
+def _of_one_type(values: Sequence[Value]) -> Sequence[Value]:
+    """Return a column as Parquet takes it: text where not all values are numbers."""
+    if all(value is None or isinstance(value, int | float) for value in values):
+        is_whole = all(value is None or isinstance(value, int) for value in values)
+        return values if is_whole else [None if v is None else float(v) for v in values]
+    return [None if value is None else str(value) for value in values]

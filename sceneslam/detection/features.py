@@ -1,0 +1,76 @@
+"""What a detector measures of every observation of a recording, and what is true of it: kept."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.interfaces import FeatureDetector
+from sceneslam.types.observation import Observation
+from sceneslam.types.truth import GroundTruth, SceneChange
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Features:
+    """A recording as a detector sees it."""
+
+    stamps_ns: NDArray[np.int64]  # (N,) of all observations
+    values: NDArray[np.float64]  # (N, F); rows of what held nothing are not used
+    is_there: NDArray[np.bool_]  # (N,) whether the observation held anything to vote on
+    scenes: tuple[SceneChange, ...] | None  # the true ones, None where nothing is known
+
+    @property
+    def truth(self) -> GroundTruth | None:
+        """Return what is known to be true."""
+        return None if self.scenes is None else GroundTruth(scenes=self.scenes)
+
+    def write(self, path: Path) -> None:
+        """Write a file, whole or not at all."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_suffix(f".{os.getpid()}.part")
+        scenes = self.scenes and [[change.stamp_ns, change.scene] for change in self.scenes]
+        with part.open("wb") as file:
+            np.savez_compressed(
+                file,
+                stamps_ns=self.stamps_ns,
+                values=self.values,
+                is_there=self.is_there,
+                scenes=np.array(json.dumps(scenes)),
+            )
+        part.replace(path)
+
+    @classmethod
+    def read(cls, path: Path) -> Features:
+        """Return what a file holds, to the bit what was written."""
+        with np.load(path, allow_pickle=False) as arrays:
+            scenes = json.loads(str(arrays["scenes"]))
+            return cls(
+                stamps_ns=arrays["stamps_ns"],
+                values=arrays["values"],
+                is_there=arrays["is_there"],
+                scenes=None
+                if scenes is None
+                else tuple(SceneChange(stamp_ns=at, scene=scene) for at, scene in scenes),
+            )
+
+
+def measure(
+    observations: Iterable[Observation], detector: FeatureDetector
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Return stamps, features and whether there were any, of all observations."""
+    stamps_ns, rows = [], []
+    for observation in observations:
+        stamps_ns.append(observation.stamp_ns)
+        rows.append(detector.get_features(observation))
+    width = max((len(row) for row in rows if row is not None), default=0)
+    values = np.zeros((len(rows), width))
+    for number, row in enumerate(rows):
+        if row is not None:
+            values[number] = row
+    return np.array(stamps_ns, np.int64), values, np.array([row is not None for row in rows], bool)

@@ -1,0 +1,102 @@
+"""Thousands of settings of detector and policy, tried on features that were taken once."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any
+
+from sceneslam.bus.policy import Policy
+from sceneslam.config.component import Builder
+from sceneslam.detection.decide import confirm, vote
+from sceneslam.detection.run import Watched, score, watch
+from sceneslam.evaluation.metrics import Metrics
+from sceneslam.interfaces import FeatureDetector
+from sceneslam.types.errors import SceneSlamError
+from sceneslam.types.observation import SceneVote
+
+Setting = Mapping[str, Any]  # full key -> value
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Axis:
+    """A key of detector or policy, and the values that are tried."""
+
+    key: str
+    values: Sequence[Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tried:
+    """What a setting is worth, or why it could not be tried."""
+
+    setting: Setting
+    metrics: Metrics = field(default_factory=dict)
+    error: str = ""
+
+
+def try_all(config: Mapping[str, Any], axes: Sequence[Axis]) -> Iterator[Tried]:
+    """Yield every combination of the axes' values in a resolved configuration, the last fastest.
+
+    The recording is read once per detector whose features differ, and votes are cast once per
+    detector's setting.
+    """
+    detectors = list(_settings(axes, "detector."))
+    policies = [_built(config, setting) for setting in _settings(axes, "policy.")]
+    watched: dict[str, Watched] = {}
+    for setting in detectors:
+        try:
+            seen, votes = _votes(_with(config, setting), watched)
+        except SceneSlamError as error:
+            yield from (
+                Tried(setting={**setting, **other}, error=str(error)) for other, _ in policies
+            )
+            continue
+        for other, policy in policies:
+            both = {**setting, **other}
+            if isinstance(policy, SceneSlamError):
+                yield Tried(setting=both, error=str(policy))
+            else:
+                yield Tried(setting=both, metrics=score(seen.features, confirm(votes, policy)))
+
+
+def _votes(
+    config: Mapping[str, Any], watched: dict[str, Watched]
+) -> tuple[Watched, list[SceneVote]]:
+    detector = Builder(config).make("detector", FeatureDetector)
+    kind = json.dumps([config["detector"].get(name) for name in detector.feature_settings])
+    if kind not in watched:
+        watched[kind] = watch(config)
+    return watched[kind], vote(detector, watched[kind].rig, watched[kind].features)
+
+
+def _built(config: Mapping[str, Any], setting: Setting) -> tuple[Setting, Policy | SceneSlamError]:
+    try:
+        return setting, Builder(_with(config, setting)).make("policy", Policy)
+    except SceneSlamError as error:
+        return setting, error
+
+
+def _settings(axes: Sequence[Axis], prefix: str) -> Iterator[Setting]:
+    own = [axis for axis in axes if axis.key.startswith(prefix)]
+    for values in product(*(axis.values for axis in own)):
+        yield dict(zip((axis.key for axis in own), values, strict=True))
+
+
+def _with(config: Mapping[str, Any], setting: Setting) -> dict[str, Any]:
+    """Return a copy of a configuration with other values at some keys."""
+    changed = {
+        **config,
+        "detector": deepcopy(config["detector"]),
+        "policy": deepcopy(config["policy"]),
+    }
+    for key, value in setting.items():
+        *path, name = key.split(".")
+        node = changed
+        for part in path:
+            node = node[part]
+        node[name] = value
+    return changed

@@ -1,0 +1,60 @@
+"""Finds the kept features of a recording, or reads the recording once for them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from sceneslam.config.provenance import code_sha256, input_sha256
+from sceneslam.config.settings import RunSettings
+from sceneslam.detection.features import Features, measure
+from sceneslam.interfaces import FeatureDetector, Source
+
+_CACHE = "~/.cache/sceneslam"
+
+
+def recall(
+    config: Mapping[str, Any], detector: FeatureDetector, source: Source, run: RunSettings
+) -> Features:
+    """Return the features that a configuration's detector takes from its source.
+
+    Raises InputError where the source cannot be read.
+    """
+    path = _path(config, detector)
+    if path.is_file():
+        return Features.read(path)
+    detector.activate(source.rig)
+    observations = islice(source, run.max_observations)
+    bar = tqdm(observations, desc="features", unit="obs", disable=not run.progress)
+    stamps_ns, values, is_there = measure(bar, detector)
+    detector.shutdown()
+    truth = source.ground_truth()
+    scenes = truth.scenes if truth is not None and truth.scenes else None
+    found = Features(stamps_ns=stamps_ns, values=values, is_there=is_there, scenes=scenes)
+    found.write(path)
+    return found
+
+
+def _path(config: Mapping[str, Any], detector: FeatureDetector) -> Path:
+    """Return where features are kept, under a name that changes with all that they depend on."""
+    source = config["source"]
+    node = config["detector"]
+    depends_on = {
+        "source": {name: value for name, value in source.items() if name != "workers"},
+        "effects": config.get("effects"),
+        "detector": {name: node.get(name) for name in ("_target_", *detector.feature_settings)},
+        "max_observations": config["run"].get("max_observations"),
+        "input": input_sha256(source),
+        "code": code_sha256(),
+    }
+    text = json.dumps(depends_on, sort_keys=True, default=str)
+    folder = source.get("cache_dir") or os.environ.get("SCENESLAM_CACHE_DIR") or _CACHE
+    name = f"features_{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
+    return Path(folder).expanduser() / name

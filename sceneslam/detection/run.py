@@ -1,0 +1,93 @@
+"""A run without SLAM: the scenes that a detector and a policy find in a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from sceneslam.bus.events import EventLog
+from sceneslam.bus.policy import Policy
+from sceneslam.bus.scene_filter import ConfirmedScene
+from sceneslam.config.build import check_detector, make_source
+from sceneslam.config.check import check_keys
+from sceneslam.config.component import Builder
+from sceneslam.config.provenance import save_config
+from sceneslam.config.settings import RunSettings
+from sceneslam.detection.decide import confirm, vote
+from sceneslam.detection.features import Features
+from sceneslam.detection.recall import recall
+from sceneslam.evaluation.detection import score_detection
+from sceneslam.evaluation.metrics import Metrics, write_metrics
+from sceneslam.evaluation.summary import number
+from sceneslam.interfaces import FeatureDetector
+from sceneslam.types.observation import SceneVote
+from sceneslam.types.rig import Rig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Watched:
+    """A recording as a detector saw it; other settings of the detector can be tried on it."""
+
+    rig: Rig
+    features: Features
+    faults: Sequence[str]  # of the recording, where it was read just now
+
+
+def watch(config: Mapping[str, Any]) -> Watched:
+    """Return what the configuration's detector sees; raises ConfigError or InputError."""
+    check_keys(config)
+    builder = Builder(config)
+    run = builder.make("run", RunSettings)
+    detector = builder.make("detector", FeatureDetector)
+    source = make_source(config, builder)
+    rig = source.rig
+    check_detector(config, detector, rig)
+    features = recall(config, detector, source, run)
+    return Watched(rig=rig, features=features, faults=tuple(source.faults))
+
+
+def detect(config: Mapping[str, Any], folder: Path) -> list[str]:
+    """Write a folder with events, metrics and configuration; return what to tell in short lines."""
+    watched = watch(config)
+    builder = Builder(config)
+    votes = vote(builder.make("detector", FeatureDetector), watched.rig, watched.features)
+    confirmed = confirm(votes, builder.make("policy", Policy))
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_events(folder / "events.jsonl", votes, confirmed)
+    save_config(config, folder / "config.yaml")
+    metrics = score(watched.features, confirmed)
+    write_metrics(folder / "metrics.json", metrics)
+    scores = metrics["detection"]
+    return [
+        f"{metrics['observations']} observations, {scores['confirmed']} scenes confirmed",
+        f"false {number(scores['false'], 0)}, missed {number(scores['missed'], 0)}, "
+        f"found {number(scores['delay_s'], 2, ' s')} after the change "
+        f"(at most {number(scores['delay_max_s'], 2, ' s')}), "
+        f"wrong for {number(scores['wrong_s'], 2, ' s')}",
+    ]
+
+
+def score(features: Features, confirmed: Sequence[ConfirmedScene]) -> Metrics:
+    """Return the metrics of confirmed scenes, named as those of a run with SLAM."""
+    stamps_ns = features.stamps_ns
+    end_ns = int(stamps_ns[-1]) if len(stamps_ns) else 0
+    events = [asdict(scene) for scene in confirmed]
+    return {
+        "detection": score_detection(events, features.truth, end_ns),
+        "observations": len(stamps_ns),
+    }
+
+
+def _write_events(
+    path: Path, votes: Sequence[SceneVote], confirmed: Sequence[ConfirmedScene]
+) -> None:
+    """Write votes and confirmed scenes as a run with SLAM does."""
+    log = EventLog(path)
+    scenes = {scene.stamp_ns: scene for scene in confirmed}
+    for one in votes:
+        log.add("vote", one.stamp_ns, scene=one.scene, value=one.value)
+        if one.stamp_ns in scenes:
+            log.add("scene", **asdict(scenes[one.stamp_ns]))
+    log.close()

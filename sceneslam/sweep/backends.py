@@ -1,0 +1,144 @@
+"""Where the jobs of a sweep run: what each launcher does with orders, each a process of its own."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from time import sleep
+from typing import Any, Protocol
+
+from sceneslam.sweep.status import State
+from sceneslam.sweep.supervise import Order, run_job, settle
+from sceneslam.types.errors import ConfigError
+
+_LOOK_S = 0.2
+
+
+class Backend(Protocol):
+    """Runs jobs; the death of one, or of what runs it, is noted in its folder."""
+
+    def run(self, orders: Sequence[Order]) -> None:
+        """Run all orders; return when each is settled."""
+        ...
+
+
+class Basic:
+    """One job after the other, here."""
+
+    def run(self, orders: Sequence[Order]) -> None:
+        """Run them in order."""
+        for order in orders:
+            run_job(order)
+
+
+class Joblib:
+    """So many jobs at a time, on this machine."""
+
+    def __init__(self, n_jobs: int) -> None:
+        if n_jobs == 0:
+            raise ConfigError("n_jobs", n_jobs, "1 or more; -1: one per core")
+        self._n_jobs = n_jobs
+
+    def run(self, orders: Sequence[Order]) -> None:
+        """Run them from threads, each of which waits for its job's process."""
+        try:
+            from joblib import Parallel, delayed
+        except ImportError as error:
+            raise _missing("joblib", "sweep", error) from error
+
+        parallel = Parallel(n_jobs=self._n_jobs, backend="threading", batch_size=1)
+        parallel(delayed(run_job)(order) for order in orders)
+
+
+class Submitit:
+    """Jobs of a SLURM cluster, or of submitit's stand-in for one on this machine.
+
+    `array_parallelism` jobs run at a time; `parameters` are submitit's own (`timeout_min`,
+    `cpus_per_task`, `slurm_partition`, ...).
+    """
+
+    def __init__(
+        self, cluster: str, array_parallelism: int | None, parameters: Mapping[str, Any]
+    ) -> None:
+        if cluster not in ("local", "slurm"):
+            raise ConfigError("cluster", cluster, "local | slurm")
+        self._cluster = cluster
+        self._at_once = array_parallelism or os.cpu_count() or 1
+        self._parameters = dict(parameters)
+
+    def run(self, orders: Sequence[Order]) -> None:
+        """Submit them: to SLURM as one array, else as there is room."""
+        try:
+            from submitit import AutoExecutor
+        except ImportError as error:
+            raise _missing("submitit", "sweep", error) from error
+
+        executor = AutoExecutor(orders[0].stop.parent / "submitit", cluster=self._cluster)
+        executor.update_parameters(**self._parameters)
+        if self._cluster == "slurm":
+            executor.update_parameters(slurm_array_parallelism=self._at_once)
+            jobs = executor.map_array(run_job, orders)
+            for order, job in zip(orders, jobs, strict=True):
+                _note(order, job.result)
+            return
+        waiting, running = deque(orders), dict[Order, Any]()
+        while waiting or running:
+            while waiting and len(running) < self._at_once:
+                order = waiting.popleft()
+                running[order] = executor.submit(run_job, order)
+            for order in [order for order, job in running.items() if job.done()]:
+                _note(order, running.pop(order).result)
+            sleep(_LOOK_S)
+
+
+class Ray:
+    """Tasks of a Ray cluster; without an address, of one that is started on this machine."""
+
+    def __init__(self, address: str | None, num_cpus: int | None, cpus_per_job: float) -> None:
+        self._address, self._num_cpus = address, num_cpus
+        self._cpus_per_job = cpus_per_job
+
+    def run(self, orders: Sequence[Order]) -> None:
+        """Run them as there are cores; a worker that dies takes its own job along, no other."""
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        try:
+            import ray
+        except ImportError as error:
+            raise _missing("ray", "ray", error) from error
+
+        num_cpus = None if self._address else self._num_cpus or os.cpu_count()
+        ray.init(self._address, num_cpus=num_cpus, include_dashboard=False, log_to_driver=False)
+        try:
+            task = ray.remote(num_cpus=self._cpus_per_job, max_retries=0)(run_job)
+            running = {task.remote(order): order for order in orders}
+            while running:
+                ended, _ = ray.wait(list(running))
+                for reference in ended:
+                    _note(running.pop(reference), partial(ray.get, reference))
+        finally:
+            ray.shutdown()
+
+
+def _note(order: Order, result: Callable[[], object]) -> None:
+    """Note in the job's folder when what ran it died."""
+    try:
+        result()
+    except Exception as error:
+        reason = str(error).strip().splitlines() or [""]
+        settle(order.folder, State.KILLED, f"what ran it died: {type(error).__name__}: {reason[0]}")
+
+
+def _missing(package: str, extra: str, error: ImportError) -> ConfigError:
+    return ConfigError(
+        "hydra/launcher", package, f"an installed one: pip install 'sceneslam[{extra}]' ({error})"
+    )
+
+
+BACKENDS: Mapping[str, type[Any]] = {
+    "basic": Basic,
+    "joblib": Joblib,
+    "submitit": Submitit,
+    "ray": Ray,
+}

@@ -1,0 +1,80 @@
+"""`run=detect_only` as a sweep: no job per setting, but all settings on what was seen once."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, QuotedString, Transformer
+from hydra.types import HydraContext
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from sceneslam.collect.flatten import flat
+from sceneslam.collect.rows import ROWS, Row, parsed
+from sceneslam.collect.write import write_rows
+from sceneslam.config.resolve import resolved, without_hydra
+from sceneslam.detection.grid import Axis, Tried, try_all
+from sceneslam.sweep.status import State
+
+_INNER = ("detector.", "policy.")  # what can be changed without composing or reading again
+
+
+def sweep_detection(
+    context: HydraContext, config: DictConfig, words: Sequence[str], folder: Path
+) -> bool:
+    """Try every combination of overrides, write the table; return whether all could be tried."""
+    parser = OverridesParser.create(config_loader=context.config_loader)
+    overrides = {one.get_key_element(): one for one in parser.parse_overrides(list(words))}
+    inner = {key: one for key, one in overrides.items() if key.startswith(_INNER)}
+    axes = [Axis(key=key, values=list(_values(one))) for key, one in inner.items()]
+    first = [_words(one)[0] for one in inner.values()]  # a misspelt key is found by composing
+    outer = [_words(one) for key, one in overrides.items() if key not in inner]
+    composed = [
+        (chosen, context.config_loader.load_sweep_config(config, [*chosen, *first]))
+        for chosen in map(list, product(*outer))
+    ]
+    rows: list[Row] = []
+    with tqdm(desc="sweep", unit="setting", mininterval=0.5) as bar:
+        for chosen, one in composed:
+            for tried in try_all(resolved(without_hydra(one)), axes):
+                rows.append(_row(len(rows), chosen, tried))
+                bar.update()
+    (folder / ROWS).write_text("".join(json.dumps(asdict(row)) + "\n" for row in rows))
+    page = write_rows(folder, rows)
+    print(f"{len(rows)} settings\ntable    {folder}/table.csv\npage     {page}")
+    return all(row.status == State.DONE.value for row in rows)
+
+
+def _row(number: int, chosen: Sequence[str], tried: Tried) -> Row:
+    state = State.FAILED if tried.error else State.DONE
+    return Row(
+        name=str(number),
+        status=state.value,
+        error=tried.error,
+        keys={**dict(map(parsed, chosen)), **tried.setting},
+        metrics=flat(tried.metrics),
+    )
+
+
+def _words(override: Override) -> list[str]:
+    """Return an override once for each of its values."""
+    key = override.get_key_element()
+    if override.is_sweep_override():
+        return [f"{key}={value}" for value in override.sweep_string_iterator()]
+    return [f"{key}={override.get_value_element_as_str()}"]
+
+
+def _values(override: Override) -> Iterator[Any]:
+    """Yield an override's values."""
+    if override.is_sweep_override():
+        found: Iterator[Any] = override.sweep_iterator(Transformer.identity)
+    else:
+        found = iter([override.value()])
+    for value in found:
+        yield value.text if isinstance(value, QuotedString) else value

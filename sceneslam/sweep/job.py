@@ -1,0 +1,80 @@
+"""One job of a sweep, as a process: `python -m sceneslam.sweep.job FOLDER`."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import platform
+import signal
+import sys
+import threading
+import traceback
+from pathlib import Path
+from typing import cast
+
+from hydra import version
+from hydra._internal.callbacks import Callbacks
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path
+from hydra.core.utils import run_job
+from hydra.types import HydraContext
+from omegaconf import DictConfig
+
+from sceneslam.cli import CONFIG, INCOMPLETE, OK, Ended, carry_out
+from sceneslam.sweep.plugin import COMPOSED
+from sceneslam.sweep.status import State, Status
+
+_STATES = {OK: State.DONE, INCOMPLETE: State.INCOMPLETE}
+
+
+def main() -> None:
+    """Run the job of a folder and leave its status there."""
+    folder = Path(sys.argv[1])
+    threading.Thread(target=_end_with_parent, daemon=True, name="parent").start()
+    status = Status.read(folder) or Status(state=State.WAITING)
+    status.now(State.RUNNING, host=platform.node(), pid=os.getpid()).write(folder)
+    state, error = _run(folder)
+    status.now(state, error, host=platform.node(), pid=os.getpid()).write(folder)
+
+
+def _run(folder: Path) -> tuple[State, str]:
+    """Return how a job ended, and what was wrong."""
+    try:
+        with (folder / COMPOSED).open("rb") as file:
+            config: DictConfig = pickle.load(file)
+        ended = _carried_out(config)
+    except KeyboardInterrupt:
+        return State.STOPPED, "stopped while it ran"
+    except Exception as error:
+        traceback.print_exc()
+        return State.FAILED, f"unexpected {type(error).__name__}: {error}; see job.log"
+    return _STATES.get(ended.code, State.FAILED), "; ".join(ended.errors)
+
+
+def _carried_out(config: DictConfig) -> Ended:
+    """Run a configuration as Hydra runs a job, in a Hydra that can compose more like it."""
+    search_path = create_config_search_path(CONFIG)
+    for source in config.hydra.runtime.config_sources:
+        if source.provider == "command-line":  # the user's --config-dir
+            search_path.append(source.provider, f"{source.schema}://{source.path}")
+    version.setbase(config.hydra.runtime.version_base)
+    hydra = Hydra.create_main_hydra2(config.hydra.job.name, search_path)
+    done = run_job(
+        task_function=carry_out,
+        config=config,
+        job_dir_key="hydra.sweep.dir",
+        job_subdir_key="hydra.sweep.subdir",
+        hydra_context=HydraContext(hydra.config_loader, Callbacks(config)),
+    )
+    return cast(Ended, done.return_value)
+
+
+def _end_with_parent() -> None:
+    """End when the process that started this one is gone: standard input closes then."""
+    while os.read(0, 1):  # not sys.stdin, whose lock would be held when the job ends
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+if __name__ == "__main__":
+    main()

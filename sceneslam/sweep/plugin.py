@@ -1,0 +1,159 @@
+"""Sweeps as Hydra asks for them: all jobs are composed before the first one begins."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.core.utils import JobReturn, JobStatus, configure_log, setup_globals
+from hydra.errors import HydraException
+from hydra.plugins.launcher import Launcher
+from hydra.plugins.sweeper import Sweeper
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from sceneslam.config.resolve import without_hydra
+from sceneslam.config.settings import DETECT_ONLY
+from sceneslam.sweep.detection import sweep_detection
+from sceneslam.sweep.status import State, Status
+from sceneslam.sweep.sweep import run_sweep
+from sceneslam.types.errors import ConfigError, SceneSlamError
+
+INCOMPLETE, UNUSABLE = 1, 2  # exit codes: not all jobs are finished, nothing was run
+COMPOSED = ".composed.pickle"  # a job's configuration with Hydra's own part
+
+
+class SweepLauncher(Launcher):
+    """Has jobs run by a backend; those whose folder holds the same job, finished, are kept."""
+
+    def __init__(self, backend: str, **settings: Any) -> None:
+        plain = OmegaConf.to_container(OmegaConf.create(settings), resolve=True)
+        self._launcher = {"backend": backend, **cast("dict[str, Any]", plain)}
+
+    def setup(
+        self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
+    ) -> None:
+        """Take the sweep's configuration; a job calls the program itself, not `task_function`."""
+        self._context, self._config = hydra_context, config
+
+    def launch(
+        self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
+    ) -> Sequence[JobReturn]:
+        """Run the jobs that are missing; return how all of them stand."""
+        setup_globals()
+        configure_log(self._config.hydra.hydra_logging, self._config.hydra.verbose)
+        sweep = Path(self._config.hydra.sweep.dir).absolute()
+        numbered = enumerate(job_overrides, start=initial_job_idx)
+        configs = [self._compose(sweep, number, overrides) for number, overrides in numbered]
+        folders = [Path(config.hydra.runtime.output_dir) for config in configs]
+        if len(set(folders)) < len(folders):
+            subdir = self._config.hydra.sweep.subdir
+            raise ConfigError("hydra.sweep.subdir", subdir, "a folder of its own for every job")
+        for folder, config in zip(folders, configs, strict=True):
+            _prepare(folder, config)
+        run_sweep(sweep, folders, self._launcher, Path.cwd())
+        return [_returned(*pair) for pair in zip(folders, configs, strict=True)]
+
+    def _compose(self, sweep: Path, number: int, overrides: Sequence[str]) -> DictConfig:
+        loader = self._context.config_loader
+        config = loader.load_sweep_config(self._config, list(overrides))
+        with open_dict(config):
+            config.hydra.job.id = str(number)
+            config.hydra.job.num = number
+            config.hydra.sweep.dir = str(sweep)
+            config.hydra.runtime.output_dir = str(sweep / str(config.hydra.sweep.subdir))
+        return config
+
+
+class GridSweeper(Sweeper):
+    """Every combination of the values given, as Hydra's own, but composed once."""
+
+    def __init__(self, params: Mapping[str, Any] | None) -> None:
+        self._params = params or {}
+
+    def setup(
+        self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
+    ) -> None:
+        """Take the sweep's configuration and make its launcher."""
+        self._context, self._config = hydra_context, config
+        self._launcher = Plugins.instance().instantiate_launcher(
+            hydra_context=hydra_context, task_function=task_function, config=config
+        )
+
+    def sweep(self, arguments: list[str]) -> Sequence[JobReturn]:
+        """Run all combinations; ends the program where one is not done, or none can be."""
+        words = [*(f"{key}={value}" for key, value in self._params.items()), *arguments]
+        folder = Path(self._config.hydra.sweep.dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(self._config, folder / "multirun.yaml")
+        try:
+            if OmegaConf.select(self._config, "run.mode") == DETECT_ONLY:
+                return self._detect(words, folder)
+            return self._launch(words)
+        except SceneSlamError as error:
+            print(f"error: {error}", file=sys.stderr)
+            raise SystemExit(UNUSABLE) from error
+
+    def _launch(self, words: list[str]) -> Sequence[JobReturn]:
+        parser = OverridesParser.create(config_loader=self._context.config_loader)
+        (jobs,) = BasicSweeper.split_arguments(parser.parse_overrides(words), None)
+        returned = self._launcher.launch(jobs, initial_job_idx=0)
+        if any(one.status is not JobStatus.COMPLETED for one in returned):
+            raise SystemExit(INCOMPLETE)
+        return returned
+
+    def _detect(self, words: list[str], folder: Path) -> Sequence[JobReturn]:
+        if not sweep_detection(self._context, self._config, words, folder):
+            raise SystemExit(INCOMPLETE)
+        return []
+
+
+def register() -> None:
+    """Let `hydra/launcher=` and `hydra/sweeper=` choose ours, as the YAML files beside this say.
+
+    Hydra takes plugins from its own namespace only, and these files in place of those that it or
+    an installed plugin registered under the same names.
+    """
+    for plugin in (SweepLauncher, GridSweeper):
+        Plugins.instance().class_name_to_class[f"hydra_plugins.{plugin.__name__}"] = plugin
+    for path in sorted(Path(__file__).parent.glob("conf/*/*.yaml")):
+        ConfigStore.instance().store(
+            name=path.stem,
+            group=f"hydra/{path.parent.name}",
+            node=OmegaConf.load(path),
+            provider="sceneslam",
+        )
+
+
+def _prepare(folder: Path, config: DictConfig) -> None:
+    """Write a job into its folder, unless the same one is finished there."""
+    digest = hashlib.sha256(OmegaConf.to_yaml(without_hydra(config)).encode()).hexdigest()
+    before = Status.read(folder)
+    if before is not None and before.is_finished and before.config_sha256 == digest:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / COMPOSED).open("wb") as file:
+        pickle.dump(config, file)
+    overrides = [str(word) for word in config.hydra.overrides.task]
+    Status(state=State.WAITING, config_sha256=digest, overrides=overrides).write(folder)
+
+
+def _returned(folder: Path, config: DictConfig) -> JobReturn:
+    """Return a job's end as Hydra's sweepers take it."""
+    status = Status.read(folder)
+    done = JobReturn()
+    done.overrides = status.overrides if status else ()
+    done.cfg, done.working_dir = config, str(Path.cwd())
+    is_finished = status is not None and status.state is State.DONE
+    done.status = JobStatus.COMPLETED if is_finished else JobStatus.FAILED
+    if status is not None and not is_finished:
+        done.return_value = HydraException(f"job {folder.name} {status.state.value}")
+    return done

@@ -1,0 +1,57 @@
+"""One line that tells how all jobs of a sweep stand."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from tqdm import tqdm
+
+from sceneslam.sweep.status import State, Status
+
+_LOOK_S = 0.5
+_TOLD = (State.RUNNING, State.INCOMPLETE, State.FAILED, State.KILLED, State.STOPPED)
+
+
+class Progress:
+    """Shows the states that the jobs' folders tell, while it is entered."""
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        self._waiting = set(folders)
+        self._states: Counter[State] = Counter()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True, name="progress")
+
+    def __enter__(self) -> Progress:
+        self._bar = tqdm(total=len(self._waiting), desc="sweep", unit="job", smoothing=0.0)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        self._show()
+        self._bar.close()
+
+    def _watch(self) -> None:
+        while not self._ended.wait(_LOOK_S):
+            self._show()
+
+    def _show(self) -> None:
+        found = {folder: Status.read(folder) for folder in self._waiting}
+        states = {folder: status.state for folder, status in found.items() if status}
+        settled = {folder for folder, status in found.items() if status and status.is_settled}
+        self._states.update(states[folder] for folder in settled)
+        self._waiting -= settled
+        counts = self._states + Counter(
+            states[folder] for folder in states if folder not in settled
+        )
+        told = [f"{counts[state]} {state.value}" for state in _TOLD if counts[state]]
+        is_news = self._bar.postfix != (", ".join(told) or None) or bool(settled)
+        self._bar.set_postfix_str(", ".join(told), refresh=False)
+        self._bar.n += len(settled)
+        if is_news or sys.stderr.isatty():
+            self._bar.refresh()

@@ -1,0 +1,72 @@
+"""How a job of a sweep stands: `job.json` in its folder."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from sceneslam.types.errors import InputError
+
+_FILE = "job.json"
+
+
+class State(Enum):
+    """What became of a job so far."""
+
+    WAITING = "waiting"
+    RUNNING = "running"
+    DONE = "done"
+    INCOMPLETE = "incomplete"  # ended early or its input was damaged; what was computed is saved
+    FAILED = "failed"  # could not be run
+    KILLED = "killed"  # its process died
+    STOPPED = "stopped"  # with the sweep, by Ctrl-C or SIGTERM
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Status:
+    """A job's state, and what it is a state of."""
+
+    state: State
+    config_sha256: str = ""
+    overrides: Sequence[str] = ()  # of the job, as on the command line
+    error: str = ""
+    host: str = ""
+    pid: int | None = None
+    wall_s: float | None = None
+
+    @property
+    def is_finished(self) -> bool:
+        """Tell whether its metrics are final: running it again would give the same."""
+        return self.state in (State.DONE, State.INCOMPLETE)
+
+    @property
+    def is_settled(self) -> bool:
+        """Tell whether nothing more is to come of it in this sweep."""
+        return self.state not in (State.WAITING, State.RUNNING)
+
+    def now(self, state: State, error: str = "", **values: Any) -> Status:
+        """Return the same job in another state."""
+        return replace(self, state=state, error=error, **values)
+
+    def write(self, folder: Path) -> None:
+        """Write it, whole or not at all: others read it meanwhile."""
+        part = folder / f"{_FILE}.{os.getpid()}.part"
+        part.write_text(json.dumps(asdict(self) | {"state": self.state.value}, indent=2) + "\n")
+        part.replace(folder / _FILE)
+
+    @classmethod
+    def read(cls, folder: Path) -> Status | None:
+        """Return a folder's status, None where it is no job of a sweep."""
+        path = folder / _FILE
+        if not path.is_file():
+            return None
+        try:
+            values = json.loads(path.read_text())
+            return cls(**values | {"state": State(values["state"])})
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"not the status of a job ({error!r}): {path}") from error

@@ -1,0 +1,96 @@
+"""Runs a job in a process of its own, so that its death is nobody else's."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+from typing import BinaryIO
+
+from sceneslam.sweep.status import State, Status
+
+_LOOK_S = 0.2  # between two looks at whether the sweep is to stop
+_PATIENCE_S = 30.0  # for a job that is to stop to save what it has
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Order:
+    """A job and what it is run with, by any process of any machine that sees the folders."""
+
+    folder: Path
+    code: Path  # a copy of the package as it was when the sweep began
+    began_in: Path  # the working folder of the sweep: relative paths are meant from there
+    stop: Path  # the sweep is to stop as soon as there is such a file
+
+
+def run_job(order: Order) -> None:
+    """Run a job to its end; how it ended is in its folder, whatever happens."""
+    if order.stop.exists():
+        settle(order.folder, State.STOPPED, "stopped before it began")
+        return
+    began_s = perf_counter()
+    with (order.folder / "job.log").open("wb") as log, _start(order, log) as process:
+        _wait(process, order.stop)
+    died = State.STOPPED if order.stop.exists() else State.KILLED
+    settle(order.folder, died, _last_words(process.returncode))
+    ended = Status.read(order.folder) or Status(state=died)
+    replace(ended, wall_s=perf_counter() - began_s).write(order.folder)
+
+
+def settle(folder: Path, state: State, error: str) -> None:
+    """Note the end of a job that left no word of it itself."""
+    status = Status.read(folder) or Status(state=State.WAITING)
+    if not status.is_settled:
+        status.now(state, error).write(folder)
+
+
+def _start(order: Order, log: BinaryIO) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", "sceneslam.sweep.job", str(order.folder)],
+        stdin=subprocess.PIPE,  # closes with this process: the job does not outlive it
+        stdout=log,
+        stderr=subprocess.STDOUT,
+        cwd=order.began_in,
+        env=_environment(order),
+        start_new_session=True,  # Ctrl-C is told to it in order
+    )
+
+
+def _wait(process: subprocess.Popen[bytes], stop: Path) -> None:
+    """Wait for a job's end; ask for it once the sweep is to stop."""
+    left_s: float | None = None
+    while True:
+        try:
+            process.wait(_LOOK_S)
+            return
+        except subprocess.TimeoutExpired:
+            if left_s is not None:
+                left_s -= _LOOK_S
+                if left_s < 0:
+                    process.kill()
+            elif stop.exists():
+                left_s = _PATIENCE_S
+                process.terminate()
+
+
+def _environment(order: Order) -> dict[str, str]:
+    """Return a job's environment: that code first, and one thread per library.
+
+    Jobs side by side are faster than threads side by side, and with more threads BLAS adds in
+    another order.
+    """
+    before = os.environ.get("PYTHONPATH")
+    path = [str(order.code), str(order.began_in), *([before] if before else [])]
+    threads = {name: os.environ.get(name, "1") for name in _THREADS}
+    return {**os.environ, **threads, "PYTHONPATH": os.pathsep.join(path)}
+
+
+def _last_words(code: int) -> str:
+    if code < 0:
+        return f"its process was ended by {signal.Signals(-code).name}; see job.log"
+    return f"its process ended with exit code {code}; see job.log"

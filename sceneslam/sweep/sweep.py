@@ -1,0 +1,102 @@
+"""Runs what is missing of a sweep's jobs, and makes its table."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from sceneslam.collect.write import collect
+from sceneslam.interrupts import termination_noted
+from sceneslam.sweep.backends import BACKENDS, Backend
+from sceneslam.sweep.progress import Progress
+from sceneslam.sweep.snapshot import keep_code
+from sceneslam.sweep.status import State, Status
+from sceneslam.sweep.supervise import Order, settle
+from sceneslam.types.errors import ConfigError, InputError
+
+_OWN = ".sweep"  # in a sweep's folder: the launcher, the code, and whether to stop
+_KEPT = "sweep.json"
+_TOLD_ERRORS = 10
+
+
+def run_sweep(
+    sweep: Path, folders: Sequence[Path], launcher: Mapping[str, Any], began_in: Path
+) -> bool:
+    """Run the jobs that are not finished; return whether all are. Writes the sweep's table.
+
+    `launcher` is the name of a backend, under `backend`, with its settings; `began_in` the folder
+    that relative paths are meant from.
+    """
+    backend = _backend(launcher)
+    own = sweep / _OWN
+    own.mkdir(parents=True, exist_ok=True)
+    kept = {"launcher": dict(launcher), "began_in": str(began_in)}
+    (own / _KEPT).write_text(json.dumps(kept, indent=2) + "\n")
+    stop = own / "stop"
+    stop.unlink(missing_ok=True)
+    missing = [folder for folder in folders if not _is_finished(folder)]
+    for folder in missing:
+        _status(folder).now(State.WAITING, wall_s=None).write(folder)
+    if missing:
+        code = keep_code(own / "code")
+        orders = [
+            Order(folder=folder, code=code, began_in=began_in, stop=stop) for folder in missing
+        ]
+        with termination_noted(stop.touch), Progress(missing):
+            backend.run(orders)
+    for folder in missing:
+        settle(folder, State.STOPPED, "never began")
+    tell(sweep, folders, skipped=len(folders) - len(missing))
+    return all(map(_is_finished, folders))
+
+
+def resume(sweep: Path) -> bool:
+    """Run what is missing of a sweep as it was composed; return whether all is finished then."""
+    path = sweep / _OWN / _KEPT
+    if not path.is_file():
+        raise InputError(f"not the folder of a sweep (it has no {_OWN}/{_KEPT}): {sweep}")
+    folders = sorted((path.parent for path in sweep.rglob("job.json")), key=_order)
+    kept = json.loads(path.read_text())
+    return run_sweep(sweep, folders, kept["launcher"], Path(kept["began_in"]))
+
+
+def tell(sweep: Path, folders: Sequence[Path], *, skipped: int) -> None:
+    """Write the sweep's table and page, and say how its jobs ended."""
+    page = collect(sweep)
+    statuses = {folder: _status(folder) for folder in folders}
+    counts = Counter(status.state.value for status in statuses.values())
+    wrong = [(folder, status) for folder, status in statuses.items() if status.error]
+    for folder, status in wrong[:_TOLD_ERRORS]:
+        print(f"error: job {folder.relative_to(sweep)}: {status.error}", file=sys.stderr)
+    told = ", ".join(f"{count} {state}" for state, count in counts.items())
+    was = f" ({skipped} of them before)" if skipped else ""
+    print(f"{len(folders)} jobs: {told}{was}\ntable    {page.parent}/table.csv\npage     {page}")
+
+
+def _backend(launcher: Mapping[str, Any]) -> Backend:
+    settings = dict(launcher)
+    name = settings.pop("backend", None)
+    if name not in BACKENDS:
+        raise ConfigError("hydra.launcher.backend", name, " | ".join(BACKENDS))
+    try:
+        made: Backend = BACKENDS[name](**settings)
+    except ConfigError as error:
+        raise error.under("hydra.launcher") from error
+    return made
+
+
+def _status(folder: Path) -> Status:
+    return Status.read(folder) or Status(state=State.WAITING)
+
+
+def _is_finished(folder: Path) -> bool:
+    return _status(folder).is_finished
+
+
+def _order(folder: Path) -> tuple[int, str]:
+    """Sort numbered folders by their number, others by name."""
+    return (int(folder.name), "") if folder.name.isdecimal() else (sys.maxsize, str(folder))

@@ -1,0 +1,175 @@
+"""One table of many runs, and its page."""
+
+from __future__ import annotations
+
+import csv
+import json
+from html.parser import HTMLParser
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+
+from sceneslam.collect.__main__ import main
+from sceneslam.collect.chart import Point, front
+from sceneslam.collect.flatten import flat
+from sceneslam.collect.rows import read_rows
+from sceneslam.collect.summary import mean_of, student_t
+from sceneslam.sweep.status import State, Status
+
+SWITCH = {"confirm_delay_s": 2.0, "gap_s": 0.0, "jump_m": 0.1, "jump_rad": None, "cost_ms": 3.0}
+
+
+def metrics(error_m, delay_s=1.0):
+    return {
+        "ate_rmse_m": error_m,
+        "realtime_factor": 3.0,
+        "switches": [SWITCH, SWITCH | {"confirm_delay_s": 1.0}],
+        "detection": {"delay_s": delay_s, "false": 0, "missed": 0},
+        "detector_us": {"median": 40.0},
+        "notes": [],
+    }
+
+
+def job(folder, number, *overrides, state=State.DONE, error="", **values):
+    path = folder / str(number)
+    path.mkdir(parents=True)
+    Status(state=state, error=error, overrides=overrides, wall_s=2.5).write(path)
+    if values:
+        (path / "metrics.json").write_text(json.dumps(metrics(**values)))
+    return path
+
+
+@pytest.fixture
+def sweep(tmp_path):
+    """Give a sweep of two thresholds and three seeds, of which one run died."""
+    number = 0
+    for threshold in (60, 100):
+        for seed in (0, 1, 2):
+            words = ("+scenario=flicker", f"detector.threshold={threshold}", f"seed={seed}")
+            if (threshold, seed) == (100, 2):
+                job(tmp_path, number, *words, state=State.KILLED, error="ended by SIGKILL")
+            else:
+                job(tmp_path, number, *words, error_m=0.01 * (seed + 1) * threshold / 60)
+            number += 1
+    return tmp_path
+
+
+def table(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_table_has_a_row_per_job_with_swept_keys_and_error(sweep):
+    assert main([str(sweep)]) == 0
+    rows = table(sweep / "table.csv")
+    assert [row["job"] for row in rows] == ["0", "1", "2", "3", "4", "5"]
+    assert "scenario" not in rows[0]  # the same for all
+    assert (rows[4]["detector.threshold"], rows[4]["seed"]) == ("100", "1")
+    assert float(rows[1]["ate_rmse_m"]) == 0.02
+    assert (rows[5]["status"], rows[5]["error"]) == ("killed", "ended by SIGKILL")
+    assert rows[5]["ate_rmse_m"] == ""
+
+
+def test_what_the_clock_tells_is_in_a_table_of_its_own(sweep):
+    main([str(sweep)])
+    columns = set(table(sweep / "table.csv")[0])
+    costs = {"realtime_factor", "detector_us.median", "switch_cost_ms", "job.wall_s"}
+    assert not costs & columns and costs <= set(table(sweep / "costs.csv")[0])
+
+
+def test_parquet_holds_the_table(sweep):
+    main([str(sweep)])
+    read = pyarrow.parquet.read_table(sweep / "table.parquet")
+    rows = table(sweep / "table.csv")
+    assert read.column_names == list(rows[0])
+    errors = [row["ate_rmse_m"] for row in read.to_pylist()]
+    assert errors[:5] == [float(row["ate_rmse_m"]) for row in rows[:5]] and errors[5] is None
+
+
+def test_summary_has_means_over_seeds_with_intervals(sweep):
+    main([str(sweep)])
+    first, second = table(sweep / "summary.csv")
+    assert (first["detector.threshold"], first["runs"], second["runs"]) == ("60", "3", "3")
+    assert float(first["ate_rmse_m"]) == pytest.approx(0.02)
+    assert float(first["ate_rmse_m ±"]) == pytest.approx(4.3027 * 0.01 / np.sqrt(3), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("freedom", "t"),
+    [(1, 12.7062), (2, 4.3027), (3, 3.1824), (4, 2.7764), (9, 2.2622), (30, 2.0423)],
+)
+def test_quantiles_are_those_of_the_published_tables(freedom, t):
+    assert student_t(freedom) == pytest.approx(t, abs=5e-5)
+
+
+def test_interval_covers_the_true_mean_as_often_as_it_says():
+    generator = np.random.default_rng(0)
+    means = [mean_of(list(generator.normal(1.0, 2.0, 4))) for _ in range(2000)]
+    covered = np.mean([abs(one.mean - 1.0) <= one.half_width for one in means])
+    assert covered == pytest.approx(0.95, abs=0.015)
+
+
+def test_switches_are_told_by_their_number_and_their_worst():
+    numbers = flat(metrics(0.1))
+    assert numbers["switches"] == 2
+    assert (numbers["confirm_delay_s"], numbers["confirm_delay_max_s"]) == (1.5, 2.0)
+    assert numbers["switch_jump_max_rad"] is None
+
+
+def test_front_is_what_nothing_else_beats():
+    points = [Point(x=x, y=y) for x, y in [(1, 5), (2, 5), (2, 3), (3, 4), (4, 0), (5, 0)]]
+    assert [(point.x, point.y) for point in front(points)] == [(1, 5), (2, 3), (4, 0)]
+
+
+def test_run_of_hydras_own_launcher_is_read_too(tmp_path):
+    for number in (0, 1):
+        (tmp_path / str(number) / ".hydra").mkdir(parents=True)
+        (tmp_path / str(number) / ".hydra" / "overrides.yaml").write_text(f"- seed={number}\n")
+    (tmp_path / "1" / "metrics.json").write_text(json.dumps(metrics(0.5)))
+    rows = read_rows(tmp_path)
+    assert [(row.status, row.keys["seed"]) for row in rows] == [("failed", 0), ("done", 1)]
+
+
+def test_numbers_of_a_run_that_was_stopped_half_way_are_left_out(tmp_path):
+    job(tmp_path, 0, "seed=0", state=State.STOPPED, error="stopped while it ran", error_m=0.3)
+    (row,) = read_rows(tmp_path)
+    assert not row.metrics and row.status == "stopped"
+
+
+def test_folder_without_a_run_is_named(tmp_path, capsys):
+    assert main([str(tmp_path)]) == 2
+    assert f"no run in the folder: {tmp_path}" in capsys.readouterr().err
+
+
+class Page(HTMLParser):
+    """Counts tags, and refuses anything from elsewhere."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.links = {}, []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags[tag] = self.tags.get(tag, 0) + 1
+        values = dict(attrs)
+        self.links += [values[name] for name in ("href", "src") if name in values]
+
+
+def test_page_opens_alone_and_links_into_the_reports(sweep):
+    (sweep / "3" / "report.html").write_text("report")
+    main([str(sweep)])
+    text = (sweep / "index.html").read_text()
+    page = Page(text)
+    assert page.links == ["3/report.html"] and "http" not in text
+    assert page.tags["svg"] >= 2 and page.tags["table"] == 2
+    assert text.count("<tr>") == 2 + 2 + 6
+    assert "ended by SIGKILL" in text
+
+
+def test_page_escapes_what_it_is_given(tmp_path):
+    for number, value in enumerate(("<script>", "b")):
+        job(tmp_path, number, f"story={value}", error_m=0.1)
+    main([str(tmp_path)])
+    text = (tmp_path / "index.html").read_text()
+    assert "&lt;script&gt;" in text and text.count("<script>") == 1

@@ -1,0 +1,182 @@
+"""Sweeps: every launcher gives the same table, dead jobs take nobody along, the rest is resumed."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from time import monotonic, sleep
+
+import pytest
+from scenery import RIG, room_observation
+
+from sceneslam.ros.writer import ObservationWriter
+from sceneslam.sweep.__main__ import main
+from sceneslam.sweep.status import State, Status
+
+ROOT = Path(__file__).parents[1]
+JOBS = ("+scenario=single", "source=mcap", "source.path=room.mcap", "slam@slam.only=odometry")
+SLOW = (*JOBS, "run.mode=live")  # paced: 30 observations take a second
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    path = tmp_path_factory.mktemp("recording") / "room.mcap"
+    writer = ObservationWriter(path, rig=RIG, image_format="png")
+    for index in range(30):
+        writer.write(room_observation(index))
+    writer.close()
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path, recording):
+    (tmp_path / "room.mcap").symlink_to(recording)
+    return tmp_path
+
+
+def start(folder, *overrides):
+    words = [sys.executable, "-m", "sceneslam", "-m", *overrides, "~sinks@sinks.rerun"]
+    return subprocess.Popen(
+        [*words, "run.report=false"],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def sweep(folder, *overrides):
+    process = start(folder, *overrides)
+    out, errors = process.communicate(timeout=300)
+    return process.returncode, out, errors
+
+
+def table(folder):
+    with (folder / "table.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def wait_for(folder, state):
+    """Return the status of a job once it has come to a state."""
+    deadline_s = monotonic() + 60
+    while monotonic() < deadline_s:
+        status = Status.read(folder)
+        if status is not None and status.state is state:
+            return status
+        sleep(0.02)
+    raise AssertionError(f"{folder.name} never came to {state}")
+
+
+FOUR = (*JOBS, "slam.only.use_gyro=true,false", "policy.confirm_window_s=1,-1")  # -1 is a mistake
+
+
+@pytest.fixture(scope="module")
+def basic(tmp_path_factory, recording):
+    folder = tmp_path_factory.mktemp("basic")
+    (folder / "room.mcap").symlink_to(recording)
+    return sweep(folder, *FOUR, "hydra.sweep.dir=out"), folder / "out"
+
+
+def test_failed_jobs_are_rows_like_the_others(basic):
+    (code, out, errors), folder = basic
+    assert code == 1 and "4 jobs: 2 done, 2 failed" in out, errors
+    rows = table(folder)
+    assert [row["status"] for row in rows] == ["done", "failed", "done", "failed"]
+    assert "policy.confirm_window_s: got -1" in rows[1]["error"]
+    assert {row["slam.only.use_gyro"] for row in rows} == {"True", "False"}
+    assert rows[0]["path_length_m"] and not rows[1]["path_length_m"]
+    assert "Traceback" not in errors
+
+
+def test_progress_is_one_line_over_all_jobs(basic):
+    (_, _, errors), _ = basic
+    assert "4/4" in errors and "2 failed" in errors
+    assert "30/30" not in errors  # a job's own bar is in its log
+
+
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local", "ray"])
+def test_every_launcher_gives_the_same_table_to_the_bit(folder, basic, launcher):
+    words = [f"hydra/launcher={launcher}", "hydra.sweep.dir=out"]
+    code, _, errors = sweep(folder, *FOUR, *words)
+    assert code == 1, errors
+    assert (folder / "out" / "table.csv").read_bytes() == (basic[1] / "table.csv").read_bytes()
+
+
+def test_killed_job_takes_nobody_along_and_is_resumed(folder, capsys):
+    jobs = (*JOBS, "slam.only.use_gyro=true,false", "policy.dwell_s=0,1")
+    words = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=out")
+    process = start(folder, *jobs, *words)
+    status = wait_for(folder / "out" / "1", State.RUNNING)
+    os.kill(status.pid, signal.SIGKILL)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 1, errors
+    rows = table(folder / "out")
+    assert [row["status"] for row in rows] == ["done", "killed", "done", "done"]
+    assert "ended by SIGKILL" in rows[1]["error"]
+    before = (folder / "out" / "0" / "metrics.json").stat().st_mtime_ns
+    assert main([str(folder / "out")]) == 0
+    assert "4 jobs: 4 done (3 of them before)" in capsys.readouterr().out
+    assert (folder / "out" / "0" / "metrics.json").stat().st_mtime_ns == before
+    assert {row["status"] for row in table(folder / "out")} == {"done"}
+
+
+def test_stopped_sweep_goes_on_where_it_was_by_the_same_command(folder):
+    jobs = (*SLOW, "slam.only.use_gyro=true,false", "hydra.sweep.dir=out")
+    process = start(folder, *jobs)
+    wait_for(folder / "out" / "0", State.RUNNING)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 1 and "Traceback" not in errors
+    assert {row["status"] for row in table(folder / "out")} == {"stopped"}
+    code, out, errors = sweep(folder, *jobs)
+    assert code == 0 and "2 jobs: 2 done" in out, errors
+    code, out, _ = sweep(folder, *jobs)
+    assert code == 0 and "(2 of them before)" in out
+
+
+def test_job_whose_configuration_changed_is_run_again(folder):
+    words = (*JOBS, "hydra.sweep.dir=out")
+    assert sweep(folder, *words, "policy.dwell_s=0,1")[0] == 0
+    code, out, _ = sweep(folder, *words, "policy.dwell_s=0,2")
+    assert code == 0 and "2 jobs: 2 done (1 of them before)" in out
+    assert [row["policy.dwell_s"] for row in table(folder / "out")] == ["0", "2"]
+
+
+def test_running_sweep_does_not_see_later_edits(folder):
+    mine = folder / "mine" / "policy" / "mine.yaml"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("defaults: [default]\ndwell_s: 0.25\n")
+    words = ("--config-dir", "mine", *SLOW, "policy=mine", "slam.only.use_gyro=true,false")
+    process = start(folder, *words, "hydra.sweep.dir=out")
+    wait_for(folder / "out" / "0", State.RUNNING)
+    mine.write_text("defaults: [default]\ndwell_s: 0.75\n")
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    for job in ("0", "1"):
+        assert "dwell_s: 0.25" in (folder / "out" / job / "config.yaml").read_text()
+    (code,) = (folder / "out" / ".sweep" / "code").iterdir()
+    assert (code / "sceneslam" / "sweep" / "job.py").is_file()
+
+
+def test_folders_that_collide_are_refused(folder):
+    code, _, errors = sweep(folder, *FOUR, "hydra.sweep.dir=out", "hydra.sweep.subdir=same")
+    assert code == 2 and "hydra.sweep.subdir: got 'same'" in errors
+    assert not list((folder / "out").glob("*/metrics.json"))
+
+
+def test_folder_that_is_no_sweep_is_named(tmp_path, capsys):
+    assert main([str(tmp_path)]) == 2
+    assert "not the folder of a sweep" in capsys.readouterr().err
+
+
+def test_status_is_read_as_it_was_written(tmp_path):
+    status = Status(state=State.KILLED, error="why", overrides=["seed=1"], wall_s=1.5, pid=3)
+    status.write(tmp_path)
+    assert Status.read(tmp_path) == status
+    assert json.loads((tmp_path / "job.json").read_text())["state"] == "killed"
