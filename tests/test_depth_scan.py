@@ -80,12 +80,23 @@ def test_floor_is_no_obstacle_and_a_box_on_it_is():
     np.testing.assert_allclose(points_base(scan, scan_frame(camera))[:, 0], 1.5, atol=0.01)
 
 
-def test_nearest_of_two_returns_in_one_column_wins():
+def test_nearest_of_two_upright_surfaces_in_one_column_wins():
     camera = camera_at()
     depth = depth_of_wall(camera, 3.0)
-    depth[240:244] = 1.0
+    depth[210:270] = 1.0  # 0.11 m high
     scan = scan_from_depth(depth, camera, stamp_ns=0)
     assert np.nanmax(np.abs(scan.ranges_m * np.cos(scan.angles_rad) - 1.0)) < 0.005
+
+
+def test_edge_of_a_board_is_overlooked_from_near_and_far():
+    camera = camera_at()
+    for board_m, rows in ((0.6, slice(250, 276)), (2.0, slice(243, 251))):  # 0.03 m high
+        depth = depth_of_wall(camera, board_m + 0.3)
+        depth[rows] = board_m
+        scan = scan_from_depth(depth, camera, stamp_ns=0)
+        np.testing.assert_allclose(
+            scan.ranges_m * np.cos(scan.angles_rad), board_m + 0.3, atol=0.005
+        )
 
 
 def test_noise_does_not_shorten_the_range():

@@ -16,7 +16,10 @@ from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import LaserScan
 from sceneslam.types.rig import Camera
 
-_PIXELS_MIN = 2  # one pixel alone is a speckle
+# A beam's return is something that stands: boards and table tops come and go with the distance.
+_UPRIGHT_M, _UPRIGHT_RATIO = 0.1, 1 / 3  # so high, or so much of the band where that is less
+_NOISE_M, _NOISE_PER_M = 0.005, 0.003  # of a range, its square's growing as a triangulation's does
+_PER_BIN, _RATIO = np.sqrt(_NOISE_M * _NOISE_PER_M), np.sqrt(_NOISE_PER_M / _NOISE_M)
 
 
 def scan_frame(camera: Camera) -> se3.Transform:
@@ -98,11 +101,12 @@ class DepthScanner:
         valid = (depths > 0) & (depths >= z_min_m) & (depths <= z_max_m)  # false for NaN
         valid &= (heights >= self.band_m[0]) & (heights <= self.band_m[1])
         beam = self._beam[valid]
-        ranges = self._nearest(beam, (self._range_ratio * depths)[valid])
+        ranges_m = (self._range_ratio * depths)[valid]
+        nearest_m = self._nearest(beam, ranges_m, self._height_per_m[valid] * ranges_m)
         ratio_max = float(self._range_ratio.max(initial=1.0))
         return LaserScan(
             stamp_ns=stamp_ns,
-            ranges_m=ranges,
+            ranges_m=nearest_m,
             angle_min_rad=self._angle_min_rad + 0.5 * self._step_rad,
             angle_step_rad=self._step_rad,
             range_min_m=0.0,
@@ -110,21 +114,30 @@ class DepthScanner:
         )
 
     def _nearest(
-        self, beam: NDArray[np.int64], ranges_m: NDArray[np.float32]
+        self,
+        beam: NDArray[np.int64],
+        ranges_m: NDArray[np.float32],
+        heights_m: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Return per beam the mean of the returns that are as near as noise can tell.
+        """Return per beam the mean of the returns of the nearest upright surface, NaN without one.
 
-        The mean, since the least of many noisy depths would be too short; a triangulating
-        camera's noise grows with the square of the distance.
+        The mean, since the least of many noisy depths would be too short. A surface is what lies
+        in two neighbouring bins of range; each return adds the height that its pixel covers.
         """
-        nearest = np.full(self._beams, np.inf, dtype=np.float32)
-        np.minimum.at(nearest, beam, ranges_m)
-        limit = nearest + 0.01 + 0.006 * nearest * nearest
-        agrees = ranges_m <= limit[beam]
-        count = np.bincount(beam[agrees], minlength=self._beams)
-        total = np.bincount(beam[agrees], weights=ranges_m[agrees], minlength=self._beams)
-        mean = total / np.maximum(count, 1)
-        scan = np.where(count >= _PIXELS_MIN, mean, np.nan).astype(np.float32)
+        depth = (np.arctan(_RATIO * ranges_m) / _PER_BIN).astype(np.int64)
+        count = int(depth.max(initial=0)) + 2
+        found = np.bincount(beam * count + depth, heights_m, minlength=self._beams * count)
+        found = found.reshape(self._beams, count)
+        is_upright = found[:, :-1] + found[:, 1:] >= self._upright_m
+        middle_m = np.tan((is_upright.argmax(axis=1) + 1) * _PER_BIN) / _RATIO
+        mean_m = np.where(is_upright.any(axis=1), middle_m, np.nan)
+        for _ in range(2):  # the two bins may hold the nearer half of the noise only
+            limit_m = 2.0 * (_NOISE_M + _NOISE_PER_M * mean_m * mean_m)
+            agrees = np.abs(ranges_m - mean_m[beam]) <= limit_m[beam]
+            total_m = np.bincount(beam[agrees], ranges_m[agrees], minlength=self._beams)
+            number = np.bincount(beam[agrees], minlength=self._beams)
+            mean_m = np.where(number > 0, total_m / np.maximum(number, 1), np.nan)
+        scan = mean_m.astype(np.float32)
         scan.flags.writeable = False
         return scan
 
@@ -153,6 +166,10 @@ class DepthScanner:
         self._beam = np.clip(beam, 0, self._beams - 1)
         self._range_ratio = range_ratio[crosses].astype(np.float32)
         self._height_ratio = rays_base[crosses, 2].astype(np.float32)
+        # A pixel's share of an upright surface at 1 m, as a height over the width of a beam.
+        solid = self._stride_px**2 / (self._camera.fx * self._camera.fy)
+        self._height_per_m = (solid / self._step_rad / self._range_ratio**3).astype(np.float32)
+        self._upright_m = min(_UPRIGHT_M, _UPRIGHT_RATIO * (high_m - low_m))
 
 
 def _rays_cam(camera: Camera, stride_px: int) -> NDArray[np.float64]:
