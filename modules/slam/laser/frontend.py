@@ -13,7 +13,7 @@ from .field import LikelihoodField
 from .history import History
 from .keyframes import Keyframe, Keyframes
 from .loop_search import LoopSearch
-from .matcher import Match, Matcher
+from .matcher import Match, Matcher, novelty
 from .motion import Motion, MotionModel
 from .planar import Matrix, Planar, between, compose, propagate, turn
 from .surface import SurfacePoints
@@ -62,6 +62,7 @@ class FrontEnd:
     _stamp_ns: int | None = field(default=None, init=False)
     _held_pose: Planar = field(default_factory=lambda: np.zeros(3), init=False)
     _held_ns: int | None = field(default=None, init=False)
+    _seen_pose: Planar = field(default_factory=lambda: np.zeros(3), init=False)  # of its scan
     _is_measured: bool = field(default=True, init=False)  # all motion since a scan held the pose
     _failures: int = field(default=0, init=False)
     _field: LikelihoodField | None = field(default=None, init=False)
@@ -93,8 +94,11 @@ class FrontEnd:
         if self._field is None:
             self._extend(predicted_then, None, scan, surfaces)
             return self._hold(observation, predicted, None)
-        match = self.matcher.match(surfaces, self._field, predicted_then, self._covariance)
         is_measured = self._is_measured and motion.is_measured
+        new = novelty(between(self._seen_pose, predicted_then)) if is_measured else 1.0
+        match = self.matcher.match(
+            surfaces, self._field, predicted_then, self._covariance, novelty=new
+        )
         if not is_measured and not self._believes(match):
             match = self._find_again(surfaces, self._field, predicted_then) or match
         if not self._believes(match):
@@ -146,6 +150,7 @@ class FrontEnd:
         self._is_measured, self._failures = True, 0
         if match is not None:
             self._covariance = match.covariance + np.diag(_DEVIATION_MIN**2)
+            self._seen_pose = match.T_local_base
         return Estimate(
             T_local_base=pose,
             covariance=self._covariance,

@@ -5,6 +5,10 @@ refinement is point-to-line where the map holds lines, with the prediction as on
 Directions that the geometry does not hold are taken out of the laser's information (after Zhang,
 Kaess, Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016), so that
 there the prior alone decides.
+
+What a scan made of a band of heights shows is not quite a wall: which of the things in the band is
+the nearest changes with the view, for many beams together. Such an error does not average out over
+beams, nor over scans taken from almost the same place.
 """
 
 from __future__ import annotations
@@ -27,6 +31,8 @@ _ITERATIONS = (3, 3, 8)  # at most, per kernel
 _CONVERGED = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: a step this small is the last
 _INLIER_M = 0.1
 _CORRELATION = 4.0  # neighbouring beams share their errors: information is this much less
+_VIEW_M, _VIEW_RAD = 0.1, 0.1  # scans taken so far apart err each in its own way
+_NOVELTY_MIN = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,7 +40,7 @@ class Match:
     """A scan's pose in the local map."""
 
     T_local_base: Planar
-    information: Matrix  # of the laser alone, axes of local
+    information: Matrix  # of the laser alone, as if nothing was seen before; axes of local
     covariance: Matrix  # of the pose: laser and prior together, axes of local
     inliers: int
     inlier_ratio: float
@@ -49,15 +55,30 @@ class Matcher:
     window_m: float
     window_rad: float
     degeneracy_ratio: float
+    shift_m: float  # standard deviation of what a scan's points are off by together
 
     def match(
-        self, scan_base: SurfacePoints, field: LikelihoodField, predicted: Planar, prior: Matrix
+        self,
+        scan_base: SurfacePoints,
+        field: LikelihoodField,
+        predicted: Planar,
+        prior: Matrix,
+        *,
+        novelty: float = 1.0,
     ) -> Match:
-        """Return the pose of a scan near `predicted`, whose covariance is `prior`."""
+        """Return the pose of a scan near `predicted`, whose covariance is `prior`.
+
+        `novelty` (0 to 1): how much of its error it does not share with the scan before; 1 where
+        the prediction is a guess, which outweighs no scan.
+        """
         information = np.asarray(np.linalg.inv(prior), dtype=np.float64)
         found = self._search(scan_base, field, predicted, prior)
         candidates = [predicted] if np.array_equal(found, predicted) else [predicted, found]
-        refined = [self._refine(scan_base, field, c, predicted, information) for c in candidates]
+        shift_m = self.shift_m / float(np.sqrt(novelty))
+        refined = [
+            self._refine(scan_base, field, start, predicted, information, shift_m)
+            for start in candidates
+        ]
         return max(refined, key=lambda match: match.inlier_ratio)
 
     def refine(
@@ -65,7 +86,7 @@ class Matcher:
     ) -> Match:
         """Return the pose of a scan at `start`, whose covariance is `prior`, without a search."""
         information = np.asarray(np.linalg.inv(prior), dtype=np.float64)
-        return self._refine(scan_base, field, start, start, information)
+        return self._refine(scan_base, field, start, start, information, self.shift_m)
 
     def _search(
         self, scan_base: SurfacePoints, field: LikelihoodField, predicted: Planar, prior: Matrix
@@ -101,11 +122,12 @@ class Matcher:
         start: Planar,
         predicted: Planar,
         information: Matrix,
+        shift_m: float,
     ) -> Match:
         pose = start.copy()
         for kernel_m, iterations in zip(_KERNELS_M, _ITERATIONS, strict=True):
             for _ in range(iterations):
-                H, g, weak = self._laser_equations(scan_base, field, pose, kernel_m)
+                H, g, _ = self._laser_equations(scan_base, field, pose, kernel_m, shift_m)
                 off = pose - predicted
                 off[2] = wrap(off[2])
                 step = -np.linalg.solve(H + information, g + information @ off)
@@ -113,13 +135,18 @@ class Matcher:
                 pose[2] = wrap(pose[2])
                 if np.all(np.abs(step) < _CONVERGED):
                     break
-        H, _, weak = self._laser_equations(scan_base, field, pose, _KERNELS_M[-1])
+        H, _, weak = self._laser_equations(scan_base, field, pose, _KERNELS_M[-1], shift_m)
+        alone = H
+        if shift_m != self.shift_m:
+            alone, _, _ = self._laser_equations(
+                scan_base, field, pose, _KERNELS_M[-1], self.shift_m
+            )
         residual, far = _residuals(scan_base, field, pose)
         inlier = residual < _INLIER_M
         count = max(len(scan_base), 1)
         return Match(
             T_local_base=pose,
-            information=H,
+            information=alone,
             covariance=np.asarray(np.linalg.inv(H + information), dtype=np.float64),
             inliers=int(inlier.sum()),
             inlier_ratio=float(inlier.sum() / count),
@@ -128,7 +155,12 @@ class Matcher:
         )
 
     def _laser_equations(
-        self, scan_base: SurfacePoints, field: LikelihoodField, pose: Planar, kernel_m: float
+        self,
+        scan_base: SurfacePoints,
+        field: LikelihoodField,
+        pose: Planar,
+        kernel_m: float,
+        shift_m: float,
     ) -> tuple[Matrix, Planar, int]:
         """Return the normal equations H, g in (x, y, yaw), and how many directions are weak."""
         arms = scan_base.points @ rotation(pose[2]).T
@@ -149,7 +181,12 @@ class Matcher:
         H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
         g = np.array([weight @ ax, weight @ ay, weight @ (lx * ax + ly * ay)])
         spread_m = float(np.sqrt(weight @ (lx * lx + ly * ly) / max(total, 1e-12)))
-        H, g, weak = self._keep_held(H, g, total, max(spread_m, 1e-3))
+        spread_m = max(spread_m, 1e-3)
+        H, g, weak = self._keep_held(H, g, total, spread_m)
+        if shift_m > 0:  # (H^-1 + C)^-1 of what is held, for a common error of covariance C
+            C = shift_m**2 * np.diag([1.0, 1.0, spread_m**-2])
+            damping = np.linalg.inv(np.eye(3) + H @ C)
+            H, g = damping @ H, damping @ g
         # From turning about the points' centre to turning about base.
         M = np.eye(3)
         M[:2, 2] = -centre[1], centre[0]
@@ -170,6 +207,12 @@ class Matcher:
         held_H: Matrix = total * np.outer(inverse, inverse) * kept
         held_g: Planar = np.asarray(inverse * (keep @ (scale * g)), dtype=np.float64)
         return held_H, held_g, int(3 - held.sum())
+
+
+def novelty(T_before_now: Planar) -> float:
+    """Return how much of a scan's error is its own, by the motion since the scan before."""
+    moved = np.hypot(*T_before_now[:2]) / _VIEW_M, abs(T_before_now[2]) / _VIEW_RAD
+    return float(np.clip(max(moved), _NOVELTY_MIN, 1.0))
 
 
 def _residuals(

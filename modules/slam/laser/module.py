@@ -32,7 +32,7 @@ _ABOVE_0 = (
     "resolution_m range_max_m laser_noise_m depth_noise_m window_m window_rad "
     "keyframe_distance_m keyframe_angle_rad odometry_noise_ratio gyro_noise_rad_s"
 )
-_NOT_BELOW_0 = "depth_noise_per_m odometry_turn_rad_per_m predict_max_s"
+_NOT_BELOW_0 = "depth_noise_per_m depth_shift_m odometry_turn_rad_per_m predict_max_s"
 _AT_LEAST_1 = "beams_min submap_keyframes depth_beams depth_stride_px lidar_beams"
 _RATIO = "inlier_min_ratio degeneracy_ratio"
 
@@ -49,6 +49,7 @@ class LaserSlam:
     laser_noise_m: float
     depth_noise_m: float
     depth_noise_per_m: float
+    depth_shift_m: float
     beams_min: int
     inlier_min_ratio: float
     window_m: float
@@ -201,6 +202,7 @@ class LaserSlam:
             window_m=self.window_m,
             window_rad=self.window_rad,
             degeneracy_ratio=self.degeneracy_ratio,
+            shift_m=self.depth_shift_m if from_depth else 0.0,
         )
         closer = LoopCloser(keyframes, Places(keyframes, self.resolution_m), matcher)
         return FrontEnd(
