@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -15,6 +16,7 @@ from tqdm import tqdm
 from sceneslam.app import run
 from sceneslam.config.check import check_given
 from sceneslam.config.component import Builder
+from sceneslam.config.provenance import provenance
 from sceneslam.config.resolve import resolved
 from sceneslam.evaluation.verdict import write_verdict
 from sceneslam.interfaces import Experiment
@@ -22,10 +24,14 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.experiment import Outcome, Trial, Verdict
 from sceneslam.types.trajectory import Trajectory
 
+_END = "finished.json"  # written into a trial's folder when it has run to its end
+
 
 def run_experiment(config: DictConfig, folder: Path) -> Verdict:
     """Run all trials of the experiment below the key that `experiment` names; write its verdict.
 
+    A trial that is finished in the folder, by the same configuration, code and input, is not run
+    again: an experiment that was stopped goes on where it is called for the same `hydra.run.dir`.
     Raises ConfigError or InputError where a trial cannot be run.
     """
     key = str(config.experiment)
@@ -50,17 +56,28 @@ class _Trials:
         configs = [(trial, self._compose(trial)) for trial in trials]
         for trial, config in tqdm(configs, desc=self._key, unit="run", leave=False):
             folder = self._folder / trial.name
-            finished = run(config, folder, title=trial.name)
-            if finished.is_interrupted:
-                raise KeyboardInterrupt
+            made_by = provenance(config)
+            if _finished_by(folder) != made_by:
+                self._run(config, folder, trial.name, made_by)
+            end = json.loads((folder / _END).read_text())
             yield Outcome(
                 trial=trial,
                 folder=folder,
-                metrics=finished.metrics,
-                trajectory=finished.trajectory,
+                metrics=json.loads((folder / "metrics.json").read_text()),
+                trajectory=Trajectory.read_tum(folder / "trajectory.tum"),
                 online=Trajectory.read_tum(folder / "trajectory_online.tum"),
-                faults=finished.faults,
+                faults=end["faults"],
             )
+
+    def _run(
+        self, config: dict[str, Any], folder: Path, name: str, made_by: dict[str, str]
+    ) -> None:
+        (folder / _END).unlink(missing_ok=True)
+        finished = run(config, folder, title=name)
+        if finished.is_interrupted:
+            raise KeyboardInterrupt
+        end = {"made_by": made_by, "faults": finished.faults}
+        (folder / _END).write_text(json.dumps(end, indent=2))
 
     def _compose(self, trial: Trial) -> dict[str, Any]:
         """Return a trial's configuration: the user's, what it overrides, then its values."""
@@ -74,3 +91,12 @@ class _Trials:
         return {
             name: value for name, value in plain.items() if name not in ("experiment", self._key)
         }
+
+
+def _finished_by(folder: Path) -> dict[str, str] | None:
+    """Return what made the finished trial in a folder, None where none is finished."""
+    path = folder / _END
+    if not path.is_file():
+        return None
+    made_by: dict[str, str] = json.loads(path.read_text())["made_by"]
+    return made_by

@@ -19,7 +19,16 @@ _EDGE_BYTES = 32 << 20  # of the head and the tail of an input file that are has
 
 def save_config(config: Mapping[str, Any], path: Path) -> dict[str, str]:
     """Write the resolved configuration with its provenance; return the provenance."""
-    provenance = {
+    made_by = provenance(config)
+    lines = "".join(f"#   {key}: {value}\n" for key, value in made_by.items())
+    text = OmegaConf.to_yaml(OmegaConf.create(dict(config)))
+    path.write_text(f"# Resolved configuration. Made by:\n{lines}{text}")
+    return made_by
+
+
+def provenance(config: Mapping[str, Any]) -> dict[str, str]:
+    """Return what a run of this configuration is made of: hashes and versions."""
+    return {
         "config_sha256": _sha256(OmegaConf.to_yaml(OmegaConf.create(dict(config))).encode()),
         "code_sha256": code_sha256(),
         "input_sha256": input_sha256(config.get("source") or {}),
@@ -27,10 +36,6 @@ def save_config(config: Mapping[str, Any], path: Path) -> dict[str, str]:
         "python": platform.python_version(),
         **_dependencies(),
     }
-    lines = "".join(f"#   {key}: {value}\n" for key, value in provenance.items())
-    text = OmegaConf.to_yaml(OmegaConf.create(dict(config)))
-    path.write_text(f"# Resolved configuration. Made by:\n{lines}{text}")
-    return provenance
 
 
 def _dependencies() -> dict[str, str]:
