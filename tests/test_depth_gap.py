@@ -17,7 +17,7 @@ def test_depth_shows_nothing_within_a_gap_and_is_untouched_outside():
     for one, other in zip(found, source, strict=True):
         assert one.image_bgr is other.image_bgr and one.stamp_ns == other.stamp_ns
         assert one is other or not one.depth_m.any()
-    assert DepthGap(source, []).ground_truth() == source.ground_truth()
+    assert DepthGap(source, []).ground_truth().scenes == source.ground_truth().scenes
 
 
 @pytest.mark.parametrize("gap_s", [[2.0, 1.0], [1.0], [-1.0, 2.0]])
