@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.se3 import Transform
 
 from .localizer import Fix
+from .segments import Segments
 from .view import View
 
 _START_VARIANCE = 1e-8  # the first pose is the origin by definition
@@ -48,6 +51,15 @@ def held(
         inliers=len(fix.landmark_ids),
         revision=revision,
     )
+
+
+def placed(answer: Tracking, segments: Segments, segment: set[int]) -> Tracking:
+    """Return an answer with what is not known of where its segment of the map lies."""
+    measured = np.zeros((6, 6)) if answer.covariance is None else answer.covariance
+    covariance = segments.covariance(segment, answer.T_local_base, measured)
+    if covariance is None:
+        return answer
+    return replace(answer, status=TrackingStatus.DEGRADED, covariance=covariance)
 
 
 def lost(stamp_ns: int, T_local_base: Transform, *, revision: int) -> Tracking:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,10 +18,18 @@ _MIN_FOUND_RATIO = 0.2
 _MAX_GAP_M = 0.1  # between two landmarks that are one
 
 
-def join_duplicates(visual_map: VisualMap, keyframe: Keyframe) -> None:
-    """Join landmarks that should show where the keyframe shows others that look the same."""
+def join_duplicates(
+    visual_map: VisualMap, keyframe: Keyframe, segment: Iterable[int] | None
+) -> None:
+    """Join landmarks that should show where the keyframe shows others that look the same.
+
+    `segment` are the keyframes whose landmarks these may be, None: all.
+    """
     table = visual_map.landmarks
-    others = np.setdiff1d(np.flatnonzero(table.alive), keyframe.landmark_ids)
+    known = np.flatnonzero(table.alive)
+    if segment is not None:
+        known = visual_map.keyframes.landmarks_of(segment)
+    others = np.setdiff1d(known, keyframe.landmark_ids)
     expected = visual_map.predict(keyframe.T_local_base, others)
     matches = match_near(
         expected.uv_px,

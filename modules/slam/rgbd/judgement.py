@@ -1,6 +1,8 @@
-"""Two decisions about a pose that was found: how far to trust it, and whether to keep the view."""
+"""Decisions on a view: how far to trust its pose, whether to keep it, whether to begin with it."""
 
 from __future__ import annotations
+
+from collections.abc import Collection
 
 import numpy as np
 
@@ -9,9 +11,13 @@ from sceneslam.types.se3 import Transform
 
 from .keyframes import KeyframeStore
 from .localizer import Fix
+from .motion import MotionModel
 from .pose_solver import PoseEstimate
+from .view import View
 
 _MIN_DEPTH_AGREEMENT_RATIO = 0.2  # below, image and depth do not show the same place
+
+_SEARCHED_IMAGES = 3  # looked for in the map before a place is begun
 
 _RECENT = 20  # keyframes that belong to the way here
 _KNOWN_RATIO = 0.2  # of the step: a way taken before, of which there is nothing more to keep
@@ -49,21 +55,51 @@ class KeyframeRule:
         """Hear that a keyframe was made."""
         self._most_inliers = 0
 
-    def wants(self, T_local_base: Transform, fix: Fix, keyframes: KeyframeStore) -> bool:
-        """Tell whether the view from T_local_base should become a keyframe."""
+    def wants(
+        self,
+        T_local_base: Transform,
+        fix: Fix,
+        keyframes: KeyframeStore,
+        segment: Collection[int] | None,
+    ) -> bool:
+        """Tell whether the view from T_local_base should become a keyframe of a segment."""
         count = len(fix.landmark_ids)
         self._most_inliers = max(self._most_inliers, count)
-        if count < self._inlier_ratio * self._most_inliers:
-            return self._steps_away(T_local_base, keyframes, but_latest=_RECENT) > _KNOWN_RATIO
-        return self.is_far(T_local_base, keyframes)
+        is_running_out = count < self._inlier_ratio * self._most_inliers
+        distance = keyframes.nearest(
+            T_local_base,
+            per_m=self._per_m,
+            per_rad=self._per_rad,
+            but_latest=_RECENT if is_running_out else 0,
+            among=segment,
+        )
+        return distance > (_KNOWN_RATIO if is_running_out else 1.0)
 
     def is_far(self, T_local_base: Transform, keyframes: KeyframeStore) -> bool:
         """Tell whether T_local_base is more than a step from every keyframe."""
-        return self._steps_away(T_local_base, keyframes, but_latest=0) > 1.0
+        return keyframes.nearest(T_local_base, per_m=self._per_m, per_rad=self._per_rad) > 1.0
 
-    def _steps_away(
-        self, T_local_base: Transform, keyframes: KeyframeStore, *, but_latest: int
-    ) -> float:
-        return keyframes.nearest(
-            T_local_base, per_m=self._per_m, per_rad=self._per_rad, but_latest=but_latest
-        )
+
+class PlaceRule:
+    """Decides whether a place that the map does not show is begun anew."""
+
+    def __init__(self, *, patience_s: float) -> None:
+        self._patience_s = patience_s
+        self._images = 0  # that showed enough, since the map was last seen
+
+    def restart(self) -> None:
+        """Hear that there is a pose."""
+        self._images = 0
+
+    def wants(self, view: View, motion: MotionModel, *, is_far: bool) -> bool:
+        """Tell whether the place was often enough looked for in the map.
+
+        Where odometry led there, and else once the patience is over, for that is a guess. Without
+        depth, odometry has to have led far from all keyframes, to see anything in two.
+        """
+        self._images += view.shows_enough
+        if self._images <= _SEARCHED_IMAGES:
+            return False
+        if motion.is_reckoned:
+            return is_far or not view.is_monocular
+        return motion.unheld_s(view.observation) >= self._patience_s and not view.is_monocular

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -130,13 +130,20 @@ class KeyframeStore:
         return both
 
     def nearest(
-        self, T_local_base: Transform, *, per_m: float, per_rad: float, but_latest: int = 0
+        self,
+        T_local_base: Transform,
+        *,
+        per_m: float,
+        per_rad: float,
+        but_latest: int = 0,
+        among: Collection[int] | None = None,
     ) -> float:
         """Return how far the nearest keyframe is, metres and radians weighed and added.
 
-        Infinitely far where there are none but the `but_latest`.
+        Infinitely far where there are none `among` these (None: all) but the `but_latest`.
         """
-        asked = list(self.all())[: len(self) - but_latest]
+        ids = self.ids[: len(self) - but_latest]
+        asked = [self._keyframes[k] for k in ids if among is None or k in among]
         if not asked:
             return float("inf")
         T_keyframes = np.stack([keyframe.T_local_base for keyframe in asked])

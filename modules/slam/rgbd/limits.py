@@ -9,6 +9,7 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera
 
 _LIMITS: dict[str, tuple[float, float]] = {
+    "segment_patience_s": (0, 1e9),
     "feature_count": (100, 10_000),
     "fast_threshold_min": (1, 20),
     "fast_noise_ratio": (0, 100),

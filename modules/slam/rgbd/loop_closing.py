@@ -51,6 +51,10 @@ class LoopCloser:
             self._look_up(self._queries[0])
         return {}
 
+    def finish(self) -> dict[int, Transform]:
+        """Merge at once what the worker is at; return T_new_old per keyframe that was moved."""
+        return {} if self._solution is None else self._merge(self._solution)
+
     def shutdown(self) -> None:
         """End the worker."""
         self._worker.shutdown(wait=True, cancel_futures=True)
@@ -70,20 +74,34 @@ class LoopCloser:
         is_news = any(self._detector.is_news(loop) for loop in loops)
         if is_news:
             self._graph.remeasure(self._poses())
+        met = self._met(loops[-1])
         for loop in loops:
             self._graph.connect(loop.edge)
         if is_news:
-            self._begin(loops)
+            self._begin(loops, met)
         else:
             self._fuse(loops)
 
-    def _begin(self, loops: list[Loop]) -> None:
-        """Set the worker on the part of the graph that the loops are in."""
+    def _met(self, loop: Loop) -> Poses:
+        """Return where a segment comes to lie that a loop is the first to connect, as a whole."""
+        segment = self._graph.connected(loop.keyframe_id)
+        poses = self._poses()
+        T_new_old = loop.T_local_base @ se3.inverse(poses[loop.keyframe_id])
+        if loop.edge.start in segment:
+            return {}
+        other = self._graph.connected(loop.edge.start)
+        if min(segment) < min(other):  # the older one stays
+            segment, T_new_old = other, se3.inverse(T_new_old)
+        return {k: T_new_old @ poses[k] for k in segment}
+
+    def _begin(self, loops: list[Loop], met: Poses) -> None:
+        """Set the worker on the part of the graph that the loops are in; `met` lies elsewhere."""
         part = self._graph.connected(loops[0].keyframe_id)
         self._before = {k: T for k, T in self._poses().items() if k in part}
         edges = [edge for edge in self._graph.edges if edge.start in part]
         self._loops, self._images_left = loops, _MERGE_IMAGES
-        self._solution = self._worker.submit(solve, self._before, edges, held=min(part))
+        first_guess = {**self._before, **met}
+        self._solution = self._worker.submit(solve, first_guess, edges, held=min(part))
 
     def _merge(self, solution: Future[dict[int, Transform]]) -> dict[int, Transform]:
         """Move the keyframes, those that are newer along with the one they hang on."""

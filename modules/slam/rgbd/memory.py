@@ -17,6 +17,7 @@ from .loop_closing import LoopCloser
 from .loop_detection import LoopDetector, Query
 from .pose_graph import Edge, PoseGraph, motion_covariance
 from .recognition import PlaceRecognizer
+from .segments import Segments
 from .visual_map import VisualMap
 
 _MIN_SHARE = 0.1  # of a pose's landmarks, for the keyframe they come from to have an edge
@@ -34,30 +35,47 @@ class Memory:
         self.recognizer = PlaceRecognizer(visual_map, localizer, min_inliers=min_inliers)
         detector = LoopDetector(visual_map, self.recognizer, self._graph)
         self._closer = LoopCloser(visual_map, detector, self._graph)
-        self._reference = _NEVER_SAW  # the keyframe that the newest frame hangs on
+        self.segments = Segments(self._graph)
+        self.reference = _NEVER_SAW  # the keyframe that the newest frame hangs on
         self.revision = 0  # rises with every correction
 
     def hold(self, stamp_ns: int, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> None:
         """Remember where a frame was, by the keyframe that shares most landmarks with it."""
         keyframes = self._map.keyframes
-        near = [self._reference, keyframes.ids[-1], *self._graph.neighbours(self._reference)]
+        near = [self.reference, keyframes.ids[-1], *self._graph.neighbours(self.reference)]
         shared = [_shared(keyframes[k].landmark_ids, landmark_ids) for k in near]
-        self._reference = near[int(np.argmax(shared))]
-        T_local_keyframe = keyframes[self._reference].T_local_base
-        self._frames.add(stamp_ns, self._reference, se3.inverse(T_local_keyframe) @ T_local_base)
+        if not any(shared):  # it was found somewhere else
+            near, shared = [*keyframes.covisible(landmark_ids, limit=1), *near], [1]
+        self.reference = near[int(np.argmax(shared))]
+        T_local_keyframe = keyframes[self.reference].T_local_base
+        self._frames.add(stamp_ns, self.reference, se3.inverse(T_local_keyframe) @ T_local_base)
 
-    def insert(self, fix: Fix | None, depth_m: NDArray[np.float32] | None) -> None:
-        """Take the map's newest keyframe; `fix` is what placed it there, None for odometry."""
+    def insert(
+        self, fix: Fix | None, depth_m: NDArray[np.float32] | None, *, guessed_s: float | None
+    ) -> None:
+        """Take the map's newest keyframe; `fix` is what placed it there, None for odometry.
+
+        `guessed_s`: how long no pose was known, where nothing placed it: it begins a segment.
+        """
         self._follow_removals()
         keyframe_id = self._map.keyframes.ids[-1]
         keyframe = self._map.keyframes[keyframe_id]
         self._graph.insert(keyframe_id)
-        for edge in self._edges(keyframe_id, fix):
-            self._graph.connect(edge)
+        if guessed_s is None:
+            for edge in self._edges(keyframe_id, fix):
+                self._graph.connect(edge)
+        else:
+            self.segments.begin(keyframe_id, keyframe.T_local_base, lost_s=guessed_s)
         self._keyframes[keyframe_id] = keyframe
         self.recognizer.places.insert(keyframe_id, keyframe.features.descriptors)
         self._closer.insert(Query(keyframe_id=keyframe_id, depth_m=depth_m))
-        self._reference = keyframe_id
+        self.reference = keyframe_id
+
+    def segment(self, landmark_ids: NDArray[np.int64]) -> set[int] | None:
+        """Return the keyframes of the segment that these landmarks are of; None: all are of one."""
+        if not self.segments.are_many:
+            return None
+        return self.segments.around(self._map.keyframes.covisible(landmark_ids, limit=1)[0])
 
     def step(self) -> Transform | None:
         """Do an image's share of closing loops; return T_new_old of here when the map moved."""
@@ -66,10 +84,12 @@ class Memory:
         if not moved:
             return None
         self.revision += 1
-        return moved.get(self._reference, se3.identity())
+        self.segments.update()
+        return moved.get(self.reference, se3.identity())
 
     def trajectory(self) -> Trajectory:
-        """Return T_local_base of all frames that were held, as best known now."""
+        """Return T_local_base of all frames that were held, with loops that were found last."""
+        self._closer.finish()
         return self._frames.trajectory({k: v.T_local_base for k, v in self._keyframes.items()})
 
     def pose_graph(self) -> PoseGraphLayer | None:
@@ -116,7 +136,7 @@ class Memory:
             return []
         T_local_base = self._map.keyframes[keyframe_id].T_local_base
         if fix is None:
-            last = max(earlier)
+            last = self.reference
             T_last_new = se3.inverse(earlier[last].T_local_base) @ T_local_base
             reckoned = _RECKONED_VARIANCE * np.eye(6)
             return [_edge(last, keyframe_id, T_last_new, reckoned)]
@@ -149,7 +169,8 @@ class Memory:
                 gone, heir = self._keyframes[keyframe_id], self._keyframes[edge.start]
                 T_heir_gone = se3.inverse(heir.T_local_base) @ gone.T_local_base
                 self._frames.hand_over(keyframe_id, edge.start, T_heir_gone)
-                self._reference = edge.start if self._reference == keyframe_id else self._reference
+                self.segments.replace(keyframe_id, edge.start)
+                self.reference = edge.start if self.reference == keyframe_id else self.reference
             del self._keyframes[keyframe_id]
             self.recognizer.places.remove(keyframe_id)
 

@@ -15,7 +15,7 @@ from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
-from .answers import held, lost, started
+from .answers import held, lost, placed, started
 from .fusion import join_duplicates
 from .keyframes import NO_LANDMARK, Keyframe
 from .limits import check_limits, check_sizes
@@ -23,8 +23,6 @@ from .localizer import Fix
 from .parts import Parts
 from .triangulation import triangulate
 from .view import View
-
-_SEARCHED_IMAGES = 3  # looked for in the map before a new place is begun by odometry
 
 
 class RgbdSlam:
@@ -39,6 +37,7 @@ class RgbdSlam:
         self,
         *,
         monocular_scenes: list[str],
+        segment_patience_s: float,
         feature_count: int,
         fast_threshold_min: int,
         fast_noise_ratio: float,
@@ -82,12 +81,12 @@ class RgbdSlam:
         self._eye, self._motion, self._health = parts.eye, parts.motion, parts.health
         self._localizer, self._relocalizer = parts.localizer, parts.relocalizer
         self._map, self._mapping, self._memory = parts.map, parts.mapping, parts.memory
-        self._layers, self._keyframe_rule = parts.layers, parts.keyframe_rule
+        self._layers, self._place_rule = parts.layers, parts.place_rule
+        self._keyframe_rule = parts.keyframe_rule
         self._T_local_base = se3.identity()
         self._local_ids = np.zeros(0, np.int64)  # landmarks of the local map
         self._observations = 0
         self._is_lost = False
-        self._unknown_images = 0  # that showed enough, since the map was last seen
 
     def set_pose(self, T_map_local: Transform) -> None:
         """Place `local` in the map (Eq. 1)."""
@@ -117,7 +116,7 @@ class RgbdSlam:
         if fix is not None:
             self._eye.learn(view, fix)
             return self._hold(view, fix)
-        if not len(self._map.keyframes) or self._is_unknown_place(view):
+        if not len(self._map.keyframes) or self._is_unknown(view):
             return self._start(view)
         return self._lose(observation, T_predicted)
 
@@ -159,32 +158,28 @@ class RgbdSlam:
             self._motion.correct(T_new_old)
             self._local_ids = self._map.around(self._local_ids)
 
-    def _is_unknown_place(self, view: View) -> bool:
-        """Tell whether odometry led to a place that was often enough looked for in the map.
-
-        Without depth it takes some way from the last such view to see anything in two.
-        """
-        self._unknown_images += view.shows_enough
-        if not self._motion.is_reckoned or self._unknown_images <= _SEARCHED_IMAGES:
-            return False
-        return not view.is_monocular or self._keyframe_rule.is_far(
-            view.T_predicted, self._map.keyframes
-        )
+    def _is_unknown(self, view: View) -> bool:
+        is_far = self._keyframe_rule.is_far(view.T_predicted, self._map.keyframes)
+        return self._place_rule.wants(view, self._motion, is_far=is_far)
 
     def _start(self, view: View) -> Tracking:
         """Hang a keyframe on the prediction; wait, lost, for features with depth or odometry.
 
-        It is the map's first, or the first of a place that only odometry connects to the map.
+        It is the map's first, the first of a place that only odometry connects to the map, or of
+        a segment that nothing connects.
         """
         is_scaled = not view.is_monocular or view.observation.T_odom_base is not None
         if not (view.shows_enough and is_scaled):
             return self._lose(view.observation, view.T_predicted)
+        is_first, is_guess = not len(self._map.keyframes), not self._motion.is_reckoned
+        unheld_s = self._motion.unheld_s(view.observation)
         self._hold_pose(view.observation, view.T_predicted)
         unseen = np.full(len(view.features), NO_LANDMARK)
-        self._insert_keyframe(view, unseen, unseen[:0], None)
+        guessed_s = unheld_s if is_guess and not is_first else None
+        self._insert_keyframe(view, unseen, unseen[:0], set(), guessed_s=guessed_s)
         self._memory.hold(view.observation.stamp_ns, self._T_local_base, unseen[:0])
-        is_first, revision = self._observations == 1, self._memory.revision
-        return started(view, self._T_local_base, is_first=is_first, revision=revision)
+        is_origin, revision = self._observations == 1, self._memory.revision
+        return started(view, self._T_local_base, is_first=is_origin, revision=revision)
 
     def _hold(self, view: View, fix: Fix) -> Tracking:
         """Accept a pose, and extend the map where it is due."""
@@ -195,13 +190,14 @@ class RgbdSlam:
         self._hold_pose(view.observation, T_local_base)
         self._local_ids = fix.local_ids
         self._map.count_sightings(fix.expected_ids, fix.landmark_ids)
-        wanted = self._keyframe_rule.wants(T_local_base, fix, self._map.keyframes)
+        segment = self._memory.segment(fix.landmark_ids)
+        wanted = self._keyframe_rule.wants(T_local_base, fix, self._map.keyframes, segment)
         if wanted and status is TrackingStatus.TRACKING:
             landmark_ids = np.full(len(view.features), NO_LANDMARK)
             landmark_ids[fix.feature_rows] = fix.landmark_ids
-            self._insert_keyframe(view, landmark_ids, fix.deep_rows, fix)
+            self._insert_keyframe(view, landmark_ids, fix.deep_rows, segment, fix=fix)
         self._memory.hold(view.observation.stamp_ns, T_local_base, fix.landmark_ids)
-        return held(
+        answer = held(
             view,
             fix,
             T_local_base,
@@ -209,9 +205,11 @@ class RgbdSlam:
             is_reckoned=is_reckoned,
             revision=self._memory.revision,
         )
+        return answer if segment is None else placed(answer, self._memory.segments, segment)
 
     def _hold_pose(self, observation: Observation, T_local_base: Transform) -> None:
-        self._T_local_base, self._is_lost, self._unknown_images = T_local_base, False, 0
+        self._T_local_base, self._is_lost = T_local_base, False
+        self._place_rule.restart()
         self._motion.hold(observation, T_local_base)
 
     def _lose(self, observation: Observation, T_predicted: Transform) -> Tracking:
@@ -224,7 +222,10 @@ class RgbdSlam:
         view: View,
         landmark_ids: NDArray[np.int64],
         deep_rows: NDArray[np.int64],
-        fix: Fix | None,
+        segment: set[int] | None,
+        *,
+        fix: Fix | None = None,
+        guessed_s: float | None = None,
     ) -> None:
         stamp_ns = view.observation.stamp_ns
         keyframe = Keyframe(
@@ -237,7 +238,7 @@ class RgbdSlam:
         keyframe_id = self._map.insert(keyframe, deep_rows=deep_rows)
         if view.is_monocular:
             triangulate(self._map, keyframe_id)
-        join_duplicates(self._map, keyframe)
-        self._memory.insert(fix, view.depth_m)
+        join_duplicates(self._map, keyframe, segment)
+        self._memory.insert(fix, view.depth_m, guessed_s=guessed_s)
         self._keyframe_rule.restart()
         self._local_ids = self._map.around(keyframe.landmark_ids)

@@ -21,6 +21,7 @@ class MotionModel:
         self._twist_per_s = np.zeros(6)
         self._stamp_ns: int | None = None
         self._T_odom_base: Transform | None = None
+        self._held_ns: int | None = None
         self.is_reckoned = False  # odometry has carried the pose since it was last measured
 
     def predict(self, observation: Observation) -> Transform:
@@ -38,12 +39,17 @@ class MotionModel:
             return np.asarray(gyro[:, 1:4].mean(axis=0))
         return self._twist_per_s[3:]
 
+    def unheld_s(self, observation: Observation) -> float:
+        """Return how long no pose was measured; 0 before there was any."""
+        return 0.0 if self._held_ns is None else (observation.stamp_ns - self._held_ns) * _NS
+
     def hold(self, observation: Observation, T_local_base: Transform) -> None:
         """Go on from a pose that was measured."""
         gap_s = self._gap_s(observation)
         T_prev_curr = se3.inverse(self._T_local_base) @ T_local_base
         self._twist_per_s = se3.log(T_prev_curr) / gap_s if gap_s > 0 else np.zeros(6)
         self._step(observation, T_local_base)
+        self._held_ns = observation.stamp_ns
         self.is_reckoned = observation.T_odom_base is not None
 
     def correct(self, T_new_old: Transform) -> None:

@@ -9,7 +9,7 @@ from sceneslam.types.rig import Camera
 
 from .eye import Eye
 from .features import FeatureExtractor
-from .judgement import HealthRule, KeyframeRule
+from .judgement import HealthRule, KeyframeRule, PlaceRule
 from .layers import LayerBuilder
 from .local_mapping import LocalMapping
 from .localizer import Localizer
@@ -60,5 +60,6 @@ class Parts:
                 inlier_ratio="keyframe_inlier_ratio",
             )
         )
+        self.place_rule = PlaceRule(**chosen(patience_s="segment_patience_s"))
         self.health = HealthRule(**same("degraded_inliers", "degraded_sigma_m"))
         self.motion = MotionModel()

@@ -1,0 +1,92 @@
+"""A camera that is lost for good begins a new part of the map, and joins it when they meet."""
+
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scenery import observation_at
+from test_rgbd import make
+
+from sceneslam.types import se3
+from sceneslam.types.observation import TrackingStatus
+
+RATE_HZ, TURN_RAD = 15.0, 0.06
+SEEN, GAP_S, AWAY_RAD = 12, 2.0, 2.2
+IMAGES = 88  # the last twenty or so of which show again what the first did
+
+
+def pose(index):
+    """Look to and fro at one side of the room; be carried away; turn back from there."""
+    if index < SEEN:
+        return se3.from_xy_yaw(0.02 * index, 0.0, TURN_RAD * index - 0.3)
+    step = max(0, index - SEEN - int(1.2 * RATE_HZ))
+    return se3.from_xy_yaw(0.1 + 0.005 * step, 0.3, AWAY_RAD - TURN_RAD * step)
+
+
+@cache
+def images():
+    """Observations of a camera alone, two seconds of which were cut out."""
+    seen = []
+    for index in range(IMAGES):
+        time_s = index / RATE_HZ + (GAP_S if index >= SEEN else 0.0)
+        one = observation_at(pose(index), time_s)
+        seen.append(replace(one, scan=None, points_lidar=None, T_odom_base=None, gyro_base=None))
+    return seen
+
+
+def error_m(T_local_base, index):
+    T_error = se3.inverse(se3.inverse(pose(0)) @ pose(index)) @ T_local_base
+    return float(np.linalg.norm(T_error[:3, 3]))
+
+
+@pytest.fixture(scope="module")
+def kidnapped():
+    pytest.importorskip("gtsam")
+    module = make()
+    answers = [module.track(image) for image in images()]
+    revised, layers = module.get_trajectory(), module.get_map()
+    module.shutdown()
+    return answers, revised, layers
+
+
+def test_lost_camera_goes_on_after_its_patience_and_says_that_it_guesses(kidnapped):
+    answers, _, _ = kidnapped
+    status = [answer.status for answer in answers]
+    back = next(i for i in range(SEEN, IMAGES) if status[i] is not TrackingStatus.LOST)
+    assert status[SEEN] is TrackingStatus.LOST
+    assert status[back] is TrackingStatus.DEGRADED and answers[back].revision == 0
+    told = answers[back + 3]
+    assert told.status is TrackingStatus.DEGRADED
+    assert np.sqrt(told.covariance[0, 0]) > GAP_S * 0.9
+
+
+def test_segments_are_joined_where_they_meet(kidnapped):
+    answers, revised, layers = kidnapped
+    assert answers[-1].status is TrackingStatus.TRACKING and answers[-1].revision >= 1
+    assert error_m(answers[-1].T_local_base, len(answers) - 1) < 0.03
+    indices = [i for i, a in enumerate(answers) if a.status is not TrackingStatus.LOST]
+    assert len(revised) == len(indices)
+    errors = [error_m(T, i) for T, i in zip(revised.T_world_base, indices, strict=True)]
+    assert max(errors) < 0.06
+    assert layers.pose_graph.is_loop.any()
+
+
+def test_pose_jumps_to_where_the_camera_is_only_where_a_revision_says_so(kidnapped):
+    answers, _, _ = kidnapped
+    held = [answer for answer in answers if answer.status is not TrackingStatus.LOST]
+    for one, other in pairwise(held):
+        jump_m = np.linalg.norm((se3.inverse(one.T_local_base) @ other.T_local_base)[:3, 3])
+        assert jump_m < 0.1 or other.revision > one.revision
+
+
+def test_camera_that_comes_back_in_time_begins_nothing():
+    module = make()
+    for image in images()[:SEEN]:
+        module.track(image)
+    back = replace(images()[SEEN // 2], stamp_ns=images()[SEEN].stamp_ns)
+    answer = module.track(back)
+    module.shutdown()
+    assert answer.status is TrackingStatus.TRACKING
+    assert error_m(answer.T_local_base, SEEN // 2) < 0.03
