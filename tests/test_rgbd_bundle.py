@@ -135,7 +135,7 @@ def mapped(rng, *, is_matched):
 def test_landmarks_mapped_twice_become_one():
     visual_map, _ = mapped(np.random.default_rng(3), is_matched=False)
     assert len(visual_map.landmarks) == KEYFRAMES * LANDMARKS
-    join_duplicates(visual_map, visual_map.keyframes[1])
+    join_duplicates(visual_map, visual_map.keyframes[1], None)
     first, second = (visual_map.keyframes[k].landmark_ids for k in (0, 1))
     assert (first == second).mean() > 0.95
     assert len(visual_map.landmarks) <= (KEYFRAMES - 1) * LANDMARKS + 10
