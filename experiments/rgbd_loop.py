@@ -1,8 +1,8 @@
-"""Print how well the rgbd module remembers: places, loops, ways back, and what a map grows by.
+"""Print how well the rgbd module remembers: places, loops, and ways back.
 
     python experiments/rgbd_loop.py WHAT [OVERRIDES]
 
-WHAT is `places`, `loops`, `kidnap` or `twice`; the overrides choose a recording as for a run:
+WHAT is `places`, `loops` or `kidnap`; the overrides choose a recording as for a run:
 
     python experiments/rgbd_loop.py loops story=there_and_back lights=on
     python experiments/rgbd_loop.py kidnap source=tum_rgbd source.path=FOLDER
@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from itertools import chain, islice
+from itertools import islice
 from typing import Any, cast
 
 import numpy as np
@@ -147,37 +147,6 @@ def camera_only(observation: Observation) -> Observation:
     return replace(observation, T_odom_base=None, gyro_base=None, scan=None)
 
 
-def twice(overrides: list[str]) -> Row:
-    """Return what the map grows by when the same path, a round trip, is driven again."""
-    source, module, _ = build(overrides)
-    sizes = []
-    for lap in (shifted(source, 0), shifted(source, 1)):
-        follow(module, lap)
-        layers = module.get_map()
-        assert layers.pose_graph is not None and layers.landmarks is not None
-        sizes.append((len(layers.pose_graph.stamps_ns), len(layers.landmarks.points)))
-    module.shutdown()
-    first, second = np.array(sizes)
-    growth = second / first - 1.0
-    return {
-        "keyframes": f"{first[0]} -> {second[0]} ({growth[0]:+.0%})",
-        "landmarks": f"{first[1]} -> {second[1]} ({growth[1]:+.0%})",
-    }
-
-
-def shifted(source: Source, lap: int) -> Iterator[Observation]:
-    """Yield a lap's observations, each lap beginning 33 ms after the one before it ended."""
-    observations = iter(source)
-    first = next(observations)
-    end_ns = first.stamp_ns
-    if lap:
-        for last in source:
-            end_ns = last.stamp_ns
-    offset_ns = lap * (end_ns - first.stamp_ns + 33_000_000)
-    for observation in chain([first], observations):
-        yield replace(camera_only(observation), stamp_ns=observation.stamp_ns + offset_ns)
-
-
 def places(overrides: list[str]) -> Row:
     """Return how often the keyframe most alike shows the place of an image seen longer ago."""
     source, module, truth = build(overrides)
@@ -217,16 +186,19 @@ WHAT: Mapping[str, Callable[[list[str]], Row]] = {
     "places": places,
     "loops": loops,
     "kidnap": kidnap,
-    "twice": twice,
 }
+
+
+def show(row: Row) -> None:
+    """Print a table of one line."""
+    print("| " + " | ".join(row) + " |")
+    print("|---" * len(row) + "|")
+    print("| " + " | ".join(str(value) for value in row.values()) + " |")
 
 
 def main() -> None:
     """Run what the first word says on the recording that the others choose."""
-    row = WHAT[sys.argv[1]](sys.argv[2:])
-    print("| " + " | ".join(row) + " |")
-    print("|---" * len(row) + "|")
-    print("| " + " | ".join(str(value) for value in row.values()) + " |")
+    show(WHAT[sys.argv[1]](sys.argv[2:]))
 
 
 if __name__ == "__main__":
