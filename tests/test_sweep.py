@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -12,8 +14,13 @@ from pathlib import Path
 from time import monotonic, sleep
 
 import pytest
+from hydra import compose, initialize_config_module
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 from scenery import RIG, room_observation
 
+from sceneslam.config.check import check_keys
 from sceneslam.ros.writer import ObservationWriter
 from sceneslam.sweep.__main__ import main
 from sceneslam.sweep.status import State, Status
@@ -180,3 +187,31 @@ def test_status_is_read_as_it_was_written(tmp_path):
     status.write(tmp_path)
     assert Status.read(tmp_path) == status
     assert json.loads((tmp_path / "job.json").read_text())["state"] == "killed"
+
+
+def commands():
+    text = (ROOT / "docs" / "sweeps.md").read_text().replace("\\\n", " ")
+    lines = "\n".join(re.findall(r"```sh\n(.*?)```", text, re.S)).splitlines()
+    return [line for line in lines if "sceneslam -m" in line]
+
+
+@pytest.mark.parametrize("line", commands())
+def test_command_of_the_guide_composes(line):
+    words = shlex.split(line)[4:]
+    (jobs,) = BasicSweeper.split_arguments(OverridesParser.create().parse_overrides(words), None)
+    with initialize_config_module("sceneslam.conf", version_base="1.3"):
+        for job in (jobs[0], jobs[-1]):
+            config = compose("config", overrides=[w for w in job if not w.startswith("hydra/")])
+            check_keys(OmegaConf.to_container(config, resolve=True))
+
+
+@pytest.mark.parametrize("name", ["threshold_sweep", "window_sweep", "detection_sweep"])
+def test_shipped_sweep_composes_at_both_ends(name):
+    with initialize_config_module("sceneslam.conf", version_base="1.3"):
+        whole = compose("config", overrides=[f"+experiment={name}"], return_hydra_config=True)
+        params = [f"{key}={value}" for key, value in whole.hydra.sweeper.params.items()]
+        parsed = OverridesParser.create().parse_overrides([f"+experiment={name}", *params])
+        (jobs,) = BasicSweeper.split_arguments(parsed, None)
+        assert len(jobs) == {"detection_sweep": 3 * 60 * 9}.get(name, 24)
+        for job in (jobs[0], jobs[-1]):
+            check_keys(OmegaConf.to_container(compose("config", overrides=job), resolve=True))

@@ -1,0 +1,168 @@
+"""Detection scored alone decides as the full run does, a hundred times faster."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from time import process_time
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_module
+
+from sceneslam.app import run
+from sceneslam.config.resolve import resolved
+from sceneslam.detection.features import Features
+from sceneslam.detection.grid import Axis, try_all
+from sceneslam.detection.run import detect
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.truth import SceneChange
+
+ROOT = Path(__file__).parents[1]
+TINY = ("story=flicker", "source.camera.size_wh=[80,60]", "source.camera.rate_hz=10")
+FULL = ("+scenario=single", "slam@slam.only=odometry", "detector=grey_mean", "run.report=false")
+FULL = (*FULL, "~sinks@sinks.rerun", "+scenes={Bright:[only],Dark:[only]}", "run.progress=false")
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def config(cache, monkeypatch):
+    """Give what a command line would run, with a cache of its own."""
+    monkeypatch.setenv("SCENESLAM_CACHE_DIR", str(cache))
+
+    def composed(*overrides):
+        with initialize_config_module("sceneslam.conf", version_base="1.3"):
+            return resolved(compose("config", overrides=["run.progress=false", *overrides]))
+
+    return composed
+
+
+def told(folder, *kinds):
+    events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
+    return [event for event in events if event["event"] in kinds]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        (),
+        ("policy.confirm_window_s=0.3", "detector.threshold=110"),
+        ("policy.confirm_window_s=0.0", "detector.threshold=130", "run.max_observations=150"),
+    ],
+)
+def test_votes_and_scenes_are_those_of_the_full_run(config, tmp_path, words):
+    words = (*TINY, *words)
+    detect(config(*words, "run=detect_only"), tmp_path / "alone")
+    finished = run(config(*FULL, *words), tmp_path / "full")
+    alone = told(tmp_path / "alone", "vote", "scene")
+    assert alone == told(tmp_path / "full", "vote", "scene") and len(alone) > 100
+    metrics = json.loads((tmp_path / "alone" / "metrics.json").read_text())
+    assert metrics["detection"] == finished.metrics["detection"]
+    assert metrics["detection"]["missed"] is not None
+
+
+def test_real_recording_in_less_light_is_decided_as_by_the_full_run(config, tmp_path, shared_data):
+    path = shared_data / "tum_fr1_rpy"
+    words = (f"source.path={path}", "source=tum_rgbd", "effects=lights_out")
+    words = (*words, "effects.schedule=[[0.0,1.0],[0.08,0.0]]", "policy.confirm_window_s=0.2")
+    words = (*words, "run.max_observations=60")
+    detect(config(*words, "run=detect_only"), tmp_path / "alone")
+    single = ("+scenario=single", "slam@slam.only=depth", *FULL[2:])
+    run(config(*single, *words), tmp_path / "full")
+    alone = told(tmp_path / "alone", "vote", "scene")
+    assert alone == told(tmp_path / "full", "vote", "scene")
+    assert [event["scene"] for event in told(tmp_path / "alone", "scene")] == ["Bright", "Dark"]
+
+
+THRESHOLDS, WINDOWS = Axis(key="detector.threshold", values=[60, 100, 300]), [0.0, 1.0, -1.0]
+
+
+def test_grid_gives_what_every_setting_gives_alone(config, tmp_path):
+    words = (*TINY, "run=detect_only")
+    axes = [THRESHOLDS, Axis(key="policy.confirm_window_s", values=WINDOWS)]
+    tried = list(try_all(config(*words), axes))
+    assert len(tried) == 9
+    for one in tried:
+        setting = [f"{key}={value}" for key, value in one.setting.items()]
+        if one.error:
+            with pytest.raises(ConfigError, match=r"threshold: got 300|window_s: got -1"):
+                detect(config(*words, *setting), tmp_path)
+        else:
+            detect(config(*words, *setting), tmp_path)
+            assert json.loads((tmp_path / "metrics.json").read_text()) == one.metrics
+    assert sum(bool(one.error) for one in tried) == 5
+
+
+def test_recording_is_read_once_for_all_settings(config, tmp_path, cache, monkeypatch):
+    words = (*TINY, "run=detect_only")
+    detect(config(*words), tmp_path)
+    monkeypatch.setattr("sceneslam.detection.recall.measure", None)  # a second time fails
+    detect(config(*words, "detector.threshold=60"), tmp_path)
+    with pytest.raises(TypeError):
+        detect(config(*words, "run.max_observations=50"), tmp_path)  # other images
+
+
+def test_thousand_settings_take_seconds(config):
+    axes = [
+        Axis(key="detector.threshold", values=range(40, 140)),
+        Axis(key="policy.confirm_window_s", values=[k / 10 for k in range(10)]),
+    ]
+    words = (*TINY, "run=detect_only")
+    next(try_all(config(*words), axes))  # the recording is read here
+    began_s = process_time()
+    assert len(list(try_all(config(*words), axes))) == 1000
+    assert process_time() - began_s < 10.0
+
+
+def test_features_are_kept_to_the_bit(tmp_path):
+    features = Features(
+        stamps_ns=np.array([1, 2**60 + 1]),
+        values=np.array([[0.1], [np.pi]]),
+        is_there=np.array([False, True]),
+        scenes=(SceneChange(stamp_ns=2**60 + 1, scene="Bright"),),
+    )
+    features.write(tmp_path / "features.npz")
+    read = Features.read(tmp_path / "features.npz")
+    for name in ("stamps_ns", "values", "is_there"):
+        assert np.array_equal(getattr(read, name), getattr(features, name))
+    assert read.scenes == features.scenes
+
+
+def test_detector_without_features_is_refused(config, tmp_path):
+    words = ("detector._target_=sceneslam.modules.slam.odometry.Odometry", "run=detect_only")
+    with pytest.raises(ConfigError, match="detector"):
+        detect(config(*words), tmp_path)
+
+
+def test_modules_are_not_built_by_a_run_without_slam(config, tmp_path):
+    with pytest.raises(ConfigError, match=r"run\.mode"):
+        run(config("+scenario=bright_to_dark", "run=detect_only"), tmp_path)
+
+
+def test_command_sweeps_settings_and_recordings_into_one_table(cache, tmp_path):
+    words = [sys.executable, "-m", "sceneslam", "-m", "run.max_observations=100,200"]
+    words += [*TINY, "run=detect_only", "detector.threshold=range(80,121,10)"]
+    done = subprocess.run(
+        [*words, "policy.confirm_window_s=0.5,1,-1", "hydra.sweep.dir=out"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "SCENESLAM_CACHE_DIR": str(cache)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 1 and "30 settings" in done.stdout, done.stderr
+    with (tmp_path / "out" / "table.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    observed = [row["observations"] for row in rows if row["status"] == "done"]
+    assert observed == ["100"] * 10 + ["200"] * 10
+    failed = [row for row in rows if row["status"] == "failed"]
+    assert len(failed) == 10 and {row["policy.confirm_window_s"] for row in failed} == {"-1"}
+    assert (tmp_path / "out" / "index.html").is_file()
