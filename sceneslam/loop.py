@@ -17,7 +17,7 @@ from sceneslam.bus.events import EventLog
 from sceneslam.bus.live import run_live
 from sceneslam.config.build import Parts
 from sceneslam.interfaces import Sink
-from sceneslam.types.errors import InputError
+from sceneslam.types.errors import InputError, told
 from sceneslam.types.observation import Observation
 from sceneslam.types.run import RunResult, Timings
 from sceneslam.types.truth import GroundTruth
@@ -51,8 +51,7 @@ class Loop:
         )
         self._sinks: dict[str, Sink] = {}
         for key, sink in parts.sinks.items():
-            sink.open(parts.rig, folder)
-            self._sinks[key] = sink
+            self._open_sink(key, sink, folder)
 
     def run(self) -> None:
         """Feed all observations; an error or Ctrl-C ends the run, not the program."""
@@ -63,10 +62,9 @@ class Loop:
             self.faults.append(f"stopped after {len(self._observed_ns)} observations; saved so far")
         except InputError as error:
             self.faults.append(str(error))
-        except Exception as error:
+        except BaseException as error:
             _log.info("unexpected error", exc_info=error)
-            kind = type(error).__name__
-            self.faults.append(f"unexpected {kind}: {error}; saved so far, traceback in the log")
+            self.faults.append(f"unexpected {told(error)}; saved so far, traceback in the log")
         self._wall_s = perf_counter() - self._began_s
 
     def close(self) -> None:
@@ -156,6 +154,14 @@ class Loop:
         except InputError as error:
             self.faults.append(f"no ground truth: {error}")
 
+    def _open_sink(self, key: str, sink: Sink, folder: Path) -> None:
+        try:
+            sink.open(self._parts.rig, folder)
+        except Exception as error:
+            _log.info("sinks.%s", key, exc_info=error)
+            raise InputError(f"sinks.{key} could not be opened: {told(error)}") from error
+        self._sinks[key] = sink
+
     def _close_sink(self, key: str) -> None:
         try:
             if self.truth is not None:
@@ -167,7 +173,7 @@ class Loop:
     def _drop_sink(self, key: str, error: Exception) -> None:
         """Go on without a sink that cannot write."""
         _log.info("sinks.%s", key, exc_info=error)
-        self.faults.append(f"sinks.{key} stopped writing: {type(error).__name__}: {error}")
+        self.faults.append(f"sinks.{key} stopped writing: {told(error)}")
         del self._sinks[key]
 
     def _last_ns(self) -> int:

@@ -8,8 +8,8 @@ from time import perf_counter_ns
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.scene_filter import SceneFilter
 from sceneslam.interfaces import Detector
-from sceneslam.types.errors import ModuleError
-from sceneslam.types.observation import Observation
+from sceneslam.types.errors import ModuleError, told
+from sceneslam.types.observation import UNSURE, Observation, SceneVote
 from sceneslam.types.rig import Rig
 
 _log = logging.getLogger(__name__)
@@ -28,8 +28,7 @@ class Watch:
         try:
             detector.activate(rig)
         except Exception as error:
-            what = f"detector could not be activated: {type(error).__name__}: {error}"
-            raise ModuleError(what) from error
+            raise ModuleError(f"detector could not be activated: {told(error)}") from error
 
     @property
     def scene(self) -> str | None:
@@ -44,12 +43,17 @@ class Watch:
     def look(self, observation: Observation) -> None:
         """Take a vote and log it, and what it confirms."""
         began_ns = perf_counter_ns()
+        vote: SceneVote | None = None
         try:
-            vote = self._detector.get_scene(observation) if self.is_working else None
-        except Exception as error:
-            self.is_working, vote = False, None
-            _log.warning("the detector failed: %s", error)
-            self._log.add("fault", observation.stamp_ns, what=f"the detector failed: {error}")
+            if self.is_working:
+                vote = self._checked(self._detector.get_scene(observation))
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            self.is_working = False
+            what = f"the detector failed: {told(error)}"
+            _log.warning(what)
+            self._log.add("fault", observation.stamp_ns, what=what)
         self.spent_us.append((perf_counter_ns() - began_ns) / 1e3)
         if vote is None:
             return
@@ -66,4 +70,16 @@ class Watch:
 
     def close(self) -> None:
         """Shut the detector down. May be called twice."""
-        self._detector.shutdown()
+        try:
+            self._detector.shutdown()
+        except Exception as error:
+            _log.warning("the detector could not be shut down: %s", told(error))
+
+    def _checked(self, vote: object) -> SceneVote:
+        """Return a vote for a scene that the detector has; raises TypeError or ValueError."""
+        if not isinstance(vote, SceneVote):
+            raise TypeError(f"get_scene returned {type(vote).__name__}, expected SceneVote")
+        if vote.scene not in (*self._detector.scenes, UNSURE):
+            scenes = ", ".join(self._detector.scenes)
+            raise ValueError(f"scene: got {vote.scene!r}, expected {scenes} or {UNSURE}")
+        return vote

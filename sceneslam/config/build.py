@@ -19,7 +19,7 @@ from sceneslam.interfaces import Detector, Sink, SlamModule, Source
 from sceneslam.sources.made_once import MadeOnce
 from sceneslam.sources.ordered import Ordered
 from sceneslam.supervision.isolated import IsolatedModule
-from sceneslam.types.errors import ConfigError, ModuleError
+from sceneslam.types.errors import ConfigError, ModuleError, told
 from sceneslam.types.rig import Rig, Sensor
 
 _log = logging.getLogger(__name__)
@@ -113,8 +113,12 @@ def _requires(module: SlamModule, key: str) -> Sequence[frozenset[Sensor]]:
     """Return what the module requires; raises ConfigError where its process could not build it."""
     try:
         return module.requires
+    except ConfigError:
+        raise
     except ModuleError as error:
         raise ConfigError(key, "process", f"a target that builds (its process {error})") from error
+    except Exception as error:
+        raise ConfigError(f"{key}.requires", told(error), "sets of sensors") from error
 
 
 def _table(config: Mapping[str, Any], detector: Detector) -> dict[str, tuple[str, ...]]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from numbers import Integral
+from typing import Any
 
 from sceneslam.interfaces import Source
 from sceneslam.sources.clean import cleaned
@@ -12,6 +14,7 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
 from sceneslam.types.truth import GroundTruth
 
+_STAMP_MAX_NS = 2**62  # 146 years: differences of two stamps fit into 64 bits
 _PERIODS = 4  # one or two frames lost in a row are common
 
 
@@ -40,7 +43,7 @@ class Ordered(Wrapped):
         last_ns: int | None = None
         period_ns = self._max_gap_ns // _PERIODS  # the longest of late
         held: Observation | None = None  # after a jump: it may be the jump that is wrong
-        for observation in self._source:
+        for observation in filter(self._is_stamped, self._source):
             stamp_ns = observation.stamp_ns
             if held is not None:
                 is_back = stamp_ns < held.stamp_ns
@@ -66,6 +69,14 @@ class Ordered(Wrapped):
     def ground_truth(self) -> GroundTruth | None:
         """Return the source's ground truth."""
         return self._source.ground_truth()
+
+    def _is_stamped(self, observation: object) -> bool:
+        """Tell whether this is an observation with a stamp that a recording can hold."""
+        stamp_ns: Any = observation.stamp_ns if isinstance(observation, Observation) else None
+        if isinstance(stamp_ns, Integral) and abs(int(stamp_ns)) <= _STAMP_MAX_NS:
+            return True
+        self._log.add("observation left out, it has no stamp in nanoseconds", f"stamp {stamp_ns}")
+        return False
 
     def _skip(self, observation: Observation) -> None:
         kind = "observation left out, its stamp repeats, runs backwards or jumps"

@@ -9,15 +9,18 @@ import socket
 import subprocess
 import sys
 from contextlib import suppress
+from pathlib import Path
 from time import monotonic
 from typing import Any
+from uuid import uuid4
 from weakref import finalize
 
 from sceneslam.supervision.limits import Limits
 from sceneslam.supervision.messages import Reply, Request
 from sceneslam.supervision.transport import Channel
-from sceneslam.types.errors import ModuleError
+from sceneslam.types.errors import ModuleError, told
 
+_MARK = "SCENESLAM_PROCESS"  # in the environment of all that a module starts
 _END_PATIENCE_S = 1.0  # for a process that hung up, or was hung up on, to be gone
 # The path is set when the interpreter is up: what lies in a user's folder must not shadow its own.
 _MAIN = """
@@ -43,20 +46,21 @@ class Process:
         self._limits = limits
         near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         lifeline, self._lifeline = os.pipe()
+        mark = uuid4().hex
         self._popen = subprocess.Popen(
             [sys.executable, "-P", "-c", _MAIN, str(far.fileno()), str(lifeline), *sys.path],
             # All else about threads is the parent's: with more of BLAS's, sums differ in a bit.
-            env={**os.environ, "OPENCV_FOR_THREADS_NUM": str(limits.threads)},
+            env={**os.environ, "OPENCV_FOR_THREADS_NUM": str(limits.threads), _MARK: mark},
             stdin=subprocess.DEVNULL,
             pass_fds=(far.fileno(), lifeline),
             process_group=0,  # a terminal's Ctrl-C is the parent's to handle
         )
         far.close()
         os.close(lifeline)
-        self._channel = Channel(near)
+        self._channel = Channel(near, os.pidfd_open(self._popen.pid))
         self._number = 0
         self._asked_s = 0.0
-        self._end = finalize(self, _end, self._popen, self._channel, self._lifeline)
+        self._end = finalize(self, _end, self._popen, self._channel, self._lifeline, mark)
 
     @property
     def is_alive(self) -> bool:
@@ -92,6 +96,9 @@ class Process:
                 raise ProcessDeathError(f"did not answer within {deadline_s:g} s") from error
             except EOFError as error:
                 raise self._died() from error
+            except Exception as error:
+                self._end()
+                raise ProcessDeathError(f"answered what is no answer ({told(error)})") from error
             for line in reply.log:
                 logging.getLogger(line.logger).log(line.level, "%s", line.text)
             if reply.number == self._number:
@@ -133,10 +140,14 @@ class _Elsewhere(Exception):  # noqa: N818 - not an error, but where one came fr
         return f"\n{self.args[0]}"
 
 
-def _end(popen: subprocess.Popen[bytes], channel: Channel, lifeline: int) -> None:
+def _end(popen: subprocess.Popen[bytes], channel: Channel, lifeline: int, mark: str) -> None:
     """Kill a process with all that it started, and leave no zombie."""
     with suppress(ProcessLookupError):
         os.killpg(popen.pid, signal.SIGKILL)
     popen.wait()
     channel.close()
     os.close(lifeline)
+    for path in Path("/proc").glob("[0-9]*/environ"):  # what left the group has its mark still
+        with suppress(OSError):
+            if f"{_MARK}={mark}".encode() in path.read_bytes():
+                os.kill(int(path.parent.name), signal.SIGKILL)

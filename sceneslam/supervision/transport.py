@@ -44,10 +44,13 @@ class Channel:
     for as long as one likes. Arrays arrive read-only.
     """
 
-    def __init__(self, line: socket.socket) -> None:
-        self._line = line
+    def __init__(self, line: socket.socket, pidfd: int | None = None) -> None:
+        """Talk over `line`; `pidfd` tells of the other end's death, whoever else has its line."""
+        self._line, self._pidfd = line, pidfd
         self._arrivals = select.poll()
         self._arrivals.register(line, select.POLLIN)
+        if pidfd is not None:
+            self._arrivals.register(pidfd, select.POLLIN)
         self._blocks: list[_Block] = []
         self._free: list[int] = []  # of the blocks
         self._borrowed: dict[int, mmap.mmap] = {}  # the other end's blocks
@@ -110,14 +113,22 @@ class Channel:
             except BlockingIOError:
                 if monotonic_ns() < asleep_ns:
                     os.sched_yield()
-                elif not self._arrivals.poll(None if timeout_s is None else 1000.0 * timeout_s):
-                    raise TimeoutError from None
+                else:
+                    self._sleep(timeout_s)
                 continue
             except ConnectionError as error:
                 raise EOFError from error
             if not packet:
                 raise EOFError
             return packet, extra
+
+    def _sleep(self, timeout_s: float | None) -> None:
+        """Wait for a packet."""
+        arrivals = self._arrivals.poll(None if timeout_s is None else 1000.0 * timeout_s)
+        if not arrivals:
+            raise TimeoutError
+        if all(fd == self._pidfd for fd, _ in arrivals):
+            raise EOFError
 
     def has_message(self) -> bool:
         """Tell whether `receive` would return, or raise, at once."""
@@ -126,6 +137,9 @@ class Channel:
     def close(self) -> None:
         """Hang up; what was received stays readable."""
         self._line.close()
+        pidfd, self._pidfd = self._pidfd, None
+        if pidfd is not None:
+            os.close(pidfd)
         for block in self._blocks:
             self._forget_fd(block)
 

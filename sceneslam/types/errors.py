@@ -28,3 +28,13 @@ class ConfigError(SceneSlamError):
 
 class ModuleError(SceneSlamError):
     """A SLAM module or detector broke its contract and was stopped."""
+
+
+def told(error: BaseException) -> str:
+    """Return what kind of error it is and what it says, on one line where it can say it at all."""
+    kind = type(error).__name__
+    try:
+        said = str(error)
+    except Exception:
+        return kind
+    return f"{kind}: {said}" if said else kind

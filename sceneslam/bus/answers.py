@@ -1,0 +1,128 @@
+"""What a module answers, checked where it enters the bus: each raises TypeError or ValueError."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.maps import GridLayer, LandmarkLayer, MapLayers, PointLayer, PoseGraphLayer
+from sceneslam.types.observation import Tracking, TrackingStatus
+from sceneslam.types.trajectory import Trajectory
+
+_FAR_M = 1e8  # more than twice around the Earth
+_SKEW_MAX = 1e-3  # of R^T R off the identity; the rounding of float32 is a thousandth of that
+_Shapes = dict[str, tuple[str | int, ...]]
+_LAYERS: dict[str, tuple[type, _Shapes]] = {
+    "points": (PointLayer, {"points": ("N", 3), "colors_bgr": ("N", 3)}),
+    "grid": (GridLayer, {"log_odds": ("rows", "columns")}),
+    "pose_graph": (
+        PoseGraphLayer,
+        {
+            "stamps_ns": ("N",),
+            "T_world_base": ("N", 4, 4),
+            "edges": ("M", 2),
+            "T_from_to": ("M", 4, 4),
+            "information": ("M", 6, 6),
+            "is_loop": ("M",),
+        },
+    ),
+    "landmarks": (
+        LandmarkLayer,
+        {"points": ("N", 3), "first_stamps_ns": ("N",), "sightings": ("N",)},
+    ),
+}
+Value = TypeVar("Value")
+
+
+def checked_tracking(tracking: object, stamp_ns: int) -> Tracking:
+    """Return the answer to the observation at `stamp_ns`, its pose a copy of the bus's own."""
+    tracking = _of("track's answer", tracking, Tracking)
+    _of("status", tracking.status, TrackingStatus)
+    _of("revision", tracking.revision, int)
+    if tracking.stamp_ns != stamp_ns:
+        raise ValueError(f"stamp_ns: expected {stamp_ns}, got {tracking.stamp_ns}")
+    if not 0.0 <= tracking.quality_ratio <= 1.0:
+        raise ValueError(f"quality_ratio: expected 0 to 1, got {tracking.quality_ratio}")
+    T_local_base = np.array(tracking.T_local_base, dtype=np.float64)
+    _check_shape("T_local_base", T_local_base, (4, 4))
+    _check_rigid("T_local_base", T_local_base)
+    T_local_base.flags.writeable = False
+    if tracking.covariance is not None:
+        _check_covariance(tracking.covariance)
+    return replace(tracking, T_local_base=T_local_base)
+
+
+def checked_trajectory(trajectory: object) -> Trajectory:
+    """Return a trajectory of poses by rising stamp."""
+    trajectory = _of("get_trajectory's answer", trajectory, Trajectory)
+    stamps_ns = _of("stamps_ns", trajectory.stamps_ns, np.ndarray)
+    if stamps_ns.dtype.kind != "i" or (np.diff(stamps_ns) <= 0).any():
+        raise ValueError(f"stamps_ns: expected rising int64, got {stamps_ns.dtype}: {stamps_ns}")
+    T_world_base = _of("T_world_base", trajectory.T_world_base, np.ndarray)
+    _check_shape("T_world_base", T_world_base, (len(stamps_ns), 4, 4))
+    _check_rigid("T_world_base", T_world_base)
+    return trajectory
+
+
+def checked_layers(layers: object) -> MapLayers:
+    """Return a map whose arrays have the shapes they promise, and hold finite numbers."""
+    layers = _of("get_map's answer", layers, MapLayers)
+    for name, (kind, shapes) in _LAYERS.items():
+        layer = getattr(layers, name)
+        if layer is not None:
+            _check_layer(name, _of(name, layer, kind), shapes)
+    if layers.grid is not None and not layers.grid.resolution_m > 0:
+        raise ValueError(f"grid.resolution_m: expected above 0, got {layers.grid.resolution_m}")
+    return layers
+
+
+def _check_layer(name: str, layer: Any, shapes: _Shapes) -> None:
+    sizes: dict[str, int] = {}
+    for field in fields(layer):
+        value, key = getattr(layer, field.name), f"{name}.{field.name}"
+        if field.name not in shapes:
+            if not np.isfinite(value).all():
+                raise ValueError(f"{key}: expected finite numbers, got {value}")
+        elif value is not None:
+            array = _of(key, value, np.ndarray)
+            if array.ndim == len(shapes[field.name]):
+                for axis, size in zip(shapes[field.name], array.shape, strict=True):
+                    sizes.setdefault(str(axis), size)
+            expected = tuple(a if isinstance(a, int) else sizes.get(a) for a in shapes[field.name])
+            _check_shape(key, array, expected)
+            if not np.isfinite(array).all():
+                raise ValueError(f"{key}: it is not finite")
+
+
+def _of(name: str, value: object, kind: type[Value]) -> Value:
+    if not isinstance(value, kind):
+        raise TypeError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
+    return value
+
+
+def _check_shape(name: str, array: NDArray[Any], expected: tuple[int | None, ...]) -> None:
+    if array.shape != expected:
+        raise ValueError(f"{name}: expected {expected}, got {array.shape}")
+
+
+def _check_rigid(name: str, T_a_b: NDArray[np.float64]) -> None:
+    """Raise ValueError where a (..., 4, 4) array holds anything but rigid transforms."""
+    if not np.isfinite(T_a_b).all():
+        raise ValueError(f"{name}: it is not finite")
+    rotations = T_a_b[..., :3, :3]
+    skew = np.abs(np.swapaxes(rotations, -1, -2) @ rotations - np.eye(3)).max(initial=0.0)
+    if skew > _SKEW_MAX or (np.linalg.det(rotations) < 0).any():
+        raise ValueError(f"{name}: expected a rotation, R^T R is off the identity by {skew:.3g}")
+    far_m = np.abs(T_a_b[..., :3, 3]).max(initial=0.0)
+    if far_m > _FAR_M or (T_a_b[..., 3, :] != (0, 0, 0, 1)).any():
+        raise ValueError(f"{name}: expected a place on Earth and a last row of 0 0 0 1")
+
+
+def _check_covariance(covariance: object) -> None:
+    matrix = _of("covariance", covariance, np.ndarray)
+    _check_shape("covariance", matrix, (6, 6))
+    if not (np.isfinite(matrix).all() and (matrix.diagonal() >= 0).all()):
+        raise ValueError("covariance: expected finite numbers, none below 0 on the diagonal")

@@ -1,0 +1,201 @@
+"""Components that break every promise they can: the run goes on, and says what was wrong."""
+
+import os
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import hostile
+import numpy as np
+import pytest
+from driving import assert_exact, dark_from, drive, events
+from fakes import ExactModule
+from isolation import isolating
+from test_app import config
+from test_isolation import active, drive_into, seen
+
+from sceneslam.app import run
+from sceneslam.types.errors import InputError, ModuleError
+
+ERRORS = sorted(hostile.ERRORS.keys() - {"KeyboardInterrupt"})  # that one ends the run
+SOUND = {"covariance huge"}  # it may be so
+
+
+@pytest.fixture
+def isolated():
+    with isolating() as isolated:
+        yield isolated
+
+
+def survives(module):
+    """Drive with a module that fails at some time; return what the log says of it."""
+    modules = {"bright": module, "dark": ExactModule()}
+    _, atlas, log, _ = drive(modules, steps=60, scene_at=dark_from(40), handover="rewind")
+    assert len(atlas.online) == 60
+    assert_exact(atlas)
+    return [event["what"] for event in events(log, "fault")]
+
+
+@pytest.mark.parametrize("answer", hostile.ANSWERS)
+def test_an_answer_that_is_none_costs_no_pose(answer):
+    assert bool(survives(hostile.Answers(answer))) is (answer not in SOUND)
+
+
+@pytest.mark.parametrize("error", ERRORS)
+@pytest.mark.parametrize("method", ["activate", "set_pose", "set_scene", "track"])
+def test_whatever_a_module_raises_costs_no_pose(error, method):
+    (what,) = survives(hostile.Throws(error, method))
+    assert what.startswith("slam.bright ")
+
+
+@pytest.mark.parametrize("error", ERRORS)
+@pytest.mark.parametrize("method", ["get_pose", "get_trajectory", "get_map", "shutdown"])
+def test_whatever_a_module_raises_when_it_leaves_costs_no_pose(error, method, caplog):
+    assert survives(hostile.Throws(error, method)) == []
+    assert ("slam.bright could not" in caplog.text) is (method != "get_pose")
+
+
+@pytest.mark.parametrize("layers", hostile.MAPS)
+def test_a_map_that_is_none_is_left_out(layers, caplog):
+    assert survives(hostile.Leaves(layers=layers)) == []
+    is_sound = layers == "a cloud beyond all measure"
+    assert ("slam.bright could not give its map" in caplog.text) is not is_sound
+
+
+@pytest.mark.parametrize("trajectory", hostile.TRAJECTORIES)
+def test_a_trajectory_that_is_none_is_left_out(trajectory, caplog):
+    assert survives(hostile.Leaves(trajectory=trajectory)) == []
+    is_sound = trajectory == "stamps of another time"
+    assert ("slam.bright could not give its trajectory" in caplog.text) is not is_sound
+
+
+@pytest.mark.parametrize(
+    ("how", "what"),
+    [
+        ("throws", "RuntimeError: out of memory"),
+        ("none", "get_scene returned NoneType, expected SceneVote"),
+        ("a text", "get_scene returned str, expected SceneVote"),
+        ("an unknown scene", "scene: got 'Fog', expected Bright, Dark or Unsure"),
+        ("leaves", "SystemExit: 3"),
+    ],
+)
+def test_a_detector_that_fails_is_stopped_and_its_last_scene_stays(tmp_path, how, what):
+    detector = {"_target_": "hostile.Votes", "how": how}
+    finished = run(hostile_config(detector=detector), tmp_path)
+    assert finished.faults == () and len(finished.trajectory) == 100
+    assert what in (tmp_path / "events.jsonl").read_text()
+
+
+@pytest.mark.parametrize(
+    ("how", "poses", "what"),
+    [
+        ("throw", 50, "unexpected ValueError: the driver crashed; saved so far"),
+        ("leave", 50, "unexpected SystemExit: 3; saved so far"),
+        ("nothing", 50, "observation left out, it has no stamp in nanoseconds: 50 times"),
+        ("stamp_is_huge", 50, "observation left out, it has no stamp in nanoseconds: 50 times"),
+        ("stamp_jumps_years", 100, "no observation for 315360000.1 s"),
+        ("stamp_jumps_back_years", 50, "observation left out, its stamp repeats, runs backwards"),
+        ("image_grows", 100, ""),
+        ("image_is_grey", 100, ""),
+        ("image_is_float", 100, ""),
+        ("odometry_is_sheared", 100, ""),
+        ("odometry_is_far", 100, ""),
+        ("odometry_is_infinite", 100, "odometry that is not finite: 50 times"),
+    ],
+)
+def test_a_source_that_talks_nonsense_ends_what_it_spoils_and_no_more(tmp_path, how, poses, what):
+    source = {"_target_": "hostile.BreaksOff", "how": how}
+    finished = run(hostile_config(source=source), tmp_path)
+    assert len(finished.trajectory) == poses
+    assert np.isfinite(finished.trajectory.T_world_base).all()
+    assert any(what in fault for fault in finished.faults) or not what
+
+
+def test_a_sink_that_cannot_be_opened_is_named_before_the_first_frame(tmp_path):
+    sinks = {"tape": {"_target_": "hostile.Fails", "method": "open"}}
+    with pytest.raises(InputError, match=r"sinks\.tape could not be opened: Exception: as usual"):
+        run(hostile_config(sinks=sinks), tmp_path)
+
+
+@pytest.mark.parametrize("method", ["write", "write_event", "write_truth", "close"])
+def test_a_sink_that_fails_is_dropped(tmp_path, method):
+    sinks = {"tape": {"_target_": "hostile.Fails", "method": method}}
+    finished = run(hostile_config(sinks=sinks), tmp_path)
+    assert finished.faults == ("sinks.tape stopped writing: Exception: as usual",)
+    assert len(finished.trajectory) == 100
+
+
+def hostile_config(**changes):
+    allowed = ["fakes", "hostile"]
+    return config(allow_targets=allowed, run__report=False, **changes)
+
+
+@pytest.mark.parametrize(
+    ("how", "what"),
+    [
+        ("die", "ended by itself with exit code 0"),
+        ("wait_for_a_thread", "did not answer within 0.5 s"),
+        ("stop", "did not answer within 0.5 s"),
+        ("close_descriptors", "ended by itself with exit code 1"),
+        ("babble", "answered what is no answer"),
+        ("fork_and_die", "ended by itself with exit code 1"),
+        ("signal_its_group", "was killed by signal 15"),
+    ],
+)
+def test_a_process_that_is_wrecked_is_named_and_survived(isolated, how, what):
+    module = active(isolated(Wrecked(how), step_deadline_s=0.5))
+    with pytest.raises(ModuleError, match=what):
+        drive_into(module)
+    assert active(module).track(seen(0)).T_local_base.shape == (4, 4)
+
+
+class Wrecked:
+    """Makes a module that harms its process at the third observation."""
+
+    def __init__(self, how):
+        self.how = how
+
+    def __call__(self):
+        return hostile.Wrecks(self.how, at=3)
+
+
+@pytest.mark.parametrize(
+    "how", ["use_up_descriptors", "log_megabytes", "ignore_signals", "start_a_thread_that_stays"]
+)
+def test_a_process_that_harms_itself_alone_goes_or_is_ended(isolated, how):
+    module = active(isolated(Wrecked(how)))
+    try:
+        drive_into(module)
+    except OSError as error:
+        assert "Too many open files" in str(error)
+    module.close()
+
+
+def test_what_a_module_does_to_its_surroundings_stays_in_its_process(isolated):
+    before = Path.cwd(), dict(os.environ)
+    drive_into(active(isolated(Wrecked("move"))))
+    assert (Path.cwd(), dict(os.environ)) == before
+
+
+@pytest.mark.parametrize("how", ["fork", "start_a_daemon"])
+def test_processes_that_a_module_starts_end_with_it(isolated, how, monkeypatch):
+    monkeypatch.setenv("HOSTILE", f"{how} of {os.getpid()}")
+    module = active(isolated(Wrecked(how)))
+    drive_into(module)
+    assert len(marked()) == 2
+    module.close()
+    deadline_s = time.monotonic() + 10.0
+    while marked() and time.monotonic() < deadline_s:
+        pass
+    assert marked() == []
+
+
+def marked():
+    """Return the processes that were started with this one's HOSTILE in their environment."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            state = (path / "stat").read_text().rpartition(") ")[2][0]
+            is_ours = os.environ["HOSTILE"] in (path / "environ").read_text(errors="replace")
+            found += [path.name] if is_ours and state not in "ZX" else []
+    return found
