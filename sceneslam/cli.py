@@ -6,6 +6,7 @@ saved; 2 nothing was run because the configuration or the input cannot be used.
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,8 +14,10 @@ from typing import Any, cast
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from sceneslam.app import Finished, run
 from sceneslam.config.resolve import resolved
@@ -49,8 +52,12 @@ def main() -> None:
     def job(config: DictConfig) -> None:
         codes.append(carry_out(config).code)
 
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises then, and does not exit
     try:
         job()
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        codes.append(UNUSABLE)
     except KeyboardInterrupt:  # ends a sweep as well
         codes.append(INCOMPLETE)
     sys.exit(max(codes, default=OK))

@@ -1,60 +1,106 @@
-"""The guides work as they are written."""
+"""Every command of the documentation runs as it is written, every file it shows is used."""
 
-import os
+import json
 import re
-import shlex
+import shutil
 import subprocess
 import sys
-from pathlib import Path
+import tomllib
 
 import pytest
-from scenery import RIG, room_observation
+from documentation import (
+    OBSERVATIONS,
+    PAGES,
+    ROOT,
+    commands,
+    run,
+    run_inside,
+    write_files,
+    write_recordings,
+)
 
-from sceneslam.ros.writer import ObservationWriter
+NOT_RUN = {  # first words -> why it is not run here
+    "make": "runs these tests, or the run that stands beside it in the README",
+    ".": "makes the environment that the tests run in",
+    "pip install": "needs a network; what it installs is held against pyproject.toml",
+    "rerun": "opens a window; the recording is read by tests of the sink",
+    "mkdocs serve": "serves until it is stopped; the site is built by a test",
+    "python experiments/": "takes minutes; its numbers stand beside it, a test finds the program",
+}
+ALL = [(page, command) for page in PAGES for command in commands(page)]
+RUN = [(page, command) for page, command in ALL if not command.startswith(tuple(NOT_RUN))]
 
-GUIDE = Path(__file__).parents[1] / "docs" / "own_module.md"
 
-
-def block(language):
-    return re.search(rf"```{language}\n(.*?)```", GUIDE.read_text(), re.S).group(1)
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("recordings")
+    write_recordings(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert run_inside("python -m sceneslam +scenario=bright_to_dark hydra.run.dir=run") == 0
+    for name in ("ESTIMATE", "TRUTH"):
+        shutil.copy(folder / "run" / "trajectory.tum", folder / f"{name}.tum")
+    return folder
 
 
 @pytest.fixture
-def workshop(tmp_path):
-    """Give a folder that holds what the guide's reader wrote, and a recording."""
-    (tmp_path / "my_slam.py").write_text(block("python"))
-    (tmp_path / "my_conf" / "slam").mkdir(parents=True)
-    (tmp_path / "my_conf" / "slam" / "mine.yaml").write_text(block("yaml"))
-    writer = ObservationWriter(tmp_path / "room.mcap", rig=RIG, image_format="png")
-    for index in range(12):
-        writer.write(room_observation(index))
-    writer.close()
+def workshop(tmp_path, recordings):
+    for path in recordings.iterdir():
+        (tmp_path / path.name).symlink_to(path)
     return tmp_path
 
 
-def test_guide_keeps_its_promise_of_40_lines():
-    assert len([line for line in block("python").splitlines() if line.strip()]) <= 40
+@pytest.mark.parametrize(("page", "command"), RUN, ids=[f"{p.stem}: {c}" for p, c in RUN])
+def test_command_runs(workshop, monkeypatch, capfd, page, command):
+    write_files(page, workshop)
+    monkeypatch.chdir(workshop)
+    if any(workshop.glob("*.py")):  # the reader's own code is found in the current folder
+        done = run(command, workshop)
+        code, said, errors = done.returncode, done.stdout, done.stderr
+    else:
+        code = run_inside(command)
+        said, errors = capfd.readouterr()
+    assert code == 0, errors
+    if re.search(r"-m sceneslam (?!-m|--help|.*--cfg)", command):
+        assert f"{OBSERVATIONS} poses (coverage 100.0 %)" in said
 
 
-@pytest.mark.parametrize("command", block("sh").strip().splitlines())
-def test_command_of_the_guide_runs_the_module(workshop, command):
-    words = shlex.split(command)
-    assert words[0] == "python"
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    done = subprocess.run(
-        [
-            sys.executable,
-            *words[1:],
-            "source=mcap",
-            "source.path=room.mcap",
-            "hydra.run.dir=out",
-            "run.progress=false",
-        ],
-        cwd=workshop,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+@pytest.mark.parametrize("command", [c for _, c in ALL if c.startswith("python experiments/")])
+def test_program_that_takes_minutes_is_there(command):
+    assert (ROOT / command.split()[1]).is_file()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_installed_extras_exist(page):
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for extras in re.findall(r"pip install [^\n`]*\[([\w,]+)\]", page.read_text()):
+        assert set(extras.split(",")) <= set(project["optional-dependencies"])
+
+
+def test_guide_keeps_its_promise_of_40_lines(tmp_path):
+    write_files(ROOT / "docs" / "own_module.md", tmp_path)
+    lines = (tmp_path / "my_slam.py").read_text().splitlines()
+    assert len([line for line in lines if line.strip()]) <= 40
+
+
+def test_site_builds_without_a_warning(tmp_path):
+    pytest.importorskip("mkdocs", reason="the extra `docs` is not installed")
+    pytest.importorskip("material", reason="the extra `docs` is not installed")
+    build = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "-q",
+        "--strict",
+        "-d",
+        str(tmp_path / "site"),
+    ]
+    done = subprocess.run(build, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    assert "12 poses (coverage 100.0 %)" in done.stdout
+    found = json.loads((tmp_path / "site" / "search" / "search_index.json").read_text())
+    titles = {entry["title"] for entry in found["docs"]}
+    assert {"Your own recording in ten minutes", "detector", "Frames and maps"} <= titles
+    fetched = r'<(?:script|link|img)[^>]*(?:src|href)="?(?:https?:)?//'
+    for page in (tmp_path / "site").rglob("*.html"):
+        assert not re.search(fetched, page.read_text()), page
