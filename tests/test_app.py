@@ -16,6 +16,7 @@ CONFIG = {
         "_target_": "sceneslam.modules.detectors.grey_mean.GreyMean",
         "scenes": ["Bright", "Dark"],
         "threshold": 100.0,
+        "hysteresis": 0.0,
     },
     "slam": {
         "bright": {"_target_": "fakes.ExactModule"},

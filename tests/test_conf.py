@@ -99,7 +99,7 @@ ALLOWED = {  # package -> what of ours it may import
     "experiments/openloris": {"types", "evaluation", "experiments"},
     "experiments/handover": {"types", "evaluation", "experiments"},
     "experiments/mutants": {"types", "ros", "config", "experiments"},
-    "experiments/matrix": {"types", "evaluation", "bus", "experiments"},
+    "experiments/matrix": {"types", "evaluation", "bus", "modules", "experiments"},
     "experiments/paper": {"types", "interfaces", "evaluation", "config", "experiments"},
     "experiments/table": {"types", "evaluation", "experiments"},
     "experiments/tune": {"types", "evaluation", "experiments"},

@@ -39,7 +39,7 @@ def test_mean_of_a_view_is_that_of_its_copy():
 
 @pytest.mark.parametrize(("grey", "scene"), [(101, "Bright"), (100, "Dark"), (99, "Dark")])
 def test_bright_is_above_the_threshold(grey, scene):
-    detector = GreyMean(threshold=100.0, scenes=NAMES)
+    detector = GreyMean(threshold=100.0, hysteresis=0.0, scenes=NAMES)
     detector.activate(RIG)
     vote = detector.get_scene(Observation(stamp_ns=5, image_bgr=image_of(grey)))
     assert (vote.scene, vote.stamp_ns) == (scene, 5)
@@ -47,19 +47,38 @@ def test_bright_is_above_the_threshold(grey, scene):
 
 
 def test_no_image_is_an_unsure_vote():
-    vote = GreyMean(threshold=100.0, scenes=NAMES).get_scene(Observation(stamp_ns=5))
+    vote = GreyMean(threshold=100.0, hysteresis=0.0, scenes=NAMES).get_scene(
+        Observation(stamp_ns=5)
+    )
     assert vote.scene == UNSURE
 
 
 @pytest.mark.parametrize("threshold", [-1.0, 256.0, float("nan")])
 def test_threshold_out_of_range_is_refused(threshold):
     with pytest.raises(ConfigError) as caught:
-        GreyMean(threshold=threshold, scenes=NAMES)
+        GreyMean(threshold=threshold, hysteresis=0.0, scenes=NAMES)
     assert caught.value.key == "threshold"
 
 
+def test_hysteresis_leaves_a_scene_only_far_beyond_the_threshold():
+    detector = GreyMean(threshold=100.0, hysteresis=10.0, scenes=NAMES)
+    greys = [101, 95, 91, 90, 105, 110, 111, 99, 90]
+    expected = ["Bright"] * 3 + ["Dark"] * 3 + ["Bright"] * 2 + ["Dark"]
+    for _ in range(2):  # activation starts anew
+        detector.activate(RIG)
+        observations = [Observation(stamp_ns=0, image_bgr=image_of(grey)) for grey in greys]
+        assert [detector.get_scene(one).scene for one in observations] == expected
+
+
+@pytest.mark.parametrize("hysteresis", [-1.0, 101.0, float("nan")])
+def test_hysteresis_that_never_lets_a_scene_go_is_refused(hysteresis):
+    with pytest.raises(ConfigError) as caught:
+        GreyMean(threshold=100.0, hysteresis=hysteresis, scenes=NAMES)
+    assert caught.value.key == "hysteresis"
+
+
 def test_scenes_have_the_names_that_they_are_given():
-    detector = GreyMean(threshold=100.0, scenes=["Hall", "Tunnel"])
+    detector = GreyMean(threshold=100.0, hysteresis=0.0, scenes=["Hall", "Tunnel"])
     bright, dark = (Observation(stamp_ns=0, image_bgr=image_of(grey)) for grey in (200, 20))
     assert [detector.get_scene(bright).scene, detector.get_scene(dark).scene] == ["Hall", "Tunnel"]
 
@@ -67,7 +86,7 @@ def test_scenes_have_the_names_that_they_are_given():
 @pytest.mark.parametrize("names", [["Hall"], ["Hall", "Hall"], ["Hall", UNSURE], ["a", "b", "c"]])
 def test_scenes_are_two_different_names(names):
     with pytest.raises(ConfigError) as caught:
-        GreyMean(threshold=100.0, scenes=names)
+        GreyMean(threshold=100.0, hysteresis=0.0, scenes=names)
     assert caught.value.key == "scenes"
 
 

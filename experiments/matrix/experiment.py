@@ -13,7 +13,7 @@ import numpy as np
 from sceneslam.experiments.matrix.cell import Cell, Strategy, judge, mean
 from sceneslam.experiments.matrix.figure import draw_errors, draw_sweep
 from sceneslam.experiments.matrix.oracle import best_of
-from sceneslam.experiments.matrix.sweep import sweep
+from sceneslam.experiments.matrix.sweep import Grid, sweep
 from sceneslam.types.experiment import Figure, Outcome, Relation, RunTrials, Table, Trial, Verdict
 from sceneslam.types.trajectory import Trajectory
 
@@ -33,6 +33,7 @@ class MatrixExperiment:
         judged: str,
         regret_limit: float,
         thresholds: Sequence[float],
+        hystereses: Sequence[float],
         windows_s: Sequence[float],
     ) -> None:
         self._places = [(story, seed) for story in stories for seed in seeds]
@@ -42,7 +43,7 @@ class MatrixExperiment:
             *(Strategy(name=kind, handover=kind) for kind in handovers),
         ]
         self._judged, self._regret_limit = judged, regret_limit
-        self._thresholds, self._windows_s = thresholds, windows_s
+        self._grid = Grid(thresholds=thresholds, hystereses=hystereses, windows_s=windows_s)
 
     def run(self, run_trials: RunTrials, folder: Path) -> Verdict:
         """Run every cell; return the table over stories and what holds of `rewind`."""
@@ -59,8 +60,7 @@ class MatrixExperiment:
             cells.append(self._oracle(story, seed, group))
         means = mean(cells)
         draw_errors(folder / "errors.png", means)
-        sweeps = sweep(outcomes, self._thresholds, self._windows_s)
-        draw_sweep(folder / "sweep.png", sweeps)
+        draw_sweep(folder / "sweep.png", sweep(outcomes, self._grid))
         return Verdict(figures=list(self._figures(means)), table=_table(means))
 
     def _oracle(self, story: str, seed: int, group: Sequence[Outcome]) -> Cell:

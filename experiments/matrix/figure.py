@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,24 +34,31 @@ def draw_errors(path: Path, means: Sequence[Cell]) -> None:
 
 
 def draw_sweep(path: Path, settings: Sequence[Setting]) -> None:
-    """Write a PNG: one map per story of how many changes threshold and window confirm."""
+    """Write a PNG: how many changes are confirmed, a map per story and hysteresis."""
     stories = list(dict.fromkeys(one.story for one in settings))
+    hystereses = list(dict.fromkeys(one.hysteresis for one in settings))
+    maps = [(story, hysteresis) for story in stories for hysteresis in hystereses]
+    columns = 2 * len(hystereses)
+    rows = -(-len(maps) // columns)
+    figure = look.new_figure(height_in=2.0 * rows + 0.5)
+    for number, (story, hysteresis) in enumerate(maps):
+        axes = figure.add_subplot(rows, columns, number + 1)
+        axes.set_title(f"{story}, {hysteresis:g}", fontsize=8)
+        chosen = [s for s in settings if (s.story, s.hysteresis) == (story, hysteresis)]
+        _draw_map(axes, chosen, most=max(s.changes for s in settings if s.story == story))
+    figure.supxlabel("window [s]", fontsize=11)
+    figure.supylabel("threshold (beside the story: hysteresis)", fontsize=11)
+    look.save(figure, path)
+
+
+def _draw_map(axes: Any, settings: Sequence[Setting], *, most: float) -> None:
     thresholds = sorted({one.threshold for one in settings})
     windows_s = sorted({one.window_s for one in settings})
-    columns = 2
-    rows = -(-len(stories) // columns)
-    figure = look.new_figure(height_in=2.4 * rows)
-    for number, story in enumerate(stories):
-        axes = figure.add_subplot(rows, columns, number + 1)
-        of = {(s.threshold, s.window_s): s.changes for s in settings if s.story == story}
-        counts = np.array([[of[t, w] for w in windows_s] for t in thresholds])
-        axes.imshow(counts, cmap="cividis", aspect="auto", origin="lower", vmin=0)
-        for (row, column), count in np.ndenumerate(counts):
-            color = "white" if count < counts.max() / 2 or not counts.max() else "black"
-            axes.text(column, row, f"{count:g}", ha="center", va="center", color=color, fontsize=8)
-        axes.set_xticks(range(len(windows_s)), [f"{w:g}" for w in windows_s], fontsize=8)
-        axes.set_yticks(range(len(thresholds)), [f"{t:g}" for t in thresholds], fontsize=8)
-        axes.set_title(story, fontsize=10)
-    figure.supxlabel("window [s]", fontsize=11)
-    figure.supylabel("threshold", fontsize=11)
-    look.save(figure, path)
+    of = {(one.threshold, one.window_s): one.changes for one in settings}
+    counts = np.array([[of[t, w] for w in windows_s] for t in thresholds])
+    axes.imshow(counts, cmap="cividis", aspect="auto", origin="lower", vmin=0, vmax=max(most, 1))
+    for (row, column), count in np.ndenumerate(counts):
+        color = "white" if count < max(most, 1) / 2 else "black"
+        axes.text(column, row, f"{count:g}", ha="center", va="center", color=color, fontsize=7)
+    axes.set_xticks(range(len(windows_s)), [f"{w:g}" for w in windows_s], fontsize=6)
+    axes.set_yticks(range(len(thresholds)), [f"{t:g}" for t in thresholds], fontsize=6)

@@ -1,61 +1,74 @@
-"""Threshold against window: false confirmations and delay, from the votes' values alone."""
+"""Threshold, hysteresis and window: which changes they confirm, from the votes' values alone."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.bus.scene_filter import SceneFilter
+from sceneslam.modules.detectors.grey_mean import GreyMean
 from sceneslam.types.experiment import Outcome
-from sceneslam.types.observation import UNSURE, SceneVote
+
+Votes = Sequence[tuple[int, NDArray[np.float64] | None]]  # stamp [ns], mean of grey
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
-    """What a threshold and a window confirm, on average over the runs of a story."""
+    """What a setting confirms, on average over the runs of a story."""
 
     story: str
     threshold: float
+    hysteresis: float
     window_s: float
     changes: float  # scenes confirmed after the first
 
 
-def sweep(
-    outcomes: Sequence[Outcome], thresholds: Sequence[float], windows_s: Sequence[float]
-) -> list[Setting]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Grid:
+    """The settings that are tried, each with each."""
+
+    thresholds: Sequence[float]
+    hystereses: Sequence[float]
+    windows_s: Sequence[float]
+
+
+def sweep(outcomes: Sequence[Outcome], grid: Grid) -> list[Setting]:
     """Return the confirmed changes per story, each story's votes read once per seed."""
-    votes: dict[str, dict[str, list[tuple[int, float]]]] = {}
+    votes: dict[str, dict[str, Votes]] = {}
     for outcome in outcomes:
         story, _, seed = outcome.trial.name.split("/")
         if seed not in votes.setdefault(story, {}):
-            votes[story][seed] = _values(outcome)
+            votes[story][seed] = _read(outcome)
+    settings = product(grid.thresholds, grid.hystereses, grid.windows_s)
     return [
         Setting(
             story=story,
             threshold=threshold,
+            hysteresis=hysteresis,
             window_s=window_s,
-            changes=float(np.mean([_changes(one, threshold, window_s) for one in runs.values()])),
+            changes=float(
+                np.mean([_changes(one, threshold, hysteresis, window_s) for one in runs.values()])
+            ),
         )
+        for threshold, hysteresis, window_s in settings
         for story, runs in votes.items()
-        for threshold in thresholds
-        for window_s in windows_s
     ]
 
 
-def _values(outcome: Outcome) -> list[tuple[int, float]]:
+def _read(outcome: Outcome) -> Votes:
     with (outcome.folder / "events.jsonl").open() as file:
         events = [json.loads(line) for line in file if '"event": "vote"' in line]
     values = [(event["stamp_ns"], event["value"]) for event in events]
-    return [(stamp_ns, float("nan") if value is None else value) for stamp_ns, value in values]
+    return [(at, None if value is None else np.array([value])) for at, value in values]
 
 
-def _changes(votes: Sequence[tuple[int, float]], threshold: float, window_s: float) -> int:
+def _changes(votes: Votes, threshold: float, hysteresis: float, window_s: float) -> int:
+    detector = GreyMean(threshold=threshold, hysteresis=hysteresis, scenes=("Bright", "Dark"))
     scenes = SceneFilter(window_s=window_s, first_window_s=0.0)
-    confirmed = 0
-    for stamp_ns, value in votes:
-        scene = UNSURE if np.isnan(value) else "Bright" if value > threshold else "Dark"
-        confirmed += scenes.update(SceneVote(stamp_ns=stamp_ns, scene=scene)) is not None
-    return confirmed - 1
+    confirmed = [scenes.update(detector.decide(*vote)) for vote in votes]
+    return sum(one is not None for one in confirmed) - 1

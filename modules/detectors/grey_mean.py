@@ -16,24 +16,31 @@ from sceneslam.types.rig import Rig, Sensor
 class GreyMean:
     """Votes the first scene where the mean of S = .299 R + .587 G + .114 B is above the threshold.
 
-    Else it votes the second; the paper calls them Bright and Dark.
+    Else it votes the second; the paper calls them Bright and Dark. With hysteresis there are two
+    thresholds: what was voted last is left only where the mean is as far beyond the threshold, so
+    that light that is about as bright as the threshold, and its noise, changes nothing.
     """
 
     quantity = "mean of grey"
     requires = (frozenset({Sensor.IMAGE}),)
     feature_settings: tuple[str, ...] = ()
 
-    def __init__(self, threshold: float, scenes: Sequence[str]) -> None:
+    def __init__(self, threshold: float, hysteresis: float, scenes: Sequence[str]) -> None:
         if not 0 <= threshold <= 255:
             raise ConfigError("threshold", threshold, "a grey value from 0 to 255")
+        limit = min(threshold, 255 - threshold)  # beyond it one scene could never be left
+        if not 0 <= hysteresis <= limit:
+            raise ConfigError("hysteresis", hysteresis, f"grey values from 0 to {limit:g}")
         if len(scenes) != 2 or scenes[0] == scenes[1] or UNSURE in scenes:
             allowed = f"two names, of above and below the threshold, other than {UNSURE}"
             raise ConfigError("scenes", list(scenes), allowed)
-        self._threshold = threshold
+        self._threshold, self._hysteresis = threshold, hysteresis
+        self._voted: str | None = None
         self.scenes = (scenes[0], scenes[1])
 
     def activate(self, rig: Rig) -> None:
-        """Do nothing: the detector has no state."""
+        """Forget the last vote."""
+        self._voted = None
 
     def get_scene(self, observation: Observation) -> SceneVote:
         """Return the scene with the mean of grey, UNSURE without an image."""
@@ -46,11 +53,13 @@ class GreyMean:
         return np.array([grey_mean(observation.image_bgr)])
 
     def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
-        """Return on which side of the threshold the mean is."""
+        """Return on which side of the threshold the mean is, far enough from it."""
         if features is None:
             return SceneVote(stamp_ns=stamp_ns, scene=UNSURE)
         mean = float(features[0])
-        scene = self.scenes[0 if mean > self._threshold else 1]
+        towards = {None: 0.0, self.scenes[0]: -1.0, self.scenes[1]: 1.0}[self._voted]
+        scene = self.scenes[0 if mean > self._threshold + towards * self._hysteresis else 1]
+        self._voted = scene
         return SceneVote(stamp_ns=stamp_ns, scene=scene, value=mean)
 
     def shutdown(self) -> None:
