@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from rgbd_features import features_at, random_descriptors
 
+from sceneslam.modules.slam.rgbd.alignment import Alignment
 from sceneslam.modules.slam.rgbd.bundle import Bundle, adjust
 from sceneslam.modules.slam.rgbd.fusion import join_duplicates
 from sceneslam.modules.slam.rgbd.keyframes import NO_LANDMARK, DepthView, Keyframe
 from sceneslam.modules.slam.rgbd.local_mapping import LocalMapping
 from sceneslam.modules.slam.rgbd.residuals import Sightings, errors
+from sceneslam.modules.slam.rgbd.ties import Tie
 from sceneslam.modules.slam.rgbd.visual_map import VisualMap
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
@@ -49,6 +51,7 @@ def exact_bundle(rng, *, has_depth=True):
             depth_m=depth_m if has_depth else np.zeros(count),
             inverse_depth_sigma_per_m=np.full(count, 0.003),
         ),
+        ties={},
     )
 
 
@@ -68,6 +71,18 @@ def test_disturbed_bundle_is_put_right_and_its_held_keyframe_stays():
     assert (adjusted.bundle.T_local_cam[0] == exact.T_local_cam[0]).all()
     assert adjusted.bundle.T_local_cam == pytest.approx(exact.T_local_cam, abs=1e-3)
     assert adjusted.bundle.points_local == pytest.approx(exact.points_local, abs=5e-3)
+
+
+def test_tie_pulls_a_keyframe_that_hardly_anything_else_holds():
+    rng = np.random.default_rng(6)
+    exact = exact_bundle(rng)
+    vague = replace(exact.seen, sigma_px=np.full(len(exact.keyframe_rows), 50.0))
+    off = se3.exp(np.array([0.02, -0.01, 0.01, 0.01, 0.0, -0.01]))
+    T_tied = se3.inverse(exact.T_local_cam[0]) @ exact.T_local_cam[4] @ off
+    tie = Tie(T_one_other=T_tied, root=1e4 * np.eye(6))
+    adjusted = adjust(CAMERA, replace(exact, seen=vague, ties={(0, 4): tie}))
+    T_found = se3.inverse(adjusted.bundle.T_local_cam[0]) @ adjusted.bundle.T_local_cam[4]
+    assert pytest.approx(T_tied, abs=1e-3) == T_found
 
 
 def test_wrong_sightings_are_named_and_do_no_harm():
@@ -121,7 +136,12 @@ def mapped(rng, *, is_matched):
     points = rng.uniform([-0.6, -0.4, 1.5], [0.6, 0.4, 3.0], (LANDMARKS, 3))
     descriptors = random_descriptors(rng, LANDMARKS)
     visual_map = VisualMap(
-        CAMERA, sigma_px=1.0, inverse_depth_sigma_per_m=0.003, keyframe_limit=9, landmark_limit=9999
+        CAMERA,
+        CAMERA,
+        sigma_px=1.0,
+        inverse_depth_sigma_per_m=0.003,
+        keyframe_limit=9,
+        landmark_limit=9999,
     )
     for T_local_cam in true_poses():
         ids = np.full(LANDMARKS, NO_LANDMARK)
@@ -147,7 +167,7 @@ def test_merge_comes_at_a_fixed_image_and_moves_what_is_newer_along():
     T_true = visual_map.keyframes[4].T_local_base
     slip = se3.exp(np.array([0.03, 0, 0, 0, 0, 0]))
     visual_map.keyframes[4].T_local_base = slip @ T_true
-    mapping = LocalMapping(CAMERA, visual_map, every_images=3)
+    mapping = LocalMapping(CAMERA, visual_map, alignment=Alignment(), every_images=3)
     moved = [mapping.step() for _ in range(5)]
     assert (np.stack(moved) == np.eye(4)).all()
     newer = keyframe_at(
@@ -169,7 +189,7 @@ def test_merge_comes_at_a_fixed_image_and_moves_what_is_newer_along():
 
 def test_map_that_was_corrected_meanwhile_stays_as_it_is():
     visual_map, _ = mapped(np.random.default_rng(5), is_matched=True)
-    mapping = LocalMapping(CAMERA, visual_map, every_images=2)
+    mapping = LocalMapping(CAMERA, visual_map, alignment=Alignment(), every_images=2)
     for _ in range(2):
         mapping.step()
     corrected = se3.from_xy_yaw(1.0, 0.0, 0.1)

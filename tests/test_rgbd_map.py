@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from rgbd_features import features_at, random_descriptors
 
+from sceneslam.modules.slam.rgbd.alignment import Alignment
 from sceneslam.modules.slam.rgbd.features import FeatureExtractor
 from sceneslam.modules.slam.rgbd.keyframes import DepthView, Keyframe, KeyframeStore
 from sceneslam.modules.slam.rgbd.landmarks import LandmarkTable, Looks
@@ -74,6 +75,7 @@ def test_covisible_keyframes_are_ranked_by_shared_landmarks():
 def test_map_stays_within_its_limits_and_forgets_only_redundant_keyframes():
     visual_map = VisualMap(
         CAMERA,
+        CAMERA,
         sigma_px=1.0,
         inverse_depth_sigma_per_m=0.003,
         keyframe_limit=10,
@@ -91,7 +93,12 @@ def test_map_stays_within_its_limits_and_forgets_only_redundant_keyframes():
 
 def test_corrected_keyframes_take_along_the_landmarks_that_they_saw_first():
     visual_map = VisualMap(
-        CAMERA, sigma_px=1.0, inverse_depth_sigma_per_m=0.003, keyframe_limit=9, landmark_limit=9999
+        CAMERA,
+        CAMERA,
+        sigma_px=1.0,
+        inverse_depth_sigma_per_m=0.003,
+        keyframe_limit=9,
+        landmark_limit=9999,
     )
     first, second = keyframe_at(0.5), keyframe_at(1.5)
     visual_map.insert(first, deep_rows=np.zeros(0, np.int64))
@@ -113,7 +120,12 @@ def test_corrected_keyframes_take_along_the_landmarks_that_they_saw_first():
 
 def test_landmarks_are_predicted_where_they_were_seen():
     visual_map = VisualMap(
-        CAMERA, sigma_px=1.0, inverse_depth_sigma_per_m=0.003, keyframe_limit=9, landmark_limit=9999
+        CAMERA,
+        CAMERA,
+        sigma_px=1.0,
+        inverse_depth_sigma_per_m=0.003,
+        keyframe_limit=9,
+        landmark_limit=9999,
     )
     keyframe = keyframe_at(0.5)
     visual_map.insert(keyframe, deep_rows=np.zeros(0, np.int64))
@@ -163,7 +175,9 @@ def patchwork(rng, fine_px=24, coarse_px=48):
 
 def test_features_cover_more_of_the_image_than_the_strongest_corners():
     gray = patchwork(np.random.default_rng(0))
-    extractor = FeatureExtractor(CAMERA, count=500, fast_threshold_min=7, fast_noise_ratio=4.0)
+    extractor = FeatureExtractor(
+        CAMERA, Alignment(), count=500, fast_threshold_min=7, fast_noise_ratio=4.0
+    )
     spread = extractor.extract(gray, None).uv_px
     strongest = cv2.KeyPoint.convert(cv2.ORB.create(nfeatures=500).detect(gray, None))
     assert len(spread) == 500
@@ -176,14 +190,18 @@ def cells_covered(uv_px):
 
 def test_noise_and_black_give_few_features():
     rng = np.random.default_rng(0)
-    extractor = FeatureExtractor(CAMERA, count=500, fast_threshold_min=7, fast_noise_ratio=4.0)
+    extractor = FeatureExtractor(
+        CAMERA, Alignment(), count=500, fast_threshold_min=7, fast_noise_ratio=4.0
+    )
     noise = np.clip(rng.normal(20, 4, (480, 640)), 0, 255).astype(np.uint8)
     assert len(extractor.extract(noise, None)) < 150
     assert len(extractor.extract(np.zeros((480, 640), np.uint8), None)) == 0
 
 
 def test_depth_is_missing_at_depth_edges_and_where_it_is_not_a_number():
-    extractor = FeatureExtractor(CAMERA, count=500, fast_threshold_min=7, fast_noise_ratio=4.0)
+    extractor = FeatureExtractor(
+        CAMERA, Alignment(), count=500, fast_threshold_min=7, fast_noise_ratio=4.0
+    )
     gray = patchwork(np.random.default_rng(0), fine_px=16, coarse_px=16)
     depth_m = np.full((480, 640), 1.0, np.float32)
     depth_m[:, 320:] = 3.0

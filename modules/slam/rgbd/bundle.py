@@ -6,6 +6,7 @@ window are small enough for dense algebra.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 
 from .residuals import Errors, Sightings, errors
+from .ties import Pull, Tie, pull
 
 _ROUNDS = (5, 5)
 _DAMPING = (1e-4, 1e-8, 1e4)  # of the diagonal: first, least, most
@@ -31,6 +33,7 @@ class Bundle:
     keyframe_rows: NDArray[np.int64]  # (N,), of each sighting, rising
     landmark_rows: NDArray[np.int64]  # (N,); a keyframe sees a landmark once
     seen: Sightings  # (N,)
+    ties: Mapping[tuple[int, int], Tie]  # by the keyframes' rows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -46,7 +49,7 @@ class Adjusted:
 class _Normal:
     """The normal equations: blocks of keyframes, of landmarks, and between them."""
 
-    poses: NDArray[np.float64]  # (F, 6, 6) of the free keyframes
+    poses: NDArray[np.float64]  # (F, 6, F, 6) of the free keyframes
     points: NDArray[np.float64]  # (L, 3, 3)
     between: NDArray[np.float64]  # (F, 6, L, 3)
     pose_slopes: NDArray[np.float64]  # (F, 6)
@@ -61,23 +64,26 @@ def adjust(camera: Camera, bundle: Bundle) -> Adjusted:
         found = _errors(camera, bundle)
         agrees = found.pixels_agree()
         use = np.stack([agrees, agrees & bundle.seen.measures_depth & found.depths_agree()])
-    normal = _linearise(bundle, found, use)
+    normal = _linearise(bundle, found, use, [])
     return Adjusted(bundle=bundle, agrees=agrees, information=normal.points)
 
 
 def _descend(camera: Camera, bundle: Bundle, use: NDArray[np.float64], steps: int) -> Bundle:
     damping = _DAMPING[0]
     found = _errors(camera, bundle)
-    cost = _cost(found, use)
+    pulls = _pulls(bundle)
+    cost = _cost(found, use, pulls)
     for _ in range(steps):
-        normal = _linearise(bundle, found, use)
+        normal = _linearise(bundle, found, use, pulls)
         moved = _step(bundle, normal, damping)
         found_there = _errors(camera, moved)
-        cost_there = _cost(found_there, use)
+        pulls_there = _pulls(moved)
+        cost_there = _cost(found_there, use, pulls_there)
         if not cost_there < cost:
             damping = min(damping * 100.0, _DAMPING[2])
             continue
         gain, bundle, found, cost = cost - cost_there, moved, found_there, cost_there
+        pulls = pulls_there
         damping = max(damping * 0.1, _DAMPING[1])
         if gain < _SMALL_GAIN * cost:
             break
@@ -91,16 +97,23 @@ def _errors(camera: Camera, bundle: Bundle) -> Errors:
     return errors(camera, points_cam + T_cam_local[:, :3, 3], bundle.seen)
 
 
-def _cost(found: Errors, use: NDArray[np.float64]) -> float:
+def _pulls(bundle: Bundle) -> list[Pull]:
+    return [pull(tie, bundle.T_local_cam, *rows) for rows, tie in bundle.ties.items()]
+
+
+def _cost(found: Errors, use: NDArray[np.float64], pulls: Sequence[Pull]) -> float:
     """Return the Huber cost: quadratic near zero, linear beyond."""
     weights = found.huber_weights()
     squares = np.stack([(found.of[:2] ** 2).sum(axis=0), found.of[2] ** 2])
     weight = weights[1:]
     # rho = s^2 w (2 - w): s^2 where w = 1, and 2 h s - h^2 with w = h / s.
-    return float((use * squares * weight * (2.0 - weight)).sum())
+    cost = float((use * squares * weight * (2.0 - weight)).sum())
+    return cost + sum(each.cost for each in pulls)
 
 
-def _linearise(bundle: Bundle, found: Errors, use: NDArray[np.float64]) -> _Normal:
+def _linearise(
+    bundle: Bundle, found: Errors, use: NDArray[np.float64], pulls: Sequence[Pull]
+) -> _Normal:
     weights = np.sqrt(found.huber_weights() * use[[0, 0, 1]])
     residuals = (found.of * weights).T  # (N, 3)
     by_point_cam = np.moveaxis(found.by_point * weights[:, None], 2, 0)  # (N, 3, 3)
@@ -112,7 +125,20 @@ def _linearise(bundle: Bundle, found: Errors, use: NDArray[np.float64]) -> _Norm
     points_cam = np.einsum("nji,nj->ni", rotations, offsets)
     # A twist of the camera moves a point by -rho + point x phi.
     by_pose = np.concatenate([-by_point_cam, np.cross(by_point_cam, points_cam[:, None])], axis=2)
-    return _assemble(bundle, residuals, by_pose, by_point)
+    normal = _assemble(bundle, residuals, by_pose, by_point)
+    _add_ties(normal, bundle, pulls)
+    return normal
+
+
+def _add_ties(normal: _Normal, bundle: Bundle, pulls: Sequence[Pull]) -> None:
+    free = np.cumsum(bundle.is_free) - 1
+    for each in pulls:
+        ends = [(each.one, each.by_one), (each.other, each.by_other)]
+        movable = [(free[row], by) for row, by in ends if bundle.is_free[row]]
+        for row, by in movable:
+            normal.pose_slopes[row] += each.weight * by.T @ each.residual
+            for column, by_column in movable:
+                normal.poses[row, :, column] += each.weight * by.T @ by_column
 
 
 def _assemble(
@@ -129,12 +155,12 @@ def _assemble(
     free = np.cumsum(bundle.is_free) - 1
     starts = np.searchsorted(bundle.keyframe_rows, np.arange(len(bundle.is_free) + 1))
     total = int(bundle.is_free.sum())
-    poses, pose_slopes = np.zeros((total, 6, 6)), np.zeros((total, 6))
+    poses, pose_slopes = np.zeros((total, 6, total, 6)), np.zeros((total, 6))
     between = np.zeros((total, 6, count, 3))
     for row in np.flatnonzero(bundle.is_free):
         these = slice(starts[row], starts[row + 1])
         jacobian = by_pose[these].reshape(-1, 6)
-        poses[free[row]] = jacobian.T @ jacobian
+        poses[free[row], :, free[row]] = jacobian.T @ jacobian
         pose_slopes[free[row]] = jacobian.T @ residuals[these].ravel()
         blocks = np.swapaxes(by_pose[these], 1, 2) @ by_point[these]  # (n, 6, 3)
         between[free[row]][:, bundle.landmark_rows[these]] = np.swapaxes(blocks, 0, 1)
@@ -149,15 +175,12 @@ def _assemble(
 
 def _step(bundle: Bundle, normal: _Normal, damping: float) -> Bundle:
     """Return the bundle after one step of the damped normal equations."""
-    poses, points = _damped(normal.poses, damping), _damped(normal.points, damping)
-    inverses = np.linalg.inv(points)
-    size = 6 * len(poses)
+    size = 6 * len(normal.poses)
+    poses = _damped(normal.poses.reshape(1, size, size), damping)[0]
+    inverses = np.linalg.inv(_damped(normal.points, damping))
     between = normal.between.reshape(size, -1, 3)
     eliminated = (np.swapaxes(between, 0, 1) @ inverses).swapaxes(0, 1)  # (6F, L, 3)
-    left = -eliminated.reshape(size, -1) @ between.reshape(size, -1).T
-    blocks = left.reshape(len(poses), 6, len(poses), 6)
-    diagonal = np.arange(len(poses))
-    blocks[diagonal, :, diagonal] += poses
+    left = poses - eliminated.reshape(size, -1) @ between.reshape(size, -1).T
     right = normal.pose_slopes.ravel() - eliminated.reshape(size, -1) @ normal.point_slopes.ravel()
     twists = np.asarray(-np.linalg.solve(left, right), np.float64)
     pulled = normal.point_slopes + np.tensordot(twists, between, 1)

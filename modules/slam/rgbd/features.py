@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from sceneslam.types.rig import Camera
 
+from .alignment import Alignment
+
 LEVELS = 8
 SCALE = 1.2  # between two levels of the pyramid
 _CELL_PX = 40  # side of the cells that share out the features
@@ -43,9 +45,16 @@ class FeatureExtractor:
     """Finds features where the image holds structure above its own noise."""
 
     def __init__(
-        self, camera: Camera, *, count: int, fast_threshold_min: int, fast_noise_ratio: float
+        self,
+        depth_camera: Camera,
+        alignment: Alignment,
+        *,
+        count: int,
+        fast_threshold_min: int,
+        fast_noise_ratio: float,
     ) -> None:
-        self._camera, self._count = camera, count
+        self._depth_camera, self._alignment = depth_camera, alignment
+        self._camera, self._count = alignment.color_camera(depth_camera), count
         self._threshold_min, self._noise_ratio = fast_threshold_min, fast_noise_ratio
         self._orb = cv2.ORB.create(nfeatures=_SURPLUS * count, scaleFactor=SCALE, nlevels=LEVELS)
 
@@ -57,9 +66,10 @@ class FeatureExtractor:
         if not corners:
             return _none_found()
         uv_image = np.asarray(cv2.KeyPoint.convert(corners), dtype=np.float64)
-        depths_m, slopes = self._depths(uv_image, depth_m)
+        uv_px = self._undistort(uv_image)
+        depths_m, slopes = self._depths(self._in_depth(uv_image, uv_px, depth_m), depth_m)
         return Features(
-            uv_px=self._undistort(uv_image),
+            uv_px=uv_px,
             levels=np.array([corner.octave for corner in corners], dtype=np.int64),
             descriptors=np.asarray(descriptors, dtype=np.uint8),
             depth_m=depths_m,
@@ -80,6 +90,18 @@ class FeatureExtractor:
             return uv_image
         K, distortion = self._camera.K, np.array(self._camera.distortion)
         return np.asarray(cv2.undistortPoints(uv_image[:, None], K, distortion, P=K)[:, 0])
+
+    def _in_depth(
+        self,
+        uv_image: NDArray[np.float64],
+        uv_px: NDArray[np.float64],
+        depth_m: NDArray[np.float32] | None,
+    ) -> NDArray[np.float64]:
+        """Return where the depth image shows the corners."""
+        if depth_m is None or self._alignment.is_registered:
+            return uv_image
+        images = np.zeros(len(uv_px), np.int64)
+        return self._alignment.find(self._depth_camera, uv_px, depth_m[None], images)
 
     def _depths(
         self, uv_image: NDArray[np.float64], depth_m: NDArray[np.float32] | None

@@ -63,6 +63,14 @@ class FrameLog:
             setattr(self, name, np.concatenate([rows, np.zeros_like(rows)]))
 
 
+def joined(first: Trajectory, then: Trajectory) -> Trajectory:
+    """Return one trajectory after the other."""
+    return Trajectory(
+        stamps_ns=np.concatenate([first.stamps_ns, then.stamps_ns]),
+        T_world_base=np.concatenate([first.T_world_base, then.T_world_base]),
+    )
+
+
 def _rigid(T_a_b: np.ndarray) -> np.ndarray:
     """Return the transforms without the rounding that products leave in their rotations."""
     return se3.from_quat_xyzw(T_a_b[:, :3, 3], se3.to_quat_xyzw(T_a_b))

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
+from .alignment import Alignment
+from .alignment_search import AlignmentSearch, Shown, pair_of
 from .bundle import Adjusted, adjust
+from .ties import DepthTies, Tie
+from .view import View
 from .visual_map import VisualMap
 from .window import Window, merge_window, take_window
 
@@ -20,12 +26,31 @@ class LocalMapping:
     map is at an image depends on the images alone.
     """
 
-    def __init__(self, camera: Camera, visual_map: VisualMap, *, every_images: int) -> None:
-        self._camera, self._map, self._every = camera, visual_map, every_images
+    def __init__(
+        self,
+        depth_camera: Camera,
+        visual_map: VisualMap,
+        *,
+        alignment: Alignment | None,
+        every_images: int,
+    ) -> None:
+        self._camera, self._map, self._every = visual_map.camera, visual_map, every_images
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="rgbd-mapping")
         self._window: Window | None = None
         self._result: Future[Adjusted] | None = None
         self._images, self._newest = 0, -1
+        self._fresh: dict[int, Shown] = {}  # keyframes that the worker has not seen yet
+        T_depth_cam = (alignment or Alignment()).T_depth_color
+        self._depth_ties = DepthTies(depth_camera, T_depth_cam)  # the worker's own
+        self._search = AlignmentSearch(depth_camera, is_over=alignment is not None)  # its too
+        self._searched: dict[int, Shown] = {}  # its too
+        self.alignment: Alignment | None = None  # where it was found not to be what was taken
+        self._ties: dict[tuple[int, int], Tie] = {}  # by keyframe ids; the worker's own
+
+    def insert(self, keyframe_id: int, view: View) -> None:
+        """Take what a new keyframe shows; without depth it is tied to none."""
+        if view.depth_m is not None:
+            self._fresh[keyframe_id] = Shown(features=view.features, depth_m=view.depth_m)
 
     def step(self) -> Transform:
         """Count an image; merge what is due and begin what is next.
@@ -41,12 +66,45 @@ class LocalMapping:
             self._newest = newest
             self._window = take_window(self._map, newest)
             if self._window is not None:
-                self._result = self._worker.submit(adjust, self._camera, self._window.bundle)
+                fresh, self._fresh = self._fresh, {}
+                self._result = self._worker.submit(self._adjust, self._window, fresh)
         return T_new_old
 
     def shutdown(self) -> None:
         """End the worker; what it was at is not merged."""
         self._worker.shutdown(wait=True, cancel_futures=True)
+
+    def _adjust(self, window: Window, fresh: Mapping[int, Shown]) -> Adjusted:
+        """Return the window adjusted; runs in the worker."""
+        for keyframe_id, shown in fresh.items():
+            self._depth_ties.look(keyframe_id, shown.depth_m)
+            if not self._search.is_over:
+                self._searched[keyframe_id] = shown
+        poses = dict(zip(window.keyframe_ids, window.bundle.T_local_cam, strict=True))
+        for other in sorted(fresh.keys() & poses.keys()):
+            for one in window.free_ids:
+                if one < other:
+                    T_one_other = se3.inverse(poses[one]) @ poses[other]
+                    tie = self._depth_ties.tie(one, other, T_one_other)
+                    if tie is not None:
+                        self._ties[one, other] = tie
+                        self._compare(one, other, tie)
+        rows = {keyframe_id: row for row, keyframe_id in enumerate(window.keyframe_ids)}
+        ties = {
+            (rows[one], rows[other]): tie
+            for (one, other), tie in self._ties.items()
+            if one in rows and other in rows
+        }
+        return adjust(self._camera, replace(window.bundle, ties=ties))
+
+    def _compare(self, one: int, other: int, tie: Tie) -> None:
+        """Ask the colours of two keyframes whether they are the depth camera's."""
+        if one in self._searched and other in self._searched:
+            here, there = self._searched[one], self._searched[other]
+            found = self._search.add(pair_of(here, there, se3.inverse(tie.T_one_other)))
+            self.alignment = found or self.alignment
+        if self._search.is_over:
+            self._searched.clear()
 
     def _merge(self) -> Transform:
         window, result = self._window, self._result

@@ -15,11 +15,14 @@ from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
+from .alignment import Alignment
 from .answers import held, lost, placed, started
+from .frame_log import joined
 from .fusion import join_duplicates
 from .keyframes import NO_LANDMARK, Keyframe
 from .limits import check_limits, check_sizes
 from .localizer import Fix
+from .motion import MotionModel
 from .parts import Parts
 from .triangulation import triangulate
 from .view import View
@@ -77,12 +80,8 @@ class RgbdSlam:
         if rig.camera is None:
             raise InputError("rig: rgbd needs the camera's intrinsics, got none")
         self._camera: Camera = rig.camera
-        parts = Parts(self._arguments, rig.camera)
-        self._eye, self._motion, self._health = parts.eye, parts.motion, parts.health
-        self._localizer, self._relocalizer = parts.localizer, parts.relocalizer
-        self._map, self._mapping, self._memory = parts.map, parts.mapping, parts.memory
-        self._layers, self._place_rule = parts.layers, parts.place_rule
-        self._keyframe_rule = parts.keyframe_rule
+        self._motion, self._before = MotionModel(), Trajectory.empty()
+        self._build(None)
         self._T_local_base = se3.identity()
         self._local_ids = np.zeros(0, np.int64)  # landmarks of the local map
         self._observations = 0
@@ -106,16 +105,14 @@ class RgbdSlam:
         T_predicted = self._motion.predict(observation)
         if observation.image_bgr is None:
             return self._lose(observation, T_predicted)
-        view = self._eye.look(
-            observation,
-            observation.image_bgr,
-            T_predicted=T_predicted,
-            rate_base=self._motion.turn_rate(observation),
-        )
+        view = self._look(observation, observation.image_bgr, T_predicted)
         fix = self._locate(view) if len(self._map.keyframes) else None
         if fix is not None:
             self._eye.learn(view, fix)
-            return self._hold(view, fix)
+            answer = self._hold(view, fix)
+            if self._mapping.alignment is not None and view.shows_enough:
+                self._build_anew(view, self._mapping.alignment)
+            return answer
         if not len(self._map.keyframes) or self._is_unknown(view):
             return self._start(view)
         return self._lose(observation, T_predicted)
@@ -126,7 +123,7 @@ class RgbdSlam:
 
     def get_trajectory(self) -> Trajectory:
         """Return T_local_base of every frame that was held, with all that loops corrected."""
-        return self._memory.trajectory()
+        return joined(self._before, self._memory.trajectory())
 
     def get_map(self) -> MapLayers:
         """Return in `local` the keyframes' cloud and, for a robot in the plane, their grid,
@@ -140,6 +137,34 @@ class RgbdSlam:
         """Stop the workers; the map stays readable."""
         self._mapping.shutdown()
         self._memory.shutdown()
+
+    def _look(
+        self, observation: Observation, image_bgr: NDArray[np.uint8], T_predicted: Transform
+    ) -> View:
+        return self._eye.look(
+            observation,
+            image_bgr,
+            T_predicted=T_predicted,
+            rate_base=self._motion.turn_rate(observation),
+        )
+
+    def _build(self, alignment: Alignment | None) -> None:
+        parts = Parts(self._arguments, self._camera, alignment)
+        self._eye, self._health = parts.eye, parts.health
+        self._localizer, self._relocalizer = parts.localizer, parts.relocalizer
+        self._map, self._mapping, self._memory = parts.map, parts.mapping, parts.memory
+        self._layers, self._place_rule = parts.layers, parts.place_rule
+        self._keyframe_rule = parts.keyframe_rule
+
+    def _build_anew(self, view: View, alignment: Alignment) -> None:
+        """Begin a new map at the pose just held: the old one has its depths at wrong corners."""
+        self._before, revision = self._memory.trajectory(), self._memory.revision
+        self.shutdown()
+        self._build(alignment)
+        self._memory.revision = revision
+        view = self._look(view.observation, view.image_bgr, self._T_local_base)
+        unseen = np.full(len(view.features), NO_LANDMARK)
+        self._insert_keyframe(view, unseen, unseen[:0], set())
 
     def _locate(self, view: View) -> Fix | None:
         fix = self._localizer.near(view.features, view.T_predicted, self._local_ids)
@@ -240,5 +265,6 @@ class RgbdSlam:
             triangulate(self._map, keyframe_id)
         join_duplicates(self._map, keyframe, segment)
         self._memory.insert(fix, view.depth_m, guessed_s=guessed_s)
+        self._mapping.insert(keyframe_id, view)
         self._keyframe_rule.restart()
         self._local_ids = self._map.around(keyframe.landmark_ids)

@@ -7,6 +7,7 @@ from typing import Any
 
 from sceneslam.types.rig import Camera
 
+from .alignment import Alignment
 from .eye import Eye
 from .features import FeatureExtractor
 from .judgement import HealthRule, KeyframeRule, PlaceRule
@@ -14,7 +15,6 @@ from .layers import LayerBuilder
 from .local_mapping import LocalMapping
 from .localizer import Localizer
 from .memory import Memory
-from .motion import MotionModel
 from .pose_solver import PoseSolver
 from .relocalizer import Relocalizer
 from .visual_map import VisualMap
@@ -25,21 +25,29 @@ _MERGE_IMAGES = 5  # that the worker has for one bundle adjustment
 class Parts:
     """An empty map, and all that looks, locates, maps, judges and remembers."""
 
-    def __init__(self, arguments: Mapping[str, Any], camera: Camera) -> None:
+    def __init__(
+        self, arguments: Mapping[str, Any], depth_camera: Camera, alignment: Alignment | None
+    ) -> None:
+        """Build; without an alignment colours count as registered until they turn out not to be."""
+
         def chosen(**names: str) -> dict[str, Any]:
             return {name: arguments[argument] for name, argument in names.items()}
 
         def same(*names: str) -> dict[str, Any]:
             return {name: arguments[name] for name in names}
 
+        known = alignment or Alignment()
+        camera = known.color_camera(depth_camera)
         extractor = FeatureExtractor(
-            camera,
+            depth_camera,
+            known,
             **chosen(count="feature_count"),
             **same("fast_threshold_min", "fast_noise_ratio"),
         )
         self.eye = Eye(camera, extractor)
         self.map = VisualMap(
             camera,
+            depth_camera,
             **same("sigma_px", "inverse_depth_sigma_per_m", "keyframe_limit", "landmark_limit"),
         )
         self.localizer = Localizer(
@@ -49,9 +57,11 @@ class Parts:
         )
         self.memory = Memory(self.map, self.localizer, **chosen(min_inliers="degraded_inliers"))
         self.relocalizer = Relocalizer(self.map.keyframes, self.memory.recognizer)
-        self.mapping = LocalMapping(camera, self.map, every_images=_MERGE_IMAGES)
+        self.mapping = LocalMapping(
+            depth_camera, self.map, alignment=alignment, every_images=_MERGE_IMAGES
+        )
         self.layers = LayerBuilder(
-            camera, **same("cloud_stride_px", "cloud_voxel_m", "grid_resolution_m")
+            depth_camera, **same("cloud_stride_px", "cloud_voxel_m", "grid_resolution_m")
         )
         self.keyframe_rule = KeyframeRule(
             **chosen(
@@ -62,4 +72,3 @@ class Parts:
         )
         self.place_rule = PlaceRule(**chosen(patience_s="segment_patience_s"))
         self.health = HealthRule(**same("degraded_inliers", "degraded_sigma_m"))
-        self.motion = MotionModel()

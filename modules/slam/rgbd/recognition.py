@@ -68,7 +68,7 @@ class PlaceRecognizer:
 
         True for a keyframe that was made without depth: there is nothing to hold it against.
         """
-        camera = self._map.camera
+        camera = self._map.depth_camera
         if not len(keyframe.view.points_base):
             return True
         T_cam_keyframe = se3.inverse(T_local_base @ camera.T_base_cam) @ keyframe.T_local_base

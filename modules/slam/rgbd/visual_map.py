@@ -48,6 +48,7 @@ class VisualMap:
     def __init__(
         self,
         camera: Camera,
+        depth_camera: Camera,
         *,
         sigma_px: float,
         inverse_depth_sigma_per_m: float,
@@ -55,7 +56,7 @@ class VisualMap:
         landmark_limit: int,
     ) -> None:
         self.landmarks, self.keyframes = LandmarkTable(), KeyframeStore()
-        self.camera = camera
+        self.camera, self.depth_camera = camera, depth_camera
         self._sigma_px, self.inverse_depth_sigma_per_m = sigma_px, inverse_depth_sigma_per_m
         self._keyframe_limit, self._landmark_limit = keyframe_limit, landmark_limit
         self.corrections = 0  # how often keyframes were moved

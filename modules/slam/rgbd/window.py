@@ -26,6 +26,7 @@ class Window:
 
     bundle: Bundle
     keyframe_ids: list[int]  # (K,), rising
+    free_ids: list[int]
     landmark_ids: NDArray[np.int64]  # (L,), rising
     births: NDArray[np.int64]  # (L,), to tell a landmark from a later one of the same id
     feature_rows: NDArray[np.int64]  # (N,), of each sighting in its keyframe
@@ -70,10 +71,12 @@ def take_window(visual_map: VisualMap, keyframe_id: int) -> Window | None:
                 [visual_map.inverse_depth_sigmas_per_m(f) for f in features]
             )[chosen],
         ),
+        ties={},
     )
     return Window(
         bundle=bundle,
         keyframe_ids=keyframe_ids,
+        free_ids=free,
         landmark_ids=landmark_ids,
         births=visual_map.landmarks.births[landmark_ids],
         feature_rows=of_feature[chosen],

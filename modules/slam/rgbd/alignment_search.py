@@ -1,0 +1,156 @@
+"""Finds out whether colours and depth are of one camera, from what both say of the same motion.
+
+Surfaces tell how the depth camera moved, without the colours (see `ties`). Where a corner of one
+image should then be in another depends on the colour camera's focal length and place alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.rig import Camera
+from sceneslam.types.se3 import Transform
+
+from .alignment import Alignment, look_up
+from .features import SCALE, Features
+
+_STARTS = (Alignment(), Alignment(focal_ratio=0.9, baseline_m=0.025))  # registered; a raw Kinect
+_ASKED_AT = (9, 14, 20)  # pairs of keyframes; unregistered after none of them: registered
+_CORNERS = 200  # of a pair
+_MAX_HAMMING = 40
+_STEPS = 10
+_WIDTHS = np.array([0.004, 0.004])  # of the differences that stand for slopes
+_LONGEST = np.array([0.03, 0.02])  # of one step
+_HUBER, _WORST = 2.0, 3.0  # [sigma] of a corner, [its root cost]
+_MIN_CHANGE = 0.03  # of the focal length: 10 px at the edge of the image
+_MIN_GAIN = 0.2  # of the cost
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Pair:
+    """Two keyframes: corners that both show, and how the depth camera moved between."""
+
+    one_px: NDArray[np.float64]  # (N, 2), without distortion
+    other_px: NDArray[np.float64]  # (N, 2)
+    sigma_px: NDArray[np.float64]  # (N,)
+    one_depth_m: NDArray[np.float32]  # (H, W)
+    T_other_one: Transform  # of the depth camera
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Shown:
+    """What one keyframe shows."""
+
+    features: Features
+    depth_m: NDArray[np.float32]  # (H, W)
+
+
+def pair_of(one: Shown, other: Shown, T_other_one: Transform) -> Pair:
+    """Return the corners that look most like each other, whatever any pose says of them."""
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
+    matches = matcher.match(one.features.descriptors, other.features.descriptors)
+    alike = [(m.queryIdx, m.trainIdx) for m in matches if m.distance < _MAX_HAMMING]
+    here, there = np.array(alike, np.int64).reshape(-1, 2).T
+    return Pair(
+        one_px=one.features.uv_px[here],
+        other_px=other.features.uv_px[there],
+        sigma_px=SCALE ** one.features.levels[here].astype(np.float64),
+        one_depth_m=one.depth_m,
+        T_other_one=T_other_one,
+    )
+
+
+class AlignmentSearch:
+    """Collects pairs of keyframes until they tell, or do not."""
+
+    def __init__(self, camera: Camera, *, is_over: bool) -> None:
+        self._camera, self.is_over = camera, is_over
+        self._pairs: list[Pair] = []
+
+    def add(self, pair: Pair) -> Alignment | None:
+        """Take a pair; return the cameras' alignment when they turn out to be two."""
+        self._pairs.append(pair)
+        count = len(self._pairs)
+        if self.is_over or count not in _ASKED_AT:
+            return None
+        found = self._find()
+        self.is_over = found is not None or count == _ASKED_AT[-1]
+        if self.is_over:
+            self._pairs.clear()
+        return found
+
+    def _find(self) -> Alignment | None:
+        costs = _Costs(self._camera, self._pairs)
+        ends = [_descend(costs, start) for start in _STARTS]
+        best = min(ends, key=costs.total)
+        is_other = abs(best.focal_ratio - 1.0) > _MIN_CHANGE
+        gain = 1.0 - costs.total(best) / costs.total(Alignment())
+        return best if is_other and gain > _MIN_GAIN else None
+
+
+class _Costs:
+    """How badly corners of all pairs fit an alignment."""
+
+    def __init__(self, camera: Camera, pairs: list[Pair]) -> None:
+        chosen = [slice(None, None, 1 + len(pair.sigma_px) // _CORNERS) for pair in pairs]
+        both = list(zip(pairs, chosen, strict=True))
+        self._camera = camera
+        self._one_px = np.concatenate([pair.one_px[rows] for pair, rows in both])
+        self._other_px = np.concatenate([pair.other_px[rows] for pair, rows in both])
+        self._sigma_px = np.concatenate([pair.sigma_px[rows] for pair, rows in both])
+        counts = [len(pair.sigma_px[rows]) for pair, rows in both]
+        self._images = np.repeat(np.arange(len(pairs)), counts)
+        self._depths_m = np.stack([pair.one_depth_m for pair in pairs])
+        self._T_other_one = np.stack([pair.T_other_one for pair in pairs])[self._images]
+
+    def total(self, alignment: Alignment) -> float:
+        """Return the mean square, of the corners that have a depth."""
+        return float(np.nanmean(self.roots(alignment) ** 2))
+
+    def roots(self, alignment: Alignment) -> NDArray[np.float64]:
+        """Return the root of each corner's cost (N,), NaN where there is no depth."""
+        camera = self._camera
+        color, right = alignment.color_camera(camera), alignment.T_depth_color[:3, 3]
+        focal_px, centre_px = np.array([color.fx, color.fy]), np.array([color.cx, color.cy])
+        where_px = alignment.find(camera, self._one_px, self._depths_m, self._images)
+        z = look_up(self._depths_m, self._images, where_px)
+        rays = np.column_stack([(self._one_px - centre_px) / focal_px, np.ones(len(z))])
+        points_depth = rays * z[:, None] + right
+        turned = np.einsum("nij,nj->ni", self._T_other_one[:, :3, :3], points_depth)
+        points_color = turned + self._T_other_one[:, :3, 3] - right
+        ahead = points_color[:, 2] > 0.1
+        uv_px = points_color[:, :2] / np.where(ahead, points_color[:, 2], 1.0)[:, None]
+        off_px = np.linalg.norm(uv_px * focal_px + centre_px - self._other_px, axis=1)
+        # Pseudo-Huber, so that its root is smooth.
+        soft = np.sqrt(1.0 + (off_px / self._sigma_px / _HUBER) ** 2) - 1.0
+        roots = np.where(ahead, np.minimum(np.sqrt(2.0 * soft), _WORST), _WORST)
+        return np.where(z > 0, roots, np.nan)
+
+
+def _descend(costs: _Costs, start: Alignment) -> Alignment:
+    """Return the alignment that Gauss-Newton ends at."""
+    best = start
+    for _ in range(_STEPS):
+        roots = costs.roots(best)
+        slopes = [costs.roots(_moved(best, step)) - roots for step in np.diag(_WIDTHS)]
+        jacobian = np.stack(slopes) / _WIDTHS[:, None]
+        fits = (roots < _WORST) & np.isfinite(jacobian).all(axis=0)
+        jacobian = jacobian[:, fits]
+        normal = jacobian @ jacobian.T + 1e-6 * np.eye(2)
+        step = -np.linalg.solve(normal, jacobian @ roots[fits])
+        moved = _moved(best, np.clip(step, -_LONGEST, _LONGEST))
+        if not costs.total(moved) < costs.total(best):
+            break
+        best = moved
+    return best
+
+
+def _moved(alignment: Alignment, step: NDArray[np.float64]) -> Alignment:
+    return Alignment(
+        focal_ratio=alignment.focal_ratio + float(step[0]),
+        baseline_m=alignment.baseline_m + float(step[1]),
+    )

@@ -1,0 +1,97 @@
+"""How the rgbd module finds out that colours and depth are of two cameras, and ties keyframes."""
+
+import numpy as np
+import pytest
+
+from sceneslam.modules.slam.rgbd.alignment import Alignment
+from sceneslam.modules.slam.rgbd.alignment_search import AlignmentSearch, Pair
+from sceneslam.modules.slam.rgbd.ties import DepthTies
+from sceneslam.types import se3
+from sceneslam.types.rig import Camera
+
+CAMERA = Camera(size_wh=(640, 480), fx=585.0, fy=585.0, cx=320.0, cy=240.0)
+RAW_KINECT = Alignment(focal_ratio=0.9, baseline_m=0.025)
+# A corner of a room: normals and offsets [m] of its planes in the first camera.
+NORMALS = np.array([[0.6, 0.0, 0.8], [-0.7, 0.1, 0.7], [0.0, 0.8, 0.6]])
+OFFSETS_M = np.array([1.6, 1.7, 1.5])
+
+
+def depth_image(T_local_cam):
+    """Return the corner's depth [m] from a pose."""
+    v, u = np.mgrid[:480, :640]
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u)], -1)
+    along = rays @ (NORMALS @ T_local_cam[:3, :3]).T
+    left = OFFSETS_M - NORMALS @ T_local_cam[:3, 3]
+    depths_m = np.where(along > 1e-6, left / np.where(along > 1e-6, along, 1.0), np.inf)
+    return depths_m.min(axis=-1).astype(np.float32)
+
+
+def corners(rng, depth_m, count=300):
+    """Return points (N, 3) of a depth image, in its camera."""
+    u, v = rng.uniform(60, 580, count), rng.uniform(60, 420, count)
+    z = depth_m[np.rint(v).astype(int), np.rint(u).astype(int)]
+    x, y = (np.rint(u) - CAMERA.cx) / CAMERA.fx, (np.rint(v) - CAMERA.cy) / CAMERA.fy
+    return np.column_stack([x * z, y * z, z])
+
+
+def pixels(alignment, points_depth):
+    camera = alignment.color_camera(CAMERA)
+    points = points_depth - alignment.T_depth_color[:3, 3]
+    return points[:, :2] / points[:, 2:] * camera.fx + np.array([camera.cx, camera.cy])
+
+
+def motions(rng, count):
+    return [se3.exp(rng.normal(0, [0.08, 0.08, 0.08, 0.06, 0.06, 0.06])) for _ in range(count)]
+
+
+def search(alignment):
+    rng = np.random.default_rng(0)
+    one_depth_m = depth_image(np.eye(4))
+    finder, found = AlignmentSearch(CAMERA, is_over=False), None
+    for T_one_other in motions(rng, 9):
+        points = corners(rng, one_depth_m)
+        there = se3.apply(se3.inverse(T_one_other), points)
+        pair = Pair(
+            one_px=pixels(alignment, points) + rng.normal(0, 0.5, (len(points), 2)),
+            other_px=pixels(alignment, there) + rng.normal(0, 0.5, (len(points), 2)),
+            sigma_px=np.ones(len(points)),
+            one_depth_m=one_depth_m,
+            T_other_one=se3.inverse(T_one_other),
+        )
+        found = finder.add(pair) or found
+    return found
+
+
+def test_colours_of_a_raw_kinect_are_found_to_be_of_another_camera():
+    found = search(RAW_KINECT)
+    assert found is not None
+    assert found.focal_ratio == pytest.approx(0.9, abs=0.01)
+    assert found.baseline_m == pytest.approx(0.025, abs=0.01)
+
+
+@pytest.mark.parametrize("baseline_m", [0.0, 0.005])
+def test_registered_colours_stay_registered(baseline_m):
+    assert search(Alignment(focal_ratio=1.005, baseline_m=baseline_m)) is None
+
+
+def test_depth_is_looked_up_where_the_other_camera_sees_the_same():
+    depth_m = depth_image(np.eye(4))
+    points = corners(np.random.default_rng(1), depth_m)
+    uv_px, images = pixels(RAW_KINECT, points), np.zeros(len(points), int)
+    found_px = RAW_KINECT.find(CAMERA, uv_px, depth_m[None], images)
+    true_px = pixels(Alignment(), points)
+    assert np.median(np.abs(found_px - true_px)) < 0.2
+    assert np.median(np.abs(uv_px - true_px)) > 5.0
+
+
+def test_surfaces_tie_two_keyframes_where_they_truly_are():
+    T_one_other = se3.exp(np.array([0.08, -0.05, 0.06, 0.03, -0.05, 0.04]))
+    T_depth_cam = RAW_KINECT.T_depth_color
+    ties = DepthTies(CAMERA, T_depth_cam)
+    ties.look(0, depth_image(np.eye(4)))
+    ties.look(1, depth_image(T_one_other))
+    T_true = se3.inverse(T_depth_cam) @ T_one_other @ T_depth_cam
+    tie = ties.tie(0, 1, T_true @ se3.exp(np.full(6, 0.02)))
+    assert tie is not None
+    assert tie.T_one_other == pytest.approx(T_true, abs=2e-3)
+    assert ties.tie(0, 7, T_true) is None
