@@ -5,8 +5,8 @@ from __future__ import annotations
 import ctypes
 import gc
 import resource
-from collections.abc import Mapping
-from contextlib import closing, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from sceneslam.evaluation.metrics import Metrics, evaluate, write_metrics
 from sceneslam.evaluation.report import write_report
 from sceneslam.interrupts import termination_as_interrupt, uninterrupted
 from sceneslam.loop import Loop
+from sceneslam.types.errors import told
 from sceneslam.types.trajectory import Trajectory
 
 _WRITTEN = (
@@ -56,6 +57,7 @@ def run(
     """
     _reclaim()
     with closing(build(config)) as parts:
+        folder = folder.resolve()  # a module may leave the working directory
         folder.mkdir(parents=True, exist_ok=True)
         _clear(folder)
         cv2.setNumThreads(parts.run.threads)
@@ -89,17 +91,18 @@ def _save(
     title: str,
     reference: Trajectory | None,
 ) -> Finished:
-    """Write the run's folder, what matters most first."""
+    """Write the run's folder, what matters most first; what cannot be written is a fault."""
     result, truth = loop.result(), loop.truth
-    result.trajectory.write_tum(folder / "trajectory.tum")
-    result.online.write_tum(folder / "trajectory_online.tum")
-    if truth is not None and len(truth.trajectory):
-        truth.trajectory.write_tum(folder / "groundtruth.tum")
-    for session in result.sessions:
-        name = f"trajectory_{session.index}_{session.module}.tum"
-        session.trajectory.write_tum(folder / name)
-    save_map(result.map, folder / "map")
-    versions = save_config(config, folder / "config.yaml")
+    with _noting(loop.faults, "the trajectories"):
+        result.trajectory.write_tum(folder / "trajectory.tum")
+        result.online.write_tum(folder / "trajectory_online.tum")
+        if truth is not None and len(truth.trajectory):
+            truth.trajectory.write_tum(folder / "groundtruth.tum")
+        for session in result.sessions:
+            name = f"trajectory_{session.index}_{session.module}.tum"
+            session.trajectory.write_tum(folder / name)
+    with _noting(loop.faults, "the map"):
+        save_map(result.map, folder / "map")
     metrics = evaluate(
         result,
         truth,
@@ -107,25 +110,36 @@ def _save(
         peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         reference=reference,
     )
-    write_metrics(folder / "metrics.json", metrics)
-    if parts.run.report:
-        write_report(
-            folder,
-            result,
-            truth,
-            metrics,
-            title=title,
-            config=config,
-            threshold=parts.threshold,
-            config_yaml=(folder / "config.yaml").read_text(),
-            versions=versions,
-            faults=loop.faults,
-            reference=reference,
-            value_label=parts.detector.quantity,
-        )
+    with _noting(loop.faults, "configuration, metrics and report"):
+        versions = save_config(config, folder / "config.yaml")
+        write_metrics(folder / "metrics.json", metrics)
+        if parts.run.report:
+            write_report(
+                folder,
+                result,
+                truth,
+                metrics,
+                title=title,
+                config=config,
+                threshold=parts.threshold,
+                config_yaml=(folder / "config.yaml").read_text(),
+                versions=versions,
+                faults=loop.faults,
+                reference=reference,
+                value_label=parts.detector.quantity,
+            )
     return Finished(
         metrics=metrics,
         trajectory=result.trajectory,
         faults=tuple(loop.faults),
         is_interrupted=loop.is_interrupted,
     )
+
+
+@contextmanager
+def _noting(faults: list[str], what: str) -> Iterator[None]:
+    """Note what a full disk or the like keeps from being saved, and go on with the rest."""
+    try:
+        yield
+    except OSError as error:
+        faults.append(f"{what} could not all be saved: {told(error)}")

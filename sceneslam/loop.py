@@ -18,6 +18,7 @@ from sceneslam.bus.live import run_live
 from sceneslam.config.build import Parts
 from sceneslam.interfaces import Sink
 from sceneslam.types.errors import InputError, told
+from sceneslam.types.maps import HybridMap, PointLayer
 from sceneslam.types.observation import Observation
 from sceneslam.types.run import RunResult, Timings
 from sceneslam.types.truth import GroundTruth
@@ -80,6 +81,8 @@ class Loop:
         for key in list(self._sinks):
             self._close_sink(key)
         self._log.close()
+        if self._log.fault:
+            self.faults.append(self._log.fault)
 
     def result(self) -> RunResult:
         """Return everything the run produced."""
@@ -90,7 +93,7 @@ class Loop:
             online=atlas.online,
             modules=atlas.pose_modules,
             sessions=atlas.sessions,
-            map=atlas.fuse_maps(),
+            map=self._fused(),
             events=self._log.events,
             dropped=self._dropped,
             timings=Timings(
@@ -100,6 +103,16 @@ class Loop:
                 wall_s=self._wall_s,
             ),
         )
+
+    def _fused(self) -> HybridMap:
+        """Return the one map, an empty one where it cannot be had: the trajectory is worth more."""
+        try:
+            return self._parts.atlas.fuse_maps()
+        except Exception as error:
+            _log.info("the maps could not be fused", exc_info=error)
+            self.faults.append(f"the maps could not be fused: {told(error)}")
+            nothing = PointLayer(points=np.zeros((0, 3), np.float32))
+            return HybridMap(points=nothing, point_modules=np.zeros(0, np.uint8), modules=())
 
     def _feed(self) -> None:
         observations = islice(self._parts.source, self._parts.run.max_observations)

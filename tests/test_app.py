@@ -1,7 +1,11 @@
 """A whole run in memory: what its folder holds, and what is saved when it goes wrong."""
 
 import json
+import os
+import resource
+from contextlib import contextmanager
 from copy import deepcopy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -244,3 +248,50 @@ def test_mistake_is_named_before_the_first_frame(tmp_path, changes, sentence):
         run(config(**changes), tmp_path / "run")
     assert sentence in str(caught.value)
     assert not (tmp_path / "run").exists()
+
+
+@contextmanager
+def largest_file(size):
+    """Let no file grow beyond `size` bytes, as if the disk were full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("size", [0, 4000, 20000])
+def test_a_full_disk_is_told_in_sentences_and_keeps_what_fits(tmp_path, size):
+    with largest_file(size):
+        finished = run(config(), tmp_path)
+    assert len(finished.trajectory) == 100 and finished.metrics["coverage"] == 1.0
+    assert finished.faults and all("File too large" in fault for fault in finished.faults)
+    is_saved = size == 20000
+    is_cut = any("events.jsonl is not complete" in fault for fault in finished.faults)
+    assert is_cut is not is_saved
+    assert is_saved is (len(text := (tmp_path / "trajectory.tum").read_text().splitlines()) == 101)
+    assert not text or text[0].startswith("#")
+
+
+def test_maps_that_cannot_be_fused_cost_the_map_alone(tmp_path, monkeypatch):
+    def fail(atlas):
+        raise MemoryError("too large")
+
+    monkeypatch.setattr("sceneslam.atlas.atlas.Atlas.fuse_maps", fail)
+    finished = run(config(), tmp_path)
+    assert finished.faults == ("the maps could not be fused: MemoryError: too large",)
+    assert len(Trajectory.read_tum(tmp_path / "trajectory.tum")) == 100
+
+
+def test_a_module_that_leaves_the_folder_does_not_take_the_results_along(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    leaves = {"_target_": "hostile.Wrecks", "how": "move"}
+    monkeypatch.setattr("os.environ", dict(os.environ))
+    allowed = ["fakes", "hostile"]
+    mask = os.umask(0)
+    try:
+        run(config(slam__bright=leaves, allow_targets=allowed), Path("here"))
+    finally:
+        os.umask(mask)
+    assert len(Trajectory.read_tum(tmp_path / "here" / "trajectory.tum")) == 100

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TextIO
 
+from sceneslam.types.errors import told
 from sceneslam.types.run import Event
 
 _WAITING_MAX = 64  # votes, which are written together
@@ -22,6 +24,7 @@ class EventLog:
         self._events: list[Event] = []
         self._written = 0  # how many of them are in the file
         self._file: TextIO | None = path.open("w") if path else None
+        self.fault = ""  # why the file ends before the run did
 
     @property
     def events(self) -> tuple[Event, ...]:
@@ -49,9 +52,16 @@ class EventLog:
             self._file = None
 
     def _write(self) -> None:
-        """Write the events that wait."""
-        if self._file:
-            lines = [json.dumps(line) + "\n" for line in self._events[self._written :]]
+        """Write the events that wait; where the disk does not take them, they stay in memory."""
+        lines = [json.dumps(line) + "\n" for line in self._events[self._written :]]
+        self._written = len(self._events)
+        if self._file is None:
+            return
+        try:
             self._file.write("".join(lines))
             self._file.flush()
-        self._written = len(self._events)
+        except OSError as error:
+            self.fault = f"events.jsonl is not complete: {told(error)}"
+            file, self._file = self._file, None
+            with suppress(OSError):  # it tries to write what is left
+                file.close()
