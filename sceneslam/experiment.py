@@ -18,6 +18,8 @@ from sceneslam.config.check import check_given
 from sceneslam.config.component import Builder
 from sceneslam.config.provenance import provenance
 from sceneslam.config.resolve import resolved
+from sceneslam.config.settings import DETECT_ONLY
+from sceneslam.detection.run import detect
 from sceneslam.evaluation.verdict import write_verdict
 from sceneslam.interfaces import Experiment
 from sceneslam.types.errors import ConfigError
@@ -59,24 +61,29 @@ class _Trials:
             made_by = provenance(config)
             if _finished_by(folder) != made_by:
                 self._run(config, folder, trial.name, made_by)
-            end = json.loads((folder / _END).read_text())
+            has_poses = config["run"]["mode"] != DETECT_ONLY
             yield Outcome(
                 trial=trial,
                 folder=folder,
                 metrics=json.loads((folder / "metrics.json").read_text()),
-                trajectory=Trajectory.read_tum(folder / "trajectory.tum"),
-                online=Trajectory.read_tum(folder / "trajectory_online.tum"),
-                faults=end["faults"],
+                trajectory=_read(folder / "trajectory.tum", has_poses),
+                online=_read(folder / "trajectory_online.tum", has_poses),
+                faults=json.loads((folder / _END).read_text())["faults"],
             )
 
     def _run(
         self, config: dict[str, Any], folder: Path, name: str, made_by: dict[str, str]
     ) -> None:
         (folder / _END).unlink(missing_ok=True)
-        finished = run(config, folder, title=name)
-        if finished.is_interrupted:
-            raise KeyboardInterrupt
-        end = {"made_by": made_by, "faults": finished.faults}
+        faults: tuple[str, ...] = ()
+        if config["run"]["mode"] == DETECT_ONLY:
+            detect(config, folder)
+        else:
+            finished = run(config, folder, title=name)
+            if finished.is_interrupted:
+                raise KeyboardInterrupt
+            faults = finished.faults
+        end = {"made_by": made_by, "faults": faults}
         (folder / _END).write_text(json.dumps(end, indent=2))
 
     def _compose(self, trial: Trial) -> dict[str, Any]:
@@ -91,6 +98,10 @@ class _Trials:
         return {
             name: value for name, value in plain.items() if name not in ("experiment", self._key)
         }
+
+
+def _read(path: Path, is_there: bool) -> Trajectory:
+    return Trajectory.read_tum(path) if is_there else Trajectory.empty()
 
 
 def _finished_by(folder: Path) -> dict[str, str] | None:

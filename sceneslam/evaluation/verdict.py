@@ -51,6 +51,6 @@ def _plain(figure: Figure) -> dict[str, str | float | bool | None]:
 
 
 def _cell(value: str | float | None) -> str:
-    if value is None:
-        return "-"
-    return value if isinstance(value, str) else f"{value:.4g}"
+    if isinstance(value, str):
+        return value
+    return "-" if value is None or math.isnan(value) else f"{value:.4g}"
