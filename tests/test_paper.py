@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from sceneslam.experiments.paper.switch import SwitchExperiment
 from sceneslam.ros.writer import ObservationWriter
 from sceneslam.types import se3
 
+PAGE = Path(__file__).parents[1] / "experiments" / "paper"
 DARK_NS, CONFIRMED_NS = START_NS + 30 * PERIOD_NS, START_NS + 50 * PERIOD_NS
 
 
@@ -151,3 +153,13 @@ def test_the_start_of_a_module_is_measured(tmp_path):
     assert done.returncode == 0, done.stderr
     times = json.loads(done.stdout.splitlines()[-1])
     assert 0.0 < times["built_s"] <= times["first_pose_s"] < 60.0
+
+
+def test_the_page_holds_what_the_commands_printed():
+    page = (PAGE / "README.md").read_text()
+    tables = sorted((PAGE / "results").glob("*/table.md"))
+    assert len(tables) == 5
+    for path in tables:
+        assert path.read_text() in page, path
+    for path in (PAGE / "results").glob("*/*.png"):
+        assert f"({path.relative_to(PAGE)})" in page and path.stat().st_size < 150_000, path
