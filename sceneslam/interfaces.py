@@ -19,7 +19,7 @@ from sceneslam.types.experiment import RunTrials, Verdict
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, SceneVote, Tracking
 from sceneslam.types.rig import Rig, Sensor
-from sceneslam.types.run import Event
+from sceneslam.types.run import Event, RunResult
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
@@ -236,4 +236,13 @@ class Sink(Protocol):
 
     def close(self) -> None:
         """Finish the output so that it can be read, also after an error. May be called twice."""
+        ...
+
+
+@runtime_checkable
+class ResultSink(Protocol):
+    """A sink that also wants what was known at the end."""
+
+    def write_result(self, result: RunResult) -> None:
+        """Take the revised trajectory and the map, once, after the truth, before `close`."""
         ...

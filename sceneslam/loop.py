@@ -16,7 +16,7 @@ from sceneslam.bus.bus import Bus
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.live import run_live
 from sceneslam.config.build import Parts
-from sceneslam.interfaces import Sink
+from sceneslam.interfaces import ResultSink, Sink
 from sceneslam.types.errors import InputError, told
 from sceneslam.types.maps import HybridMap, PointLayer
 from sceneslam.types.observation import Observation
@@ -34,6 +34,7 @@ class Loop:
         self.faults: list[str] = []
         self.is_interrupted = False
         self.truth: GroundTruth | None = None
+        self._result: RunResult | None = None
         self._parts, self._title = parts, title
         self._log = EventLog(folder / "events.jsonl")
         self._events_written = 0
@@ -85,7 +86,12 @@ class Loop:
             self.faults.append(self._log.fault)
 
     def result(self) -> RunResult:
-        """Return everything the run produced."""
+        """Return everything the run produced, once it is closed."""
+        if self._result is None:
+            self._result = self._gather()
+        return self._result
+
+    def _gather(self) -> RunResult:
         atlas, bus = self._parts.atlas, self._bus
         return RunResult(
             observed_ns=np.array(self._observed_ns, np.int64),
@@ -177,9 +183,12 @@ class Loop:
 
     def _close_sink(self, key: str) -> None:
         try:
+            sink = self._sinks[key]
             if self.truth is not None:
-                self._sinks[key].write_truth(self.truth)
-            self._sinks[key].close()
+                sink.write_truth(self.truth)
+            if isinstance(sink, ResultSink):
+                sink.write_result(self.result())
+            sink.close()
         except Exception as error:
             self._drop_sink(key, error)
 

@@ -81,7 +81,7 @@ def test_experiment_composes(experiment):
 def test_every_folder_of_conf_is_a_group_that_config_yaml_or_a_scenario_uses():
     folders = {path.name for path in (ROOT / "conf").iterdir() if path.is_dir()}
     folders.discard("__pycache__")
-    assert folders <= {*GROUPS, "slam", "sinks", "scenario", "experiment"}
+    assert folders <= {*GROUPS, "slam", "sinks", "scenario", "experiment", "viewer"}
 
 
 ALLOWED = {  # package -> what of ours it may import

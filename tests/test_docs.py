@@ -27,8 +27,13 @@ NOT_RUN = {  # first words -> why it is not run here
     "mkdocs serve": "serves until it is stopped; the site is built by a test",
     "python experiments/": "takes minutes; its numbers stand beside it, a test finds the program",
 }
+SHOWS = "viewer=rerun"  # starts a viewer that stays; tests of the sink start one and end it
 ALL = [(page, command) for page in PAGES for command in commands(page)]
-RUN = [(page, command) for page, command in ALL if not command.startswith(tuple(NOT_RUN))]
+RUN = [
+    (page, command)
+    for page, command in ALL
+    if not command.startswith(tuple(NOT_RUN)) and SHOWS not in command
+]
 
 
 @pytest.fixture(scope="module")

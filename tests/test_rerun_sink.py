@@ -1,11 +1,17 @@
+import os
+import re
+import signal
+import socket
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluation_runs import first_events, loop, switch_events, votes
+from evaluation_runs import first_events, loop, poseless_run, switch_events, switched_run, votes
 
-from sceneslam.interfaces import Sink
+from sceneslam.interfaces import ResultSink, Sink
 from sceneslam.sinks.rerun import RerunSink
+from sceneslam.sinks.rerun_viewer import Viewer
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Camera, Laser, Rig, Sensor
@@ -19,7 +25,8 @@ RIG = Rig(
 
 
 def sink_to(path, **changes):
-    values = {"required": False, "image_every": 1, "depth_every": 5, "scan_every": 5}
+    values = {"viewer": None, "required": False}
+    values |= {"image_every": 1, "depth_every": 5, "scan_every": 5}
     return RerunSink(path, **(values | {"jpeg_quality": 80} | changes))
 
 
@@ -42,7 +49,7 @@ def test_recording_holds_images_poses_and_detector_values(tmp_path):
     rerun = pytest.importorskip("rerun", reason="the extra `rerun` is not installed")
     path = tmp_path / "deep" / "run.rrd"
     sink = sink_to("deep/run.rrd")
-    assert isinstance(sink, Sink)
+    assert isinstance(sink, Sink) and isinstance(sink, ResultSink)
     sink.open(RIG, tmp_path)
     path_of_robot = loop(30)
     for event in [*first_events(), *votes(30, 15)]:
@@ -54,7 +61,10 @@ def test_recording_holds_images_poses_and_detector_values(tmp_path):
             for event in switch_events(stamp_ns, stamp_ns):
                 sink.write_event(event)
     sink.write_truth(GroundTruth(trajectory=path_of_robot))
+    size = path.stat().st_size
+    sink.write_result(switched_run())
     sink.close()
+    assert path.stat().st_size > size + 20_000  # the map and the errors
     sink.close()
     assert path.stat().st_size > 10_000
     assert path.read_bytes()[:4] in (b"RRF2", b"RRIO", b"RRF0")
@@ -67,6 +77,7 @@ def test_observation_with_nothing_in_it_is_written(tmp_path):
     sink.open(Rig(sensors=frozenset()), tmp_path)
     sink.write(Observation(stamp_ns=1), None, "")
     sink.write_truth(GroundTruth())
+    sink.write_result(poseless_run(1))
     sink.close()
     assert (tmp_path / "run.rrd").stat().st_size > 0
 
@@ -97,3 +108,52 @@ def test_missing_extra_writes_nothing_where_it_is_not_required(without_rerun, tm
     sink.write_truth(GroundTruth(trajectory=loop(3)))
     sink.close()
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("path", [None, "run.rrd"])
+def test_a_sink_has_either_a_file_or_a_viewer(path):
+    viewer = None if path is None else Viewer(port=9876, web_port=None)
+    with pytest.raises(ConfigError, match="path"):
+        sink_to(path, viewer=viewer)
+
+
+def test_ports_of_the_viewer_are_checked():
+    with pytest.raises(ConfigError, match="web_port"):
+        Viewer(port=9876, web_port=80)
+
+
+def test_viewer_shows_a_run_to_this_machine_only_and_stays_for_the_next(tmp_path, capfd):
+    pytest.importorskip("rerun", reason="the extra `rerun` is not installed")
+    ports = free_ports(2)
+    viewer = Viewer(port=ports[0], web_port=ports[1])
+    sink = sink_to(None, viewer=viewer)
+    try:
+        sink.open(RIG, tmp_path)
+        sink.write(observe(0), loop(1).T_world_base[0], "rgbd")
+        sink.close()
+        assert {listening_on(port) for port in ports} == {"0100007F"}  # 127.0.0.1
+        assert f"http://127.0.0.1:{ports[1]}/" in capfd.readouterr().err
+        second = Viewer(port=ports[0], web_port=ports[1])
+        assert "stays open" not in second.open() and second.process is None
+    finally:
+        os.killpg(viewer.process.pid, signal.SIGKILL)
+        viewer.process.wait()
+    assert list(tmp_path.iterdir()) == []
+
+
+def free_ports(count):
+    sockets = [socket.socket() for _ in range(count)]
+    for held in sockets:
+        held.bind(("127.0.0.1", 0))
+    ports = [held.getsockname()[1] for held in sockets]
+    for held in sockets:
+        held.close()
+    return ports
+
+
+def listening_on(port):
+    """The address, as /proc has it, on which a port of this machine is listened to."""
+    table = Path("/proc/net/tcp")
+    if not table.exists():
+        pytest.skip("sockets are not listed here")
+    return re.search(rf"([0-9A-F]{{8}}):{port:04X} 00000000:0000 0A", table.read_text())[1]

@@ -28,6 +28,7 @@ GROUPS = {  # group -> what it chooses
     "run": "How a run is carried out: `run=NAME`.",
     "evaluation": "How a run is measured: `evaluation=NAME`.",
     "sinks": "What writes along: `+sinks@sinks.KEY=NAME`; `~sinks@sinks.rerun` leaves one out.",
+    "viewer": "What shows the run while it runs: `viewer=NAME`.",
     "experiment": "A question that takes many runs, or a second one: `+experiment=NAME`.",
 }
 _LINE = re.compile(

@@ -1,0 +1,76 @@
+"""A Rerun viewer on this machine: one that runs already, or a new one."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import subprocess
+import sys
+from time import monotonic, sleep
+
+from sceneslam.types.errors import ConfigError
+
+HOST = "127.0.0.1"  # nothing of the run leaves this machine
+_STARTS_WITHIN_S = 30.0
+_log = logging.getLogger(__name__)
+
+
+class Viewer:
+    """Listens on 127.0.0.1; it outlives the run, and the next one is shown in it as well."""
+
+    def __init__(self, *, port: int, web_port: int | None) -> None:
+        """Take the ports; with a `web_port` it is a page for a browser, else a window."""
+        for name, value in (("port", port), ("web_port", web_port)):
+            if value is not None and not 1024 <= value <= 65535:
+                raise ConfigError(name, value, "1024 to 65535")
+        self._port, self._web_port = port, web_port
+        self.process: subprocess.Popen[bytes] | None = None  # that this run started
+
+    @property
+    def url(self) -> str:
+        """Return where recordings are sent."""
+        return f"rerun+http://{HOST}:{self._port}/proxy"
+
+    def open(self) -> str:
+        """Start the viewer where none listens; return in a sentence where to look.
+
+        Raises ConfigError when it does not come up.
+        """
+        started = not self._listens()
+        if started:
+            self.process = subprocess.Popen(
+                self._command(),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,  # Ctrl-C ends the run, not the viewer
+            )
+            self._wait()
+        where = f"window on port {self._port}"
+        if self._web_port is not None:
+            address = self.url.replace("+", "%2B")
+            where = f"http://{HOST}:{self._web_port}/?url={address}"
+        stays = f"; it stays open: `kill -- -{self.process.pid}` ends it" if self.process else ""
+        return f"Rerun: {where}{stays}"
+
+    def _command(self) -> list[str]:
+        command = [sys.executable, "-m", "rerun", "--bind", HOST, "--port", str(self._port)]
+        if self._web_port is not None:
+            command += ["--serve-web", "--web-viewer-port", str(self._web_port)]
+        return command
+
+    def _listens(self) -> bool:
+        try:
+            socket.create_connection((HOST, self._port), timeout=0.5).close()
+        except OSError:
+            return False
+        return True
+
+    def _wait(self) -> None:
+        assert self.process is not None
+        until_s = monotonic() + _STARTS_WITHIN_S
+        while not self._listens():
+            if self.process.poll() is not None or monotonic() > until_s:
+                allowed = "a port on which the viewer comes up; without a display: web_port=9090"
+                raise ConfigError("port", self._port, allowed)
+            sleep(0.05)
