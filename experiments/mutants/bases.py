@@ -68,6 +68,12 @@ def bases(folder: Path) -> list[Base]:
         _single("manual", "detector", "detector=manual", "+scenes={Bright:[only],Dark:[only]}"),
         _single("one_scene", "detector"),
         _single(
+            "rules",
+            "detector",
+            "detector=rules",
+            "+scenes={Dark:[only],Blinded:[only],Plain:[only],Bright:[only]}",
+        ),
+        _single(
             "lights_out_effect",
             "effects",
             "effects=lights_out",

@@ -1,0 +1,137 @@
+"""Scenes by rules over measured features, so that a new kind of scene needs no code."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.observation import UNSURE, Observation, SceneVote
+from sceneslam.types.rig import Rig, Sensor
+
+from .features import FEATURES
+
+Limits = Mapping[str, Sequence[float | None]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Rule:
+    """A scene, and within which limits (low, high) each of its features lies."""
+
+    scene: str
+    indices: NDArray[np.int64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+    def holds(self, features: NDArray[np.float64], margin_ratio: float) -> bool | None:
+        """Tell whether all features lie in the limits, None where one was not measured."""
+        values = features[self.indices]
+        if np.isnan(values).any():
+            return None
+        low_margin, high_margin = (
+            margin_ratio * np.nan_to_num(np.abs(limit), posinf=0.0)
+            for limit in (self.low, self.high)
+        )
+        inside = (values >= self.low - low_margin) & (values < self.high + high_margin)
+        return bool(inside.all())
+
+
+class Rules:
+    """Votes for the first scene, in the rules' order, whose conditions all hold; else UNSURE.
+
+    Each rule is `{scene: NAME, when: {FEATURE: [low, high], ...}}` with null for no limit; `when:
+    {}` always holds. The scene voted last keeps until its limits, wider by `hysteresis_ratio` of
+    themselves, are left, or a rule before it holds.
+    """
+
+    quantity = ""
+    feature_settings = ("features",)
+
+    def __init__(
+        self,
+        features: Sequence[str],
+        rules: Sequence[Mapping[str, str | Limits]],
+        hysteresis_ratio: float,
+    ) -> None:
+        if not features or not set(features) <= set(FEATURES) or len(set(features)) < len(features):
+            raise ConfigError(
+                "features", list(features), f"different ones of {', '.join(FEATURES)}"
+            )
+        if not 0 <= hysteresis_ratio < 1:
+            raise ConfigError("hysteresis_ratio", hysteresis_ratio, "0 to below 1")
+        if not rules:
+            raise ConfigError("rules", [], "one rule or more")
+        self._features = tuple(features)
+        self._rules = [self._read(number, rule) for number, rule in enumerate(rules)]
+        self._hysteresis_ratio = hysteresis_ratio
+        self._voted: str | None = None
+        self.scenes = tuple(dict.fromkeys(rule.scene for rule in self._rules))
+
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return the sensors of all features."""
+        return (frozenset(FEATURES[name].sensor for name in self._features),)
+
+    def activate(self, rig: Rig) -> None:
+        """Forget the last vote."""
+        self._voted = None
+
+    def get_scene(self, observation: Observation) -> SceneVote:
+        """Return the first scene whose conditions hold."""
+        return self.decide(observation.stamp_ns, self.get_features(observation))
+
+    def get_features(self, observation: Observation) -> NDArray[np.float64] | None:
+        """Return (F,) the configured features, NaN where a sensor was silent."""
+        told = np.array([FEATURES[name].measure(observation) for name in self._features])
+        return None if np.isnan(told).all() else told
+
+    def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
+        """Return the vote; UNSURE where no rule holds, or one that comes first cannot be judged."""
+        scene = UNSURE if features is None else self._first(features)
+        if scene == UNSURE:
+            return SceneVote(stamp_ns=stamp_ns, scene=UNSURE)
+        self._voted = scene
+        return SceneVote(stamp_ns=stamp_ns, scene=scene)
+
+    def shutdown(self) -> None:
+        """Do nothing: there is nothing to free."""
+
+    def _first(self, features: NDArray[np.float64]) -> str:
+        for rule in self._rules:
+            margin_ratio = self._hysteresis_ratio if rule.scene == self._voted else 0.0
+            holds = rule.holds(features, margin_ratio)
+            if holds is None:
+                return UNSURE
+            if holds:
+                return rule.scene
+        return UNSURE
+
+    def _read(self, number: int, rule: Mapping[str, str | Limits]) -> _Rule:
+        key = f"rules[{number}]"
+        scene, when = rule.get("scene"), rule.get("when")
+        if set(rule) != {"scene", "when"} or not isinstance(scene, str) or scene in ("", UNSURE):
+            raise ConfigError(key, dict(rule), f"a scene, not {UNSURE}, and when")
+        if not isinstance(when, Mapping) or not set(when) <= set(self._features):
+            raise ConfigError(f"{key}.when", when, f"limits of {', '.join(self._features)}")
+        for name, limits in when.items():
+            _check(f"{key}.when.{name}", limits)
+        lows = [-np.inf if limits[0] is None else limits[0] for limits in when.values()]
+        highs = [np.inf if limits[1] is None else limits[1] for limits in when.values()]
+        return _Rule(
+            scene=scene,
+            indices=np.array([self._features.index(name) for name in when], np.int64),
+            low=np.array(lows, np.float64),
+            high=np.array(highs, np.float64),
+        )
+
+
+def _check(key: str, limits: Sequence[float | None]) -> None:
+    """Raise ConfigError where limits are no [low, high]."""
+    is_pair = isinstance(limits, Sequence) and not isinstance(limits, str) and len(limits) == 2
+    numbers = [one for one in limits if one is not None] if is_pair else []
+    is_number = all(isinstance(one, int | float) and np.isfinite(one) for one in numbers)
+    if not is_pair or not is_number or sorted(set(numbers)) != numbers or not numbers:
+        raise ConfigError(key, limits, "[low, high], low below high, null for no limit")
