@@ -47,10 +47,10 @@ def _tables(folder: Path, words: list[str]) -> None:
 
 
 def _killed(folder: Path, words: list[str]) -> None:
-    """Kill a job of each launcher that runs several, and under Ray also a worker; then resume."""
+    """Kill a job half-way, and a worker of Ray with its job; then resume."""
     print("\n| launcher | killed | states of the others | after resuming | table.csv |")
     print("|---|---|---|---|---|")
-    for launcher, what in (("joblib", "job"), ("ray", "job"), ("ray", "worker")):
+    for launcher, what in (("joblib", "job"), ("ray", "worker")):
         out = folder / f"{launcher}_{what}_killed"
         sweep = _sweep(out, launcher, words)
         pid = _running(out / "5")

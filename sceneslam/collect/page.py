@@ -10,21 +10,11 @@ from pathlib import Path
 from string import Template
 
 from sceneslam.collect.curves import charts
+from sceneslam.collect.overview import FIRST
 from sceneslam.collect.rows import Row, Value, swept_keys
 from sceneslam.collect.summary import Group, Mean
 from sceneslam.evaluation.markup import bullets, tiles
 
-_FIRST = (  # the metrics that are looked at first; the others are shown on demand
-    "ate_rmse_m",
-    "ate_max_m",
-    "correct_rate",
-    "coverage",
-    "switches",
-    "false_switches",
-    "detection.delay_s",
-    "detection.false",
-    "detection.missed",
-)
 _ROWS_MAX = 2000
 _ERRORS_MAX = 20
 
@@ -59,7 +49,7 @@ def _errors(rows: Sequence[Row]) -> str:
 def _summary(groups: Sequence[Group]) -> str:
     if all(len(group.rows) == 1 for group in groups):
         return ""
-    metrics = [name for name in _FIRST if any(group.mean(name) for group in groups)]
+    metrics = [name for name in FIRST if any(group.mean(name) for group in groups)]
     body = [
         [
             *(_cell(value) for value in group.keys.values()),
@@ -81,7 +71,7 @@ def _table(folder: Path, rows: Sequence[Row]) -> str:
     shown = rows[:_ROWS_MAX]
     metrics = list(dict.fromkeys(name for row in rows for name in row.metrics))
     costs = list(dict.fromkeys(name for row in rows for name in row.costs))
-    first = [name for name in _FIRST if name in metrics]
+    first = [name for name in FIRST if name in metrics]
     rest = [name for name in (*metrics, *costs) if name not in first]
     heads = [(name, False) for name in ("job", *keys, "status", *first)]
     heads += [(name, True) for name in rest]

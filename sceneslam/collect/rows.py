@@ -73,6 +73,8 @@ def _row(root: Path, folder: Path) -> Row:
     if status.is_finished and path.is_file():
         for name, value in flat(_json(path)).items():
             (costs if _is_cost(name) else metrics)[name] = value
+    if status.is_finished and (folder / "verdict.json").is_file():
+        metrics |= _figures(folder / "verdict.json")
     if status.wall_s is not None:
         costs["job.wall_s"] = status.wall_s
     return Row(
@@ -83,6 +85,13 @@ def _row(root: Path, folder: Path) -> Row:
         metrics=metrics,
         costs=costs,
     )
+
+
+def _figures(path: Path) -> dict[str, Value]:
+    """Return what an experiment found: its promised figures by their names."""
+    figures = _json(path).get("figures")
+    named = figures if isinstance(figures, list) else []
+    return {str(figure["name"]): figure["value"] for figure in named}
 
 
 def _is_cost(name: str) -> bool:

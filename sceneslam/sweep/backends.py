@@ -9,7 +9,7 @@ from functools import partial
 from time import sleep
 from typing import Any, Protocol
 
-from sceneslam.sweep.status import State
+from sceneslam.sweep.status import State, Status
 from sceneslam.sweep.supervise import Order, run_job, settle
 from sceneslam.types.errors import ConfigError
 
@@ -77,19 +77,21 @@ class Submitit:
 
         executor = AutoExecutor(orders[0].stop.parent / "submitit", cluster=self._cluster)
         executor.update_parameters(**self._parameters)
+        waiting, running = deque(orders), dict[Order, Any]()
         if self._cluster == "slurm":
             executor.update_parameters(slurm_array_parallelism=self._at_once)
-            jobs = executor.map_array(run_job, orders)
-            for order, job in zip(orders, jobs, strict=True):
-                _note(order, job.result)
-            return
-        waiting, running = deque(orders), dict[Order, Any]()
+            running = dict(zip(orders, executor.map_array(run_job, orders), strict=True))
+            waiting.clear()
         while waiting or running:
             while waiting and len(running) < self._at_once:
                 order = waiting.popleft()
                 running[order] = executor.submit(run_job, order)
-            for order in [order for order, job in running.items() if job.done()]:
-                _note(order, running.pop(order).result)
+            for order, job in list(running.items()):
+                if job.done():
+                    del running[order]
+                    _note(order, job.result)
+                elif order.stop.exists() and _is_waiting(order):
+                    running.pop(order).cancel()  # it may wait for long to be told so
             sleep(_LOOK_S)
 
 
@@ -119,6 +121,11 @@ class Ray:
                     _note(running.pop(reference), partial(ray.get, reference))
         finally:
             ray.shutdown()
+
+
+def _is_waiting(order: Order) -> bool:
+    status = Status.read(order.folder)
+    return status is None or status.state is State.WAITING
 
 
 def _note(order: Order, result: Callable[[], object]) -> None:

@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from sceneslam.collect.flatten import flat
+from sceneslam.collect.overview import overview
 from sceneslam.collect.rows import ROWS, Row, parsed
 from sceneslam.collect.write import write_rows
 from sceneslam.config.resolve import resolved, without_hydra
@@ -47,7 +48,7 @@ def sweep_detection(
                 bar.update()
     (folder / ROWS).write_text("".join(json.dumps(asdict(row)) + "\n" for row in rows))
     page = write_rows(folder, rows)
-    print(f"{len(rows)} settings\ntable    {folder}/table.csv\npage     {page}")
+    print(f"{overview(rows)}{len(rows)} settings\ntable    {folder}/table.csv\npage     {page}")
     return all(row.status == State.DONE.value for row in rows)
 
 

@@ -22,6 +22,7 @@ class Progress:
     def __init__(self, folders: Sequence[Path]) -> None:
         self._waiting = set(folders)
         self._states: Counter[State] = Counter()
+        self._told = ""
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True, name="progress")
 
@@ -50,8 +51,8 @@ class Progress:
             states[folder] for folder in states if folder not in settled
         )
         told = [f"{counts[state]} {state.value}" for state in _TOLD if counts[state]]
-        is_news = self._bar.postfix != (", ".join(told) or None) or bool(settled)
-        self._bar.set_postfix_str(", ".join(told), refresh=False)
+        before, self._told = self._told, ", ".join(told)
+        self._bar.set_postfix_str(self._told, refresh=False)
         self._bar.n += len(settled)
-        if is_news or sys.stderr.isatty():
+        if settled or self._told != before or sys.stderr.isatty():
             self._bar.refresh()

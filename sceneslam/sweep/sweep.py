@@ -9,7 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sceneslam.collect.write import collect
+from sceneslam.collect.overview import overview
+from sceneslam.collect.rows import read_rows
+from sceneslam.collect.write import write_rows
 from sceneslam.interrupts import termination_noted
 from sceneslam.sweep.backends import BACKENDS, Backend
 from sceneslam.sweep.progress import Progress
@@ -50,7 +52,7 @@ def run_sweep(
             backend.run(orders)
     for folder in missing:
         settle(folder, State.STOPPED, "never began")
-    tell(sweep, folders, skipped=len(folders) - len(missing))
+    _tell(sweep, folders, skipped=len(folders) - len(missing))
     return all(map(_is_finished, folders))
 
 
@@ -64,9 +66,11 @@ def resume(sweep: Path) -> bool:
     return run_sweep(sweep, folders, kept["launcher"], Path(kept["began_in"]))
 
 
-def tell(sweep: Path, folders: Sequence[Path], *, skipped: int) -> None:
+def _tell(sweep: Path, folders: Sequence[Path], *, skipped: int) -> None:
     """Write the sweep's table and page, and say how its jobs ended."""
-    page = collect(sweep)
+    rows = read_rows(sweep)
+    page = write_rows(sweep, rows)
+    print(overview(rows), end="")
     statuses = {folder: _status(folder) for folder in folders}
     counts = Counter(status.state.value for status in statuses.values())
     wrong = [(folder, status) for folder, status in statuses.items() if status.error]

@@ -1,0 +1,36 @@
+"""What is looked at first in a table of runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sceneslam.collect.rows import Row, swept_keys
+from sceneslam.evaluation.verdict import markdown
+from sceneslam.types.experiment import Table
+
+FIRST = (
+    "ate_rmse_m",
+    "ate_max_m",
+    "correct_rate",
+    "coverage",
+    "switches",
+    "false_switches",
+    "detection.delay_s",
+    "detection.false",
+    "detection.missed",
+)
+_ROWS_MAX = 40
+
+
+def overview(rows: Sequence[Row]) -> str:
+    """Return the table in Markdown with the first metrics, "" where it is too long to be read."""
+    if len(rows) > _ROWS_MAX:
+        return ""
+    keys = swept_keys(rows)
+    metrics = [name for name in FIRST if any(row.metrics.get(name) is not None for row in rows)]
+    cells = [
+        [row.name, *(row.keys.get(key) for key in keys), row.status]
+        + [row.metrics.get(name) for name in metrics]
+        for row in rows
+    ]
+    return markdown(Table(columns=["job", *keys, "status", *metrics], rows=cells))
