@@ -143,10 +143,6 @@ class DepthScanner:
 
     def _tabulate(self) -> None:
         rays_base = _rays_cam(self._camera, self._stride_px) @ self._camera.T_base_cam[:3, :3].T
-        yaw = se3.yaw_rad(self.T_base_laser)
-        angle = np.arctan2(rays_base[:, 1], rays_base[:, 0]) - yaw
-        angle = (angle + np.pi) % (2 * np.pi) - np.pi
-        range_ratio = np.hypot(rays_base[:, 0], rays_base[:, 1])
         low_m, high_m = (limit - self._camera_height_m for limit in self.band_m)
         farthest = rays_base[:, 2] * self._camera.depth_range_m[1]
         nearest = rays_base[:, 2] * self._camera.depth_range_m[0]
@@ -154,18 +150,19 @@ class DepthScanner:
         crosses = (np.minimum(nearest, farthest) <= high_m) & (
             np.maximum(nearest, farthest) >= low_m
         )
-        crosses &= range_ratio > 1e-3
+        crosses &= (np.abs(rays_base[:, :2]) > 1e-3).any(axis=1)
         if not crosses.any():
             raise ConfigError("height_min_m", self.band_m, "a band that the depth camera sees")
-        self._pixels = np.flatnonzero(crosses)
-        angle = angle[crosses]
+        self._pixels, rays_base = np.flatnonzero(crosses), rays_base[crosses]
+        angle = np.arctan2(rays_base[:, 1], rays_base[:, 0]) - se3.yaw_rad(self.T_base_laser)
+        angle = (angle + np.pi) % (2 * np.pi) - np.pi
         half_rad = float(np.abs(angle).max()) + 1e-9
         self._angle_min_rad = -half_rad
         self._step_rad = 2 * half_rad / self._beams
         beam = np.floor((angle + half_rad) / self._step_rad).astype(np.int64)
         self._beam = np.clip(beam, 0, self._beams - 1)
-        self._range_ratio = range_ratio[crosses].astype(np.float32)
-        self._height_ratio = rays_base[crosses, 2].astype(np.float32)
+        self._range_ratio = np.hypot(rays_base[:, 0], rays_base[:, 1]).astype(np.float32)
+        self._height_ratio = rays_base[:, 2].astype(np.float32)
         # A pixel's share of an upright surface at 1 m, as a height over the width of a beam.
         solid = self._stride_px**2 / (self._camera.fx * self._camera.fy)
         self._height_per_m = (solid / self._step_rad / self._range_ratio**3).astype(np.float32)
@@ -176,6 +173,12 @@ def _rays_cam(camera: Camera, stride_px: int) -> NDArray[np.float64]:
     """Return the rays (N, 3) with z = 1 of every stride-th pixel, lens distortion taken out."""
     width, height = camera.size_wh
     u, v = np.meshgrid(np.arange(0, width, stride_px), np.arange(0, height, stride_px))
-    pixels = np.stack([u.ravel(), v.ravel()], axis=-1).astype(np.float64)
-    xy = cv2.undistortPoints(pixels[:, None], camera.K, np.array(camera.distortion)).reshape(-1, 2)
-    return np.column_stack([xy, np.ones(len(xy))])
+    rays = np.ones((u.size, 3))
+    if any(camera.distortion):
+        pixels = np.stack([u.ravel(), v.ravel()], axis=-1).astype(np.float64)
+        distortion = np.array(camera.distortion)
+        rays[:, :2] = cv2.undistortPoints(pixels[:, None], camera.K, distortion).reshape(-1, 2)
+    else:
+        rays[:, 0] = (u.ravel() - camera.cx) * (1.0 / camera.fx)
+        rays[:, 1] = (v.ravel() - camera.cy) * (1.0 / camera.fy)
+    return rays

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from time import perf_counter_ns
 
 from sceneslam.atlas.atlas import BRIDGED
@@ -28,13 +30,14 @@ class Handover:
         self.began_at = anchor
         self.trail: list[Moment] = []  # all after the anchor, and itself if no module gave its pose
         self.tracked: list[Tracking] = []  # what it said from the anchor on, where it holds
-        self.first_cost_ns = 0  # until its first pose
+        self.cost_ns = 0  # that it took so far; what is waited for between is not counted ...
+        self.first_cost_ns = 0  # ... and until the first pose
         self._memory, self._bridge = memory, anchor.bridge.copy()
         self._done_ns = anchor.stamp_ns - 1
         self.is_placed = False
         self._told: Transform | None = None  # the pose of the moment before, as told at the time
-        self._began_ns = perf_counter_ns()
-        runner.activate(rig, scene)
+        with self._timed():
+            runner.activate(rig, scene)
 
     @property
     def is_lost(self) -> bool:
@@ -46,27 +49,37 @@ class Handover:
         """Return the newest pose, None when there is none."""
         return self.trail[-1].T_map_base if self.trail else self.anchor.T_map_base
 
-    @property
-    def cost_ns(self) -> int:
-        """Return the time since it began."""
-        return perf_counter_ns() - self._began_ns
-
     def advance(self, limit: int | None) -> bool:
         """Lead the module through up to `limit` moments; return whether it has caught up.
 
         Raises ModuleError when the module breaks its promise.
         """
         ahead = self._memory.after(self._done_ns)
-        for moment in ahead[:limit]:
-            self._feed(moment)
+        with self._timed():
+            for moment in ahead[:limit]:
+                self._feed(moment)
         return limit is None or len(ahead) <= limit
 
     def settle(self, anchor: Moment) -> None:
-        """Place the module, which has caught up, anew: at the pose of another moment, now."""
+        """Place the module, which has caught up, anew: at the pose of another moment, now.
+
+        What it did before was its trial, not the hand-over.
+        """
         last = self.tracked[-1]
+        self.began_at, self.cost_ns = anchor, 0
         self.anchor, self.trail, self.tracked = anchor, [], [last]
         self._bridge = anchor.bridge.copy()
-        self.runner.place(self._bridge.T_map_base @ se3.inverse(last.T_local_base))
+        with self._timed():
+            self.runner.place(self._bridge.T_map_base @ se3.inverse(last.T_local_base))
+        self.first_cost_ns = self.cost_ns
+
+    @contextmanager
+    def _timed(self) -> Iterator[None]:
+        self._since_ns = perf_counter_ns()
+        try:
+            yield
+        finally:
+            self.cost_ns += perf_counter_ns() - self._since_ns
 
     def _feed(self, moment: Moment) -> None:
         if not self.is_placed and moment.is_trusted:
@@ -102,7 +115,7 @@ class Handover:
     def _place(self, moment: Moment, tracking: Tracking) -> Transform:
         """Return the pose of a module that holds one; its first is the pose handed over (Eq. 1)."""
         if not self.is_placed:
-            self.first_cost_ns = self.cost_ns
+            self.first_cost_ns = self.cost_ns + perf_counter_ns() - self._since_ns
             self._bridge.predict(moment.observation, by_velocity=True)
             self.runner.place(self._bridge.T_map_base @ se3.inverse(tracking.T_local_base))
             self.tracked, self.is_placed = [], True
