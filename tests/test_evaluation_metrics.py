@@ -61,6 +61,8 @@ SWITCH_KEYS = {
     "jump_m",
     "jump_rad",
     "cost_ms",
+    "first_pose_ms",
+    "catch_up_s",
 }
 TRUTH_KEYS = (
     "ate_rmse_m",

@@ -120,6 +120,8 @@ def _describe(decision: Event, result: RunResult, truth: GroundTruth | None) -> 
         "jump_m": jump_m,
         "jump_rad": jump_rad,
         "cost_ms": cost.get("handover_ms"),
+        "first_pose_ms": cost.get("first_pose_ms"),
+        "catch_up_s": cost.get("catch_up_s"),
     }
 
 
