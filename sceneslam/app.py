@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 
 from sceneslam.atlas.save import save_map
+from sceneslam.atlas.uncertainty import write_covariances
 from sceneslam.config.build import Parts, build
 from sceneslam.config.provenance import save_config
 from sceneslam.evaluation.metrics import Metrics, evaluate, write_metrics
@@ -21,10 +22,12 @@ from sceneslam.evaluation.report import write_report
 from sceneslam.interrupts import termination_as_interrupt, uninterrupted
 from sceneslam.loop import Loop
 from sceneslam.types.errors import told
+from sceneslam.types.rig import Sensor
 from sceneslam.types.trajectory import Trajectory
 
 _WRITTEN = (
     "trajectory*.tum",
+    "trajectory_covariance.txt",
     "groundtruth.tum",
     "figures/*.png",
     "map/*",
@@ -101,6 +104,11 @@ def _save(
         for session in result.sessions:
             name = f"trajectory_{session.index}_{session.module}.tum"
             session.trajectory.write_tum(folder / name)
+        write_covariances(
+            folder / "trajectory_covariance.txt",
+            result.trajectory.stamps_ns,
+            parts.atlas.covariances(Sensor.ODOMETRY in parts.rig.sensors),
+        )
     with _noting(loop.faults, "the map"):
         save_map(result.map, folder / "map")
     metrics = evaluate(

@@ -19,6 +19,7 @@ def moment(index, *, is_trusted=True, has_pose=True):
         module="a",
         bridge=Bridge(velocity_horizon_s=0.5, uses_odometry=True),
         turn=None,
+        covariance=None,
         is_trusted=is_trusted,
     )
 

@@ -93,7 +93,7 @@ class Odometry:
         along = self.translation_noise_ratio * distance_m
         turn = self.rotation_noise_ratio * angle_rad + self.rotation_noise_rad_per_m * distance_m
         # Errors of odometry go on in the same way: deviations add up, not variances.
-        carried = _adjoint(se3.inverse(T_prev_curr))
+        carried = se3.adjoint(se3.inverse(T_prev_curr))
         covariance = carried @ self._covariance @ carried.T
         deviation = np.sqrt(np.diag(covariance)) + np.array([along] * 3 + [turn] * 3)
         scale = deviation / np.sqrt(np.diag(covariance))
@@ -125,13 +125,3 @@ class Odometry:
             covariance=None if is_lost else self._covariance.copy(),
             quality_ratio=0.0 if is_lost else 1.0,
         )
-
-
-def _adjoint(T_a_b: se3.Transform) -> NDArray[np.float64]:
-    """Return the (6, 6) matrix that takes twists of b to a (translation first)."""
-    R, (x, y, z) = T_a_b[:3, :3], T_a_b[:3, 3]
-    hat = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = R
-    adjoint[:3, 3:] = hat @ R
-    return adjoint

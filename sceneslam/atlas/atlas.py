@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.atlas.fusion import fuse
 from sceneslam.atlas.revision import Revised, Told, revise
+from sceneslam.atlas.uncertainty import VELOCITY, WHEELS, Covariance, Step, propagate
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import HybridMap, MapLayers
 from sceneslam.types.run import Session
@@ -45,11 +47,20 @@ class _Path:
     poses: list[Transform] = field(default_factory=list)  # T_map_base
     modules: list[str] = field(default_factory=list)
     sessions: list[int] = field(default_factory=list)  # that was open, -1 before the first
+    covariances: list[Covariance | None] = field(default_factory=list)  # of T_local_base, as told
 
-    def add(self, stamp_ns: int, T_map_base: Transform, module: str, session: int) -> None:
+    def add(
+        self,
+        stamp_ns: int,
+        T_map_base: Transform,
+        module: str,
+        session: int,
+        covariance: Covariance | None,
+    ) -> None:
         """Add a pose unless its stamp has one."""
         if self.stamps_ns and stamp_ns <= self.stamps_ns[-1]:
             return
+        self.covariances.append(covariance)
         self.stamps_ns.append(stamp_ns)
         self.poses.append(T_map_base)
         self.modules.append(module)
@@ -58,7 +69,13 @@ class _Path:
     def cut(self, stamp_ns: int) -> None:
         """Forget the poses from an instant on."""
         keep = bisect_left(self.stamps_ns, stamp_ns)
-        for values in (self.stamps_ns, self.poses, self.modules, self.sessions):
+        for values in (
+            self.stamps_ns,
+            self.poses,
+            self.modules,
+            self.sessions,
+            self.covariances,
+        ):
             del values[keep:]
 
 
@@ -83,11 +100,20 @@ class Atlas:
         self._sessions[-1].stamps_ns.append(stamp_ns)
         self._sessions[-1].poses.append(T_local_base)
 
-    def add(self, stamp_ns: int, T_map_base: Transform, module: str) -> None:
-        """Add a pose to the global trajectory; a stamp has one pose, the first."""
+    def add(
+        self,
+        stamp_ns: int,
+        T_map_base: Transform,
+        module: str,
+        covariance: Covariance | None = None,
+    ) -> None:
+        """Add a pose to the global trajectory; a stamp has one pose, the first.
+
+        `covariance` is that of T_local_base, where the module tells it.
+        """
         session = len(self._sessions) - 1
-        self._online.add(stamp_ns, T_map_base, module, session)
-        self._path.add(stamp_ns, T_map_base, module, session)
+        self._online.add(stamp_ns, T_map_base, module, session, covariance)
+        self._path.add(stamp_ns, T_map_base, module, session, covariance)
 
     def rewind(self, stamp_ns: int) -> None:
         """Take the poses from an instant on back, for better ones; `online` keeps them."""
@@ -121,6 +147,30 @@ class Atlas:
             return Trajectory.empty()
         stamps_ns = np.array(self._path.stamps_ns, np.int64)
         return Trajectory(stamps_ns=stamps_ns, T_world_base=self._revise().T_map_base)
+
+    def session_rows(self) -> dict[int, int]:
+        """Return, per session, the row of the first pose that its module gave."""
+        rows: dict[int, int] = {}
+        for row, (session, module) in enumerate(
+            zip(self._path.sessions, self._path.modules, strict=True)
+        ):
+            if module != BRIDGED:
+                rows.setdefault(session, row)
+        return rows
+
+    def covariances(self, has_odometry: bool) -> NDArray[np.float64]:
+        """Return how sure the poses of the trajectory are (N, 6, 6), before modules revised them.
+
+        In `base`, translation first. Bridges are the wheels' motion where there is odometry.
+        """
+        path = self._path
+        steps = [
+            Step(T_map_base=T, session=session, is_bridged=module == BRIDGED, covariance=told)
+            for T, session, module, told in zip(
+                path.poses, path.sessions, path.modules, path.covariances, strict=True
+            )
+        ]
+        return propagate(steps, WHEELS if has_odometry else VELOCITY)
 
     @property
     def pose_modules(self) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.decision import Health
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.handover import Handover
+from sceneslam.bus.handover_log import log_cost, log_uncertainty
 from sceneslam.bus.hold import Hold
 from sceneslam.bus.memory import Memory, Moment
 from sceneslam.bus.policy import Policy
@@ -19,7 +20,7 @@ from sceneslam.types import se3
 from sceneslam.types.errors import ModuleError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, TrackingStatus
-from sceneslam.types.rig import Rig
+from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
 
 _log = logging.getLogger(__name__)
@@ -83,13 +84,14 @@ class Estimator:
             )
         module = self.active.key if is_told and self.active is not None else BRIDGED
         if T_map_base is not None:
-            self._atlas.add(observation.stamp_ns, T_map_base, module)
+            self._atlas.add(observation.stamp_ns, T_map_base, module, self.hold.covariance)
         moment = Moment(
             observation=observation,
             T_map_base=T_map_base,
             module=module,
             bridge=self._bridge.copy(),
             turn=self.hold.turn,
+            covariance=self.hold.covariance,
             is_trusted=is_told and self.hold.is_trusted,
         )
         self._memory.add(moment)
@@ -122,7 +124,7 @@ class Estimator:
         if handover.is_placed:
             self._rewrite(handover)
         self._tell(self._memory.newest.stamp_ns)
-        self._log_cost(handover)
+        log_cost(self._log, handover, self._memory.newest.stamp_ns)
         self._retire(old, old_sessions)
 
     def retire(self) -> None:
@@ -134,6 +136,8 @@ class Estimator:
         """Shut the active module down for good, and forget what was observed."""
         self.retire()
         self._memory.clear()
+        has_odometry = Sensor.ODOMETRY in self._rig.sensors
+        log_uncertainty(self._log, self._atlas, has_odometry=has_odometry)
 
     def _ask(self, observation: Observation) -> Transform | None:
         """Return the active module's pose in the map, None where it holds none."""
@@ -173,7 +177,8 @@ class Estimator:
         """Put moments that are better known now in the place of those that were told."""
         for moment in moments:
             if moment.T_map_base is not None:
-                self._atlas.add(moment.stamp_ns, moment.T_map_base, moment.module)
+                told = (moment.T_map_base, moment.module, moment.covariance)
+                self._atlas.add(moment.stamp_ns, *told)
         if moments:
             self._memory.rewrite(moments)
         if len(moments) > 1:
@@ -221,19 +226,6 @@ class Estimator:
             jump_m=float(np.linalg.norm(jump[:3, 3])),
             jump_rad=float(se3.rotation_angle_rad(jump)),
             gap_s=0.0 if last_ns is None else (from_ns - last_ns) / 1e9,
-        )
-
-    def _log_cost(self, handover: Handover) -> None:
-        """Log what the hand-over took; never part of what is reproducible."""
-        newest_ns = self._memory.newest.stamp_ns
-        span_s = (newest_ns - handover.began_at.stamp_ns) / 1e9
-        self._log.add(
-            "cost",
-            newest_ns,
-            module=handover.runner.key,
-            handover_ms=handover.cost_ns / 1e6,
-            first_pose_ms=handover.first_cost_ns / 1e6,
-            catch_up_s=span_s,
         )
 
     def _tell(self, stamp_ns: int) -> None:

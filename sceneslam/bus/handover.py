@@ -98,6 +98,7 @@ class Handover:
                     module=BRIDGED if tracking is None else self.runner.key,
                     bridge=self._bridge.copy(),
                     turn=self.hold.turn,
+                    covariance=None if tracking is None else tracking.covariance,
                     is_trusted=self.hold.is_trusted,
                 )
             )

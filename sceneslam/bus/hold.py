@@ -25,6 +25,7 @@ class Hold:
         self.held_since_ns: int | None = None
         self.held_ns = 0  # how long it had held its pose without a break before that
         self.turn: NDArray[np.float64] | None = None  # its last (3, 3) rotation, where believed
+        self.covariance: NDArray[np.float64] | None = None  # of its pose, where that may be used
         self.T_local_base: Transform | None = None  # at the last observation, where it told one
         self._gate = Gate(gate) if gate is not None else None
         self._sureness = Sureness()
@@ -39,7 +40,7 @@ class Hold:
 
     def ask(self, runner: Runner, observation: Observation) -> Tracking | None:
         """Return a module's answer where its pose may be used; raises ModuleError as the runner."""
-        self.is_trusted = False
+        self.is_trusted, self.covariance = False, None
         if not runner.can_use(observation):
             self._judge(observation, None)
             self._wait(observation.stamp_ns)
@@ -51,6 +52,7 @@ class Hold:
         if is_lost or self.is_suspect:
             self._lose(tracking.stamp_ns)
             return None
+        self.covariance = tracking.covariance
         is_sure = self._sureness.is_usual(tracking.covariance)
         self.is_trusted = is_sure and tracking.status is TrackingStatus.TRACKING
         self.unheld_since_ns = None

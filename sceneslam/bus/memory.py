@@ -25,6 +25,7 @@ class Moment:
     module: str  # that gave it, BRIDGED for none
     bridge: Bridge  # after the observation
     turn: NDArray[np.float64] | None  # (3, 3) since the moment before, as a believed module says
+    covariance: NDArray[np.float64] | None  # (6, 6) of its T_local_base, as the module says
     is_trusted: bool  # a module that was not suspect said it was tracking, as sure as usual
 
     @property
@@ -34,7 +35,14 @@ class Moment:
 
     def bridged(self, T_map_base: Transform | None, bridge: Bridge) -> Moment:
         """Return the moment with a pose that no module gave."""
-        return replace(self, T_map_base=T_map_base, module=BRIDGED, bridge=bridge, is_trusted=False)
+        return replace(
+            self,
+            T_map_base=T_map_base,
+            module=BRIDGED,
+            bridge=bridge,
+            covariance=None,
+            is_trusted=False,
+        )
 
 
 class Memory:

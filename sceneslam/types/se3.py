@@ -101,6 +101,15 @@ def log(T_a_b: Transform) -> NDArray[np.float64]:
     return np.concatenate([rho, phi])
 
 
+def adjoint(T_a_b: Transform) -> NDArray[np.float64]:
+    """Return the (6, 6) matrix that takes twists of b to a (translation first)."""
+    rotation = T_a_b[:3, :3]
+    adjoint_a_b = np.zeros((6, 6))
+    adjoint_a_b[:3, :3] = adjoint_a_b[3:, 3:] = rotation
+    adjoint_a_b[:3, 3:] = _hat(T_a_b[:3, 3]) @ rotation
+    return adjoint_a_b
+
+
 def interpolate(T_w_0: Transform, T_w_1: Transform, ratio: float) -> Transform:
     """Return the pose at `ratio` of the way from 0 to 1 (straight line, slerp)."""
     step = so3_log(T_w_0[:3, :3].T @ T_w_1[:3, :3])
