@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types.se3 import Transform
+
 Doubles = NDArray[np.float64]
 
 
@@ -57,6 +59,14 @@ def localizability(
     return Localizability(
         ratios=np.maximum(ratios, 0.0), directions=directions, scale=_motion_of(centre, turn_m)
     )
+
+
+def adjoint(T_a_b: Transform) -> Doubles:
+    """Return the (6, 6) matrix that takes twists of b to a (translation first)."""
+    ad = np.zeros((6, 6))
+    ad[:3, :3] = ad[3:, 3:] = T_a_b[:3, :3]
+    ad[:3, 3:] = _hat(T_a_b[:3, 3]) @ T_a_b[:3, :3]
+    return ad
 
 
 def _motion_of(centre: NDArray[np.floating], turn_m: Doubles) -> Doubles:
