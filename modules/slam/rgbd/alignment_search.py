@@ -19,7 +19,7 @@ from .alignment import Alignment, look_up
 from .features import SCALE, Features
 
 _STARTS = (Alignment(), Alignment(focal_ratio=0.9, baseline_m=0.025))  # registered; a raw Kinect
-_ASKED_AT = (9, 14, 20)  # pairs of keyframes; unregistered after none of them: registered
+_ASKED_AT = (6, 9, 14, 20)  # pairs of keyframes; unregistered after none of them: registered
 _CORNERS = 200  # of a pair
 _MAX_HAMMING = 40
 _STEPS = 10
@@ -27,7 +27,8 @@ _WIDTHS = np.array([0.004, 0.004])  # of the differences that stand for slopes
 _LONGEST = np.array([0.03, 0.02])  # of one step
 _HUBER, _WORST = 2.0, 3.0  # [sigma] of a corner, [its root cost]
 _MIN_CHANGE = 0.03  # of the focal length: 10 px at the edge of the image
-_MIN_GAIN = 0.2  # of the cost
+_SAME = 0.02  # difference of two answers that agree
+_MIN_GAIN = 0.4  # of the cost
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -70,6 +71,7 @@ class AlignmentSearch:
     def __init__(self, camera: Camera, *, is_over: bool) -> None:
         self._camera, self.is_over = camera, is_over
         self._pairs: list[Pair] = []
+        self._guess = Alignment()  # when last asked
 
     def add(self, pair: Pair) -> Alignment | None:
         """Take a pair; return the cameras' alignment when they turn out to be two."""
@@ -77,19 +79,21 @@ class AlignmentSearch:
         count = len(self._pairs)
         if self.is_over or count not in _ASKED_AT:
             return None
-        found = self._find()
+        before, self._guess = self._guess, self._find()
+        is_sure = abs(before.focal_ratio - self._guess.focal_ratio) < _SAME
+        found = self._guess if is_sure and not self._guess.is_registered else None
         self.is_over = found is not None or count == _ASKED_AT[-1]
         if self.is_over:
             self._pairs.clear()
         return found
 
-    def _find(self) -> Alignment | None:
+    def _find(self) -> Alignment:
         costs = _Costs(self._camera, self._pairs)
         ends = [_descend(costs, start) for start in _STARTS]
         best = min(ends, key=costs.total)
         is_other = abs(best.focal_ratio - 1.0) > _MIN_CHANGE
         gain = 1.0 - costs.total(best) / costs.total(Alignment())
-        return best if is_other and gain > _MIN_GAIN else None
+        return best if is_other and gain > _MIN_GAIN else Alignment()
 
 
 class _Costs:
