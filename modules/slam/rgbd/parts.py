@@ -19,7 +19,7 @@ from .pose_solver import PoseSolver
 from .relocalizer import Relocalizer
 from .visual_map import VisualMap
 
-_MERGE_IMAGES = 5  # that the worker has for one bundle adjustment
+_MERGE_IMAGES = 10  # that the worker has for one bundle adjustment
 
 
 class Parts:

@@ -18,7 +18,7 @@ _RANSAC_PX = 4.0
 _RANSAC_TRIALS = 200
 _RANSAC_CONFIDENCE = 0.999
 _ROUNDS = (4, 3, 2)  # Gauss-Newton steps between two looks at who is an outlier
-_SMALL_STEP = 1e-5  # [m] and [rad]
+_SMALL_STEP = 1e-4  # [m] and [rad]
 _MAX_CONDITION = 1e12  # of the normal matrix; beyond, some motion is not measured at all
 
 
