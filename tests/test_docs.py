@@ -25,14 +25,16 @@ NOT_RUN = {  # first words -> why it is not run here
     "pip install": "needs a network; what it installs is held against pyproject.toml",
     "rerun": "opens a window; the recording is read by tests of the sink",
     "mkdocs serve": "serves until it is stopped; the site is built by a test",
+    "python -m sceneslam.sweep": "goes on with a sweep; tests of sweeps stop one and do",
     "python experiments/": "takes minutes; its numbers stand beside it, a test finds the program",
 }
 SHOWS = "viewer=rerun"  # starts a viewer that stays; tests of the sink start one and end it
+ASKS = re.compile(r" \+experiment=(?!unswitched)")  # takes minutes; is composed only
 ALL = [(page, command) for page in PAGES for command in commands(page)]
 RUN = [
     (page, command)
     for page, command in ALL
-    if not command.startswith(tuple(NOT_RUN)) and SHOWS not in command
+    if not command.startswith(tuple(NOT_RUN)) and not (SHOWS in command or ASKS.search(command))
 ]
 
 
@@ -68,6 +70,14 @@ def test_command_runs(workshop, monkeypatch, capfd, page, command):
     assert code == 0, errors
     if re.search(r"-m sceneslam (?!-m|--help|.*--cfg)", command):
         assert f"{OBSERVATIONS} poses (coverage 100.0 %)" in said
+
+
+@pytest.mark.parametrize("command", [c for _, c in ALL if ASKS.search(c)])
+def test_experiment_composes(workshop, monkeypatch, capfd, command):
+    monkeypatch.chdir(workshop)
+    asked = command.replace("sceneslam -m ", "sceneslam ")
+    assert run_inside(f"{asked} --cfg job") == 0
+    assert "policy:" in capfd.readouterr().out
 
 
 @pytest.mark.parametrize("command", [c for _, c in ALL if c.startswith("python experiments/")])
