@@ -124,7 +124,10 @@ class SlamModule(Protocol):
         ...
 
     def activate(self, rig: Rig) -> None:
-        """Start anew: empty map, `local` at the next observation."""
+        """Start anew: empty map, `local` at the next observation.
+
+        What an earlier session saw may be recognised later: `Tracking.revision` tells of it.
+        """
         ...
 
     def set_pose(self, T_map_local: Transform) -> None:

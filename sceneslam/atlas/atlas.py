@@ -36,7 +36,9 @@ class _Open:
     def told(self) -> Told:
         """Return its poses, as told and as revised."""
         online = _trajectory(self.stamps_ns, self.poses)
-        return Told(T_map_local=self.T_map_local, online=online, revised=self.revised)
+        return Told(
+            module=self.module, T_map_local=self.T_map_local, online=online, revised=self.revised
+        )
 
 
 @dataclass(slots=True)

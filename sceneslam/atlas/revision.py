@@ -12,11 +12,14 @@ from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
+_ROUNDING = 1e-9  # of products of transforms
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Told:
     """A session as its module told it, and as it says at its end that it was."""
 
+    module: str
     T_map_local: Transform
     online: Trajectory  # T_local_base
     revised: Trajectory  # T_local_base; empty: as told
@@ -39,7 +42,9 @@ def revise(
     """Return the poses after all revisions; `pose_sessions` (N,) is -1 before the first session.
 
     Every pose moves with the newest pose of its session that was revised, so that bridged motion
-    stays what it was. A session starts where the one before it, revised, left off (Eq. 1).
+    stays what it was. A session starts where the one before it, revised, left off (Eq. 1), unless
+    its module moved its start too: it knew the place from an earlier session. Then what drifted
+    in between is put right, by the way covered.
     """
     moved = np.array(T_map_base)
     placed: list[Transform] = []
@@ -49,8 +54,40 @@ def revise(
         rows = np.flatnonzero(pose_sessions == index)
         corrections = _corrections(session, carried, stamps_ns[rows])
         moved[rows] = corrections @ moved[rows]
+        before = [j for j in range(index) if sessions[j].module == session.module]
+        if before and len(rows):
+            step = corrections[0] @ se3.inverse(carried)
+            between = _between(pose_sessions, before[-1], index)
+            _spread(step, moved, between, placed, pose_sessions)
         carried = corrections[-1] if len(rows) else carried
     return Revised(T_map_local=placed, T_map_base=moved)
+
+
+def _between(pose_sessions: NDArray[np.int64], first: int, last: int) -> NDArray[np.int64]:
+    """Return the rows (N,) of the poses between two sessions."""
+    return np.flatnonzero((pose_sessions > first) & (pose_sessions < last))
+
+
+def _spread(
+    step: Transform,
+    moved: NDArray[np.float64],
+    rows: NDArray[np.int64],
+    placed: list[Transform],
+    pose_sessions: NDArray[np.int64],
+) -> None:
+    """Move poses, and the sessions' places by their middle ones, by their share of a step."""
+    if not len(rows) or np.allclose(step, np.eye(4), rtol=0.0, atol=_ROUNDING):
+        return
+    ways_m = np.linalg.norm(
+        np.diff(moved[rows, :3, 3], axis=0, prepend=moved[rows[:1], :3, 3]), axis=1
+    )
+    shares = np.cumsum(ways_m) / max(float(ways_m.sum()), 1e-9)
+    xi = se3.log(step)
+    T_new_old = np.stack([se3.exp(share * xi) for share in shares.tolist()])
+    moved[rows] = T_new_old @ moved[rows]
+    for index in np.unique(pose_sessions[rows]).tolist():
+        within = np.flatnonzero(pose_sessions[rows] == index)
+        placed[index] = T_new_old[within[len(within) // 2]] @ placed[index]
 
 
 def _corrections(

@@ -33,6 +33,11 @@ class LoopCloser:
         self._loops: list[Loop] = []
         self._images_left = 0
 
+    @property
+    def is_solving(self) -> bool:
+        """Tell whether the worker is at a pose graph, or its poses are not merged yet."""
+        return self._solution is not None
+
     def insert(self, query: Query) -> None:
         """Take a new keyframe to look up."""
         if len(self._queries) == _QUEUE:

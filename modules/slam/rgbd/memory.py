@@ -10,13 +10,14 @@ from sceneslam.types.maps import LandmarkLayer, PoseGraphLayer
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
-from .frame_log import FrameLog
+from .frame_log import FrameLog, joined, moved
 from .keyframes import Keyframe
 from .localizer import Fix, Localizer
 from .loop_closing import LoopCloser
 from .loop_detection import LoopDetector, Query
 from .pose_graph import Edge, PoseGraph, motion_covariance
 from .recognition import PlaceRecognizer
+from .reunion import Reunion
 from .segments import Segments
 from .visual_map import VisualMap
 
@@ -26,10 +27,12 @@ _NEVER_SAW = -1
 
 
 class Memory:
-    """Follows the map as it grows and shrinks, and corrects it where a loop closes."""
+    """Follows the map as it grows and shrinks, and corrects it where it knows a place again."""
 
-    def __init__(self, visual_map: VisualMap, localizer: Localizer, *, min_inliers: int) -> None:
-        self._map = visual_map
+    def __init__(
+        self, visual_map: VisualMap, localizer: Localizer, reunion: Reunion, *, min_inliers: int
+    ) -> None:
+        self._map, self._reunion = visual_map, reunion
         self._graph, self._frames = PoseGraph(), FrameLog()
         self._keyframes: dict[int, Keyframe] = {}  # also those that the map has just let go
         self.recognizer = PlaceRecognizer(visual_map, localizer, min_inliers=min_inliers)
@@ -38,6 +41,11 @@ class Memory:
         self.segments = Segments(self._graph)
         self.reference = _NEVER_SAW  # the keyframe that the newest frame hangs on
         self.revision = 0  # rises with every correction
+        self._before = Trajectory.empty()  # what the map that this one replaces held
+
+    def follow(self, before: Memory) -> None:
+        """Go on from a map that this one replaces."""
+        self._before, self.revision = before.trajectory(), before.revision
 
     def hold(self, stamp_ns: int, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> None:
         """Remember where a frame was, by the keyframe that shares most landmarks with it."""
@@ -78,19 +86,26 @@ class Memory:
         return self.segments.around(self._map.keyframes.covisible(landmark_ids, limit=1)[0])
 
     def step(self) -> Transform | None:
-        """Do an image's share of closing loops; return T_new_old of here when the map moved."""
+        """Do an image's share of recognising; return T_new_old of here when the map moved."""
         self._follow_removals()
-        moved = self._closer.step()
-        if not moved:
-            return None
-        self.revision += 1
-        self.segments.update()
-        return moved.get(self.reference, se3.identity())
+        corrections = self._closer.step()
+        if corrections:
+            self.revision += 1
+            self.segments.update()
+            return corrections.get(self.reference, se3.identity())
+        T_new_old = None if self._closer.is_solving else self._reunion.step()
+        if T_new_old is not None:
+            keyframes = self._map.keyframes
+            self._map.correct({k: T_new_old @ keyframes[k].T_local_base for k in keyframes.ids})
+            self._before = moved(self._before, T_new_old)
+            self.revision += 1
+        return T_new_old
 
     def trajectory(self) -> Trajectory:
         """Return T_local_base of all frames that were held, with loops that were found last."""
         self._closer.finish()
-        return self._frames.trajectory({k: v.T_local_base for k, v in self._keyframes.items()})
+        frames = self._frames.trajectory({k: v.T_local_base for k, v in self._keyframes.items()})
+        return joined(self._before, frames)
 
     def pose_graph(self) -> PoseGraphLayer | None:
         """Return the keyframes and what was measured between them."""

@@ -17,13 +17,13 @@ from sceneslam.types.trajectory import Trajectory
 
 from .alignment import Alignment
 from .answers import held, lost, placed, started
-from .frame_log import joined
 from .fusion import join_duplicates
 from .keyframes import NO_LANDMARK, Keyframe
 from .limits import check_limits, check_sizes
 from .localizer import Fix
 from .motion import MotionModel
 from .parts import Parts
+from .reunion import Reunion
 from .triangulation import triangulate
 from .view import View
 
@@ -64,6 +64,7 @@ class RgbdSlam:
         check_limits(self._arguments)
         self._monocular_scenes = frozenset(monocular_scenes)
         self._ignores_depth = False
+        self._reunion = Reunion(keyframe_limit=keyframe_limit)
         self._T_map_local = se3.identity()
         self._T_local_base = se3.identity()
 
@@ -76,11 +77,15 @@ class RgbdSlam:
         )
 
     def activate(self, rig: Rig) -> None:
-        """Start anew with an empty map; raises InputError for a rig without a camera."""
+        """Start anew with an empty map; raises InputError for a rig without a camera.
+
+        Where it sees what an earlier, placed session saw, its poses are moved to fit beside it.
+        """
         if rig.camera is None:
             raise InputError("rig: rgbd needs the camera's intrinsics, got none")
         self._camera: Camera = rig.camera
-        self._motion, self._before = MotionModel(), Trajectory.empty()
+        self._motion = MotionModel()
+        self._reunion.begin()
         self._build(None)
         self._T_local_base = se3.identity()
         self._local_ids = np.zeros(0, np.int64)  # landmarks of the local map
@@ -90,6 +95,7 @@ class RgbdSlam:
     def set_pose(self, T_map_local: Transform) -> None:
         """Place `local` in the map (Eq. 1)."""
         self._T_map_local = T_map_local.copy()
+        self._reunion.place(T_map_local)
 
     def set_scene(self, scene: str) -> None:
         """Hear of the scene; in some of them depth is not to be trusted."""
@@ -123,12 +129,10 @@ class RgbdSlam:
 
     def get_trajectory(self) -> Trajectory:
         """Return T_local_base of every frame that was held, with all that loops corrected."""
-        return joined(self._before, self._memory.trajectory())
+        return self._memory.trajectory()
 
     def get_map(self) -> MapLayers:
-        """Return in `local` the keyframes' cloud and, for a robot in the plane, their grid,
-        the pose graph and the landmarks.
-        """
+        """Return in `local` the cloud, a planar robot's grid, the pose graph and the landmarks."""
         layers = self._layers.build(list(self._map.keyframes.all()))
         graph, landmarks = self._memory.pose_graph(), self._memory.landmarks()
         return replace(layers, pose_graph=graph, landmarks=landmarks)
@@ -137,6 +141,7 @@ class RgbdSlam:
         """Stop the workers; the map stays readable."""
         self._mapping.shutdown()
         self._memory.shutdown()
+        self._reunion.end(self._map, self._memory.recognizer)
 
     def _look(
         self, observation: Observation, image_bgr: NDArray[np.uint8], T_predicted: Transform
@@ -149,7 +154,7 @@ class RgbdSlam:
         )
 
     def _build(self, alignment: Alignment | None) -> None:
-        parts = Parts(self._arguments, self._camera, alignment)
+        parts = Parts(self._arguments, self._camera, alignment, self._reunion)
         self._eye, self._health = parts.eye, parts.health
         self._localizer, self._relocalizer = parts.localizer, parts.relocalizer
         self._map, self._mapping, self._memory = parts.map, parts.mapping, parts.memory
@@ -158,10 +163,11 @@ class RgbdSlam:
 
     def _build_anew(self, view: View, alignment: Alignment) -> None:
         """Begin a new map at the pose just held: the old one has its depths at wrong corners."""
-        self._before, revision = self._memory.trajectory(), self._memory.revision
-        self.shutdown()
+        before = self._memory
+        self._mapping.shutdown()
+        before.shutdown()
         self._build(alignment)
-        self._memory.revision = revision
+        self._memory.follow(before)
         view = self._look(view.observation, view.image_bgr, self._T_local_base)
         unseen = np.full(len(view.features), NO_LANDMARK)
         self._insert_keyframe(view, unseen, unseen[:0], set())
@@ -175,7 +181,7 @@ class RgbdSlam:
         return self._relocalizer.find(view.features, view.depth_m)
 
     def _recall(self) -> None:
-        """Go on from where the map is, if bundle adjustment or a loop has moved it."""
+        """Go on from where the map is: adjusted, after a loop, or beside an earlier session's."""
         self._motion.correct(self._mapping.step())
         T_new_old = self._memory.step()
         if T_new_old is not None:
@@ -188,23 +194,21 @@ class RgbdSlam:
         return self._place_rule.wants(view, self._motion, is_far=is_far)
 
     def _start(self, view: View) -> Tracking:
-        """Hang a keyframe on the prediction; wait, lost, for features with depth or odometry.
+        """Hang a keyframe on the prediction: the map's first, or of a place or segment of its own.
 
-        It is the map's first, the first of a place that only odometry connects to the map, or of
-        a segment that nothing connects.
+        Wait, lost, for features with depth or odometry.
         """
         is_scaled = not view.is_monocular or view.observation.T_odom_base is not None
         if not (view.shows_enough and is_scaled):
             return self._lose(view.observation, view.T_predicted)
-        is_first, is_guess = not len(self._map.keyframes), not self._motion.is_reckoned
-        unheld_s = self._motion.unheld_s(view.observation)
+        is_placed = self._motion.is_reckoned or not len(self._map.keyframes)
+        guessed_s = None if is_placed else self._motion.unheld_s(view.observation)
         self._hold_pose(view.observation, view.T_predicted)
         unseen = np.full(len(view.features), NO_LANDMARK)
-        guessed_s = unheld_s if is_guess and not is_first else None
         self._insert_keyframe(view, unseen, unseen[:0], set(), guessed_s=guessed_s)
         self._memory.hold(view.observation.stamp_ns, self._T_local_base, unseen[:0])
-        is_origin, revision = self._observations == 1, self._memory.revision
-        return started(view, self._T_local_base, is_first=is_origin, revision=revision)
+        is_first, revision = self._observations == 1, self._memory.revision
+        return started(view, self._T_local_base, is_first=is_first, revision=revision)
 
     def _hold(self, view: View, fix: Fix) -> Tracking:
         """Accept a pose, and extend the map where it is due."""
@@ -217,6 +221,8 @@ class RgbdSlam:
         self._map.count_sightings(fix.expected_ids, fix.landmark_ids)
         segment = self._memory.segment(fix.landmark_ids)
         wanted = self._keyframe_rule.wants(T_local_base, fix, self._map.keyframes, segment)
+        if status is TrackingStatus.TRACKING:
+            self._reunion.see(view, T_local_base)
         if wanted and status is TrackingStatus.TRACKING:
             landmark_ids = np.full(len(view.features), NO_LANDMARK)
             landmark_ids[fix.feature_rows] = fix.landmark_ids

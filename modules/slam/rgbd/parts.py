@@ -17,6 +17,7 @@ from .localizer import Localizer
 from .memory import Memory
 from .pose_solver import PoseSolver
 from .relocalizer import Relocalizer
+from .reunion import Reunion
 from .visual_map import VisualMap
 
 _MERGE_IMAGES = 10  # that the worker has for one bundle adjustment
@@ -26,7 +27,11 @@ class Parts:
     """An empty map, and all that looks, locates, maps, judges and remembers."""
 
     def __init__(
-        self, arguments: Mapping[str, Any], depth_camera: Camera, alignment: Alignment | None
+        self,
+        arguments: Mapping[str, Any],
+        depth_camera: Camera,
+        alignment: Alignment | None,
+        reunion: Reunion,
     ) -> None:
         """Build; without an alignment colours count as registered until they turn out not to be."""
 
@@ -55,7 +60,9 @@ class Parts:
             PoseSolver(camera, **same("seed")),
             **chosen(radius_px="search_radius_px", min_inliers="min_inliers"),
         )
-        self.memory = Memory(self.map, self.localizer, **chosen(min_inliers="degraded_inliers"))
+        self.memory = Memory(
+            self.map, self.localizer, reunion, **chosen(min_inliers="degraded_inliers")
+        )
         self.relocalizer = Relocalizer(self.map.keyframes, self.memory.recognizer)
         self.mapping = LocalMapping(
             depth_camera, self.map, alignment=alignment, every_images=_MERGE_IMAGES
