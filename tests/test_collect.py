@@ -50,7 +50,8 @@ def sweep(tmp_path):
             if (threshold, seed) == (100, 2):
                 job(tmp_path, number, *words, state=State.KILLED, error="ended by SIGKILL")
             else:
-                job(tmp_path, number, *words, error_m=0.01 * (seed + 1) * threshold / 60)
+                error_m = 0.01 * (seed + 1) * threshold / 60
+                job(tmp_path, number, *words, error_m=error_m, delay_s=threshold / 60)
             number += 1
     return tmp_path
 

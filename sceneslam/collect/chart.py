@@ -9,7 +9,7 @@ from html import escape
 
 from sceneslam.evaluation.figure_style import PALETTE
 
-_WIDTH, _HEIGHT = 640, 330
+_WIDTH, _HEIGHT = 480, 280
 _DOTS_MAX = 30  # of a line; more would hide it
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 16, 14, 46  # of the axes [px]
 
@@ -33,8 +33,8 @@ class Line:
     points: Sequence[Point]
 
 
-def draw_lines(lines: Sequence[Line], *, x_label: str, y_label: str) -> str:
-    """Return a chart of lines in colours, with a legend where there are several."""
+def draw_lines(lines: Sequence[Line], *, x_label: str, y_label: str, key: str = "") -> str:
+    """Return a chart of lines in colours, with a legend of their names, which `key` explains."""
     axes = _Axes([point for line in lines for point in line.points])
     parts = [axes.frame(x_label, y_label)]
     for line in lines:
@@ -44,7 +44,7 @@ def draw_lines(lines: Sequence[Line], *, x_label: str, y_label: str) -> str:
         parts += [_bar(axes, point, color) for point in line.points if point.half_width]
         if len(line.points) <= _DOTS_MAX:
             parts += [_dot(axes, point, color) for point in line.points]
-    return _svg(parts) + _legend(lines)
+    return _svg(parts) + _legend(lines, key)
 
 
 def draw_front(points: Sequence[Point], *, x_label: str, y_label: str) -> str:
@@ -147,10 +147,10 @@ def _svg(parts: Sequence[str]) -> str:
     return f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}">{"".join(parts)}</svg>'
 
 
-def _legend(lines: Sequence[Line]) -> str:
+def _legend(lines: Sequence[Line], key: str) -> str:
     if len(lines) < 2:
         return ""
     items = "".join(
         f'<li><i style="background:{line.color}"></i>{escape(line.name)}</li>' for line in lines
     )
-    return f'<ul class="legend">{items}</ul>'
+    return f'<ul class="legend"><li>{escape(key)}</li>{items}</ul>'

@@ -29,8 +29,9 @@ def charts(groups: Sequence[Group]) -> Iterator[str]:
     for key in numeric:
         for metric, name in _SHOWN.items():
             lines = list(_lines(groups, key, metric))
-            if any(len(line.points) > 1 for line in lines):
-                drawn = draw_lines(lines, x_label=key, y_label=name)
+            if len({point.y for line in lines for point in line.points}) > 1:
+                other = _other(groups, key) or ""
+                drawn = draw_lines(lines, x_label=key, y_label=name, key=other)
                 yield figure(drawn, _caption(groups, key, name))
 
 
@@ -63,9 +64,7 @@ def _lines(groups: Sequence[Group], key: str, metric: str) -> Iterator[Line]:
         points = [_point(chosen, key, x, metric) for x in _values(chosen, key)]
         known = [point for point in points if point is not None]
         if known:
-            yield Line(
-                name=f"{other}={value}", color=color, points=sorted(known, key=lambda p: p.x)
-            )
+            yield Line(name=str(value), color=color, points=sorted(known, key=lambda p: p.x))
 
 
 def _point(groups: Sequence[Group], key: str, x: Value, metric: str) -> Point | None:
@@ -86,7 +85,7 @@ def _caption(groups: Sequence[Group], key: str, name: str) -> str:
     other = _other(groups, key)
     rest = [one for one in groups[0].keys if one not in (key, other)]
     has_seeds = any(len(group.rows) > 1 for group in groups)
-    told = f"{name} against {key}"
+    told = f"{name[0].upper()}{name[1:]} against {key}"
     if other and len(_values(groups, other)) > _LINES_MAX:
         told += f", for some values of {other}"
     if rest or has_seeds:
