@@ -12,6 +12,8 @@ from sceneslam.evaluation import figure_style as look
 from sceneslam.experiments.matrix.cell import Cell
 from sceneslam.experiments.matrix.sweep import Setting
 
+_TICKS_CM = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
+
 
 def draw_errors(path: Path, means: Sequence[Cell]) -> None:
     """Write a PNG: the error of every strategy, story by story, on a log scale."""
@@ -28,6 +30,10 @@ def draw_errors(path: Path, means: Sequence[Cell]) -> None:
     axes.set_yticks(range(len(stories)), stories)
     axes.invert_yaxis()
     axes.set_xscale("log")
+    axes.set_xticks(_TICKS_CM, [f"{tick:g}" for tick in _TICKS_CM])
+    axes.minorticks_off()
+    errors_cm = [100 * cell.ate_m for cell in means]
+    axes.set_xlim(0.8 * min(errors_cm), 1.2 * max(errors_cm))
     look.style(axes, x_label="ATE RMSE [cm]")
     figure.legend(loc="outside upper center", ncols=3, frameon=False, fontsize=11)
     look.save(figure, path)
