@@ -96,6 +96,8 @@ class Bus:
         began_ns = perf_counter_ns()
         spent_ns = self._spent_ns()
         self._watch.look(observation)
+        if self._state == "run":
+            self._changeover.submit(observation)
         self._track(observation)
         outcome = self._do(observation)
         while outcome is not None:

@@ -15,7 +15,7 @@ from sceneslam.bus.handover import Handover
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.runner import Runner
 from sceneslam.types.errors import ModuleError
-from sceneslam.types.observation import TrackingStatus
+from sceneslam.types.observation import Observation, TrackingStatus
 
 _log = logging.getLogger(__name__)
 
@@ -118,6 +118,16 @@ class Changeover:
         """Let the scene's first choice run beside the fallback, unseen, from now on."""
         self._trial = _Attempt(key=key, ready_ns=self._ready_ns(key, stamp_ns))
         self.try_on(stamp_ns)
+
+    def submit(self, observation: Observation) -> None:
+        """Let the module on trial begin with an observation, beside the active one."""
+        if self._trial is None or self._trial.handover is None:
+            return
+        try:
+            self._trial.handover.runner.submit(observation)
+        except ModuleError as error:
+            self._fault(observation.stamp_ns, str(error))
+            self._end_trial()
 
     def try_on(self, stamp_ns: int) -> None:
         """Feed the module on trial, if there is one; it ends where it fails or is lost."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from time import perf_counter_ns
 
 from sceneslam.bus.answers import checked_layers, checked_tracking, checked_trajectory
-from sceneslam.interfaces import Restartable, SlamModule
+from sceneslam.interfaces import Concurrent, Restartable, SlamModule
 from sceneslam.types.errors import ModuleError, told
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking
@@ -38,6 +38,7 @@ class Runner:
         self.track_ms: list[float] = []
         self.spent_ns = 0  # in all calls together
         self._is_active = False
+        self._submitted: Observation | None = None  # its answer was not collected yet
         self._module = module
         # What every set holds is what it works on; without such, any of them may be.
         common = frozenset[Sensor].intersection(*module.requires)
@@ -78,18 +79,29 @@ class Runner:
         """Tell whether the observation holds any sensor that the module works on."""
         return any(observation.has(sensor) for sensor in self._sensors)
 
+    def submit(self, observation: Observation) -> None:
+        """Let a module with a process of its own begin; `track` with the same observation ends it.
+
+        Does nothing for any other. Raises ModuleError as `track`.
+        """
+        if isinstance(self._module, Concurrent) and self.can_use(observation):
+            with self._asking("failed while tracking"):
+                self._module.submit(observation)
+                self._submitted = observation
+
     def track(self, observation: Observation) -> Tracking:
         """Return the module's answer; raises ModuleError on an exception or no proper pose."""
         began_ns = perf_counter_ns()
         try:
             with self._asking("failed while tracking"):
-                return checked_tracking(self._module.track(observation), observation.stamp_ns)
+                return checked_tracking(self._answer(observation), observation.stamp_ns)
         finally:
             self.track_ms.append((perf_counter_ns() - began_ns) / 1e6)
 
     def retire(self) -> Legacy:
         """Shut the module down and return what it leaves, empty where it cannot give it."""
         layers, trajectory = MapLayers(), Trajectory.empty()
+        self._drain()
         if self._is_active:
             with self._parting("could not give its trajectory"):
                 trajectory = checked_trajectory(self._module.get_trajectory())
@@ -99,6 +111,21 @@ class Runner:
             self._module.shutdown()
         self._is_active = False
         return Legacy(layers=layers, trajectory=trajectory)
+
+    def _answer(self, observation: Observation) -> Tracking:
+        submitted, self._submitted = self._submitted, None
+        if isinstance(self._module, Concurrent) and submitted is not None:
+            answer = self._module.collect()
+            if submitted is observation:
+                return answer
+        return self._module.track(observation)
+
+    def _drain(self) -> None:
+        """Take an answer that nobody waits for any more: the module is to be asked for another."""
+        submitted, self._submitted = self._submitted, None
+        if submitted is not None and isinstance(self._module, Concurrent):
+            with suppress(Exception):  # what is wrong with it shows when it is asked again
+                self._module.collect()
 
     @contextmanager
     def _asking(self, what: str) -> Iterator[None]:
