@@ -84,6 +84,15 @@ def test_chronicle_tells_long_trouble_and_counts_short():
     assert not any("degraded" in what for what in whats)
 
 
+def test_chronicle_tells_of_a_module_that_is_lost_from_its_first_observation_on():
+    run = switched_run()
+    lost = [e | {"status": "lost"} if e["event"] == "tracking" else e for e in run.events]
+    lost = sorted((e for e in lost if e["event"] in ("vote", "tracking")), key=lambda e: e["event"])
+    decided = [e for e in run.events if e["event"] == "decision"][:1]
+    whats = [entry.what for entry in tell(replace(run, events=[*lost[:1], *decided, *lost[1:]]))]
+    assert any(what.startswith("“rgbd” is lost for 19.9 s") for what in whats), whats
+
+
 def test_chronicle_tells_trials_refusals_and_faults():
     at = int(stamps(200)[50])
     choice = {"scene": "Bright", "from_": "rgbd", "to": "laser", "reason": "lost"}

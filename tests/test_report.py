@@ -144,6 +144,11 @@ def test_figures_of_a_page_refer_to_nothing_of_each_other(tmp_path):
     assert all(len(numbers) == 1 for numbers in owners.values())
 
 
+def test_figures_of_the_report_round_no_number_that_is_read(tmp_path):
+    html = report(tmp_path, switched_run(), true_loop())
+    assert re.search(r">RMS 0\.00\d m, max 0\.00\d m</text>", html)
+
+
 def test_figures_take_the_colours_of_the_page(tmp_path):
     html = report(tmp_path, switched_run(), true_loop())
     drawn = html[html.index("<svg") : html.rindex("</svg>")]

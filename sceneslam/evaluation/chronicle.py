@@ -114,7 +114,8 @@ class _Writer:
         self._add(event["stamp_ns"], "decision", f"“{event['to']}” was not taken: {why}")
 
     def _tell_decision(self, event: Event) -> None:
-        self._end_trouble(event["stamp_ns"])
+        if self._trouble is not None and self._trouble["module"] != event["to"]:
+            self._end_trouble(event["stamp_ns"])
         replaced = event.get("from")
         what = f"“{event['to']}” takes over from “{replaced}”" if replaced else ""
         switch = self._switches.get((event["stamp_ns"], event["to"]), {})

@@ -94,13 +94,19 @@ def to_svg(figure: Any, name: str) -> str:
     svg = re.sub(r'^<svg [^>]*?viewBox="([^"]*)"[^>]*>', r'<svg viewBox="\1">', svg)
     for color, variable in _PAGE_COLORS.items():
         svg = re.sub(color, f"var({variable})", svg, flags=re.I)
-    svg = re.sub(r"(\.\d\d)\d+", r"\1", svg)  # a hundredth of a point is finer than any screen
+    svg = re.sub(r"<[^>]+>", _round, svg)
     return re.sub(r"font-family: [^;\"]*;? ?", "", svg)
+
+
+def _round(tag: re.Match[str]) -> str:
+    """Return a tag with hundredths of a point, which are finer than any screen."""
+    return re.sub(r"(\.\d\d)\d+", r"\1", tag[0])
 
 
 def module_colors(result: RunResult) -> dict[str, str]:
     """Return a colour for every module: in the map's order, then by first appearance."""
-    keys = dict.fromkeys([*result.map.modules, *(key for key in result.modules if key)])
+    told = [event["module"] for event in result.events if event["event"] == "tracking"]
+    keys = dict.fromkeys([*result.map.modules, *(key for key in result.modules if key), *told])
     return {key: PALETTE[number % len(PALETTE)] for number, key in enumerate(keys)}
 
 
