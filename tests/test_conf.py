@@ -98,7 +98,7 @@ ALLOWED = {  # package -> what of ours it may import
     "modules": {"types", "interfaces"},
     "experiments/openloris": {"types", "evaluation", "experiments"},
     "experiments/handover": {"types", "atlas", "evaluation", "experiments"},
-    "experiments/mutants": {"types", "ros", "config", "experiments"},
+    "experiments/mutants": {"types", "interfaces", "ros", "config", "experiments"},
     "experiments/matrix": {"types", "evaluation", "bus", "modules", "experiments"},
     "experiments/paper": {"types", "interfaces", "evaluation", "config", "experiments"},
     "experiments/table": {"types", "evaluation", "experiments"},

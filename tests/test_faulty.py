@@ -51,7 +51,9 @@ def test_without_faults_nothing_is_changed(record):
 
 
 def test_faults_are_as_frequent_as_told_and_of_all_kinds(record):
-    plan = FaultPlan(kinds=("one", "two"), rate_ratio=0.2, seed=0, record=record)
+    plan = FaultPlan(
+        kinds=("one", "two"), known=("one", "two"), rate_ratio=0.2, seed=0, record=record
+    )
     kinds = [plan.strike(stamp_ns) for stamp_ns in range(2000)]
     assert 150 <= kinds.count("one") <= 250 and 150 <= kinds.count("two") <= 250
     assert len(struck(record)) == 2000 - kinds.count(None)
@@ -59,7 +61,7 @@ def test_faults_are_as_frequent_as_told_and_of_all_kinds(record):
 
 def test_a_fault_strikes_once_whoever_is_there(record):
     def strikes():
-        plan = FaultPlan(kinds=("one",), rate_ratio=0.5, seed=1, record=record)
+        plan = FaultPlan(kinds=("one",), known=("one",), rate_ratio=0.5, seed=1, record=record)
         return [stamp_ns for stamp_ns in range(100) if plan.strike(stamp_ns)]
 
     assert strikes() and strikes() == []
@@ -69,7 +71,7 @@ def test_other_seeds_strike_elsewhere(tmp_path):
     found = []
     for seed in (1, 2):
         path = tmp_path / f"{seed}.jsonl"
-        plan = FaultPlan(kinds=("one",), rate_ratio=0.3, seed=seed, record=path)
+        plan = FaultPlan(kinds=("one",), known=("one",), rate_ratio=0.3, seed=seed, record=path)
         found.append([stamp_ns for stamp_ns in range(100) if plan.strike(stamp_ns)])
     assert found[0] != found[1]
 

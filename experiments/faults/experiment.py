@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from sceneslam.experiments.faults.survival import Survival, survival
-from sceneslam.types.errors import ConfigError
 from sceneslam.types.experiment import Figure, Outcome, Relation, RunTrials, Table, Trial, Verdict
+from sceneslam.types.ranges import check_above, check_between, check_least, check_some
 
 
 class FaultsExperiment:
@@ -33,8 +33,11 @@ class FaultsExperiment:
         availability_min: float,
         recovery_max_s: float,
     ) -> None:
-        if runs < 1:
-            raise ConfigError("runs", runs, "1 or more")
+        check_least(1, runs=runs)
+        check_least(0, seed=seed, faults_min=faults_min)
+        check_above(0, right_m=right_m, recovery_max_s=recovery_max_s)
+        check_between(0, 1, availability_min=availability_min)
+        check_some(struck=struck)
         self._runs, self._struck, self._seed, self._right_m = runs, struck, seed, right_m
         self._faults_min = faults_min
         self._availability_min, self._recovery_max_s = availability_min, recovery_max_s

@@ -13,6 +13,8 @@ from sceneslam.experiments.handover.figure import draw_seams
 from sceneslam.experiments.handover.seam import Seam, measure
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.experiment import Figure, Relation, RunTrials, Table, Trial, Verdict
+from sceneslam.types.ranges import check_above, check_among, check_least, check_some
+from sceneslam.types.run import HANDOVERS
 
 _PERIOD_S = 1.0  # of slack, so that the run does not end at the very pose that is measured
 
@@ -32,6 +34,10 @@ class HandoverExperiment:
         rate_hz: float,
         seam_limit_m: float,
     ) -> None:
+        check_some(kinds=kinds, startups_s=startups_s, lost_s=lost_s)
+        check_among(HANDOVERS, kinds=kinds)
+        check_least(0, startups_s=startups_s, lost_s=lost_s, after_s=after_s)
+        check_above(0, window_s=window_s, rate_hz=rate_hz, seam_limit_m=seam_limit_m)
         if not window_s < confirmed_s:
             raise ConfigError("confirmed_s", confirmed_s, f"more than the window of {window_s} s")
         if max(lost_s, default=0.0) > window_s:

@@ -15,6 +15,8 @@ from sceneslam.experiments.matrix.figure import draw_errors, draw_sweep
 from sceneslam.experiments.matrix.oracle import best_of
 from sceneslam.experiments.matrix.sweep import Grid, sweep
 from sceneslam.types.experiment import Figure, Outcome, Relation, RunTrials, Table, Trial, Verdict
+from sceneslam.types.ranges import check_above, check_among, check_between, check_least, check_some
+from sceneslam.types.run import HANDOVERS
 from sceneslam.types.trajectory import Trajectory
 
 _ORACLE = Strategy(name="oracle")
@@ -36,6 +38,13 @@ class MatrixExperiment:
         hystereses: Sequence[float],
         windows_s: Sequence[float],
     ) -> None:
+        check_some(stories=stories, seeds=seeds, modules=modules, handovers=handovers)
+        check_some(thresholds=thresholds, hystereses=hystereses, windows_s=windows_s)
+        check_among(HANDOVERS, handovers=handovers)
+        check_among(handovers, judged=judged)
+        check_least(0, seeds=seeds, hystereses=hystereses, windows_s=windows_s)
+        check_between(0, 255, thresholds=thresholds)
+        check_above(0, regret_limit=regret_limit)
         self._places = [(story, seed) for story in stories for seed in seeds]
         self._alone = [Strategy(name=f"{key} alone", module=key) for key in modules]
         self._strategies = [

@@ -16,6 +16,18 @@ SCENARIOS = (
     "dark_corridor",
     "depth_dropout",
 )
+EXPERIMENTS = (
+    "faults",
+    "handover",
+    "matrix",
+    "mutants",
+    "paper_iv_a",
+    "paper_iv_b",
+    "paper_iv_c",
+    "paper_iv_d",
+    "paper_iv_e",
+    "table",
+)
 _CAMERA = tuple(f"source.camera.{key}=30.0" for key in ("fx", "fy", "cx", "cy"))
 
 
@@ -89,6 +101,8 @@ def bases(folder: Path) -> list[Base]:
         _single("evaluation", "evaluation"),
         _single("rerun", "sinks.rerun"),
         _single("mcap_sink", "sinks.mcap", "+sinks@sinks.mcap=mcap"),
+        _single("depth_gap", "effects", "effects=depth_gap"),
+        *(Base(name=name, overrides=(f"+experiment={name}",), part=name) for name in EXPERIMENTS),
     ]
 
 

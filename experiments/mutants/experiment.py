@@ -12,11 +12,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
 from sceneslam.config.build import build
+from sceneslam.config.check import check_given
+from sceneslam.config.component import Builder
 from sceneslam.config.resolve import composed, resolved
 from sceneslam.experiments.mutants.bases import Base, bases
 from sceneslam.experiments.mutants.combinations import combinations
@@ -24,8 +27,10 @@ from sceneslam.experiments.mutants.mutant import Mutant
 from sceneslam.experiments.mutants.mutations import Subject, component_mutants
 from sceneslam.experiments.mutants.recordings import write_recordings
 from sceneslam.experiments.mutants.table_mutations import table_mutants
+from sceneslam.interfaces import Experiment
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.experiment import Figure, Relation, RunTrials, Table, Verdict
+from sceneslam.types.ranges import check_between, check_least
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,8 +48,8 @@ class MutantsExperiment:
     def __init__(
         self, *, seed: int, sample: int | None, mutants_min: int, refused_min: float
     ) -> None:
-        if seed < 0:
-            raise ConfigError("seed", seed, "0 or more")
+        check_least(0, seed=seed, mutants_min=mutants_min)
+        check_between(0, 100, refused_min=refused_min)
         if sample is not None and sample < 1:
             raise ConfigError("sample", sample, "1 or more, or null: all")
         self._seed, self._sample = seed, sample
@@ -118,13 +123,23 @@ def _subject(base: Base) -> Subject:
 def judged(mutant: Mutant) -> Finding:
     """Return what is said of a mutant before the first frame."""
     try:
-        build(resolved(mutant.config)).close()
+        _make(resolved(mutant.config))
     except ConfigError as error:
         is_right = error.key in mutant.named
         return Finding(mutant=mutant, said=str(error), is_right=is_right)
     except Exception as error:  # anything else is a traceback, or a sentence without a key
         return Finding(mutant=mutant, said=f"{type(error).__name__}: {error}", is_right=False)
     return Finding(mutant=mutant, said="", is_right=not mutant.named)
+
+
+def _make(config: dict[str, Any]) -> None:
+    """Build what a run, or an experiment, is made of."""
+    key = config.get("experiment")
+    if key is None:
+        build(config).close()
+        return
+    check_given(config.get(key), key)
+    Builder(config).make(key, Experiment)
 
 
 @contextmanager

@@ -30,6 +30,9 @@ _NULLABLE = re.compile(
     r"|catch_up_steps"
 )
 
+# Tables whose keys are the user's own names.
+_FREE = re.compile(r"^table\.recordings\.|^paper_iv_b\.own\.|^paper_iv_c\.startup_s\.")
+
 # A word out of a list.
 _CHOICE = re.compile(
     r"handover|\.mode$|isolation|story|lights|schedule_unit|image_format|\.faults\[|sequence"
@@ -60,6 +63,11 @@ def may_be_null(key: str) -> bool:
     return bool(_NULLABLE.search(key))
 
 
+def is_of_a_free_table(key: str) -> bool:
+    """Tell whether a key is a name of the user's own, so that none is wrong."""
+    return bool(_FREE.search(key))
+
+
 def is_choice(key: str) -> bool:
     """Tell whether a text is one of few."""
     return bool(_CHOICE.search(key))
@@ -74,4 +82,4 @@ def smaller(key: str, value: float) -> float:
     """Return a value close to a valid one, that is valid as well."""
     if isinstance(value, int):
         return value - 1 if value > 2 else value
-    return value * (1.05 if "exposure_gain_max" in key else 0.95)
+    return value * (1.05 if re.search("exposure_gain_max|handover.window_s", key) else 0.95)

@@ -45,6 +45,8 @@ class Subject:
         key = dotted(path)
         names = (key, dotted(path[:-1])) if isinstance(path[-1], int) else (key,)
         outer = dotted(tuple(path[: _first_index(path)]))  # a list is named as a whole
+        if knowledge.is_of_a_free_table(key):  # named as a whole, too
+            outer = dotted(path[:2])
         config = replaced(self.composed, path, value)
         return self.mutant(kind, f"{key} = {value!r}", config, *names, outer)
 
@@ -72,7 +74,7 @@ def component_mutants(subject: Subject, part: Path, rng: np.random.Generator) ->
 def _of_key(subject: Subject, path: Path, rng: np.random.Generator) -> Iterator[Mutant]:
     """Yield a misspelt, a missing and an additional key."""
     name, key = path[-1], dotted(path)
-    if isinstance(name, int):
+    if isinstance(name, int) or knowledge.is_of_a_free_table(key):
         return
     typo = misspelt(name, rng)
     config, wrong = renamed(subject.composed, path, typo), dotted((*path[:-1], typo))

@@ -15,6 +15,7 @@ from sceneslam.experiments.openloris.figure import draw_rates
 from sceneslam.experiments.openloris.rates import Rates, mean, table
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.experiment import Figure, Outcome, Relation, RunTrials, Trial, Verdict
+from sceneslam.types.ranges import check_above, check_between, check_least
 from sceneslam.types.trajectory import Trajectory
 
 _ALL = "all scenes"
@@ -33,6 +34,9 @@ class OpenLorisExperiment:
         harm_points: float,
         promised: Mapping[str, float],
     ) -> None:
+        check_above(0, limits_m=limits_m, limit_rad=limit_rad)
+        check_least(0, harm_points=harm_points)
+        check_between(0, 100, promised=promised)
         self._path, self._data = path, Dataset(Path(path))
         for sequence in self._data.sequences:
             if sequence.scene not in limits_m:

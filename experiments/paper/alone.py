@@ -8,12 +8,16 @@ from pathlib import Path
 
 from sceneslam.experiments.paper.runs import keep_figure, number
 from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, Verdict
+from sceneslam.types.ranges import check_above, check_among, check_some
 
 
 class AloneExperiment:
     """Runs every module in every light; `own` names the light that each is meant for."""
 
     def __init__(self, *, own: Mapping[str, str], ate_max_m: float) -> None:
+        check_some(own=own)
+        check_among(("on", "off", "story"), own=list(own.values()))
+        check_above(0, ate_max_m=ate_max_m)
         self._own, self._ate_max_m = own, ate_max_m
 
     def run(self, run_trials: RunTrials, folder: Path) -> Verdict:

@@ -9,6 +9,7 @@ import numpy as np
 
 from sceneslam.experiments.paper.runs import events_of, keep_figure, number
 from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.ranges import check_above, check_least
 
 Row = tuple[str, float, float, float | None, float, float]
 
@@ -17,6 +18,8 @@ class DetectionExperiment:
     """Runs the detector alone; every module is dead reckoning, which costs nothing."""
 
     def __init__(self, *, window_s: float, late_max_s: float, vote_max_ms: float) -> None:
+        check_above(0, vote_max_ms=vote_max_ms)
+        check_least(0, window_s=window_s, late_max_s=late_max_s)
         self._window_s, self._late_max_s, self._vote_max_ms = window_s, late_max_s, vote_max_ms
 
     def run(self, run_trials: RunTrials, folder: Path) -> Verdict:

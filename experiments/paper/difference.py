@@ -12,12 +12,15 @@ from sceneslam.evaluation import figure_style as look
 from sceneslam.evaluation.comparison import Difference, compare
 from sceneslam.experiments.paper.runs import number
 from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.ranges import check_above, check_some
 
 
 class DifferenceExperiment:
     """Compares each story's switched run with one module that has all lights on."""
 
     def __init__(self, *, stories: Sequence[str], lit_module: str, difference_max_m: float) -> None:
+        check_some(stories=stories)
+        check_above(0, difference_max_m=difference_max_m)
         self._stories, self._lit_module = stories, lit_module
         self._difference_max_m = difference_max_m
 

@@ -12,6 +12,7 @@ from statistics import median
 from sceneslam.experiments.paper.runs import events_of
 from sceneslam.types.errors import InputError
 from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.ranges import check_above, check_least, check_some
 
 Row = tuple[str, float, float, float]
 
@@ -30,6 +31,10 @@ class StartupExperiment:
         first_pose_max_s: float,
         switch_max_s: float,
     ) -> None:
+        check_some(modules=modules, stories=stories)
+        check_least(1, repeats=repeats)
+        check_above(0, start_max_s=start_max_s, first_pose_max_s=first_pose_max_s)
+        check_above(0, switch_max_s=switch_max_s)
         self._modules, self._overrides, self._repeats = modules, overrides, repeats
         self._stories, self._start_max_s = stories, start_max_s
         self._first_pose_max_s, self._switch_max_s = first_pose_max_s, switch_max_s

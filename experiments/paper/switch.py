@@ -7,6 +7,8 @@ from pathlib import Path
 
 from sceneslam.experiments.paper.runs import keep_figure, number
 from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.ranges import check_above, check_among, check_least, check_some
+from sceneslam.types.run import HANDOVERS
 
 
 class SwitchExperiment:
@@ -19,6 +21,10 @@ class SwitchExperiment:
         startup_s: Mapping[str, float],
         ate_max_m: float,
     ) -> None:
+        check_some(handovers=handovers)
+        check_among(HANDOVERS, handovers=handovers)
+        check_least(0, startup_s=startup_s)
+        check_above(0, ate_max_m=ate_max_m)
         self._handovers, self._startup_s, self._ate_max_m = handovers, startup_s, ate_max_m
 
     def run(self, run_trials: RunTrials, folder: Path) -> Verdict:

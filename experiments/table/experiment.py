@@ -18,6 +18,7 @@ from sceneslam.experiments.table.overlay import write_scenario
 from sceneslam.experiments.table.stretch import Motions, measure
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, Verdict
+from sceneslam.types.ranges import check_above, check_between, check_some
 
 
 class TableExperiment:
@@ -37,8 +38,9 @@ class TableExperiment:
         fallback_min: float,
         available_min: float,
     ) -> None:
-        if not recordings or not modules:
-            raise ConfigError("recordings", dict(recordings), "recordings, and modules to run")
+        check_some(recordings=recordings, modules=modules)
+        check_above(0, interval_s=interval_s, lost_m=lost_m)
+        check_between(0, 1, fallback_min=fallback_min, available_min=available_min)
         self._recordings, self._modules = recordings, modules
         self._interval_s, self._lost_m = interval_s, lost_m
         self._fallback_min, self._available_min = fallback_min, available_min

@@ -17,6 +17,7 @@ from sceneslam.experiments.tune.space import read_space
 from sceneslam.experiments.tune.study import Drawn, Search
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.ranges import check_least, check_some
 
 Outcomes = Mapping[str, Outcome]  # by recording
 
@@ -37,11 +38,9 @@ class TuneExperiment:
         trials: int,
         seed: int,
     ) -> None:
-        if trials < 1:
-            raise ConfigError("trials", trials, "1 or more")
-        for split, recordings in (("train", train), ("held_out", held_out)):
-            if not recordings:
-                raise ConfigError(split, dict(recordings), "one or more recordings")
+        check_least(1, trials=trials)
+        check_least(0, seed=seed)
+        check_some(train=train, held_out=held_out)
         for name in set(train) & set(held_out):
             raise ConfigError(f"held_out.{name}", name, "a recording that is not in train")
         self._space, self._objective = read_space(space), objective

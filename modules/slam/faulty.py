@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from sceneslam.interfaces import SlamModule
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError
 from sceneslam.types.fault_plan import FaultPlan
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.ranges import check_least
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
@@ -45,16 +45,15 @@ class Faulty:
         seed: int,
         record: Path,
     ) -> None:
-        for fault in faults:
-            if fault not in FAULTS:
-                raise ConfigError("faults", fault, ", ".join(FAULTS))
-        for name, value in (("lasting_s", lasting_s), ("jump_m", jump_m)):
-            if not 0 <= value < np.inf:
-                raise ConfigError(name, value, "0 or more")
+        check_least(0, lasting_s=lasting_s, jump_m=jump_m)
         self._module, self._jump_m = module, jump_m
         self._lasting_ns = round(lasting_s * 1e9)
         self._plan = FaultPlan(
-            kinds=tuple(faults), rate_ratio=rate_ratio, seed=seed, record=Path(record)
+            kinds=tuple(faults),
+            known=FAULTS,
+            rate_ratio=rate_ratio,
+            seed=seed,
+            record=Path(record),
         )
         self._silent_until_ns: int | None = None
         self._T_wrong_local = se3.identity()

@@ -7,8 +7,7 @@ from dataclasses import dataclass, fields
 
 from sceneslam.bus.gate import GateSettings
 from sceneslam.types.errors import ConfigError
-
-HANDOVERS = ("cold", "warm", "rewind")
+from sceneslam.types.run import HANDOVERS
 
 
 @dataclass(slots=True, kw_only=True)

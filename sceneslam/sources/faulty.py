@@ -10,9 +10,9 @@ import numpy as np
 
 from sceneslam.interfaces import Source
 from sceneslam.sources.wrapped import Wrapped
-from sceneslam.types.errors import ConfigError
 from sceneslam.types.fault_plan import FaultPlan
 from sceneslam.types.observation import Observation
+from sceneslam.types.ranges import check_least
 from sceneslam.types.truth import GroundTruth
 
 SENSORS = ("image_bgr", "depth_m", "scan", "points_lidar", "T_odom_base", "gyro_base")
@@ -37,18 +37,17 @@ class Faulty(Wrapped):
         seed: int,
         record: Path,
     ) -> None:
-        for fault in faults:
-            if fault not in FAULTS:
-                raise ConfigError("faults", fault, ", ".join(FAULTS))
-        for name, value in (("lasting_s", lasting_s), ("clock_jump_s", clock_jump_s)):
-            if not 0 <= value < np.inf:
-                raise ConfigError(name, value, "0 or more [s]")
+        check_least(0, lasting_s=lasting_s, clock_jump_s=clock_jump_s)
         super().__init__(source)
         self._seed = seed
         self._lasting_ns = round(lasting_s * 1e9)
         self._clock_jump_ns = round(clock_jump_s * 1e9)
         self._plan = FaultPlan(
-            kinds=tuple(faults), rate_ratio=rate_ratio, seed=seed, record=Path(record)
+            kinds=tuple(faults),
+            known=FAULTS,
+            rate_ratio=rate_ratio,
+            seed=seed,
+            record=Path(record),
         )
 
     def __iter__(self) -> Iterator[Observation]:

@@ -67,11 +67,12 @@ class Channel:
         if not large and len(head) <= _PACKET_BYTES:
             self._line.send(self._packet(head, None), socket.MSG_DONTWAIT)
             return
-        parts = [memoryview(head), *large]
+        is_short = len(head) <= _PACKET_BYTES
+        parts = large if is_short else [memoryview(head), *large]
         spans = _layout(parts)
         index = self._borrow(spans[-1][1])
         block = self._blocks[index]
-        packet = self._packet(None, (index, len(block.memory), spans))
+        packet = self._packet(head if is_short else None, (index, len(block.memory), spans))
         fds = [] if block.fd is None else [_as_message(block.fd)]
         end = _VOID
         try:
@@ -98,9 +99,13 @@ class Channel:
             if place is None:
                 return put_together(marshal.loads(head), [])
             parts: list[Any] = self._look_at(place, extra)
+            # All but what the arrays hold can be put together while they are written.
+            message = None if head is None else put_together(marshal.loads(head), parts)
             if self._arrival(timeout_s, _AWAKE_NS)[0] == _WRITTEN:
-                head, *large = parts
-                return put_together(marshal.loads(head), large)
+                if head is None:
+                    head, *large = parts
+                    return put_together(marshal.loads(head), large)
+                return message
 
     def _arrival(self, timeout_s: float | None, awake_ns: int) -> tuple[bytes, Sequence[Any]]:
         """Return the next packet and what came along with it; sleep only after `awake_ns`."""

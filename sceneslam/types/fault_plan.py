@@ -9,7 +9,7 @@ from time import monotonic_ns
 
 import numpy as np
 
-from sceneslam.types.errors import ConfigError
+from sceneslam.types.ranges import check_among, check_between, check_least
 
 
 @dataclass(slots=True, kw_only=True)
@@ -21,16 +21,16 @@ class FaultPlan:
     """
 
     kinds: tuple[str, ...]
+    known: tuple[str, ...]  # the kinds that there are
     rate_ratio: float  # of the observations
     seed: int
     record: Path
     _struck: set[int] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.rate_ratio <= 1:
-            raise ConfigError("rate_ratio", self.rate_ratio, "0 to 1")
-        if self.seed < 0:
-            raise ConfigError("seed", self.seed, "0 or more")
+        check_among(self.known, faults=self.kinds)
+        check_between(0, 1, rate_ratio=self.rate_ratio)
+        check_least(0, seed=self.seed)
         lines = self.record.read_text().splitlines() if self.record.exists() else []
         self._struck = {json.loads(line)["stamp_ns"] for line in lines}
 

@@ -13,6 +13,7 @@ from sceneslam.types.maps import HybridMap
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
+HANDOVERS = ("cold", "warm", "rewind")  # how a pose can pass from module to module
 Event = Mapping[str, Any]  # one line of events.jsonl: `event` (kind), `stamp_ns`, and its own keys
 
 
