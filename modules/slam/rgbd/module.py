@@ -31,9 +31,8 @@ from .view import View
 class RgbdSlam:
     """Tracks a camera, with depth or without: the map and its scale stay when depth ends.
 
-    After ORB-SLAM2's front end (Mur-Artal and Tardos 2017): corners, a guided search in the local
-    map, PnP, motion-only least squares; keyframes where the view has changed. Without depth, new
-    landmarks are triangulated, and odometry or the map that is there tells the scale.
+    After ORB-SLAM2's front end (Mur-Artal and Tardos 2017). Without depth, new landmarks are
+    triangulated, and odometry or the map that is there tells the scale.
     """
 
     def __init__(
@@ -71,10 +70,8 @@ class RgbdSlam:
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
         """Return that colour suffices with anything that tells how large the scene is."""
-        return (
-            frozenset({Sensor.IMAGE, Sensor.DEPTH}),
-            frozenset({Sensor.IMAGE, Sensor.ODOMETRY}),
-        )
+        scales = (Sensor.DEPTH, Sensor.ODOMETRY)
+        return tuple(frozenset({Sensor.IMAGE, scale}) for scale in scales)
 
     def activate(self, rig: Rig) -> None:
         """Start anew with an empty map; raises InputError for a rig without a camera.
@@ -112,7 +109,9 @@ class RgbdSlam:
         if observation.image_bgr is None:
             return self._lose(observation, T_predicted)
         view = self._look(observation, observation.image_bgr, T_predicted)
-        fix = self._locate(view) if len(self._map.keyframes) else None
+        fix = None
+        if len(self._map.keyframes):
+            fix = self._search.find(view, self._local_ids, is_lost=self._is_lost)
         if fix is not None:
             self._eye.learn(view, fix)
             answer = self._hold(view, fix)
@@ -146,17 +145,12 @@ class RgbdSlam:
     def _look(
         self, observation: Observation, image_bgr: NDArray[np.uint8], T_predicted: Transform
     ) -> View:
-        return self._eye.look(
-            observation,
-            image_bgr,
-            T_predicted=T_predicted,
-            rate_base=self._motion.turn_rate(observation),
-        )
+        rate_base = self._motion.turn_rate(observation)
+        return self._eye.look(observation, image_bgr, T_predicted=T_predicted, rate_base=rate_base)
 
     def _build(self, alignment: Alignment | None) -> None:
         parts = Parts(self._arguments, self._camera, alignment, self._reunion)
-        self._eye, self._health = parts.eye, parts.health
-        self._localizer, self._relocalizer = parts.localizer, parts.relocalizer
+        self._eye, self._health, self._search = parts.eye, parts.health, parts.search
         self._map, self._mapping, self._memory = parts.map, parts.mapping, parts.memory
         self._layers, self._place_rule = parts.layers, parts.place_rule
         self._keyframe_rule = parts.keyframe_rule
@@ -169,16 +163,7 @@ class RgbdSlam:
         self._build(alignment)
         self._memory.follow(before)
         view = self._look(view.observation, view.image_bgr, self._T_local_base)
-        unseen = np.full(len(view.features), NO_LANDMARK)
-        self._insert_keyframe(view, unseen, unseen[:0], set())
-
-    def _locate(self, view: View) -> Fix | None:
-        fix = self._localizer.near(view.features, view.T_predicted, self._local_ids)
-        if fix is None and not self._is_lost:
-            fix = self._localizer.anywhere(view.features, self._local_ids)
-        if fix is not None:
-            return fix
-        return self._relocalizer.find(view.features, view.depth_m)
+        self._insert_keyframe(view, set())
 
     def _recall(self) -> None:
         """Go on from where the map is: adjusted, after a loop, or beside an earlier session's."""
@@ -204,9 +189,8 @@ class RgbdSlam:
         is_placed = self._motion.is_reckoned or not len(self._map.keyframes)
         guessed_s = None if is_placed else self._motion.unheld_s(view.observation)
         self._hold_pose(view.observation, view.T_predicted)
-        unseen = np.full(len(view.features), NO_LANDMARK)
-        self._insert_keyframe(view, unseen, unseen[:0], set(), guessed_s=guessed_s)
-        self._memory.hold(view.observation.stamp_ns, self._T_local_base, unseen[:0])
+        self._insert_keyframe(view, set(), guessed_s=guessed_s)
+        self._memory.hold(view.observation.stamp_ns, self._T_local_base, np.zeros(0, np.int64))
         is_first, revision = self._observations == 1, self._memory.revision
         return started(view, self._T_local_base, is_first=is_first, revision=revision)
 
@@ -224,17 +208,11 @@ class RgbdSlam:
         if status is TrackingStatus.TRACKING:
             self._reunion.see(view, T_local_base)
         if wanted and status is TrackingStatus.TRACKING:
-            landmark_ids = np.full(len(view.features), NO_LANDMARK)
-            landmark_ids[fix.feature_rows] = fix.landmark_ids
-            self._insert_keyframe(view, landmark_ids, fix.deep_rows, segment, fix=fix)
+            self._insert_keyframe(view, segment, fix=fix)
         self._memory.hold(view.observation.stamp_ns, T_local_base, fix.landmark_ids)
+        revision = self._memory.revision
         answer = held(
-            view,
-            fix,
-            T_local_base,
-            status=status,
-            is_reckoned=is_reckoned,
-            revision=self._memory.revision,
+            view, fix, T_local_base, status=status, is_reckoned=is_reckoned, revision=revision
         )
         return answer if segment is None else placed(answer, self._memory.segments, segment)
 
@@ -251,21 +229,24 @@ class RgbdSlam:
     def _insert_keyframe(
         self,
         view: View,
-        landmark_ids: NDArray[np.int64],
-        deep_rows: NDArray[np.int64],
         segment: set[int] | None,
         *,
         fix: Fix | None = None,
         guessed_s: float | None = None,
     ) -> None:
+        landmark_ids = np.full(len(view.features), NO_LANDMARK)
+        if fix is not None:
+            landmark_ids[fix.feature_rows] = fix.landmark_ids
         stamp_ns = view.observation.stamp_ns
+        kept = self._layers.view(view.depth_m, view.image_bgr, stamp_ns=stamp_ns)
         keyframe = Keyframe(
             stamp_ns=stamp_ns,
             T_local_base=self._T_local_base.copy(),
             features=view.features,
             landmark_ids=landmark_ids,
-            view=self._layers.view(view.depth_m, view.image_bgr, stamp_ns=stamp_ns),
+            view=kept,
         )
+        deep_rows = landmark_ids[:0] if fix is None else fix.deep_rows
         keyframe_id = self._map.insert(keyframe, deep_rows=deep_rows)
         if view.is_monocular:
             triangulate(self._map, keyframe_id)

@@ -18,9 +18,10 @@ from .memory import Memory
 from .pose_solver import PoseSolver
 from .relocalizer import Relocalizer
 from .reunion import Reunion
+from .search import Search
 from .visual_map import VisualMap
 
-_MERGE_IMAGES = 10  # that the worker has for one bundle adjustment
+_MERGE_IMAGES = 5  # that the worker has for one bundle adjustment
 
 
 class Parts:
@@ -55,15 +56,14 @@ class Parts:
             depth_camera,
             **same("sigma_px", "inverse_depth_sigma_per_m", "keyframe_limit", "landmark_limit"),
         )
-        self.localizer = Localizer(
+        localizer = Localizer(
             self.map,
             PoseSolver(camera, **same("seed")),
             **chosen(radius_px="search_radius_px", min_inliers="min_inliers"),
         )
-        self.memory = Memory(
-            self.map, self.localizer, reunion, **chosen(min_inliers="degraded_inliers")
-        )
-        self.relocalizer = Relocalizer(self.map.keyframes, self.memory.recognizer)
+        self.memory = Memory(self.map, localizer, reunion, **chosen(min_inliers="degraded_inliers"))
+        relocalizer = Relocalizer(self.map.keyframes, self.memory.recognizer)
+        self.search = Search(localizer, relocalizer)
         self.mapping = LocalMapping(
             depth_camera, self.map, alignment=alignment, every_images=_MERGE_IMAGES
         )
