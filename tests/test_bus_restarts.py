@@ -1,6 +1,7 @@
 """Modules that can be started again after they failed: the bus goes on without, and with them."""
 
 import numpy as np
+import pytest
 from driving import assert_exact, drive, events
 from fakes import PERIOD_NS, ExactModule, observation
 
@@ -82,3 +83,22 @@ def test_a_short_silence_of_the_wheels_while_they_bridge_costs_no_pose():
     lost = ExactModule(lost=range(30, 60))
     _, atlas, _, _ = drive({"bright": lost, "dark": ExactModule(lost=range(1000))}, feed=feed)
     assert len(atlas.online) == 100
+
+
+@pytest.mark.parametrize("handover", ["cold", "warm", "rewind"])
+@pytest.mark.parametrize("catch_up_steps", [None, 4])
+def test_modules_that_all_fail_at_the_start_may_come_back(handover, catch_up_steps):
+    modules = {"bright": Phoenix(raises={0, 1, 2}, asked=3), "dark": Phoenix(raises={0, 1})}
+    options = {"handover": handover, "catch_up_steps": catch_up_steps}
+    bus, atlas, log, _ = drive(modules, **options)
+    assert [event["to"] for event in events(log, "state")].count("terminate") == 1
+    assert len(atlas.trajectory) >= 90 and bus.state == "terminate"
+    assert np.isfinite(atlas.trajectory.T_world_base).all()
+
+
+def test_modules_that_fail_for_good_at_the_start_end_the_run():
+    modules = {key: Phoenix(raises=set(range(100)), budget=2) for key in ("bright", "dark")}
+    _, atlas, log, _ = drive(modules)
+    states = [event["to"] for event in events(log, "state")]
+    assert states[-1] == "terminate" and log.events[-1]["stamp_ns"] < 50 * PERIOD_NS
+    assert len(atlas.trajectory) < 50

@@ -25,7 +25,8 @@ class BusMachine(StateMachine):
     | state     | success          | failure                                             |
     |-----------|------------------|-----------------------------------------------------|
     | init      | start            | terminate                                           |
-    | start     | run              | start with the next candidate, terminate if none    |
+    | start     | run              | start with the next candidate; run without while one |
+    |           |                  | may come back, terminate if none                    |
     | run       | run              | switch: the scene changed or the module is unhealthy |
     | switch    | run              | run with the fallback, terminate if none            |
     """
@@ -40,6 +41,7 @@ class BusMachine(StateMachine):
     failure = (
         init.to(terminate)
         | start.to(start, cond="candidate_left")
+        | start.to(run, cond="fallback_active")
         | start.to(terminate)
         | run.to(switch)
         | switch.to(run, cond="fallback_active")
