@@ -44,6 +44,7 @@ class LocalMapping:
         self._depth_ties = DepthTies(depth_camera, T_depth_cam)  # the worker's own
         self._search = AlignmentSearch(depth_camera, is_over=alignment is not None)  # its too
         self._searched: dict[int, Shown] = {}  # its too
+        self._found: Alignment | None = None  # by the worker; told at a merge, a fixed image
         self.alignment: Alignment | None = None  # where it was found not to be what was taken
         self._ties: dict[tuple[int, int], Tie] = {}  # by keyframe ids; the worker's own
 
@@ -102,7 +103,7 @@ class LocalMapping:
         if one in self._searched and other in self._searched:
             here, there = self._searched[one], self._searched[other]
             found = self._search.add(pair_of(here, there, se3.inverse(tie.T_one_other)))
-            self.alignment = found or self.alignment
+            self._found = found or self._found
         if self._search.is_over:
             self._searched.clear()
 
@@ -111,4 +112,6 @@ class LocalMapping:
         self._window = self._result = None
         if window is None or result is None:
             return se3.identity()
-        return merge_window(self._map, window, result.result())
+        adjusted = result.result()
+        self.alignment = self._found
+        return merge_window(self._map, window, adjusted)
