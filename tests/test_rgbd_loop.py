@@ -60,7 +60,7 @@ def test_loop_is_closed_and_the_past_corrected():
     assert answers[0].revision == 0 and answers[-1].revision >= 1
     drift_told, drift_revised = (drift_rad(T) for T in (told, revised.T_world_base))
     assert drift_told > np.deg2rad(3.0)
-    assert drift_revised < 0.4 * drift_told
+    assert drift_revised < 0.25 * drift_told
     # From the correction on, the pose that is told is the corrected one.
     np.testing.assert_allclose(told[-1], revised.T_world_base[-1], atol=1e-9)
 

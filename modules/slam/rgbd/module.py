@@ -86,8 +86,7 @@ class RgbdSlam:
         self._build(None)
         self._T_local_base = se3.identity()
         self._local_ids = np.zeros(0, np.int64)  # landmarks of the local map
-        self._observations = 0
-        self._is_lost = False
+        self._observations, self._is_lost = 0, False
 
     def set_pose(self, T_map_local: Transform) -> None:
         """Place `local` in the map (Eq. 1)."""
@@ -115,7 +114,7 @@ class RgbdSlam:
         if fix is not None:
             self._eye.learn(view, fix)
             answer = self._hold(view, fix)
-            if self._mapping.alignment is not None and view.shows_enough:
+            if self._mapping.alignment is not None and not view.is_monocular:
                 self._build_anew(view, self._mapping.alignment)
             return answer
         if not len(self._map.keyframes) or self._is_unknown(view):
@@ -179,10 +178,7 @@ class RgbdSlam:
         return self._place_rule.wants(view, self._motion, is_far=is_far)
 
     def _start(self, view: View) -> Tracking:
-        """Hang a keyframe on the prediction: the map's first, or of a place or segment of its own.
-
-        Wait, lost, for features with depth or odometry.
-        """
+        """Hang a keyframe on the prediction; wait, lost, for features with depth or odometry."""
         is_scaled = not view.is_monocular or view.observation.T_odom_base is not None
         if not (view.shows_enough and is_scaled):
             return self._lose(view.observation, view.T_predicted)
