@@ -21,6 +21,13 @@ def test_the_first_restart_is_at_once_and_each_further_one_waits_twice_as_long()
     assert waits_s == pytest.approx([0.0, 0.2, 0.4])
 
 
+def test_no_wait_is_longer_than_the_pace_that_the_window_allows():
+    budget = restarts(restarts_max=1000)
+    for _ in range(100):
+        budget.note_failure(100.0)
+    assert budget.wait_s(100.0) == pytest.approx(0.06)
+
+
 def test_a_spent_budget_waits_until_the_window_has_moved_on():
     budget = restarts()
     for now_s in (100.0, 101.0, 102.0, 103.0):

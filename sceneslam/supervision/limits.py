@@ -6,6 +6,8 @@ from dataclasses import dataclass, fields
 
 from sceneslam.types.errors import ConfigError
 
+_DOUBLINGS = 30  # more are years
+
 
 @dataclass(slots=True, kw_only=True)
 class Limits:
@@ -16,7 +18,9 @@ class Limits:
     memory_limit_mb: int  # of its private memory
     restarts_max: int  # within the window
     restart_window_s: float
-    restart_backoff_s: float  # before the second start in the window, then twice as long each time
+    # Before the second start in the window; then twice as long each time, up to the pace that the
+    # window allows on average.
+    restart_backoff_s: float
     threads: int  # of OpenCV
 
     def __post_init__(self) -> None:
@@ -52,7 +56,9 @@ class Restarts:
         if self.is_spent(now_s):
             due_s = self._failures_s[-self._limits.restarts_max - 1] + self._limits.restart_window_s
         elif failures > 1:
-            due_s = self._failures_s[-1] + self._limits.restart_backoff_s * 2 ** (failures - 2)
+            pace_s = self._limits.restart_window_s / self._limits.restarts_max
+            backoff_s = self._limits.restart_backoff_s * 2 ** min(failures - 2, _DOUBLINGS)
+            due_s = self._failures_s[-1] + min(backoff_s, pace_s)
         else:
             return 0.0
         return max(due_s - now_s, 0.0)
