@@ -1,6 +1,7 @@
 """How the rgbd module adjusts keyframes and landmarks together, beside the tracking."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -167,8 +168,8 @@ def test_merge_comes_at_a_fixed_image_and_moves_what_is_newer_along():
     T_true = visual_map.keyframes[4].T_local_base
     slip = se3.exp(np.array([0.03, 0, 0, 0, 0, 0]))
     visual_map.keyframes[4].T_local_base = slip @ T_true
-    mapping = LocalMapping(CAMERA, visual_map, alignment=Alignment(), every_images=3)
-    moved = [mapping.step() for _ in range(5)]
+    mapping = LocalMapping(CAMERA, visual_map, alignment=Alignment())
+    moved = [mapping.step() for _ in range(9)]  # begins at the fifth
     assert (np.stack(moved) == np.eye(4)).all()
     newer = keyframe_at(
         slip @ T_true @ CAMERA.T_base_cam,
@@ -187,15 +188,26 @@ def test_merge_comes_at_a_fixed_image_and_moves_what_is_newer_along():
     assert np.abs(shared - points).max() < 0.02
 
 
+def test_keyframes_with_depth_give_the_worker_twice_the_images():
+    visual_map, _ = mapped(np.random.default_rng(6), is_matched=True)
+    visual_map.keyframes[4].T_local_base = se3.from_xy_yaw(0.03, 0.0, 0.0)
+    mapping = LocalMapping(CAMERA, visual_map, alignment=Alignment())
+    frame = np.full(CAMERA.size_wh[::-1], np.nan, np.float32)
+    mapping.insert(4, SimpleNamespace(features=visual_map.keyframes[4].features, depth_m=frame))
+    moved = [not np.array_equal(mapping.step(), np.eye(4)) for _ in range(15)]
+    mapping.shutdown()
+    assert [image + 1 for image, has_moved in enumerate(moved) if has_moved] == [15]
+
+
 def test_map_that_was_corrected_meanwhile_stays_as_it_is():
     visual_map, _ = mapped(np.random.default_rng(5), is_matched=True)
-    mapping = LocalMapping(CAMERA, visual_map, alignment=Alignment(), every_images=2)
-    for _ in range(2):
+    mapping = LocalMapping(CAMERA, visual_map, alignment=Alignment())
+    for _ in range(5):
         mapping.step()
     corrected = se3.from_xy_yaw(1.0, 0.0, 0.1)
     visual_map.correct({k: corrected @ visual_map.keyframes[k].T_local_base for k in range(5)})
     before = visual_map.keyframes[4].T_local_base
-    mapping.step()
-    assert np.array_equal(mapping.step(), np.eye(4))
+    moved = [mapping.step() for _ in range(5)]
+    assert (np.stack(moved) == np.eye(4)).all()
     assert (visual_map.keyframes[4].T_local_base == before).all()
     mapping.shutdown()

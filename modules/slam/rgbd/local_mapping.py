@@ -18,12 +18,15 @@ from .view import View
 from .visual_map import VisualMap
 from .window import Window, merge_window, take_window
 
+_TIED_IMAGES = 10  # for what has depth: registering it takes the worker 100 to 200 ms
+_FREE_IMAGES = 5  # for what has none: triangulated landmarks wait for it, and drift in scale
+
 
 class LocalMapping:
     """Adjusts the newest keyframes and their landmarks, every so many images.
 
     A worker has all images between two merges to do it; a merge waits for it, so that what the
-    map is at an image depends on the images alone.
+    map is at an image depends on the images alone. How many these are depends on its work.
     """
 
     def __init__(
@@ -32,13 +35,12 @@ class LocalMapping:
         visual_map: VisualMap,
         *,
         alignment: Alignment | None,
-        every_images: int,
     ) -> None:
-        self._camera, self._map, self._every = visual_map.camera, visual_map, every_images
+        self._camera, self._map = visual_map.camera, visual_map
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="rgbd-mapping")
         self._window: Window | None = None
         self._result: Future[Adjusted] | None = None
-        self._images, self._newest = 0, -1
+        self._images_left, self._newest = _FREE_IMAGES, -1
         self._fresh: dict[int, Shown] = {}  # keyframes that the worker has not seen yet
         T_depth_cam = (alignment or Alignment()).T_depth_color
         self._depth_ties = DepthTies(depth_camera, T_depth_cam)  # the worker's own
@@ -58,9 +60,10 @@ class LocalMapping:
 
         Returns T_new_old, by which the newest keyframe and what is near it were moved.
         """
-        self._images += 1
-        if self._images % self._every:
+        self._images_left -= 1
+        if self._images_left:
             return se3.identity()
+        self._images_left = _FREE_IMAGES
         T_new_old = self._merge()
         newest = max(self._map.keyframes.ids, default=-1)
         if newest != self._newest:
@@ -68,6 +71,7 @@ class LocalMapping:
             self._window = take_window(self._map, newest)
             if self._window is not None:
                 fresh, self._fresh = self._fresh, {}
+                self._images_left = _TIED_IMAGES if fresh else _FREE_IMAGES
                 self._result = self._worker.submit(self._adjust, self._window, fresh)
         return T_new_old
 

@@ -21,8 +21,6 @@ from .reunion import Reunion
 from .search import Search
 from .visual_map import VisualMap
 
-_MERGE_IMAGES = 5  # that the worker has for one bundle adjustment
-
 
 class Parts:
     """An empty map, and all that looks, locates, maps, judges and remembers."""
@@ -64,9 +62,7 @@ class Parts:
         self.memory = Memory(self.map, localizer, reunion, **chosen(min_inliers="degraded_inliers"))
         relocalizer = Relocalizer(self.map.keyframes, self.memory.recognizer)
         self.search = Search(localizer, relocalizer)
-        self.mapping = LocalMapping(
-            depth_camera, self.map, alignment=alignment, every_images=_MERGE_IMAGES
-        )
+        self.mapping = LocalMapping(depth_camera, self.map, alignment=alignment)
         self.layers = LayerBuilder(
             depth_camera, **same("cloud_stride_px", "cloud_voxel_m", "grid_resolution_m")
         )
