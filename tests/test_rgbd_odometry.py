@@ -8,8 +8,9 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from scenery import RIG, observation_at, room_observation
 
+from sceneslam.modules.slam.rgbd.motion import MotionModel
 from sceneslam.types import se3
-from sceneslam.types.observation import TrackingStatus
+from sceneslam.types.observation import Observation, TrackingStatus
 
 YAML = Path(__file__).parents[1] / "conf" / "slam" / "rgbd.yaml"
 
@@ -28,8 +29,9 @@ def drive_away_in_the_dark(*, has_odometry):
     for step in range(8):
         there = turned @ se3.from_xy_yaw(0.01 * step, 0, 0)
         observations.append(observation_at(there, (16 + step) / 30))
+    observations = [replace(o, gyro_base=None) for o in observations]  # it knows no such turn
     if not has_odometry:
-        observations = [replace(o, T_odom_base=None, gyro_base=None) for o in observations]
+        observations = [replace(o, T_odom_base=None) for o in observations]
     return [module.track(observation) for observation in observations], turned
 
 
@@ -48,3 +50,14 @@ def test_new_place_is_hung_on_odometry_after_it_was_looked_for_in_the_map():
 def test_new_place_stays_lost_without_odometry():
     answers, _ = drive_away_in_the_dark(has_odometry=False)
     assert {answer.status for answer in answers[6:]} == {TrackingStatus.LOST}
+
+
+def test_heading_is_the_gyro_s_and_the_way_the_wheels():
+    motion = MotionModel()
+    motion.hold(Observation(stamp_ns=0, T_odom_base=se3.identity()), se3.identity())
+    turning = np.array([[-0.1, 0.0, 0.0, 0.5], [0.0, 0.0, 0.0, 0.5]])
+    slipped = se3.from_xy_yaw(0.04, 0.0, 0.2)
+    predicted = motion.predict(
+        Observation(stamp_ns=100_000_000, T_odom_base=slipped, gyro_base=turning)
+    )
+    np.testing.assert_allclose(predicted, se3.from_xy_yaw(0.04, 0.0, 0.05), atol=1e-12)

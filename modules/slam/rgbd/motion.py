@@ -14,7 +14,10 @@ _MAX_GAP_S = 0.5  # beyond it, a velocity says nothing any more
 
 
 class MotionModel:
-    """Predicts by odometry, else by constant velocity with the gyro's rotation."""
+    """Predicts by odometry, else by constant velocity; the rotation is the gyro's where it has one.
+
+    Wheels measure the way well and turns badly: half a second of a slip is a degree.
+    """
 
     def __init__(self) -> None:
         self._T_local_base = se3.identity()
@@ -28,16 +31,17 @@ class MotionModel:
         """Return the expected T_local_base at the observation."""
         if self._T_odom_base is not None and observation.T_odom_base is not None:
             T_prev_curr = se3.inverse(self._T_odom_base) @ observation.T_odom_base
+            gap_s = self._gap_s(observation)
+            if gap_s > 0 and _gyro_rate(observation) is not None:
+                T_prev_curr[:3, :3] = se3.so3_exp(self.turn_rate(observation) * gap_s)
             return self._T_local_base @ T_prev_curr
         twist = np.concatenate([self._twist_per_s[:3], self.turn_rate(observation)])
         return self._T_local_base @ se3.exp(twist * self._gap_s(observation))
 
     def turn_rate(self, observation: Observation) -> NDArray[np.float64]:
         """Return how fast the base should turn (3,) [rad/s], by the gyro if there is one."""
-        gyro = observation.gyro_base
-        if gyro is not None and len(gyro) and np.isfinite(gyro[:, 1:4]).all():
-            return np.asarray(gyro[:, 1:4].mean(axis=0))
-        return self._twist_per_s[3:]
+        rate = _gyro_rate(observation)
+        return self._twist_per_s[3:] if rate is None else rate
 
     def unheld_s(self, observation: Observation) -> float:
         """Return how long no pose was measured; 0 before there was any."""
@@ -71,3 +75,11 @@ class MotionModel:
             return 0.0
         gap_s = (observation.stamp_ns - self._stamp_ns) * _NS
         return gap_s if 0.0 < gap_s <= _MAX_GAP_S else 0.0
+
+
+def _gyro_rate(observation: Observation) -> NDArray[np.float64] | None:
+    """Return the mean turn rate (3,) [rad/s] of an observation's gyro, None without one."""
+    gyro = observation.gyro_base
+    if gyro is None or not len(gyro) or not np.isfinite(gyro[:, 1:4]).all():
+        return None
+    return np.asarray(gyro[:, 1:4].mean(axis=0))
