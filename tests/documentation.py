@@ -94,6 +94,8 @@ def run_inside(command: str) -> int:
     """Run a `python -m` command in this process and folder, which saves the imports."""
     arguments, module = as_run_here(command)[3:], shlex.split(command)[2]
     was, sys.argv = sys.argv, [module, *arguments]
+    is_package = hasattr(sys.modules.get(module), "__path__")
+    sys.modules.pop(f"{module}.__main__" if is_package else module, None)  # a test imported it
     try:
         runpy.run_module(module, run_name="__main__", alter_sys=False)
     except SystemExit as end:

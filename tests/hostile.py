@@ -351,7 +351,8 @@ class Votes:
     quantity = ""
 
     def __init__(self, how):
-        self._how, self._inner = how, GreyMean(threshold=100.0, scenes=["Bright", "Dark"])
+        self._how = how
+        self._inner = GreyMean(threshold=100.0, hysteresis=0.0, scenes=["Bright", "Dark"])
         self.scenes, self.requires = self._inner.scenes, self._inner.requires
 
     def activate(self, rig):
