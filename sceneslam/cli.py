@@ -58,6 +58,12 @@ def main() -> None:
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         print(f"error: {error}", file=sys.stderr)
         codes.append(UNUSABLE)
+    except ValueError as error:  # Hydra's, which does not say which
+        if not str(error).startswith("Config group override must be"):
+            raise
+        empty = [word for word in sys.argv[1:] if word.endswith(("=null", "="))]
+        print(f"error: {', '.join(empty)}: a group holds options; ~GROUP removes", file=sys.stderr)
+        codes.append(UNUSABLE)
     except KeyboardInterrupt:  # ends a sweep as well
         codes.append(INCOMPLETE)
     sys.exit(max(codes, default=OK))
@@ -83,7 +89,9 @@ def carry_out(config: DictConfig) -> Ended:
         raise
     for fault in finished.faults:
         print(f"error: {fault}", file=sys.stderr)
-    print("\n".join([*summary_lines(finished.metrics), f"report   {_short(folder)}/report.html"]))
+    page = folder / "report.html"
+    told = f"report   {_short(page)}" if page.exists() else f"results  {_short(folder)}"
+    print("\n".join([*summary_lines(finished.metrics), told]))
     if finished.is_interrupted:
         raise KeyboardInterrupt
     return Ended(code=INCOMPLETE if finished.faults else OK, errors=finished.faults)

@@ -74,6 +74,7 @@ def test_run_says_what_happened_in_ten_lines_at_most(folder):
         ((*SINGLE, "slam.only.feature_count=many"), "slam.only.feature_count: got 'many'"),
         ((*SINGLE, "policy=typo"), "policy/typo"),
         ((*SINGLE, "policy.typo=1"), "policy.typo"),
+        ((*SINGLE, "sinks=null"), "sinks=null"),
         ((*SINGLE, "scenes.Any=[onyl]"), "scenes.Any: got ['onyl']"),
     ],
 )
