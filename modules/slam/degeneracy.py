@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.types.se3 import Transform
+from sceneslam.types import se3
 
 Doubles = NDArray[np.float64]
 
@@ -61,20 +61,8 @@ def localizability(
     )
 
 
-def adjoint(T_a_b: Transform) -> Doubles:
-    """Return the (6, 6) matrix that takes twists of b to a (translation first)."""
-    ad = np.zeros((6, 6))
-    ad[:3, :3] = ad[3:, 3:] = T_a_b[:3, :3]
-    ad[:3, 3:] = _hat(T_a_b[:3, 3]) @ T_a_b[:3, :3]
-    return ad
-
-
 def _motion_of(centre: NDArray[np.floating], turn_m: Doubles) -> Doubles:
     scale = np.eye(6)
-    scale[:3, 3:] = -_hat(centre)
+    scale[:3, 3:] = -se3.hat(centre)
     scale[3:, 3:] = turn_m
     return scale
-
-
-def _hat(v: NDArray[np.floating]) -> Doubles:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

@@ -19,7 +19,7 @@ from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
 from .clouds import CloudReader
-from .degeneracy import Localizability, adjoint
+from .degeneracy import Localizability
 from .icp_map import IcpMap
 
 _POINTS_MIN = 50  # fewer do not hold six degrees of freedom
@@ -175,7 +175,7 @@ class KissIcp:
             self._is_measured = False
             T_prev_curr = se3.exp(self._twist_s * gap_s)
             deviation = 0.5 * _JERKED * gap_s**2 + _STEP_DEVIATION
-        carry = adjoint(se3.inverse(T_prev_curr))
+        carry = se3.adjoint(se3.inverse(T_prev_curr))
         grown = np.diag(np.repeat(deviation**2, 3))
         self._covariance = carry @ self._covariance @ carry.T + grown
         return T_prev_curr

@@ -67,10 +67,15 @@ def rotation_angle_rad(T_a_b: Transform) -> NDArray[np.float64]:
     return np.asarray(np.arctan2(sine, cosine))
 
 
+def hat(v: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the (3, 3) matrix whose product with w is the cross product v x w."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
 def so3_exp(rotvec_rad: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the (3, 3) rotation by the vector (3,) [rad] (Rodrigues)."""
     angle = float(np.linalg.norm(rotvec_rad))
-    k = _hat(rotvec_rad)
+    k = hat(rotvec_rad)
     if angle < 1e-8:
         return np.eye(3) + k + 0.5 * k @ k
     a = np.sin(angle) / angle
@@ -106,7 +111,7 @@ def adjoint(T_a_b: Transform) -> NDArray[np.float64]:
     rotation = T_a_b[:3, :3]
     adjoint_a_b = np.zeros((6, 6))
     adjoint_a_b[:3, :3] = adjoint_a_b[3:, 3:] = rotation
-    adjoint_a_b[:3, 3:] = _hat(T_a_b[:3, 3]) @ rotation
+    adjoint_a_b[:3, 3:] = hat(T_a_b[:3, 3]) @ rotation
     return adjoint_a_b
 
 
@@ -165,13 +170,9 @@ def to_quat_xyzw(T_a_b: Transform) -> NDArray[np.float64]:
     return np.asarray(np.where(quat[..., 3:] < 0, -quat, quat))
 
 
-def _hat(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-
-
 def _left_jacobian(phi: NDArray[np.float64]) -> NDArray[np.float64]:
     angle = float(np.linalg.norm(phi))
-    k = _hat(phi)
+    k = hat(phi)
     if angle < 1e-6:
         return np.eye(3) + 0.5 * k + k @ k / 6.0
     a = (1.0 - np.cos(angle)) / angle**2

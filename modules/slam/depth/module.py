@@ -13,7 +13,6 @@ from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
-from ..degeneracy import adjoint
 from .history import History
 from .keyframe_map import KeyframeMap
 from .localizer import Localizer
@@ -141,7 +140,7 @@ class DepthSlam:
 
     def _prior(self, prediction: Prediction) -> Prior:
         T_cam_base = se3.inverse(self._camera.T_base_cam)
-        turned = adjoint(T_cam_base)
+        turned = se3.adjoint(T_cam_base)
         information = np.linalg.inv(turned @ prediction.covariance @ turned.T)
         T_local_cam = prediction.T_local_base @ self._camera.T_base_cam
         return Prior(T_local_cam, np.asarray(information, np.float64))
@@ -155,7 +154,7 @@ class DepthSlam:
         found: Registration,
     ) -> Tracking:
         T_base_cam = self._camera.T_base_cam
-        turned = adjoint(T_base_cam)
+        turned = se3.adjoint(T_base_cam)
         covariance = np.linalg.inv(found.information + self._prior(prediction).information)
         weak = found.localizability.weak_twists(self.weak_ratio) @ turned.T
         T_local_base = found.T_local_cam @ se3.inverse(T_base_cam)

@@ -10,7 +10,6 @@ from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
-from ..degeneracy import adjoint
 from .surface import Doubles
 
 _NS = 1e-9
@@ -71,7 +70,7 @@ class Motion:
             T_prev_curr = se3.from_parts(se3.so3_exp(turn), T_prev_curr[:3, 3])
             by_gyro = _GYRO_RATE * gap_s + _GYRO_SHARE * float(np.linalg.norm(turn))
             deviation = np.array([deviation[0], min(deviation[1], by_gyro)])
-        carry = adjoint(se3.inverse(T_prev_curr))
+        carry = se3.adjoint(se3.inverse(T_prev_curr))
         covariance = carry @ self.covariance @ carry.T + np.diag(np.repeat(deviation**2, 3))
         return Prediction(self.T_local_base @ T_prev_curr, covariance, is_measured)
 

@@ -31,7 +31,7 @@ class Edge:
 
     def turned(self) -> Edge:
         """Return the same measurement from the end to the start."""
-        adjoint = _adjoint(self.T_start_end)
+        adjoint = se3.adjoint(self.T_start_end)
         return Edge(
             start=self.end,
             end=self.start,
@@ -42,7 +42,7 @@ class Edge:
 
     def then(self, after: Edge) -> Edge:
         """Return the motion along this edge and one that begins where it ends."""
-        adjoint = _adjoint(se3.inverse(after.T_start_end))
+        adjoint = se3.adjoint(se3.inverse(after.T_start_end))
         return Edge(
             start=self.start,
             end=after.end,
@@ -207,13 +207,3 @@ def _moved(edge: Edge, T_start_end: Transform) -> Edge:
 def _length(edge: Edge) -> float:
     T = edge.T_start_end
     return float(np.linalg.norm(T[:3, 3]) + _RADIAN_M * se3.rotation_angle_rad(T))
-
-
-def _adjoint(T_a_b: Transform) -> NDArray[np.float64]:
-    """Return (6, 6): what a twist (translation, rotation) at b is at a."""
-    rotation, (x, y, z) = T_a_b[:3, :3], T_a_b[:3, 3]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = rotation
-    adjoint[:3, 3:] = cross @ rotation
-    return adjoint

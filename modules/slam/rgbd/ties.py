@@ -15,7 +15,6 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
-from ..degeneracy import adjoint
 from ..depth.keyframe import Keyframe as DepthKeyframe
 from ..depth.registration import Prior, Samples, register, samples_of
 from ..depth.surface import SurfaceReader
@@ -65,7 +64,7 @@ def pull(tie: Tie, T_local_cam: NDArray[np.float64], one: int, other: int) -> Pu
         one=one,
         other=other,
         residual=tie.root @ off,
-        by_one=-tie.root @ adjoint(se3.inverse(T_one_other)),
+        by_one=-tie.root @ se3.adjoint(se3.inverse(T_one_other)),
         by_other=tie.root,
     )
 
@@ -108,5 +107,5 @@ class DepthTies:
         root = np.sqrt(np.maximum(squares, 0.0))[:, None] * axes.T
         return Tie(
             T_one_other=to_cam @ found.T_local_cam @ self._T_depth_cam,
-            root=root @ adjoint(self._T_depth_cam),
+            root=root @ se3.adjoint(self._T_depth_cam),
         )

@@ -108,9 +108,8 @@ def _eye(visual_map: VisualMap, keyframe: Keyframe) -> _Eye:
 def _match(visual_map: VisualMap, new: _Eye, other: _Eye) -> Matches:
     """Return pairs (row of new, row of other) that look alike and lie on epipolar lines."""
     T_other_new = other.T_cam_local @ se3.inverse(new.T_cam_local)
-    x, y, z = T_other_new[:3, 3]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    lines = new.rays @ (cross @ T_other_new[:3, :3]).T  # (N, 3), in the other's image at z = 1
+    essential = se3.hat(T_other_new[:3, 3]) @ T_other_new[:3, :3]
+    lines = new.rays @ essential.T  # (N, 3), in the other's image at z = 1
     within = _LINE_SIGMAS * np.sqrt(2.0) * new.sigma_px / visual_map.camera.fx  # of about a level
     lines /= np.maximum(np.hypot(lines[:, 0], lines[:, 1]) * within, 1e-12)[:, None]
     gaps = lines.astype(np.float32) @ other.rays.T.astype(np.float32)
