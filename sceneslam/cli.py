@@ -75,7 +75,7 @@ def carry_out(config: DictConfig) -> Ended:
     try:
         if config.get("experiment"):
             verdict = run_experiment(config, folder)
-            print("\n".join([*verdict_lines(verdict), f"verdict  {_short(folder)}/verdict.json"]))
+            print("\n".join([*verdict_lines(verdict), f"report  {_short(folder)}/report.html"]))
             return Ended(code=OK)
         if OmegaConf.select(config, "run.mode") == DETECT_ONLY:
             print("\n".join(detect(resolved(config), folder)))

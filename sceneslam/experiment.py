@@ -16,11 +16,13 @@ from tqdm import tqdm
 from sceneslam.app import run
 from sceneslam.config.check import check_given
 from sceneslam.config.component import Builder
-from sceneslam.config.provenance import provenance
+from sceneslam.config.overlay import command_of, comment_of
+from sceneslam.config.provenance import provenance, save_config
 from sceneslam.config.resolve import resolved
 from sceneslam.config.settings import DETECT_ONLY
 from sceneslam.detection.run import detect
 from sceneslam.evaluation.verdict import write_verdict
+from sceneslam.evaluation.verdict_page import Asked, Ran, write_verdict_page
 from sceneslam.interfaces import Experiment
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.experiment import Outcome, Trial, Verdict
@@ -41,9 +43,18 @@ def run_experiment(config: DictConfig, folder: Path) -> Verdict:
     check_given(plain.get(key), key)
     experiment = Builder(plain).make(key, Experiment)
     folder.mkdir(parents=True, exist_ok=True)
-    trials = _Trials(key, folder / "runs", HydraConfig.get().overrides.task)
+    hydra = HydraConfig.get()
+    trials = _Trials(key, folder / "runs", hydra.overrides.task)
     verdict = experiment.run(trials.run, folder)
     write_verdict(folder, key, verdict)
+    save_config(plain, folder / "config.yaml")
+    asked = Asked(
+        name=str(hydra.runtime.choices.get("experiment") or key),
+        question=comment_of(hydra, "experiment"),
+        command=command_of(hydra),
+        config_yaml=(folder / "config.yaml").read_text(),
+    )
+    write_verdict_page(folder, asked, verdict, trials.done)
     return verdict
 
 
@@ -52,6 +63,7 @@ class _Trials:
 
     def __init__(self, key: str, folder: Path, overrides: Sequence[str]) -> None:
         self._key, self._folder, self._overrides = key, folder, overrides
+        self.done: list[Ran] = []
 
     def run(self, trials: Iterable[Trial]) -> Iterator[Outcome]:
         """Yield the outcomes in order; all trials are composed before the first is run."""
@@ -61,15 +73,20 @@ class _Trials:
             made_by = provenance(config)
             if _finished_by(folder) != made_by:
                 self._run(config, folder, trial.name, made_by)
-            has_poses = config["run"]["mode"] != DETECT_ONLY
-            yield Outcome(
-                trial=trial,
-                folder=folder,
-                metrics=json.loads((folder / "metrics.json").read_text()),
-                trajectory=_read(folder / "trajectory.tum", has_poses),
-                online=_read(folder / "trajectory_online.tum", has_poses),
-                faults=json.loads((folder / _END).read_text())["faults"],
-            )
+            yield self._outcome(trial, folder, config["run"]["mode"] != DETECT_ONLY)
+
+    def _outcome(self, trial: Trial, folder: Path, has_poses: bool) -> Outcome:
+        metrics = json.loads((folder / "metrics.json").read_text())
+        faults = json.loads((folder / _END).read_text())["faults"]
+        self.done.append(Ran(trial=trial, folder=folder, metrics=metrics, faults=faults))
+        return Outcome(
+            trial=trial,
+            folder=folder,
+            metrics=metrics,
+            trajectory=_read(folder / "trajectory.tum", has_poses),
+            online=_read(folder / "trajectory_online.tum", has_poses),
+            faults=faults,
+        )
 
     def _run(
         self, config: dict[str, Any], folder: Path, name: str, made_by: dict[str, str]

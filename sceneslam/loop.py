@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Sequence
 from itertools import chain, islice
 from pathlib import Path
@@ -24,6 +25,7 @@ from sceneslam.types.run import RunResult, Timings
 from sceneslam.types.truth import GroundTruth
 
 _BAR_S = 0.5  # between two updates of the progress bar
+_LINE_S = 10.0  # the same where it is written into a file
 _log = logging.getLogger(__name__)
 
 
@@ -141,7 +143,7 @@ class Loop:
             total=min([limit for limit in limits if limit is not None], default=None),
             desc=self._title,
             unit="obs",
-            mininterval=_BAR_S,
+            mininterval=_BAR_S if sys.stderr.isatty() else _LINE_S,
             disable=not self._parts.run.progress,
         )
 

@@ -136,7 +136,7 @@ def call(folder, *overrides):
 def test_openloris_says_for_every_system_and_scene_whether_harm_was_done(folder):
     done = call(folder, "openloris.path=data")
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == "verdict  out/verdict.json"
+    assert done.stdout.splitlines()[-1] == "report  out/report.html"
     verdict = json.loads((folder / "out" / "verdict.json").read_text())
     values = {entry["name"]: entry["value"] for entry in verdict["figures"]}
     # Nothing was recorded in cafe: odometry alone is all there is, and right.
@@ -149,6 +149,10 @@ def test_openloris_says_for_every_system_and_scene_whether_harm_was_done(folder)
     assert float(rows["home-1-1"]["odometry [%]"]) == 100.0
     assert float(rows["home-1-1"]["alone [%]"]) < 30.0
     assert (folder / "out" / "runs" / VINS / "home-1-1" / "trajectory.tum").is_file()
+    page = (folder / "out" / "report.html").read_text()
+    assert "Does the policy ever do harm? What real systems put out" in page
+    command = "python -m sceneslam +experiment=openloris openloris.path=data hydra.run.dir=out"
+    assert f"<pre>{command}</pre>" in page
 
 
 @pytest.mark.parametrize(

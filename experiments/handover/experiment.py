@@ -55,7 +55,11 @@ class HandoverExperiment:
             for cell, outcome in zip(self._cells, outcomes, strict=True)
         ]
         draw_seams(folder / "seams.png", seams)
-        return Verdict(figures=list(self._figures(seams)), table=_table(seams))
+        return Verdict(
+            figures=list(self._figures(seams)),
+            table=_table(seams),
+            pictures={"seams.png": "What each kind of hand-over loses beyond the module's drift."},
+        )
 
     def _trial(self, kind: str, startup_s: float, lost_s: float) -> Trial:
         changed_s = self._confirmed_s - self._window_s

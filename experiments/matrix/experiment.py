@@ -70,7 +70,14 @@ class MatrixExperiment:
         means = mean(cells)
         draw_errors(folder / "errors.png", means)
         draw_sweep(folder / "sweep.png", sweep(outcomes, self._grid))
-        return Verdict(figures=list(self._figures(means)), table=_table(means))
+        return Verdict(
+            figures=list(self._figures(means)),
+            table=_table(means),
+            pictures={
+                "errors.png": "The error of every strategy, story by story.",
+                "sweep.png": "Which changes a threshold, hysteresis and window confirm.",
+            },
+        )
 
     def _oracle(self, story: str, seed: int, group: Sequence[Outcome]) -> Cell:
         truth = Trajectory.read_tum(group[0].folder / "groundtruth.tum")

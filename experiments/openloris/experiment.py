@@ -52,7 +52,11 @@ class OpenLorisExperiment:
         rates = [self._rates(*pair, outcome) for pair, outcome in zip(pairs, outcomes, strict=True)]
         means = [one for system in self._data.systems for one in _means(system, rates)]
         draw_rates(folder / "rates.png", means)
-        return Verdict(figures=self._figures(means), table=table([*rates, *means]))
+        return Verdict(
+            figures=self._figures(means),
+            table=table([*rates, *means]),
+            pictures={"rates.png": "Correct Rates per system and scene."},
+        )
 
     def _trial(self, system: str, key: Sequence) -> Trial:
         """Return the run of a system beside odometry; of odometry where nothing was recorded."""

@@ -40,7 +40,12 @@ class AloneExperiment:
             correct = 100 * number(metrics["correct_rate"])
             rows.append((key, lights, 100 * coverage, correct, 100 * ate_m, frame_ms))
         columns = ("module", "lights", "coverage [%]", "correct [%]", "ATE [cm]", "median [ms]")
-        return Verdict(figures=figures, table=Table(columns=columns, rows=rows))
+        pictures = {
+            f"{key}.png": f"Map and path of {key} alone, lights {lights}."
+            for key, lights in self._own.items()
+        }
+        table = Table(columns=columns, rows=rows)
+        return Verdict(figures=figures, table=table, pictures=pictures)
 
 
 def _trial(key: str, lights: str) -> Trial:

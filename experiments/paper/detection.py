@@ -31,6 +31,7 @@ class DetectionExperiment:
         return Verdict(
             figures=list(self._figures(outcome)),
             table=Table(columns=(*columns, *grey), rows=self._rows(outcome)),
+            pictures={"grey_mean.png": "The mean of grey, the threshold, and confirmed changes."},
         )
 
     def _figures(self, outcome: Outcome) -> Iterator[Figure]:

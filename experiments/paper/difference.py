@@ -42,7 +42,11 @@ class DifferenceExperiment:
         columns = ("story", "largest difference [cm]", "RMS [cm]", "poses compared")
         errors = ("ATE switched [cm]", "ATE unswitched [cm]")
         rows = [_row(name, one, *pairs[name]) for name, one in found.items()]
-        return Verdict(figures=figures, table=Table(columns=(*columns, *errors), rows=rows))
+        return Verdict(
+            figures=figures,
+            table=Table(columns=(*columns, *errors), rows=rows),
+            pictures={"difference.png": "How far the two runs are apart, over time."},
+        )
 
 
 def draw_differences(path: Path, found: Mapping[str, Difference]) -> None:

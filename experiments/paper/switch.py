@@ -42,7 +42,9 @@ class SwitchExperiment:
         columns = ("hand-over", "switches", "coverage [%]", "gap [s]", "seam [cm]", "ATE [cm]")
         rows = [_row(*pair) for pair in zip(self._handovers, outcomes, strict=True)]
         return Verdict(
-            figures=figures, table=Table(columns=(*columns, "max [cm]", "points"), rows=rows)
+            figures=figures,
+            table=Table(columns=(*columns, "max [cm]", "points"), rows=rows),
+            pictures={"map.png": "One map of both modules, and one trajectory."},
         )
 
     def _trial(self, kind: str) -> Trial:

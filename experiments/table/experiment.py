@@ -60,7 +60,8 @@ class TableExperiment:
             )
             for one in first
         ]
-        return Verdict(figures=figures, table=_table(evidence, table))
+        scores = {"scores.png": "The score of every module, scene by scene: less is better."}
+        return Verdict(figures=figures, table=_table(evidence, table), pictures=scores)
 
     def _weigh(self, run_trials: RunTrials, module: str) -> Sequence[Evidence]:
         """Return what a module did in every scene that it was shown."""

@@ -63,6 +63,7 @@ class TuneExperiment:
                 for split, (default, tuned_) in scores.items()
             ],
             table=self._table(defaults, tuned),
+            pictures={"search.png": "The score of every trial, and the best so far."},
         )
 
     def _try(self, run_trials: RunTrials, number: int, drawn: Drawn) -> float:

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from html import escape
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 
 from sceneslam.collect.curves import charts
 from sceneslam.collect.overview import FIRST
 from sceneslam.collect.rows import Row, Value, swept_keys
 from sceneslam.collect.summary import Group, Mean
 from sceneslam.evaluation.markup import bullets, tiles
+from sceneslam.evaluation.page import fill_page
 
 _ROWS_MAX = 2000
 _ERRORS_MAX = 20
@@ -25,16 +24,12 @@ def write_page(folder: Path, rows: Sequence[Row], groups: Sequence[Group]) -> Pa
     told = {
         "title": escape(folder.resolve().name),
         "numbers": tiles({name: str(count) for name, count in counts.items()}),
-        "style": files("sceneslam.evaluation").joinpath("page.css").read_text("utf-8"),
         "errors": _errors(rows),
         "charts": "".join(charts(groups)),
         "summary": _summary(groups),
         "table": _table(folder, rows),
     }
-    page = files("sceneslam.collect").joinpath("page.html").read_text("utf-8")
-    path = folder / "index.html"
-    path.write_text(Template(page).substitute(told), encoding="utf-8")
-    return path
+    return fill_page(folder / "index.html", "sceneslam.collect", "page.html", told)
 
 
 def _errors(rows: Sequence[Row]) -> str:

@@ -144,11 +144,11 @@ def _table(config: Mapping[str, Any], detector: Detector) -> dict[str, tuple[str
 
 
 def _tell_of_rows(table: Mapping[str, Any], scenes: Mapping[str, Sequence[str]]) -> None:
-    """Say which rows of the table have no fallback, and which are never asked for."""
+    """Say which rows lack a fallback though there are other modules, and which none asks for."""
     for scene in table:
         if scene not in scenes:
             _log.warning("scenes.%s: the detector does not report this scene", scene)
-        elif len(scenes[scene]) == 1:
+        elif len(scenes[scene]) == 1 and len(_used(scenes)) > 1:
             (key,) = scenes[scene]
             _log.warning("scenes.%s: %s has no fallback; without it the run ends", scene, key)
 

@@ -2,8 +2,21 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
+from urllib.parse import quote
+
+
+class Markup(str):
+    """Text that is HTML already."""
+
+    __slots__ = ()
+
+
+def link(path: str, text: str) -> Markup:
+    """Return a link to a file beside the page."""
+    return Markup(f'<a href="{escape(quote(path))}">{escape(text)}</a>')
 
 
 def paragraphs(sentences: Iterable[str]) -> str:
@@ -30,7 +43,7 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """Return a table that scrolls by itself where the page is too narrow for it."""
     head = "".join(f"<th>{escape(name)}</th>" for name in heads)
     body = "".join(
-        "<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows
+        f"<tr>{''.join(f'<td>{_escaped(cell)}</td>' for cell in row)}</tr>" for row in rows
     )
     whole = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
     return f'<div class="scroll">{whole}</div>'
@@ -41,3 +54,14 @@ def figure(svg: str, caption: str) -> str:
     told = escape(caption)
     labelled = svg.replace("<svg ", f'<svg role="img" aria-label="{told}" ', 1)
     return f"<figure>{labelled}<figcaption>{told}</figcaption></figure>\n"
+
+
+def picture(png: bytes, caption: str) -> str:
+    """Return a figure from the bytes of a PNG file, with its caption."""
+    told, data = escape(caption), b64encode(png).decode("ascii")
+    image = f'<img alt="{told}" src="data:image/png;base64,{data}">'
+    return f"<figure>{image}<figcaption>{told}</figcaption></figure>\n"
+
+
+def _escaped(cell: object) -> str:
+    return cell if isinstance(cell, Markup) else escape(str(cell))

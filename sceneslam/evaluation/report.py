@@ -5,15 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from html import escape
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import Any
 
 from sceneslam.evaluation import markup
 from sceneslam.evaluation.chronicle import Entry, chronicle
 from sceneslam.evaluation.figures import write_figures
 from sceneslam.evaluation.metrics import Metrics
+from sceneslam.evaluation.page import fill_page
 from sceneslam.evaluation.story import tell
 from sceneslam.evaluation.summary import degrees, number, percent, seconds
 from sceneslam.types.run import RunResult
@@ -73,16 +72,7 @@ def write_report(
         "versions": markup.table(["part", "version"], [[*item] for item in versions.items()]),
         "config": escape(config_yaml),
     }
-    return write_page(folder / "report.html", "report.html", told)
-
-
-def write_page(path: Path, template: str, told: Mapping[str, str]) -> Path:
-    """Fill a template of this package, which is given the style as well; return its path."""
-    package = files("sceneslam.evaluation")
-    page = Template(package.joinpath(template).read_text("utf-8"))
-    style = package.joinpath("page.css").read_text("utf-8")
-    path.write_text(page.substitute(told, style=style), encoding="utf-8")
-    return path
+    return fill_page(folder / "report.html", "sceneslam.evaluation", "report.html", told)
 
 
 def _told(metrics: Metrics) -> dict[str, str]:

@@ -27,14 +27,14 @@ def write_verdict(folder: Path, experiment: str, verdict: Verdict) -> None:
 def markdown(table: Table) -> str:
     """Return the table in Markdown, numbers with four digits."""
     rows = [table.columns, ["---"] * len(table.columns), *table.rows]
-    return "".join(f"| {' | '.join(map(_cell, row))} |\n" for row in rows)
+    return "".join(f"| {' | '.join(map(rounded, row))} |\n" for row in rows)
 
 
 def verdict_lines(verdict: Verdict) -> list[str]:
     """Return one line per figure, for the command line."""
     return [
-        f"{'holds' if figure.holds else 'FAILS'}  {figure.name}: {figure.value:.4g} {figure.unit} "
-        f"({figure.relation.value} {figure.bound:.4g})"
+        f"{'holds' if figure.holds else 'FAILS'}  {figure.name}: {rounded(figure.value)} "
+        f"{figure.unit} ({figure.relation.value} {rounded(figure.bound)})"
         for figure in verdict.figures
     ]
 
@@ -50,7 +50,10 @@ def _plain(figure: Figure) -> dict[str, str | float | bool | None]:
     }
 
 
-def _cell(value: str | float | None) -> str:
+def rounded(value: str | float | None) -> str:
+    """Return a cell as a person reads it: a number with four digits, a large one in full."""
     if isinstance(value, str):
         return value
-    return "-" if value is None or math.isnan(value) else f"{value:.4g}"
+    if value is None or math.isnan(value):
+        return "-"
+    return f"{value:.0f}" if 1e4 <= abs(value) < 1e15 else f"{value:.4g}"

@@ -84,6 +84,7 @@ class Verdict:
 
     figures: Sequence[Figure]
     table: Table
+    pictures: Mapping[str, str] = field(default_factory=dict)  # PNG in the folder -> its caption
 
     @property
     def holds(self) -> bool:

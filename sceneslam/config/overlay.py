@@ -1,0 +1,53 @@
+"""What was chosen, in words: the comment of an experiment's overlay, and the command line."""
+
+from __future__ import annotations
+
+import shlex
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+from hydra.conf import HydraConf
+from omegaconf import DictConfig
+
+_COMMAND_LINE = "command-line"  # Hydra's name for the provider of --config-dir
+
+
+def comment_of(hydra: HydraConf | DictConfig, group: str) -> list[str]:
+    """Return what the chosen option of a group says of itself at its top, as paragraphs.
+
+    What is set off further in such a comment is a command, and ends a paragraph.
+    """
+    choice = hydra.runtime.choices.get(group)
+    for source in hydra.runtime.config_sources:
+        path = _folder(source.schema, source.path)
+        if choice and path is not None and (found := path / group / f"{choice}.yaml").is_file():
+            return _paragraphs(found.read_text("utf-8"))
+    return []
+
+
+def command_of(hydra: HydraConf | DictConfig) -> str:
+    """Return the command line that gives the same once more."""
+    folders = [s.path for s in hydra.runtime.config_sources if s.provider == _COMMAND_LINE]
+    words = [word for word in hydra.overrides.hydra if not word.startswith("hydra.mode=")]
+    given = [word for folder in folders for word in ("--config-dir", folder)]
+    return shlex.join(["python", "-m", "sceneslam", *given, *hydra.overrides.task, *words])
+
+
+def _folder(schema: str, path: str) -> Traversable | None:
+    if schema == "pkg":
+        return files(path.replace("/", "."))
+    return Path(path) if schema == "file" else None
+
+
+def _paragraphs(text: str) -> list[str]:
+    paragraphs = [""]
+    for line in text.splitlines():
+        if not line.startswith("#"):
+            break
+        said = line.removeprefix("#").removeprefix(" ")
+        if said.startswith("  "):
+            paragraphs.append("")
+        elif not said.startswith("@package"):
+            paragraphs[-1] = f"{paragraphs[-1]} {said}".strip()
+    return [f"{one.removesuffix(':')}." if one.endswith(":") else one for one in paragraphs if one]

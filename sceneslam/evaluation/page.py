@@ -1,0 +1,16 @@
+"""One HTML file that opens alone: a template, filled, with the style that all pages share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+
+
+def fill_page(path: Path, package: str, template: str, told: Mapping[str, str]) -> Path:
+    """Fill a template that lies in a package, which is given the style as well; return its path."""
+    page = Template(files(package).joinpath(template).read_text("utf-8"))
+    style = files("sceneslam.evaluation").joinpath("page.css").read_text("utf-8")
+    path.write_text(page.substitute(told, style=style), encoding="utf-8")
+    return path
