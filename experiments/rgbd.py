@@ -1,5 +1,6 @@
 """Print how well and how fast the RGB-D module follows recordings in the TUM layout.
 
+    export OPENBLAS_NUM_THREADS=1  # as `python -m sceneslam` sets it; two threads are slower
     python experiments/rgbd.py FOLDER [FX FY CX CY DEPTH_SCALE]  # the table below
     python experiments/rgbd.py FOLDER [...] sweep  # seeds and feature counts
     python experiments/rgbd.py FOLDER [...] honest  # errors in claimed sigmas

@@ -13,7 +13,7 @@ from sceneslam.modules.slam.rgbd.fusion import join_duplicates
 from sceneslam.modules.slam.rgbd.keyframes import NO_LANDMARK, DepthView, Keyframe
 from sceneslam.modules.slam.rgbd.local_mapping import LocalMapping
 from sceneslam.modules.slam.rgbd.residuals import Sightings, errors
-from sceneslam.modules.slam.rgbd.ties import Tie
+from sceneslam.modules.slam.rgbd.ties import Tie, Ties
 from sceneslam.modules.slam.rgbd.visual_map import VisualMap
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
@@ -52,7 +52,7 @@ def exact_bundle(rng, *, has_depth=True):
             depth_m=depth_m if has_depth else np.zeros(count),
             inverse_depth_sigma_per_m=np.full(count, 0.003),
         ),
-        ties={},
+        ties=Ties.of({}),
     )
 
 
@@ -81,7 +81,7 @@ def test_tie_pulls_a_keyframe_that_hardly_anything_else_holds():
     off = se3.exp(np.array([0.02, -0.01, 0.01, 0.01, 0.0, -0.01]))
     T_tied = se3.inverse(exact.T_local_cam[0]) @ exact.T_local_cam[4] @ off
     tie = Tie(T_one_other=T_tied, root=1e4 * np.eye(6))
-    adjusted = adjust(CAMERA, replace(exact, seen=vague, ties={(0, 4): tie}))
+    adjusted = adjust(CAMERA, replace(exact, seen=vague, ties=Ties.of({(0, 4): tie})))
     T_found = se3.inverse(adjusted.bundle.T_local_cam[0]) @ adjusted.bundle.T_local_cam[4]
     assert pytest.approx(T_tied, abs=1e-3) == T_found
 

@@ -68,8 +68,10 @@ def rotation_angle_rad(T_a_b: Transform) -> NDArray[np.float64]:
 
 
 def hat(v: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the (3, 3) matrix whose product with w is the cross product v x w."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    """Return the (..., 3, 3) matrices whose products with x are the cross products v x x."""
+    cross = np.zeros((*v.shape, 3))
+    cross[..., 2, 1], cross[..., 0, 2], cross[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
+    return cross - np.swapaxes(cross, -1, -2)
 
 
 def so3_exp(rotvec_rad: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -84,13 +86,11 @@ def so3_exp(rotvec_rad: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def so3_log(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation vector (3,) [rad] of a (3, 3) rotation."""
-    x, y, z, w = to_quat_xyzw(from_parts(rotation, np.zeros(3)))
-    vector = np.array([x, y, z])
-    sine = float(np.linalg.norm(vector))
-    if sine < 1e-12:
-        return 2.0 * vector
-    return np.asarray(vector * (2.0 * np.arctan2(sine, w) / sine))
+    """Return the rotation vectors (..., 3) [rad] of (..., 3, 3) rotations."""
+    quat = to_quat_xyzw(rotation)
+    sine = np.linalg.norm(quat[..., :3], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, quat[..., 3:])
+    return np.asarray(quat[..., :3] * (angle / np.maximum(sine, np.finfo(float).tiny)))
 
 
 def exp(xi: NDArray[np.float64]) -> Transform:
@@ -100,18 +100,18 @@ def exp(xi: NDArray[np.float64]) -> Transform:
 
 
 def log(T_a_b: Transform) -> NDArray[np.float64]:
-    """Return the twist (6,) of a transform: translation [m] first, then rotation [rad]."""
-    phi = so3_log(T_a_b[:3, :3])
-    rho = np.linalg.solve(_left_jacobian(phi), T_a_b[:3, 3])
-    return np.concatenate([rho, phi])
+    """Return the twist (..., 6) of transforms: translation [m] first, then rotation [rad]."""
+    phi = so3_log(T_a_b[..., :3, :3])
+    rho = np.linalg.solve(_left_jacobian(phi), T_a_b[..., :3, 3:])[..., 0]
+    return np.concatenate([rho, phi], axis=-1)
 
 
 def adjoint(T_a_b: Transform) -> NDArray[np.float64]:
-    """Return the (6, 6) matrix that takes twists of b to a (translation first)."""
-    rotation = T_a_b[:3, :3]
-    adjoint_a_b = np.zeros((6, 6))
-    adjoint_a_b[:3, :3] = adjoint_a_b[3:, 3:] = rotation
-    adjoint_a_b[:3, 3:] = hat(T_a_b[:3, 3]) @ rotation
+    """Return the (..., 6, 6) matrices that take twists of b to a (translation first)."""
+    rotation = T_a_b[..., :3, :3]
+    adjoint_a_b = np.zeros((*T_a_b.shape[:-2], 6, 6))
+    adjoint_a_b[..., :3, :3] = adjoint_a_b[..., 3:, 3:] = rotation
+    adjoint_a_b[..., :3, 3:] = hat(T_a_b[..., :3, 3]) @ rotation
     return adjoint_a_b
 
 
@@ -146,35 +146,27 @@ def to_quat_xyzw(T_a_b: Transform) -> NDArray[np.float64]:
     r = T_a_b[..., :3, :3]
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     # The four candidates of Shepperd's method; the largest diagonal term is the stable one.
-    squares = np.stack([1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz], -1)
-    off = {
-        "xy": r[..., 0, 1] + r[..., 1, 0],
-        "xz": r[..., 0, 2] + r[..., 2, 0],
-        "yz": r[..., 1, 2] + r[..., 2, 1],
-        "xw": r[..., 2, 1] - r[..., 1, 2],
-        "yw": r[..., 0, 2] - r[..., 2, 0],
-        "zw": r[..., 1, 0] - r[..., 0, 1],
-    }
-    rows = np.stack(
-        [
-            np.stack([squares[..., 0], off["xy"], off["xz"], off["xw"]], -1),
-            np.stack([off["xy"], squares[..., 1], off["yz"], off["yw"]], -1),
-            np.stack([off["xz"], off["yz"], squares[..., 2], off["zw"]], -1),
-            np.stack([off["xw"], off["yw"], off["zw"], squares[..., 3]], -1),
-        ],
-        axis=-2,
-    )
-    best = np.argmax(squares, axis=-1)
+    rows = np.empty((*r.shape[:-2], 4, 4))
+    rows[..., 0, 0] = 1 + xx - yy - zz
+    rows[..., 1, 1] = 1 - xx + yy - zz
+    rows[..., 2, 2] = 1 - xx - yy + zz
+    rows[..., 3, 3] = 1 + xx + yy + zz
+    rows[..., 0, 1] = rows[..., 1, 0] = r[..., 0, 1] + r[..., 1, 0]
+    rows[..., 0, 2] = rows[..., 2, 0] = r[..., 0, 2] + r[..., 2, 0]
+    rows[..., 1, 2] = rows[..., 2, 1] = r[..., 1, 2] + r[..., 2, 1]
+    rows[..., 0, 3] = rows[..., 3, 0] = r[..., 2, 1] - r[..., 1, 2]
+    rows[..., 1, 3] = rows[..., 3, 1] = r[..., 0, 2] - r[..., 2, 0]
+    rows[..., 2, 3] = rows[..., 3, 2] = r[..., 1, 0] - r[..., 0, 1]
+    best = np.argmax(np.einsum("...ii->...i", rows), axis=-1)
     quat = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
     quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
     return np.asarray(np.where(quat[..., 3:] < 0, -quat, quat))
 
 
 def _left_jacobian(phi: NDArray[np.float64]) -> NDArray[np.float64]:
-    angle = float(np.linalg.norm(phi))
+    # Below 1e-4 rad the two factors change by less than what double precision tells apart.
+    angle = np.maximum(np.linalg.norm(phi, axis=-1), 1e-4)[..., None, None]
     k = hat(phi)
-    if angle < 1e-6:
-        return np.eye(3) + 0.5 * k + k @ k / 6.0
     a = (1.0 - np.cos(angle)) / angle**2
     b = (angle - np.sin(angle)) / angle**3
     return np.asarray(np.eye(3) + a * k + b * k @ k)

@@ -6,7 +6,6 @@ window are small enough for dense algebra.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +15,7 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 
 from .residuals import Errors, Sightings, errors
-from .ties import Pull, Tie, pull
+from .ties import Pulls, Ties
 
 _ROUNDS = (5, 5)
 _DAMPING = (1e-4, 1e-8, 1e4)  # of the diagonal: first, least, most
@@ -33,7 +32,7 @@ class Bundle:
     keyframe_rows: NDArray[np.int64]  # (N,), of each sighting, rising
     landmark_rows: NDArray[np.int64]  # (N,); a keyframe sees a landmark once
     seen: Sightings  # (N,)
-    ties: Mapping[tuple[int, int], Tie]  # by the keyframes' rows
+    ties: Ties
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,20 +63,20 @@ def adjust(camera: Camera, bundle: Bundle) -> Adjusted:
         found = _errors(camera, bundle)
         agrees = found.pixels_agree()
         use = np.stack([agrees, agrees & bundle.seen.measures_depth & found.depths_agree()])
-    normal = _linearise(bundle, found, use, [])
+    normal = _linearise(bundle, found, use, Ties.of({}).pull(bundle.T_local_cam))
     return Adjusted(bundle=bundle, agrees=agrees, information=normal.points)
 
 
 def _descend(camera: Camera, bundle: Bundle, use: NDArray[np.float64], steps: int) -> Bundle:
     damping = _DAMPING[0]
     found = _errors(camera, bundle)
-    pulls = _pulls(bundle)
+    pulls = bundle.ties.pull(bundle.T_local_cam)
     cost = _cost(found, use, pulls)
     for _ in range(steps):
         normal = _linearise(bundle, found, use, pulls)
         moved = _step(bundle, normal, damping)
         found_there = _errors(camera, moved)
-        pulls_there = _pulls(moved)
+        pulls_there = moved.ties.pull(moved.T_local_cam)
         cost_there = _cost(found_there, use, pulls_there)
         if not cost_there < cost:
             damping = min(damping * 100.0, _DAMPING[2])
@@ -97,23 +96,17 @@ def _errors(camera: Camera, bundle: Bundle) -> Errors:
     return errors(camera, points_cam + T_cam_local[:, :3, 3], bundle.seen)
 
 
-def _pulls(bundle: Bundle) -> list[Pull]:
-    return [pull(tie, bundle.T_local_cam, *rows) for rows, tie in bundle.ties.items()]
-
-
-def _cost(found: Errors, use: NDArray[np.float64], pulls: Sequence[Pull]) -> float:
+def _cost(found: Errors, use: NDArray[np.float64], pulls: Pulls) -> float:
     """Return the Huber cost: quadratic near zero, linear beyond."""
     weights = found.huber_weights()
     squares = np.stack([(found.of[:2] ** 2).sum(axis=0), found.of[2] ** 2])
     weight = weights[1:]
     # rho = s^2 w (2 - w): s^2 where w = 1, and 2 h s - h^2 with w = h / s.
     cost = float((use * squares * weight * (2.0 - weight)).sum())
-    return cost + sum(each.cost for each in pulls)
+    return cost + pulls.cost
 
 
-def _linearise(
-    bundle: Bundle, found: Errors, use: NDArray[np.float64], pulls: Sequence[Pull]
-) -> _Normal:
+def _linearise(bundle: Bundle, found: Errors, use: NDArray[np.float64], pulls: Pulls) -> _Normal:
     weights = np.sqrt(found.huber_weights() * use[[0, 0, 1]])
     residuals = (found.of * weights).T  # (N, 3)
     by_point_cam = np.moveaxis(found.by_point * weights[:, None], 2, 0)  # (N, 3, 3)
@@ -126,19 +119,9 @@ def _linearise(
     # A twist of the camera moves a point by -rho + point x phi.
     by_pose = np.concatenate([-by_point_cam, np.cross(by_point_cam, points_cam[:, None])], axis=2)
     normal = _assemble(bundle, residuals, by_pose, by_point)
-    _add_ties(normal, bundle, pulls)
+    blocks = np.swapaxes(normal.poses, 1, 2)
+    pulls.add_to(blocks, normal.pose_slopes, bundle.is_free)
     return normal
-
-
-def _add_ties(normal: _Normal, bundle: Bundle, pulls: Sequence[Pull]) -> None:
-    free = np.cumsum(bundle.is_free) - 1
-    for each in pulls:
-        ends = [(each.one, each.by_one), (each.other, each.by_other)]
-        movable = [(free[row], by) for row, by in ends if bundle.is_free[row]]
-        for row, by in movable:
-            normal.pose_slopes[row] += each.weight * by.T @ each.residual
-            for column, by_column in movable:
-                normal.poses[row, :, column] += each.weight * by.T @ by_column
 
 
 def _assemble(

@@ -13,7 +13,7 @@ from sceneslam.types.se3 import Transform
 from .alignment import Alignment
 from .alignment_search import AlignmentSearch, Shown, pair_of
 from .bundle import Adjusted, adjust
-from .ties import DepthTies, Tie
+from .ties import DepthTies, Tie, Ties
 from .view import View
 from .visual_map import VisualMap
 from .window import Window, merge_window, take_window
@@ -100,7 +100,7 @@ class LocalMapping:
             for (one, other), tie in self._ties.items()
             if one in rows and other in rows
         }
-        return adjust(self._camera, replace(window.bundle, ties=ties))
+        return adjust(self._camera, replace(window.bundle, ties=Ties.of(ties)))
 
     def _compare(self, one: int, other: int, tie: Tie) -> None:
         """Ask the colours of two keyframes whether they are the depth camera's."""

@@ -6,6 +6,7 @@ pixels, whatever the colours' calibration. Both together err less than either.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,37 +37,73 @@ class Tie:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Pull:
-    """A tie between two keyframes of a bundle, by their rows, at the poses they have."""
+class Ties:
+    """The ties between keyframes of a bundle, by their rows."""
 
-    one: int
-    other: int
-    residual: NDArray[np.float64]  # (6,) in sigmas
-    by_one: NDArray[np.float64]  # (6, 6)
-    by_other: NDArray[np.float64]  # (6, 6)
+    one: NDArray[np.int64]  # (M,)
+    other: NDArray[np.int64]  # (M,)
+    T_other_one: NDArray[np.float64]  # (M, 4, 4)
+    roots: NDArray[np.float64]  # (M, 6, 6), see Tie
+
+    @staticmethod
+    def of(ties: Mapping[tuple[int, int], Tie]) -> Ties:
+        """Return ties by the rows of the two keyframes."""
+        rows = np.array(list(ties), np.int64).reshape(-1, 2)
+        T_one_other = np.array([tie.T_one_other for tie in ties.values()]).reshape(-1, 4, 4)
+        roots = np.array([tie.root for tie in ties.values()]).reshape(-1, 6, 6)
+        one, other = rows.T
+        return Ties(one=one, other=other, T_other_one=se3.inverse(T_one_other), roots=roots)
+
+    def pull(self, T_local_cam: NDArray[np.float64]) -> Pulls:
+        """Return how the ties pull at the keyframes at these poses (K, 4, 4)."""
+        T_one_other = se3.inverse(T_local_cam[self.one]) @ T_local_cam[self.other]
+        off = se3.log(self.T_other_one @ T_one_other)
+        return Pulls(
+            ties=self,
+            T_one_other=T_one_other,
+            residuals=(self.roots @ off[:, :, None])[:, :, 0],
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Pulls:
+    """What ties say of the poses that keyframes have."""
+
+    ties: Ties
+    T_one_other: NDArray[np.float64]  # (M, 4, 4)
+    residuals: NDArray[np.float64]  # (M, 6) in sigmas
 
     @property
-    def weight(self) -> float:
-        """Return Huber's weight."""
-        return _HUBER / max(_HUBER, float(np.linalg.norm(self.residual)))
+    def weights(self) -> NDArray[np.float64]:
+        """Return Huber's weights (M,)."""
+        return np.asarray(_HUBER / np.maximum(_HUBER, np.linalg.norm(self.residuals, axis=1)))
 
     @property
     def cost(self) -> float:
         """Return Huber's cost."""
-        return float(self.residual @ self.residual) * self.weight * (2.0 - self.weight)
+        squares, weights = (self.residuals**2).sum(axis=1), self.weights
+        return float((squares * weights * (2.0 - weights)).sum())
 
-
-def pull(tie: Tie, T_local_cam: NDArray[np.float64], one: int, other: int) -> Pull:
-    """Return how a tie pulls at two of the poses (K, 4, 4)."""
-    T_one_other = se3.inverse(T_local_cam[one]) @ T_local_cam[other]
-    off = se3.log(se3.inverse(tie.T_one_other) @ T_one_other)
-    return Pull(
-        one=one,
-        other=other,
-        residual=tie.root @ off,
-        by_one=-tie.root @ se3.adjoint(se3.inverse(T_one_other)),
-        by_other=tie.root,
-    )
+    def add_to(
+        self,
+        blocks: NDArray[np.float64],
+        slopes: NDArray[np.float64],
+        is_free: NDArray[np.bool_],
+    ) -> None:
+        """Add the normal equations of the free keyframes to blocks (F, F, 6, 6), slopes (F, 6)."""
+        free = np.cumsum(is_free) - 1
+        by_one = -self.ties.roots @ se3.adjoint(se3.inverse(self.T_one_other))
+        ends = [(self.ties.one, by_one), (self.ties.other, self.ties.roots)]
+        weights = self.weights[:, None, None]
+        for rows, by in ends:
+            pulled = weights * np.swapaxes(by, 1, 2)
+            held = is_free[rows]
+            slope = (pulled @ self.residuals[:, :, None])[held, :, 0]
+            np.add.at(slopes, free[rows[held]], slope)
+            for columns, by_column in ends:
+                both = held & is_free[columns]
+                cell = free[rows[both]], free[columns[both]]
+                np.add.at(blocks, cell, (pulled @ by_column)[both])
 
 
 class DepthTies:

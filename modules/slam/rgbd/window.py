@@ -13,6 +13,7 @@ from sceneslam.types.se3 import Transform
 from .bundle import Adjusted, Bundle
 from .keyframes import NO_LANDMARK
 from .residuals import Sightings
+from .ties import Ties
 from .visual_map import VisualMap
 
 _FREE = 5
@@ -71,7 +72,7 @@ def take_window(visual_map: VisualMap, keyframe_id: int) -> Window | None:
                 [visual_map.inverse_depth_sigmas_per_m(f) for f in features]
             )[chosen],
         ),
-        ties={},
+        ties=Ties.of({}),
     )
     return Window(
         bundle=bundle,
