@@ -129,6 +129,27 @@ class Runner:
 
     @contextmanager
     def _asking(self, what: str) -> Iterator[None]:
+        """Note a failure before it is passed on."""
+        try:
+            with self._calling(what):
+                yield
+        except ModuleError:
+            self.is_failed = True
+            if isinstance(self._module, Restartable):
+                self._module.note_failure()
+            raise
+
+    @contextmanager
+    def _parting(self, what: str) -> Iterator[None]:
+        """Go on without what a module cannot give any more."""
+        try:
+            with self._calling(what):
+                yield
+        except ModuleError as error:
+            _log.warning(str(error))
+
+    @contextmanager
+    def _calling(self, what: str) -> Iterator[None]:
         """Count what a call costs; turn whatever it raises, but Ctrl-C, into a ModuleError."""
         began_ns = perf_counter_ns()
         try:
@@ -136,26 +157,8 @@ class Runner:
         except KeyboardInterrupt:
             raise
         except BaseException as error:
-            self.is_failed = True
-            if isinstance(self._module, Restartable):
-                self._module.note_failure()
-            raise ModuleError(self._sentence(what, error)) from error
+            sentence = f"slam.{self.key} {what}: {told(error)}"
+            _log.info(sentence, exc_info=error)
+            raise ModuleError(sentence) from error
         finally:
             self.spent_ns += perf_counter_ns() - began_ns
-
-    @contextmanager
-    def _parting(self, what: str) -> Iterator[None]:
-        """Go on without what a module cannot give any more."""
-        began_ns = perf_counter_ns()
-        try:
-            yield
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:
-            _log.warning(self._sentence(what, error))
-        finally:
-            self.spent_ns += perf_counter_ns() - began_ns
-
-    def _sentence(self, what: str, error: BaseException) -> str:
-        _log.info("slam.%s %s", self.key, what, exc_info=error)
-        return f"slam.{self.key} {what}: {told(error)}"
