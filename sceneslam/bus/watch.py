@@ -6,13 +6,26 @@ import logging
 from time import perf_counter_ns
 
 from sceneslam.bus.events import EventLog
-from sceneslam.bus.scene_filter import SceneFilter
+from sceneslam.bus.scene_filter import ConfirmedScene, SceneFilter
 from sceneslam.interfaces import Detector
 from sceneslam.types.errors import ModuleError, told
 from sceneslam.types.observation import UNSURE, Observation, SceneVote
 from sceneslam.types.rig import Rig
 
 _log = logging.getLogger(__name__)
+
+
+def log_vote(log: EventLog, vote: SceneVote, confirmed: ConfirmedScene | None) -> None:
+    """Log a vote, and the scene that it confirmed."""
+    log.add("vote", vote.stamp_ns, scene=vote.scene, value=vote.value)
+    if confirmed is not None:
+        log.add(
+            "scene",
+            confirmed.stamp_ns,
+            scene=confirmed.scene,
+            previous=confirmed.previous,
+            since_ns=confirmed.since_ns,
+        )
 
 
 class Watch:
@@ -57,16 +70,7 @@ class Watch:
         self.spent_us.append((perf_counter_ns() - began_ns) / 1e3)
         if vote is None:
             return
-        self._log.add("vote", vote.stamp_ns, scene=vote.scene, value=vote.value)
-        confirmed = self._filter.update(vote)
-        if confirmed is not None:
-            self._log.add(
-                "scene",
-                confirmed.stamp_ns,
-                scene=confirmed.scene,
-                previous=confirmed.previous,
-                since_ns=confirmed.since_ns,
-            )
+        log_vote(self._log, vote, self._filter.update(vote))
 
     def close(self) -> None:
         """Shut the detector down. May be called twice."""

@@ -10,6 +10,7 @@ from typing import Any
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.scene_filter import ConfirmedScene
+from sceneslam.bus.watch import log_vote
 from sceneslam.config.build import check_detector, make_source
 from sceneslam.config.check import check_keys
 from sceneslam.config.component import Builder
@@ -87,7 +88,5 @@ def _write_events(
     log = EventLog(path)
     scenes = {scene.stamp_ns: scene for scene in confirmed}
     for one in votes:
-        log.add("vote", one.stamp_ns, scene=one.scene, value=one.value)
-        if one.stamp_ns in scenes:
-            log.add("scene", **asdict(scenes[one.stamp_ns]))
+        log_vote(log, one, scenes.get(one.stamp_ns))
     log.close()
