@@ -36,7 +36,7 @@ def read_rows(folder: Path) -> list[Row]:
 
     Raises InputError where there is none.
     """
-    found = sorted((path for path in _runs(folder)), key=lambda path: _order(folder, path))
+    found = sorted(_runs(folder), key=lambda path: _order(folder, path))
     rows = [_row(folder, path) for path in found]
     if (folder / ROWS).is_file():
         rows += [Row(**json.loads(line)) for line in (folder / ROWS).read_text().splitlines()]
