@@ -22,7 +22,6 @@ from sceneslam.evaluation.report import write_report
 from sceneslam.interrupts import termination_as_interrupt, uninterrupted
 from sceneslam.loop import Loop
 from sceneslam.types.errors import told
-from sceneslam.types.rig import Sensor
 from sceneslam.types.trajectory import Trajectory
 
 _WRITTEN = (
@@ -107,7 +106,7 @@ def _save(
         write_covariances(
             folder / "trajectory_covariance.txt",
             result.trajectory.stamps_ns,
-            parts.atlas.covariances(Sensor.ODOMETRY in parts.rig.sensors),
+            result.covariances,
         )
     with _noting(loop.faults, "the map"):
         save_map(result.map, folder / "map")

@@ -15,12 +15,14 @@ from tqdm import tqdm
 
 from sceneslam.bus.bus import Bus
 from sceneslam.bus.events import EventLog
+from sceneslam.bus.handover_log import log_uncertainty
 from sceneslam.bus.live import run_live
 from sceneslam.config.build import Parts
 from sceneslam.interfaces import ResultSink, Sink
 from sceneslam.types.errors import InputError, told
 from sceneslam.types.maps import HybridMap, PointLayer
 from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Sensor
 from sceneslam.types.run import RunResult, Timings
 from sceneslam.types.truth import GroundTruth
 
@@ -42,6 +44,7 @@ class Loop:
         self._events_written = 0
         self._observed_ns: list[int] = []
         self._dropped = 0
+        self._covariances = np.zeros((0, 6, 6))
         self._began_s, self._wall_s = perf_counter(), 0.0
         self._bus = Bus(
             detector=parts.detector,
@@ -76,6 +79,9 @@ class Loop:
         if self._bus.state == "terminate":
             self.faults.append(self._why_over())
         self._bus.close(self._last_ns())
+        has_odometry = Sensor.ODOMETRY in self._parts.rig.sensors
+        self._covariances = self._parts.atlas.covariances(has_odometry)
+        log_uncertainty(self._log, self._parts.atlas, self._covariances)
         if not len(self._parts.atlas.online) and not self.faults:
             self.faults.append(self._why_no_pose())
         self.faults += self._parts.source.faults
@@ -99,6 +105,7 @@ class Loop:
             observed_ns=np.array(self._observed_ns, np.int64),
             trajectory=atlas.trajectory,
             online=atlas.online,
+            covariances=self._covariances,
             modules=atlas.pose_modules,
             sessions=atlas.sessions,
             map=self._fused(),

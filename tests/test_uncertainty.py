@@ -15,6 +15,7 @@ from sceneslam.atlas.uncertainty import (
     read_covariances,
     write_covariances,
 )
+from sceneslam.bus.handover_log import log_uncertainty
 from sceneslam.types import se3
 
 T_STEP = se3.from_xy_yaw(0.1, 0.0, 0.05)
@@ -85,10 +86,11 @@ def test_the_share_of_the_old_module_goes_with_its_pose_into_the_next_session():
 def test_a_run_logs_how_sure_every_session_was_where_it_began():
     modules = {"bright": ExactModule(), "dark": ExactModule()}
     _, atlas, log, _ = drive(modules, scene_at=lambda i: "Dark" if i >= 40 else "Bright")
+    covariances = atlas.covariances(True)
+    log_uncertainty(log, atlas, covariances)
     told = events(log, "uncertainty")
     assert [event["module"] for event in told] == ["bright", "dark"]
     assert told[0]["deviation_m"] == 0.0 < told[1]["deviation_m"] < 0.2
-    covariances = atlas.covariances(True)
     assert covariances.shape == (len(atlas.trajectory), 6, 6)
     assert (np.linalg.eigvalsh(covariances) >= -1e-12).all()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +82,15 @@ class _Path:
             del values[keep:]
 
 
+class Start(NamedTuple):
+    """Where a session begins in the trajectory."""
+
+    row: int
+    session: int
+    module: str
+    stamp_ns: int
+
+
 class Atlas:
     """Keeps one trajectory and one map in `map` through every change of module."""
 
@@ -150,15 +160,14 @@ class Atlas:
         stamps_ns = np.array(self._path.stamps_ns, np.int64)
         return Trajectory(stamps_ns=stamps_ns, T_world_base=self._revise().T_map_base)
 
-    def session_rows(self) -> dict[int, int]:
-        """Return, per session, the row of the first pose that its module gave."""
-        rows: dict[int, int] = {}
-        for row, (session, module) in enumerate(
-            zip(self._path.sessions, self._path.modules, strict=True)
-        ):
-            if module != BRIDGED:
-                rows.setdefault(session, row)
-        return rows
+    def session_starts(self) -> list[Start]:
+        """Return, per session, the first pose of the trajectory that its module gave."""
+        path = self._path
+        starts: dict[int, Start] = {}
+        for row, told in enumerate(zip(path.sessions, path.modules, path.stamps_ns, strict=True)):
+            if told[1] != BRIDGED:
+                starts.setdefault(told[0], Start(row, *told))
+        return list(starts.values())
 
     def covariances(self, has_odometry: bool) -> NDArray[np.float64]:
         """Return how sure the poses of the trajectory are (N, 6, 6), before modules revised them.

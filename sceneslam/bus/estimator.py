@@ -11,7 +11,7 @@ from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.decision import Health
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.handover import Handover
-from sceneslam.bus.handover_log import log_cost, log_uncertainty
+from sceneslam.bus.handover_log import log_cost
 from sceneslam.bus.hold import Hold
 from sceneslam.bus.memory import Memory, Moment
 from sceneslam.bus.policy import Policy
@@ -20,7 +20,7 @@ from sceneslam.types import se3
 from sceneslam.types.errors import ModuleError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, TrackingStatus
-from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
 
 _log = logging.getLogger(__name__)
@@ -136,8 +136,6 @@ class Estimator:
         """Shut the active module down for good, and forget what was observed."""
         self.retire()
         self._memory.clear()
-        has_odometry = Sensor.ODOMETRY in self._rig.sensors
-        log_uncertainty(self._log, self._atlas, has_odometry=has_odometry)
 
     def _ask(self, observation: Observation) -> Transform | None:
         """Return the active module's pose in the map, None where it holds none."""

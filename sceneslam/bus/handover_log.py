@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.bus.events import EventLog
@@ -22,19 +23,18 @@ def log_cost(log: EventLog, handover: Handover, stamp_ns: int) -> None:
     )
 
 
-def log_uncertainty(log: EventLog, atlas: Atlas, *, has_odometry: bool) -> None:
+def log_uncertainty(log: EventLog, atlas: Atlas, covariances: NDArray[np.float64]) -> None:
     """Log, for every session, how sure the pose is where it begins, as known at the end.
 
-    `covariance` (6, 6) is in `base`, translation first [m, rad].
+    `covariances` (N, 6, 6) are those of the trajectory's poses, in `base`, translation first.
     """
-    stamps_ns, covariances = atlas.trajectory.stamps_ns, atlas.covariances(has_odometry)
-    for session, row in atlas.session_rows().items():
-        covariance = covariances[row]
+    for start in atlas.session_starts():
+        covariance = covariances[start.row]
         log.add(
             "uncertainty",
-            int(stamps_ns[row]),
-            session=session,
-            module=atlas.pose_modules[row],
+            start.stamp_ns,
+            session=start.session,
+            module=start.module,
             deviation_m=float(np.sqrt(np.trace(covariance[:3, :3]))),
             deviation_rad=float(np.sqrt(np.trace(covariance[3:, 3:]))),
             covariance=covariance.tolist(),
