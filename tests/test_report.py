@@ -55,6 +55,18 @@ def test_all_figures_of_a_switched_run_are_drawn(tmp_path):
     assert names == ["map", "timeline", "grey_mean", "error", "difference"]
 
 
+def test_a_path_that_is_small_in_the_map_is_drawn_apart(tmp_path):
+    wide, run = hybrid_map(), switched_run()
+    far = replace(wide.points, points=20.0 * wide.points.points)
+    names = draw(tmp_path, replace(run, map=replace(wide, points=far, grid=None)), true_loop())
+    assert names == ["map", "path", "timeline", "grey_mean", "error"]
+
+
+def test_the_page_is_named_after_its_recording_and_says_when_no_truth_is_known(tmp_path):
+    page = report(tmp_path, switched_run(), None, config={"source": {"path": "night/<1>.bag"}})
+    assert "<h1>a run · &lt;1&gt;.bag</h1>" in page and "is not known" in page
+
+
 def test_map_has_equal_axes(tmp_path):
     run, grid_alone = switched_run(), replace(empty_map(), grid=hybrid_map().grid)
     draw(tmp_path, replace(run, map=grid_alone), None)

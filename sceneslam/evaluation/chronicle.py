@@ -11,6 +11,16 @@ from sceneslam.evaluation.reasons import why_chosen
 from sceneslam.types.run import Event, RunResult
 
 _SHORT_S = 0.5  # trouble that passes sooner is counted, not told
+_TOLD_TROUBLES = 5  # of one kind and module; more are summed up
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Trouble:
+    """A stretch in which a module did not track as it should."""
+
+    what: str  # "“key” is lost"
+    stamp_ns: int
+    lasted_s: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +57,7 @@ class _Writer:
         self._situation: Event | None = None  # the last that led to a change of module
         self._values: list[tuple[int, float]] = []
         self._trouble: Event | None = None
-        self._passing = 0
+        self._troubles: list[_Trouble] = []
 
     def write(self) -> list[Entry]:
         """Return all entries."""
@@ -65,11 +75,9 @@ class _Writer:
         for event in self._events:
             if event["event"] in tellers:
                 tellers[event["event"]](event)
-        self._end_trouble(self._events[-1]["stamp_ns"] if self._events else 0)
-        if self._passing:
-            times = "once" if self._passing == 1 else f"{self._passing} times"
-            what = f"Besides, a module was in trouble {times} for less than {_SHORT_S:g} s"
-            self._add(self._events[-1]["stamp_ns"], "trouble", what)
+        end_ns = max((event["stamp_ns"] for event in self._events), default=0)
+        self._end_trouble(end_ns)
+        self._tell_troubles(end_ns)
         return sorted(self._entries, key=lambda entry: entry.at_s)
 
     def _add(self, stamp_ns: int, kind: str, what: str, *details: str) -> None:
@@ -133,12 +141,37 @@ class _Writer:
         event, self._trouble = self._trouble, None
         if event is None:
             return
-        lasted_s = (stamp_ns - event["stamp_ns"]) * 1e-9
-        if lasted_s < _SHORT_S:
-            self._passing += 1
-            return
-        what = f"“{event['module']}” is {event['status']} for {lasted_s:.1f} s"
-        self._add(event["stamp_ns"], "trouble", what)
+        began_ns = event["stamp_ns"]
+        what = f"“{event['module']}” is {event['status']}"
+        lasted_s = (stamp_ns - began_ns) * 1e-9
+        self._troubles.append(_Trouble(what=what, stamp_ns=began_ns, lasted_s=lasted_s))
+
+    def _tell_troubles(self, end_ns: int) -> None:
+        """Tell long troubles one by one, many of a kind together; count the short ones."""
+        long = [one for one in self._troubles if one.lasted_s >= _SHORT_S]
+        for what in dict.fromkeys(one.what for one in long):
+            same = [one for one in long if one.what == what]
+            if len(same) > _TOLD_TROUBLES:
+                self._sum_up(same)
+                continue
+            for one in same:
+                self._add(one.stamp_ns, "trouble", f"{what} for {one.lasted_s:.1f} s")
+        passing = len(self._troubles) - len(long)
+        if passing:
+            times = "once" if passing == 1 else f"{passing} times"
+            what = f"Besides, a module was in trouble {times} for less than {_SHORT_S:g} s"
+            self._add(end_ns, "trouble", what)
+
+    def _sum_up(self, same: Sequence[_Trouble]) -> None:
+        worst = max(same, key=lambda one: one.lasted_s)
+        at_s = self._seconds(worst.stamp_ns)
+        self._add(
+            same[0].stamp_ns,
+            "trouble",
+            f"{same[0].what} {len(same)} times from here on",
+            f"{sum(one.lasted_s for one in same):.1f} s in all, at most {worst.lasted_s:.1f} s "
+            f"(at {at_s:.1f} s); the figure shows when.",
+        )
 
     def _tell_suspicion(self, event: Event) -> None:
         what = f"“{event['module']}” is not believed"

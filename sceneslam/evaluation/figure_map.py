@@ -16,6 +16,7 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import GroundTruth
 
 _CELLS = 420  # along the longer side of the drawn area
+_SMALL = 0.3  # of the map's extent: a path that is smaller is drawn apart
 _UNKNOWN, _OCCUPIED = 0.55, 0.4  # greys that are seen on white and on black
 
 
@@ -26,8 +27,32 @@ def draw_map(result: RunResult, truth: GroundTruth | None, T_map_gt: Transform |
     points costs the same. `T_map_gt` places the ground truth; without it none is drawn.
     """
     bounds = _bounds(result)
-    if bounds is None:
+    return None if bounds is None else _draw(result, truth, T_map_gt, bounds)
+
+
+def draw_path(result: RunResult, truth: GroundTruth | None, T_map_gt: Transform | None) -> Any:
+    """Return the part of the map where the path lies; None where that is not much smaller.
+
+    A camera that is held and turned sees a room and moves by a hand's breadth.
+    """
+    whole, path = _bounds(result), result.trajectory.positions_m[:, :2]
+    if whole is None or len(path) < 2:
         return None
+    low, high = path.min(axis=0), path.max(axis=0)
+    extent_m = float((high - low).max())
+    if not 0.0 < extent_m < _SMALL * float((whole[1] - whole[0]).max()):
+        return None
+    half_m = 0.6 * extent_m  # a square, with a margin of a tenth
+    middle = 0.5 * (low + high)
+    return _draw(result, truth, T_map_gt, np.stack([middle - half_m, middle + half_m]))
+
+
+def _draw(
+    result: RunResult,
+    truth: GroundTruth | None,
+    T_map_gt: Transform | None,
+    bounds: NDArray[np.float64],
+) -> Any:
     low, high = bounds
     ratio = float(np.clip((high - low)[1] / (high - low)[0], 0.45, 1.3))
     figure = look.new_figure(look.WIDTH_IN, look.WIDTH_IN * ratio + 0.9)

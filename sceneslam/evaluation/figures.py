@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sceneslam.evaluation import figure_style as look
 from sceneslam.evaluation.accuracy import AbsoluteErrors, absolute_errors
 from sceneslam.evaluation.comparison import compare
-from sceneslam.evaluation.figure_map import draw_map
+from sceneslam.evaluation.figure_map import draw_map, draw_path
 from sceneslam.evaluation.figure_time import draw_series, draw_timeline, draw_votes
 from sceneslam.types import se3
 from sceneslam.types.run import RunResult
@@ -43,7 +43,8 @@ def write_figures(
 ) -> list[Drawn]:
     """Write what can be drawn of a run; return the figures, in the order of the story.
 
-    `map`, `timeline`, `grey_mean`, `error` (with ground truth), `difference` (with a reference).
+    `map`, `path` (where it is small in the map), `timeline`, `grey_mean`, `error` (with ground
+    truth), `difference` (with a reference).
     """
     folder.mkdir(parents=True, exist_ok=True)
     true = truth.trajectory if truth else Trajectory.empty()
@@ -52,6 +53,7 @@ def write_figures(
     T_map_gt = se3.inverse(errors.T_gt_map) if len(errors.errors_m) else None
     drawn = {
         "map": draw_map(result, truth, T_map_gt),
+        "path": draw_path(result, truth, T_map_gt),
         "timeline": draw_timeline(result, truth),
         "grey_mean": draw_votes(result, truth, threshold, value_label),
         "error": draw_series(

@@ -84,7 +84,8 @@ def _effect(switch: Mapping[str, Any]) -> str:
 
 
 def _cost(event: Event) -> str:
-    cost = f"Cost: {number(event['handover_ms'], 0, ' ms')} of computing"
+    spent_ms = event["handover_ms"]
+    cost = f"Cost: {number(spent_ms, 0 if spent_ms >= 10.0 else 1, ' ms')} of computing"
     if event.get("catch_up_s"):
         cost += f", for {event['catch_up_s']:.1f} s of the recording led through the new module"
     return f"{cost}."

@@ -23,6 +23,7 @@ _SHOWN_FAULTS, _SHOWN_ENTRIES = 20, 80
 _CAPTIONS = {
     "map": "The map from above: occupancy grid in grey, points and trajectory in the colour of "
     "the module that gave them, ground truth dashed.",
+    "path": "The same, as near as the path allows.",
     "timeline": "Which module gave the poses, and when it was in trouble.",
     "grey_mean": "What the detector measured. Shading: the true scene, where it is known; "
     "dash-dotted: the instant at which a change of scene was confirmed.",
@@ -63,7 +64,7 @@ def write_report(
     entries = chronicle(result, metrics["switches"], value_label=value_label)
     told = {
         **_told(metrics),
-        "title": escape(title),
+        "title": escape(_titled(title, config)),
         "made_of": markup.bullets(_made_of(config)),
         "faults": _faults([*faults, *metrics["faults"], *metrics["notes"]]),
         "figures": "".join(markup.figure(f.svg, _CAPTIONS[f.name]) for f in figures),
@@ -85,21 +86,35 @@ def _told(metrics: Metrics) -> dict[str, str]:
     }
 
 
+def _titled(title: str, config: Mapping[str, Any]) -> str:
+    """Return the title with the name of the recording, so that pages are told apart."""
+    path = (config.get("source") or {}).get("path")
+    return f"{title} · {Path(path).name}" if path else title
+
+
 def _made_of(config: Mapping[str, Any]) -> list[str]:
     """Return what was put together: one line per part."""
-    source, detector = config.get("source") or {}, config.get("detector") or {}
+    source = config.get("source") or {}
     given = [str(source[key]) for key in ("path", "story") if source.get(key)]
     parts = {
         "source": " ".join([_kind(source), *given]),
         "effects": _kind(config.get("effects") or {}),
-        "detector": _kind(detector) + _plain_values(detector),
-        "policy": str((config.get("policy") or {}).get("handover", "")),
     }
     scenes = config.get("scenes") or {}
-    table = "; ".join(f"{scene} → {', then '.join(keys)}" for scene, keys in scenes.items())
-    lines = [f"{name}: {value}" for name, value in (parts | {"scenes": table}).items() if value]
+    if len(scenes) > 1:  # else there is nothing to choose
+        parts |= _chosen_by(config, scenes)
+    lines = [f"{name}: {value}" for name, value in parts.items() if value]
     modules = (config.get("slam") or {}).items()
     return [*lines, *(f"“{key}”: {_kind(node)}" for key, node in modules if node)]
+
+
+def _chosen_by(config: Mapping[str, Any], scenes: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    detector = config.get("detector") or {}
+    return {
+        "detector": _kind(detector) + _plain_values(detector),
+        "hand-over": str((config.get("policy") or {}).get("handover", "")),
+        "scenes": "; ".join(f"{name} → {', then '.join(keys)}" for name, keys in scenes.items()),
+    }
 
 
 def _kind(node: Mapping[str, Any]) -> str:

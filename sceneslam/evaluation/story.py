@@ -26,8 +26,7 @@ def tell(metrics: Metrics) -> list[str]:
         paragraphs.append(" ".join(_change(metrics, switch) for switch in told))
     if len(metrics["switches"]) > len(told):
         paragraphs.append("The later changes are in the table below.")
-    paragraphs += [_accuracy(metrics)] if metrics["ate_rmse_m"] is not None else []
-    return paragraphs
+    return [*paragraphs, _accuracy(metrics)] if metrics["poses"] else paragraphs
 
 
 def _opening(metrics: Metrics) -> str:
@@ -74,6 +73,8 @@ def _change(metrics: Metrics, switch: dict[str, Any]) -> str:
 
 
 def _accuracy(metrics: Metrics) -> str:
+    if metrics["ate_rmse_m"] is None:
+        return "Where the robot truly was is not known, or not at these times: no error is told."
     text = (
         f"Against the ground truth the position is off by {number(metrics['ate_rmse_m'], 3, ' m')} "
         f"(root mean square) and at most {number(metrics['ate_max_m'], 3, ' m')}. "
