@@ -37,6 +37,7 @@ def policy(**changes):
         "trial_s": 1.0,
         "buffer_s": 12.0,
         "buffer_mb": 256.0,
+        "turn_by_gyro": True,
         "gate": None,
         "startup_s": {},
     }
@@ -47,6 +48,7 @@ def drive(modules, *, steps=100, scene_at=lambda i: "Bright", table=TABLE, **opt
     """Run the bus over a straight drive; return it with its atlas, log and detector."""
     has_odometry = options.pop("has_odometry", True)
     catch_up_steps = options.pop("catch_up_steps", None)
+    rig = options.pop("rig", RIG)
     feed = options.pop("feed", lambda index: observation(index, has_odometry=has_odometry))
     atlas, log, detector = Atlas(voxel_m=0.05), EventLog(), ScriptedDetector(scene_at)
     bus = Bus(
@@ -54,7 +56,7 @@ def drive(modules, *, steps=100, scene_at=lambda i: "Bright", table=TABLE, **opt
         modules=modules,
         scenes=table,
         policy=policy(**options),
-        rig=RIG,
+        rig=rig,
         atlas=atlas,
         log=log,
         catch_up_steps=catch_up_steps,

@@ -3,11 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from driving import GATE, drive, events
-from fakes import PERIOD_NS, ExactModule, true_pose
+from fakes import PERIOD_NS, RIG, TWIST, ExactModule, observation, true_pose
 
 from sceneslam.atlas.atlas import BRIDGED
 from sceneslam.types import se3
+from sceneslam.types.rig import Sensor
 
 ONE = {"Bright": ["bright"], "Dark": ["bright"]}
 
@@ -87,3 +89,30 @@ def test_map_begins_with_the_odometry_where_the_module_holds_its_pose_later():
     _, atlas, _, _ = drive({"bright": bright}, table=ONE, gate=GATE, handover="rewind")
     assert len(atlas.trajectory) == 100 and errors_m(atlas.trajectory).max() < 1e-9
     assert atlas.pose_modules[0] == BRIDGED and atlas.pose_modules[-1] == "bright"
+
+
+def slipping(has_gyro):
+    """The robot, one of whose wheels slips from index 50 to 54; the gyro does not turn with it."""
+    times_s = np.linspace(-PERIOD_NS / 1e9 + 0.01, 0.0, 10)
+    gyro = np.column_stack([times_s, np.tile(TWIST[3:], (10, 1))]) if has_gyro else None
+    T_odom_base = se3.identity()
+    for index in range(100):
+        yield replace(observation(index), T_odom_base=T_odom_base, gyro_base=gyro)
+        slip = se3.from_xy_yaw(0.0, 0.0, 0.03 if 50 <= index < 55 else 0.0)
+        T_odom_base = T_odom_base @ true_pose(PERIOD_NS) @ slip
+
+
+@pytest.mark.parametrize("has_gyro", [True, False])
+def test_a_wheel_that_slips_is_not_believed_against_gyro_and_module(has_gyro):
+    sensors = RIG.sensors | {Sensor.GYRO} if has_gyro else RIG.sensors
+    feed = list(slipping(has_gyro))
+    _, atlas, log, _ = drive(
+        {"bright": ExactModule()},
+        table=ONE,
+        gate=GATE,
+        handover="rewind",
+        rig=replace(RIG, sensors=sensors),
+        feed=lambda index: feed[index],
+    )
+    assert bool(events(log, "suspect")) == (not has_gyro)  # without, wheels are the only witness
+    assert (BRIDGED in atlas.pose_modules) == (not has_gyro)

@@ -9,6 +9,8 @@ from sceneslam.bus.gate import GateSettings
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.run import HANDOVERS
 
+_OTHERS = ("handover", "turn_by_gyro", "gate")  # settings that are no durations
+
 
 @dataclass(slots=True, kw_only=True)
 class Policy:
@@ -25,6 +27,7 @@ class Policy:
     trial_s: float  # it has to hold its pose this long, beside the fallback, to come back
     buffer_s: float  # observations are remembered this long, for `rewind` ...
     buffer_mb: float  # ... and up to this much; beyond it the older, the thinner
+    turn_by_gyro: bool  # what bridges and judges, where there is a gyro; else by the wheels
     gate: GateSettings | None  # how far a module's motion may differ from odometry's, None: any
     startup_s: dict[str, float]  # slam key -> time its start takes on the recording's clock
 
@@ -35,7 +38,7 @@ class Policy:
             value = getattr(self, field.name)
             if field.name == "startup_s":
                 _check_startups(value)
-            elif field.name not in ("handover", "gate") and not 0 <= value < float("inf"):
+            elif field.name not in _OTHERS and not 0 <= value < float("inf"):
                 unit = "megabytes" if field.name.endswith("_mb") else "seconds"
                 raise ConfigError(field.name, value, f"{unit}, 0 or more")
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sceneslam.types.rig import Sensor
 from sceneslam.types.se3 import Transform
 
+_GYRO_GAP_S = 0.1  # over which a rate is not taken to be constant
 UNSURE = "Unsure"  # the scene of a vote that could not be cast
 
 
@@ -51,6 +52,23 @@ class Observation:
     def has(self, sensor: Sensor) -> bool:
         """Tell whether this observation holds a measurement of `sensor`."""
         return getattr(self, _FIELD[sensor]) is not None
+
+    def turn_by_gyro(self, duration_s: float) -> NDArray[np.float64] | None:
+        """Return the base's rotation vector (3,) [rad] over the last `duration_s`.
+
+        None where the gyro was silent in it for a tenth of a second.
+        """
+        gyro = self.gyro_base
+        if gyro is None or duration_s <= 0:
+            return None
+        gyro = gyro[(gyro[:, 0] > -duration_s) & (gyro[:, 0] <= 0)]
+        if len(gyro) == 0 or not np.isfinite(gyro).all():
+            return None
+        times = np.concatenate([[-duration_s], gyro[:, 0], [0.0]])
+        if np.diff(times).max() > _GYRO_GAP_S:
+            return None
+        rates = np.concatenate([gyro[:1, 1:], gyro[:, 1:], gyro[-1:, 1:]])
+        return np.asarray(np.trapezoid(rates, times, axis=0))
 
 
 _FIELD = {
