@@ -104,17 +104,12 @@ class Odometry:
         self, T_prev_curr: se3.Transform, observation: Observation
     ) -> se3.Transform:
         """Return the motion with the gyro's rotation, where it covers all of the interval."""
-        gyro = observation.gyro_base
-        if gyro is None or self._stamp_ns is None or not np.isfinite(gyro).all():
+        if self._stamp_ns is None:
             return T_prev_curr
-        interval_s = (observation.stamp_ns - self._stamp_ns) * 1e-9
-        inside = gyro[(gyro[:, 0] > -interval_s) & (gyro[:, 0] <= 0.0)]
-        if interval_s <= 0 or len(inside) == 0:
+        turn = observation.turn_by_gyro((observation.stamp_ns - self._stamp_ns) * 1e-9)
+        if turn is None:
             return T_prev_curr
-        times = np.concatenate([[-interval_s], inside[:, 0], [0.0]])
-        rates = np.concatenate([inside[:1, 1:], inside[:, 1:], inside[-1:, 1:]])
-        turned = se3.so3_exp(np.trapezoid(rates, times, axis=0))
-        return se3.from_parts(turned, T_prev_curr[:3, 3])
+        return se3.from_parts(se3.so3_exp(turn), T_prev_curr[:3, 3])
 
     def _answer(self, observation: Observation, status: TrackingStatus) -> Tracking:
         is_lost = status is TrackingStatus.LOST

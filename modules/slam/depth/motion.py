@@ -20,7 +20,6 @@ _ODOMETRY_SHARE = np.array([0.05, 0.05])  # of the way [m] and the turn [rad], a
 _ODOMETRY_STEP = np.array([5e-4, 5e-4])  # m, rad: the least per step
 _GYRO_RATE = 0.01  # rad/s
 _GYRO_SHARE = 0.02  # of the turn
-_GYRO_REACH_S = 0.05  # that a sample stands for, before and after it
 _FADE_S = 0.5  # in which a velocity that nothing confirms is forgotten
 
 
@@ -65,7 +64,7 @@ class Motion:
             deviation = 0.5 * _JERKED * gap_s**2 + 1e-4
         else:
             T_prev_curr, deviation = se3.identity(), _START_SPEED * gap_s + 1e-4
-        turn = _turn(observation, gap_s)
+        turn = observation.turn_by_gyro(gap_s)
         if turn is not None:
             T_prev_curr = se3.from_parts(se3.so3_exp(turn), T_prev_curr[:3, 3])
             by_gyro = _GYRO_RATE * gap_s + _GYRO_SHARE * float(np.linalg.norm(turn))
@@ -107,13 +106,3 @@ class Motion:
 def _odometry(observation: Observation) -> Transform | None:
     T_odom_base = observation.T_odom_base
     return T_odom_base if T_odom_base is not None and np.isfinite(T_odom_base).all() else None
-
-
-def _turn(observation: Observation, gap_s: float) -> Doubles | None:
-    """Return the gyro's turn [rad] over the gap, None where it was silent."""
-    gyro = observation.gyro_base
-    if gyro is None or not len(gyro) or not np.isfinite(gyro).all():
-        return None
-    if not 0 < gap_s <= 2.0 * _GYRO_REACH_S - float(gyro[0, 0]):
-        return None
-    return np.asarray(gyro[:, 1:4].mean(axis=0) * gap_s)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
@@ -61,7 +62,7 @@ class MotionModel:
             T_prev_curr = from_transform(se3.inverse(T_odom_prev) @ T_odom_base)
             if np.hypot(*T_prev_curr[:2]) <= _LATE_M + self.speed_max_m_s * duration_s:
                 motion = self._by_odometry(T_prev_curr)
-        motion = self._turn(motion, _integrate(observation, duration_s), duration_s)
+        motion = self._turn(motion, observation.turn_by_gyro(duration_s), duration_s)
         self._turned_rad += float(motion.T_prev_curr[2])
         return motion
 
@@ -103,12 +104,14 @@ class MotionModel:
             T_prev_curr=compose(half, half), covariance=np.diag(deviation**2), is_measured=False
         )
 
-    def _turn(self, motion: Motion, gyro_rad: float | None, duration_s: float) -> Motion:
+    def _turn(
+        self, motion: Motion, by_gyro: NDArray[np.float64] | None, duration_s: float
+    ) -> Motion:
         """Return the motion with the gyro's turn, where there is one, and without known errors."""
         forward_m, sideways_m, turn_rad = motion.T_prev_curr.tolist()
         covariance = motion.covariance.copy()
-        if gyro_rad is not None:
-            turn_rad = self._turns.correct(gyro_rad, distance_m=0.0, duration_s=duration_s)
+        if by_gyro is not None:
+            turn_rad = self._turns.correct(float(by_gyro[2]), distance_m=0.0, duration_s=duration_s)
             covariance[2, 2] = (self.gyro_noise_rad_s * duration_s + 0.1 * _STEP_NOISE[2]) ** 2
         elif motion.is_measured:
             turn_rad = self._turns.correct(turn_rad, distance_m=forward_m, duration_s=0.0)
@@ -117,17 +120,3 @@ class MotionModel:
             covariance=covariance,
             is_measured=motion.is_measured,
         )
-
-
-def _integrate(observation: Observation, duration_s: float) -> float | None:
-    """Return the yaw [rad] that the gyro turned by in the last `duration_s`, None without one."""
-    gyro = observation.gyro_base
-    if gyro is None or len(gyro) == 0 or duration_s <= 0:
-        return None
-    gyro = gyro[np.isfinite(gyro).all(axis=1)]
-    gyro = gyro[(gyro[:, 0] > -duration_s) & (gyro[:, 0] <= 0)]
-    if len(gyro) == 0:
-        return None
-    times = np.concatenate([[-duration_s], gyro[:, 0], [0.0]])
-    rates = np.concatenate([gyro[:1, 3], gyro[:, 3], gyro[-1:, 3]])
-    return float(np.trapezoid(rates, times))
