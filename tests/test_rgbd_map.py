@@ -10,7 +10,9 @@ from sceneslam.modules.slam.rgbd.features import FeatureExtractor
 from sceneslam.modules.slam.rgbd.keyframes import DepthView, Keyframe, KeyframeStore
 from sceneslam.modules.slam.rgbd.landmarks import LandmarkTable, Looks
 from sceneslam.modules.slam.rgbd.layers import LayerBuilder
+from sceneslam.modules.slam.rgbd.localizer import Localizer
 from sceneslam.modules.slam.rgbd.motion import MotionModel
+from sceneslam.modules.slam.rgbd.pose_solver import PoseSolver
 from sceneslam.modules.slam.rgbd.visual_map import VisualMap
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
@@ -234,3 +236,27 @@ def test_nearest_keyframe_can_be_asked_for_among_the_old_ones_alone():
     assert store.nearest(here, per_m=1.0, per_rad=1.0) == 0.0
     assert store.nearest(here, per_m=1.0, per_rad=1.0, but_latest=1) == pytest.approx(1.0)
     assert store.nearest(here, per_m=1.0, per_rad=1.0, but_latest=3) == np.inf
+
+
+@pytest.mark.parametrize(("shown", "is_found"), [(40, False), (120, True)])
+def test_a_pose_is_told_only_where_a_tenth_of_what_should_show_is_found(shown, is_found):
+    visual_map = VisualMap(
+        CAMERA,
+        CAMERA,
+        sigma_px=1.0,
+        inverse_depth_sigma_per_m=0.003,
+        keyframe_limit=10,
+        landmark_limit=5000,
+    )
+    mapped = keyframe_at(0, count=800)
+    visual_map.insert(mapped, deep_rows=np.zeros(0, np.int64))
+    rng = np.random.default_rng(1)
+    uv_px = mapped.features.uv_px.copy()
+    uv_px[shown:] = rng.uniform([0, 0], CAMERA.size_wh, (800 - shown, 2))
+    descriptors = random_descriptors(rng, 800)
+    descriptors[:shown] = mapped.features.descriptors[:shown]
+    features = features_at(uv_px, descriptors, depth_m=np.full(800, 2.0))
+    localizer = Localizer(visual_map, PoseSolver(CAMERA, seed=0), radius_px=20.0, min_inliers=20)
+    ids = visual_map.keyframes.landmarks_of([0])
+    fix = localizer.near(features, se3.identity(), ids)
+    assert (fix is not None) == is_found

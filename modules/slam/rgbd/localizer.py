@@ -19,6 +19,7 @@ from .visual_map import VisualMap
 _RADIUS_REFINED_PX = 10.0
 _WIDER = 2.5  # second try of a guided search
 _MIN_INLIER_RATIO = 0.4  # of the matches around a pose that is right
+_MIN_FOUND_RATIO = 0.1  # of the landmarks that should show: chance finds 0.05, an image 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -103,8 +104,9 @@ class Localizer:
         estimate = self._solver.refine(measured, T_local_base)
         if estimate is None:
             return None
-        count = int(estimate.inliers.sum())
-        if count < max(self._min_inliers, _MIN_INLIER_RATIO * len(matches)):
+        count, possible = int(estimate.inliers.sum()), min(len(prediction.ids), len(features))
+        least = max(_MIN_INLIER_RATIO * len(matches), _MIN_FOUND_RATIO * possible)
+        if count < max(self._min_inliers, least):
             return None
         return Fix(
             estimate=estimate,
