@@ -4,7 +4,6 @@
     python experiments/rgbd.py FOLDER [FX FY CX CY DEPTH_SCALE]  # the table below
     python experiments/rgbd.py FOLDER [...] sweep  # seeds and feature counts
     python experiments/rgbd.py FOLDER [...] honest  # errors in claimed sigmas
-    python experiments/rgbd.py FOLDER [...] blind  # black, white, covered and blurred images
     python experiments/rgbd.py FOLDER [...] profile  # where the time goes
 
 Every recording is also run backwards and with every second image, since one ATE says little.
@@ -156,38 +155,6 @@ def honest(source: TumRgbd, truth: Trajectory) -> None:
     )
 
 
-def blinded(kind: str, image_bgr: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return what a camera shows that sees nothing."""
-    if kind == "blur":
-        return cv2.GaussianBlur(image_bgr, (0, 0), 25)
-    grey = {"black": 0.0, "covered": 3.0, "dark, noise": 1.5, "white wall": 200.0}[kind]
-    noise = {"black": 0.0, "covered": 1.5, "dark, noise": 2.0, "white wall": 2.0}[kind]
-    return np.clip(rng.normal(grey, noise, image_bgr.shape), 0, 255).astype(np.uint8)
-
-
-def blind(source: TumRgbd, truth: Trajectory) -> None:
-    """Print how soon the module says that it is lost, and how soon it is back."""
-    kinds, rng = ("black", "covered", "dark, noise", "white wall", "blur"), np.random.default_rng(0)
-    observations, gaps = list(source), []
-    for number, start in enumerate(range(20, len(observations) - 20, 20)):
-        gaps.append((kinds[number % len(kinds)], start))
-        for index in range(start, start + 10):
-            image_bgr = blinded(gaps[-1][0], observations[index].image_bgr, rng)
-            observations[index] = replace(observations[index], image_bgr=image_bgr)
-    answers = follow(source.rig, observations).answers
-    is_lost = np.array([answer.status is TrackingStatus.LOST for answer in answers])
-    print("| images | cuts | LOST after, at most | poses told after the third | back after |")
-    print("|---|---|---|---|---|")
-    for kind in kinds:
-        starts = [start for name, start in gaps if name == kind]
-        during = [is_lost[start : start + 10] for start in starts]
-        first = [int(np.argmax(lost)) if lost.any() else 10 for lost in during]
-        told = sum(int((~lost[3:]).sum()) for lost in during)
-        after = [is_lost[start + 10 : start + 20] for start in starts]
-        back = [int(np.argmin(lost)) if not lost.all() else 10 for lost in after]
-        print(f"| {kind} | {len(starts)} | {max(first)} | {told} | {max(back)} |")
-
-
 def profile(source: TumRgbd, truth: Trajectory) -> None:
     """Print the functions that take most time of their own, of all but the worker."""
     profiler = cProfile.Profile()
@@ -200,7 +167,7 @@ def main() -> None:
     """Run the command in the first lines of this file."""
     cv2.setNumThreads(1)
     words = sys.argv[1:]
-    modes = {"sweep": sweep, "honest": honest, "blind": blind, "profile": profile}
+    modes = {"sweep": sweep, "honest": honest, "profile": profile}
     mode = modes.get(words[-1], table)
     source = recording([word for word in words if word not in modes])
     truth = source.ground_truth()

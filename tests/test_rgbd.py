@@ -207,3 +207,22 @@ def test_frozen_image_over_moving_depth_is_not_trusted(shared_data):
     frozen = observations[19].image_bgr
     answers = drive(module, [replace(live, image_bgr=frozen) for live in observations[30:]])
     assert all(answer.status is not TrackingStatus.TRACKING for answer in answers)
+
+
+@pytest.mark.parametrize("has_odometry", [False, True])
+def test_image_that_is_repeated_holds_no_pose(has_odometry):
+    def seen(index):
+        return room_observation(index) if has_odometry else camera_only(index)
+
+    module = make()
+    answers = drive(module, [seen(index) for index in range(10)])
+    hanging = [
+        replace(seen(index), image_bgr=seen(9).image_bgr, depth_m=seen(9).depth_m)
+        for index in range(10, 25)
+    ]
+    repeated = drive(module, hanging)
+    assert {answer.status for answer in repeated} == {TrackingStatus.DEGRADED}
+    assert all(answer.covariance is None for answer in repeated)
+    T_expected = true_pose(24) if has_odometry else answers[-1].T_local_base
+    assert repeated[-1].T_local_base[:3, 3] == pytest.approx(T_expected[:3, 3], abs=0.01)
+    assert drive(module, [seen(25)])[0].status is TrackingStatus.TRACKING

@@ -62,6 +62,20 @@ def placed(answer: Tracking, segments: Segments, segment: set[int]) -> Tracking:
     return replace(answer, status=TrackingStatus.DEGRADED, covariance=covariance)
 
 
+def repeated(stamp_ns: int, T_local_base: Transform, *, revision: int) -> Tracking:
+    """Return the answer where no new image came: odometry's pose, else the last, for it may stand.
+
+    Nobody knows how exact it is.
+    """
+    return Tracking(
+        stamp_ns=stamp_ns,
+        T_local_base=T_local_base.copy(),
+        status=TrackingStatus.DEGRADED,
+        quality_ratio=0.0,
+        revision=revision,
+    )
+
+
 def lost(stamp_ns: int, T_local_base: Transform, *, revision: int) -> Tracking:
     """Return the answer where no pose can be told: the last one that was held."""
     return Tracking(

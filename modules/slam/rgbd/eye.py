@@ -15,6 +15,8 @@ from .localizer import Fix
 from .shutter import RollingShutter
 from .view import View
 
+_ROW_STEP = 32  # rows that are compared first
+
 
 class Eye:
     """Finds features and straightens them; learns how from the poses that they led to."""
@@ -23,6 +25,17 @@ class Eye:
         self._rotation_cam_base = camera.T_base_cam[:3, :3].T
         self._extractor, self._shutter = extractor, RollingShutter(camera)
         self._rate_cam = np.zeros(3)  # [rad/s], while the last image was read
+        self._last_bgr: NDArray[np.uint8] | None = None
+
+    def is_repeated(self, image_bgr: NDArray[np.uint8]) -> bool:
+        """Tell whether an image is the last one again, to the bit: a sensor's noise never is.
+
+        Then the camera hangs, or what brings its images does, and nothing was measured.
+        """
+        last, self._last_bgr = self._last_bgr, image_bgr
+        if last is None or not np.array_equal(last[::_ROW_STEP], image_bgr[::_ROW_STEP]):
+            return False
+        return np.array_equal(last, image_bgr)
 
     def look(
         self,

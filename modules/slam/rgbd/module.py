@@ -16,7 +16,7 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
 from .alignment import Alignment
-from .answers import held, lost, placed, started
+from .answers import held, lost, placed, repeated, started
 from .fusion import join_duplicates
 from .keyframes import NO_LANDMARK, Keyframe
 from .limits import check_limits, check_sizes
@@ -107,6 +107,8 @@ class RgbdSlam:
         T_predicted = self._motion.predict(observation)
         if observation.image_bgr is None:
             return self._lose(observation, T_predicted)
+        if self._eye.is_repeated(observation.image_bgr):
+            return self._repeat(observation, T_predicted)
         view = self._look(observation, observation.image_bgr, T_predicted)
         fix = None
         if len(self._map.keyframes):
@@ -216,6 +218,17 @@ class RgbdSlam:
         self._T_local_base, self._is_lost = T_local_base, False
         self._place_rule.restart()
         self._motion.hold(observation, T_local_base)
+
+    def _repeat(self, observation: Observation, T_predicted: Transform) -> Tracking:
+        """Stay where odometry leads, else where the camera was: its image is the last one again."""
+        if self._is_lost or not len(self._map.keyframes):
+            return self._lose(observation, T_predicted)
+        if observation.T_odom_base is not None:
+            self._T_local_base = T_predicted if self._motion.is_reckoned else self._T_local_base
+            self._motion.hold(observation, self._T_local_base)
+        stamp_ns = observation.stamp_ns
+        self._memory.hold(stamp_ns, self._T_local_base, np.zeros(0, np.int64))
+        return repeated(stamp_ns, self._T_local_base, revision=self._memory.revision)
 
     def _lose(self, observation: Observation, T_predicted: Transform) -> Tracking:
         self._motion.lose(observation, T_predicted)
