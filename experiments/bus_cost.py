@@ -21,6 +21,7 @@ from sceneslam.atlas.atlas import Atlas
 from sceneslam.bus.bus import Bus
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.gate import GateSettings
+from sceneslam.bus.pace import PaceSettings
 from sceneslam.bus.policy import Policy
 from sceneslam.modules.slam.odometry import Odometry
 from sceneslam.types import se3
@@ -53,9 +54,10 @@ def policy(*, gate: bool, buffer: bool) -> Policy:
     """Return the shipped policy, with or without its gate and its buffer."""
     path = Path(__file__).resolve().parents[1] / "conf" / "policy" / "default.yaml"
     values = yaml.safe_load(path.read_text())
-    settings = values.pop("gate")
-    del values["_target_"], settings["_target_"]
-    shipped = Policy(**values, gate=GateSettings(**settings) if gate else None)
+    settings, pace = values.pop("gate"), values.pop("catch_up")
+    del values["_target_"], settings["_target_"], pace["_target_"]
+    judge = GateSettings(**settings) if gate else None
+    shipped = Policy(**values, gate=judge, catch_up=PaceSettings(**pace))
     return shipped if buffer else replace(shipped, buffer_s=0.0)
 
 

@@ -7,6 +7,7 @@ from sceneslam.atlas.atlas import Atlas
 from sceneslam.bus.bus import Bus
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.gate import GateSettings
+from sceneslam.bus.pace import PaceSettings
 from sceneslam.bus.policy import Policy
 from sceneslam.types import se3
 
@@ -37,6 +38,7 @@ def policy(**changes):
         "trial_s": 1.0,
         "buffer_s": 12.0,
         "buffer_mb": 256.0,
+        "catch_up": PaceSettings(period_s=0.0, step_m=0.0, turn_rad=0.0),
         "turn_by_gyro": True,
         "gate": None,
         "startup_s": {},

@@ -40,6 +40,12 @@ CONFIG = {
         "trial_s": 1.0,
         "buffer_s": 12.0,
         "buffer_mb": 256.0,
+        "catch_up": {
+            "_target_": "sceneslam.bus.pace.PaceSettings",
+            "period_s": 0.06,
+            "step_m": 0.05,
+            "turn_rad": 0.05,
+        },
         "gate": None,
         "startup_s": {},
     },

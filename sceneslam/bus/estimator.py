@@ -14,6 +14,7 @@ from sceneslam.bus.handover import Handover
 from sceneslam.bus.handover_log import log_cost
 from sceneslam.bus.hold import Hold
 from sceneslam.bus.memory import Memory, Moment
+from sceneslam.bus.pace import Pace
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.runner import Runner
 from sceneslam.types import se3
@@ -110,7 +111,10 @@ class Estimator:
         if self._policy.handover == "rewind" and not is_trial:
             anchor = self._memory.anchor(since_ns)
         hold = self._new_hold()
-        return Handover(runner, self._memory, anchor=anchor, hold=hold, scene=scene, rig=self._rig)
+        pace = Pace(self._policy.catch_up)
+        return Handover(
+            runner, self._memory, anchor=anchor, hold=hold, pace=pace, scene=scene, rig=self._rig
+        )
 
     def settle(self, handover: Handover) -> None:
         """Place a module that was on trial at the pose of now: what it gave before is not used."""

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from time import perf_counter_ns
 
 from sceneslam.atlas.atlas import BRIDGED
 from sceneslam.bus.hold import Hold
 from sceneslam.bus.memory import Memory, Moment
+from sceneslam.bus.pace import Pace
 from sceneslam.bus.runner import Runner
 from sceneslam.types import se3
-from sceneslam.types.observation import Tracking, TrackingStatus
+from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
 
@@ -24,9 +26,20 @@ class Handover:
     """
 
     def __init__(
-        self, runner: Runner, memory: Memory, *, anchor: Moment, hold: Hold, scene: str, rig: Rig
+        self,
+        runner: Runner,
+        memory: Memory,
+        *,
+        anchor: Moment,
+        hold: Hold,
+        pace: Pace,
+        scene: str,
+        rig: Rig,
     ) -> None:
         self.runner, self.anchor, self.hold = runner, anchor, hold
+        self._pace = pace
+        self._spared: list[Moment] = []  # since the last that the module was given ...
+        self._given_ns = anchor.stamp_ns  # ... and held its pose
         self.began_at = anchor
         self.trail: list[Moment] = []  # all after the anchor, and itself if no module gave its pose
         self.tracked: list[Tracking] = []  # what it said from the anchor on, where it holds
@@ -50,15 +63,17 @@ class Handover:
         return self.trail[-1].T_map_base if self.trail else self.anchor.T_map_base
 
     def advance(self, limit: int | None) -> bool:
-        """Lead the module through up to `limit` moments; return whether it has caught up.
+        """Give the module up to `limit` observations; return whether it has caught up.
 
         Raises ModuleError when the module breaks its promise.
         """
-        ahead = self._memory.after(self._done_ns)
+        given = 0
         with self._timed():
-            for moment in ahead[:limit]:
-                self._feed(moment)
-        return limit is None or len(ahead) <= limit
+            for moment in self._memory.after(self._done_ns):
+                if given == limit:
+                    return False
+                given += self._go_on_to(moment)
+        return True
 
     def settle(self, anchor: Moment) -> None:
         """Place the module, which has caught up, anew: at the pose of another moment, now.
@@ -81,15 +96,48 @@ class Handover:
         finally:
             self.cost_ns += perf_counter_ns() - self._since_ns
 
-    def _feed(self, moment: Moment) -> None:
+    def _go_on_to(self, moment: Moment) -> bool:
+        """Give the module a moment's observation, or spare it that; return whether it was given."""
         if not self.is_placed and moment.is_trusted:
             self.anchor, self._bridge, self.trail = moment, moment.bridge.copy(), []
-        tracking = self.hold.ask(self.runner, moment.observation)
+        is_newest = moment is self._memory.newest
+        is_sure = self.is_placed and self.hold.is_held
+        if is_sure and not is_newest and self._pace.spares(moment.observation):
+            self._spare(moment)
+            return False
+        tracking = self._ask(moment.observation)
+        spared, self._spared = self._spared, []
+        for each in spared:
+            self._note(each, self._bridge_to(each))
         if tracking is None:
-            T_map_base = self._bridge_to(moment)
+            self._note(moment, self._bridge_to(moment))
             self.is_placed = self.is_placed and not self.hold.is_suspect
         else:
+            T_map_told = self._bridge.copy().predict(moment.observation, by_velocity=False)
             T_map_base = self._place(moment, tracking)
+            if spared and T_map_told is not None and not self.hold.is_revised:
+                self._bend(len(spared), tracking, se3.inverse(T_map_told) @ T_map_base)
+            self._note(moment, T_map_base, tracking)
+            self._given_ns = moment.stamp_ns
+        return True
+
+    def _spare(self, moment: Moment) -> None:
+        self._pace.spare(moment.observation)
+        self.hold.spare(moment.observation)
+        self._spared.append(moment)
+        self._done_ns = moment.stamp_ns
+
+    def _ask(self, observation: Observation) -> Tracking | None:
+        """Return what the module says, with the gyro samples since it was last given any."""
+        if self.runner.can_use(observation):
+            return self.hold.ask(self.runner, self._pace.give(observation))
+        self._pace.spare(observation)
+        return self.hold.ask(self.runner, observation)
+
+    def _note(
+        self, moment: Moment, T_map_base: Transform | None, tracking: Tracking | None = None
+    ) -> None:
+        """Go on to a moment with its pose, and what the module said where it is the module's."""
         if moment is not self.anchor or moment.module == BRIDGED:
             self.trail.append(
                 Moment(
@@ -99,10 +147,26 @@ class Handover:
                     bridge=self._bridge.copy(),
                     turn=self.hold.turn,
                     covariance=None if tracking is None else tracking.covariance,
-                    is_trusted=self.hold.is_trusted,
+                    is_trusted=tracking is not None and self.hold.is_trusted,
                 )
             )
         self._done_ns, self._told = moment.stamp_ns, moment.T_map_base
+
+    def _bend(self, count: int, tracking: Tracking, T_told_base: Transform) -> None:
+        """Lay the last poses of the trail, odometry's, between the module's before and after them.
+
+        `T_told_base`: where the module is now, seen from where odometry led.
+        """
+        xi, given_s = se3.log(T_told_base), (tracking.stamp_ns - self._given_ns) / 1e9
+        for index in range(-count, 0):
+            moment = self.trail[index]
+            share = (moment.stamp_ns - self._given_ns) / 1e9 / given_s
+            self.trail[index] = replace(
+                moment,
+                T_map_base=moment.bridge.follow(moment.observation, se3.exp(share * xi)),
+                module=self.runner.key,
+                covariance=tracking.covariance,
+            )
 
     def _bridge_to(self, moment: Moment) -> Transform | None:
         """Return a pose that the module did not give: the old one's motion is better than none."""

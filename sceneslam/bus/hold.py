@@ -60,6 +60,11 @@ class Hold:
             self.held_since_ns = tracking.stamp_ns
         return tracking
 
+    def spare(self, observation: Observation) -> None:
+        """Take note of an observation that a module which is catching up was not given."""
+        self.is_trusted, self.covariance = False, None
+        self._judge(observation, None)
+
     def _feed(self, tracking: Tracking) -> None:
         if self._fed_ns is not None:
             self._period_ns = tracking.stamp_ns - self._fed_ns

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from time import monotonic_ns
 
-import numpy as np
-
+from sceneslam.bus.pace import with_gyro_of
 from sceneslam.types.observation import Observation
 
 
@@ -26,7 +24,7 @@ class Mailbox:
         with self._changed:
             if self._waiting is not None:
                 self.dropped += 1
-                observation = _with_gyro_of(self._waiting, observation)
+                observation = with_gyro_of(self._waiting, observation)
             self._waiting = observation
             self._changed.notify()
 
@@ -86,13 +84,3 @@ def _deliver(
         if is_over.wait(max(wait_s, 0.0)):
             return
         mailbox.put(observation)
-
-
-def _with_gyro_of(dropped: Observation, newer: Observation) -> Observation:
-    """Return the newer observation with the gyro samples of both."""
-    if dropped.gyro_base is None:
-        return newer
-    shift_s = (dropped.stamp_ns - newer.stamp_ns) / 1e9
-    older = dropped.gyro_base + np.array([shift_s, 0.0, 0.0, 0.0])
-    samples = older if newer.gyro_base is None else np.concatenate([older, newer.gyro_base])
-    return replace(newer, gyro_base=samples)

@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 from sceneslam.bus.gate import GateSettings
+from sceneslam.bus.pace import PaceSettings
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.run import HANDOVERS
 
-_OTHERS = ("handover", "turn_by_gyro", "gate")  # settings that are no durations
+_OTHERS = ("handover", "catch_up", "turn_by_gyro", "gate")  # settings that are no durations
 
 
 @dataclass(slots=True, kw_only=True)
@@ -27,6 +28,7 @@ class Policy:
     trial_s: float  # it has to hold its pose this long, beside the fallback, to come back
     buffer_s: float  # observations are remembered this long, for `rewind` ...
     buffer_mb: float  # ... and up to this much; beyond it the older, the thinner
+    catch_up: PaceSettings  # what a module that is led through them is spared
     turn_by_gyro: bool  # what bridges and judges, where there is a gyro; else by the wheels
     gate: GateSettings | None  # how far a module's motion may differ from odometry's, None: any
     startup_s: dict[str, float]  # slam key -> time its start takes on the recording's clock

@@ -1,0 +1,112 @@
+"""What a module that catches up is spared, and what comes of the poses in between."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from driving import assert_exact, dark_from, drive, events
+from fakes import PERIOD_NS, ExactModule, observation
+from test_handover import errors_m, slipping
+
+from sceneslam.atlas.atlas import BRIDGED
+from sceneslam.bus.pace import Pace, PaceSettings
+from sceneslam.types.errors import ConfigError
+
+EVERY_THIRD = PaceSettings(period_s=0.3, step_m=10.0, turn_rad=3.0)
+SWITCHED = {"scene_at": dark_from(40), "handover": "rewind"}  # confirmed at 60
+
+
+class Asked(ExactModule):
+    """Remembers what it was given."""
+
+    def __init__(self, **options):
+        super().__init__(**options)
+        self.given = []
+
+    def track(self, observation):
+        self.given.append(observation)
+        return super().track(observation)
+
+    @property
+    def indices(self):
+        return [given.stamp_ns // PERIOD_NS for given in self.given]
+
+
+def test_module_that_catches_up_is_given_every_third_observation_and_the_newest():
+    dark = Asked()
+    _, atlas, _, _ = drive(
+        {"bright": ExactModule(), "dark": dark}, catch_up=EVERY_THIRD, **SWITCHED
+    )
+    assert dark.indices[:9] == [40, 43, 46, 49, 52, 55, 58, 60, 61]
+    assert_exact(atlas)
+
+
+def test_poses_in_between_are_the_modules_where_odometry_slips():
+    _, atlas, _, _ = drive(
+        {"bright": ExactModule(), "dark": ExactModule()},
+        feed=slipping,
+        catch_up=EVERY_THIRD,
+        **SWITCHED,
+    )
+    assert BRIDGED not in atlas.pose_modules and len(atlas.trajectory) == 100
+    assert atlas.pose_modules[40:62] == ("bright", *["dark"] * 21)
+    errors = errors_m(atlas.trajectory)
+    assert errors[60] < 1e-9
+    slip_m = 0.02  # of every step; without what the module says at the third, they would add up
+    assert errors[41] < slip_m / 2 and errors.max() < slip_m
+
+
+@pytest.mark.parametrize("limit", [2, 5])
+def test_spared_observations_do_not_count_in_live_mode(limit):
+    """21 observations wait for the new module, of which it is given 7."""
+    dark = Asked()
+    _, atlas, log, _ = drive(
+        {"bright": ExactModule(), "dark": dark},
+        catch_up=EVERY_THIRD,
+        catch_up_steps=limit,
+        **SWITCHED,
+    )
+    assert_exact(atlas)
+    took = events(log, "decision")[1]["stamp_ns"] // PERIOD_NS - 60
+    assert took == {2: 4, 5: 1}[limit]
+
+
+def test_nothing_is_spared_to_a_module_that_is_lost():
+    dark = Asked(lost=range(43, 50))
+    drive({"bright": ExactModule(), "dark": dark}, catch_up=EVERY_THIRD, **SWITCHED)
+    assert dark.indices[:4] == [40, 43, 44, 45]
+
+
+@pytest.mark.parametrize("change", [{"step_m": 0.01}, {"turn_rad": 0.01}, {"period_s": 0.1}])
+def test_observation_after_more_time_or_motion_is_not_spared(change):
+    pace = Pace(replace(EVERY_THIRD, **change))
+    pace.give(observation(0))
+    assert not pace.spares(observation(1))
+    assert Pace(EVERY_THIRD).spares(observation(1)) is False  # nothing was given yet
+    pace = Pace(EVERY_THIRD)
+    pace.give(observation(0))
+    assert pace.spares(observation(1)) and not pace.spares(observation(3))
+
+
+def test_nothing_is_spared_without_odometry():
+    pace = Pace(EVERY_THIRD)
+    pace.give(observation(0, has_odometry=False))
+    assert not pace.spares(observation(1, has_odometry=False))
+
+
+def test_gyro_samples_of_spared_observations_are_given_with_the_next():
+    sample = np.array([[-0.05, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 2.0]])
+    first, second, third = (replace(observation(i), gyro_base=sample) for i in range(3))
+    pace = Pace(EVERY_THIRD)
+    assert pace.give(first) is first
+    pace.spare(second)
+    np.testing.assert_allclose(
+        pace.give(third).gyro_base[:, 0], [-0.15, -0.1, -0.05, 0.0], atol=1e-12
+    )
+    assert pace.give(third) is third
+
+
+@pytest.mark.parametrize("name", ["period_s", "step_m", "turn_rad"])
+def test_impossible_paces_are_refused(name):
+    with pytest.raises(ConfigError, match=name):
+        replace(EVERY_THIRD, **{name: -1.0})
