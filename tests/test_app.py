@@ -46,6 +46,7 @@ CONFIG = {
             "step_m": 0.05,
             "turn_rad": 0.05,
         },
+        "turn_by_gyro": True,
         "gate": None,
         "startup_s": {},
     },
