@@ -3,6 +3,9 @@
 from pathlib import Path
 
 import pytest
+from scenery import RIG, room_observation
+
+from sceneslam.ros.writer import ObservationWriter
 
 _SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -13,3 +16,21 @@ def shared_data() -> Path:
     if not _SHARED_DATA.is_dir():
         pytest.skip("the real recordings (../shared/data) are not on this machine")
     return _SHARED_DATA
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory) -> Path:
+    """Give a recording of a second in a small room, with every sensor on board."""
+    path = tmp_path_factory.mktemp("recording") / "room.mcap"
+    writer = ObservationWriter(path, rig=RIG, image_format="png")
+    for index in range(30):
+        writer.write(room_observation(index))
+    writer.close()
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path, recording) -> Path:
+    """Give a folder that holds `room.mcap`."""
+    (tmp_path / "room.mcap").symlink_to(recording)
+    return tmp_path

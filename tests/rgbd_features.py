@@ -3,6 +3,7 @@
 import numpy as np
 
 from sceneslam.modules.slam.rgbd.features import Features
+from sceneslam.modules.slam.rgbd.visual_map import VisualMap
 
 
 def features_at(uv_px, descriptors, levels=None, depth_m=None):
@@ -18,3 +19,14 @@ def features_at(uv_px, descriptors, levels=None, depth_m=None):
 
 def random_descriptors(rng, count):
     return rng.integers(0, 256, (count, 32), dtype=np.uint8)
+
+
+def empty_map(camera, *, keyframe_limit=9, landmark_limit=9999):
+    return VisualMap(
+        camera,
+        camera,
+        sigma_px=1.0,
+        inverse_depth_sigma_per_m=0.003,
+        keyframe_limit=keyframe_limit,
+        landmark_limit=landmark_limit,
+    )

@@ -12,29 +12,11 @@ from time import monotonic, sleep
 
 import numpy as np
 import pytest
-from scenery import RIG, room_observation
 
-from sceneslam.ros.writer import ObservationWriter
 from sceneslam.types.trajectory import Trajectory
 
 ROOT = Path(__file__).parents[1]
 SINGLE = ("+scenario=single", "source=mcap", "source.path=room.mcap")
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    path = tmp_path_factory.mktemp("recording") / "room.mcap"
-    writer = ObservationWriter(path, rig=RIG, image_format="png")
-    for index in range(30):
-        writer.write(room_observation(index))
-    writer.close()
-    return path
-
-
-@pytest.fixture
-def folder(tmp_path, recording):
-    (tmp_path / "room.mcap").symlink_to(recording)
-    return tmp_path
 
 
 def command(*overrides):

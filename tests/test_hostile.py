@@ -80,7 +80,7 @@ def test_a_trajectory_that_is_none_is_left_out(trajectory, caplog):
     ],
 )
 def test_a_detector_that_fails_is_stopped_and_its_last_scene_stays(tmp_path, how, what):
-    detector = {"_target_": "hostile.Votes", "how": how}
+    detector = {"_target_": "hostile_parts.Votes", "how": how}
     finished = run(hostile_config(detector=detector), tmp_path)
     assert finished.faults == () and len(finished.trajectory) == 100
     assert what in (tmp_path / "events.jsonl").read_text()
@@ -104,7 +104,7 @@ def test_a_detector_that_fails_is_stopped_and_its_last_scene_stays(tmp_path, how
     ],
 )
 def test_a_source_that_talks_nonsense_ends_what_it_spoils_and_no_more(tmp_path, how, poses, what):
-    source = {"_target_": "hostile.BreaksOff", "how": how}
+    source = {"_target_": "hostile_parts.BreaksOff", "how": how}
     finished = run(hostile_config(source=source), tmp_path)
     assert len(finished.trajectory) == poses
     assert np.isfinite(finished.trajectory.T_world_base).all()
@@ -112,21 +112,21 @@ def test_a_source_that_talks_nonsense_ends_what_it_spoils_and_no_more(tmp_path, 
 
 
 def test_a_sink_that_cannot_be_opened_is_named_before_the_first_frame(tmp_path):
-    sinks = {"tape": {"_target_": "hostile.Fails", "method": "open"}}
+    sinks = {"tape": {"_target_": "hostile_parts.Fails", "method": "open"}}
     with pytest.raises(InputError, match=r"sinks\.tape could not be opened: Exception: as usual"):
         run(hostile_config(sinks=sinks), tmp_path)
 
 
 @pytest.mark.parametrize("method", ["write", "write_event", "write_truth", "close"])
 def test_a_sink_that_fails_is_dropped(tmp_path, method):
-    sinks = {"tape": {"_target_": "hostile.Fails", "method": method}}
+    sinks = {"tape": {"_target_": "hostile_parts.Fails", "method": method}}
     finished = run(hostile_config(sinks=sinks), tmp_path)
     assert finished.faults == ("sinks.tape stopped writing: Exception: as usual",)
     assert len(finished.trajectory) == 100
 
 
 def hostile_config(**changes):
-    allowed = ["fakes", "hostile"]
+    allowed = ["fakes", "hostile", "hostile_parts"]
     return config(allow_targets=allowed, run__report=False, **changes)
 
 

@@ -8,12 +8,11 @@ import pytest
 import yaml
 
 from sceneslam.interfaces import SlamModule
-from sceneslam.modules.slam.clouds import CloudReader
 from sceneslam.modules.slam.kiss_icp import KissIcp
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation, TrackingStatus
-from sceneslam.types.rig import Camera, Lidar, Rig, Sensor
+from sceneslam.types.rig import Lidar, Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
 SETTINGS = yaml.safe_load(
@@ -22,7 +21,6 @@ SETTINGS = yaml.safe_load(
 SETTINGS.pop("_target_")
 RANGE_M = (0.5, 30.0)
 RIG = Rig(sensors=frozenset({Sensor.POINTS}), lidar=Lidar(range_m=RANGE_M))
-CAMERA = Camera(size_wh=(64, 48), fx=52.5, fy=52.5, cx=31.5, cy=23.5)
 
 
 def active(rig=RIG, **settings):
@@ -188,40 +186,6 @@ def test_activation_starts_anew_and_shutdown_may_come_twice():
     assert len(module.get_map().points.points) == 0
     again = [module.track(observation).T_local_base for observation in observations]
     np.testing.assert_array_equal(first, again)
-
-
-def test_sweep_is_undone_to_the_stamp():
-    rig = Rig(sensors=RIG.sensors, lidar=Lidar(range_m=(0.1, 50.0)))
-    reader = CloudReader(rig, depth_range_max_m=5.0, depth_stride_px=8)
-    twist_s = np.array([2.0, -1.0, 0.5, 0.1, -0.2, 0.9])
-    times = np.linspace(0.0, 0.1, 50)
-    still = np.random.default_rng(1).uniform(-10, 10, (50, 3))
-    swept = np.array(
-        [
-            se3.apply(se3.inverse(se3.exp(twist_s * time)), point[None])[0]
-            for time, point in zip(times, still, strict=True)
-        ]
-    ).astype(np.float32)
-    observation = Observation(stamp_ns=0, points_lidar=swept, point_times_s=times)
-    np.testing.assert_allclose(reader.read_unswept(observation, twist_s), still, atol=0.02)
-    equal = replace(observation, point_times_s=np.full(50, 0.1))
-    assert np.isfinite(reader.read_unswept(equal, twist_s)).all()
-    with pytest.raises(InputError, match="point_times_s: expected 50 values, got 3"):
-        reader.read_unswept(replace(observation, point_times_s=np.zeros(3)), twist_s)
-
-
-def test_depth_becomes_points_of_base():
-    camera = replace(CAMERA, depth_range_m=(0.0, 8.0))
-    rig = Rig(sensors=frozenset({Sensor.DEPTH}), camera=camera)
-    reader = CloudReader(rig, depth_range_max_m=5.0, depth_stride_px=4)
-    depth = np.full((48, 64), 2.0, np.float32)
-    depth[:, :32] = [[0.0], [np.nan], [np.inf], [6.0]] * 12
-    cloud = reader.read(Observation(stamp_ns=0, depth_m=depth))
-    assert len(cloud) == 12 * 8
-    np.testing.assert_allclose(cloud[:, 0], 2.0)
-    assert (cloud[:, 1] < 0).all()  # the right half of the image lies to the right
-    with pytest.raises(InputError, match="depth_m"):
-        reader.read(Observation(stamp_ns=0, depth_m=np.zeros((4, 4), np.float32)))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from rgbd_features import features_at, random_descriptors
+from rgbd_features import empty_map, features_at, random_descriptors
 
 from sceneslam.modules.slam.rgbd.alignment import Alignment
 from sceneslam.modules.slam.rgbd.bundle import Bundle, adjust
@@ -14,7 +14,6 @@ from sceneslam.modules.slam.rgbd.keyframes import NO_LANDMARK, DepthView, Keyfra
 from sceneslam.modules.slam.rgbd.local_mapping import LocalMapping
 from sceneslam.modules.slam.rgbd.residuals import Sightings, errors
 from sceneslam.modules.slam.rgbd.ties import Tie, Ties
-from sceneslam.modules.slam.rgbd.visual_map import VisualMap
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 
@@ -136,14 +135,7 @@ def mapped(rng, *, is_matched):
     """Return a map of one scene seen by all keyframes, which share landmarks or do not."""
     points = rng.uniform([-0.6, -0.4, 1.5], [0.6, 0.4, 3.0], (LANDMARKS, 3))
     descriptors = random_descriptors(rng, LANDMARKS)
-    visual_map = VisualMap(
-        CAMERA,
-        CAMERA,
-        sigma_px=1.0,
-        inverse_depth_sigma_per_m=0.003,
-        keyframe_limit=9,
-        landmark_limit=9999,
-    )
+    visual_map = empty_map(CAMERA)
     for T_local_cam in true_poses():
         ids = np.full(LANDMARKS, NO_LANDMARK)
         if is_matched and len(visual_map.keyframes):

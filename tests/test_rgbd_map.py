@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from rgbd_features import features_at, random_descriptors
+from rgbd_features import empty_map, features_at, random_descriptors
 
 from sceneslam.modules.slam.rgbd.alignment import Alignment
 from sceneslam.modules.slam.rgbd.features import FeatureExtractor
@@ -13,7 +13,6 @@ from sceneslam.modules.slam.rgbd.layers import LayerBuilder
 from sceneslam.modules.slam.rgbd.localizer import Localizer
 from sceneslam.modules.slam.rgbd.motion import MotionModel
 from sceneslam.modules.slam.rgbd.pose_solver import PoseSolver
-from sceneslam.modules.slam.rgbd.visual_map import VisualMap
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera
@@ -75,14 +74,7 @@ def test_covisible_keyframes_are_ranked_by_shared_landmarks():
 
 
 def test_map_stays_within_its_limits_and_forgets_only_redundant_keyframes():
-    visual_map = VisualMap(
-        CAMERA,
-        CAMERA,
-        sigma_px=1.0,
-        inverse_depth_sigma_per_m=0.003,
-        keyframe_limit=10,
-        landmark_limit=100_000,
-    )
+    visual_map = empty_map(CAMERA, keyframe_limit=10, landmark_limit=100_000)
     for step in range(30):
         visual_map.insert(keyframe_at(0.1 * step), deep_rows=np.zeros(0, np.int64))
     assert len(visual_map.keyframes) == 10
@@ -94,14 +86,7 @@ def test_map_stays_within_its_limits_and_forgets_only_redundant_keyframes():
 
 
 def test_corrected_keyframes_take_along_the_landmarks_that_they_saw_first():
-    visual_map = VisualMap(
-        CAMERA,
-        CAMERA,
-        sigma_px=1.0,
-        inverse_depth_sigma_per_m=0.003,
-        keyframe_limit=9,
-        landmark_limit=9999,
-    )
+    visual_map = empty_map(CAMERA)
     first, second = keyframe_at(0.5), keyframe_at(1.5)
     visual_map.insert(first, deep_rows=np.zeros(0, np.int64))
     second.landmark_ids[:20] = first.landmark_ids[:20]
@@ -121,14 +106,7 @@ def test_corrected_keyframes_take_along_the_landmarks_that_they_saw_first():
 
 
 def test_landmarks_are_predicted_where_they_were_seen():
-    visual_map = VisualMap(
-        CAMERA,
-        CAMERA,
-        sigma_px=1.0,
-        inverse_depth_sigma_per_m=0.003,
-        keyframe_limit=9,
-        landmark_limit=9999,
-    )
+    visual_map = empty_map(CAMERA)
     keyframe = keyframe_at(0.5)
     visual_map.insert(keyframe, deep_rows=np.zeros(0, np.int64))
     prediction = visual_map.predict(keyframe.T_local_base, keyframe.landmark_ids)
@@ -240,14 +218,7 @@ def test_nearest_keyframe_can_be_asked_for_among_the_old_ones_alone():
 
 @pytest.mark.parametrize(("shown", "is_found"), [(40, False), (120, True)])
 def test_a_pose_is_told_only_where_a_tenth_of_what_should_show_is_found(shown, is_found):
-    visual_map = VisualMap(
-        CAMERA,
-        CAMERA,
-        sigma_px=1.0,
-        inverse_depth_sigma_per_m=0.003,
-        keyframe_limit=10,
-        landmark_limit=5000,
-    )
+    visual_map = empty_map(CAMERA, keyframe_limit=10, landmark_limit=5000)
     mapped = keyframe_at(0, count=800)
     visual_map.insert(mapped, deep_rows=np.zeros(0, np.int64))
     rng = np.random.default_rng(1)

@@ -18,32 +18,14 @@ from hydra import compose, initialize_config_module
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
-from scenery import RIG, room_observation
 
 from sceneslam.config.check import check_keys
-from sceneslam.ros.writer import ObservationWriter
 from sceneslam.sweep.__main__ import main
 from sceneslam.sweep.status import State, Status
 
 ROOT = Path(__file__).parents[1]
 JOBS = ("+scenario=single", "source=mcap", "source.path=room.mcap", "slam@slam.only=odometry")
 SLOW = (*JOBS, "run.mode=live")  # paced: 30 observations take a second
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    path = tmp_path_factory.mktemp("recording") / "room.mcap"
-    writer = ObservationWriter(path, rig=RIG, image_format="png")
-    for index in range(30):
-        writer.write(room_observation(index))
-    writer.close()
-    return path
-
-
-@pytest.fixture
-def folder(tmp_path, recording):
-    (tmp_path / "room.mcap").symlink_to(recording)
-    return tmp_path
 
 
 def start(folder, *overrides):
