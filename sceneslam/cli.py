@@ -7,6 +7,7 @@ saved; 2 nothing was run because the configuration or the input cannot be used.
 from __future__ import annotations
 
 import os
+import re
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any, cast
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
@@ -26,7 +27,7 @@ from sceneslam.detection.run import detect
 from sceneslam.evaluation.summary import summary_lines
 from sceneslam.evaluation.verdict import verdict_lines
 from sceneslam.experiment import run_experiment
-from sceneslam.types.errors import ConfigError, SceneSlamError
+from sceneslam.types.errors import ConfigError, SceneSlamError, told
 from sceneslam.types.trajectory import Trajectory
 
 OK, INCOMPLETE, UNUSABLE = 0, 1, 2
@@ -50,13 +51,20 @@ def main() -> None:
 
     @hydra.main(version_base="1.3", config_path=CONFIG, config_name="config")
     def job(config: DictConfig) -> None:
+        codes.append(OK)  # it has begun
         codes.append(carry_out(config).code)
 
+    sys.argv[1:] = sorted(sys.argv[1:], key=_is_override)  # Hydra takes no option between them
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises then, and does not exit
     try:
         job()
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {_said(error)}", file=sys.stderr)
+        codes.append(UNUSABLE)
+    except OSError as error:  # Hydra's, before the job: a run's own are handled in it
+        if codes:
+            raise
+        print(f"error: hydra.run.dir or hydra.sweep.dir: {told(error)}", file=sys.stderr)
         codes.append(UNUSABLE)
     except ValueError as error:  # Hydra's, which does not say which
         if not str(error).startswith("Config group override must be"):
@@ -67,6 +75,20 @@ def main() -> None:
     except KeyboardInterrupt:  # ends a sweep as well
         codes.append(INCOMPLETE)
     sys.exit(max(codes, default=OK))
+
+
+def _is_override(word: str) -> bool:
+    return not word.startswith("-") and ("=" in word or word.startswith("~"))
+
+
+def _said(error: Exception) -> str:
+    """Return what Hydra says, with the words that it is about, and no advice that leads astray."""
+    said = str(error)
+    if isinstance(error, OverrideParseException) and error.override not in said:
+        said = f"{error.override}: {said}"
+    return re.sub(
+        r"To append to your config use \+(.*)", r"There is no such key; --cfg job shows all", said
+    )
 
 
 def carry_out(config: DictConfig) -> Ended:
@@ -90,8 +112,8 @@ def carry_out(config: DictConfig) -> Ended:
     for fault in finished.faults:
         print(f"error: {fault}", file=sys.stderr)
     page = folder / "report.html"
-    told = f"report   {_short(page)}" if page.exists() else f"results  {_short(folder)}"
-    print("\n".join([*summary_lines(finished.metrics), told]))
+    where = f"report   {_short(page)}" if page.exists() else f"results  {_short(folder)}"
+    print("\n".join([*summary_lines(finished.metrics), where]))
     if finished.is_interrupted:
         raise KeyboardInterrupt
     return Ended(code=INCOMPLETE if finished.faults else OK, errors=finished.faults)

@@ -58,6 +58,8 @@ def test_run_says_what_happened_in_ten_lines_at_most(folder):
         ((*SINGLE, "policy.typo=1"), "policy.typo"),
         ((*SINGLE, "sinks=null"), "sinks=null"),
         ((*SINGLE, "scenes.Any=[onyl]"), "scenes.Any: got ['onyl']"),
+        ((*SINGLE, "--config-dir", "nowhere", "seed=1"), "nowhere' not found"),
+        ((*SINGLE, "scenes.Any=[only"), "scenes.Any=[only: no viable"),
     ],
 )
 def test_mistake_is_one_sentence_without_a_traceback(folder, overrides, sentence):
@@ -65,6 +67,13 @@ def test_mistake_is_one_sentence_without_a_traceback(folder, overrides, sentence
     assert done.returncode in (1, 2)
     assert sentence in done.stderr + done.stdout
     assert "Traceback" not in done.stderr + done.stdout
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(folder):
+    words = [*command(*SINGLE)[:-1], "hydra.run.dir=room.mcap/out"]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2 and done.stderr.startswith("error: hydra.run.dir")
+    assert "room.mcap/out" in done.stderr and "Traceback" not in done.stderr
 
 
 def test_cut_recording_is_read_as_far_as_it_goes(folder, recording):

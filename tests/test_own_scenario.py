@@ -37,6 +37,7 @@ def test_robot_of_the_guide_is_driven_by_its_three_modules_and_policy(folder, ca
         ("detector/hall_or_tunnel", "- grey_mean", "- gray_mean", "detector/gray_mean"),
         ("scenario/depot", "[eyes,", "[eye,", "scenes.Hall: got ['eye', 'laser', 'wheels']"),
         ("scenario/depot", "[laser, wheels]", "laser", "scenes.Tunnel: got 'laser'"),
+        ("scenario/depot", "\n  laser:\n", "\n  lasr:\n", "slam.lasr: got {'range_max_m': 6.0}"),
         ("scenario/depot", "range_max_m", "range_max", "slam.laser.range_max: got 6.0"),
         ("scenario/depot", "wheels: odometry", "wheels: odometer", "slam/odometer"),
         ("scenario/depot", "slam@slam.eyes", "slam@slm.eyes", "did you mean slam?"),

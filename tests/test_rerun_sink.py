@@ -122,6 +122,13 @@ def test_ports_of_the_viewer_are_checked():
         Viewer(port=9876, web_port=80)
 
 
+def test_a_port_that_something_else_listens_on_is_no_port_for_a_page():
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken, (free,) = other.getsockname()[1], free_ports(1)
+        with pytest.raises(ConfigError, match=f"web_port: got {taken}, allowed: a port that"):
+            Viewer(port=free, web_port=taken).open()
+
+
 def test_viewer_shows_a_run_to_this_machine_only_and_stays_for_the_next(tmp_path, capfd):
     pytest.importorskip("rerun", reason="the extra `rerun` is not installed")
     ports = free_ports(2)

@@ -36,6 +36,8 @@ def read_rows(folder: Path) -> list[Row]:
 
     Raises InputError where there is none.
     """
+    if not folder.is_dir():
+        raise InputError(f"expected the folder of a sweep, or of runs: {folder}")
     found = sorted(_runs(folder), key=lambda path: _order(folder, path))
     rows = [_row(folder, path) for path in found]
     if (folder / ROWS).is_file():

@@ -138,6 +138,8 @@ def _table(config: Mapping[str, Any], detector: Detector) -> dict[str, tuple[str
     scenes = {scene: tuple(table[scene]) for scene in detector.scenes}
     for key in modules:
         if key not in _used(scenes):
+            if "_target_" not in config["slam"][key]:
+                raise ConfigError(f"slam.{key}", config["slam"][key], known)
             _log.warning("slam.%s: no scene names it, so it does not run", key)
     _tell_of_rows(table, scenes)
     return scenes

@@ -36,8 +36,9 @@ class Viewer:
 
         Raises ConfigError when it does not come up.
         """
-        started = not self._listens()
-        if started:
+        if not _listens(self._port):
+            if self._web_port is not None and _listens(self._web_port):
+                raise ConfigError("web_port", self._web_port, "a port that nothing else listens on")
             self.process = subprocess.Popen(
                 self._command(),
                 stdin=subprocess.DEVNULL,
@@ -59,18 +60,19 @@ class Viewer:
             command += ["--serve-web", "--web-viewer-port", str(self._web_port)]
         return command
 
-    def _listens(self) -> bool:
-        try:
-            socket.create_connection((HOST, self._port), timeout=0.5).close()
-        except OSError:
-            return False
-        return True
-
     def _wait(self) -> None:
         assert self.process is not None
         until_s = monotonic() + _STARTS_WITHIN_S
-        while not self._listens():
+        while not _listens(self._port):
             if self.process.poll() is not None or monotonic() > until_s:
                 allowed = "a port on which the viewer comes up; without a display: web_port=9090"
                 raise ConfigError("port", self._port, allowed)
             sleep(0.05)
+
+
+def _listens(port: int) -> bool:
+    try:
+        socket.create_connection((HOST, port), timeout=0.5).close()
+    except OSError:
+        return False
+    return True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from itertools import product
@@ -24,6 +25,7 @@ from sceneslam.detection.grid import Axis, Tried, try_all
 from sceneslam.sweep.status import State
 
 _INNER = ("detector.", "policy.")  # what can be changed without composing or reading again
+_TOLD_ERRORS = 5  # the table has all of them
 
 
 def sweep_detection(
@@ -48,7 +50,10 @@ def sweep_detection(
                 bar.update()
     (folder / ROWS).write_text("".join(json.dumps(asdict(row)) + "\n" for row in rows))
     page = write_rows(folder, rows)
-    print(f"{overview(rows)}{len(rows)} settings\ntable    {folder}/table.csv\npage     {page}")
+    print(overview(rows), end="")
+    for error in list(dict.fromkeys(row.error for row in rows if row.error))[:_TOLD_ERRORS]:
+        print(f"error: {error}", file=sys.stderr)
+    print(f"{len(rows)} settings\ntable    {folder}/table.csv\npage     {page}")
     return all(row.status == State.DONE.value for row in rows)
 
 
