@@ -107,9 +107,9 @@ def test_slopes_of_the_errors_are_their_differences():
         depth_m=bundle.seen.depth_m[:20] * 1.02,
         inverse_depth_sigma_per_m=np.full(20, 0.003),
     )
-    points_cam, tiny_m = bundle.points_local[:20], 1e-6
+    points_cam, tiny_m = bundle.points_local[:20].T, 1e-6
     for axis in range(3):
-        step = np.zeros(3)
+        step = np.zeros((3, 1))
         step[axis] = tiny_m
         above, below = (errors(CAMERA, points_cam + sign * step, seen).of for sign in (1, -1))
         slope = errors(CAMERA, points_cam, seen).by_point[:, axis]

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 Transform = NDArray[np.float64]  # (4, 4), rigid
 Vector = NDArray[np.float64]
+
+_SMALLEST_RAD = 1e-4  # below, the factors of the series stay what they are, to 1e-9
 
 
 def identity() -> Transform:
@@ -94,9 +98,17 @@ def so3_log(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def exp(xi: NDArray[np.float64]) -> Transform:
-    """Return the transform of the twist (6,): translation [m] first, then rotation [rad]."""
-    rho, phi = xi[:3], xi[3:]
-    return from_parts(so3_exp(phi), _left_jacobian(phi) @ rho)
+    """Return the transform of the twist (6,): translation [m] first, then rotation [rad].
+
+    The series of the matrix exponential, which the generator's fourth power closes.
+    """
+    generator = np.zeros((4, 4))
+    generator[:3, :3], generator[:3, 3] = hat(xi[3:]), xi[:3]
+    square = generator @ generator
+    angle = max(math.sqrt(xi[3:] @ xi[3:]), _SMALLEST_RAD)
+    b = (1.0 - math.cos(angle)) / angle**2
+    c = (angle - math.sin(angle)) / angle**3
+    return np.asarray(np.eye(4) + generator + b * square + c * (square @ generator))
 
 
 def log(T_a_b: Transform) -> NDArray[np.float64]:
@@ -164,8 +176,7 @@ def to_quat_xyzw(T_a_b: Transform) -> NDArray[np.float64]:
 
 
 def _left_jacobian(phi: NDArray[np.float64]) -> NDArray[np.float64]:
-    # Below 1e-4 rad the two factors change by less than what double precision tells apart.
-    angle = np.maximum(np.linalg.norm(phi, axis=-1), 1e-4)[..., None, None]
+    angle = np.maximum(np.linalg.norm(phi, axis=-1), _SMALLEST_RAD)[..., None, None]
     k = hat(phi)
     a = (1.0 - np.cos(angle)) / angle**2
     b = (angle - np.sin(angle)) / angle**3

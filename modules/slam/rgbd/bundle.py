@@ -45,14 +45,23 @@ class Adjusted:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Slopes:
+    """Weighted residuals, and how they follow keyframes and landmarks."""
+
+    residuals: NDArray[np.float64]  # (3, N)
+    by_pose: NDArray[np.float64]  # (6, 3, N), by a twist of the camera
+    by_point: NDArray[np.float64]  # (3, 3, N): residual, component of the point in local
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Normal:
     """The normal equations: blocks of keyframes, of landmarks, and between them."""
 
     poses: NDArray[np.float64]  # (F, 6, F, 6) of the free keyframes
     points: NDArray[np.float64]  # (L, 3, 3)
-    between: NDArray[np.float64]  # (F, 6, L, 3)
+    between: NDArray[np.float64]  # (F, 6, 3, L)
     pose_slopes: NDArray[np.float64]  # (F, 6)
-    point_slopes: NDArray[np.float64]  # (L, 3)
+    point_slopes: NDArray[np.float64]  # (3, L)
 
 
 def adjust(camera: Camera, bundle: Bundle) -> Adjusted:
@@ -63,96 +72,97 @@ def adjust(camera: Camera, bundle: Bundle) -> Adjusted:
         found = _errors(camera, bundle)
         agrees = found.pixels_agree()
         use = np.stack([agrees, agrees & bundle.seen.measures_depth & found.depths_agree()])
-    normal = _linearise(bundle, found, use, Ties.of({}).pull(bundle.T_local_cam))
-    return Adjusted(bundle=bundle, agrees=agrees, information=normal.points)
+    information = _point_blocks(bundle, _slopes(bundle, found, use))
+    return Adjusted(bundle=bundle, agrees=agrees, information=information)
 
 
 def _descend(camera: Camera, bundle: Bundle, use: NDArray[np.float64], steps: int) -> Bundle:
-    damping = _DAMPING[0]
-    found = _errors(camera, bundle)
-    pulls = bundle.ties.pull(bundle.T_local_cam)
+    damping, normal = _DAMPING[0], None
+    found, pulls = _errors(camera, bundle), bundle.ties.pull(bundle.T_local_cam)
     cost = _cost(found, use, pulls)
     for _ in range(steps):
-        normal = _linearise(bundle, found, use, pulls)
+        if normal is None:
+            normal = _assemble(bundle, _slopes(bundle, found, use), pulls)
         moved = _step(bundle, normal, damping)
-        found_there = _errors(camera, moved)
-        pulls_there = moved.ties.pull(moved.T_local_cam)
+        found_there, pulls_there = _errors(camera, moved), moved.ties.pull(moved.T_local_cam)
         cost_there = _cost(found_there, use, pulls_there)
         if not cost_there < cost:
             damping = min(damping * 100.0, _DAMPING[2])
             continue
         gain, bundle, found, cost = cost - cost_there, moved, found_there, cost_there
-        pulls = pulls_there
+        pulls, normal = pulls_there, None
         damping = max(damping * 0.1, _DAMPING[1])
         if gain < _SMALL_GAIN * cost:
             break
     return bundle
 
 
+def _rotations(bundle: Bundle) -> NDArray[np.float64]:
+    """Return R_local_cam (3, 3, N) of each sighting."""
+    by_keyframe = np.ascontiguousarray(np.moveaxis(bundle.T_local_cam[:, :3, :3], 0, 2))
+    return np.take(by_keyframe, bundle.keyframe_rows, axis=2)
+
+
 def _errors(camera: Camera, bundle: Bundle) -> Errors:
-    T_cam_local = se3.inverse(bundle.T_local_cam)[bundle.keyframe_rows]
-    points_local = bundle.points_local[bundle.landmark_rows]
-    points_cam = np.einsum("nij,nj->ni", T_cam_local[:, :3, :3], points_local)
-    return errors(camera, points_cam + T_cam_local[:, :3, 3], bundle.seen)
+    viewers_local = bundle.T_local_cam[bundle.keyframe_rows, :3, 3]
+    rays_local = bundle.points_local[bundle.landmark_rows] - viewers_local
+    points_cam = np.einsum("jin,nj->in", _rotations(bundle), rays_local)
+    return errors(camera, points_cam, bundle.seen)
 
 
 def _cost(found: Errors, use: NDArray[np.float64], pulls: Pulls) -> float:
     """Return the Huber cost: quadratic near zero, linear beyond."""
-    weights = found.huber_weights()
     squares = np.stack([(found.of[:2] ** 2).sum(axis=0), found.of[2] ** 2])
-    weight = weights[1:]
+    weight = found.huber_weights()[1:]
     # rho = s^2 w (2 - w): s^2 where w = 1, and 2 h s - h^2 with w = h / s.
     cost = float((use * squares * weight * (2.0 - weight)).sum())
     return cost + pulls.cost
 
 
-def _linearise(bundle: Bundle, found: Errors, use: NDArray[np.float64], pulls: Pulls) -> _Normal:
+def _slopes(bundle: Bundle, found: Errors, use: NDArray[np.float64]) -> _Slopes:
     weights = np.sqrt(found.huber_weights() * use[[0, 0, 1]])
-    residuals = (found.of * weights).T  # (N, 3)
-    by_point_cam = np.moveaxis(found.by_point * weights[:, None], 2, 0)  # (N, 3, 3)
-    rotations = bundle.T_local_cam[bundle.keyframe_rows, :3, :3]
-    by_point = by_point_cam @ np.swapaxes(rotations, 1, 2)
-    offsets = (
-        bundle.points_local[bundle.landmark_rows] - bundle.T_local_cam[bundle.keyframe_rows, :3, 3]
+    by_point_cam = found.by_point * weights[:, None]
+    return _Slopes(
+        residuals=found.of * weights,
+        by_pose=found.by_twist() * weights,
+        by_point=np.einsum("rin,jin->rjn", by_point_cam, _rotations(bundle)),
     )
-    points_cam = np.einsum("nji,nj->ni", rotations, offsets)
-    # A twist of the camera moves a point by -rho + point x phi.
-    by_pose = np.concatenate([-by_point_cam, np.cross(by_point_cam, points_cam[:, None])], axis=2)
-    normal = _assemble(bundle, residuals, by_pose, by_point)
-    blocks = np.swapaxes(normal.poses, 1, 2)
-    pulls.add_to(blocks, normal.pose_slopes, bundle.is_free)
-    return normal
 
 
-def _assemble(
-    bundle: Bundle,
-    residuals: NDArray[np.float64],
-    by_pose: NDArray[np.float64],
-    by_point: NDArray[np.float64],
-) -> _Normal:
+def _point_blocks(bundle: Bundle, slopes: _Slopes) -> NDArray[np.float64]:
+    """Return the information (L, 3, 3) on landmarks, were the keyframes known."""
+    squares = np.einsum("rin,rjn->ijn", slopes.by_point, slopes.by_point).reshape(9, -1)
+    return _per_landmark(bundle, squares).T.reshape(-1, 3, 3)
+
+
+def _per_landmark(bundle: Bundle, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sums (R, L), over each landmark's sightings, of rows (R, N)."""
     count = len(bundle.points_local)
-    flat = np.einsum("nri,nrj->ijn", by_point, by_point).reshape(9, -1)
-    points = np.stack([np.bincount(bundle.landmark_rows, row, count) for row in flat], axis=1)
-    slopes = np.einsum("nri,nr->in", by_point, residuals)
-    point_slopes = np.stack([np.bincount(bundle.landmark_rows, row, count) for row in slopes], 1)
+    return np.stack([np.bincount(bundle.landmark_rows, row, count) for row in rows])
+
+
+def _assemble(bundle: Bundle, slopes: _Slopes, pulls: Pulls) -> _Normal:
+    point_slopes = np.einsum("rin,rn->in", slopes.by_point, slopes.residuals)
     free = np.cumsum(bundle.is_free) - 1
     starts = np.searchsorted(bundle.keyframe_rows, np.arange(len(bundle.is_free) + 1))
     total = int(bundle.is_free.sum())
     poses, pose_slopes = np.zeros((total, 6, total, 6)), np.zeros((total, 6))
-    between = np.zeros((total, 6, count, 3))
+    between = np.zeros((total, 6, 3, len(bundle.points_local)))
     for row in np.flatnonzero(bundle.is_free):
         these = slice(starts[row], starts[row + 1])
-        jacobian = by_pose[these].reshape(-1, 6)
-        poses[free[row], :, free[row]] = jacobian.T @ jacobian
-        pose_slopes[free[row]] = jacobian.T @ residuals[these].ravel()
-        blocks = np.swapaxes(by_pose[these], 1, 2) @ by_point[these]  # (n, 6, 3)
-        between[free[row]][:, bundle.landmark_rows[these]] = np.swapaxes(blocks, 0, 1)
+        by_pose = slopes.by_pose[:, :, these]
+        jacobian = by_pose.reshape(6, -1)
+        poses[free[row], :, free[row]] = jacobian @ jacobian.T
+        pose_slopes[free[row]] = jacobian @ slopes.residuals[:, these].ravel()
+        blocks = np.einsum("arn,rcn->acn", by_pose, slopes.by_point[:, :, these])
+        between[free[row]][:, :, bundle.landmark_rows[these]] = blocks
+    pulls.add_to(np.swapaxes(poses, 1, 2), pose_slopes, bundle.is_free)
     return _Normal(
         poses=poses,
-        points=points.reshape(count, 3, 3).astype(np.float64),
+        points=_point_blocks(bundle, slopes),
         between=between,
         pose_slopes=pose_slopes,
-        point_slopes=point_slopes.astype(np.float64),
+        point_slopes=_per_landmark(bundle, point_slopes),
     )
 
 
@@ -160,14 +170,15 @@ def _step(bundle: Bundle, normal: _Normal, damping: float) -> Bundle:
     """Return the bundle after one step of the damped normal equations."""
     size = 6 * len(normal.poses)
     poses = _damped(normal.poses.reshape(1, size, size), damping)[0]
-    inverses = np.linalg.inv(_damped(normal.points, damping))
-    between = normal.between.reshape(size, -1, 3)
-    eliminated = (np.swapaxes(between, 0, 1) @ inverses).swapaxes(0, 1)  # (6F, L, 3)
-    left = poses - eliminated.reshape(size, -1) @ between.reshape(size, -1).T
-    right = normal.pose_slopes.ravel() - eliminated.reshape(size, -1) @ normal.point_slopes.ravel()
+    inverses = np.moveaxis(np.linalg.inv(_damped(normal.points, damping)), 0, 2).copy()
+    between = normal.between.reshape(size, -1)
+    eliminated = np.einsum("adl,dcl->acl", between.reshape(size, 3, -1), inverses)
+    eliminated = eliminated.reshape(size, -1)
+    left = poses - eliminated @ between.T
+    right = normal.pose_slopes.ravel() - eliminated @ normal.point_slopes.ravel()
     twists = np.asarray(-np.linalg.solve(left, right), np.float64)
-    pulled = normal.point_slopes + np.tensordot(twists, between, 1)
-    moves = -np.einsum("lij,lj->li", inverses, pulled)
+    pulled = normal.point_slopes + (twists @ between).reshape(3, -1)
+    moves = -np.einsum("dcl,cl->ld", inverses, pulled)
     T_local_cam = bundle.T_local_cam.copy()
     for row, twist in zip(np.flatnonzero(bundle.is_free), twists.reshape(-1, 6), strict=True):
         T_local_cam[row] = T_local_cam[row] @ se3.exp(twist)

@@ -96,8 +96,8 @@ class KeyframeStore:
     def landmarks_of(self, keyframe_ids: Iterable[int]) -> NDArray[np.int64]:
         """Return the ids of all landmarks that these keyframes saw, rising."""
         seen = [self._keyframes[keyframe_id].landmark_ids for keyframe_id in keyframe_ids]
-        ids = np.unique(np.concatenate([*seen, np.array([NO_LANDMARK])]))
-        return np.asarray(ids[ids != NO_LANDMARK])
+        marks = self._marked(np.concatenate([*seen, np.array([NO_LANDMARK])]))
+        return np.flatnonzero(marks)
 
     def owned_landmarks(self) -> dict[int, NDArray[np.int64]]:
         """Return for every keyframe the landmarks that it saw before any other did."""

@@ -12,12 +12,12 @@ from sceneslam.types.se3 import Transform
 
 from .features import Features
 from .matching import Matches, match_anywhere, match_near
-from .pose_solver import Measurements, PoseEstimate, PoseSolver
+from .pose_solver import Consensus, Measurements, PoseEstimate, PoseSolver
 from .residuals import Sightings
 from .visual_map import VisualMap
 
 _RADIUS_REFINED_PX = 10.0
-_WIDER = 2.5  # second try of a guided search
+_WIDER = 2.5  # last try of a guided search
 _MIN_INLIER_RATIO = 0.4  # of the matches around a pose that is right
 _MIN_FOUND_RATIO = 0.1  # of the landmarks that should show: chance finds 0.05, an image 0.2
 
@@ -31,7 +31,19 @@ class Fix:
     feature_rows: NDArray[np.int64]  # (N,)
     deep_rows: NDArray[np.int64]  # those of them whose depth agrees too
     expected_ids: NDArray[np.int64]  # landmarks that the image should show
-    local_ids: NDArray[np.int64]  # the local map that they are of
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Found:
+    """Landmarks that were looked for, and the features taken for them."""
+
+    expected_ids: NDArray[np.int64]  # (M,)
+    landmark_ids: NDArray[np.int64]  # (N,)
+    feature_rows: NDArray[np.int64]  # (N,)
+    measured: Measurements  # (N,)
+
+    def __len__(self) -> int:
+        return len(self.feature_rows)
 
 
 class Localizer:
@@ -44,77 +56,99 @@ class Localizer:
         self._radius_px, self._min_inliers = radius_px, min_inliers
 
     def near(
-        self, features: Features, T_predicted: Transform, landmark_ids: NDArray[np.int64]
+        self, features: Features, T_predicted: Transform, held_ids: NDArray[np.int64]
     ) -> Fix | None:
-        """Return the pose found by looking for landmarks where a predicted pose shows them."""
+        """Return the pose found by looking for landmarks where a predicted pose shows them.
+
+        First for those that were held last; then for all that are around them, then further away.
+        """
+        found = self._look(features, T_predicted, held_ids, self._radius_px)
+        if len(found) >= self._min_inliers:
+            fix = self._confirm(features, found, self._solver.approach(found.measured, T_predicted))
+            if fix is not None:
+                return fix
+        local_ids = self._map.around(held_ids)
         for radius_px in (self._radius_px, _WIDER * self._radius_px):
-            prediction = self._map.predict(T_predicted, landmark_ids)
-            matches = match_near(
-                prediction.uv_px,
-                prediction.levels,
-                self._map.landmarks.descriptors[prediction.ids],
-                features,
-                radius_px=radius_px,
-            )
-            fix = self._solve(features, prediction.ids, matches, T_predicted)
+            found = self._look(features, T_predicted, local_ids, radius_px)
+            fix = self._search(features, found)
             if fix is not None:
                 return fix
         return None
 
+    def around(self, features: Features, held_ids: NDArray[np.int64]) -> Fix | None:
+        """Return the pose found by comparing the descriptors of all around some landmarks."""
+        return self.anywhere(features, self._map.around(held_ids))
+
     def anywhere(self, features: Features, landmark_ids: NDArray[np.int64]) -> Fix | None:
         """Return the pose found by comparing all descriptors."""
-        matches = match_anywhere(self._map.landmarks.descriptors[landmark_ids], features)
-        return self._solve(features, landmark_ids, matches, se3.identity())
-
-    def _solve(
-        self,
-        features: Features,
-        landmark_ids: NDArray[np.int64],
-        matches: Matches,
-        T_local_base: Transform,
-    ) -> Fix | None:
-        """Return the pose that the matches agree on, confirmed by the landmarks around it."""
-        if len(matches) < self._min_inliers:
-            return None
-        ids = landmark_ids[matches.landmark_rows]
-        coarse = self._solver.search(
-            self._measured(features, ids, matches.feature_rows, T_local_base)
+        matches = match_anywhere(
+            self._map.landmarks.descriptors.take(landmark_ids, axis=0), features
         )
-        if coarse is None or len(coarse.inlier_rows) < self._min_inliers:
+        return self._search(features, self._found(features, landmark_ids, matches, se3.identity()))
+
+    def _search(self, features: Features, found: _Found) -> Fix | None:
+        """Return the pose that most of the pairs agree on, confirmed by the landmarks around it."""
+        if len(found) < self._min_inliers:
             return None
-        local_ids = self._map.around(ids[coarse.inlier_rows])
-        return self._confirm(features, coarse.T_local_base, local_ids)
+        return self._confirm(features, found, self._solver.search(found.measured))
 
     def _confirm(
-        self, features: Features, T_local_base: Transform, landmark_ids: NDArray[np.int64]
+        self, features: Features, rough: _Found, consensus: Consensus | None
     ) -> Fix | None:
         """Return the final pose from all landmarks that a nearly right pose lets us find."""
-        prediction = self._map.predict(T_local_base, landmark_ids)
-        matches = match_near(
-            prediction.uv_px,
-            prediction.levels,
-            self._map.landmarks.descriptors[prediction.ids],
-            features,
-            radius_px=_RADIUS_REFINED_PX,
-        )
-        if len(matches) < self._min_inliers:
+        if consensus is None or len(consensus.inlier_rows) < self._min_inliers:
             return None
-        ids = prediction.ids[matches.landmark_rows]
-        measured = self._measured(features, ids, matches.feature_rows, T_local_base)
-        estimate = self._solver.refine(measured, T_local_base)
+        T_local_base = consensus.T_local_base
+        local_ids = self._map.around(rough.landmark_ids[consensus.inlier_rows])
+        found = self._look(features, T_local_base, local_ids, _RADIUS_REFINED_PX)
+        if len(found) < self._min_inliers:
+            return None
+        estimate = self._solver.refine(found.measured, T_local_base)
         if estimate is None:
             return None
-        count, possible = int(estimate.inliers.sum()), min(len(prediction.ids), len(features))
-        least = max(_MIN_INLIER_RATIO * len(matches), _MIN_FOUND_RATIO * possible)
+        count, possible = int(estimate.inliers.sum()), min(len(found.expected_ids), len(features))
+        least = max(_MIN_INLIER_RATIO * len(found), _MIN_FOUND_RATIO * possible)
         if count < max(self._min_inliers, least):
             return None
         return Fix(
             estimate=estimate,
-            landmark_ids=ids[estimate.inliers],
-            feature_rows=matches.feature_rows[estimate.inliers],
-            deep_rows=matches.feature_rows[estimate.depth_inliers],
-            expected_ids=prediction.ids,
-            local_ids=landmark_ids,
+            landmark_ids=found.landmark_ids[estimate.inliers],
+            feature_rows=found.feature_rows[estimate.inliers],
+            deep_rows=found.feature_rows[estimate.depth_inliers],
+            expected_ids=found.expected_ids,
+        )
+
+    def _look(
+        self,
+        features: Features,
+        T_local_base: Transform,
+        landmark_ids: NDArray[np.int64],
+        radius_px: float,
+    ) -> _Found:
+        """Return which landmarks are found where a pose shows them."""
+        prediction = self._map.predict(T_local_base, landmark_ids)
+        matches = match_near(
+            prediction.uv_px,
+            prediction.levels,
+            self._map.landmarks.descriptors.take(prediction.ids, axis=0),
+            features,
+            radius_px=radius_px,
+        )
+        return self._found(features, prediction.ids, matches, T_local_base)
+
+    def _found(
+        self,
+        features: Features,
+        expected_ids: NDArray[np.int64],
+        matches: Matches,
+        T_local_base: Transform,
+    ) -> _Found:
+        landmark_ids = expected_ids[matches.landmark_rows]
+        return _Found(
+            expected_ids=expected_ids,
+            landmark_ids=landmark_ids,
+            feature_rows=matches.feature_rows,
+            measured=self._measured(features, landmark_ids, matches.feature_rows, T_local_base),
         )
 
     def _measured(
@@ -127,7 +161,7 @@ class Localizer:
         """Return what to solve for, seen from about T_local_base, with the landmarks' own doubt."""
         doubts = self._map.doubts(T_local_base, ids)
         return Measurements(
-            points_local=self._map.landmarks.points_local[ids],
+            points_local=self._map.landmarks.points_local.take(ids, axis=0),
             seen=Sightings(
                 uv_px=features.uv_px[rows],
                 sigma_px=np.hypot(self._map.sigma_px(features.levels[rows]), doubts.across_px),

@@ -62,8 +62,9 @@ def match_pairs(
     """Return the pairs that look alike, of those given (P,): by rising row of `descriptors`."""
     if not len(rows):
         return _no_matches()
-    bits = descriptors.view(np.uint64)[rows] ^ others.view(np.uint64)[candidates]
-    distances = np.bitwise_count(bits).sum(axis=1, dtype=np.int64)
+    words = descriptors.view(np.uint64).take(rows, axis=0)
+    words ^= others.view(np.uint64).take(candidates, axis=0)
+    distances = np.einsum("ij->i", np.bitwise_count(words), dtype=np.int64)
     return _clear_winners(rows, candidates, distances, ratio)
 
 

@@ -85,7 +85,7 @@ class RgbdSlam:
         self._reunion.begin()
         self._build(None)
         self._T_local_base = se3.identity()
-        self._local_ids = np.zeros(0, np.int64)  # landmarks of the local map
+        self._held_ids = np.zeros(0, np.int64)  # landmarks that hold the newest pose
         self._observations, self._is_lost = 0, False
 
     def set_pose(self, T_map_local: Transform) -> None:
@@ -112,7 +112,7 @@ class RgbdSlam:
         view = self._look(observation, observation.image_bgr, T_predicted)
         fix = None
         if len(self._map.keyframes):
-            fix = self._search.find(view, self._local_ids, is_lost=self._is_lost)
+            fix = self._search.find(view, self._held_ids, is_lost=self._is_lost)
         if fix is not None:
             self._eye.learn(view, fix)
             answer = self._hold(view, fix)
@@ -173,7 +173,6 @@ class RgbdSlam:
         if T_new_old is not None:
             self._T_local_base = T_new_old @ self._T_local_base
             self._motion.correct(T_new_old)
-            self._local_ids = self._map.around(self._local_ids)
 
     def _is_unknown(self, view: View) -> bool:
         is_far = self._keyframe_rule.is_far(view.T_predicted, self._map.keyframes)
@@ -199,7 +198,7 @@ class RgbdSlam:
         is_reckoned = status is TrackingStatus.DEGRADED and self._motion.is_reckoned
         T_local_base = view.T_predicted if is_reckoned else fix.estimate.T_local_base
         self._hold_pose(view.observation, T_local_base)
-        self._local_ids = fix.local_ids
+        self._held_ids = fix.landmark_ids
         self._map.count_sightings(fix.expected_ids, fix.landmark_ids)
         segment = self._memory.segment(fix.landmark_ids)
         wanted = self._keyframe_rule.wants(T_local_base, fix, self._map.keyframes, segment)
@@ -263,4 +262,4 @@ class RgbdSlam:
         self._memory.insert(fix, view.depth_m, guessed_s=guessed_s)
         self._mapping.insert(keyframe_id, view)
         self._keyframe_rule.restart()
-        self._local_ids = self._map.around(keyframe.landmark_ids)
+        self._held_ids = landmark_ids[landmark_ids != NO_LANDMARK]

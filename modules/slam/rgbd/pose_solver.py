@@ -1,7 +1,8 @@
-"""The camera's pose from matched landmarks: PnP against outliers, then Gauss-Newton."""
+"""The camera's pose from matched landmarks: Gauss-Newton, and PnP where nothing is known."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -17,7 +18,8 @@ from .residuals import Errors, Sightings, errors
 _RANSAC_PX = 4.0
 _RANSAC_TRIALS = 200
 _RANSAC_CONFIDENCE = 0.999
-_ROUNDS = (4, 3, 2)  # Gauss-Newton steps between two looks at who is an outlier
+_APPROACH = (2, 2)  # Gauss-Newton steps between two looks at who is an outlier
+_REFINEMENT = (2, 1, 1)
 _SMALL_STEP = 1e-4  # [m] and [rad]
 _MAX_CONDITION = 1e12  # of the normal matrix; beyond, some motion is not measured at all
 
@@ -43,7 +45,7 @@ class Linearised:
     """The pixels that agree with a pose, and what moves they would follow."""
 
     residuals: NDArray[np.float64]  # (2 N,) in sigmas, all u before all v
-    jacobian: NDArray[np.float64]  # (6, 2 N), by a twist of the base
+    jacobian: NDArray[np.float64]  # (6, 2 N), by a twist of the camera
     sigma_px: NDArray[np.float64]  # (N,)
 
 
@@ -57,6 +59,17 @@ class PoseEstimate:
     depth_inliers: NDArray[np.bool_]  # (N,), depths agree too
     depth_agreement_ratio: float  # of the inliers that have a depth; 1 where none has
     linearised: Linearised  # of the inliers
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Descent:
+    """Where Gauss-Newton has come to, and who agrees with it."""
+
+    T_local_cam: Transform
+    errors: Errors
+    normal: NDArray[np.float64]  # (6, 6), of the last step's twist of the camera
+    inliers: NDArray[np.bool_]  # (N,), pixels agree
+    depth_inliers: NDArray[np.bool_]  # (N,), depths agree too
 
 
 class PoseSolver:
@@ -90,63 +103,83 @@ class PoseSolver:
             inlier_rows=inlier_rows.ravel().astype(np.int64),
         )
 
+    def approach(self, measured: Measurements, T_local_base: Transform) -> Consensus | None:
+        """Return a rough pose beside a predicted one, None where the pixels agree on none."""
+        end = self._descend(measured, T_local_base, _APPROACH)
+        if end is None:
+            return None
+        return Consensus(
+            T_local_base=end.T_local_cam @ self._T_cam_base,
+            inlier_rows=np.flatnonzero(end.inliers),
+        )
+
     def refine(self, measured: Measurements, T_local_base: Transform) -> PoseEstimate | None:
         """Return the pose that minimises pixel and inverse-depth errors, None if it has none.
 
-        The motion is a twist of the base, T_local_base @ exp(xi), so that the inverse of the
-        normal matrix is the covariance in base. Residuals as in stereo bundle adjustment: a
-        depth camera's disparity error is constant, so its depth error grows with the square.
+        Its covariance is of a twist of the base, T_local_base @ exp(xi). Residuals as in stereo
+        bundle adjustment: a depth camera's disparity error is constant, so its depth error grows
+        with the square.
         """
-        measures_depth = measured.seen.measures_depth
-        inliers, depth_inliers = np.ones(len(measures_depth), bool), measures_depth
-        for steps in _ROUNDS:
-            for _ in range(steps):
-                found, jacobian = self._linearise(measured, T_local_base)
-                weights = found.huber_weights() * np.stack([inliers, inliers, depth_inliers])
-                weighted = (jacobian * weights).reshape(6, -1)
-                normal = np.einsum("ia,ja->ij", weighted, jacobian.reshape(6, -1))
-                if not np.isfinite(normal).all() or np.linalg.cond(normal) > _MAX_CONDITION:
-                    return None
-                step = -np.linalg.solve(normal, weighted @ found.of.ravel())
-                T_local_base = T_local_base @ se3.exp(step)
-                if np.abs(step).max() < _SMALL_STEP:
-                    break
-            found, jacobian = self._linearise(measured, T_local_base)
-            inliers = found.pixels_agree()
-            depth_inliers = inliers & measures_depth & found.depths_agree()
-            if inliers.sum() < 4:
-                return None
+        end = self._descend(measured, T_local_base, _REFINEMENT)
+        if end is None:
+            return None
+        inliers, residuals = end.inliers, end.errors.of[:2, end.inliers].ravel()
         # Where the errors are larger than their sigmas say, so is the covariance.
-        pixel_variance = float((found.of[:2, inliers] ** 2).sum() / (2 * inliers.sum() - 6))
-        covariance = np.linalg.inv(normal) * max(1.0, pixel_variance)
+        pixel_variance = float(residuals @ residuals) / (len(residuals) - 6)
+        carry = se3.adjoint(self._camera.T_base_cam)
+        covariance = carry @ np.linalg.inv(end.normal) @ carry.T * max(1.0, pixel_variance)
         return PoseEstimate(
-            T_local_base=_orthonormal(T_local_base),
+            T_local_base=_orthonormal(end.T_local_cam @ self._T_cam_base),
             covariance=0.5 * (covariance + covariance.T),
             inliers=inliers,
-            depth_inliers=depth_inliers,
-            depth_agreement_ratio=_share(depth_inliers, inliers & measures_depth),
+            depth_inliers=end.depth_inliers,
+            depth_agreement_ratio=_share(end.depth_inliers, inliers & measured.seen.measures_depth),
             linearised=Linearised(
-                residuals=found.of[:2, inliers].ravel(),
-                jacobian=jacobian[:, :2, inliers].reshape(6, -1),
+                residuals=residuals,
+                jacobian=end.errors.by_twist()[:, :2, inliers].reshape(6, -1),
                 sigma_px=measured.seen.sigma_px[inliers],
             ),
         )
 
-    def _linearise(
-        self, measured: Measurements, T_local_base: Transform
-    ) -> tuple[Errors, NDArray[np.float64]]:
-        """Return the errors, and their Jacobian (6, 3, N) by a twist of the base."""
-        points_base = se3.apply(se3.inverse(T_local_base), measured.points_local)
-        points_cam = np.asarray(se3.apply(self._T_cam_base, points_base), np.float64)
-        found = errors(self._camera, points_cam, measured.seen)
-        jacobian = np.empty((6, 3, len(points_cam)))
-        jacobian[:3] = -np.einsum("kjn,ji->ikn", found.by_point, self._T_cam_base[:3, :3])
-        p, move = points_base.T, jacobian[:3]
-        # A turn phi of the base moves the point by points_base x phi.
-        jacobian[3] = p[1] * move[2] - p[2] * move[1]
-        jacobian[4] = p[2] * move[0] - p[0] * move[2]
-        jacobian[5] = p[0] * move[1] - p[1] * move[0]
-        return found, jacobian
+    def _descend(
+        self, measured: Measurements, T_local_base: Transform, rounds: Sequence[int]
+    ) -> _Descent | None:
+        T_local_cam = T_local_base @ self._camera.T_base_cam
+        found = self._errors(T_local_cam, measured)
+        measures_depth = measured.seen.measures_depth
+        inliers, depth_inliers = np.ones(len(measures_depth), bool), measures_depth
+        for steps in rounds:
+            use = np.stack([inliers, inliers, depth_inliers])
+            for _ in range(steps):
+                jacobian = found.by_twist()
+                weighted = (jacobian * (found.huber_weights() * use)).reshape(6, -1)
+                normal = weighted @ jacobian.reshape(6, -1).T
+                if not np.isfinite(normal).all():
+                    return None
+                squares, axes = np.linalg.eigh(normal)
+                if squares[0] * _MAX_CONDITION < squares[-1]:
+                    return None
+                step = -(axes / squares) @ (axes.T @ (weighted @ found.of.ravel()))
+                T_local_cam = T_local_cam @ se3.exp(step)
+                found = self._errors(T_local_cam, measured)
+                if np.abs(step).max() < _SMALL_STEP:
+                    break
+            inliers = found.pixels_agree()
+            depth_inliers = inliers & measures_depth & found.depths_agree()
+            if inliers.sum() < 4:
+                return None
+        return _Descent(
+            T_local_cam=T_local_cam,
+            errors=found,
+            normal=normal,
+            inliers=inliers,
+            depth_inliers=depth_inliers,
+        )
+
+    def _errors(self, T_local_cam: Transform, measured: Measurements) -> Errors:
+        T_cam_local = se3.inverse(T_local_cam)
+        points_cam = T_cam_local[:3, :3] @ measured.points_local.T + T_cam_local[:3, 3:]
+        return errors(self._camera, points_cam, measured.seen)
 
 
 def _share(chosen: NDArray[np.bool_], of: NDArray[np.bool_]) -> float:

@@ -37,12 +37,24 @@ class Errors:
     A depth camera's disparity error is constant, so its depth error grows with the square.
     """
 
+    points_cam: NDArray[np.float64]  # (3, N) [m]
     of: NDArray[np.float64]  # (3, N), of u, v and 1/z
     by_point: NDArray[np.float64]  # (3, 3, N): residual, component of the point in cam
 
+    def by_twist(self) -> NDArray[np.float64]:
+        """Return the slopes (6, 3, N) by a twist of the camera."""
+        slopes = np.empty((6, *self.of.shape))
+        slopes[:3] = -np.swapaxes(self.by_point, 0, 1)
+        p, move = self.points_cam, slopes[:3]
+        # A turn phi of the camera moves the point by points_cam x phi.
+        slopes[3] = p[1] * move[2] - p[2] * move[1]
+        slopes[4] = p[2] * move[0] - p[0] * move[2]
+        slopes[5] = p[0] * move[1] - p[1] * move[0]
+        return slopes
+
     def huber_weights(self) -> NDArray[np.float64]:
         """Return weights (3, N); u and v share one, by their joint length."""
-        pixel = np.hypot(self.of[0], self.of[1])
+        pixel = np.sqrt(self.of[0] ** 2 + self.of[1] ** 2)
         sizes = np.stack([pixel, pixel, np.abs(self.of[2])])
         return np.asarray(_HUBER / np.maximum(sizes, _HUBER))
 
@@ -56,9 +68,9 @@ class Errors:
 
 
 def errors(camera: Camera, points_cam: NDArray[np.float64], seen: Sightings) -> Errors:
-    """Return the errors of landmarks (N, 3) [m] in the camera, and their slopes."""
-    inverse_z = 1.0 / np.maximum(points_cam[:, 2], _MIN_DEPTH_M)
-    x, y = points_cam[:, 0] * inverse_z, points_cam[:, 1] * inverse_z
+    """Return the errors of landmarks (3, N) [m] in the camera, and their slopes."""
+    inverse_z = 1.0 / np.maximum(points_cam[2], _MIN_DEPTH_M)
+    x, y = points_cam[0] * inverse_z, points_cam[1] * inverse_z
     per_px = 1.0 / seen.sigma_px
     per_m = seen.measures_depth / seen.inverse_depth_sigma_per_m
     depth_m = np.where(seen.measures_depth, seen.depth_m, 1.0)
@@ -74,4 +86,4 @@ def errors(camera: Camera, points_cam: NDArray[np.float64], seen: Sightings) -> 
     by_point[1, 1] = dv = camera.fy * per_px * inverse_z
     by_point[0, 2], by_point[1, 2] = -du * x, -dv * y
     by_point[2, 2] = -(inverse_z**2) * per_m
-    return Errors(of=of, by_point=by_point)
+    return Errors(points_cam=points_cam, of=of, by_point=by_point)

@@ -16,9 +16,9 @@ class Search:
     def __init__(self, localizer: Localizer, relocalizer: Relocalizer) -> None:
         self._localizer, self._relocalizer = localizer, relocalizer
 
-    def find(self, view: View, local_ids: NDArray[np.int64], *, is_lost: bool) -> Fix | None:
-        """Return the pose of a view; the landmarks around the last pose are worth less if lost."""
-        fix = self._localizer.near(view.features, view.T_predicted, local_ids)
+    def find(self, view: View, held_ids: NDArray[np.int64], *, is_lost: bool) -> Fix | None:
+        """Return the pose of a view; the what was held last is worth less if lost."""
+        fix = self._localizer.near(view.features, view.T_predicted, held_ids)
         if fix is None and not is_lost:
-            fix = self._localizer.anywhere(view.features, local_ids)
+            fix = self._localizer.around(view.features, held_ids)
         return fix or self._relocalizer.find(view.features, view.depth_m)

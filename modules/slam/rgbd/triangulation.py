@@ -132,7 +132,7 @@ def _intersect(visual_map: VisualMap, new: _Eye, other: _Eye, matches: Matches) 
         for eye, rows in pairs:
             points_cam = points @ eye.T_cam_local[:3, :3].T + eye.T_cam_local[:3, 3]
             seen = _sightings(visual_map, eye, rows)
-            found = errors(visual_map.camera, points_cam, seen)
+            found = errors(visual_map.camera, points_cam.T, seen)
             by_point = np.moveaxis(found.by_point, 2, 0) @ eye.T_cam_local[:3, :3]
             information += np.swapaxes(by_point, 1, 2) @ by_point
             slopes += np.einsum("nri,rn->ni", by_point, found.of)

@@ -77,14 +77,14 @@ class VisualMap:
     def doubts(self, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> Doubts:
         """Return the landmarks' own uncertainty as the camera sees it from a pose."""
         T_cam_local = se3.inverse(T_local_base @ self.camera.T_base_cam)
-        points_cam = se3.apply(T_cam_local, self.landmarks.points_local[landmark_ids])
+        points_cam = se3.apply(T_cam_local, self.landmarks.points_local.take(landmark_ids, axis=0))
         z = np.maximum(points_cam[:, 2], _NEAREST_M)
         # Moves of a landmark: across the ray (two ways) and along the optical axis.
         rows = np.zeros((len(z), 3, 3))
         rows[:, 0, 0] = rows[:, 1, 1] = rows[:, 2, 2] = 1.0
         rows[:, :2, 2] = -points_cam[:, :2] / z[:, None]
         rows = rows @ T_cam_local[:3, :3]
-        covariance = self.landmarks.covariance[landmark_ids]
+        covariance = self.landmarks.covariance.take(landmark_ids, axis=0)
         variances = ((rows @ covariance) * rows).sum(axis=2)
         across_m = np.sqrt(0.5 * variances[:, :2].sum(axis=1))
         return Doubts(
@@ -100,13 +100,15 @@ class VisualMap:
         """Return which of these landmarks the image should show from a pose, and where."""
         camera = self.camera
         T_local_cam = T_local_base @ camera.T_base_cam
-        points_local = self.landmarks.points_local[landmark_ids]
+        points_local = self.landmarks.points_local.take(landmark_ids, axis=0)
         points_cam = se3.apply(se3.inverse(T_local_cam), points_local)
         z = np.maximum(points_cam[:, 2], _NEAREST_M)
         uv_px = points_cam[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         to_viewer = T_local_cam[:3, 3] - points_local
         distance_m = np.maximum(np.linalg.norm(to_viewer, axis=1), _NEAREST_M)
-        cos_view = (to_viewer * self.landmarks.normals_local[landmark_ids]).sum(1) / distance_m
+        cos_view = (to_viewer * self.landmarks.normals_local.take(landmark_ids, axis=0)).sum(
+            1
+        ) / distance_m
         levels = np.log(self.landmarks.reach_m[landmark_ids] / distance_m) / np.log(SCALE)
         visible = (points_cam[:, 2] > _NEAREST_M) & (cos_view > _MIN_COS_VIEW)
         visible &= ((uv_px >= 0) & (uv_px <= camera.size_wh)).all(axis=1)
