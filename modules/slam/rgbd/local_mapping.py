@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
+from concurrent.futures import Future
 
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
 from .alignment import Alignment
-from .alignment_search import AlignmentSearch, Shown, pair_of
-from .bundle import Adjusted, adjust
-from .ties import DepthTies, Tie, Ties
+from .alignment_search import Shown
+from .mapping_work import MappingWork, Outcome, Task
+from .side_process import SideProcess
 from .view import View
 from .visual_map import VisualMap
 from .window import Window, merge_window, take_window
@@ -36,22 +34,17 @@ class LocalMapping:
         *,
         alignment: Alignment | None,
     ) -> None:
-        self._camera, self._map = visual_map.camera, visual_map
-        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="rgbd-mapping")
+        self._map, self._depth_camera, self._known = visual_map, depth_camera, alignment
+        self._worker: SideProcess[Task, Outcome] | None = None
         self._window: Window | None = None
-        self._result: Future[Adjusted] | None = None
+        self._result: Future[Outcome] | None = None
         self._images_left, self._newest = _FREE_IMAGES, -1
         self._fresh: dict[int, Shown] = {}  # keyframes that the worker has not seen yet
-        T_depth_cam = (alignment or Alignment()).T_depth_color
-        self._depth_ties = DepthTies(depth_camera, T_depth_cam)  # the worker's own
-        self._search = AlignmentSearch(depth_camera, is_over=alignment is not None)  # its too
-        self._searched: dict[int, Shown] = {}  # its too
-        self._found: Alignment | None = None  # by the worker; told at a merge, a fixed image
         self.alignment: Alignment | None = None  # where it was found not to be what was taken
-        self._ties: dict[tuple[int, int], Tie] = {}  # by keyframe ids; the worker's own
 
     def insert(self, keyframe_id: int, view: View) -> None:
         """Take what a new keyframe shows; without depth it is tied to none."""
+        self._process()
         if view.depth_m is not None:
             self._fresh[keyframe_id] = Shown(features=view.features, depth_m=view.depth_m)
 
@@ -72,50 +65,34 @@ class LocalMapping:
             if self._window is not None:
                 fresh, self._fresh = self._fresh, {}
                 self._images_left = _TIED_IMAGES if fresh else _FREE_IMAGES
-                self._result = self._worker.submit(self._adjust, self._window, fresh)
+                self._result = self._process().submit(
+                    Task(
+                        bundle=self._window.bundle,
+                        keyframe_ids=self._window.keyframe_ids,
+                        free_ids=self._window.free_ids,
+                        fresh=fresh,
+                    )
+                )
         return T_new_old
 
     def shutdown(self) -> None:
         """End the worker; what it was at is not merged."""
-        self._worker.shutdown(wait=True, cancel_futures=True)
-
-    def _adjust(self, window: Window, fresh: Mapping[int, Shown]) -> Adjusted:
-        """Return the window adjusted; runs in the worker."""
-        for keyframe_id, shown in fresh.items():
-            self._depth_ties.look(keyframe_id, shown.depth_m)
-            if not self._search.is_over:
-                self._searched[keyframe_id] = shown
-        poses = dict(zip(window.keyframe_ids, window.bundle.T_local_cam, strict=True))
-        for other in sorted(fresh.keys() & poses.keys()):
-            for one in window.free_ids:
-                if one < other:
-                    T_one_other = se3.inverse(poses[one]) @ poses[other]
-                    tie = self._depth_ties.tie(one, other, T_one_other)
-                    if tie is not None:
-                        self._ties[one, other] = tie
-                        self._compare(one, other, tie)
-        rows = {keyframe_id: row for row, keyframe_id in enumerate(window.keyframe_ids)}
-        ties = {
-            (rows[one], rows[other]): tie
-            for (one, other), tie in self._ties.items()
-            if one in rows and other in rows
-        }
-        return adjust(self._camera, replace(window.bundle, ties=Ties.of(ties)))
-
-    def _compare(self, one: int, other: int, tie: Tie) -> None:
-        """Ask the colours of two keyframes whether they are the depth camera's."""
-        if one in self._searched and other in self._searched:
-            here, there = self._searched[one], self._searched[other]
-            found = self._search.add(pair_of(here, there, se3.inverse(tie.T_one_other)))
-            self._found = found or self._found
-        if self._search.is_over:
-            self._searched.clear()
+        if self._worker is not None:
+            self._worker.end()
 
     def _merge(self) -> Transform:
         window, result = self._window, self._result
         self._window = self._result = None
         if window is None or result is None:
             return se3.identity()
-        adjusted = result.result()
-        self.alignment = self._found
-        return merge_window(self._map, window, adjusted)
+        outcome = result.result()
+        self.alignment = outcome.alignment
+        return merge_window(self._map, window, outcome.adjusted)
+
+    def _process(self) -> SideProcess[Task, Outcome]:
+        """Return the worker; it starts with the first keyframe, to be there when it is needed."""
+        if self._worker is None:
+            self._worker = SideProcess(
+                MappingWork, self._map.camera, self._depth_camera, self._known
+            )
+        return self._worker

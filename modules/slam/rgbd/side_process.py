@@ -1,0 +1,91 @@
+"""A process that works beside the tracking: many small NumPy calls would hold its thread up."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import IO, Any, Generic, TypeVar
+from weakref import finalize
+
+from sceneslam.types.errors import ModuleError
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
+
+
+class SideProcess(Generic[Task, Result]):
+    """Does tasks one after the other, by what is built in the process; it keeps its state there.
+
+    Not by multiprocessing, which runs the caller's main module anew. The process ends with this
+    object, and with its parent, however that ends: its input is closed then.
+    """
+
+    def __init__(self, build: Callable[..., Callable[[Task], Result]], *arguments: object) -> None:
+        """Start the process; do not wait until it is there."""
+        main = f"import sys; sys.path[:] = sys.argv[1:]; from {__name__} import main; main()"
+        popen = subprocess.Popen(
+            [sys.executable, "-P", "-c", main, *sys.path],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=os.environ | _ONE_THREAD,
+            start_new_session=True,  # a terminal's Ctrl-C is the parent's to handle
+        )
+        line = ThreadPoolExecutor(max_workers=1, thread_name_prefix="rgbd-mapping")
+        line.submit(_send, popen.stdin, (build, arguments))
+        self._popen, self._line = popen, line
+        self._end = finalize(self, _end, popen, line)
+
+    def submit(self, task: Task) -> Future[Result]:
+        """Return at once; the future raises ModuleError where the process is no more."""
+        return self._line.submit(_ask, self._popen, task)
+
+    def end(self) -> None:
+        """End the process, whatever it is at; may be called twice."""
+        self._end()
+
+
+def main() -> None:
+    """Do what standard input asks for until it is closed; answers go to standard output."""
+    output = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever a library prints
+    build, arguments = pickle.load(sys.stdin.buffer)
+    work = build(*arguments)
+    while True:
+        try:
+            task = pickle.load(sys.stdin.buffer)
+        except EOFError:
+            return
+        _send(output, work(task))
+
+
+def _ask(popen: subprocess.Popen[bytes], task: Any) -> Any:
+    assert popen.stdout is not None
+    try:
+        _send(popen.stdin, task)
+        return pickle.load(popen.stdout)
+    except (OSError, EOFError, pickle.UnpicklingError) as error:
+        raise ModuleError("rgbd: the process that adjusts its map has ended") from error
+
+
+def _send(stream: IO[bytes] | None, value: Any) -> None:
+    assert stream is not None
+    pickle.dump(value, stream, protocol=5)
+    stream.flush()
+
+
+def _end(popen: subprocess.Popen[bytes], line: ThreadPoolExecutor) -> None:
+    """Kill the process, and leave no zombie, thread or open pipe."""
+    popen.kill()
+    line.shutdown(wait=True, cancel_futures=True)
+    popen.wait()
+    for stream in (popen.stdin, popen.stdout):
+        assert stream is not None
+        try:
+            stream.close()
+        except BrokenPipeError:  # what had not been sent
+            continue
