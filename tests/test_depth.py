@@ -145,6 +145,13 @@ def test_turning_round_once_closes_and_the_past_is_revised():
     assert np.linalg.norm(revised.positions_m - truth[:, :3, 3], axis=1).max() < 0.015
 
 
+def test_rounding_does_not_grow_from_keyframe_to_keyframe():
+    slam, poses = active(), [se3.from_xy_yaw(0.0, 0.0, 0.2 * k) for k in range(63)]
+    for tracking in track(slam, ROOM, poses):  # twice round: many keyframes, moved many times
+        rotation = tracking.T_local_base[:3, :3]
+        assert np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-12
+
+
 def test_standing_still_needs_no_more_memory():
     module = active()
     track(module, ROOM, [se3.identity()] * 20)

@@ -31,6 +31,15 @@ def test_log_undoes_exp_near_identity(xi):
     np.testing.assert_allclose(se3.log(se3.exp(xi)), xi, atol=1e-12)
 
 
+@given(twists, tiny)
+def test_rounding_is_taken_out_of_a_rotation(T_a_b, off):
+    rough = T_a_b.copy()
+    rough[:3, :3] @= np.eye(3) + np.diag(off[:3])
+    found = se3.orthonormal(rough)
+    np.testing.assert_allclose(se3.inverse(found) @ found, np.eye(4), atol=1e-14)
+    np.testing.assert_allclose(found, T_a_b, atol=1e-6)
+
+
 @given(twists)
 def test_quaternion_and_its_negative_are_one_rotation(T_a_b):
     quat_xyzw = se3.to_quat_xyzw(T_a_b)

@@ -175,6 +175,11 @@ def to_quat_xyzw(T_a_b: Transform) -> NDArray[np.float64]:
     return np.asarray(np.where(quat[..., 3:] < 0, -quat, quat))
 
 
+def orthonormal(T_a_b: Transform) -> Transform:
+    """Return the transform without the rounding that many products leave in its rotation."""
+    return from_quat_xyzw(T_a_b[..., :3, 3], to_quat_xyzw(T_a_b))
+
+
 def _left_jacobian(phi: NDArray[np.float64]) -> NDArray[np.float64]:
     angle = np.maximum(np.linalg.norm(phi, axis=-1), _SMALLEST_RAD)[..., None, None]
     k = hat(phi)

@@ -26,9 +26,12 @@ class Keyframe:
         self.move(T_local_cam)
 
     def move(self, T_local_cam: se3.Transform) -> None:
-        """Put the view elsewhere."""
-        self.T_local_cam = T_local_cam
-        self.T_cam_local = se3.inverse(T_local_cam)
+        """Put the view elsewhere, where both directions undo each other.
+
+        Poses lead from keyframe to keyframe: rounding that one keeps is multiplied by every next.
+        """
+        self.T_local_cam = se3.orthonormal(T_local_cam)
+        self.T_cam_local = se3.inverse(self.T_local_cam)
 
     def fuse(self, surface: Surface, T_local_cam: se3.Transform, grid: Grid) -> None:
         """Average what the surface at T_local_cam shows of this view into it, per cell.

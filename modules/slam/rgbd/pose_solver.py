@@ -129,7 +129,7 @@ class PoseSolver:
         carry = se3.adjoint(self._camera.T_base_cam)
         covariance = carry @ np.linalg.inv(end.normal) @ carry.T * max(1.0, pixel_variance)
         return PoseEstimate(
-            T_local_base=_orthonormal(end.T_local_cam @ self._T_cam_base),
+            T_local_base=se3.orthonormal(end.T_local_cam @ self._T_cam_base),
             covariance=0.5 * (covariance + covariance.T),
             inliers=inliers,
             depth_inliers=end.depth_inliers,
@@ -184,8 +184,3 @@ class PoseSolver:
 
 def _share(chosen: NDArray[np.bool_], of: NDArray[np.bool_]) -> float:
     return float(chosen.sum() / of.sum()) if of.any() else 1.0
-
-
-def _orthonormal(T_a_b: Transform) -> Transform:
-    """Return the transform without the rounding that many products leave in its rotation."""
-    return se3.from_quat_xyzw(T_a_b[:3, 3], se3.to_quat_xyzw(T_a_b))
