@@ -98,8 +98,9 @@ def test_a_detector_that_fails_is_stopped_and_its_last_scene_stays(tmp_path, how
         ("image_grows", 100, ""),
         ("image_is_grey", 100, ""),
         ("image_is_float", 100, ""),
-        ("odometry_is_sheared", 100, ""),
-        ("odometry_is_far", 100, ""),
+        ("odometry_is_sheared", 100, "odometry that is no pose: 50 times"),
+        ("odometry_is_far", 100, "odometry that is no pose: 50 times"),
+        ("odometry_is_reset", 100, "odometry that jumps: 1 time"),
         ("odometry_is_infinite", 100, "odometry that is not finite: 50 times"),
     ],
 )

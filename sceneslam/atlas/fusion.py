@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 
 import cv2
@@ -13,7 +14,9 @@ from sceneslam.types import se3
 from sceneslam.types.maps import GridLayer, HybridMap, MapLayers, PointLayer
 from sceneslam.types.se3 import Transform
 
+_log = logging.getLogger(__name__)
 _GREY = 160  # colour of points that no camera saw
+_CELLS_MAX = 10**8  # 500 m x 500 m at 5 cm: 400 MB while it is made
 _LOG_ODDS_LIMIT = 10.0  # a cell stays open to change, however many sessions agree on it
 
 Placed = tuple[str, Transform, MapLayers]  # module, T_map_local, its layers in `local`
@@ -80,6 +83,9 @@ def _fuse_grids(placed: Sequence[tuple[Transform, GridLayer]]) -> GridLayer | No
     low = np.floor(corners.min(axis=0) / resolution_m).astype(int)
     columns, rows = np.ceil(corners.max(axis=0) / resolution_m).astype(int) - low
     origin_xy_m = (float(low[0] * resolution_m), float(low[1] * resolution_m))
+    if rows * columns > _CELLS_MAX:
+        _log.warning("the grids lie too far apart for one: it would have %d x %d", columns, rows)
+        return None
     total = np.zeros((rows, columns), np.float32)
     for T_map_local, grid in placed:
         total += _resample(T_map_local, grid, origin_xy_m, resolution_m, (columns, rows))

@@ -10,13 +10,17 @@ import numpy as np
 from sceneslam.ros.pixels import locked
 from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.types.observation import Observation
+from sceneslam.types.se3 import Transform
+
+_FAR_M = 1e8  # more than twice around the Earth
+_SKEW_MAX = 1e-3  # of R^T R off the identity; the rounding of float32 is a thousandth of that
 
 
 def cleaned(observation: Observation, log: FaultLog) -> Observation:
     """Return the observation with finite arrays; the same object when there is nothing to mend.
 
-    Depth that is not finite is missing (REP-118), which is a value. Empty images, and points, gyro
-    samples and odometry that are not finite, are left out and told to `log`.
+    Depth that is not finite is missing (REP-118), which is a value. Empty images, points and gyro
+    samples that are not finite, and odometry that is no pose, are left out and told to `log`.
     """
     changes = {
         **_pictures(observation, log),
@@ -62,9 +66,21 @@ def _motion(observation: Observation, log: FaultLog) -> Mapping[str, object]:
     if T_odom_base is not None and not np.isfinite(T_odom_base).all():
         log.add("odometry that is not finite", at_stamp(observation.stamp_ns))
         changes["T_odom_base"] = None
+    elif T_odom_base is not None and not _is_pose(T_odom_base):
+        log.add("odometry that is no pose", at_stamp(observation.stamp_ns))
+        changes["T_odom_base"] = None
     if gyro_base is not None and not np.isfinite(gyro_base).all():
         is_good = np.isfinite(gyro_base).all(axis=1)
         bad = int(np.count_nonzero(~is_good))
         log.add("gyro sample that is not finite", at_stamp(observation.stamp_ns), bad)
         changes["gyro_base"] = locked(gyro_base[is_good]) if is_good.any() else None
     return changes
+
+
+def _is_pose(T_odom_base: Transform) -> bool:
+    """Tell whether this is a rigid transform to a place on Earth."""
+    if T_odom_base.shape != (4, 4) or np.abs(T_odom_base[:3, 3]).max() > _FAR_M:
+        return False
+    rotation = T_odom_base[:3, :3]
+    skew = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    return bool(skew <= _SKEW_MAX and np.linalg.det(rotation) > 0)

@@ -1,4 +1,4 @@
-"""Any source, with the promises of a source kept: stamps rise, arrays hold numbers."""
+"""Any source, with its promises kept: stamps rise, arrays hold numbers, odometry is smooth."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 from sceneslam.interfaces import Source
 from sceneslam.sources.clean import cleaned
 from sceneslam.sources.faults import FaultLog, at_stamp
+from sceneslam.sources.odometer import Odometer
 from sceneslam.sources.wrapped import Wrapped
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
@@ -20,6 +21,8 @@ _PERIODS = 4  # one or two frames lost in a row are common
 
 class Ordered(Wrapped):
     """Leaves out observations whose stamps repeat or run backwards, and values that are NaN.
+
+    Odometry that was reset goes on from where it was.
 
     A single stamp ahead of its neighbours, by more than a few of the source's own periods, is left
     out too, rather than all that follow it. A gap longer than `max_gap_s` is reported.
@@ -40,6 +43,7 @@ class Ordered(Wrapped):
     def __iter__(self) -> Iterator[Observation]:
         """Yield the source's observations by rising stamp."""
         self._log.clear()
+        self._odometer = Odometer()
         last_ns: int | None = None
         period_ns = self._max_gap_ns // _PERIODS  # the longest of late
         held: Observation | None = None  # after a jump: it may be the jump that is wrong
@@ -52,7 +56,7 @@ class Ordered(Wrapped):
                 else:
                     self._note_gap(last_ns, held.stamp_ns)
                     last_ns = held.stamp_ns
-                    yield cleaned(held, self._log)
+                    yield self._mended(held)
                 held = None
             if last_ns is not None and stamp_ns <= last_ns:
                 self._skip(observation)
@@ -61,14 +65,17 @@ class Ordered(Wrapped):
             else:
                 period_ns = max(stamp_ns - last_ns, period_ns // 2)
                 last_ns = stamp_ns
-                yield cleaned(observation, self._log)
+                yield self._mended(observation)
         if held is not None:
             self._note_gap(last_ns, held.stamp_ns)
-            yield cleaned(held, self._log)
+            yield self._mended(held)
 
     def ground_truth(self) -> GroundTruth | None:
         """Return the source's ground truth."""
         return self._source.ground_truth()
+
+    def _mended(self, observation: Observation) -> Observation:
+        return self._odometer.smooth(cleaned(observation, self._log), self._log)
 
     def _is_stamped(self, observation: object) -> bool:
         """Tell whether this is an observation with a stamp that a recording can hold."""
