@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from html.parser import HTMLParser
 
 import numpy as np
@@ -11,10 +12,11 @@ import pyarrow.parquet
 import pytest
 
 from sceneslam.collect.__main__ import main
-from sceneslam.collect.chart import Point, front
+from sceneslam.collect.chart import Line, Point, draw_lines, front
+from sceneslam.collect.curves import charts
 from sceneslam.collect.flatten import flat
-from sceneslam.collect.rows import read_rows
-from sceneslam.collect.summary import mean_of, student_t
+from sceneslam.collect.rows import Row, read_rows
+from sceneslam.collect.summary import groups_of, mean_of, student_t
 from sceneslam.sweep.status import State, Status
 
 SWITCH = {"confirm_delay_s": 2.0, "gap_s": 0.0, "jump_m": 0.1, "jump_rad": None, "cost_ms": 3.0}
@@ -174,3 +176,20 @@ def test_page_escapes_what_it_is_given(tmp_path):
     main([str(tmp_path)])
     text = (tmp_path / "index.html").read_text()
     assert "&lt;script&gt;" in text and text.count("<script>") == 1
+
+
+def test_long_numbers_leave_room_for_the_name_of_their_axis():
+    points = [Point(x=80.0, y=0.0012), Point(x=90.0, y=0.0038)]
+    drawn = draw_lines([Line(name="one", color="red", points=points)], x_label="x", y_label="y")
+    ends_at = float(re.search(r'<text x="([\d.]+)" [^>]*>0.001</text>', drawn)[1])
+    assert ends_at - 9 * len("0.001") >= 20  # a digit is about 9 px, the name ends at 20
+
+
+def test_no_front_is_drawn_where_nothing_false_was_seen():
+    metrics = [{"detection.delay_s": delay_s, "detection.false": 0.0} for delay_s in (1.0, 2.0)]
+    rows = [
+        Row(name=str(k), status="done", keys={"key": float(k)}, metrics=one)
+        for k, one in enumerate(metrics)
+    ]
+    told = " ".join(charts(groups_of(rows)))
+    assert "Every setting" not in told and "Detection delay" in told

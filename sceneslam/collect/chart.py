@@ -11,7 +11,8 @@ from sceneslam.evaluation.figure_style import PALETTE
 
 _WIDTH, _HEIGHT = 480, 280
 _DOTS_MAX = 30  # of a line; more would hide it
-_LEFT, _RIGHT, _TOP, _BOTTOM = 64, 16, 14, 46  # of the axes [px]
+_RIGHT, _TOP, _BOTTOM = 16, 14, 46  # of the axes [px]
+_NAME, _DIGIT = 36, 9.5  # left of the axes: the name of y, and every digit of its numbers [px]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,9 +80,10 @@ class _Axes:
         highs = [point.y + (point.half_width or 0.0) for point in points]
         self._xs = _ticks(min(p.x for p in points), max(p.x for p in points))
         self._ys = _ticks(min(0.0, min(p.y for p in points)), max(highs))
+        self._left = _NAME + _DIGIT * max(len(f"{value:g}") for value in self._ys)
 
     def x(self, value: float) -> float:
-        return _LEFT + _share(value, self._xs) * (_WIDTH - _LEFT - _RIGHT)
+        return self._left + _share(value, self._xs) * (_WIDTH - self._left - _RIGHT)
 
     def y(self, value: float) -> float:
         height = _HEIGHT - _TOP - _BOTTOM
@@ -91,8 +93,8 @@ class _Axes:
         """Return grid, numbers and labels."""
         low, right = _HEIGHT - _BOTTOM, _WIDTH - _RIGHT
         parts = [
-            f'<line x1="{_LEFT}" x2="{right}" y1="{self.y(v):.1f}" y2="{self.y(v):.1f}" '
-            f'class="grid"/><text x="{_LEFT - 8}" y="{self.y(v) + 5:.1f}" '
+            f'<line x1="{self._left}" x2="{right}" y1="{self.y(v):.1f}" y2="{self.y(v):.1f}" '
+            f'class="grid"/><text x="{self._left - 8}" y="{self.y(v) + 5:.1f}" '
             f'text-anchor="end">{v:g}</text>'
             for v in self._ys
         ]
@@ -101,7 +103,7 @@ class _Axes:
             for v in self._xs
         ]
         parts.append(
-            f'<text x="{(_LEFT + right) / 2}" y="{_HEIGHT - 6}" text-anchor="middle" '
+            f'<text x="{(self._left + right) / 2}" y="{_HEIGHT - 6}" text-anchor="middle" '
             f'class="name">{escape(x_label)}</text>'
             f'<text transform="translate(14 {(_TOP + low) / 2}) rotate(-90)" '
             f'text-anchor="middle" class="name">{escape(y_label)}</text>'

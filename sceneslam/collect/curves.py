@@ -43,7 +43,7 @@ def _front(groups: Sequence[Group]) -> str:
         if delay and false and not (missed and missed.mean):
             label = ", ".join(f"{key}={value}" for key, value in group.keys.items())
             points.append(Point(x=delay.mean, y=false.mean, label=label))
-    if len({(point.x, point.y) for point in points}) < 2:
+    if len({point.y for point in points}) < 2:  # nothing to weigh against the delay
         return ""
     drawn = draw_front(
         points, x_label=_SHOWN["detection.delay_s"], y_label=_SHOWN["detection.false"]

@@ -22,7 +22,7 @@ def write_page(folder: Path, rows: Sequence[Row], groups: Sequence[Group]) -> Pa
     """Write `index.html`; return its path."""
     counts = {"runs": len(rows), **Counter(row.status for row in rows)}
     told = {
-        "title": escape(folder.resolve().name),
+        "title": escape("/".join(folder.resolve().parts[-2:])),  # Hydra's are DATE/TIME
         "numbers": tiles({name: str(count) for name, count in counts.items()}),
         "errors": _errors(rows),
         "charts": "".join(charts(groups)),
