@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from evaluation_runs import PERIOD_NS, START_NS, happened, loop, stamps
@@ -16,6 +18,7 @@ from sceneslam.experiments.table.stretch import Motions, stretches_of
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.trajectory import Trajectory
 
+PAGE = Path(__file__).parents[1] / "experiments" / "table"
 DARK_NS = START_NS + 100 * PERIOD_NS
 
 
@@ -127,3 +130,12 @@ def test_the_proposed_scenario_composes(tmp_path):
         words = [f"hydra.searchpath=[file://{tmp_path}]", "+scenario=proposed"]
         config = compose("config", overrides=words)
     assert dict(config.scenes) == table and set(config.slam) == {"rgbd", "laser"}
+
+
+def test_the_page_holds_what_the_commands_printed():
+    page = (PAGE / "README.md").read_text()
+    for name in ("five", "wheeled"):
+        folder = PAGE / "results" / name
+        assert (folder / "table.md").read_text() in page
+        assert (folder / "proposed.yaml").read_text() in page
+        assert f"(results/{name}/scores.png)" in page
