@@ -170,7 +170,8 @@ def to_quat_xyzw(T_a_b: Transform) -> NDArray[np.float64]:
     rows[..., 1, 3] = rows[..., 3, 1] = r[..., 0, 2] - r[..., 2, 0]
     rows[..., 2, 3] = rows[..., 3, 2] = r[..., 1, 0] - r[..., 0, 1]
     best = np.argmax(np.einsum("...ii->...i", rows), axis=-1)
-    quat = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
+    flat = rows.reshape(-1, 4, 4)
+    quat = flat[np.arange(len(flat)), best.ravel()].reshape(*best.shape, 4)
     quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
     return np.asarray(np.where(quat[..., 3:] < 0, -quat, quat))
 

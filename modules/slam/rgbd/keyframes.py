@@ -87,11 +87,17 @@ class KeyframeStore:
 
     def covisible(self, landmark_ids: NDArray[np.int64], *, limit: int) -> list[int]:
         """Return the keyframes that share most of these landmarks, most first."""
-        wanted = self._marked(landmark_ids)
-        ids = np.array(self.ids)
-        shared = np.array([np.count_nonzero(wanted[k.landmark_ids]) for k in self.all()])
+        ids, shared = np.array(self.ids), self.shared(landmark_ids, self.ids)
         order = np.argsort(-shared, kind="stable")[:limit]
         return [int(keyframe_id) for keyframe_id in ids[order][shared[order] > 0]]
+
+    def shared(
+        self, landmark_ids: NDArray[np.int64], keyframe_ids: Iterable[int]
+    ) -> NDArray[np.int64]:
+        """Return how many of these landmarks each of the keyframes shows."""
+        wanted = self._marked(landmark_ids)
+        shows = [self._keyframes[keyframe_id].landmark_ids for keyframe_id in keyframe_ids]
+        return np.array([np.count_nonzero(wanted[ids]) for ids in shows], np.int64)
 
     def landmarks_of(self, keyframe_ids: Iterable[int]) -> NDArray[np.int64]:
         """Return the ids of all landmarks that these keyframes saw, rising."""

@@ -51,10 +51,11 @@ class Memory:
         """Remember where a frame was, by the keyframe that shares most landmarks with it."""
         keyframes = self._map.keyframes
         near = [self.reference, keyframes.ids[-1], *self._graph.neighbours(self.reference)]
-        shared = [_shared(keyframes[k].landmark_ids, landmark_ids) for k in near]
-        if not any(shared):  # it was found somewhere else
-            near, shared = [*keyframes.covisible(landmark_ids, limit=1), *near], [1]
-        self.reference = near[int(np.argmax(shared))]
+        shared = keyframes.shared(landmark_ids, near)
+        if shared.any():
+            self.reference = near[int(np.argmax(shared))]
+        else:  # it was found somewhere else
+            self.reference = [*keyframes.covisible(landmark_ids, limit=1), *near][0]
         T_local_keyframe = keyframes[self.reference].T_local_base
         self._frames.add(stamp_ns, self.reference, se3.inverse(T_local_keyframe) @ T_local_base)
 
@@ -193,7 +194,3 @@ class Memory:
 def _edge(start: int, end: int, T_start_end: Transform, covariance: NDArray[np.float64]) -> Edge:
     covariance = motion_covariance(T_start_end, covariance)
     return Edge(start=start, end=end, T_start_end=T_start_end, covariance=covariance)
-
-
-def _shared(landmark_ids: NDArray[np.int64], others: NDArray[np.int64]) -> int:
-    return int(np.isin(others, landmark_ids).sum())
