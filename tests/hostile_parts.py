@@ -7,6 +7,7 @@ from fakes import PERIOD_NS, FakeSource, IdleSink
 from hostile import SHEAR, put, throw
 
 from sceneslam.modules.detectors.grey_mean import GreyMean
+from sceneslam.types import se3
 
 
 class BreaksOff(FakeSource):
@@ -46,6 +47,9 @@ class BreaksOff(FakeSource):
 
     def odometry_is_sheared(self, found, index):
         return replace(found, T_odom_base=found.T_odom_base @ SHEAR)
+
+    def odometry_is_reset(self, found, index):
+        return replace(found, T_odom_base=se3.from_xy_yaw(5.0, 2.0, 1.0) @ found.T_odom_base)
 
     def odometry_is_far(self, found, index):
         return replace(found, T_odom_base=put(found.T_odom_base, 0, 3, 1e200))
