@@ -19,7 +19,7 @@ from sceneslam.bus.handover_log import log_uncertainty
 from sceneslam.types import se3
 
 T_STEP = se3.from_xy_yaw(0.1, 0.0, 0.05)
-NO_DRIFT = Drift(per_m=0.0, rad_per_m=0.0, rad_per_rad=0.0)
+NO_DRIFT = Drift(per_m=0.0, rad_per_m=0.0, rad_per_rad=0.0, rad_per_root=0.0)
 
 
 def steps(kinds, covariance=None):
@@ -53,6 +53,14 @@ def test_a_bridge_costs_more_certainty_than_a_module_and_a_guess_more_than_wheel
     deviations = [position_m(found[-1]) for found in (held, driven, guessed)]
     assert deviations[0] < 0.5 * deviations[1] < 0.25 * deviations[2]
     assert deviations[1] == pytest.approx(np.sqrt(3) * WHEELS.per_m * 0.5, rel=0.2)
+
+
+def test_a_map_loses_the_rotation_by_the_root_of_the_way_and_wheels_by_the_way():
+    kinds = {"held": "0" * 41, "driven": "0" + "-" * 40}
+    for kind, ratio in (("held", 2.0), ("driven", 4.0)):
+        found = propagate(steps(kinds[kind]), WHEELS)
+        quarter, end = (np.sqrt(found[index, 5, 5]) for index in (10, 40))
+        assert end / quarter == pytest.approx(ratio)
 
 
 def test_what_was_lost_before_a_handover_is_never_regained():

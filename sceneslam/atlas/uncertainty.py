@@ -18,17 +18,24 @@ Covariance = NDArray[np.float64]  # (6, 6): T_true = T_told @ exp(xi), xi in bas
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drift:
-    """Standard deviations by which a motion of one kind goes wrong."""
+    """Standard deviations by which a motion of one kind goes wrong.
+
+    A wrong scale or unequal wheels err the same way all along: these deviations add up. What a map
+    makes of the rotation is sometimes too much, sometimes too little: variances add up.
+    """
 
     per_m: float  # of the position [m], per metre of the way
     rad_per_m: float  # of the rotation
     rad_per_rad: float  # of the rotation, per radian turned
+    rad_per_root: float  # of the rotation at random, per root of a metre, and of a radian
 
 
 # A module's own covariance is that of its pose beside the map around it, which drifts as it grows.
-MAPPED = Drift(per_m=0.005, rad_per_m=0.002, rad_per_rad=0.005)
-WHEELS = Drift(per_m=0.02, rad_per_m=0.01, rad_per_rad=0.02)  # as `policy.gate` has them
-VELOCITY = Drift(per_m=0.5, rad_per_m=0.1, rad_per_rad=0.5)  # guessed: it may have braked meanwhile
+MAPPED = Drift(per_m=0.005, rad_per_m=0.0, rad_per_rad=0.0, rad_per_root=0.003)
+# As `policy.gate` has them.
+WHEELS = Drift(per_m=0.02, rad_per_m=0.01, rad_per_rad=0.02, rad_per_root=0.0)
+# Guessed: it may have braked meanwhile.
+VELOCITY = Drift(per_m=0.5, rad_per_m=0.1, rad_per_rad=0.5, rad_per_root=0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,7 +92,7 @@ def _total(known: _Known) -> Covariance:
 
 
 def _grown(covariance: Covariance, T_prev_curr: Transform, drift: Drift) -> Covariance:
-    """Return the covariance after a motion: what goes wrong goes on so, deviations add up."""
+    """Return the covariance after a motion, and what went wrong in it."""
     way_m = float(np.linalg.norm(T_prev_curr[:3, 3]))
     turned_rad = float(se3.rotation_angle_rad(T_prev_curr))
     adjoint = se3.adjoint(se3.inverse(T_prev_curr))
@@ -94,7 +101,8 @@ def _grown(covariance: Covariance, T_prev_curr: Transform, drift: Drift) -> Cova
     turn_rad = drift.rad_per_m * way_m + drift.rad_per_rad * turned_rad
     more = np.repeat([along_m, turn_rad], 3)
     deviations = np.sqrt(np.maximum(np.diag(carried), 0.0))
-    return np.asarray(carried + np.diag(more * (more + 2.0 * deviations)))
+    random = np.repeat([0.0, drift.rad_per_root**2 * (way_m + turned_rad)], 3)
+    return np.asarray(carried + np.diag(more * (more + 2.0 * deviations) + random))
 
 
 def write_covariances(
