@@ -26,11 +26,12 @@ def join_duplicates(
     `segment` are the keyframes whose landmarks these may be, None: all.
     """
     table = visual_map.landmarks
-    known = np.flatnonzero(table.alive)
+    others = table.alive.copy()
     if segment is not None:
-        known = visual_map.keyframes.landmarks_of(segment)
-    others = np.setdiff1d(known, keyframe.landmark_ids)
-    expected = visual_map.predict(keyframe.T_local_base, others)
+        others[:] = False
+        others[visual_map.keyframes.landmarks_of(segment)] = True
+    others[keyframe.landmark_ids[keyframe.landmark_ids != NO_LANDMARK]] = False
+    expected = visual_map.predict(keyframe.T_local_base, np.flatnonzero(others))
     matches = match_near(
         expected.uv_px,
         expected.levels,
@@ -42,7 +43,6 @@ def join_duplicates(
     matches = matches.only(_are_many(table.births[expected.ids], matches.landmark_rows))
     here, there = keyframe.landmark_ids[matches.feature_rows], expected.ids[matches.landmark_rows]
     known = here != NO_LANDMARK
-    matches = matches.only(_are_many(table.births[expected.ids], matches.landmark_rows))
     here, there = here[known], there[known]
     older = table.births[there] < table.births[here]
     keep, drop = np.where(older, there, here), np.where(older, here, there)

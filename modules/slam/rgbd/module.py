@@ -17,14 +17,11 @@ from sceneslam.types.trajectory import Trajectory
 
 from .alignment import Alignment
 from .answers import held, lost, placed, repeated, started
-from .fusion import join_duplicates
-from .keyframes import NO_LANDMARK, Keyframe
 from .limits import check_limits, check_sizes
 from .localizer import Fix
 from .motion import MotionModel
 from .parts import Parts
 from .reunion import Reunion
-from .triangulation import triangulate
 from .view import View
 
 
@@ -154,7 +151,7 @@ class RgbdSlam:
         self._eye, self._health, self._search = parts.eye, parts.health, parts.search
         self._map, self._mapping, self._memory = parts.map, parts.mapping, parts.memory
         self._layers, self._place_rule = parts.layers, parts.place_rule
-        self._keyframe_rule = parts.keyframe_rule
+        self._keyframe_rule, self._maker = parts.keyframe_rule, parts.maker
 
     def _build_anew(self, view: View, alignment: Alignment) -> None:
         """Begin a new map at the pose just held: the old one has its depths at wrong corners."""
@@ -242,24 +239,7 @@ class RgbdSlam:
         fix: Fix | None = None,
         guessed_s: float | None = None,
     ) -> None:
-        landmark_ids = np.full(len(view.features), NO_LANDMARK)
-        if fix is not None:
-            landmark_ids[fix.feature_rows] = fix.landmark_ids
-        stamp_ns = view.observation.stamp_ns
-        kept = self._layers.view(view.depth_m, view.image_bgr, stamp_ns=stamp_ns)
-        keyframe = Keyframe(
-            stamp_ns=stamp_ns,
-            T_local_base=self._T_local_base.copy(),
-            features=view.features,
-            landmark_ids=landmark_ids,
-            view=kept,
+        self._held_ids = self._maker.insert(
+            view, self._T_local_base, segment, fix=fix, guessed_s=guessed_s
         )
-        deep_rows = landmark_ids[:0] if fix is None else fix.deep_rows
-        keyframe_id = self._map.insert(keyframe, deep_rows=deep_rows)
-        if view.is_monocular:
-            triangulate(self._map, keyframe_id)
-        join_duplicates(self._map, keyframe, segment)
-        self._memory.insert(fix, view.depth_m, guessed_s=guessed_s)
-        self._mapping.insert(keyframe_id, view)
         self._keyframe_rule.restart()
-        self._held_ids = landmark_ids[landmark_ids != NO_LANDMARK]

@@ -11,6 +11,7 @@ from .alignment import Alignment
 from .eye import Eye
 from .features import FeatureExtractor
 from .judgement import HealthRule, KeyframeRule, PlaceRule
+from .keyframe_maker import KeyframeMaker
 from .layers import LayerBuilder
 from .local_mapping import LocalMapping
 from .localizer import Localizer
@@ -66,6 +67,7 @@ class Parts:
         self.layers = LayerBuilder(
             depth_camera, **same("cloud_stride_px", "cloud_voxel_m", "grid_resolution_m")
         )
+        self.maker = KeyframeMaker(self.map, self.layers, self.memory, self.mapping)
         self.keyframe_rule = KeyframeRule(
             **chosen(
                 step_m="keyframe_step_m",

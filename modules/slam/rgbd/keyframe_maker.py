@@ -1,0 +1,62 @@
+"""Makes a keyframe of a view, and tells all who work with keyframes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.se3 import Transform
+
+from .fusion import join_duplicates
+from .keyframes import NO_LANDMARK, Keyframe
+from .layers import LayerBuilder
+from .local_mapping import LocalMapping
+from .localizer import Fix
+from .memory import Memory
+from .triangulation import triangulate
+from .view import View
+from .visual_map import VisualMap
+
+
+class KeyframeMaker:
+    """Extends the map by what a view shows."""
+
+    def __init__(
+        self, visual_map: VisualMap, layers: LayerBuilder, memory: Memory, mapping: LocalMapping
+    ) -> None:
+        self._map, self._layers = visual_map, layers
+        self._memory, self._mapping = memory, mapping
+
+    def insert(
+        self,
+        view: View,
+        T_local_base: Transform,
+        segment: set[int] | None,
+        *,
+        fix: Fix | None,
+        guessed_s: float | None,
+    ) -> NDArray[np.int64]:
+        """Insert a keyframe at a pose and return the landmarks that it shows.
+
+        `segment`: the keyframes whose landmarks these may be, None: all. `fix` is what placed it
+        there, None for odometry; `guessed_s`: how long no pose was known, where nothing did.
+        """
+        landmark_ids = np.full(len(view.features), NO_LANDMARK)
+        if fix is not None:
+            landmark_ids[fix.feature_rows] = fix.landmark_ids
+        stamp_ns = view.observation.stamp_ns
+        keyframe = Keyframe(
+            stamp_ns=stamp_ns,
+            T_local_base=T_local_base.copy(),
+            features=view.features,
+            landmark_ids=landmark_ids,
+            view=self._layers.view(view.depth_m, view.image_bgr, stamp_ns=stamp_ns),
+        )
+        deep_rows = landmark_ids[:0] if fix is None else fix.deep_rows
+        keyframe_id = self._map.insert(keyframe, deep_rows=deep_rows)
+        if view.is_monocular:
+            triangulate(self._map, keyframe_id)
+        join_duplicates(self._map, keyframe, segment)
+        self._memory.insert(fix, view.depth_m, guessed_s=guessed_s)
+        self._mapping.insert(keyframe_id, view)
+        return np.asarray(landmark_ids[landmark_ids != NO_LANDMARK])
