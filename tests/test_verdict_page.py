@@ -55,5 +55,5 @@ def test_the_page_needs_no_other_file_but_the_reports_that_it_leads_to(page):
 def test_the_page_tells_what_was_asked_and_how_to_ask_again(page):
     assert "What is lost at &lt;night&gt;?" in page
     assert "<pre>python -m sceneslam +experiment=night</pre>" in page and "seed: 0" in page
-    assert "lights=dark seed=3" in page and "100.0 %" in page and "0.012 m" in page
+    assert "lights=dark seed=3" in page and "100.0 %" in page and "0.0123 m" in page
     assert "<td>40050</td>" in page and "<td>-</td>" in page

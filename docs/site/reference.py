@@ -91,13 +91,23 @@ def _option(path: Path, name: str) -> str:
     based = [_based(entry) for entry in content.get("defaults", []) if entry != "_self_"]
     if based:
         parts.append(f"Based on {', '.join(based)}.")
-    hints: Mapping[str, object] = {}
     if "_target_" in content:
         target = _locate(content["_target_"])
         parts.append(f"`{content['_target_']}`\n\n{inspect.getdoc(target) or ''}")
-        hints = hints_of(target)
+    hints = dict(_hints(content, ""))
     parts.append(_rows(path, lambda key: not key.startswith(("defaults", "_target_")), hints))
     return "\n\n".join(part for part in parts if part)
+
+
+def _hints(node: object, prefix: str) -> Iterator[tuple[str, object]]:
+    """Yield what every key of a file's components takes, by its dotted name."""
+    if not isinstance(node, dict):
+        return
+    if str(node.get("_target_", "")).startswith("sceneslam."):
+        for name, hint in hints_of(_locate(node["_target_"])).items():
+            yield f"{prefix}{name}", hint
+    for name, inner in node.items():
+        yield from _hints(inner, f"{prefix}{name}.")
 
 
 def _head(path: Path) -> str:
@@ -121,9 +131,11 @@ def _based(entry: str | dict[str, str]) -> str:
 
 def _rows(path: Path, is_shown: Callable[[str], bool], hints: Mapping[str, object]) -> str:
     rows = [
-        _row(key.name, f"`{key.value}`" if key.value else "", _type(hints, key.name), key.note)
+        _row(
+            f"`{key.name}`", f"`{key.value}`" if key.value else "", _type(hints, key.name), key.note
+        )
         for key in keys_of(path)
-        if is_shown(key.name)
+        if is_shown(key.name) and (key.value or key.note)
     ]
     if not rows:
         return ""

@@ -85,20 +85,20 @@ def _measured(figure: Figure) -> str:
 def _runs(folder: Path, runs: Sequence[Ran]) -> str:
     if not runs:
         return '<p class="muted">None: this experiment needs no run of the robot.</p>'
-    heads = ["run", "how it differs", "poses", "error (ATE)", "faults"]
+    heads = ["run", "poses", "error (ATE)", "faults", "given besides the command"]
     rows = [
         [
             _link(folder, run),
-            " ".join([*run.trial.overrides, *(f"{k}={v}" for k, v in run.trial.values.items())]),
             percent(run.metrics.get("coverage")),
-            number(run.metrics.get("ate_rmse_m"), 3, " m"),
+            number(run.metrics.get("ate_rmse_m"), 4, " m"),
             str(len(run.faults) or ""),
+            " ".join([*run.trial.overrides, *(f"{k}={v}" for k, v in run.trial.values.items())]),
         ]
         for run in runs
     ]
     is_open = " open" if len(runs) <= _OPEN_RUNS else ""
-    summary = f"<summary>{len(runs)} runs, and what each was given besides the command</summary>"
-    return f'<details class="runs"{is_open}>{summary}{markup.table(heads, rows)}</details>'
+    summary = f"<summary>{len(runs)} runs</summary>"
+    return f"<details{is_open}>{summary}{markup.table(heads, rows)}</details>"
 
 
 def _link(folder: Path, run: Ran) -> str:
