@@ -3,7 +3,6 @@
     export OPENBLAS_NUM_THREADS=1  # as `python -m sceneslam` sets it; two threads are slower
     python experiments/rgbd.py FOLDER [FX FY CX CY DEPTH_SCALE]  # the table below
     python experiments/rgbd.py FOLDER [...] sweep  # seeds and feature counts
-    python experiments/rgbd.py FOLDER [...] honest  # errors in claimed sigmas
     python experiments/rgbd.py FOLDER [...] profile  # where the time goes
 
 Every recording is also run backwards and with every second image, since one ATE says little.
@@ -26,7 +25,7 @@ import cv2
 import numpy as np
 import yaml
 
-from sceneslam.evaluation.accuracy import absolute_errors, relative_errors
+from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.modules.slam.rgbd.module import RgbdSlam
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
@@ -158,22 +157,6 @@ def sweep(source: TumRgbd, truth: Trajectory) -> None:
         print(row(name, follow(source.rig, iter(source), **changes), truth), flush=True)
 
 
-def honest(source: TumRgbd, truth: Trajectory) -> None:
-    """Print the motion's error from image to image beside the sigma that was claimed."""
-    run = follow(source.rig, iter(source))
-    sigma_mm = {
-        a.stamp_ns: 1e3 * np.sqrt(np.trace(a.covariance[:3, :3]))
-        for a in run.answers
-        if a.covariance is not None
-    }
-    error = relative_errors(run.told, truth, GAP_S, 1.0)
-    print(
-        f"claimed sigma, median: {np.median(list(sigma_mm.values())):.1f} mm; "
-        f"error over 1 s, median: {1e3 * np.median(error.trans_m):.1f} mm, "
-        f"{np.degrees(np.median(error.rot_rad)):.2f} deg"
-    )
-
-
 def profile(source: TumRgbd, truth: Trajectory) -> None:
     """Print the functions that take most time of their own, of all but the worker."""
     profiler = cProfile.Profile()
@@ -186,7 +169,7 @@ def main() -> None:
     """Run the command in the first lines of this file."""
     cv2.setNumThreads(1)
     words = sys.argv[1:]
-    modes = {"sweep": sweep, "honest": honest, "profile": profile}
+    modes = {"sweep": sweep, "profile": profile}
     mode = modes.get(words[-1], table)
     source = recording([word for word in words if word not in modes])
     truth = source.ground_truth()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.se3 import Transform
@@ -37,7 +38,7 @@ def held(
     T_local_base: Transform,
     *,
     status: TrackingStatus,
-    is_reckoned: bool,
+    covariance: NDArray[np.float64] | None,
     revision: int,
 ) -> Tracking:
     """Return the answer where the map was seen; a reckoned pose has no covariance."""
@@ -46,7 +47,7 @@ def held(
         stamp_ns=view.observation.stamp_ns,
         T_local_base=T_local_base.copy(),
         status=status,
-        covariance=None if is_reckoned else fix.estimate.covariance,
+        covariance=covariance,
         quality_ratio=min(1.0, len(fix.landmark_ids) / possible),
         inliers=len(fix.landmark_ids),
         revision=revision,

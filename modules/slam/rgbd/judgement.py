@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.types.observation import TrackingStatus
 from sceneslam.types.se3 import Transform
@@ -33,14 +34,17 @@ class HealthRule:
 
     def judge(self, estimate: PoseEstimate) -> TrackingStatus:
         """Return TRACKING or DEGRADED."""
-        worst_variance = float(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1])
         if (
             int(estimate.inliers.sum()) < self._inliers
-            or worst_variance > self._variance
+            or self.is_unsure(estimate.covariance)
             or estimate.depth_agreement_ratio < _MIN_DEPTH_AGREEMENT_RATIO
         ):
             return TrackingStatus.DEGRADED
         return TrackingStatus.TRACKING
+
+    def is_unsure(self, covariance: NDArray[np.float64]) -> bool:
+        """Tell whether a position is not known well enough in some direction."""
+        return bool(np.linalg.eigvalsh(covariance[:3, :3])[-1] > self._variance)
 
 
 class KeyframeRule:

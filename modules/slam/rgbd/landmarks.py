@@ -39,6 +39,7 @@ class LandmarkTable:
         self.alive = np.zeros(_FIRST_CAPACITY, bool)
         self.expected = np.zeros(_FIRST_CAPACITY, np.int64)  # images that should show it
         self.found = np.zeros(_FIRST_CAPACITY, np.int64)  # images that did
+        self.scale_sigma = np.zeros(_FIRST_CAPACITY)  # share of its distance; 0: depth measured it
         self.births = np.zeros(_FIRST_CAPACITY, np.int64)  # rises with every call of `add`
         self._born = 0
 
@@ -51,13 +52,15 @@ class LandmarkTable:
         points_local: NDArray[np.float64],
         information: NDArray[np.float64],
         looks: Looks,
+        scale_sigma: float = 0.0,
     ) -> NDArray[np.int64]:
-        """Store N landmarks and return their ids (N,)."""
+        """Store N landmarks, which share an error of scale, and return their ids (N,)."""
         self._reserve(len(points_local))
         ids = np.flatnonzero(~self.alive)[: len(points_local)]
         self.settle(ids, points_local=points_local, information=information)
         self.births[ids], self._born = self._born, self._born + 1
         self.describe(ids, looks)
+        self.scale_sigma[ids] = scale_sigma
         self.alive[ids], self.expected[ids], self.found[ids] = True, 1, 1
         return ids
 
@@ -68,11 +71,11 @@ class LandmarkTable:
         points_local: NDArray[np.float64],
         information: NDArray[np.float64],
     ) -> None:
-        """Move landmarks towards what was measured of them, by inverse variance."""
+        """Move landmarks towards what depth measured of them, by inverse variance."""
         total = self.information[ids] + information
         pull = information @ (points_local - self.points_local[ids])[:, :, None]
         self.points_local[ids] += np.linalg.solve(total, pull)[:, :, 0]
-        self.information[ids] = total
+        self.information[ids], self.scale_sigma[ids] = total, 0.0
         self.covariance[ids] = np.linalg.inv(total)
 
     def settle(

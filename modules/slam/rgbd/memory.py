@@ -59,6 +59,11 @@ class Memory:
         T_local_keyframe = keyframes[self.reference].T_local_base
         self._frames.add(stamp_ns, self.reference, se3.inverse(T_local_keyframe) @ T_local_base)
 
+    def around(self, T_local_base: Transform) -> list[Transform]:
+        """Return T_keyframe_base of a pose for the keyframes around that of the newest frame."""
+        near = [self.reference, *self._graph.neighbours(self.reference)]
+        return [se3.inverse(self._map.keyframes[k].T_local_base) @ T_local_base for k in near]
+
     def insert(
         self, fix: Fix | None, depth_m: NDArray[np.float32] | None, *, guessed_s: float | None
     ) -> None:

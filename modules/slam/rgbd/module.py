@@ -152,6 +152,7 @@ class RgbdSlam:
         self._map, self._mapping, self._memory = parts.map, parts.mapping, parts.memory
         self._layers, self._place_rule = parts.layers, parts.place_rule
         self._keyframe_rule, self._maker = parts.keyframe_rule, parts.maker
+        self._certainty = parts.certainty
 
     def _build_anew(self, view: View, alignment: Alignment) -> None:
         """Begin a new map at the pose just held: the old one has its depths at wrong corners."""
@@ -204,9 +205,15 @@ class RgbdSlam:
         if wanted and status is TrackingStatus.TRACKING:
             self._insert_keyframe(view, segment, fix=fix)
         self._memory.hold(view.observation.stamp_ns, T_local_base, fix.landmark_ids)
+        covariance = None
+        if not is_reckoned:
+            around = self._memory.around(T_local_base)
+            covariance = self._certainty.covariance(view, fix, T_local_base, around)
+            if self._health.is_unsure(covariance):
+                status = TrackingStatus.DEGRADED
         revision = self._memory.revision
         answer = held(
-            view, fix, T_local_base, status=status, is_reckoned=is_reckoned, revision=revision
+            view, fix, T_local_base, status=status, covariance=covariance, revision=revision
         )
         return answer if segment is None else placed(answer, self._memory.segments, segment)
 

@@ -8,6 +8,7 @@ from typing import Any
 from sceneslam.types.rig import Camera
 
 from .alignment import Alignment
+from .certainty import Certainty
 from .eye import Eye
 from .features import FeatureExtractor
 from .judgement import HealthRule, KeyframeRule, PlaceRule
@@ -76,4 +77,5 @@ class Parts:
             )
         )
         self.place_rule = PlaceRule(**chosen(patience_s="segment_patience_s"))
+        self.certainty = Certainty(self.map.landmarks)
         self.health = HealthRule(**same("degraded_inliers", "degraded_sigma_m"))

@@ -23,6 +23,7 @@ _LEVEL_TOLERANCE = 1
 _RATIO = 0.8
 _STEPS = 3
 _NEAREST_M = 0.1
+_CORRELATED = 10.0  # errors of one pair of images that say the same
 _MAX_DOUBT_RATIO = 0.3  # of its distance: a landmark less well known waits for another keyframe
 
 
@@ -45,6 +46,7 @@ class _Eye:
 class _Found:
     points_local: NDArray[np.float64]  # (N, 3) [m]
     information: NDArray[np.float64]  # (N, 3, 3) [1/m^2]
+    doubt_ratio: NDArray[np.float64]  # (N,), deviation over distance
     is_sure: NDArray[np.bool_]  # (N,)
 
 
@@ -82,14 +84,30 @@ def _triangulate_with(visual_map: VisualMap, new_id: int, other_id: int) -> None
         return
     found = _intersect(visual_map, new, other, matches)
     matches, sure = matches.only(found.is_sure), found.is_sure
+    if not len(matches):
+        return
     rows = new.rows[matches.landmark_rows]
     ids = visual_map.landmarks.add(
         points_local=found.points_local[sure],
         information=found.information[sure],
         looks=visual_map.looks(new.keyframe, rows, found.points_local[sure]),
+        scale_sigma=_scale_sigma(visual_map, new.keyframe, found),
     )
     store.show(new_id, rows, ids)
     store.show(other_id, other.rows[matches.feature_rows], ids)
+
+
+def _scale_sigma(visual_map: VisualMap, keyframe: Keyframe, found: _Found) -> float:
+    """Return by what share of their distance landmarks of a keyframe are wrong together.
+
+    As wrong as the landmarks that placed it, and by what new ones add: many pixels of two images
+    say the same.
+    """
+    known = keyframe.landmark_ids[keyframe.landmark_ids != NO_LANDMARK]
+    before = float(np.mean(visual_map.landmarks.scale_sigma[known] ** 2)) if len(known) else 0.0
+    doubts = found.doubt_ratio[found.is_sure]
+    more = _CORRELATED * float(np.mean(doubts**2)) / len(doubts)
+    return float(np.sqrt(before + min(more, _MAX_DOUBT_RATIO**2)))
 
 
 def _eye(visual_map: VisualMap, keyframe: Keyframe) -> _Eye:
@@ -141,8 +159,13 @@ def _intersect(visual_map: VisualMap, new: _Eye, other: _Eye, matches: Matches) 
         points = points - np.linalg.solve(information, slopes[:, :, None])[:, :, 0]
     distance_m = np.linalg.norm(points @ new.T_cam_local[:3, :3].T + new.T_cam_local[:3, 3], axis=1)
     doubt_m = np.linalg.eigvalsh(information)[:, 0] ** -0.5
-    is_sure = agrees & (doubt_m < _MAX_DOUBT_RATIO * distance_m)
-    return _Found(points_local=points, information=information, is_sure=is_sure)
+    doubt_ratio = doubt_m / distance_m
+    return _Found(
+        points_local=points,
+        information=information,
+        doubt_ratio=doubt_ratio,
+        is_sure=agrees & (doubt_ratio < _MAX_DOUBT_RATIO),
+    )
 
 
 def _midpoints(new: _Eye, other: _Eye, matches: Matches) -> NDArray[np.float64]:

@@ -1,0 +1,83 @@
+"""How exactly a pose is known beside the map around it, by more than its pixels' noise.
+
+What a wrong model of the camera does to a pose (intrinsics, shutter, depth against colours) no
+covariance of pixels knows, and without depth the map's scale drifts, which no image shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.se3 import Transform
+
+from .landmarks import LandmarkTable
+from .localizer import Fix
+from .pose_graph import motion_covariance
+from .pose_solver import Linearised
+from .view import View
+
+_CELLS = 8  # across the image, within which residuals are summed up
+_INDEPENDENT = 1.5  # common ratio up to which no wrong model shows: 1.0 to 1.7 in simulations,
+# 2.1 to 3.8 on freiburg1_rpy, 1.3 to 2.6 on RedKitchen
+_KEPT = 0.95  # from image to image, of what residuals have in common
+
+
+class Certainty:
+    """Widens the covariance of a pose by what its residuals and landmarks say of the model."""
+
+    def __init__(self, landmarks: LandmarkTable) -> None:
+        self._landmarks = landmarks
+        self._common: float | None = None  # see `common_ratio`, followed over images
+        self._scaled_local = np.zeros(3)  # [m], where the camera was when its scale was known
+
+    def covariance(
+        self, view: View, fix: Fix, T_local_base: Transform, T_keyframe_base: Sequence[Transform]
+    ) -> NDArray[np.float64]:
+        """Return the covariance (6, 6) of a pose, of se3.log order [m, rad], in base.
+
+        It is that of the pose beside the map around it. Residuals that neighbouring pixels have
+        in common are no noise: where they say so, it holds the share of the motion from the
+        keyframes around it that no noise explains, and as much less of the pixels' information.
+        What triangulated landmarks do not know of the scale counts from where depth was seen last.
+        """
+        common = self._follow(common_ratio(view, fix))
+        measured = fix.estimate.covariance * common
+        motions = [motion_covariance(T, np.zeros((6, 6))) for T in T_keyframe_base]
+        model = np.mean(motions, axis=0) * np.clip(common - _INDEPENDENT, 0.0, 1.0)
+        scale = np.zeros((6, 6))
+        scale[:3, :3] = self._scale_variance(view, fix, T_local_base)
+        return np.asarray(measured + model + scale)
+
+    def _follow(self, ratio: float) -> float:
+        before = ratio if self._common is None else self._common
+        self._common = _KEPT * before + (1.0 - _KEPT) * ratio
+        return max(1.0, self._common)
+
+    def _scale_variance(self, view: View, fix: Fix, T_local_base: Transform) -> NDArray[np.float64]:
+        """Return (3, 3) [m^2]: the way since the scale was known, times how unsure it is."""
+        sigmas = self._landmarks.scale_sigma[fix.landmark_ids]
+        if not view.is_monocular or not sigmas.any():
+            self._scaled_local = T_local_base[:3, 3].copy()
+        way_base = T_local_base[:3, :3].T @ (T_local_base[:3, 3] - self._scaled_local)
+        return np.asarray(np.mean(sigmas**2) * np.outer(way_base, way_base))
+
+
+def common_ratio(view: View, fix: Fix) -> float:
+    """Return how much more residuals pull at the pose than independent ones would.
+
+    The pulls of all pixels of a cell, summed and squared, over the sum of squares: 1 where they
+    are independent. As in a covariance that is robust against clusters (Liang and Zeger 1986).
+    """
+    seen: Linearised = fix.estimate.linearised
+    pulls = (seen.jacobian * seen.residuals).reshape(6, 2, -1).sum(axis=1)  # (6, N)
+    root = np.linalg.cholesky(seen.jacobian @ seen.jacobian.T)
+    pulls = np.linalg.solve(root, pulls)
+    side_px = view.gray.shape[1] / _CELLS
+    cells = (view.features.uv_px[fix.feature_rows] // side_px).astype(np.int64)
+    cells -= cells.min(axis=0)
+    flat = cells[:, 1] * (cells[:, 0].max() + 1) + cells[:, 0]
+    sums = np.stack([np.bincount(flat, row) for row in pulls])
+    return float((sums**2).sum() / max((pulls**2).sum(), 1e-12))

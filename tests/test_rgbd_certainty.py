@@ -1,0 +1,83 @@
+"""How sure the rgbd module says that its poses are."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from rgbd_features import features_at, random_descriptors
+from test_rgbd import drive, make
+from test_rgbd_mono import IMAGES, error_m, images
+
+from sceneslam.modules.slam.rgbd.certainty import Certainty, common_ratio
+from sceneslam.modules.slam.rgbd.pose_solver import Linearised
+from sceneslam.types import se3
+from sceneslam.types.observation import TrackingStatus
+
+COUNT = 600
+
+
+def sighting(bend, *, is_monocular=False):
+    """A view of pixels all over the image, and a fix whose residuals are noise and a bent lens."""
+    rng = np.random.default_rng(0)
+    uv_px = rng.uniform([0, 0], [640, 480], (COUNT, 2))
+    x, y = uv_px.T / 320.0 - 1.0
+    one, none = np.ones(COUNT), np.zeros(COUNT)
+    by_u, by_v = [one, none, y, x, x * y, 1 + x * x], [none, one, -x, y, 1 + y * y, x * y]
+    residuals = rng.normal(size=(2, COUNT)) + bend * np.sin(uv_px.T / 50.0)
+    linearised = Linearised(
+        residuals=residuals.ravel(),
+        jacobian=np.concatenate([by_u, by_v], axis=1),
+        sigma_px=one,
+    )
+    features = features_at(uv_px, random_descriptors(rng, COUNT))
+    gray = np.zeros((480, 640), np.uint8)
+    estimate = SimpleNamespace(linearised=linearised, covariance=1e-6 * np.eye(6))
+    rows = np.arange(COUNT)
+    fix = SimpleNamespace(estimate=estimate, feature_rows=rows, landmark_ids=rows)
+    return SimpleNamespace(gray=gray, features=features, is_monocular=is_monocular), fix
+
+
+def sigma_m(bend, *, from_keyframe_m):
+    landmarks = SimpleNamespace(scale_sigma=np.zeros(COUNT))
+    beside = [se3.from_xy_yaw(from_keyframe_m, 0.0, 0.0)]
+    covariance = Certainty(landmarks).covariance(*sighting(bend), se3.identity(), beside)
+    return float(np.sqrt(covariance[0, 0]))
+
+
+def test_independent_residuals_have_nothing_in_common():
+    assert common_ratio(*sighting(bend=0.0)) == pytest.approx(1.0, abs=0.25)
+    assert common_ratio(*sighting(bend=1.0)) > 2.5
+
+
+def test_what_neighbouring_residuals_have_in_common_widens_the_covariance():
+    assert sigma_m(0.0, from_keyframe_m=1.0) < 1.2e-3  # of independent pixels: 1.0e-3
+    near, far = sigma_m(1.0, from_keyframe_m=0.0), sigma_m(1.0, from_keyframe_m=1.0)
+    assert near > 1.5e-3
+    assert far == pytest.approx(np.hypot(near, 0.03), rel=0.01)  # no noise explains 3 %
+
+
+def test_a_scale_that_nothing_holds_counts_from_where_depth_was_seen_last():
+    certainty = Certainty(SimpleNamespace(scale_sigma=np.full(COUNT, 0.1)))
+
+    def sigmas_m(x_m, *, is_monocular):
+        T_local_base = se3.from_xy_yaw(x_m, 0.0, np.pi / 2)
+        view, fix = sighting(0.0, is_monocular=is_monocular)
+        covariance = certainty.covariance(view, fix, T_local_base, [se3.identity()])
+        return np.sqrt(covariance.diagonal()[:2])
+
+    assert sigmas_m(1.0, is_monocular=False).max() < 0.01
+    along, across = sigmas_m(3.0, is_monocular=True)[[1, 0]]  # base faces y
+    assert along == pytest.approx(0.2, abs=0.01)
+    assert across < 0.01
+    assert sigmas_m(3.0, is_monocular=False).max() < 0.01
+    assert sigmas_m(3.0, is_monocular=True).max() < 0.01
+
+
+def test_the_longer_there_is_no_depth_the_less_sure_is_the_scale():
+    module = make()
+    answers = drive(module, images(depth=4, odometry=False))
+    sigma_m = [np.sqrt(np.linalg.eigvalsh(a.covariance[:3, :3])[-1]) for a in answers]
+    assert sigma_m[-1] > 3 * sigma_m[3]
+    assert error_m(answers[-1], IMAGES - 1) < 3 * sigma_m[-1]
+    is_degraded = [answer.status is TrackingStatus.DEGRADED for answer in answers]
+    assert is_degraded == [sigma > 0.05 for sigma in sigma_m]
