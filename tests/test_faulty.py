@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import resource
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -112,6 +113,17 @@ def test_memory_is_not_taken_where_there_is_no_limit(record):
     assert resource.getrlimit(resource.RLIMIT_DATA)[0] == resource.RLIM_INFINITY
     with pytest.raises(MemoryError, match="without a limit"):
         module(record, "memory", rate_ratio=1.0).track(observation(0))
+
+
+def test_odometry_that_begins_anew_does_so_at_the_identity_and_moves_on(record):
+    sound, seen = list(FakeSource(steps=200, dark_from=1000)), list(source(record, "reset"))
+    for index in (round(line["stamp_ns"] / 1e8) for line in struck(record)):
+        np.testing.assert_allclose(seen[index].T_odom_base, np.eye(4), atol=1e-9)
+    T_new_old = [
+        s.T_odom_base @ np.linalg.inv(f.T_odom_base) for s, f in zip(seen, sound, strict=True)
+    ]
+    changes = sum(not np.allclose(a, b) for a, b in pairwise(T_new_old))
+    assert changes == sum(line["stamp_ns"] > 0 for line in struck(record)) > 0
 
 
 def test_a_faulty_source_behind_the_repair_keeps_the_promises_of_a_source(record):

@@ -22,7 +22,12 @@ from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
 IN_ANY_PROCESS = ("raise", "nan", "jump", "silence")
-IN_ITS_OWN_PROCESS = ("hang", "kill", "memory")  # run.isolation=process: else the bus is struck
+IN_ITS_OWN_PROCESS = (
+    "hang",
+    "kill",
+    "memory",
+    "stop",
+)  # else the bus is struck
 FAULTS = (*IN_ANY_PROCESS, *IN_ITS_OWN_PROCESS)
 _HANG_S = 3600.0
 _GULP = 1 << 22  # numbers of 8 bytes
@@ -79,7 +84,7 @@ class Faulty:
     def track(self, observation: Observation) -> Tracking:
         """Return the module's answer, unless a fault strikes or one lasts."""
         fault = self._plan.strike(observation.stamp_ns)
-        if fault in ("raise", "hang", "kill", "memory"):
+        if fault in ("raise", *IN_ITS_OWN_PROCESS):
             getattr(self, f"_{fault}")()
         if fault == "silence":
             self._silent_until_ns = observation.stamp_ns + self._lasting_ns
@@ -124,6 +129,9 @@ class Faulty:
 
     def _kill(self) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
+
+    def _stop(self) -> None:
+        os.kill(os.getpid(), signal.SIGSTOP)
 
     def _memory(self) -> None:
         """Take memory until the process's limit; where there is none, say so at once."""

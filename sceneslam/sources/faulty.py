@@ -10,13 +10,15 @@ import numpy as np
 
 from sceneslam.interfaces import Source
 from sceneslam.sources.wrapped import Wrapped
+from sceneslam.types import se3
 from sceneslam.types.fault_plan import FaultPlan
 from sceneslam.types.observation import Observation
 from sceneslam.types.ranges import check_least
+from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import GroundTruth
 
 SENSORS = ("image_bgr", "depth_m", "scan", "points_lidar", "T_odom_base", "gyro_base")
-FAULTS = ("dropout", "blackout", "nan", "clock", "duplicate", "disorder")
+FAULTS = ("dropout", "blackout", "nan", "clock", "duplicate", "disorder", "reset")
 
 
 class Faulty(Wrapped):
@@ -24,7 +26,8 @@ class Faulty(Wrapped):
 
     `dropout`: one sensor says nothing for `lasting_s`; `blackout`: none but odometry does. `nan`:
     one sensor's numbers are none. `clock`: one stamp is off by up to `clock_jump_s`. `duplicate`:
-    the observation comes twice. `disorder`: it comes after the next one.
+    the observation comes twice. `disorder`: it comes after the next one. `reset`: odometry begins
+    anew, at the identity.
     """
 
     def __init__(
@@ -54,6 +57,7 @@ class Faulty(Wrapped):
         """Yield the source's observations, struck."""
         late: Observation | None = None
         silent: dict[str, int] = {}  # sensor -> until when
+        self._T_new_odom: Transform | None = None  # of odometry that began anew
         for observation in self._source:
             stamp_ns = observation.stamp_ns
             rng = np.random.default_rng([self._seed, 1, stamp_ns % 2**64])
@@ -61,7 +65,7 @@ class Faulty(Wrapped):
             silent |= dict.fromkeys(
                 self._silenced(fault, observation, rng), stamp_ns + self._lasting_ns
             )
-            struck = self._struck(fault, observation, rng)
+            struck = self._struck(fault, self._reset(fault, observation), rng)
             quiet = {name: None for name, until_ns in silent.items() if stamp_ns < until_ns}
             struck = replace(struck, **quiet)  # type: ignore[arg-type]
             if fault == "disorder" and late is None:
@@ -87,6 +91,15 @@ class Faulty(Wrapped):
         if fault == "blackout":
             return [name for name in SENSORS if name != "T_odom_base"]
         return [_any_sensor(observation, rng)] if fault == "dropout" else []
+
+    def _reset(self, fault: str | None, observation: Observation) -> Observation:
+        """Return the observation with the odometry that began anew, if it did."""
+        T_odom_base = observation.T_odom_base
+        if fault == "reset" and T_odom_base is not None:
+            self._T_new_odom = se3.inverse(T_odom_base)
+        if self._T_new_odom is None or T_odom_base is None:
+            return observation
+        return replace(observation, T_odom_base=self._T_new_odom @ T_odom_base)
 
     def _struck(
         self, fault: str | None, observation: Observation, rng: np.random.Generator
