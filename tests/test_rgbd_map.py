@@ -1,5 +1,7 @@
 """What the rgbd module keeps: features, landmarks, keyframes, motion, layers."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -176,6 +178,17 @@ def test_noise_and_black_give_few_features():
     noise = np.clip(rng.normal(20, 4, (480, 640)), 0, 255).astype(np.uint8)
     assert len(extractor.extract(noise, None)) < 150
     assert len(extractor.extract(np.zeros((480, 640), np.uint8), None)) == 0
+
+
+@pytest.mark.parametrize("alignment", [Alignment(), Alignment(focal_ratio=0.9, baseline_m=0.02)])
+def test_black_image_of_any_camera_has_no_features(alignment):
+    camera = replace(CAMERA, distortion=(0.26, -0.95, -0.005, 0.003, 1.16))
+    extractor = FeatureExtractor(
+        camera, alignment, count=500, fast_threshold_min=7, fast_noise_ratio=4.0
+    )
+    features = extractor.extract(np.zeros((480, 640), np.uint8), np.ones((480, 640), np.float32))
+    assert len(features) == 0
+    assert features.descriptors.shape == (0, 32)
 
 
 def test_depth_is_missing_at_depth_edges_and_where_it_is_not_a_number():

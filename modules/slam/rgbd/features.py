@@ -156,7 +156,7 @@ class FeatureExtractor:
         return int(np.clip(self._noise_ratio * noise, self._threshold_min, _FAST_THRESHOLD_MAX))
 
     def _undistort(self, uv_image: NDArray[np.float64]) -> NDArray[np.float64]:
-        if not any(self._camera.distortion):
+        if not (len(uv_image) and any(self._camera.distortion)):
             return uv_image
         K, distortion = self._camera.K, np.array(self._camera.distortion)
         return np.asarray(cv2.undistortPoints(uv_image[:, None], K, distortion, P=K)[:, 0])

@@ -57,10 +57,9 @@ def main() -> None:
     work = build(*arguments)
     while True:
         try:
-            task = pickle.load(sys.stdin.buffer)
-        except EOFError:
+            _send(output, work(pickle.load(sys.stdin.buffer)))
+        except (EOFError, BrokenPipeError):  # the parent is no more
             return
-        _send(output, work(task))
 
 
 def _ask(popen: subprocess.Popen[bytes], task: Any) -> Any:
