@@ -37,9 +37,15 @@ def sighting(bend, *, is_monocular=False):
     return SimpleNamespace(gray=gray, features=features, is_monocular=is_monocular), fix
 
 
-def sigma_m(bend, *, from_keyframe_m):
-    landmarks = SimpleNamespace(scale_sigma=np.zeros(COUNT))
-    beside = [se3.from_xy_yaw(from_keyframe_m, 0.0, 0.0)]
+def landmarks_with(scale_sigma):
+    """Landmarks 2 m away."""
+    points_local = np.tile([2.0, 0.0, 0.0], (COUNT, 1))
+    return SimpleNamespace(scale_sigma=np.full(COUNT, scale_sigma), points_local=points_local)
+
+
+def sigma_m(bend, *, from_keyframe_m, turned_rad=0.0):
+    landmarks = landmarks_with(0.0)
+    beside = [se3.from_xy_yaw(from_keyframe_m, 0.0, turned_rad)]
     covariance = Certainty(landmarks).covariance(*sighting(bend), se3.identity(), beside)
     return float(np.sqrt(covariance[0, 0]))
 
@@ -54,10 +60,12 @@ def test_what_neighbouring_residuals_have_in_common_widens_the_covariance():
     near, far = sigma_m(1.0, from_keyframe_m=0.0), sigma_m(1.0, from_keyframe_m=1.0)
     assert near > 1.5e-3
     assert far == pytest.approx(np.hypot(near, 0.03), rel=0.01)  # no noise explains 3 %
+    turned = sigma_m(1.0, from_keyframe_m=0.0, turned_rad=0.5)
+    assert turned == pytest.approx(np.hypot(near, 0.03 * 0.5 * 2.0), rel=0.01)
 
 
 def test_a_scale_that_nothing_holds_counts_from_where_depth_was_seen_last():
-    certainty = Certainty(SimpleNamespace(scale_sigma=np.full(COUNT, 0.1)))
+    certainty = Certainty(landmarks_with(0.1))
 
     def sigmas_m(x_m, *, is_monocular):
         T_local_base = se3.from_xy_yaw(x_m, 0.0, np.pi / 2)

@@ -47,6 +47,9 @@ class Certainty:
         measured = fix.estimate.covariance * common
         motions = [motion_covariance(T, np.zeros((6, 6))) for T in T_keyframe_base]
         model = np.mean(motions, axis=0) * np.clip(common - _INDEPENDENT, 0.0, 1.0)
+        # A turn that is wrong is made up for by a shift, by as much as what is seen is far.
+        away_m = self._landmarks.points_local[fix.landmark_ids] - T_local_base[:3, 3]
+        model[:3, :3] += np.median((away_m**2).sum(axis=1)) * model[3:, 3:]
         scale = np.zeros((6, 6))
         scale[:3, :3] = self._scale_variance(view, fix, T_local_base)
         return np.asarray(measured + model + scale)
