@@ -40,6 +40,14 @@ def test_odometry_that_was_reset_goes_on_from_where_it_was(T_new_old):
     assert faults == ["odometry that jumps: 1 time at stamp 1.000000 s"]
 
 
+@pytest.mark.parametrize("index", [10, 17, 25])
+def test_odometry_that_begins_anew_at_the_origin_goes_on_after_a_third_of_a_metre_already(index):
+    T_new_old = se3.inverse(true_pose(index))
+    told, faults = drive(lambda i, T: T_new_old @ T if i >= index else T)
+    assert_true(told)
+    assert len(faults) == 1
+
+
 def test_turn_alone_is_a_jump_too():
     told, _ = drive(lambda i, T: se3.from_xy_yaw(0.0, 0.0, 1.5) @ T if i >= 10 else T)
     assert_true(told)

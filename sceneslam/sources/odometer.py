@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.types import se3
@@ -12,8 +13,11 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
 # What wheels may tell beyond twice the step before: what was held up (the Intel log has 0.87 m and
-# 51 degrees within 20 ms, and no jump), and full throttle.
+# 51 degrees within 20 ms, and no jump), and full throttle. Who comes to where odometry begins has
+# most likely been reset.
 _SLACK_M, _SLACK_RAD = 1.0, 1.2
+_SLACK_AT_ORIGIN = 0.1  # of both
+_ORIGIN_M, _ORIGIN_RAD = 0.05, 0.05  # so near is where it begins
 _BOOST_M_S2, _BOOST_RAD_S2 = 10.0, 20.0
 _COAST_S = 0.5  # a motion of so long ago says nothing any more
 
@@ -39,7 +43,11 @@ class Odometer:
         self._before = observation
         if before is not None and before.T_odom_base is not None:
             duration_s = (observation.stamp_ns - before.stamp_ns) / 1e9
-            if not self._take(se3.inverse(before.T_odom_base) @ T_odom_base, duration_s):
+            slack = np.array([_SLACK_M, _SLACK_RAD])
+            if (_moved(T_odom_base) < (_ORIGIN_M, _ORIGIN_RAD)).all():
+                slack *= _SLACK_AT_ORIGIN
+            T_prev_curr = se3.inverse(before.T_odom_base) @ T_odom_base
+            if not self._take(T_prev_curr, duration_s, slack):
                 log.add("odometry that jumps", at_stamp(observation.stamp_ns))
                 T_prev_curr = se3.exp(self._twist * min(duration_s, _COAST_S))
                 T_before = self._told(before.T_odom_base)
@@ -52,14 +60,17 @@ class Odometer:
         offset = self._T_smooth_odom
         return T_odom_base if offset is None else offset @ T_odom_base
 
-    def _take(self, T_prev_curr: Transform, duration_s: float) -> bool:
+    def _take(self, T_prev_curr: Transform, duration_s: float, slack: NDArray[np.float64]) -> bool:
         """Tell whether a vehicle moves so, after the step before; if so, note this one."""
-        moved = np.array(
-            [np.linalg.norm(T_prev_curr[:3, 3]), float(se3.rotation_angle_rad(T_prev_curr))]
-        )
-        slack = np.array([_SLACK_M, _SLACK_RAD])
+        moved = _moved(T_prev_curr)
         boost = np.array([_BOOST_M_S2, _BOOST_RAD_S2]) * duration_s**2
         if (moved > slack + 2.0 * self._rates * duration_s + boost).any():
             return False
         self._rates, self._twist = moved / duration_s, se3.log(T_prev_curr) / duration_s
         return True
+
+
+def _moved(T_prev_curr: Transform) -> NDArray[np.float64]:
+    """Return way [m] and turn [rad]."""
+    way_m = np.linalg.norm(T_prev_curr[:3, 3])
+    return np.array([way_m, float(se3.rotation_angle_rad(T_prev_curr))])
