@@ -4,93 +4,14 @@ import json
 import os
 import resource
 from contextlib import contextmanager
-from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
 import pytest
+from configured import config
 
 from sceneslam.app import run
-from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.trajectory import Trajectory
-
-CONFIG = {
-    "source": {"_target_": "fakes.FakeSource", "steps": 100, "dark_from": 40},
-    "detector": {
-        "_target_": "sceneslam.modules.detectors.grey_mean.GreyMean",
-        "scenes": ["Bright", "Dark"],
-        "threshold": 100.0,
-        "hysteresis": 0.0,
-    },
-    "slam": {
-        "bright": {"_target_": "fakes.ExactModule"},
-        "dark": {"_target_": "fakes.ExactModule"},
-    },
-    "scenes": {"Bright": ["bright", "dark"], "Dark": ["dark", "bright"]},
-    "policy": {
-        "_target_": "sceneslam.bus.policy.Policy",
-        "handover": "cold",
-        "confirm_window_s": 2.0,
-        "first_confirm_window_s": 0.0,
-        "lost_patience_s": 0.3,
-        "blind_patience_s": 0.1,
-        "bridge_s": 0.5,
-        "dwell_s": 0.0,
-        "retry_s": 2.0,
-        "trial_s": 1.0,
-        "buffer_s": 12.0,
-        "buffer_mb": 256.0,
-        "catch_up": {
-            "_target_": "sceneslam.bus.pace.PaceSettings",
-            "period_s": 0.06,
-            "step_m": 0.05,
-            "turn_rad": 0.05,
-        },
-        "turn_by_gyro": True,
-        "gate": None,
-        "startup_s": {},
-    },
-    "atlas": {"_target_": "sceneslam.atlas.atlas.Atlas", "voxel_m": 0.05},
-    "evaluation": {
-        "_target_": "sceneslam.evaluation.settings.EvaluationSettings",
-        "association_gap_s": 0.01,
-        "rpe_interval_s": 1.0,
-        "correct_limit_m": 0.25,
-        "correct_limit_rad": 0.17,
-    },
-    "run": {
-        "_target_": "sceneslam.config.settings.RunSettings",
-        "mode": "recording",
-        "threads": 1,
-        "isolation": "inline",
-        "step_deadline_s": 10.0,
-        "start_deadline_s": 60.0,
-        "memory_limit_mb": 4000,
-        "restarts_max": 5,
-        "restart_window_s": 60.0,
-        "restart_backoff_s": 0.2,
-        "progress": False,
-        "report": True,
-        "max_observations": None,
-        "catch_up_steps": None,
-    },
-    "allow_targets": ["fakes"],
-}
-
-
-def config(**changes):
-    """Return the configuration with values changed by dotted key (dots as __)."""
-    changed = deepcopy(CONFIG)
-    for key, value in changes.items():
-        *path, last = key.split("__")
-        node = changed
-        for name in path:
-            node = node[name]
-        if value is ...:
-            del node[last]
-        else:
-            node[last] = value
-    return changed
 
 
 def test_run_through_a_scene_change_is_measured_and_written(tmp_path):
@@ -204,57 +125,6 @@ def test_folder_holds_the_newest_run_alone(tmp_path):
 def test_module_that_no_scene_names_is_said_not_to_run(tmp_path, caplog):
     run(config(scenes__Dark=["bright"], scenes__Bright=["bright"]), tmp_path)
     assert "slam.dark: no scene names it" in caplog.text
-
-
-BAD = {
-    "an unknown key": ({"scenaro": "x"}, "scenaro: got 'x'"),
-    "an unknown argument": ({"policy__confirm_windw_s": 1.0}, "policy.confirm_windw_s"),
-    "a missing argument": ({"detector__threshold": ...}, "detector.threshold: got nothing"),
-    "a value that was not given": ({"source__steps": "???"}, "source.steps: got nothing"),
-    "a wrong type": ({"detector__threshold": "abc"}, "detector.threshold: got 'abc'"),
-    "a flag for a number": ({"run__threads": True}, "run.threads: got True"),
-    "a value out of range": ({"policy__confirm_window_s": -1.0}, "policy.confirm_window_s: got -1"),
-    "a target that was not allowed": ({"detector___target_": "os.system"}, "detector._target_"),
-    "a target that does not exist": (
-        {"detector___target_": "sceneslam.modules.nothing.Nothing"},
-        "detector._target_",
-    ),
-    "a target within a table": (
-        {"source__fault": {"inner": {"_target_": "os.mkdir", "path": "x"}}},
-        "source.fault.inner._target_: got 'os.mkdir'",
-    ),
-    "a target that leads through our code to another's": (
-        {"slam__dark": {"_target_": "sceneslam.config.check.inspect.os.mkdir", "path": "x"}},
-        "slam.dark._target_",
-    ),
-    "a key of Hydra's": ({"detector___partial_": True}, "detector._partial_: got True"),
-    "a component that is no detector": (
-        {"detector": {"_target_": "fakes.ExactModule"}},
-        "allowed: a Detector, which has: quantity, get_scene",
-    ),
-    "a component that breaks without a word": (
-        {"slam__dark": {"_target_": "fakes.Mute"}},
-        "slam.dark: got 'fakes.Mute', allowed: a target that builds (AssertionError)",
-    ),
-    "no module": ({"slam": {}}, "slam: got nothing"),
-    "a scene without a module": ({"scenes__Dark": ...}, "scenes.Dark: got nothing"),
-    "an unknown module in the table": ({"scenes__Dark": ["drak"]}, "scenes.Dark: got ['drak']"),
-    "an empty list of modules": ({"scenes__Dark": []}, "scenes.Dark: got []"),
-    "a module twice": ({"scenes__Dark": ["dark", "dark"]}, "scenes.Dark"),
-    "an argument of the wrong kind": ({"slam__dark": 7}, "slam.dark: got 7"),
-    "a sensor that the source lacks": (
-        {"slam__dark": {"_target_": "fakes.DepthModule"}},
-        "slam.dark: got 'DepthModule', allowed: a source with depth; this one has: image",
-    ),
-}
-
-
-@pytest.mark.parametrize(("changes", "sentence"), BAD.values(), ids=BAD)
-def test_mistake_is_named_before_the_first_frame(tmp_path, changes, sentence):
-    with pytest.raises((ConfigError, InputError)) as caught:
-        run(config(**changes), tmp_path / "run")
-    assert sentence in str(caught.value)
-    assert not (tmp_path / "run").exists()
 
 
 @contextmanager

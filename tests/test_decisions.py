@@ -2,7 +2,7 @@
 
 import json
 
-from test_app import config
+from configured import config
 
 from sceneslam.app import run
 from sceneslam.decisions import main

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from test_app import config
+from configured import config
 
 from sceneslam.app import run
 from sceneslam.experiments.faults.experiment import FaultsExperiment

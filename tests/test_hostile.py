@@ -8,10 +8,10 @@ from pathlib import Path
 import hostile
 import numpy as np
 import pytest
+from configured import config
 from driving import assert_exact, dark_from, drive, events
 from fakes import ExactModule
 from isolation import isolating
-from test_app import config
 from test_isolation import active, drive_into, seen
 
 from sceneslam.app import run

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from configured import config
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
-from test_app import config
 
 from sceneslam.app import run
 from sceneslam.types.errors import ConfigError

@@ -110,8 +110,7 @@ class Estimator:
         anchor = self._memory.newest
         if self._policy.handover == "rewind" and not is_trial:
             anchor = self._memory.anchor(since_ns)
-        hold = self._new_hold()
-        pace = Pace(self._policy.catch_up)
+        hold, pace = self._new_hold(), Pace(self._policy.catch_up)
         return Handover(
             runner, self._memory, anchor=anchor, hold=hold, pace=pace, scene=scene, rig=self._rig
         )
@@ -212,8 +211,7 @@ class Estimator:
         `jump` is how the pose that was told at `stamp_ns` differs from the one now known.
         """
         assert self.active is not None and self.active.T_map_local is not None
-        T_map_local = self.active.T_map_local
-        last_ns = self._atlas.last_stamp_ns
+        T_map_local, last_ns = self.active.T_map_local, self._atlas.last_stamp_ns
         session = self._atlas.begin_session(self.active.key, T_map_local)
         self._sessions.append(session)
         self._is_placed = True

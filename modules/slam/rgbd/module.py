@@ -61,8 +61,7 @@ class RgbdSlam:
         self._monocular_scenes = frozenset(monocular_scenes)
         self._ignores_depth = False
         self._reunion = Reunion(keyframe_limit=keyframe_limit)
-        self._T_map_local = se3.identity()
-        self._T_local_base = se3.identity()
+        self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
@@ -229,9 +228,8 @@ class RgbdSlam:
         if observation.T_odom_base is not None:
             self._T_local_base = T_predicted if self._motion.is_reckoned else self._T_local_base
             self._motion.hold(observation, self._T_local_base)
-        stamp_ns = observation.stamp_ns
-        self._memory.hold(stamp_ns, self._T_local_base, np.zeros(0, np.int64))
-        return repeated(stamp_ns, self._T_local_base, revision=self._memory.revision)
+        self._memory.hold(observation.stamp_ns, self._T_local_base, np.zeros(0, np.int64))
+        return repeated(observation.stamp_ns, self._T_local_base, revision=self._memory.revision)
 
     def _lose(self, observation: Observation, T_predicted: Transform) -> Tracking:
         self._motion.lose(observation, T_predicted)
