@@ -183,16 +183,20 @@ def test_processes_that_a_module_starts_end_with_it(isolated, how, monkeypatch):
     monkeypatch.setenv("HOSTILE", f"{how} of {os.getpid()}")
     module = active(isolated(Wrecked(how)))
     drive_into(module)
-    assert len(marked()) == 2
+    assert marked(2)
     module.close()
+    assert marked(0)
+
+
+def marked(count):
+    """Tell whether so many processes have this one's HOSTILE in their environment, or soon do."""
     deadline_s = time.monotonic() + 10.0
-    while marked() and time.monotonic() < deadline_s:
-        pass
-    assert marked() == []
+    while len(_marked()) != count and time.monotonic() < deadline_s:
+        time.sleep(0.01)
+    return len(_marked()) == count
 
 
-def marked():
-    """Return the processes that were started with this one's HOSTILE in their environment."""
+def _marked():
     found = []
     for path in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
