@@ -1,5 +1,6 @@
 """How sure the rgbd module says that its poses are."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -53,6 +54,14 @@ def sigma_m(bend, *, from_keyframe_m, turned_rad=0.0):
 def test_independent_residuals_have_nothing_in_common():
     assert common_ratio(*sighting(bend=0.0)) == pytest.approx(1.0, abs=0.25)
     assert common_ratio(*sighting(bend=1.0)) > 2.5
+
+
+def test_pixels_that_do_not_hold_a_direction_say_what_they_have_in_common_all_the_same():
+    view, fix = sighting(bend=1.0)
+    seen = fix.estimate.linearised
+    flat = replace(seen, jacobian=seen.jacobian * np.array([[1.0]] * 5 + [[0.0]]))
+    fix.estimate.linearised = flat
+    assert 1.5 < common_ratio(view, fix) < 100.0
 
 
 def test_what_neighbouring_residuals_have_in_common_widens_the_covariance():

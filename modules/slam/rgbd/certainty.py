@@ -22,6 +22,7 @@ from .view import View
 _CELLS = 8  # across the image, within which residuals are summed up
 _INDEPENDENT = 1.5  # common ratio up to which no wrong model shows: 1.0 to 1.7 in simulations,
 # 2.1 to 3.8 on freiburg1_rpy, 1.3 to 2.6 on RedKitchen
+_NOT_HELD = 1e-9  # of all information, added to every direction
 _KEPT = 0.95  # from image to image, of what residuals have in common
 
 
@@ -76,7 +77,9 @@ def common_ratio(view: View, fix: Fix) -> float:
     """
     seen: Linearised = fix.estimate.linearised
     pulls = (seen.jacobian * seen.residuals).reshape(6, 2, -1).sum(axis=1)  # (6, N)
-    root = np.linalg.cholesky(seen.jacobian @ seen.jacobian.T)
+    normal = seen.jacobian @ seen.jacobian.T
+    # Pixels alone do not hold every pose: corners on a line, say, whose depths do.
+    root = np.linalg.cholesky(normal + _NOT_HELD * np.trace(normal) * np.eye(6))
     pulls = np.linalg.solve(root, pulls)
     side_px = view.gray.shape[1] / _CELLS
     cells = (view.features.uv_px[fix.feature_rows] // side_px).astype(np.int64)
