@@ -65,6 +65,7 @@ def _draw_map(axes: Any, settings: Sequence[Setting], *, most: float) -> None:
     axes.imshow(counts, cmap="cividis", aspect="auto", origin="lower", vmin=0, vmax=max(most, 1))
     for (row, column), count in np.ndenumerate(counts):
         color = "white" if count < max(most, 1) / 2 else "black"
-        axes.text(column, row, f"{count:g}", ha="center", va="center", color=color, fontsize=7)
-    axes.set_xticks(range(len(windows_s)), [f"{w:g}" for w in windows_s], fontsize=6)
+        text = f"{count:.0f}" if count >= 10 else f"{count:.2g}"
+        axes.text(column, row, text, ha="center", va="center", color=color, fontsize=6)
+    axes.set_xticks(range(len(windows_s)), [f"{w:g}" for w in windows_s], fontsize=5)
     axes.set_yticks(range(len(thresholds)), [f"{t:g}" for t in thresholds], fontsize=6)
