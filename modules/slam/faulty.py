@@ -22,12 +22,8 @@ from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
 IN_ANY_PROCESS = ("raise", "nan", "jump", "silence")
-IN_ITS_OWN_PROCESS = (
-    "hang",
-    "kill",
-    "memory",
-    "stop",
-)  # else the bus is struck
+# With run.isolation=process; else the bus is struck.
+IN_ITS_OWN_PROCESS = ("hang", "kill", "memory", "stop")
 FAULTS = (*IN_ANY_PROCESS, *IN_ITS_OWN_PROCESS)
 _HANG_S = 3600.0
 _GULP = 1 << 22  # numbers of 8 bytes

@@ -17,7 +17,7 @@ class Search:
         self._localizer, self._relocalizer = localizer, relocalizer
 
     def find(self, view: View, held_ids: NDArray[np.int64], *, is_lost: bool) -> Fix | None:
-        """Return the pose of a view; the what was held last is worth less if lost."""
+        """Return the pose of a view; what was held last is worth less if lost."""
         fix = self._localizer.near(view.features, view.T_predicted, held_ids)
         if fix is None and not is_lost:
             fix = self._localizer.around(view.features, held_ids)
