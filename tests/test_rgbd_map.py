@@ -132,6 +132,16 @@ def test_motion_goes_on_at_constant_velocity_and_stops_when_lost():
     assert motion.predict(at(0.3))[0, 3] == pytest.approx(0.2)
 
 
+def test_way_back_of_a_lost_camera_is_no_velocity():
+    motion = MotionModel()
+    motion.hold(at(0.0), se3.identity())
+    motion.lose(at(0.1), se3.identity())
+    motion.hold(at(0.2), se3.from_xy_yaw(5.0, 0, 0))
+    assert motion.predict(at(0.3))[0, 3] == pytest.approx(5.0)
+    motion.hold(at(0.3), se3.from_xy_yaw(5.1, 0, 0))
+    assert motion.predict(at(0.4))[0, 3] == pytest.approx(5.2)
+
+
 def test_motion_prefers_odometry_and_takes_rotation_from_the_gyro():
     odometry, gyro = MotionModel(), MotionModel()
     odometry.hold(at(0.0, T_odom_base=se3.from_xy_yaw(7, 0, 0)), se3.identity())

@@ -42,13 +42,12 @@ def held(
     revision: int,
 ) -> Tracking:
     """Return the answer where the map was seen; a reckoned pose has no covariance."""
-    possible = max(1, min(len(fix.expected_ids), len(view.features)))
     return Tracking(
         stamp_ns=view.observation.stamp_ns,
         T_local_base=T_local_base.copy(),
         status=status,
         covariance=covariance,
-        quality_ratio=min(1.0, len(fix.landmark_ids) / possible),
+        quality_ratio=min(1.0, fix.found_ratio(view.features)),
         inliers=len(fix.landmark_ids),
         revision=revision,
     )

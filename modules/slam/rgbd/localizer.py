@@ -32,6 +32,11 @@ class Fix:
     deep_rows: NDArray[np.int64]  # those of them whose depth agrees too
     expected_ids: NDArray[np.int64]  # landmarks that the image should show
 
+    def found_ratio(self, features: Features) -> float:
+        """Return the share of the landmarks that the image should show, which it does."""
+        possible = min(len(self.expected_ids), len(features))
+        return len(self.landmark_ids) / max(1, possible)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Found:

@@ -50,8 +50,9 @@ class MotionModel:
     def hold(self, observation: Observation, T_local_base: Transform) -> None:
         """Go on from a pose that was measured."""
         gap_s = self._gap_s(observation)
+        is_moving = gap_s > 0 and self._held_ns == self._stamp_ns
         T_prev_curr = se3.inverse(self._T_local_base) @ T_local_base
-        self._twist_per_s = se3.log(T_prev_curr) / gap_s if gap_s > 0 else np.zeros(6)
+        self._twist_per_s = se3.log(T_prev_curr) / gap_s if is_moving else np.zeros(6)
         self._step(observation, T_local_base)
         self._held_ns = observation.stamp_ns
         self.is_reckoned = observation.T_odom_base is not None

@@ -54,8 +54,7 @@ class PlaceRecognizer:
         fix = self._localizer.anywhere(features, landmark_ids)
         if fix is None or len(fix.landmark_ids) < self._min_inliers:
             return None
-        possible = max(1, min(len(fix.expected_ids), len(features)))
-        if len(fix.landmark_ids) < _MIN_FOUND_RATIO * possible:
+        if fix.found_ratio(features) < _MIN_FOUND_RATIO:
             return None
         if depth_m is not None and not self._shows(keyframe, fix.estimate.T_local_base, depth_m):
             return None

@@ -9,16 +9,31 @@ from .localizer import Fix, Localizer
 from .relocalizer import Relocalizer
 from .view import View
 
+_CLEAR_RATIO = 0.2  # of the landmarks that should show: chance holds up to 0.12 where it was seen
+
 
 class Search:
-    """Finds the camera in the map, by the cheapest way that succeeds."""
+    """Finds the camera in the map, by the cheapest way that succeeds clearly."""
 
     def __init__(self, localizer: Localizer, relocalizer: Relocalizer) -> None:
         self._localizer, self._relocalizer = localizer, relocalizer
 
     def find(self, view: View, held_ids: NDArray[np.int64], *, is_lost: bool) -> Fix | None:
-        """Return the pose of a view; what was held last is worth less if lost."""
+        """Return the pose of a view; what was held last is worth less if lost.
+
+        Where the prediction was far off, landmarks that look alike around it may agree by chance:
+        the right pose has more of them.
+        """
         fix = self._localizer.near(view.features, view.T_predicted, held_ids)
-        if fix is None and not is_lost:
-            fix = self._localizer.around(view.features, held_ids)
+        if fix is not None and fix.found_ratio(view.features) >= _CLEAR_RATIO:
+            return fix
+        if fix is not None or not is_lost:
+            fix = _better(fix, self._localizer.around(view.features, held_ids))
         return fix or self._relocalizer.find(view.features, view.depth_m)
+
+
+def _better(one: Fix | None, other: Fix | None) -> Fix | None:
+    """Return the pose that more landmarks hold."""
+    if one is None or other is None:
+        return one or other
+    return other if len(other.landmark_ids) > len(one.landmark_ids) else one
