@@ -16,7 +16,8 @@ from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
 from .alignment import Alignment, look_up
-from .features import SCALE, Features
+from .corners import SCALE
+from .features import Features
 
 _STARTS = (Alignment(), Alignment(focal_ratio=0.9, baseline_m=0.025))  # registered; a raw Kinect
 _ASKED_AT = (6, 9, 14, 20)  # pairs of keyframes; unregistered after none of them: registered

@@ -12,7 +12,8 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
-from .features import LEVELS, SCALE, Features
+from .corners import LEVELS, SCALE
+from .features import Features
 from .keyframes import NO_LANDMARK, Keyframe, KeyframeStore
 from .landmarks import LandmarkTable, Looks
 

@@ -1,0 +1,161 @@
+"""Corners of one image: ORB on each level of a pyramid, in two threads, spread over the image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from operator import attrgetter
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+LEVELS = 8
+SCALE = 1.2  # between two levels of the pyramid
+_FIRST, _REST, _BESIDE = (0,), (3, 5, 7), (1, 2, 4, 6)  # levels; both threads have as many pixels
+_CELL_PX = 40  # side of the cells that share out the corners
+_SURPLUS = 2  # corners detected per corner kept
+_BOLDNESS = 0.8  # of the last image's weakest corner, where this one's are looked for first
+_STRONGEST = 255  # grey step
+_ROW_BY_ROW = np.array([1e-4, 1.0])  # puts pixels (u, v) in order
+_ROW_BITS = 20  # of a sort key that holds a row below
+
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Corners:
+    """Corners with what they look like."""
+
+    uv_px: NDArray[np.float64]  # (N, 2), in pixels of the image
+    levels: NDArray[np.int64]  # (N,), of the pyramid, rising
+    descriptors: NDArray[np.uint8]  # (N, 32)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Detected:
+    """Corners of one level, strongest first, before they are shared out."""
+
+    keypoints: Sequence[cv2.KeyPoint]  # (N,)
+    uv_px: NDArray[np.float64]  # (N, 2), in pixels of the level
+    strength: NDArray[np.int64]  # (N,), up to _STRONGEST
+
+
+class _Octave:
+    """ORB on one level; OpenCV lets two threads do so at a time."""
+
+    def __init__(self, quota: int) -> None:
+        self._quota, self._weakest = quota, 0
+        self._orb = cv2.ORB.create(nfeatures=quota, nlevels=1, scoreType=cv2.ORB_FAST_SCORE)
+
+    def detect(self, image: Image, threshold: int) -> _Detected:
+        """Return the strongest corners, as many as wanted, of those above a threshold.
+
+        Most images have many more: it begins near the last image's weakest, and looks again where
+        that was too bold. What is found does not depend on it, only how fast.
+        """
+        bold = round(_BOLDNESS * self._weakest)
+        keypoints = self._detect(image, bold) if bold > threshold else ()
+        if len(keypoints) < self._quota:
+            keypoints = self._detect(image, threshold)
+        strength = np.fromiter(map(attrgetter("response"), keypoints), np.int64, len(keypoints))
+        self._weakest = int(strength.min()) if len(strength) else 0
+        uv_px = np.asarray(cv2.KeyPoint.convert(keypoints), np.float64).reshape(-1, 2)
+        order = np.lexsort((uv_px @ _ROW_BY_ROW, -strength))
+        return _Detected(
+            keypoints=[keypoints[row] for row in order.tolist()],
+            uv_px=uv_px[order],
+            strength=strength[order],
+        )
+
+    def describe(self, image: Image, keypoints: Sequence[cv2.KeyPoint]) -> NDArray[np.uint8]:
+        """Return the descriptors (N, 32) of corners."""
+        if not keypoints:
+            return np.zeros((0, 32), np.uint8)
+        return np.asarray(self._orb.compute(image, keypoints)[1])
+
+    def _detect(self, image: Image, threshold: int) -> Sequence[cv2.KeyPoint]:
+        self._orb.setFastThreshold(threshold)
+        return self._orb.detect(image, None)
+
+
+class CornerFinder:
+    """Finds corners on all levels of an image, on half of them in a thread of its own."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        shares = SCALE ** -np.arange(LEVELS)
+        quotas = np.rint(_SURPLUS * count * shares / shares.sum()).astype(int)
+        self._octaves = [_Octave(quota) for quota in quotas.tolist()]
+        self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="rgbd-corners")
+
+    def find(self, gray: Image, threshold: int) -> Corners:
+        """Return the corners of an image that are a grey step of more than a threshold."""
+        shrunk = self._beside.submit(_pyramid, gray)
+        coming = self._beside.submit(lambda: self._detect(shrunk.result(), _BESIDE, threshold))
+        found = self._detect([gray], _FIRST, threshold)
+        pyramid = shrunk.result()
+        found |= self._detect(pyramid, _REST, threshold) | coming.result()
+        detected = [found[level] for level in range(LEVELS)]
+        chosen = _spread(detected, self._count)
+        described = self._beside.submit(self._describe, pyramid, detected, chosen, _BESIDE)
+        parts = self._describe(pyramid, detected, chosen, _FIRST + _REST) | described.result()
+        uv_px = [SCALE**i * detected[i].uv_px.take(chosen[i], axis=0) for i in range(LEVELS)]
+        return Corners(
+            uv_px=np.concatenate(uv_px),
+            levels=np.repeat(np.arange(LEVELS), [len(rows) for rows in chosen]),
+            descriptors=np.concatenate([parts[i] for i in range(LEVELS)]),
+        )
+
+    def _detect(
+        self, pyramid: Sequence[Image], levels: Sequence[int], threshold: int
+    ) -> dict[int, _Detected]:
+        return {i: self._octaves[i].detect(pyramid[i], threshold) for i in levels}
+
+    def _describe(
+        self,
+        pyramid: Sequence[Image],
+        detected: Sequence[_Detected],
+        chosen: Sequence[NDArray[np.int64]],
+        levels: Sequence[int],
+    ) -> dict[int, NDArray[np.uint8]]:
+        """Return the descriptors of the chosen rows of some levels."""
+        return {
+            i: self._octaves[i].describe(
+                pyramid[i], [detected[i].keypoints[row] for row in chosen[i].tolist()]
+            )
+            for i in levels
+        }
+
+
+def _pyramid(gray: Image) -> list[Image]:
+    """Return an image on all levels; the same to the bit on every machine."""
+    images = [gray]
+    for level in range(1, LEVELS):
+        height, width = (max(1, round(side / SCALE**level)) for side in gray.shape)
+        smaller = cv2.resize(images[-1], (width, height), interpolation=cv2.INTER_LINEAR_EXACT)
+        images.append(np.asarray(smaller, np.uint8))
+    return images
+
+
+def _spread(detected: Sequence[_Detected], count: int) -> list[NDArray[np.int64]]:
+    """Return which `count` corners to keep, as rows of each level.
+
+    Every cell's best first, then every cell's second, and on; of equals the finest and first.
+    """
+    ends = np.cumsum([len(corners.strength) for corners in detected])
+    places = [SCALE**i * detected[i].uv_px // _CELL_PX for i in range(LEVELS)]
+    cells = np.concatenate(places).astype(np.int64) @ np.array([1, 1 << 10])
+    rows = np.arange(len(cells))
+    # Numbers to sort by: the row in the lowest bits, above it the strength, above it the cell.
+    strength = np.concatenate([corners.strength for corners in detected])
+    by_strength = (_STRONGEST - strength << _ROW_BITS) + rows
+    by_cell = np.argsort((cells << _ROW_BITS + 8) + by_strength)
+    is_first = np.diff(cells[by_cell], prepend=-1) != 0
+    rank = rows - np.maximum.accumulate(np.where(is_first, rows, 0))
+    best = np.argsort((rank << _ROW_BITS + 8) + by_strength[by_cell])[:count]
+    chosen = np.sort(by_cell[best])
+    starts = [0, *ends[:-1].tolist()]
+    bounds = np.searchsorted(chosen, [*starts, len(cells)])
+    return [chosen[bounds[i] : bounds[i + 1]] - starts[i] for i in range(LEVELS)]
