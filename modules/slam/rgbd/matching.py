@@ -14,7 +14,9 @@ _MAX_HAMMING = 64
 _MAX_HAMMING_ANYWHERE = 50
 _RATIO_ANYWHERE = 0.75
 _LEVEL_TOLERANCE = 1
+_CELLS_PER_RADIUS = 4  # along a row of the image
 _ROW_BITS = 32  # of a sort key that holds a distance above and a row below
+_ROW_MASK = (1 << _ROW_BITS) - 1
 _NO_RIVAL = 1 << 60
 
 
@@ -46,9 +48,13 @@ def match_near(
 
     `uv_px` (M, 2), `levels` (M,) and `descriptors` (M, 32) are the landmarks' predictions.
     """
+    if not len(uv_px) or not len(features):
+        return _no_matches()
     rows, candidates = _pairs_within(uv_px, features.uv_px, radius_px)
-    near = np.abs(levels[rows] - features.levels[candidates]) <= _LEVEL_TOLERANCE
-    return match_pairs(rows[near], candidates[near], descriptors, features.descriptors, ratio=ratio)
+    apart = levels.take(rows) - features.levels.take(candidates)
+    near = np.flatnonzero(np.abs(apart) <= _LEVEL_TOLERANCE)
+    rows, candidates = rows.take(near), candidates.take(near)
+    return match_pairs(rows, candidates, descriptors, features.descriptors, ratio=ratio)
 
 
 def match_pairs(
@@ -75,12 +81,12 @@ def match_anywhere(descriptors: NDArray[np.uint8], features: Features) -> Matche
     distances, rows = cv2.batchDistance(
         features.descriptors, descriptors, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2
     )[:2]
-    best, second = distances[:, 0], distances[:, 1]
-    clear = (best <= _MAX_HAMMING_ANYWHERE) & (best < _RATIO_ANYWHERE * second)
-    feature_rows = np.flatnonzero(clear)
-    return _one_to_one(
-        rows[feature_rows, 0].astype(np.int64), feature_rows, best[feature_rows].astype(np.int64)
-    )
+    best, second = distances.astype(np.int64).T
+    clear = np.flatnonzero((best <= _MAX_HAMMING_ANYWHERE) & (best < _RATIO_ANYWHERE * second))
+    claims = rows[:, 0].take(clear).astype(np.int64)
+    kept = _first_claims(claims, best.take(clear))
+    kept = kept.take(np.argsort(claims.take(kept)))
+    return Matches(landmark_rows=claims.take(kept), feature_rows=clear.take(kept))
 
 
 def _pairs_within(
@@ -88,28 +94,30 @@ def _pairs_within(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return all pairs (row of `uv_px`, feature) closer than the radius, by rising row.
 
-    Features are sorted into cells of the radius's size: the candidates of a pixel are three
-    runs of three neighbouring cells.
+    Features are sorted into cells as high as the radius and a fraction as wide: the candidates of
+    a pixel are one run of neighbouring cells in each of three rows.
     """
-    if not len(uv_px) or not len(feature_uv_px):
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    lowest = np.minimum(uv_px.min(axis=0), feature_uv_px.min(axis=0)) - radius_px
-    cells = ((uv_px - lowest) / radius_px).astype(np.int64)
-    feature_cells = ((feature_uv_px - lowest) / radius_px).astype(np.int64)
-    width, height = np.maximum(cells.max(axis=0), feature_cells.max(axis=0)) + 2
-    flat = feature_cells[:, 1] * width + feature_cells[:, 0]
+    # Component by component: NumPy is slow along axes of two.
+    ask, have = uv_px.T.copy(), feature_uv_px.T.copy()
+    lowest = np.minimum(ask.min(axis=1), have.min(axis=1))[:, None] - radius_px
+    per_px = np.array([[_CELLS_PER_RADIUS], [1.0]]) / radius_px
+    columns, rows = ((ask - lowest) * per_px).astype(np.int64)
+    feature_columns, feature_rows = ((have - lowest) * per_px).astype(np.int64)
+    width = max(columns.max(), feature_columns.max()) + _CELLS_PER_RADIUS + 1
+    flat = feature_rows * width + feature_columns
     order = np.argsort(flat, kind="stable")
-    starts_of_cells = np.zeros(width * height + 1, np.int64)
-    np.cumsum(np.bincount(flat, minlength=width * height), out=starts_of_cells[1:])
-    middle = cells[:, 1:] * width + cells[:, :1] + width * np.array([[-1, 0, 1]])  # (M, 3)
-    starts = starts_of_cells[middle - 1].ravel()
-    counts = starts_of_cells[middle + 2].ravel() - starts
-    rows = np.repeat(np.arange(len(uv_px)), counts.reshape(-1, 3).sum(axis=1))
-    offsets = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    candidates = order[np.repeat(starts, counts) + offsets]
-    apart = np.take(uv_px, rows, axis=0) - np.take(feature_uv_px, candidates, axis=0)
-    near = np.einsum("ij,ij->i", apart, apart) <= radius_px**2
-    return rows[near], candidates[near]
+    starts_of_cells = np.zeros((max(rows.max(), feature_rows.max()) + 2) * width + 1, np.int64)
+    np.cumsum(np.bincount(flat, minlength=len(starts_of_cells) - 1), out=starts_of_cells[1:])
+    middle = ((rows * width + columns)[:, None] + width * np.array([-1, 0, 1])).ravel()  # (3 M,)
+    starts = starts_of_cells.take(middle - _CELLS_PER_RADIUS)
+    counts = starts_of_cells.take(middle + _CELLS_PER_RADIUS + 1) - starts
+    ends = np.cumsum(counts)
+    candidates = order.take(np.arange(ends[-1]) + np.repeat(starts - ends + counts, counts))
+    rows = np.repeat(np.arange(len(uv_px)), np.diff(ends[2::3], prepend=0))
+    apart_u = ask[0].take(rows) - have[0].take(candidates)
+    apart_v = ask[1].take(rows) - have[1].take(candidates)
+    near = np.flatnonzero(apart_u * apart_u + apart_v * apart_v <= radius_px**2)
+    return rows.take(near), candidates.take(near)
 
 
 def _clear_winners(
@@ -119,26 +127,29 @@ def _clear_winners(
     ratio: float,
 ) -> Matches:
     """Return each row's best candidate where it is near and clearly better than the next."""
-    starts = np.flatnonzero(np.concatenate([[True], np.diff(rows) != 0]))
-    lengths = np.diff(np.append(starts, len(rows)))
-    keys = distances * (1 << _ROW_BITS) + np.arange(len(rows))  # unique, smallest distance first
+    starts = np.flatnonzero(np.diff(rows, prepend=-1))
+    keys = _keys(distances)
     best = np.minimum.reduceat(keys, starts)
-    keys_but_best = np.where(keys == np.repeat(best, lengths), _NO_RIVAL, keys)
-    second = np.minimum.reduceat(keys_but_best, starts) >> _ROW_BITS
-    pair, best = best & ((1 << _ROW_BITS) - 1), best >> _ROW_BITS
-    clear = (best <= _MAX_HAMMING) & (best < ratio * second)
-    return _one_to_one(rows[pair[clear]], candidates[pair[clear]], best[clear])
+    pair, best = best & _ROW_MASK, best >> _ROW_BITS
+    keys[pair] = _NO_RIVAL
+    second = np.minimum.reduceat(keys, starts) >> _ROW_BITS
+    clear = np.flatnonzero((best <= _MAX_HAMMING) & (best < ratio * second))
+    pair = pair.take(clear)
+    pair = pair.take(_first_claims(candidates.take(pair), best.take(clear)))
+    return Matches(landmark_rows=rows.take(pair), feature_rows=candidates.take(pair))
 
 
-def _one_to_one(
-    rows: NDArray[np.int64], feature_rows: NDArray[np.int64], distances: NDArray[np.int64]
-) -> Matches:
-    """Return the pairs, the nearest only where a feature or landmark is claimed twice."""
-    order = np.argsort(distances, kind="stable")
-    order = order[np.unique(feature_rows[order], return_index=True)[1]]
-    order = order[np.argsort(distances[order], kind="stable")]
-    order = order[np.unique(rows[order], return_index=True)[1]]
-    return Matches(landmark_rows=rows[order], feature_rows=feature_rows[order])
+def _first_claims(claims: NDArray[np.int64], distances: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the rows, rising, of each claimed number's nearest claim."""
+    keys = _keys(distances)
+    nearest = np.full(claims.max(initial=0) + 1, _NO_RIVAL)
+    np.minimum.at(nearest, claims, keys)
+    return np.flatnonzero(nearest.take(claims) == keys)
+
+
+def _keys(distances: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return numbers that sort as the distances (N,) do, and equal ones by their row."""
+    return (distances << _ROW_BITS) + np.arange(len(distances))
 
 
 def _no_matches() -> Matches:
