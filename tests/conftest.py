@@ -1,6 +1,9 @@
 """Fixtures that all tests share."""
 
+import os
 from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `python -m sceneslam` sets it
 
 import pytest
 from scenery import RIG, room_observation

@@ -21,7 +21,9 @@ from omegaconf import OmegaConf
 
 from sceneslam.config.check import check_keys
 from sceneslam.sweep.__main__ import main
+from sceneslam.sweep.backends import Joblib
 from sceneslam.sweep.status import State, Status
+from sceneslam.sweep.supervise import Order
 
 ROOT = Path(__file__).parents[1]
 JOBS = ("+scenario=single", "source=mcap", "source.path=room.mcap", "slam@slam.only=odometry")
@@ -165,6 +167,16 @@ def test_folders_that_collide_are_refused(folder):
 def test_folder_that_is_no_sweep_is_named(tmp_path, capsys):
     assert main([str(tmp_path)]) == 2
     assert "not the folder of a sweep" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("n_jobs", "cores"), [(1, 4), (2, 2), (3, 1), (8, 1)])
+def test_jobs_share_the_cores(n_jobs, cores, tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr("sceneslam.sweep.backends.run_job", told.append)
+    monkeypatch.setattr(os, "cpu_count", lambda: 4)
+    order = Order(folder=tmp_path, code=tmp_path, began_in=tmp_path, stop=tmp_path / "stop")
+    Joblib(n_jobs).run([order] * 5)
+    assert [order.cores for order in told] == [cores] * 5
 
 
 def test_status_is_read_as_it_was_written(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from time import sleep
 from typing import Any, Protocol
@@ -44,12 +45,13 @@ class Joblib:
     def run(self, orders: Sequence[Order]) -> None:
         """Run them from threads, each of which waits for its job's process."""
         try:
-            from joblib import Parallel, delayed
+            from joblib import Parallel, delayed, effective_n_jobs
         except ImportError as error:
             raise _missing("joblib", "sweep", error) from error
 
         parallel = Parallel(n_jobs=self._n_jobs, backend="threading", batch_size=1)
-        parallel(delayed(run_job)(order) for order in orders)
+        at_once = min(effective_n_jobs(self._n_jobs), len(orders))
+        parallel(delayed(run_job)(order) for order in _sharing(orders, at_once))
 
 
 class Submitit:
@@ -77,11 +79,13 @@ class Submitit:
 
         executor = AutoExecutor(orders[0].stop.parent / "submitit", cluster=self._cluster)
         executor.update_parameters(**self._parameters)
-        waiting, running = deque(orders), dict[Order, Any]()
+        waiting, running = deque[Order](), dict[Order, Any]()
         if self._cluster == "slurm":
             executor.update_parameters(slurm_array_parallelism=self._at_once)
-            running = dict(zip(orders, executor.map_array(run_job, orders), strict=True))
-            waiting.clear()
+            told = _with_cores(orders, self._parameters.get("cpus_per_task", 1))
+            running = dict(zip(told, executor.map_array(run_job, told), strict=True))
+        else:
+            waiting.extend(_sharing(orders, min(self._at_once, len(orders))))
         while waiting or running:
             while waiting and len(running) < self._at_once:
                 order = waiting.popleft()
@@ -114,13 +118,23 @@ class Ray:
         ray.init(self._address, num_cpus=num_cpus, include_dashboard=False, log_to_driver=False)
         try:
             task = ray.remote(num_cpus=self._cpus_per_job, max_retries=0)(run_job)
-            running = {task.remote(order): order for order in orders}
+            told = _with_cores(orders, int(self._cpus_per_job))
+            running = {task.remote(order): order for order in told}
             while running:
                 ended, _ = ray.wait(list(running))
                 for reference in ended:
                     _note(running.pop(reference), partial(ray.get, reference))
         finally:
             ray.shutdown()
+
+
+def _sharing(orders: Sequence[Order], at_once: int) -> Sequence[Order]:
+    """Return jobs that share this machine's cores."""
+    return _with_cores(orders, (os.cpu_count() or 1) // at_once)
+
+
+def _with_cores(orders: Sequence[Order], cores: int) -> Sequence[Order]:
+    return [replace(order, cores=max(1, cores)) for order in orders]
 
 
 def _is_waiting(order: Order) -> bool:

@@ -26,6 +26,7 @@ class Order:
     code: Path  # a copy of the package as it was when the sweep began
     began_in: Path  # the working folder of the sweep: relative paths are meant from there
     stop: Path  # the sweep is to stop as soon as there is such a file
+    cores: int | None = None  # that the job may take; None: as many as there are
 
 
 def run_job(order: Order) -> None:
@@ -87,7 +88,8 @@ def _environment(order: Order) -> dict[str, str]:
     before = os.environ.get("PYTHONPATH")
     path = [str(order.code), str(order.began_in), *([before] if before else [])]
     threads = {name: os.environ.get(name, "1") for name in _THREADS}
-    return {**os.environ, **threads, "PYTHONPATH": os.pathsep.join(path)}
+    cores = {} if order.cores is None else {"SCENESLAM_CORES": str(order.cores)}
+    return {**os.environ, **threads, **cores, "PYTHONPATH": os.pathsep.join(path)}
 
 
 def _last_words(code: int) -> str:

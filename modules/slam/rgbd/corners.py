@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from operator import attrgetter
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from .cores import thread_beside
 
 LEVELS = 8
 SCALE = 1.2  # between two levels of the pyramid
@@ -88,7 +89,7 @@ class CornerFinder:
         shares = SCALE ** -np.arange(LEVELS)
         quotas = np.rint(_SURPLUS * count * shares / shares.sum()).astype(int)
         self._octaves = [_Octave(quota) for quota in quotas.tolist()]
-        self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="rgbd-corners")
+        self._beside = thread_beside("rgbd-corners")
 
     def find(self, gray: Image, threshold: int) -> Corners:
         """Return the corners of an image that are a grey step of more than a threshold."""

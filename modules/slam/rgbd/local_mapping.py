@@ -10,12 +10,14 @@ from sceneslam.types.se3 import Transform
 
 from .alignment import Alignment
 from .alignment_search import Shown
+from .cores import Here, worker_beside
 from .mapping_work import MappingWork, Outcome, Task
 from .side_process import SideProcess
 from .view import View
 from .visual_map import VisualMap
 from .window import Window, merge_window, take_window
 
+_Worker = SideProcess[Task, Outcome] | Here[Task, Outcome]
 _TIED_IMAGES = 10  # for what has depth: registering it takes the worker 100 to 200 ms
 _FREE_IMAGES = 5  # for what has none: triangulated landmarks wait for it, and drift in scale
 
@@ -35,7 +37,7 @@ class LocalMapping:
         alignment: Alignment | None,
     ) -> None:
         self._map, self._depth_camera, self._known = visual_map, depth_camera, alignment
-        self._worker: SideProcess[Task, Outcome] | None = None
+        self._worker: _Worker | None = None
         self._window: Window | None = None
         self._result: Future[Outcome] | None = None
         self._images_left, self._newest = _FREE_IMAGES, -1
@@ -89,10 +91,10 @@ class LocalMapping:
         self.alignment = outcome.alignment
         return merge_window(self._map, window, outcome.adjusted)
 
-    def _process(self) -> SideProcess[Task, Outcome]:
+    def _process(self) -> _Worker:
         """Return the worker; it starts with the first keyframe, to be there when it is needed."""
         if self._worker is None:
-            self._worker = SideProcess(
+            self._worker = worker_beside(
                 MappingWork, self._map.camera, self._depth_camera, self._known
             )
         return self._worker
