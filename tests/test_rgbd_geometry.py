@@ -6,6 +6,7 @@ import numpy as np
 from rgbd_features import features_at, random_descriptors
 
 from sceneslam.modules.slam.rgbd.matching import match_anywhere, match_near
+from sceneslam.modules.slam.rgbd.pose_errors import PoseErrors
 from sceneslam.modules.slam.rgbd.pose_solver import Measurements, PoseSolver
 from sceneslam.modules.slam.rgbd.residuals import Sightings
 from sceneslam.types import se3
@@ -143,3 +144,20 @@ def test_pose_solver_gives_up_on_points_that_hold_no_pose():
     coarse = solver.search(one_point)
     assert coarse is None or np.isfinite(coarse.T_local_base).all()
     assert solver.refine(one_point, se3.identity()) is None
+
+
+def test_slopes_of_a_pose_are_its_residuals_differences():
+    T_local_base, measured = scene(np.random.default_rng(0), count=20)
+    errors = PoseErrors(CAMERA, measured.points_local, measured.seen)
+    T_cam_local = se3.inverse(T_local_base @ CAMERA.T_base_cam)
+    errors.move(T_cam_local)
+    rows = errors.rows(np.ones((3, 1))).copy()
+    assert np.abs(rows[6]).max() < 1e-9
+    for axis, twist in enumerate(1e-6 * np.eye(6)):
+        sides = []
+        for sign in (1.0, -1.0):
+            # A twist of the camera is the inverse one of what it sees.
+            errors.move(se3.exp(-sign * twist) @ T_cam_local)
+            sides.append(errors.residuals)
+        slope = (sides[0] - sides[1]) / 2e-6
+        assert np.abs(rows[axis] - slope).max() < 1e-3

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -13,14 +12,14 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
-from .residuals import Errors, Sightings, errors
+from .pose_errors import PoseErrors
+from .residuals import Sightings
 
 _RANSAC_PX = 4.0
 _RANSAC_TRIALS = 200
 _RANSAC_CONFIDENCE = 0.999
-_APPROACH = (2, 2)  # Gauss-Newton steps between two looks at who is an outlier
-_REFINEMENT = (2, 1, 1)
-_SMALL_STEP = 1e-4  # [m] and [rad]
+_APPROACH_STEPS, _REFINEMENT_STEPS = 2, 5
+_SMALL_STEP = 0.3  # [sigma], the last: what is left then is a third of it
 _MAX_CONDITION = 1e12  # of the normal matrix; beyond, some motion is not measured at all
 
 
@@ -66,7 +65,7 @@ class _Descent:
     """Where Gauss-Newton has come to, and who agrees with it."""
 
     T_local_cam: Transform
-    errors: Errors
+    errors: PoseErrors
     normal: NDArray[np.float64]  # (6, 6), of the last step's twist of the camera
     inliers: NDArray[np.bool_]  # (N,), pixels agree
     depth_inliers: NDArray[np.bool_]  # (N,), depths agree too
@@ -105,7 +104,7 @@ class PoseSolver:
 
     def approach(self, measured: Measurements, T_local_base: Transform) -> Consensus | None:
         """Return a rough pose beside a predicted one, None where the pixels agree on none."""
-        end = self._descend(measured, T_local_base, _APPROACH)
+        end = self._descend(measured, T_local_base, _APPROACH_STEPS)
         if end is None:
             return None
         return Consensus(
@@ -120,10 +119,10 @@ class PoseSolver:
         bundle adjustment: a depth camera's disparity error is constant, so its depth error grows
         with the square.
         """
-        end = self._descend(measured, T_local_base, _REFINEMENT)
+        end = self._descend(measured, T_local_base, _REFINEMENT_STEPS)
         if end is None:
             return None
-        inliers, residuals = end.inliers, end.errors.of[:2, end.inliers].ravel()
+        inliers, residuals = end.inliers, end.errors.residuals[:2, end.inliers].ravel()
         # Where the errors are larger than their sigmas say, so is the covariance.
         pixel_variance = float(residuals @ residuals) / (len(residuals) - 6)
         carry = se3.adjoint(self._camera.T_base_cam)
@@ -136,50 +135,53 @@ class PoseSolver:
             depth_agreement_ratio=_share(end.depth_inliers, inliers & measured.seen.measures_depth),
             linearised=Linearised(
                 residuals=residuals,
-                jacobian=end.errors.by_twist()[:, :2, inliers].reshape(6, -1),
+                jacobian=end.errors.rows(np.ones((3, 1)))[:6, :2, inliers].reshape(6, -1),
                 sigma_px=measured.seen.sigma_px[inliers],
             ),
         )
 
     def _descend(
-        self, measured: Measurements, T_local_base: Transform, rounds: Sequence[int]
+        self, measured: Measurements, T_local_base: Transform, steps: int
     ) -> _Descent | None:
-        T_local_cam = T_local_base @ self._camera.T_base_cam
-        found = self._errors(T_local_cam, measured)
+        """Return where Gauss-Newton ends that asks after every step who is an outlier."""
+        T_cam_local = se3.inverse(T_local_base @ self._camera.T_base_cam)
+        found = PoseErrors(self._camera, measured.points_local, measured.seen)
+        found.move(T_cam_local)
         measures_depth = measured.seen.measures_depth
         inliers, depth_inliers = np.ones(len(measures_depth), bool), measures_depth
-        for steps in rounds:
+        for _ in range(steps):
             use = np.stack([inliers, inliers, depth_inliers])
-            for _ in range(steps):
-                jacobian = found.by_twist()
-                weighted = (jacobian * (found.huber_weights() * use)).reshape(6, -1)
-                normal = weighted @ jacobian.reshape(6, -1).T
-                if not np.isfinite(normal).all():
-                    return None
-                squares, axes = np.linalg.eigh(normal)
-                if squares[0] * _MAX_CONDITION < squares[-1]:
-                    return None
-                step = -(axes / squares) @ (axes.T @ (weighted @ found.of.ravel()))
-                T_local_cam = T_local_cam @ se3.exp(step)
-                found = self._errors(T_local_cam, measured)
-                if np.abs(step).max() < _SMALL_STEP:
-                    break
+            rows = found.rows(np.sqrt(found.weights() * use)).reshape(7, -1)
+            products = rows @ rows.T
+            normal, slopes = products[:6, :6], products[:6, 6]
+            step = _solve(normal, slopes)
+            if step is None:
+                return None
+            T_cam_local = se3.exp(step) @ T_cam_local
+            found.move(T_cam_local)
             inliers = found.pixels_agree()
             depth_inliers = inliers & measures_depth & found.depths_agree()
-            if inliers.sum() < 4:
+            if np.count_nonzero(inliers) < 4:
                 return None
+            if step @ slopes < _SMALL_STEP**2:
+                break
         return _Descent(
-            T_local_cam=T_local_cam,
+            T_local_cam=se3.inverse(T_cam_local),
             errors=found,
             normal=normal,
             inliers=inliers,
             depth_inliers=depth_inliers,
         )
 
-    def _errors(self, T_local_cam: Transform, measured: Measurements) -> Errors:
-        T_cam_local = se3.inverse(T_local_cam)
-        points_cam = T_cam_local[:3, :3] @ measured.points_local.T + T_cam_local[:3, 3:]
-        return errors(self._camera, points_cam, measured.seen)
+
+def _solve(normal: NDArray[np.float64], slopes: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the twist (6,) that the normal equations ask for, None where they leave it open."""
+    if not np.isfinite(normal).all():
+        return None
+    squares, axes = np.linalg.eigh(normal)
+    if squares[0] * _MAX_CONDITION < squares[-1]:
+        return None
+    return np.asarray((axes / squares) @ (axes.T @ slopes))
 
 
 def _share(chosen: NDArray[np.bool_], of: NDArray[np.bool_]) -> float:

@@ -11,8 +11,8 @@ from sceneslam.types.rig import Camera
 
 CHI2_PIXEL = 5.99  # 95 % of two degrees of freedom
 CHI2_DEPTH = 3.84  # 95 % of one
-_HUBER = 2.0  # [sigma]
-_MIN_DEPTH_M = 0.05
+HUBER = 2.0  # [sigma]
+MIN_DEPTH_M = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -56,7 +56,7 @@ class Errors:
         """Return weights (3, N); u and v share one, by their joint length."""
         pixel = np.sqrt(self.of[0] ** 2 + self.of[1] ** 2)
         sizes = np.stack([pixel, pixel, np.abs(self.of[2])])
-        return np.asarray(_HUBER / np.maximum(sizes, _HUBER))
+        return np.asarray(HUBER / np.maximum(sizes, HUBER))
 
     def pixels_agree(self) -> NDArray[np.bool_]:
         """Return (N,) where the pixel is within its 95 % limit."""
@@ -69,7 +69,7 @@ class Errors:
 
 def errors(camera: Camera, points_cam: NDArray[np.float64], seen: Sightings) -> Errors:
     """Return the errors of landmarks (3, N) [m] in the camera, and their slopes."""
-    inverse_z = 1.0 / np.maximum(points_cam[2], _MIN_DEPTH_M)
+    inverse_z = 1.0 / np.maximum(points_cam[2], MIN_DEPTH_M)
     x, y = points_cam[0] * inverse_z, points_cam[1] * inverse_z
     per_px = 1.0 / seen.sigma_px
     per_m = seen.measures_depth / seen.inverse_depth_sigma_per_m
