@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,6 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
 from sceneslam.app import run
+from sceneslam.config.build import make_source
 from sceneslam.config.check import check_given
 from sceneslam.config.component import Builder
 from sceneslam.config.overlay import command_of, comment_of
@@ -66,8 +67,12 @@ class _Trials:
         self.done: list[Ran] = []
 
     def run(self, trials: Iterable[Trial]) -> Iterator[Outcome]:
-        """Yield the outcomes in order; all trials are composed before the first is run."""
+        """Yield the outcomes in order.
+
+        Before the first is run all are composed, and each input is opened once.
+        """
         configs = [(trial, self._compose(trial)) for trial in trials]
+        _try_sources([config for _, config in configs])
         for trial, config in tqdm(configs, desc=self._key, unit="run", leave=False):
             folder = self._folder / trial.name
             made_by = provenance(config)
@@ -115,6 +120,14 @@ class _Trials:
         return {
             name: value for name, value in plain.items() if name not in ("experiment", self._key)
         }
+
+
+def _try_sources(configs: Iterable[Mapping[str, Any]]) -> None:
+    """Raise the error of any source that cannot be opened."""
+    for config in {
+        json.dumps(config["source"], default=str): config for config in configs
+    }.values():
+        make_source(config, Builder(config))
 
 
 def _read(path: Path, is_there: bool) -> Trajectory:

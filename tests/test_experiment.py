@@ -121,8 +121,8 @@ def test_a_frame_without_extrinsics_is_named(folder):
         Dataset(folder / "data")
 
 
-def call(folder, *overrides):
-    words = [sys.executable, "-m", "sceneslam", "+experiment=openloris", *overrides]
+def call(folder, *overrides, name="openloris"):
+    words = [sys.executable, "-m", "sceneslam", f"+experiment={name}", *overrides]
     return subprocess.run(
         [*words, "hydra.run.dir=out"],
         cwd=folder,
@@ -168,3 +168,10 @@ def test_a_mistake_is_one_sentence(folder, overrides, sentence):
     done = call(folder, *overrides)
     assert done.returncode == 2 and sentence in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_an_input_that_cannot_be_opened_is_told_before_the_first_run(tmp_path):
+    stories = "matrix.stories=[bright_to_dark,there_and_bak]"
+    done = call(tmp_path, stories, "matrix.seeds=[0]", name="matrix")
+    assert done.returncode == 2 and "source.story: got 'there_and_bak'" in done.stderr
+    assert not list(tmp_path.glob("out/runs/*"))
