@@ -78,19 +78,21 @@ class VisualMap:
     def doubts(self, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> Doubts:
         """Return the landmarks' own uncertainty as the camera sees it from a pose."""
         T_cam_local = se3.inverse(T_local_base @ self.camera.T_base_cam)
-        points_cam = se3.apply(T_cam_local, self.landmarks.points_local.take(landmark_ids, axis=0))
-        z = np.maximum(points_cam[:, 2], _NEAREST_M)
-        # Moves of a landmark: across the ray (two ways) and along the optical axis.
-        rows = np.zeros((len(z), 3, 3))
-        rows[:, 0, 0] = rows[:, 1, 1] = rows[:, 2, 2] = 1.0
-        rows[:, :2, 2] = -points_cam[:, :2] / z[:, None]
-        rows = rows @ T_cam_local[:3, :3]
-        covariance = self.landmarks.covariance.take(landmark_ids, axis=0)
-        variances = ((rows @ covariance) * rows).sum(axis=2)
-        across_m = np.sqrt(0.5 * variances[:, :2].sum(axis=1))
+        points_local = self.landmarks.points_local.take(landmark_ids, axis=0)
+        x, y, z = T_cam_local[:3, :3] @ points_local.T + T_cam_local[:3, 3:]
+        z = np.maximum(z, _NEAREST_M)
+        x, y = x / z, y / z
+        right, down, ahead = T_cam_local[:3, :3]
+        # A landmark moves across its ray by what it moves sideways less the ray's slope times what
+        # it moves ahead, in two ways; each product is one entry of its covariance in cam.
+        pairs = ((right, right), (down, down), (right, ahead), (down, ahead), (ahead, ahead))
+        entries = np.stack([np.outer(one, other).ravel() for one, other in pairs])
+        covariance = self.landmarks.covariance.take(landmark_ids, axis=0).reshape(-1, 9)
+        xx, yy, xz, yz, zz = entries @ covariance.T
+        across = xx + yy - 2.0 * (x * xz + y * yz) + (x * x + y * y) * zz
         return Doubts(
-            across_px=self.camera.fx * across_m / z,
-            inverse_depth_per_m=np.sqrt(variances[:, 2]) / z**2,
+            across_px=self.camera.fx * np.sqrt(0.5 * np.maximum(across, 0.0)) / z,
+            inverse_depth_per_m=np.sqrt(zz) / z**2,
         )
 
     def around(self, landmark_ids: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -99,25 +101,31 @@ class VisualMap:
 
     def predict(self, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> Prediction:
         """Return which of these landmarks the image should show from a pose, and where."""
-        camera = self.camera
+        camera, table = self.camera, self.landmarks
         T_local_cam = T_local_base @ camera.T_base_cam
-        points_local = self.landmarks.points_local.take(landmark_ids, axis=0)
-        points_cam = se3.apply(se3.inverse(T_local_cam), points_local)
-        z = np.maximum(points_cam[:, 2], _NEAREST_M)
-        uv_px = points_cam[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-        to_viewer = T_local_cam[:3, 3] - points_local
-        distance_m = np.maximum(np.linalg.norm(to_viewer, axis=1), _NEAREST_M)
-        cos_view = (to_viewer * self.landmarks.normals_local.take(landmark_ids, axis=0)).sum(
-            1
-        ) / distance_m
-        levels = np.log(self.landmarks.reach_m[landmark_ids] / distance_m) / np.log(SCALE)
-        visible = (points_cam[:, 2] > _NEAREST_M) & (cos_view > _MIN_COS_VIEW)
-        visible &= ((uv_px >= 0) & (uv_px <= camera.size_wh)).all(axis=1)
-        visible &= (levels > -1.5) & (levels < LEVELS + 0.5)
+        # Component by component: NumPy is slow along axes of two or three.
+        away = _rows(table.points_local.take(landmark_ids, axis=0)) - T_local_cam[:3, 3:]
+        normals = _rows(table.normals_local.take(landmark_ids, axis=0))
+        x, y, z = T_local_cam[:3, :3].T @ away
+        distance_m = np.maximum(np.sqrt(x * x + y * y + z * z), _NEAREST_M)
+        inverse_z = 1.0 / np.maximum(z, _NEAREST_M)
+        u, v = camera.fx * x * inverse_z + camera.cx, camera.fy * y * inverse_z + camera.cy
+        turned_away = (away * normals).sum(axis=0)  # minus the cosine, times the distance
+        levels = np.log(table.reach_m.take(landmark_ids) / distance_m) / np.log(SCALE)
+        visible = np.flatnonzero(
+            (z > _NEAREST_M)
+            & (turned_away < -_MIN_COS_VIEW * distance_m)
+            & (u >= 0)
+            & (u <= camera.size_wh[0])
+            & (v >= 0)
+            & (v <= camera.size_wh[1])
+            & (levels > -1.5)
+            & (levels < LEVELS + 0.5)
+        )
         return Prediction(
-            ids=landmark_ids[visible],
-            uv_px=uv_px[visible],
-            levels=np.clip(np.rint(levels[visible]), 0, LEVELS - 1).astype(np.int64),
+            ids=landmark_ids.take(visible),
+            uv_px=np.stack([u.take(visible), v.take(visible)], axis=1),
+            levels=np.clip(np.rint(levels.take(visible)), 0, LEVELS - 1).astype(np.int64),
         )
 
     def count_sightings(
@@ -212,3 +220,8 @@ class VisualMap:
         """Forget landmarks."""
         self.keyframes.forget_landmarks(landmark_ids)
         self.landmarks.remove(landmark_ids)
+
+
+def _rows(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return vectors (N, 3) as rows of their components (3, N)."""
+    return np.ascontiguousarray(vectors.T)
