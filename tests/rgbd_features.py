@@ -3,7 +3,10 @@
 import numpy as np
 
 from sceneslam.modules.slam.rgbd.features import Features
+from sceneslam.modules.slam.rgbd.shutter import Turning
 from sceneslam.modules.slam.rgbd.visual_map import VisualMap
+
+AT_REST = Turning(rate_cam=np.zeros(3), twist_per_s=np.zeros(6))
 
 
 def features_at(uv_px, descriptors, levels=None, depth_m=None):

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from rgbd_features import empty_map, features_at, random_descriptors
+from rgbd_features import AT_REST, empty_map, features_at, random_descriptors
 
 from sceneslam.modules.slam.rgbd.alignment import Alignment
 from sceneslam.modules.slam.rgbd.bundle import Bundle, adjust
@@ -128,6 +128,7 @@ def keyframe_at(T_local_cam, points_local, descriptors, landmark_ids):
             colors_bgr=np.zeros((0, 3), np.uint8),
             scan=None,
         ),
+        turning=AT_REST,
     )
 
 

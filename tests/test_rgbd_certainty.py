@@ -29,6 +29,7 @@ def sighting(bend, *, is_monocular=False):
         residuals=residuals.ravel(),
         jacobian=np.concatenate([by_u, by_v], axis=1),
         sigma_px=one,
+        normal=np.eye(6),
     )
     features = features_at(uv_px, random_descriptors(rng, COUNT))
     gray = np.zeros((480, 640), np.uint8)

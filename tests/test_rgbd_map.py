@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from rgbd_features import empty_map, features_at, random_descriptors
+from rgbd_features import AT_REST, empty_map, features_at, random_descriptors
 
 from sceneslam.modules.slam.rgbd.alignment import Alignment
 from sceneslam.modules.slam.rgbd.features import FeatureExtractor
@@ -62,6 +62,7 @@ def keyframe_at(x_m, landmark_ids=(), count=60, camera=CAMERA):
             colors_bgr=np.zeros((0, 3), np.uint8),
             scan=None,
         ),
+        turning=AT_REST,
     )
 
 

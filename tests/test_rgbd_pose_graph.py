@@ -119,7 +119,7 @@ def test_no_way_leads_to_what_nothing_was_measured_to():
 def test_frames_move_with_their_keyframe_and_stay_when_it_is_forgotten(moved, offset):
     frames, T_old, T_heir = FrameLog(), se3.exp(moved), se3.exp(offset)
     for index in range(1100):  # more than the first capacity
-        frames.add(index, 7, se3.from_xy_yaw(0.001 * index, 0.0, 0.0))
+        frames.add(index, 7, se3.from_xy_yaw(0.001 * index, 0.0, 0.0), np.zeros(6))
     before = frames.trajectory({7: T_old})
     assert len(before) == 1100
     np.testing.assert_allclose(before.T_world_base[0], T_old, atol=1e-9)
@@ -127,3 +127,14 @@ def test_frames_move_with_their_keyframe_and_stay_when_it_is_forgotten(moved, of
     after = frames.trajectory({3: T_heir})
     np.testing.assert_allclose(after.T_world_base, before.T_world_base, atol=1e-9)
     assert not len(frames.trajectory({7: T_old}))
+
+
+@given(TWISTS, TWISTS, TWISTS)
+def test_frame_moves_by_its_own_turn_when_reading_takes_longer(moved, of_keyframe, of_frame):
+    frames, T_local_keyframe, T_local_base = FrameLog(), se3.exp(moved), se3.exp(moved / 2)
+    frames.add(0, 7, se3.inverse(T_local_keyframe) @ T_local_base, of_frame)
+    frames.straighten(0.02, {7: of_keyframe})
+    told = frames.trajectory({7: T_local_keyframe @ se3.exp(0.02 * of_keyframe)})
+    expected = T_local_base @ se3.exp(0.02 * of_frame)
+    np.testing.assert_allclose(told.T_world_base[0], expected, atol=1e-9)
+    assert frames.newest[0] == 7

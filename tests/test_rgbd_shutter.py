@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rgbd_features import features_at, random_descriptors
+from rgbd_features import empty_map, features_at, random_descriptors
 
+from sceneslam.modules.slam.rgbd.keyframes import NO_LANDMARK, Keyframe, nothing_seen
 from sceneslam.modules.slam.rgbd.pose_solver import Measurements, PoseSolver
 from sceneslam.modules.slam.rgbd.residuals import Sightings
-from sceneslam.modules.slam.rgbd.shutter import RollingShutter
+from sceneslam.modules.slam.rgbd.shutter import RollingShutter, Turning, moves_px_per_s
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 
@@ -54,7 +55,9 @@ def after_watching(readout_s, *, images=60):
             inverse_depth_sigma_per_m=np.full(LANDMARKS, 0.003),
         )
         estimate = solver.refine(Measurements(points_local=points, seen=seen), np.eye(4))
-        shutter.learn(estimate.linearised, straight.uv_px[estimate.inliers], rate_cam)
+        slope_px = moves_px_per_s(CAMERA, straight.uv_px[estimate.inliers], rate_cam)
+        shutter.learn(estimate.linearised, slope_px)
+        shutter.step_s()
     return shutter, points
 
 
@@ -74,6 +77,59 @@ def test_features_are_put_where_the_middle_row_would_have_seen_them():
     left_px = np.linalg.norm(straight - pixels(points), axis=1)
     assert np.median(wrong_px) > 3.0
     assert np.median(left_px) < 0.15 * np.median(wrong_px)
+
+
+def estimate_of(points, uv_px):
+    """Return the pose that pixels of points lead to."""
+    seen = Sightings(
+        uv_px=uv_px,
+        sigma_px=np.ones(LANDMARKS),
+        depth_m=points[:, 2],
+        inverse_depth_sigma_per_m=np.full(LANDMARKS, 0.003),
+    )
+    measured = Measurements(points_local=points, seen=seen)
+    return PoseSolver(CAMERA, seed=0).refine(measured, np.eye(4))
+
+
+def test_rows_tell_how_fast_a_camera_turned_of_which_nothing_is_known():
+    shutter, points = after_watching(0.026)
+    rate_cam = np.array([0.6, -0.5, 0.4])
+    uv_px = rolled(points, rate_cam, 0.026)
+    estimate = estimate_of(points, uv_px)
+    found, _ = shutter.turn(estimate.linearised, uv_px[estimate.inliers], np.zeros(3), 1.0)
+    assert found == pytest.approx(rate_cam, abs=0.15)
+    kept, _ = shutter.turn(estimate.linearised, uv_px[estimate.inliers], np.zeros(3), 1e-3)
+    assert np.abs(kept).max() < 0.01
+
+
+def test_map_made_while_the_camera_turned_is_straightened_when_the_readout_is_known():
+    rng, rate_cam = np.random.default_rng(1), np.array([0.5, -1.0, 0.3])
+    points, visual_map = scene(rng), empty_map(CAMERA)
+    uv_px = rolled(points, rate_cam, 0.026)
+    estimate = estimate_of(points, uv_px)
+    slope_px = moves_px_per_s(CAMERA, uv_px[estimate.inliers], rate_cam)
+    twist_per_s = RollingShutter(CAMERA).learn(estimate.linearised, slope_px)
+    keyframe = Keyframe(
+        stamp_ns=0,
+        T_local_base=estimate.T_local_base,
+        features=features_at(uv_px, random_descriptors(rng, LANDMARKS), depth_m=points[:, 2]),
+        landmark_ids=np.full(LANDMARKS, NO_LANDMARK),
+        view=nothing_seen(),
+        turning=Turning(rate_cam=rate_cam, twist_per_s=twist_per_s),
+    )
+    visual_map.insert(keyframe, deep_rows=np.zeros(0, np.int64))
+    ids = keyframe.landmark_ids
+
+    def off_m():
+        pose_m = np.linalg.norm(keyframe.T_local_base[:3, 3])
+        gaps_m = np.linalg.norm(visual_map.landmarks.points_local[ids] - points, axis=1)
+        return np.array([pose_m, np.median(gaps_m)])
+
+    wrong_m = off_m()
+    visual_map.straighten(0.026)
+    assert (off_m() < 0.35 * wrong_m).all()
+    left_px = np.linalg.norm(keyframe.features.uv_px - pixels(points), axis=1)
+    assert np.median(left_px) < 0.15 * np.median(np.linalg.norm(uv_px - pixels(points), axis=1))
 
 
 def test_global_shutter_and_camera_at_rest_are_left_alone():

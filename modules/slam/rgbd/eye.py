@@ -2,29 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types import se3
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
 from .features import FeatureExtractor
-from .localizer import Fix
-from .shutter import RollingShutter
+from .localizer import Fix, Localizer
+from .motion import MotionModel, TurnRate
+from .shutter import RollingShutter, Turning, moves_px_per_s
 from .view import View
+from .visual_map import VisualMap
 
 _ROW_STEP = 32  # rows that are compared first
+_ROUNDS = 2  # of straightening and looking again where nothing was known of the turn
 
 
 class Eye:
     """Finds features and straightens them; learns how from the poses that they led to."""
 
-    def __init__(self, camera: Camera, extractor: FeatureExtractor) -> None:
-        self._rotation_cam_base = camera.T_base_cam[:3, :3].T
-        self._extractor, self._shutter = extractor, RollingShutter(camera)
-        self._rate_cam = np.zeros(3)  # [rad/s], while the last image was read
+    def __init__(
+        self, visual_map: VisualMap, localizer: Localizer, extractor: FeatureExtractor
+    ) -> None:
+        self._map, self._camera = visual_map, visual_map.camera
+        self._localizer = localizer
+        self._extractor, self._shutter = extractor, RollingShutter(visual_map.camera)
+        self.twist_per_s = np.zeros(6)  # of the newest pose, see Turning
         self._last_bgr: NDArray[np.uint8] | None = None
 
     def is_repeated(self, image_bgr: NDArray[np.uint8]) -> bool:
@@ -48,17 +56,56 @@ class Eye:
         """Return what an image shows, taken while the base turned by (3,) [rad/s]."""
         gray = np.asarray(cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY), np.uint8)
         features = self._extractor.extract(gray, observation.depth_m)
-        self._rate_cam = self._rotation_cam_base @ rate_base
-        features = self._shutter.straighten(features, self._rate_cam)
+        turning = Turning(
+            rate_cam=self._camera.T_base_cam[:3, :3].T @ rate_base, twist_per_s=self.twist_per_s
+        )
         return View(
             observation=observation,
             image_bgr=image_bgr,
             gray=gray,
-            features=features,
+            features=self._shutter.straighten(features, turning.rate_cam),
             T_predicted=T_predicted,
+            turning=turning,
         )
 
-    def learn(self, view: View, fix: Fix) -> None:
-        """Hear of the pose that the last view led to."""
+    def settle(self, view: View, fix: Fix, motion: MotionModel) -> tuple[View, Fix]:
+        """Return a view and the pose that it led to, now that it tells how the camera turned."""
+        turn = motion.turning(view.observation, fix.estimate.T_local_base)
+        if self._shutter.readout_s and turn.is_unknown:
+            for _ in range(_ROUNDS):
+                view, fix = self._turn(view, fix, turn)
+                fix = self._localizer.beside(view.features, fix) or fix
+        view, fix = self._turn(view, fix, turn)
+        return self._learn(view, fix), fix
+
+    def step_s(self) -> float:
+        """Return by how much longer reading takes than was taken so far, which is taken now."""
+        return self._shutter.step_s()
+
+    def _turn(self, view: View, fix: Fix, turn: TurnRate) -> tuple[View, Fix]:
+        """Let the rows say how fast the camera turned, beside what is known of it."""
+        camera, seen = self._camera, fix.estimate.linearised
+        rotation_cam_base = camera.T_base_cam[:3, :3].T
+        change = rotation_cam_base @ turn.rate_base - view.turning.rate_cam
         uv_px = view.features.uv_px[fix.feature_rows]
-        self._shutter.learn(fix.estimate.linearised, uv_px, self._rate_cam)
+        change, twist_cam = self._shutter.turn(seen, uv_px, change, turn.sigma_rad_per_s)
+        features = self._shutter.straighten(view.features, change)
+        moved = (features.uv_px[fix.feature_rows] - uv_px) / seen.sigma_px[:, None]
+        residuals = seen.residuals - moved.T.ravel() + twist_cam @ seen.jacobian
+        twist = se3.adjoint(camera.T_base_cam) @ twist_cam
+        estimate = replace(
+            fix.estimate,
+            T_local_base=fix.estimate.T_local_base @ se3.exp(twist),
+            linearised=replace(seen, residuals=residuals),
+        )
+        turning = replace(view.turning, rate_cam=view.turning.rate_cam + change)
+        return replace(view, features=features, turning=turning), replace(fix, estimate=estimate)
+
+    def _learn(self, view: View, fix: Fix) -> View:
+        """Return a view with how its pose goes with the readout, of which it tells."""
+        uv_px, ids = view.features.uv_px[fix.feature_rows], fix.landmark_ids
+        slope_px = moves_px_per_s(self._camera, uv_px, view.turning.rate_cam)
+        slope_px -= self._map.shifts_px_per_s(fix.estimate.T_local_base, ids)
+        twist_cam = self._shutter.learn(fix.estimate.linearised, slope_px)
+        self.twist_per_s = se3.adjoint(self._camera.T_base_cam) @ twist_cam
+        return replace(view, turning=replace(view.turning, twist_per_s=self.twist_per_s))

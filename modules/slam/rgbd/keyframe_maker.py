@@ -51,6 +51,7 @@ class KeyframeMaker:
             features=view.features,
             landmark_ids=landmark_ids,
             view=self._layers.view(view.depth_m, view.image_bgr, stamp_ns=stamp_ns),
+            turning=view.turning,
         )
         deep_rows = landmark_ids[:0] if fix is None else fix.deep_rows
         keyframe_id = self._map.insert(keyframe, deep_rows=deep_rows)

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.observation import LaserScan
+from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
 from .features import Features
+from .shutter import Turning, straightened
 
 NO_LANDMARK = -1
 
@@ -42,6 +44,12 @@ class Keyframe:
     features: Features
     landmark_ids: NDArray[np.int64]  # (N,), per feature, or NO_LANDMARK
     view: DepthView
+    turning: Turning
+
+    def straighten(self, camera: Camera, readout_s: float) -> None:
+        """Take it that reading the image took so much longer."""
+        self.features = straightened(camera, self.features, self.turning.rate_cam, readout_s)
+        self.T_local_base = self.T_local_base @ se3.exp(readout_s * self.turning.twist_per_s)
 
 
 class KeyframeStore:

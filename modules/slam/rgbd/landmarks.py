@@ -41,6 +41,10 @@ class LandmarkTable:
         self.found = np.zeros(_FIRST_CAPACITY, np.int64)  # images that did
         self.scale_sigma = np.zeros(_FIRST_CAPACITY)  # share of its distance; 0: depth measured it
         self.births = np.zeros(_FIRST_CAPACITY, np.int64)  # rises with every call of `add`
+        self.shift_local = np.zeros(
+            (_FIRST_CAPACITY, 3)
+        )  # [m] per second that reading takes longer
+        self.sightings = np.zeros(_FIRST_CAPACITY, np.int64)  # keyframes that tell the shift
         self._born = 0
 
     def __len__(self) -> int:
@@ -62,6 +66,7 @@ class LandmarkTable:
         self.describe(ids, looks)
         self.scale_sigma[ids] = scale_sigma
         self.alive[ids], self.expected[ids], self.found[ids] = True, 1, 1
+        self.sightings[ids] = 0
         return ids
 
     def fuse(
@@ -94,8 +99,18 @@ class LandmarkTable:
         rotation = T_new_old[:3, :3]
         self.points_local[ids] = se3.apply(T_new_old, self.points_local[ids])
         self.normals_local[ids] = self.normals_local[ids] @ rotation.T
+        self.shift_local[ids] = self.shift_local[ids] @ rotation.T
         self.information[ids] = rotation @ self.information[ids] @ rotation.T
         self.covariance[ids] = rotation @ self.covariance[ids] @ rotation.T
+
+    def shift(self, ids: NDArray[np.int64], shift_local: NDArray[np.float64]) -> None:
+        """Take in (N, 3) [m/s] where one more keyframe has landmarks when its reading takes longer.
+
+        What a landmark moves by is the mean over its keyframes.
+        """
+        self.sightings[ids] += 1
+        change = shift_local - self.shift_local[ids]
+        self.shift_local[ids] += change / self.sightings[ids][:, None]
 
     def describe(self, ids: NDArray[np.int64], looks: Looks) -> None:
         """Replace how landmarks look by how they look now."""

@@ -80,6 +80,15 @@ class Localizer:
                 return fix
         return None
 
+    def beside(self, features: Features, fix: Fix) -> Fix | None:
+        """Return the pose found by looking again from another one of the same image."""
+        found = self._look(
+            features, fix.estimate.T_local_base, fix.expected_ids, _RADIUS_REFINED_PX
+        )
+        return self._confirm(
+            features, found, self._solver.approach(found.measured, fix.estimate.T_local_base)
+        )
+
     def around(self, features: Features, held_ids: NDArray[np.int64]) -> Fix | None:
         """Return the pose found by comparing the descriptors of all around some landmarks."""
         return self.anywhere(features, self._map.around(held_ids))

@@ -10,6 +10,7 @@ from sceneslam.types.maps import LandmarkLayer, PoseGraphLayer
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
+from .eye import Eye
 from .frame_log import FrameLog, joined, moved
 from .keyframes import Keyframe
 from .localizer import Fix, Localizer
@@ -30,9 +31,15 @@ class Memory:
     """Follows the map as it grows and shrinks, and corrects it where it knows a place again."""
 
     def __init__(
-        self, visual_map: VisualMap, localizer: Localizer, reunion: Reunion, *, min_inliers: int
+        self,
+        visual_map: VisualMap,
+        localizer: Localizer,
+        eye: Eye,
+        reunion: Reunion,
+        *,
+        min_inliers: int,
     ) -> None:
-        self._map, self._reunion = visual_map, reunion
+        self._map, self._eye, self._reunion = visual_map, eye, reunion
         self._graph, self._frames = PoseGraph(), FrameLog()
         self._keyframes: dict[int, Keyframe] = {}  # also those that the map has just let go
         self.recognizer = PlaceRecognizer(visual_map, localizer, min_inliers=min_inliers)
@@ -57,7 +64,8 @@ class Memory:
         else:  # it was found somewhere else
             self.reference = [*keyframes.covisible(landmark_ids, limit=1), *near][0]
         T_local_keyframe = keyframes[self.reference].T_local_base
-        self._frames.add(stamp_ns, self.reference, se3.inverse(T_local_keyframe) @ T_local_base)
+        T_keyframe_base = se3.inverse(T_local_keyframe) @ T_local_base
+        self._frames.add(stamp_ns, self.reference, T_keyframe_base, self._eye.twist_per_s)
 
     def around(self, T_local_base: Transform) -> list[Transform]:
         """Return T_keyframe_base of a pose for the keyframes around that of the newest frame."""
@@ -99,12 +107,15 @@ class Memory:
             self.revision += 1
             self.segments.update()
             return corrections.get(self.reference, se3.identity())
-        T_new_old = None if self._closer.is_solving else self._reunion.step()
-        if T_new_old is not None:
-            keyframes = self._map.keyframes
-            self._map.correct({k: T_new_old @ keyframes[k].T_local_base for k in keyframes.ids})
-            self._before = moved(self._before, T_new_old)
-            self.revision += 1
+        if self._closer.is_solving:
+            return None
+        T_new_old = self._reunion.step()
+        if T_new_old is None:
+            return self._straighten(self._eye.step_s())
+        keyframes = self._map.keyframes
+        self._map.correct({k: T_new_old @ keyframes[k].T_local_base for k in keyframes.ids})
+        self._before = moved(self._before, T_new_old)
+        self.revision += 1
         return T_new_old
 
     def trajectory(self) -> Trajectory:
@@ -145,6 +156,22 @@ class Memory:
     def shutdown(self) -> None:
         """End the worker; what is remembered stays readable."""
         self._closer.shutdown()
+
+    def _straighten(self, readout_s: float) -> Transform | None:
+        """Take it that reading images took so much longer; return T_new_old of here."""
+        if not readout_s or not len(self._frames):
+            return None
+        T_local_old = self._newest()
+        self._map.straighten(readout_s)
+        twists = {k: keyframe.turning.twist_per_s for k, keyframe in self._keyframes.items()}
+        self._frames.straighten(readout_s, twists)
+        self.revision += 1
+        return np.asarray(self._newest() @ se3.inverse(T_local_old))
+
+    def _newest(self) -> Transform:
+        """Return T_local_base of the newest frame."""
+        keyframe_id, T_keyframe_base = self._frames.newest
+        return np.asarray(self._keyframes[keyframe_id].T_local_base @ T_keyframe_base)
 
     def _edges(self, keyframe_id: int, fix: Fix | None) -> list[Edge]:
         """Return what a new keyframe's pose was measured against.

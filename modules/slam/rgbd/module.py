@@ -110,7 +110,7 @@ class RgbdSlam:
         if len(self._map.keyframes):
             fix = self._search.find(view, self._held_ids, is_lost=self._is_lost)
         if fix is not None:
-            self._eye.learn(view, fix)
+            view, fix = self._eye.settle(view, fix, self._motion)
             answer = self._hold(view, fix)
             if self._mapping.alignment is not None and not view.is_monocular:
                 self._build_anew(view, self._mapping.alignment)

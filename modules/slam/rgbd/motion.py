@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +13,22 @@ from sceneslam.types.se3 import Transform
 
 _NS = 1e-9
 _MAX_GAP_S = 0.5  # beyond it, a velocity says nothing any more
+_GYRO_RAD_PER_S = 0.02  # deviation of a gyro's turn rate
+_TURN_RAD_PER_S2 = 6.0  # of a hand: a rate is that of half a step ago
+_TURN_RAD_PER_S = 1.0  # of a camera of which nothing is known
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TurnRate:
+    """How fast the base turns, and how sure that is."""
+
+    rate_base: NDArray[np.float64]  # (3,) [rad/s]
+    sigma_rad_per_s: float
+
+    @property
+    def is_unknown(self) -> bool:
+        """Tell whether nothing but an image can say it."""
+        return self.sigma_rad_per_s >= _TURN_RAD_PER_S
 
 
 class MotionModel:
@@ -42,6 +60,20 @@ class MotionModel:
         """Return how fast the base should turn (3,) [rad/s], by the gyro if there is one."""
         rate = _gyro_rate(observation)
         return self._twist_per_s[3:] if rate is None else rate
+
+    def turning(self, observation: Observation, T_local_base: Transform) -> TurnRate:
+        """Return how fast the base turned at an observation whose pose is found.
+
+        The gyro's rate, else that of the way from the last pose; after the camera was lost, none.
+        """
+        rate, gap_s = _gyro_rate(observation), self._gap_s(observation)
+        if rate is not None:
+            return TurnRate(rate_base=rate, sigma_rad_per_s=_GYRO_RAD_PER_S)
+        if not gap_s or self._held_ns != self._stamp_ns:
+            return TurnRate(rate_base=np.zeros(3), sigma_rad_per_s=_TURN_RAD_PER_S)
+        T_prev_curr = se3.inverse(self._T_local_base) @ T_local_base
+        rate = se3.so3_log(T_prev_curr[:3, :3]) / gap_s
+        return TurnRate(rate_base=rate, sigma_rad_per_s=_TURN_RAD_PER_S2 * gap_s)
 
     def unheld_s(self, observation: Observation) -> float:
         """Return how long no pose was measured; 0 before there was any."""

@@ -50,7 +50,6 @@ class Parts:
             **chosen(count="feature_count"),
             **same("fast_threshold_min", "fast_noise_ratio"),
         )
-        self.eye = Eye(camera, extractor)
         self.map = VisualMap(
             camera,
             depth_camera,
@@ -61,7 +60,10 @@ class Parts:
             PoseSolver(camera, **same("seed")),
             **chosen(radius_px="search_radius_px", min_inliers="min_inliers"),
         )
-        self.memory = Memory(self.map, localizer, reunion, **chosen(min_inliers="degraded_inliers"))
+        self.eye = Eye(self.map, localizer, extractor)
+        self.memory = Memory(
+            self.map, localizer, self.eye, reunion, **chosen(min_inliers="degraded_inliers")
+        )
         relocalizer = Relocalizer(self.map.keyframes, self.memory.recognizer)
         self.search = Search(localizer, relocalizer)
         self.mapping = LocalMapping(depth_camera, self.map, alignment=alignment)

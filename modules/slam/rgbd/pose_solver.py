@@ -46,6 +46,11 @@ class Linearised:
     residuals: NDArray[np.float64]  # (2 N,) in sigmas, all u before all v
     jacobian: NDArray[np.float64]  # (6, 2 N), by a twist of the camera
     sigma_px: NDArray[np.float64]  # (N,)
+    normal: NDArray[np.float64]  # (6, 6), of a twist of the camera, depths included
+
+    def follow(self, moved: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the twist of the camera (6,) that the pose follows pixels by (2 N,) sigmas."""
+        return np.asarray(np.linalg.solve(self.normal, self.jacobian @ moved))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -123,6 +128,9 @@ class PoseSolver:
         if end is None:
             return None
         inliers, residuals = end.inliers, end.errors.residuals[:2, end.inliers].ravel()
+        slopes = end.errors.rows(np.ones((3, 1)))[:6]
+        by_pixel = slopes[:, :2, inliers].reshape(6, -1)
+        by_depth = slopes[:, 2, end.depth_inliers]
         # Where the errors are larger than their sigmas say, so is the covariance.
         pixel_variance = float(residuals @ residuals) / (len(residuals) - 6)
         carry = se3.adjoint(self._camera.T_base_cam)
@@ -135,8 +143,9 @@ class PoseSolver:
             depth_agreement_ratio=_share(end.depth_inliers, inliers & measured.seen.measures_depth),
             linearised=Linearised(
                 residuals=residuals,
-                jacobian=end.errors.rows(np.ones((3, 1)))[:6, :2, inliers].reshape(6, -1),
+                jacobian=by_pixel,
                 sigma_px=measured.seen.sigma_px[inliers],
+                normal=by_pixel @ by_pixel.T + by_depth @ by_depth.T,
             ),
         )
 

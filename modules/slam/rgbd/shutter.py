@@ -6,7 +6,7 @@ and Forssen 2011, who measured 26 ms for a Kinect).
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,18 @@ from .pose_solver import Linearised
 
 _FIRST_SIGMA_S = 0.02  # of the readout, before anything was seen
 _CORRELATED = 30.0  # residuals of one image that say the same
-_KEPT = 0.98  # from image to image: what was learnt first, of an untrue map, is forgotten
+_LAST_SIGMA_S = 0.001  # what was learnt before as much as says this is forgotten: poses were worse
 _MAX_READOUT_S = 0.04
 _SIGNIFICANT = 3.0  # sigmas
+_STEP_S = 0.002  # a smaller change is not worth moving the map
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Turning:
+    """How a camera turned while an image was read, and what that does to its pose."""
+
+    rate_cam: NDArray[np.float64]  # (3,) [rad/s]
+    twist_per_s: NDArray[np.float64]  # (6,) of the base, per second that reading takes longer
 
 
 class RollingShutter:
@@ -29,48 +38,84 @@ class RollingShutter:
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
         self._information, self._pull = _FIRST_SIGMA_S**-2, 0.0  # of the readout [1/s^2, 1/s]
-
-    @property
-    def readout_s(self) -> float:
-        """Return the time from the first row to the last; 0 until it is known to be any."""
-        readout_s = self._pull / self._information
-        if abs(readout_s) < _SIGNIFICANT * self._information**-0.5:
-            return 0.0
-        return float(np.clip(readout_s, -_MAX_READOUT_S, _MAX_READOUT_S))
+        self.readout_s = 0.0  # from the first row to the last, as taken so far
 
     def straighten(self, features: Features, rate_cam: NDArray[np.float64]) -> Features:
         """Return features as of the middle row, for a camera that turns by (3,) [rad/s]."""
-        if not self.readout_s or not len(features):
-            return features
-        moves = self.readout_s * self._moves_px_per_s(features.uv_px, rate_cam)
-        return replace(features, uv_px=features.uv_px + moves)
+        return straightened(self._camera, features, rate_cam, self.readout_s)
 
-    def learn(
-        self, seen: Linearised, uv_px: NDArray[np.float64], rate_cam: NDArray[np.float64]
-    ) -> None:
-        """Take in an image's residuals, at the readout that it was straightened with."""
-        slope = (self._moves_px_per_s(uv_px, rate_cam) / seen.sigma_px[:, None]).T.ravel()
-        # What a motion of the camera explains as well tells nothing about the shutter.
-        explained = np.linalg.solve(seen.jacobian @ seen.jacobian.T, seen.jacobian @ slope)
-        slope = slope - explained @ seen.jacobian
-        information = float(slope @ slope) / _CORRELATED
-        self._information = _KEPT * self._information + information
+    def turn(
+        self,
+        seen: Linearised,
+        uv_px: NDArray[np.float64],
+        change: NDArray[np.float64],
+        sigma_rad_per_s: float,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the change of turn rate (3,) and the pose's twist (6,) that fit an image best.
+
+        `change` [rad/s]: by how much faster than the image was straightened for the camera turned,
+        by what else is known.
+        """
+        moves = [moves_px_per_s(self._camera, uv_px, axis) for axis in np.eye(3)]
+        slopes = self.readout_s * np.stack([(m / seen.sigma_px[:, None]).T.ravel() for m in moves])
+        weight = _CORRELATED / sigma_rad_per_s**2
+        across = slopes @ seen.jacobian.T
+        # What the pose follows is taken out (Schur); there its residuals pull at nothing.
+        normal = slopes @ slopes.T - across @ np.linalg.solve(seen.normal, across.T)
+        pull = slopes @ seen.residuals + weight * change
+        found = np.linalg.solve(normal + weight * np.eye(3), pull)
+        return np.asarray(found), seen.follow(found @ slopes)
+
+    def learn(self, seen: Linearised, slope_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Take in an image's residuals and return how its pose goes with the readout.
+
+        `slope_px` (N, 2): how much farther than their landmarks the pixels would be straightened,
+        per second of readout. Returns a twist of the camera per second (6,): what a motion
+        explains as well tells nothing about the shutter.
+        """
+        slope = (slope_px / seen.sigma_px[:, None]).T.ravel()
+        twist = seen.follow(slope)
+        information = float(slope @ slope - twist @ seen.jacobian @ slope) / _CORRELATED
+        kept = max(0.0, 1.0 - information * _LAST_SIGMA_S**2)
+        self._information = kept * self._information + information
         self._pull = (
-            _KEPT * self._pull
+            kept * self._pull
             + information * self.readout_s
             + float(slope @ seen.residuals) / _CORRELATED
         )
+        return twist
 
-    def _moves_px_per_s(
-        self, uv_px: NDArray[np.float64], rate_cam: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return how features (N, 2) move to the middle row's time, per second of readout."""
-        camera = self._camera
-        x = (uv_px[:, 0] - camera.cx) / camera.fx
-        y = (uv_px[:, 1] - camera.cy) / camera.fy
-        late = uv_px[:, 1] / camera.size_wh[1] - 0.5
-        wx, wy, wz = rate_cam
-        # A ray that was seen late, in the camera as it was earlier: ray + late * rate x ray.
-        across = wy - wz * y - x * (wx * y - wy * x)
-        down = wz * x - wx - y * (wx * y - wy * x)
-        return np.stack([camera.fx * late * across, camera.fy * late * down], axis=1)
+    def step_s(self) -> float:
+        """Return by how much longer reading takes than was taken so far, which is taken now."""
+        readout_s = self._pull / self._information
+        is_known = abs(readout_s) > _SIGNIFICANT * self._information**-0.5
+        readout_s = float(np.clip(readout_s, -_MAX_READOUT_S, _MAX_READOUT_S))
+        change_s = readout_s - self.readout_s if is_known else 0.0
+        if abs(change_s) < _STEP_S:
+            return 0.0
+        self.readout_s = readout_s
+        return change_s
+
+
+def straightened(
+    camera: Camera, features: Features, rate_cam: NDArray[np.float64], readout_s: float
+) -> Features:
+    """Return features as of the middle row, of a camera that turned by (3,) [rad/s]."""
+    if not readout_s or not len(features):
+        return features
+    moves_px = readout_s * moves_px_per_s(camera, features.uv_px, rate_cam)
+    return replace(features, uv_px=features.uv_px + moves_px)
+
+
+def moves_px_per_s(
+    camera: Camera, uv_px: NDArray[np.float64], rate_cam: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return how pixels (N, 2) move to the middle row's time, per second of readout."""
+    x = (uv_px[:, 0] - camera.cx) / camera.fx
+    y = (uv_px[:, 1] - camera.cy) / camera.fy
+    late = uv_px[:, 1] / camera.size_wh[1] - 0.5
+    wx, wy, wz = rate_cam
+    # A ray that was seen late, in the camera as it was earlier: ray + late * rate x ray.
+    across = wy - wz * y - x * (wx * y - wy * x)
+    down = wz * x - wx - y * (wx * y - wy * x)
+    return np.stack([camera.fx * late * across, camera.fy * late * down], axis=1)

@@ -11,6 +11,7 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
 from .features import Features
+from .shutter import Turning
 
 _FEWEST = 50  # features, with a depth where one is asked for, that a keyframe can be made of
 
@@ -24,6 +25,7 @@ class View:
     gray: NDArray[np.uint8]  # (H, W)
     features: Features
     T_predicted: Transform  # T_local_base, before the image was asked
+    turning: Turning
 
     @property
     def shows_enough(self) -> bool:
