@@ -15,7 +15,7 @@ from sceneslam.types.se3 import Transform
 from .pose_errors import PoseErrors
 from .residuals import Sightings
 
-_RANSAC_PX = 4.0
+_RANSAC_PX = 8.0  # rows of a camera that begins to turn are that far from where they should be
 _RANSAC_TRIALS = 200
 _RANSAC_CONFIDENCE = 0.999
 _APPROACH_STEPS, _REFINEMENT_STEPS = 2, 5
