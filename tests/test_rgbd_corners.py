@@ -6,7 +6,9 @@ import pytest
 
 from sceneslam.modules.slam.rgbd.corners import CornerFinder
 
-THRESHOLD = 7
+
+def finder_of(count):
+    return CornerFinder(count=count, fast_threshold_min=7, fast_noise_ratio=4.0)
 
 
 def texture(contrast_ratio=1.0):
@@ -20,24 +22,24 @@ def texture(contrast_ratio=1.0):
 
 @pytest.mark.parametrize("contrast_ratio", [1.0, 0.25, 0.0])
 def test_corners_do_not_depend_on_the_images_before(contrast_ratio):
-    image, finder = texture(contrast_ratio), CornerFinder(500)
-    fresh = finder.find(image, THRESHOLD)
+    image, finder = texture(contrast_ratio), finder_of(500)
+    fresh = finder.find(image)
     for before in (texture(), texture(), texture(0.1)):
-        finder.find(before, THRESHOLD)
-        again = finder.find(image, THRESHOLD)
+        finder.find(before)
+        again = finder.find(image)
         for name in ("uv_px", "levels", "descriptors"):
             assert np.array_equal(getattr(again, name), getattr(fresh, name)), name
 
 
 def test_count_of_corners_is_kept_where_the_image_has_them():
-    assert len(CornerFinder(500).find(texture(), THRESHOLD).levels) == 500
-    assert len(CornerFinder(500).find(texture(0.02), THRESHOLD).levels) < 500
+    assert len(finder_of(500).find(texture()).levels) == 500
+    assert len(finder_of(500).find(texture(0.02)).levels) < 500
 
 
 def test_corners_of_all_levels_lie_where_the_image_shows_them():
     gray = np.full((480, 640), 60, np.uint8)
     cv2.rectangle(gray, (250, 200), (390, 280), 200, -1)
-    corners = CornerFinder(100).find(gray, THRESHOLD)
+    corners = finder_of(100).find(gray)
     assert len(np.unique(corners.levels)) >= 6
     squares = np.array([[250, 200], [390, 200], [390, 280], [250, 280]])
     off_px = np.linalg.norm(corners.uv_px[:, None] - squares, axis=2).min(axis=1)

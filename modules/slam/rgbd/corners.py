@@ -14,10 +14,11 @@ from .cores import thread_beside
 
 LEVELS = 8
 SCALE = 1.2  # between two levels of the pyramid
-_FIRST, _REST, _BESIDE = (0,), (3, 5, 7), (1, 2, 4, 6)  # levels; both threads have as many pixels
+_FIRST, _REST, _BESIDE = (0,), (3, 5, 6, 7), (1, 2, 4)  # levels; both threads take as long
 _CELL_PX = 40  # side of the cells that share out the corners
 _SURPLUS = 2  # corners detected per corner kept
 _BOLDNESS = 0.8  # of the last image's weakest corner, where this one's are looked for first
+_THRESHOLD_MAX = 20  # ORB's own default, right for a bright and clean image
 _STRONGEST = 255  # grey step
 _ROW_BY_ROW = np.array([1e-4, 1.0])  # puts pixels (u, v) in order
 _ROW_BITS = 20  # of a sort key that holds a row below
@@ -39,15 +40,16 @@ class _Detected:
     """Corners of one level, strongest first, before they are shared out."""
 
     keypoints: Sequence[cv2.KeyPoint]  # (N,)
-    uv_px: NDArray[np.float64]  # (N, 2), in pixels of the level
+    uv_px: NDArray[np.float64]  # (N, 2), in pixels of the image
+    cells: NDArray[np.int64]  # (N,)
     strength: NDArray[np.int64]  # (N,), up to _STRONGEST
 
 
 class _Octave:
     """ORB on one level; OpenCV lets two threads do so at a time."""
 
-    def __init__(self, quota: int) -> None:
-        self._quota, self._weakest = quota, 0
+    def __init__(self, quota: int, scale: float) -> None:
+        self._quota, self._scale, self._weakest = quota, scale, 0
         self._orb = cv2.ORB.create(nfeatures=quota, nlevels=1, scoreType=cv2.ORB_FAST_SCORE)
 
     def detect(self, image: Image, threshold: int) -> _Detected:
@@ -64,10 +66,13 @@ class _Octave:
         self._weakest = int(strength.min()) if len(strength) else 0
         uv_px = np.asarray(cv2.KeyPoint.convert(keypoints), np.float64).reshape(-1, 2)
         order = np.lexsort((uv_px @ _ROW_BY_ROW, -strength))
+        uv_px = self._scale * uv_px.take(order, axis=0)
+        columns, rows = (uv_px / _CELL_PX).astype(np.int64).T
         return _Detected(
             keypoints=[keypoints[row] for row in order.tolist()],
-            uv_px=uv_px[order],
-            strength=strength[order],
+            uv_px=uv_px,
+            cells=(rows << 10) + columns,
+            strength=strength.take(order),
         )
 
     def describe(self, image: Image, keypoints: Sequence[cv2.KeyPoint]) -> NDArray[np.uint8]:
@@ -84,16 +89,18 @@ class _Octave:
 class CornerFinder:
     """Finds corners on all levels of an image, on half of them in a thread of its own."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, *, count: int, fast_threshold_min: int, fast_noise_ratio: float) -> None:
         self._count = count
+        self._threshold_min, self._noise_ratio = fast_threshold_min, fast_noise_ratio
         shares = SCALE ** -np.arange(LEVELS)
-        quotas = np.rint(_SURPLUS * count * shares / shares.sum()).astype(int)
-        self._octaves = [_Octave(quota) for quota in quotas.tolist()]
+        quotas = np.rint(_SURPLUS * count * shares / shares.sum()).astype(int).tolist()
+        self._octaves = [_Octave(quota, SCALE**level) for level, quota in enumerate(quotas)]
         self._beside = thread_beside("rgbd-corners")
 
-    def find(self, gray: Image, threshold: int) -> Corners:
-        """Return the corners of an image that are a grey step of more than a threshold."""
+    def find(self, gray: Image) -> Corners:
+        """Return the corners of an image that are clearly above its noise."""
         shrunk = self._beside.submit(_pyramid, gray)
+        threshold = self._threshold(gray)
         coming = self._beside.submit(lambda: self._detect(shrunk.result(), _BESIDE, threshold))
         found = self._detect([gray], _FIRST, threshold)
         pyramid = shrunk.result()
@@ -102,12 +109,25 @@ class CornerFinder:
         chosen = _spread(detected, self._count)
         described = self._beside.submit(self._describe, pyramid, detected, chosen, _BESIDE)
         parts = self._describe(pyramid, detected, chosen, _FIRST + _REST) | described.result()
-        uv_px = [SCALE**i * detected[i].uv_px.take(chosen[i], axis=0) for i in range(LEVELS)]
+        uv_px = [
+            level.uv_px.take(rows, axis=0) for level, rows in zip(detected, chosen, strict=True)
+        ]
         return Corners(
             uv_px=np.concatenate(uv_px),
             levels=np.repeat(np.arange(LEVELS), [len(rows) for rows in chosen]),
             descriptors=np.concatenate([parts[i] for i in range(LEVELS)]),
         )
+
+    def _threshold(self, gray: Image) -> int:
+        """Return the grey step that makes a corner: a multiple of the noise, within limits.
+
+        The noise is the median response of a Laplacian, whose gain on white noise is sqrt(20).
+        """
+        response = 4 * gray[4:-4:8, 4:-4:8].astype(np.int16)
+        for row, column in ((3, 4), (5, 4), (4, 3), (4, 5)):
+            response -= gray[row : row - 8 : 8, column : column - 8 : 8]
+        noise = float(np.median(np.abs(response))) / 0.6745 / np.sqrt(20.0)
+        return int(np.clip(self._noise_ratio * noise, self._threshold_min, _THRESHOLD_MAX))
 
     def _detect(
         self, pyramid: Sequence[Image], levels: Sequence[int], threshold: int
@@ -146,8 +166,7 @@ def _spread(detected: Sequence[_Detected], count: int) -> list[NDArray[np.int64]
     Every cell's best first, then every cell's second, and on; of equals the finest and first.
     """
     ends = np.cumsum([len(corners.strength) for corners in detected])
-    places = [SCALE**i * detected[i].uv_px // _CELL_PX for i in range(LEVELS)]
-    cells = np.concatenate(places).astype(np.int64) @ np.array([1, 1 << 10])
+    cells = np.concatenate([corners.cells for corners in detected])
     rows = np.arange(len(cells))
     # Numbers to sort by: the row in the lowest bits, above it the strength, above it the cell.
     strength = np.concatenate([corners.strength for corners in detected])

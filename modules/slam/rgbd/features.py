@@ -13,7 +13,6 @@ from sceneslam.types.rig import Camera
 from .alignment import Alignment
 from .corners import CornerFinder
 
-_FAST_THRESHOLD_MAX = 20  # ORB's own default, right for a bright and clean image
 _DEPTH_REACH_PX = 2  # of a corner, that should lie on the same surface
 _CROSS_PX = _DEPTH_REACH_PX * np.array([[0, -1, 1, 0, 0], [0, 0, 0, -1, 1]])  # columns, rows
 _DEPTH_SPREAD_RATIO = 0.03  # neighbours further apart than this lie across an edge
@@ -51,12 +50,14 @@ class FeatureExtractor:
         fast_noise_ratio: float,
     ) -> None:
         self._depth_camera, self._alignment = depth_camera, alignment
-        self._camera, self._corners = alignment.color_camera(depth_camera), CornerFinder(count)
-        self._threshold_min, self._noise_ratio = fast_threshold_min, fast_noise_ratio
+        self._camera = alignment.color_camera(depth_camera)
+        self._corners = CornerFinder(
+            count=count, fast_threshold_min=fast_threshold_min, fast_noise_ratio=fast_noise_ratio
+        )
 
     def extract(self, gray: NDArray[np.uint8], depth_m: NDArray[np.float32] | None) -> Features:
         """Return the features of `gray` (H, W); without a depth image all depths are missing."""
-        corners = self._corners.find(gray, self.fast_threshold(gray))
+        corners = self._corners.find(gray)
         uv_px = self._undistort(corners.uv_px)
         depths_m, slopes = self._depths(self._in_depth(corners.uv_px, uv_px, depth_m), depth_m)
         return Features(
@@ -66,17 +67,6 @@ class FeatureExtractor:
             depth_m=depths_m,
             depth_slope_m_per_px=slopes,
         )
-
-    def fast_threshold(self, gray: NDArray[np.uint8]) -> int:
-        """Return the grey step that makes a corner: a multiple of the noise, within limits.
-
-        The noise is the median response of a Laplacian, whose gain on white noise is sqrt(20).
-        """
-        response = 4 * gray[4:-4:4, 4:-4:4].astype(np.int16)
-        for row, column in ((3, 4), (5, 4), (4, 3), (4, 5)):
-            response -= gray[row : row - 8 : 4, column : column - 8 : 4]
-        noise = float(np.median(np.abs(response))) / 0.6745 / np.sqrt(20.0)
-        return int(np.clip(self._noise_ratio * noise, self._threshold_min, _FAST_THRESHOLD_MAX))
 
     def _undistort(self, uv_image: NDArray[np.float64]) -> NDArray[np.float64]:
         if not (len(uv_image) and any(self._camera.distortion)):
