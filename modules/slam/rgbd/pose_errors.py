@@ -40,10 +40,16 @@ class PoseErrors:
         squares = self.residuals**2
         self._pixel2, self._depth2 = squares[0] + squares[1], squares[2]
 
-    def weights(self) -> NDArray[np.float64]:
-        """Return Huber's weights (3, N); u and v share one, by their joint length."""
-        sizes = np.sqrt(np.stack([self._pixel2, self._pixel2, self._depth2]))
-        return np.asarray(HUBER / np.maximum(sizes, HUBER))
+    def scale(
+        self, use_pixel: NDArray[np.bool_], use_depth: NDArray[np.bool_]
+    ) -> NDArray[np.float64]:
+        """Return the roots of Huber's weights (3, N), zero for what is not used (N,).
+
+        The pixel's two share one, by their joint length.
+        """
+        sizes = np.sqrt(np.stack([self._pixel2, self._depth2]))
+        pixel, depth = np.sqrt(HUBER / np.maximum(sizes, HUBER))
+        return np.stack([pixel * use_pixel, pixel * use_pixel, depth * use_depth])
 
     def pixels_agree(self) -> NDArray[np.bool_]:
         """Return (N,) where the pixel is within its 95 % limit."""

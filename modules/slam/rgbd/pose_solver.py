@@ -159,8 +159,7 @@ class PoseSolver:
         measures_depth = measured.seen.measures_depth
         inliers, depth_inliers = np.ones(len(measures_depth), bool), measures_depth
         for _ in range(steps):
-            use = np.stack([inliers, inliers, depth_inliers])
-            rows = found.rows(np.sqrt(found.weights() * use)).reshape(7, -1)
+            rows = found.rows(found.scale(inliers, depth_inliers)).reshape(7, -1)
             products = rows @ rows.T
             normal, slopes = products[:6, :6], products[:6, 6]
             step = _solve(normal, slopes)

@@ -18,6 +18,7 @@ from .keyframes import NO_LANDMARK, Keyframe, KeyframeStore
 from .landmarks import LandmarkTable, Looks
 from .shutter import moves_px_per_s
 
+_SCALES = SCALE ** np.arange(LEVELS)
 _COVISIBLE = 12
 _MIN_COS_VIEW = 0.5  # a landmark looks like itself within 60 degrees of where it was seen from
 _MIN_FOUND_RATIO = 0.25
@@ -65,7 +66,7 @@ class VisualMap:
 
     def sigma_px(self, levels: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return how exactly features of these pyramid levels are located [px]."""
-        return np.asarray(self._sigma_px * SCALE ** levels.astype(np.float64))
+        return np.asarray(self._sigma_px * _SCALES.take(levels))
 
     def inverse_depth_sigmas_per_m(self, features: Features) -> NDArray[np.float64]:
         """Return how exactly the features' depths are known [1/m].
@@ -230,7 +231,7 @@ class VisualMap:
         return Looks(
             descriptors=keyframe.features.descriptors[rows],
             normals_local=to_viewer / distance_m[:, None],
-            reach_m=distance_m * SCALE ** keyframe.features.levels[rows].astype(np.float64),
+            reach_m=distance_m * _SCALES.take(keyframe.features.levels[rows]),
         )
 
     def _keep_limits(self) -> None:
