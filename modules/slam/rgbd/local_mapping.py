@@ -20,6 +20,7 @@ from .window import Window, merge_window, take_window
 _Worker = SideProcess[Task, Outcome] | Here[Task, Outcome]
 _TIED_IMAGES = 10  # for what has depth: registering it takes the worker 100 to 200 ms
 _FREE_IMAGES = 5  # for what has none: triangulated landmarks wait for it, and drift in scale
+_BEGINNING = 16  # views that the map can be made anew of: 2.4 MB each
 
 
 class LocalMapping:
@@ -42,11 +43,17 @@ class LocalMapping:
         self._result: Future[Outcome] | None = None
         self._images_left, self._newest = _FREE_IMAGES, -1
         self._fresh: dict[int, Shown] = {}  # keyframes that the worker has not seen yet
+        self._is_aligned = alignment is not None
         self.alignment: Alignment | None = None  # where it was found not to be what was taken
+        self.beginning: dict[int, View] = {}  # what newest keyframes show, until that is known
 
     def insert(self, keyframe_id: int, view: View) -> None:
         """Take what a new keyframe shows; without depth it is tied to none."""
         self._process()
+        if not self._is_aligned:
+            self.beginning[keyframe_id] = view
+            if len(self.beginning) > _BEGINNING:
+                del self.beginning[min(self.beginning)]
         if view.depth_m is not None:
             self._fresh[keyframe_id] = Shown(features=view.features, depth_m=view.depth_m)
 
@@ -88,7 +95,9 @@ class LocalMapping:
         if window is None or result is None:
             return se3.identity()
         outcome = result.result()
-        self.alignment = outcome.alignment
+        self.alignment, self._is_aligned = outcome.alignment, outcome.is_aligned
+        if self._is_aligned and self.alignment is None:
+            self.beginning.clear()
         return merge_window(self._map, window, outcome.adjusted)
 
     def _process(self) -> _Worker:

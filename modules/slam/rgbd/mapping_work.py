@@ -30,6 +30,7 @@ class Outcome:
 
     adjusted: Adjusted
     alignment: Alignment | None
+    is_aligned: bool  # or is it still asked whether colours and depth are of one camera?
 
 
 class MappingWork:
@@ -53,7 +54,11 @@ class MappingWork:
             if one in rows and other in rows
         }
         bundle = replace(task.bundle, ties=Ties.of(ties))
-        return Outcome(adjusted=adjust(self._camera, bundle), alignment=self._found)
+        return Outcome(
+            adjusted=adjust(self._camera, bundle),
+            alignment=self._found,
+            is_aligned=self._search.is_over,
+        )
 
     def _tie(self, task: Task) -> None:
         """Register the new keyframes with the free ones before them."""

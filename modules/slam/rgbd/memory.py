@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,9 +52,13 @@ class Memory:
         self.revision = 0  # rises with every correction
         self._before = Trajectory.empty()  # what the map that this one replaces held
 
-    def follow(self, before: Memory) -> None:
-        """Go on from a map that this one replaces."""
-        self._before, self.revision = before.trajectory(), before.revision
+    def follow(self, before: Memory, T_local_keyframe: Mapping[int, Transform]) -> None:
+        """End a map and go on from it; some of its keyframes lie elsewhere by now."""
+        before._closer.finish()
+        before.shutdown()
+        poses = {k: keyframe.T_local_base for k, keyframe in before._keyframes.items()}
+        frames = before._frames.trajectory(poses | dict(T_local_keyframe))
+        self._before, self.revision = joined(before._before, frames), before.revision + 1
 
     def hold(self, stamp_ns: int, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> None:
         """Remember where a frame was, by the keyframe that shares most landmarks with it."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
@@ -21,6 +20,7 @@ from .limits import check_limits, check_sizes
 from .localizer import Fix
 from .motion import MotionModel
 from .parts import Parts
+from .renewal import NEWEST, Seen, renew, seen_by
 from .reunion import Reunion
 from .view import View
 
@@ -105,7 +105,10 @@ class RgbdSlam:
             return self._lose(observation, T_predicted)
         if self._eye.is_repeated(observation.image_bgr):
             return self._repeat(observation, T_predicted)
-        view = self._look(observation, observation.image_bgr, T_predicted)
+        rate_base = self._motion.turn_rate(observation)
+        view = self._eye.look(
+            observation, observation.image_bgr, T_predicted=T_predicted, rate_base=rate_base
+        )
         fix = None
         if len(self._map.keyframes):
             fix = self._search.find(view, self._held_ids, is_lost=self._is_lost)
@@ -139,29 +142,26 @@ class RgbdSlam:
         self._memory.shutdown()
         self._reunion.end(self._map, self._memory.recognizer)
 
-    def _look(
-        self, observation: Observation, image_bgr: NDArray[np.uint8], T_predicted: Transform
-    ) -> View:
-        rate_base = self._motion.turn_rate(observation)
-        return self._eye.look(observation, image_bgr, T_predicted=T_predicted, rate_base=rate_base)
-
-    def _build(self, alignment: Alignment | None) -> None:
+    def _build(self, alignment: Alignment | None) -> Parts:
         parts = Parts(self._arguments, self._camera, alignment, self._reunion)
         self._eye, self._health, self._search = parts.eye, parts.health, parts.search
         self._map, self._mapping, self._memory = parts.map, parts.mapping, parts.memory
         self._layers, self._place_rule = parts.layers, parts.place_rule
         self._keyframe_rule, self._maker = parts.keyframe_rule, parts.maker
         self._certainty = parts.certainty
+        return parts
 
     def _build_anew(self, view: View, alignment: Alignment) -> None:
-        """Begin a new map at the pose just held: the old one has its depths at wrong corners."""
-        before = self._memory
+        """Make the map anew of its views: the old one has its depths at wrong corners."""
+        before, newest = self._memory, Seen(view=view, T_local_base=self._T_local_base)
+        segment = before.segment(self._held_ids)
+        seen = seen_by(self._map.keyframes, self._mapping.beginning, segment, newest)
         self._mapping.shutdown()
-        before.shutdown()
-        self._build(alignment)
-        self._memory.follow(before)
-        view = self._look(view.observation, view.image_bgr, self._T_local_base)
-        self._insert_keyframe(view, set())
+        poses = renew(self._build(alignment), seen)
+        self._memory.follow(before, poses)
+        self._motion.correct(poses[NEWEST] @ se3.inverse(self._T_local_base))
+        self._T_local_base = poses[NEWEST]
+        self._held_ids = self._map.keyframes.landmarks_of(self._map.keyframes.ids[-1:])
 
     def _recall(self) -> None:
         """Go on from where the map is: adjusted, after a loop, or beside an earlier session's."""

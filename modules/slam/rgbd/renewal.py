@@ -1,0 +1,67 @@
+"""Makes the map anew of the views it was made of, for cameras that turned out to be two."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from sceneslam.types import se3
+from sceneslam.types.se3 import Transform
+
+from .keyframes import KeyframeStore
+from .parts import Parts
+from .view import View
+
+NEWEST = -1  # id of the view that may be no keyframe yet
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Seen:
+    """A view, and where the old map has it."""
+
+    view: View
+    T_local_base: Transform
+
+
+def seen_by(
+    keyframes: KeyframeStore,
+    views: Mapping[int, View],
+    segment: Collection[int] | None,
+    newest: Seen,
+) -> dict[int, Seen]:
+    """Return what the keyframes of a segment (None: all) show, by id, and the newest view, last.
+
+    Those that there are views of, and that were made before the newest one.
+    """
+    now_ns = newest.view.observation.stamp_ns
+    seen = {
+        k: Seen(view=views[k], T_local_base=keyframes[k].T_local_base)
+        for k in keyframes.ids
+        if k in views and keyframes[k].stamp_ns < now_ns and (segment is None or k in segment)
+    }
+    return seen | {NEWEST: newest}
+
+
+def renew(parts: Parts, seen: Mapping[int, Seen]) -> dict[int, Transform]:
+    """Insert a keyframe for each view, in this order; return where they are now, by the same ids.
+
+    The first stays where it is, the others are found beside those before them. Where one is not,
+    it is put where the old map has it beside the last.
+    """
+    T_new_old, held_ids, poses = se3.identity(), np.zeros(0, np.int64), dict[int, Transform]()
+    for keyframe_id, old in seen.items():
+        view = parts.eye.look(
+            old.view.observation,
+            old.view.image_bgr,
+            T_predicted=np.asarray(T_new_old @ old.T_local_base),
+            rate_base=parts.map.camera.T_base_cam[:3, :3] @ old.view.turning.rate_cam,
+        )
+        fix = parts.search.find(view, held_ids, is_lost=False) if poses else None
+        T_local_base = view.T_predicted if fix is None else fix.estimate.T_local_base
+        segment = None if poses else set[int]()
+        held_ids = parts.maker.insert(view, T_local_base, segment, fix=fix, guessed_s=None)
+        poses[keyframe_id] = T_local_base
+        T_new_old = T_local_base @ se3.inverse(old.T_local_base)
+    return poses
