@@ -9,6 +9,9 @@ there the prior alone decides.
 What a scan made of a band of heights shows is not quite a wall: which of the things in the band is
 the nearest changes with the view, for many beams together. Such an error does not average out over
 beams, nor over scans taken from almost the same place.
+
+Where the map ends, what lies beyond is no part of its last surface: pairs there are dropped (after
+Turk and Levoy, "Zippered polygon meshes from range images", SIGGRAPH 1994).
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ _KERNELS_M = (0.25, 0.12, 0.06)  # of the robust weight: coarse to fine
 _ITERATIONS = (3, 3, 8)  # at most, per kernel
 _CONVERGED = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: a step this small is the last
 _INLIER_M = 0.1
+_END_M = 0.1  # a mapped surface is known to go on so far, or as far as its beams are apart
 _CORRELATION = 4.0  # neighbouring beams share their errors: information is this much less
 _VIEW_M, _VIEW_RAD = 0.1, 0.1  # scans taken so far apart err each in its own way
 _NOVELTY_MIN = 1e-3
@@ -170,6 +174,8 @@ class Matcher:
         ax, ay = xx * ex + xy * ey, xy * ex + yy * ey  # the error across the surface
         robust = (kernel_m**2 / (kernel_m**2 + ax * ex + ay * ey)) ** 2
         gate = ex * ex + ey * ey < (4.0 * kernel_m) ** 2
+        along = (ex - ax) ** 2 + (ey - ay) ** 2  # a surface's end is further away
+        gate &= along < np.maximum(_END_M, 2.0 * scan_base.spacing_m) ** 2
         weight = scan_base.weight * robust * gate / _CORRELATION
         total = float(weight.sum())
         centre = (weight @ arms) / max(total, 1e-12)

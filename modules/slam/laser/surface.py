@@ -27,6 +27,7 @@ class SurfacePoints:
     points: Array  # (N, 2) [m], frame as in the owner's name
     shape: Array  # (N, 3): xx, xy, yy; 0 where too few neighbours tell the surface
     weight: Array  # (N,) [1/m^2], inverse variance of the range
+    spacing_m: Array  # (N,), between beams there
 
     def __len__(self) -> int:
         return len(self.points)
@@ -43,7 +44,12 @@ class SurfacePoints:
                 s * s * xx + 2 * c * s * xy + c * c * yy,
             ]
         )
-        return SurfacePoints(points=self.points @ R.T + T_a_b[:2], shape=shape, weight=self.weight)
+        return SurfacePoints(
+            points=self.points @ R.T + T_a_b[:2],
+            shape=shape,
+            weight=self.weight,
+            spacing_m=self.spacing_m,
+        )
 
 
 def joined(parts: Sequence[SurfacePoints]) -> SurfacePoints:
@@ -52,6 +58,7 @@ def joined(parts: Sequence[SurfacePoints]) -> SurfacePoints:
         points=np.concatenate([part.points for part in parts]),
         shape=np.concatenate([part.shape for part in parts]),
         weight=np.concatenate([part.weight for part in parts]),
+        spacing_m=np.concatenate([part.spacing_m for part in parts]),
     )
 
 
@@ -81,6 +88,7 @@ class SurfaceReader:
             points=points_base,
             shape=_shape(points_base, spacing),
             weight=1.0 / (self.noise_m + self.noise_per_m * r * r) ** 2,
+            spacing_m=spacing,
         )
 
 
