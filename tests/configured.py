@@ -34,6 +34,7 @@ CONFIG = {
             "step_m": 0.05,
             "turn_rad": 0.05,
         },
+        "calibrate_odometry": True,
         "turn_by_gyro": True,
         "gate": None,
         "startup_s": {},

@@ -39,6 +39,7 @@ def policy(**changes):
         "buffer_s": 12.0,
         "buffer_mb": 256.0,
         "catch_up": PaceSettings(period_s=0.0, step_m=0.0, turn_rad=0.0),
+        "calibrate_odometry": True,
         "turn_by_gyro": True,
         "gate": None,
         "startup_s": {},

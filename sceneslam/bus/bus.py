@@ -13,15 +13,15 @@ from sceneslam.bus.decision import Action, Health, Situation, Verdict, decide
 from sceneslam.bus.decision_log import DecisionLog
 from sceneslam.bus.estimator import Estimator
 from sceneslam.bus.events import EventLog
-from sceneslam.bus.gyrodometry import Gyrodometry
 from sceneslam.bus.machine import BusMachine
 from sceneslam.bus.policy import Policy
+from sceneslam.bus.reckoning import Reckoning
 from sceneslam.bus.runner import Runner
 from sceneslam.bus.watch import Watch
 from sceneslam.interfaces import Detector, SlamModule
 from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.rig import Rig
 
 _log = logging.getLogger(__name__)
 
@@ -55,9 +55,7 @@ class Bus:
             window_s=policy.confirm_window_s,
             first_window_s=policy.first_confirm_window_s,
         )
-        self._gyrodometry: Gyrodometry | None = None
-        if policy.turn_by_gyro and Sensor.GYRO in rig.sensors:
-            self._gyrodometry = Gyrodometry()
+        self._reckoning = Reckoning(policy, rig)
         self._estimator = Estimator(
             policy=policy, rig=rig, atlas=atlas, log=log, has_choice=len(modules) > 1
         )
@@ -100,11 +98,11 @@ class Bus:
         began_ns = perf_counter_ns()
         spent_ns = self._spent_ns()
         self._watch.look(observation)
-        if self._gyrodometry is not None:
-            observation = self._gyrodometry.correct(observation)
+        observation = self._reckoning.correct(observation)
         if self._state == "run":
             self._changeover.submit(observation)
         self._track(observation)
+        self._reckoning.learn(self._estimator.hold)
         outcome = self._do(observation)
         while outcome is not None:
             self._send(outcome.value, observation.stamp_ns)

@@ -10,7 +10,13 @@ from sceneslam.bus.pace import PaceSettings
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.run import HANDOVERS
 
-_OTHERS = ("handover", "catch_up", "turn_by_gyro", "gate")  # settings that are no durations
+_OTHERS = (  # settings that are no durations
+    "handover",
+    "catch_up",
+    "calibrate_odometry",
+    "turn_by_gyro",
+    "gate",
+)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -29,6 +35,7 @@ class Policy:
     buffer_s: float  # observations are remembered this long, for `rewind` ...
     buffer_mb: float  # ... and up to this much; beyond it the older, the thinner
     catch_up: PaceSettings  # what a module that is led through them is spared
+    calibrate_odometry: bool  # by what trusted modules say of its way, and by rests
     turn_by_gyro: bool  # what bridges and judges, where there is a gyro; else by the wheels
     gate: GateSettings | None  # how far a module's motion may differ from odometry's, None: any
     startup_s: dict[str, float]  # slam key -> time its start takes on the recording's clock
