@@ -46,8 +46,8 @@ class Certainty:
         """
         common = self._follow(common_ratio(view, fix))
         measured = fix.estimate.covariance * common
-        motions = [motion_covariance(T, np.zeros((6, 6))) for T in T_keyframe_base]
-        model = np.mean(motions, axis=0) * np.clip(common - _INDEPENDENT, 0.0, 1.0)
+        motions = motion_covariance(np.stack(T_keyframe_base), np.zeros((6, 6)))
+        model = motions.mean(axis=0) * np.clip(common - _INDEPENDENT, 0.0, 1.0)
         # A turn that is wrong is made up for by a shift, by as much as what is seen is far.
         away_m = self._landmarks.points_local[fix.landmark_ids] - T_local_base[:3, 3]
         model[:3, :3] += np.median((away_m**2).sum(axis=1)) * model[3:, 3:]
@@ -82,8 +82,8 @@ def common_ratio(view: View, fix: Fix) -> float:
     root = np.linalg.cholesky(normal + _NOT_HELD * np.trace(normal) * np.eye(6))
     pulls = np.linalg.solve(root, pulls)
     side_px = view.gray.shape[1] / _CELLS
-    cells = (view.features.uv_px[fix.feature_rows] // side_px).astype(np.int64)
-    cells -= cells.min(axis=0)
-    flat = cells[:, 1] * (cells[:, 0].max() + 1) + cells[:, 0]
+    columns, rows = np.floor(view.features.uv_px[fix.feature_rows].T / side_px).astype(np.int64)
+    columns -= columns.min()
+    flat = (rows - rows.min()) * (columns.max() + 1) + columns
     sums = np.stack([np.bincount(flat, row) for row in pulls])
     return float((sums**2).sum() / max((pulls**2).sum(), 1e-12))

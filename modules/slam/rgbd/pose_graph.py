@@ -193,11 +193,14 @@ def solve(
 
 
 def motion_covariance(T_start_end: Transform, measured: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a measured covariance (6, 6) with the share of the motion that no noise explains."""
-    moved = np.full(3, np.linalg.norm(T_start_end[:3, 3]))
-    turned = np.full(3, se3.rotation_angle_rad(T_start_end))
-    sigmas = _MODEL_ERROR_RATIO * np.concatenate([moved, turned])
-    return np.asarray(measured + np.diag(sigmas**2))
+    """Return a measured covariance (6, 6) with the share of the motion that no noise explains.
+
+    Works on stacks (..., 4, 4) too.
+    """
+    moved2 = (T_start_end[..., :3, 3] ** 2).sum(axis=-1)
+    turned2 = se3.rotation_angle_rad(T_start_end) ** 2
+    variances = _MODEL_ERROR_RATIO**2 * np.stack([moved2, turned2], axis=-1)
+    return np.asarray(measured + variances.repeat(3, axis=-1)[..., None] * np.eye(6))
 
 
 def _moved(edge: Edge, T_start_end: Transform) -> Edge:
