@@ -4,11 +4,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from driving import policy
 
+from sceneslam.bus.events import EventLog
 from sceneslam.bus.gyro_zero import GyroZero
+from sceneslam.bus.reckoning import Reckoning
 from sceneslam.bus.wheel_scale import WheelScale
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig, Sensor
 
 PERIOD_NS = 40_000_000
 BIAS = np.array([0.01, -0.02, 0.005])
@@ -129,3 +133,15 @@ def test_other_activation_begins_anew():
         wheels.correct(seen(index, 0.05 * index, BIAS))
         wheels.learn(hold_at(0.05 * index if index % 2 else 7.0))  # a new hold each time
     assert wheels.scale == 1.0
+
+
+def test_what_was_learnt_is_in_the_log():
+    reckoning = Reckoning(policy(), Rig(sensors=frozenset({Sensor.ODOMETRY, Sensor.GYRO})))
+    log = EventLog()
+    reckoning.tell(0, log)
+    assert not log.events
+    for index in range(60):
+        reckoning.correct(seen(index, 1.0, BIAS))
+    reckoning.tell(1, log)
+    assert log.events[0]["gyro_bias_radps"] == pytest.approx(BIAS)
+    assert "wheel_scale" not in log.events[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from sceneslam.bus.events import EventLog
 from sceneslam.bus.gyro_zero import GyroZero
 from sceneslam.bus.gyrodometry import Gyrodometry
 from sceneslam.bus.hold import Hold
@@ -31,3 +32,13 @@ class Reckoning:
         """Take in what the active module said of the newest observation."""
         if self._scale is not None:
             self._scale.learn(hold)
+
+    def tell(self, stamp_ns: int, log: EventLog) -> None:
+        """Log what was learnt, if anything."""
+        known: dict[str, object] = {}
+        if self._scale is not None and self._scale.is_learnt:
+            known |= {"wheel_scale": self._scale.scale, "scale_deviation": self._scale.deviation}
+        if self._zero is not None and self._zero.bias_radps.any():
+            known |= {"gyro_bias_radps": self._zero.bias_radps.tolist()}
+        if known:
+            log.add("calibration", stamp_ns, **known)

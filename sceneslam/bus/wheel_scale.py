@@ -46,6 +46,16 @@ class WheelScale:
         self._is_told = False  # by the newest observation
         self._mark: _Mark | None = None
 
+    @property
+    def deviation(self) -> float:
+        """Return the standard deviation of the scale."""
+        return math.sqrt(self._variance)
+
+    @property
+    def is_learnt(self) -> bool:
+        """Tell whether any module has taught it."""
+        return self._variance < _UNKNOWN**2
+
     def correct(self, observation: Observation) -> Observation:
         """Return the observation with odometry whose way is to scale, as far as is known."""
         before, T_told = self._T_told, observation.T_odom_base
