@@ -42,6 +42,7 @@ WRONG_M, WRONG_RAD = 0.3, 0.2  # a loop that is off by more joins two different 
 JUMPS, JUMP_IMAGES, GAP_NS = 20, 15, 2_000_000_000
 MAPPED_IMAGES = 440  # before the kidnapping; the ones in between are kept for afterwards
 KNOWN_AFTER_NS = 3_000_000_000  # a place seen longer ago than this counts as seen again
+REVISIT_NS = 10_000_000_000
 SAME_PLACE_M, SAME_PLACE_RAD = 0.4, 0.35
 
 Row = Mapping[str, object]
@@ -86,6 +87,7 @@ def loops(overrides: list[str]) -> Row:
     wrong = (errors[:, 0] > WRONG_M) | (errors[:, 1] > WRONG_RAD)
     return {
         "lost": len(answers) - len(held),
+        "edges of tracking to places of 10 s before": revisits(graph) if graph else 0,
         "loop edges": len(errors),
         "wrong": int(wrong.sum()),
         "worst edge [m]": f"{errors[:, 0].max(initial=0):.3f}",
@@ -94,6 +96,12 @@ def loops(overrides: list[str]) -> Row:
         "ATE revised [m]": f"{absolute_errors(revised, truth, MAX_GAP_S).rmse_m:.4f}",
         **cost,
     }
+
+
+def revisits(graph: PoseGraphLayer) -> int:
+    """Return how many edges tracking made to a keyframe of a way taken long before."""
+    apart_ns = np.abs(np.diff(graph.stamps_ns[graph.edges], axis=1))[:, 0]
+    return int(np.count_nonzero((apart_ns > REVISIT_NS) & ~graph.is_loop))
 
 
 def loop_errors(graph: PoseGraphLayer, truth: Trajectory) -> NDArray[np.float64]:

@@ -56,6 +56,8 @@ class RollingShutter:
         `change` [rad/s]: by how much faster than the image was straightened for the camera turned,
         by what else is known.
         """
+        if not self.readout_s:
+            return change, np.zeros(6)
         moves = [moves_px_per_s(self._camera, uv_px, axis) for axis in np.eye(3)]
         slopes = self.readout_s * np.stack([(m / seen.sigma_px[:, None]).T.ravel() for m in moves])
         weight = _CORRELATED / sigma_rad_per_s**2
