@@ -48,9 +48,11 @@ SAME_PLACE_M, SAME_PLACE_RAD = 0.4, 0.35
 Row = Mapping[str, object]
 
 
-def build(overrides: Iterable[str]) -> tuple[Source, RgbdSlam, Trajectory]:
+def build(
+    overrides: Iterable[str], module_name: str = "rgbd"
+) -> tuple[Source, RgbdSlam, Trajectory]:
     """Return a source, the module made ready for it, and the true poses."""
-    words = ["+scenario=single", "slam@slam.only=rgbd", *overrides]
+    words = ["+scenario=single", f"slam@slam.only={module_name}", *overrides]
     with initialize_config_module("sceneslam.conf", version_base="1.3"):
         config = OmegaConf.to_container(compose("config", overrides=words), resolve=True)
     builder = Builder(cast(dict[str, Any], config))
@@ -91,7 +93,7 @@ def loops(overrides: list[str]) -> Row:
         "loop edges": len(errors),
         "wrong": int(wrong.sum()),
         "worst edge [m]": f"{errors[:, 0].max(initial=0):.3f}",
-        "corrections": answers[-1].revision,
+        "revisions": answers[-1].revision,
         "ATE told [m]": f"{absolute_errors(told, truth, MAX_GAP_S).rmse_m:.4f}",
         "ATE revised [m]": f"{absolute_errors(revised, truth, MAX_GAP_S).rmse_m:.4f}",
         **cost,
