@@ -3,6 +3,7 @@
     export OPENBLAS_NUM_THREADS=1  # as `python -m sceneslam` sets it; two threads are slower
     python experiments/rgbd.py FOLDER [FX FY CX CY DEPTH_SCALE]  # the table below
     python experiments/rgbd.py FOLDER [...] sweep  # seeds and feature counts
+    python experiments/rgbd.py FOLDER [...] thinned  # every second to fourth image
     python experiments/rgbd.py FOLDER [...] profile  # where the time goes
 
 Every recording is also run backwards and with every second image, since one ATE says little.
@@ -33,6 +34,7 @@ from sceneslam.types.rig import Rig
 from sceneslam.types.trajectory import Trajectory
 
 CONF = Path(__file__).resolve().parents[1] / "conf" / "slam" / "rgbd.yaml"
+COUNTS = (700, 940, 970, 1030, 1060, 1500)
 GAP_S = 0.01  # between a pose and its truth
 HEAD = (
     "| run | ATE told (max) [mm] | revised [mm] | no pose | keyframes "
@@ -152,9 +154,18 @@ def table(source: TumRgbd, truth: Trajectory) -> None:
 def sweep(source: TumRgbd, truth: Trajectory) -> None:
     """Print what seeds and feature counts change."""
     print(HEAD + "\n" + "|---" * 8 + "|")
-    for changes in [{"seed": s} for s in range(3)] + [{"feature_count": c} for c in (700, 1500)]:
+    for changes in [{"seed": s} for s in range(3)] + [{"feature_count": c} for c in COUNTS]:
         name = ", ".join(f"{key} {value}" for key, value in changes.items())
         print(row(name, follow(source.rig, iter(source), **changes), truth), flush=True)
+
+
+def thinned(source: TumRgbd, truth: Trajectory) -> None:
+    """Print the recording with every second to fourth image, from several first ones."""
+    print(HEAD + "\n" + "|---" * 8 + "|")
+    observations = list(source)
+    for first, step in ((1, 2), (0, 3), (1, 3), (2, 3), (0, 4)):
+        run = follow(source.rig, observations[first::step])
+        print(row(f"every {step}. image from {first}", run, truth), flush=True)
 
 
 def profile(source: TumRgbd, truth: Trajectory) -> None:
@@ -169,7 +180,7 @@ def main() -> None:
     """Run the command in the first lines of this file."""
     cv2.setNumThreads(1)
     words = sys.argv[1:]
-    modes = {"sweep": sweep, "profile": profile}
+    modes = {"sweep": sweep, "thinned": thinned, "profile": profile}
     mode = modes.get(words[-1], table)
     source = recording([word for word in words if word not in modes])
     truth = source.ground_truth()
