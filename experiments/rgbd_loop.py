@@ -29,6 +29,7 @@ from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.evaluation.alignment import align
 from sceneslam.evaluation.association import interpolated
 from sceneslam.interfaces import SlamModule, Source
+from sceneslam.modules.slam.rgbd.keyframes import KeyframeStore
 from sceneslam.modules.slam.rgbd.module import RgbdSlam
 from sceneslam.modules.slam.rgbd.places import PlaceIndex
 from sceneslam.sources.ordered import Ordered
@@ -89,7 +90,7 @@ def loops(overrides: list[str]) -> Row:
     wrong = (errors[:, 0] > WRONG_M) | (errors[:, 1] > WRONG_RAD)
     return {
         "lost": len(answers) - len(held),
-        "edges of tracking to places of 10 s before": revisits(graph) if graph else 0,
+        "keyframes tracked to places of 10 s before": revisits(module._map.keyframes),
         "loop edges": len(errors),
         "wrong": int(wrong.sum()),
         "worst edge [m]": f"{errors[:, 0].max(initial=0):.3f}",
@@ -100,10 +101,13 @@ def loops(overrides: list[str]) -> Row:
     }
 
 
-def revisits(graph: PoseGraphLayer) -> int:
-    """Return how many edges tracking made to a keyframe of a way taken long before."""
-    apart_ns = np.abs(np.diff(graph.stamps_ns[graph.edges], axis=1))[:, 0]
-    return int(np.count_nonzero((apart_ns > REVISIT_NS) & ~graph.is_loop))
+def revisits(keyframes: KeyframeStore) -> int:
+    """Return how many keyframes share landmarks with one of long before."""
+    count = 0
+    for keyframe in keyframes.all():
+        near = keyframes.covisible(keyframe.landmark_ids, limit=len(keyframes))
+        count += any(keyframe.stamp_ns - keyframes[k].stamp_ns > REVISIT_NS for k in near)
+    return count
 
 
 def loop_errors(graph: PoseGraphLayer, truth: Trajectory) -> NDArray[np.float64]:
