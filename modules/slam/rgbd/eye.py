@@ -15,6 +15,7 @@ from sceneslam.types.se3 import Transform
 from .features import FeatureExtractor
 from .localizer import Fix, Localizer
 from .motion import MotionModel, TurnRate
+from .shifts import shifts_px_per_s
 from .shutter import RollingShutter, Turning, moves_px_per_s
 from .view import View
 from .visual_map import VisualMap
@@ -29,7 +30,7 @@ class Eye:
     def __init__(
         self, visual_map: VisualMap, localizer: Localizer, extractor: FeatureExtractor
     ) -> None:
-        self._map, self._camera = visual_map, visual_map.camera
+        self._landmarks, self._camera = visual_map.landmarks, visual_map.camera
         self._localizer = localizer
         self._extractor, self._shutter = extractor, RollingShutter(visual_map.camera)
         self.twist_per_s = np.zeros(6)  # of the newest pose, see Turning
@@ -103,9 +104,11 @@ class Eye:
 
     def _learn(self, view: View, fix: Fix) -> View:
         """Return a view with how its pose goes with the readout, of which it tells."""
-        uv_px, ids = view.features.uv_px[fix.feature_rows], fix.landmark_ids
+        uv_px = view.features.uv_px[fix.feature_rows]
         slope_px = moves_px_per_s(self._camera, uv_px, view.turning.rate_cam)
-        slope_px -= self._map.shifts_px_per_s(fix.estimate.T_local_base, ids)
+        slope_px -= shifts_px_per_s(
+            self._landmarks, self._camera, fix.estimate.T_local_base, fix.landmark_ids
+        )
         twist_cam = self._shutter.learn(fix.estimate.linearised, slope_px)
         self.twist_per_s = se3.adjoint(self._camera.T_base_cam) @ twist_cam
         return replace(view, turning=replace(view.turning, twist_per_s=self.twist_per_s))

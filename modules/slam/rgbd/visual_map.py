@@ -16,7 +16,7 @@ from .corners import LEVELS, SCALE
 from .features import Features
 from .keyframes import NO_LANDMARK, Keyframe, KeyframeStore
 from .landmarks import LandmarkTable, Looks
-from .shutter import moves_px_per_s
+from .shifts import learn_shifts
 
 _SCALES = SCALE ** np.arange(LEVELS)
 _COVISIBLE = 12
@@ -154,7 +154,7 @@ class VisualMap:
         ids[fresh] = self.landmarks.add(
             points_local=points_local, information=information, looks=looks
         )
-        self._learn_shifts(keyframe)
+        learn_shifts(self.landmarks, self.camera, keyframe)
         keyframe_id = self.keyframes.insert(keyframe)
         self._keep_limits()
         return keyframe_id
@@ -178,32 +178,6 @@ class VisualMap:
             keyframe.straighten(self.camera, readout_s)
         self.landmarks.points_local += readout_s * self.landmarks.shift_local
         self.corrections += 1
-
-    def shifts_px_per_s(
-        self, T_local_base: Transform, landmark_ids: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
-        """Return how landmarks (N, 2) move in a camera that stays, when reading takes longer."""
-        camera = self.camera
-        T_local_cam = T_local_base @ camera.T_base_cam
-        points_local = self.landmarks.points_local.take(landmark_ids, axis=0)
-        points_cam = se3.apply(se3.inverse(T_local_cam), points_local)
-        shift_cam = self.landmarks.shift_local.take(landmark_ids, axis=0) @ T_local_cam[:3, :3]
-        z = np.maximum(points_cam[:, 2:], _NEAREST_M)
-        across = shift_cam[:, :2] - points_cam[:, :2] / z * shift_cam[:, 2:]
-        return np.asarray(across / z * [camera.fx, camera.fy])
-
-    def _learn_shifts(self, keyframe: Keyframe) -> None:
-        """Hear where a keyframe will have its landmarks when reading takes longer than taken."""
-        camera, rows = self.camera, np.flatnonzero(keyframe.landmark_ids != NO_LANDMARK)
-        ids, turning = keyframe.landmark_ids[rows], keyframe.turning
-        T_local_cam = keyframe.T_local_base @ camera.T_base_cam
-        points_cam = se3.apply(se3.inverse(T_local_cam), self.landmarks.points_local[ids])
-        moves_px = moves_px_per_s(camera, keyframe.features.uv_px[rows], turning.rate_cam)
-        shift_cam = np.zeros((len(rows), 3))
-        shift_cam[:, :2] = moves_px / [camera.fx, camera.fy] * points_cam[:, 2:]
-        twist_cam = se3.adjoint(se3.inverse(camera.T_base_cam)) @ turning.twist_per_s
-        shift_cam += twist_cam[:3] + np.cross(twist_cam[3:], points_cam)
-        self.landmarks.shift(ids, shift_cam @ T_local_cam[:3, :3].T)
 
     def _locate(
         self, keyframe: Keyframe, rows: NDArray[np.int64]
