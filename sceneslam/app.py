@@ -85,6 +85,12 @@ def _clear(folder: Path) -> None:
             path.unlink()
 
 
+def _peak_rss_mb() -> float:
+    """Return the most memory of this process and, added, of the largest that it started."""
+    who = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    return sum(resource.getrusage(one).ru_maxrss for one in who) / 1024
+
+
 def _save(
     config: Mapping[str, Any],
     parts: Parts,
@@ -114,7 +120,7 @@ def _save(
         result,
         truth,
         settings=parts.evaluation,
-        peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        peak_rss_mb=_peak_rss_mb(),
         reference=reference,
     )
     with _noting(loop.faults, "configuration, metrics and report"):
