@@ -124,9 +124,12 @@ class _Trials:
 
 def _try_sources(configs: Iterable[Mapping[str, Any]]) -> None:
     """Raise the error of any source that cannot be opened."""
-    for config in {
-        json.dumps(config["source"], default=str): config for config in configs
-    }.values():
+    inputs: dict[str, Mapping[str, Any]] = {}
+    for config in configs:
+        inputs.setdefault(
+            json.dumps([config["source"], config.get("effects")], default=str), config
+        )
+    for config in inputs.values():
         make_source(config, Builder(config))
 
 

@@ -173,7 +173,7 @@ def test_folder_that_is_no_sweep_is_named(tmp_path, capsys):
 def test_jobs_share_the_cores(n_jobs, cores, tmp_path, monkeypatch):
     told = []
     monkeypatch.setattr("sceneslam.sweep.backends.run_job", told.append)
-    monkeypatch.setattr(os, "cpu_count", lambda: 4)
+    monkeypatch.setattr("sceneslam.sweep.backends._cores", lambda: 4)
     order = Order(folder=tmp_path, code=tmp_path, began_in=tmp_path, stop=tmp_path / "stop")
     Joblib(n_jobs).run([order] * 5)
     assert [order.cores for order in told] == [cores] * 5

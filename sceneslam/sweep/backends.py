@@ -67,7 +67,7 @@ class Submitit:
         if cluster not in ("local", "slurm"):
             raise ConfigError("cluster", cluster, "local | slurm")
         self._cluster = cluster
-        self._at_once = array_parallelism or os.cpu_count() or 1
+        self._at_once = array_parallelism or _cores()
         self._parameters = dict(parameters)
 
     def run(self, orders: Sequence[Order]) -> None:
@@ -82,7 +82,7 @@ class Submitit:
         waiting, running = deque[Order](), dict[Order, Any]()
         if self._cluster == "slurm":
             executor.update_parameters(slurm_array_parallelism=self._at_once)
-            told = _with_cores(orders, self._parameters.get("cpus_per_task", 1))
+            told = _with_cores(orders, self._parameters.get("cpus_per_task") or 1)
             running = dict(zip(told, executor.map_array(run_job, told), strict=True))
         else:
             waiting.extend(_sharing(orders, min(self._at_once, len(orders))))
@@ -128,9 +128,16 @@ class Ray:
             ray.shutdown()
 
 
+def _cores() -> int:
+    """Return how many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def _sharing(orders: Sequence[Order], at_once: int) -> Sequence[Order]:
     """Return jobs that share this machine's cores."""
-    return _with_cores(orders, (os.cpu_count() or 1) // at_once)
+    return _with_cores(orders, _cores() // at_once)
 
 
 def _with_cores(orders: Sequence[Order], cores: int) -> Sequence[Order]:
