@@ -114,7 +114,7 @@ class Bus:
         """End the run: shut the module down, then the detector. May be called twice."""
         if self._state != "terminate":
             self._send("stop", stamp_ns)
-            self._reckoning.tell(stamp_ns, self._log)
+        self._reckoning.close(stamp_ns, self._log)
         self._changeover.close()
         self._estimator.close()
         self._watch.close()

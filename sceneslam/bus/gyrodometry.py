@@ -46,6 +46,11 @@ class Gyrodometry:
         self._T_odom_base = self._T_odom_base @ T_prev_curr
         return replace(observation, T_odom_base=self._T_odom_base)
 
+    def shift(self, bias_radps: float) -> None:
+        """Take note that the gyro comes with so much less bias from now on."""
+        if bias_radps:
+            self._apart_radps[: min(self._count, _KEPT)] -= bias_radps
+
     def _bias_with(self, apart_radps: float) -> float:
         """Return the gyro's bias [rad/s] by all differences so far, this one too."""
         self._apart_radps[self._count % _KEPT] = apart_radps

@@ -20,6 +20,8 @@ class Hold:
         self.is_suspect = False  # from a disagreement on until it has agreed for long enough
         self.suspect_since_ns: int | None = None  # from when on it may have been wrong
         self.is_trusted = False  # another module may start from its last pose
+        self.is_asked = False  # it was given the last observation
+        self.inliers = 0  # measurements that agreed with its last pose
         self.is_revised = False  # its last pose jumped, for it corrected its past
         self.unheld_since_ns: int | None = None
         self.held_since_ns: int | None = None
@@ -41,7 +43,8 @@ class Hold:
     def ask(self, runner: Runner, observation: Observation) -> Tracking | None:
         """Return a module's answer where its pose may be used; raises ModuleError as the runner."""
         self.is_trusted, self.covariance = False, None
-        if not runner.can_use(observation):
+        self.is_asked = runner.can_use(observation)
+        if not self.is_asked:
             self._judge(observation, None)
             self._wait(observation.stamp_ns)
             return None
@@ -62,13 +65,14 @@ class Hold:
 
     def spare(self, observation: Observation) -> None:
         """Take note of an observation that a module which is catching up was not given."""
-        self.is_trusted, self.covariance = False, None
+        self.is_trusted, self.covariance, self.is_asked = False, None, False
         self._judge(observation, None)
 
     def _feed(self, tracking: Tracking) -> None:
         if self._fed_ns is not None:
             self._period_ns = tracking.stamp_ns - self._fed_ns
         self._fed_ns, self.status = tracking.stamp_ns, tracking.status
+        self.inliers = tracking.inliers
         self.is_revised = tracking.revision != self._revision
         self._revision = tracking.revision
 

@@ -20,7 +20,10 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
 _UNKNOWN = 0.02  # standard deviation of the scale before anything is learnt
-_SPAN_M = 0.5  # of the way between two poses that are compared
+_LIMIT = 0.03  # no further from 1: half of what the gate lets pass, for it is judged by this
+_DRIFT = 0.002  # from span to span: tyres wear, floors change
+_SPAN_M = 0.5  # of the way between two poses that are compared ...
+_TURN_MAX_RAD = 0.3  # ... which turned no more in all: an arc is longer than its chord
 _SLIP = 0.015  # standard deviation of what wheels slip over a span, each time anew
 _SIGMAS = 3.0  # more is no scale: a wheel spun, or the module erred
 
@@ -45,16 +48,12 @@ class WheelScale:
         self._T_odom_base = se3.identity()  # ... and its pose as corrected
         self._is_told = False  # by the newest observation
         self._mark: _Mark | None = None
+        self._turned_rad = 0.0  # in all, since the mark
 
     @property
     def deviation(self) -> float:
         """Return the standard deviation of the scale."""
         return math.sqrt(self._variance)
-
-    @property
-    def is_learnt(self) -> bool:
-        """Tell whether any module has taught it."""
-        return self._variance < _UNKNOWN**2
 
     def correct(self, observation: Observation) -> Observation:
         """Return the observation with odometry whose way is to scale, as far as is known."""
@@ -67,39 +66,53 @@ class WheelScale:
             self._T_odom_base = T_told
             return observation
         T_prev_curr = se3.inverse(before) @ T_told
+        self._turned_rad += float(se3.rotation_angle_rad(T_prev_curr))
         T_prev_curr[:3, 3] *= self.scale
         self._T_odom_base = self._T_odom_base @ T_prev_curr
+        self._T_odom_base.setflags(write=False)
         return replace(observation, T_odom_base=self._T_odom_base)
 
     def learn(self, hold: Hold) -> None:
         """Compare the odometry with what the active module told at the same observation."""
-        T_local_base, T_odom_base = hold.T_local_base, self._T_told
-        covariance = hold.covariance if hold.is_trusted and not hold.is_revised else None
-        if covariance is None or T_local_base is None or T_odom_base is None:
-            self._mark = None
+        if not (hold.is_asked and self._is_told):
+            return  # one of them speaks more seldom
+        here = self._here(hold)
+        mark, self._mark = self._mark, here
+        if here is None or mark is None or mark.hold is not hold:
+            self._turned_rad = 0.0
             return
-        if not self._is_told:
-            return
-        here = _Mark(
-            hold=hold, T_local_base=T_local_base, T_odom_base=T_odom_base, covariance=covariance
-        )
-        mark = self._mark
-        if mark is None or mark.hold is not hold:
-            self._mark = here
-            return
-        odom_m = float(np.linalg.norm(_way(mark.T_odom_base, T_odom_base)))
-        if odom_m >= _SPAN_M:
+        odom_m = float(np.linalg.norm(_way(mark.T_odom_base, here.T_odom_base)))
+        if self._turned_rad > _TURN_MAX_RAD:
+            self._turned_rad = 0.0
+        elif odom_m < _SPAN_M:
+            self._mark = mark
+        else:
             way_m, variance_m2 = _measured(mark, here)
             self._take(way_m / odom_m, variance_m2 / odom_m**2 + _SLIP**2)
-            self._mark = here
+            self._turned_rad = 0.0
+
+    def _here(self, hold: Hold) -> _Mark | None:
+        """Return where a span may begin or end: where the module measured its pose."""
+        is_known = hold.is_trusted and hold.inliers > 0 and not hold.is_revised
+        if not is_known or hold.covariance is None or hold.T_local_base is None:
+            return None
+        assert self._T_told is not None
+        return _Mark(
+            hold=hold,
+            T_local_base=hold.T_local_base,
+            T_odom_base=self._T_told,
+            covariance=hold.covariance,
+        )
 
     def _take(self, ratio: float, noise: float) -> None:
         """Learn the scale by a span's, whose variance is `noise`."""
+        self._variance += _DRIFT**2
         missed = ratio - self.scale
         if abs(missed) > _SIGMAS * math.sqrt(self._variance + noise):
+            self._variance = min(2.0 * self._variance, _UNKNOWN**2)  # or what is known is wrong
             return
         gain = self._variance / (self._variance + noise)
-        self.scale += gain * missed
+        self.scale = min(max(self.scale + gain * missed, 1.0 - _LIMIT), 1.0 + _LIMIT)
         self._variance *= 1.0 - gain
 
 

@@ -10,9 +10,10 @@ import numpy as np
 from sceneslam.ros.pixels import locked
 from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.types.observation import Observation
-from sceneslam.types.se3 import Transform
+from sceneslam.types.se3 import Transform, orthonormal
 
 _FAR_M = 1e8  # more than twice around the Earth
+_ROUNDED = 1e-12  # more adds up over a million steps
 _SKEW_MAX = 1e-3  # of R^T R off the identity; the rounding of float32 is a thousandth of that
 
 
@@ -69,6 +70,8 @@ def _motion(observation: Observation, log: FaultLog) -> Mapping[str, object]:
     elif T_odom_base is not None and not _is_pose(T_odom_base):
         log.add("odometry that is no pose", at_stamp(observation.stamp_ns))
         changes["T_odom_base"] = None
+    elif T_odom_base is not None and _skew(T_odom_base) > _ROUNDED:
+        changes["T_odom_base"] = locked(orthonormal(T_odom_base))
     if gyro_base is not None and not np.isfinite(gyro_base).all():
         is_good = np.isfinite(gyro_base).all(axis=1)
         bad = int(np.count_nonzero(~is_good))
@@ -82,5 +85,9 @@ def _is_pose(T_odom_base: Transform) -> bool:
     if T_odom_base.shape != (4, 4) or np.abs(T_odom_base[:3, 3]).max() > _FAR_M:
         return False
     rotation = T_odom_base[:3, :3]
-    skew = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    return bool(skew <= _SKEW_MAX and np.linalg.det(rotation) > 0)
+    return bool(_skew(T_odom_base) <= _SKEW_MAX and np.linalg.det(rotation) > 0)
+
+
+def _skew(T_odom_base: Transform) -> float:
+    rotation = T_odom_base[:3, :3]
+    return float(np.abs(rotation.T @ rotation - np.eye(3)).max())
