@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 
 from sceneslam.config.check import check_keys
 from sceneslam.sweep.__main__ import main
-from sceneslam.sweep.backends import Joblib
+from sceneslam.sweep.backends import Basic, Joblib
 from sceneslam.sweep.status import State, Status
 from sceneslam.sweep.supervise import Order
 
@@ -169,13 +169,15 @@ def test_folder_that_is_no_sweep_is_named(tmp_path, capsys):
     assert "not the folder of a sweep" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("n_jobs", "cores"), [(1, 4), (2, 2), (3, 1), (8, 1)])
-def test_jobs_share_the_cores(n_jobs, cores, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("backend", "cores"),
+    [(Basic(), None), (Joblib(n_jobs=2, cpus_per_job=1), 1), (Joblib(n_jobs=2, cpus_per_job=4), 4)],
+)
+def test_jobs_are_told_how_many_cores_they_may_take(backend, cores, tmp_path, monkeypatch):
     told = []
     monkeypatch.setattr("sceneslam.sweep.backends.run_job", told.append)
-    monkeypatch.setattr("sceneslam.sweep.backends._cores", lambda: 4)
     order = Order(folder=tmp_path, code=tmp_path, began_in=tmp_path, stop=tmp_path / "stop")
-    Joblib(n_jobs).run([order] * 5)
+    backend.run([order] * 5)
     assert [order.cores for order in told] == [cores] * 5
 
 

@@ -37,21 +37,23 @@ class Basic:
 class Joblib:
     """So many jobs at a time, on this machine."""
 
-    def __init__(self, n_jobs: int) -> None:
+    def __init__(self, n_jobs: int, cpus_per_job: int) -> None:
         if n_jobs == 0:
             raise ConfigError("n_jobs", n_jobs, "1 or more; -1: one per core")
-        self._n_jobs = n_jobs
+        if cpus_per_job < 1:
+            raise ConfigError("cpus_per_job", cpus_per_job, "1 or more")
+        self._n_jobs, self._cpus_per_job = n_jobs, cpus_per_job
 
     def run(self, orders: Sequence[Order]) -> None:
         """Run them from threads, each of which waits for its job's process."""
         try:
-            from joblib import Parallel, delayed, effective_n_jobs
+            from joblib import Parallel, delayed
         except ImportError as error:
             raise _missing("joblib", "sweep", error) from error
 
         parallel = Parallel(n_jobs=self._n_jobs, backend="threading", batch_size=1)
-        at_once = min(effective_n_jobs(self._n_jobs), len(orders))
-        parallel(delayed(run_job)(order) for order in _sharing(orders, at_once))
+        told = _with_cores(orders, self._cpus_per_job)
+        parallel(delayed(run_job)(order) for order in told)
 
 
 class Submitit:
@@ -79,13 +81,12 @@ class Submitit:
 
         executor = AutoExecutor(orders[0].stop.parent / "submitit", cluster=self._cluster)
         executor.update_parameters(**self._parameters)
-        waiting, running = deque[Order](), dict[Order, Any]()
+        told = _with_cores(orders, self._parameters.get("cpus_per_task") or 1)
+        waiting, running = deque(told), dict[Order, Any]()
         if self._cluster == "slurm":
             executor.update_parameters(slurm_array_parallelism=self._at_once)
-            told = _with_cores(orders, self._parameters.get("cpus_per_task") or 1)
             running = dict(zip(told, executor.map_array(run_job, told), strict=True))
-        else:
-            waiting.extend(_sharing(orders, min(self._at_once, len(orders))))
+            waiting.clear()
         while waiting or running:
             while waiting and len(running) < self._at_once:
                 order = waiting.popleft()
@@ -133,11 +134,6 @@ def _cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _sharing(orders: Sequence[Order], at_once: int) -> Sequence[Order]:
-    """Return jobs that share this machine's cores."""
-    return _with_cores(orders, _cores() // at_once)
 
 
 def _with_cores(orders: Sequence[Order], cores: int) -> Sequence[Order]:
