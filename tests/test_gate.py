@@ -83,6 +83,12 @@ def test_a_jump_is_seen_at_once_and_forgiven_when_both_horizons_have_passed_and_
     assert all(trusted(judgements)[first:])
 
 
+def test_a_jump_is_seen_in_the_first_second_too():
+    judgements = judged(jumping(2, 0.5))
+    assert judgements[1].distance is not DISAGREE and judgements[2].distance is DISAGREE
+    assert judgements[2].since_ns == 0
+
+
 def test_a_slow_drift_at_standstill_is_seen_over_the_long_horizon():
     drift = [
         judged(lambda step, v=v: se3.from_xy_yaw(v * PERIOD_S * step, 0, 0), odometry=lambda _: EYE)

@@ -200,16 +200,16 @@ class Gate:
         return Verdict.AGREE if is_known and is_long else Verdict.PROBATION
 
     def _anchors(self, stamp_ns: int) -> list[_Sample]:
-        """Return, per horizon, the newest sample before it; none while the shortest is not filled.
+        """Return, per horizon, the newest sample before it, or the oldest while it is not filled.
 
-        The oldest sample stands in for a longer one that is not. Older samples are forgotten.
+        Older samples are forgotten.
         """
+        if not self._samples:
+            return []
         indices = [
             bisect_right(self._stamps_ns, stamp_ns - horizon_ns) - 1
             for horizon_ns in self._horizons_ns
         ]
-        if indices[0] < 0:
-            return []
         found = [self._samples[max(index, 0)] for index in indices]
         old = max(indices[-1], 0)
         del self._samples[:old], self._stamps_ns[:old]
