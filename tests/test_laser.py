@@ -7,13 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from test_laser_world import corridor, drive, loop_path, room, scan_at
+from test_laser_world import corridor, drive, loop_path, room
 
 from sceneslam.interfaces import SlamModule
-from sceneslam.modules.slam.laser.field import LikelihoodField
-from sceneslam.modules.slam.laser.matcher import Matcher
 from sceneslam.modules.slam.laser.module import LaserSlam
-from sceneslam.modules.slam.laser.surface import SurfaceReader
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation, TrackingStatus
@@ -262,41 +259,3 @@ def test_map_to_match_with_ends_where_no_scan_can_reach():
     assert len(keyframes.latest) > 10
     assert near == [i for i in keyframes.latest if away_m[i] <= 50.0]
     assert 1 < len(near) < 5
-
-
-def test_scans_that_err_together_leave_the_pose_to_the_prediction():
-    reader = SurfaceReader(
-        T_base_laser=se3.identity(), range_max_m=25.0, noise_m=0.01, noise_per_m=0.0
-    )
-    seen = reader.read(scan_at(room(), se3.from_xy_yaw(2.0, 1.5, 0.3), stamp_ns=0))
-    field = LikelihoodField(seen, 0.05)
-    prior = np.diag([0.01**2, 0.01**2, 0.01**2])
-    predicted = np.array([0.02, 0.0, 0.0])  # and the scan says: not moved
-
-    def told_m(shift_m, novelty):
-        matcher = Matcher(window_m=0.5, window_rad=0.5, degeneracy_ratio=0.01, shift_m=shift_m)
-        match = matcher.match(seen, field, predicted, prior, novelty=novelty)
-        return float(match.T_local_base[0])
-
-    assert abs(told_m(0.0, 1.0)) < 0.002
-    assert told_m(0.0, 0.001) == told_m(0.0, 1.0)
-    assert 0.012 < told_m(0.01, 0.5) < 0.015
-    assert told_m(0.01, 0.001) > 0.019
-
-
-def test_wall_beyond_the_end_of_the_map_hardly_pulls():
-    """All that the map has of the wall ahead is the bevel in the corner before it."""
-    seen = np.array([[[-2.0, 1.0], [1.8, 1.0]], [[1.8, 1.0], [2.0, 0.8]]])
-    new = np.array([[[2.0, 0.8], [2.0, -1.0]]])
-    reader = SurfaceReader(
-        T_base_laser=se3.identity(), range_max_m=25.0, noise_m=0.01, noise_per_m=0.0
-    )
-
-    def points(walls):
-        return reader.read(scan_at(walls, se3.identity(), stamp_ns=0, beams=720))
-
-    field = LikelihoodField(points(seen), 0.05)
-    matcher = Matcher(window_m=0.5, window_rad=0.5, degeneracy_ratio=0.01, shift_m=0.0)
-    prior = np.diag([0.05**2, 0.05**2, 0.01**2])
-    match = matcher.match(points(np.concatenate([seen, new])), field, np.zeros(3), prior)
-    assert np.hypot(*match.T_local_base[:2]) < 0.01  # 13 mm when it does

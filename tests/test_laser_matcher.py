@@ -1,0 +1,47 @@
+"""The laser's scan matching alone: what may pull a pose, and how much."""
+
+import numpy as np
+from test_laser_world import room, scan_at
+
+from sceneslam.modules.slam.laser.field import LikelihoodField
+from sceneslam.modules.slam.laser.matcher import Matcher
+from sceneslam.modules.slam.laser.surface import SurfaceReader
+from sceneslam.types import se3
+
+
+def test_scans_that_err_together_leave_the_pose_to_the_prediction():
+    reader = SurfaceReader(
+        T_base_laser=se3.identity(), range_max_m=25.0, noise_m=0.01, noise_per_m=0.0
+    )
+    seen = reader.read(scan_at(room(), se3.from_xy_yaw(2.0, 1.5, 0.3), stamp_ns=0))
+    field = LikelihoodField(seen, 0.05)
+    prior = np.diag([0.01**2, 0.01**2, 0.01**2])
+    predicted = np.array([0.02, 0.0, 0.0])  # and the scan says: not moved
+
+    def told_m(shift_m, novelty):
+        matcher = Matcher(window_m=0.5, window_rad=0.5, degeneracy_ratio=0.01, shift_m=shift_m)
+        match = matcher.match(seen, field, predicted, prior, novelty=novelty)
+        return float(match.T_local_base[0])
+
+    assert abs(told_m(0.0, 1.0)) < 0.002
+    assert told_m(0.0, 0.001) == told_m(0.0, 1.0)
+    assert 0.012 < told_m(0.01, 0.5) < 0.015
+    assert told_m(0.01, 0.001) > 0.019
+
+
+def test_wall_beyond_the_end_of_the_map_hardly_pulls():
+    """All that the map has of the wall ahead is the bevel in the corner before it."""
+    seen = np.array([[[-2.0, 1.0], [1.8, 1.0]], [[1.8, 1.0], [2.0, 0.8]]])
+    new = np.array([[[2.0, 0.8], [2.0, -1.0]]])
+    reader = SurfaceReader(
+        T_base_laser=se3.identity(), range_max_m=25.0, noise_m=0.01, noise_per_m=0.0
+    )
+
+    def points(walls):
+        return reader.read(scan_at(walls, se3.identity(), stamp_ns=0, beams=720))
+
+    field = LikelihoodField(points(seen), 0.05)
+    matcher = Matcher(window_m=0.5, window_rad=0.5, degeneracy_ratio=0.01, shift_m=0.0)
+    prior = np.diag([0.05**2, 0.05**2, 0.01**2])
+    match = matcher.match(points(np.concatenate([seen, new])), field, np.zeros(3), prior)
+    assert np.hypot(*match.T_local_base[:2]) < 0.01  # 13 mm when it does
