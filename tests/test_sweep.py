@@ -21,9 +21,10 @@ from omegaconf import OmegaConf
 
 from sceneslam.config.check import check_keys
 from sceneslam.sweep.__main__ import main
-from sceneslam.sweep.backends import Basic, Joblib
+from sceneslam.sweep.backends import Basic, Joblib, Ray
 from sceneslam.sweep.status import State, Status
 from sceneslam.sweep.supervise import Order
+from sceneslam.types.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
 JOBS = ("+scenario=single", "source=mcap", "source.path=room.mcap", "slam@slam.only=odometry")
@@ -179,6 +180,21 @@ def test_jobs_are_told_how_many_cores_they_may_take(backend, cores, tmp_path, mo
     order = Order(folder=tmp_path, code=tmp_path, began_in=tmp_path, stop=tmp_path / "stop")
     backend.run([order] * 5)
     assert [order.cores for order in told] == [cores] * 5
+
+
+@pytest.mark.parametrize(
+    ("make", "key"),
+    [
+        (lambda: Joblib(n_jobs=0, cpus_per_job=1), "n_jobs"),
+        (lambda: Joblib(n_jobs=None, cpus_per_job=1), "n_jobs"),
+        (lambda: Joblib(n_jobs=1, cpus_per_job=0), "cpus_per_job"),
+        (lambda: Joblib(n_jobs=1, cpus_per_job=None), "cpus_per_job"),
+        (lambda: Ray(address=None, num_cpus=None, cpus_per_job=None), "cpus_per_job"),
+    ],
+)
+def test_impossible_worker_is_named(make, key):
+    with pytest.raises(ConfigError, match=key):
+        make()
 
 
 def test_status_is_read_as_it_was_written(tmp_path):

@@ -38,9 +38,9 @@ class Joblib:
     """So many jobs at a time, on this machine."""
 
     def __init__(self, n_jobs: int, cpus_per_job: int) -> None:
-        if n_jobs == 0:
+        if not isinstance(n_jobs, int) or n_jobs == 0:
             raise ConfigError("n_jobs", n_jobs, "1 or more; -1: one per core")
-        if cpus_per_job < 1:
+        if not isinstance(cpus_per_job, int) or cpus_per_job < 1:
             raise ConfigError("cpus_per_job", cpus_per_job, "1 or more")
         self._n_jobs, self._cpus_per_job = n_jobs, cpus_per_job
 
@@ -104,6 +104,8 @@ class Ray:
     """Tasks of a Ray cluster; without an address, of one that is started on this machine."""
 
     def __init__(self, address: str | None, num_cpus: int | None, cpus_per_job: float) -> None:
+        if not isinstance(cpus_per_job, int | float) or not cpus_per_job > 0:
+            raise ConfigError("cpus_per_job", cpus_per_job, "above 0")
         self._address, self._num_cpus = address, num_cpus
         self._cpus_per_job = cpus_per_job
 
