@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.bus.hold import Hold
+from sceneslam.bus.recent import RecentMedian
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
@@ -38,8 +39,7 @@ class GyroZero:
 
     def __init__(self) -> None:
         self.bias_radps = np.zeros(3)  # as far as is known
-        self._means = np.zeros((_KEPT, 3))  # a ring
-        self._count = 0
+        self._means = RecentMedian(_KEPT, width=3)
         self._rest: _Rest | None = None
 
     def correct(self, observation: Observation) -> Observation:
@@ -48,7 +48,7 @@ class GyroZero:
             return observation
         if observation.T_odom_base is not None:
             self._look(observation.stamp_ns, observation.T_odom_base, observation.gyro_base)
-        if not self._count:
+        if not len(self._means):
             return observation
         gyro = observation.gyro_base.copy()
         gyro[:, 1:] -= self.bias_radps
@@ -88,9 +88,8 @@ class GyroZero:
         mean = rates.mean(axis=0)
         if not np.abs(mean).max() <= _BIAS_MAX_RADPS:
             return
-        self._means[self._count % _KEPT] = mean
-        self._count += 1
-        self.bias_radps = np.median(self._means[: min(self._count, _KEPT)], axis=0)
+        self._means.add(mean)
+        self.bias_radps = self._means.median
 
 
 def _is_still(T_before: Transform, T_now: Transform) -> bool:

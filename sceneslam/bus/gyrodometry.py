@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
+from sceneslam.bus.recent import RecentMedian
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 
@@ -22,8 +21,7 @@ class Gyrodometry:
     """Corrects the heading of one observation's odometry after the other."""
 
     def __init__(self) -> None:
-        self._apart_radps = np.zeros(_KEPT)  # gyro less wheels, a ring
-        self._count = 0
+        self._apart_radps = RecentMedian(_KEPT, width=1)  # gyro less wheels
         self._before: Observation | None = None  # the last that had odometry, as it came ...
         self._T_odom_base = se3.identity()  # ... and its pose as corrected
 
@@ -49,11 +47,10 @@ class Gyrodometry:
     def shift(self, bias_radps: float) -> None:
         """Take note that the gyro comes with so much less bias from now on."""
         if bias_radps:
-            self._apart_radps[: min(self._count, _KEPT)] -= bias_radps
+            self._apart_radps.shift(-bias_radps)
 
     def _bias_with(self, apart_radps: float) -> float:
         """Return the gyro's bias [rad/s] by all differences so far, this one too."""
-        self._apart_radps[self._count % _KEPT] = apart_radps
-        self._count += 1
-        kept = min(self._count, _KEPT)
-        return float(np.median(self._apart_radps[:kept])) * kept / (kept + _DOUBT)
+        self._apart_radps.add(apart_radps)
+        kept = len(self._apart_radps)
+        return float(self._apart_radps.median[0]) * kept / (kept + _DOUBT)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.bus.recent import RecentMedian
+
 _UNUSUAL = 2.0  # times the usual standard deviation
 _KEPT = 300  # poses that tell what is usual: 10 s at 30 Hz, longer than it takes to reach a wall
 
@@ -17,8 +19,7 @@ class Sureness:
     """
 
     def __init__(self) -> None:
-        self._deviations = np.zeros((_KEPT, 2))  # of position [m] and rotation [rad], a ring
-        self._count = 0
+        self._deviations = RecentMedian(_KEPT, width=2)  # of position [m] and rotation [rad]
 
     def is_usual(self, covariance: NDArray[np.float64] | None) -> bool:
         """Tell whether a pose's (6, 6) covariance is nothing unusual; unknown ones are not."""
@@ -26,7 +27,5 @@ class Sureness:
             return True
         variances = covariance.diagonal()
         now = np.sqrt([variances[:3].sum(), variances[3:].sum()])
-        self._deviations[self._count % _KEPT] = now
-        self._count += 1
-        usual = np.median(self._deviations[: min(self._count, _KEPT)], axis=0)
-        return bool((now <= _UNUSUAL * usual).all())
+        self._deviations.add(now)
+        return bool((now <= _UNUSUAL * self._deviations.median).all())

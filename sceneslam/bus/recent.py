@@ -1,0 +1,32 @@
+"""What is usual of late: the median of the newest values."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class RecentMedian:
+    """Keeps so many values, the newest in the place of the oldest."""
+
+    def __init__(self, kept: int, *, width: int) -> None:
+        self._ring = np.zeros((kept, width))
+        self._count = 0
+
+    def __len__(self) -> int:
+        """Return how many values are kept."""
+        return min(self._count, len(self._ring))
+
+    @property
+    def median(self) -> NDArray[np.float64]:
+        """Return the median (width,) of those kept; there has to be one."""
+        return np.asarray(np.median(self._ring[: len(self)], axis=0))
+
+    def add(self, value: NDArray[np.float64] | float) -> None:
+        """Take in a value (width,)."""
+        self._ring[self._count % len(self._ring)] = value
+        self._count += 1
+
+    def shift(self, value: float) -> None:
+        """Add to every value kept."""
+        self._ring[: len(self)] += value
