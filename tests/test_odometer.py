@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from test_source_ordered import Listed
 
+from sceneslam.sources.clean import cleaned
+from sceneslam.sources.faults import FaultLog
 from sceneslam.sources.ordered import Ordered
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
@@ -89,3 +91,12 @@ def test_odometry_that_is_no_pose_is_left_out():
         ordered = Ordered(Listed([replace(good, T_odom_base=T_odom_base)]))
         assert [found.T_odom_base for found in ordered] == [None]
         assert ordered.faults[0].startswith("odometry that is no pose")
+
+
+def test_rotation_that_was_rounded_on_its_way_is_one_again():
+    """Its error would add up where motions are chained."""
+    T_odom_base = se3.from_xy_yaw(1.0, 2.0, 0.7).round(4)
+    seen = Observation(stamp_ns=0, T_odom_base=T_odom_base)
+    T_cleaned = cleaned(seen, FaultLog()).T_odom_base
+    np.testing.assert_allclose(T_cleaned[:3, :3].T @ T_cleaned[:3, :3], np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(T_cleaned, T_odom_base, atol=1e-4)

@@ -67,11 +67,13 @@ def _motion(observation: Observation, log: FaultLog) -> Mapping[str, object]:
     if T_odom_base is not None and not np.isfinite(T_odom_base).all():
         log.add("odometry that is not finite", at_stamp(observation.stamp_ns))
         changes["T_odom_base"] = None
-    elif T_odom_base is not None and not _is_pose(T_odom_base):
-        log.add("odometry that is no pose", at_stamp(observation.stamp_ns))
-        changes["T_odom_base"] = None
-    elif T_odom_base is not None and _skew(T_odom_base) > _ROUNDED:
-        changes["T_odom_base"] = locked(orthonormal(T_odom_base))
+    elif T_odom_base is not None:
+        skew = _skew(T_odom_base)
+        if not skew <= _SKEW_MAX:
+            log.add("odometry that is no pose", at_stamp(observation.stamp_ns))
+            changes["T_odom_base"] = None
+        elif skew > _ROUNDED:
+            changes["T_odom_base"] = locked(orthonormal(T_odom_base))
     if gyro_base is not None and not np.isfinite(gyro_base).all():
         is_good = np.isfinite(gyro_base).all(axis=1)
         bad = int(np.count_nonzero(~is_good))
@@ -80,14 +82,11 @@ def _motion(observation: Observation, log: FaultLog) -> Mapping[str, object]:
     return changes
 
 
-def _is_pose(T_odom_base: Transform) -> bool:
-    """Tell whether this is a rigid transform to a place on Earth."""
-    if T_odom_base.shape != (4, 4) or np.abs(T_odom_base[:3, 3]).max() > _FAR_M:
-        return False
-    rotation = T_odom_base[:3, :3]
-    return bool(_skew(T_odom_base) <= _SKEW_MAX and np.linalg.det(rotation) > 0)
-
-
 def _skew(T_odom_base: Transform) -> float:
+    """Return how far the rotation is from being one; inf where this is no place on Earth."""
+    if T_odom_base.shape != (4, 4) or np.abs(T_odom_base[:3, 3]).max() > _FAR_M:
+        return np.inf
     rotation = T_odom_base[:3, :3]
+    if np.linalg.det(rotation) <= 0:
+        return np.inf
     return float(np.abs(rotation.T @ rotation - np.eye(3)).max())
