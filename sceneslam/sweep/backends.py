@@ -117,7 +117,7 @@ class Ray:
         except ImportError as error:
             raise _missing("ray", "ray", error) from error
 
-        num_cpus = None if self._address else self._num_cpus or os.cpu_count()
+        num_cpus = None if self._address else self._num_cpus or _cores()
         ray.init(self._address, num_cpus=num_cpus, include_dashboard=False, log_to_driver=False)
         try:
             task = ray.remote(num_cpus=self._cpus_per_job, max_retries=0)(run_job)
