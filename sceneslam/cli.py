@@ -58,19 +58,17 @@ def main() -> None:
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises then, and does not exit
     try:
         job()
+        sys.stdout.flush()
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         print(f"error: {_said(error)}", file=sys.stderr)
         codes.append(UNUSABLE)
-    except OSError as error:  # Hydra's, before the job: a run's own are handled in it
-        if codes:
+    except BrokenPipeError:  # as of `| head`: what was said went where it was wanted
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (OSError, RecursionError, ValueError) as error:  # Hydra's, before the job
+        said = _meant(error)
+        if codes or said is None:  # a run's own are handled in it
             raise
-        print(f"error: hydra.run.dir or hydra.sweep.dir: {told(error)}", file=sys.stderr)
-        codes.append(UNUSABLE)
-    except ValueError as error:  # Hydra's, which does not say which
-        if not str(error).startswith("Config group override must be"):
-            raise
-        empty = [word for word in sys.argv[1:] if word.endswith(("=null", "="))]
-        print(f"error: {', '.join(empty)}: a group holds options; ~GROUP removes", file=sys.stderr)
+        print(f"error: {said}", file=sys.stderr)
         codes.append(UNUSABLE)
     except KeyboardInterrupt:  # ends a sweep as well
         codes.append(INCOMPLETE)
@@ -89,6 +87,21 @@ def _said(error: Exception) -> str:
     return re.sub(
         r"To append to your config use \+(.*)", r"There is no such key; --cfg job shows all", said
     )
+
+
+def _meant(error: Exception) -> str | None:
+    """Return what an error of Hydra's means that does not say which file or key; None: unknown."""
+    if isinstance(error, OSError):
+        return f"hydra.run.dir or hydra.sweep.dir: {told(error)}"
+    if isinstance(error, RecursionError):
+        return "defaults: a file is in its own list, or in that of a file in it"
+    if isinstance(error, UnicodeDecodeError):
+        near = bytes(error.object[max(0, error.start - 30) : error.start + 10])
+        return f"a YAML file is not UTF-8 text, at {near.decode('ascii', 'replace')!r}"
+    if str(error).startswith("Config group override must be"):
+        empty = [word for word in sys.argv[1:] if word.endswith(("=null", "="))]
+        return f"{', '.join(empty)}: a group holds options; ~GROUP removes"
+    return str(error) if str(error).startswith("Invalid defaults list") else None
 
 
 def carry_out(config: DictConfig) -> Ended:

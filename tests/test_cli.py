@@ -76,6 +76,35 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(folder):
     assert "room.mcap/out" in done.stderr and "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("written", "sentence"),
+    [
+        (b"defaults: default", "Invalid defaults list in 'policy/mine', defaults must be a list"),
+        (b"defaults: [mine]", "defaults: a file is in its own list"),
+        ("dwell_s: 1 # größe".encode("latin-1"), "a YAML file is not UTF-8 text, at 'dwell_s: 1"),
+    ],
+)
+def test_file_that_hydra_breaks_on_is_one_sentence(folder, tmp_path, written, sentence):
+    (tmp_path / "policy").mkdir()
+    (tmp_path / "policy" / "mine.yaml").write_bytes(written)
+    done = call(folder, "--config-dir", str(tmp_path), *SINGLE, "policy=mine")
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"error: {sentence}")
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("asked", ["--help", "--info"])
+def test_reader_that_has_gone_is_no_error(folder, asked):
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        command("--help"), cwd=folder, env=environment, stdout=writer, stderr=subprocess.PIPE
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
 def test_cut_recording_is_read_as_far_as_it_goes(folder, recording):
     data = recording.read_bytes()
     (folder / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
