@@ -74,6 +74,14 @@ def test_module_fulfils_the_interface():
     assert isinstance(active(), SlamModule)
 
 
+def test_odometry_that_is_rounded_does_not_stop_the_process():
+    observations, poses = drive(12, odometry=True)
+    rounded = np.diag([1 + 1e-9, 1, 1, 1])  # its rotations do not multiply to rotations
+    module = active()
+    told = [replace(o, T_odom_base=o.T_odom_base @ rounded) for o in observations]
+    assert worst_error_m([module.track(o) for o in told], poses) < 0.06
+
+
 @pytest.mark.parametrize("odometry", [False, True])
 def test_motion_in_a_hall_is_found(odometry):
     observations, poses = drive(25, odometry=odometry)

@@ -1,8 +1,8 @@
 """The `kiss_icp` SLAM module: an adapter over KISS-ICP, for lidars and depth cameras.
 
 Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023. The library registers and
-keeps the voxel map; deskewing, prediction and the judgement of its answer are here, since it
-takes empty clouds and NaN in silence, and stops the process where all stamps are equal.
+keeps the voxel map; deskewing, prediction and judgement are here: it takes empty clouds and NaN
+in silence, and stops the process where all stamps are equal or a rotation is off by 1e-10.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class KissIcp:
         """Return T_local_base at the observation."""
         if self._reader is None or self._icp is None:
             raise RuntimeError("track() before activate()")
-        T_local_guess = self._T_local_base @ self._predict(observation)
+        T_local_guess = se3.orthonormal(self._T_local_base @ self._predict(observation))
         twist_s = self._twist_s if self.deskew else np.zeros(6)
         cloud = self._reader.read_unswept(observation, twist_s)
         if cloud is None:
