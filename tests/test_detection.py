@@ -147,22 +147,35 @@ def test_modules_are_not_built_by_a_run_without_slam(config, tmp_path):
         run(config("+scenario=bright_to_dark", "run=detect_only"), tmp_path)
 
 
-def test_command_sweeps_settings_and_recordings_into_one_table(cache, tmp_path):
-    words = [sys.executable, "-m", "sceneslam", "-m", "run.max_observations=100,200"]
-    words += [*TINY, "run=detect_only", "detector.threshold=range(80,121,10)"]
+def swept(cache, folder, *words):
+    command = [sys.executable, "-m", "sceneslam", "-m", *TINY, "run=detect_only", *words]
     done = subprocess.run(
-        [*words, "policy.confirm_window_s=0.5,1,-1", "hydra.sweep.dir=out"],
-        cwd=tmp_path,
+        [*command, "hydra.sweep.dir=out"],
+        cwd=folder,
         env=os.environ | {"PYTHONPATH": str(ROOT), "SCENESLAM_CACHE_DIR": str(cache)},
         capture_output=True,
         text=True,
         timeout=300,
     )
+    with (folder / "out" / "table.csv").open(newline="") as file:
+        return done, list(csv.DictReader(file))
+
+
+def test_command_sweeps_settings_and_recordings_into_one_table(cache, tmp_path):
+    settings = ("detector.threshold=range(80,121,10)", "policy.confirm_window_s=0.5,1,-1")
+    done, rows = swept(cache, tmp_path, "run.max_observations=100,200", *settings)
     assert done.returncode == 1 and "30 settings" in done.stdout, done.stderr
-    with (tmp_path / "out" / "table.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
     observed = [row["observations"] for row in rows if row["status"] == "done"]
     assert observed == ["100"] * 10 + ["200"] * 10
     failed = [row for row in rows if row["status"] == "failed"]
     assert len(failed) == 10 and {row["policy.confirm_window_s"] for row in failed} == {"-1"}
     assert (tmp_path / "out" / "index.html").is_file()
+
+
+def test_lists_and_flags_are_swept_like_numbers(cache, tmp_path):
+    lists = "detector.features=[grey_mean,corner_count,depth_ratio],[grey_mean,depth_ratio]"
+    flags = "policy.turn_by_gyro=true,false"
+    _, rows = swept(cache, tmp_path, "detector=rules", lists, flags, "run.max_observations=20")
+    assert [row["policy.turn_by_gyro"] for row in rows] == ["true", "false"] * 2
+    assert rows[0]["detector.features"] == "[grey_mean, corner_count, depth_ratio]"
+    assert [row["status"] for row in rows] == ["done"] * 2 + ["failed"] * 2

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, QuotedString, Transformer
@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from sceneslam.collect.flatten import flat
 from sceneslam.collect.overview import overview
-from sceneslam.collect.rows import ROWS, Row, parsed
+from sceneslam.collect.rows import ROWS, Row, Value, parsed
 from sceneslam.collect.write import write_rows
 from sceneslam.config.resolve import resolved, without_hydra
 from sceneslam.detection.grid import Axis, Tried, try_all
@@ -63,9 +63,15 @@ def _row(number: int, chosen: Sequence[str], tried: Tried) -> Row:
         name=str(number),
         status=state.value,
         error=tried.error,
-        keys={**dict(map(parsed, chosen)), **tried.setting},
+        keys={**dict(map(parsed, chosen)), **{k: _cell(v) for k, v in tried.setting.items()}},
         metrics=flat(tried.metrics),
     )
+
+
+def _cell(value: Any) -> Value:
+    """Return a value as the table holds it: numbers and text, all else as it is typed."""
+    is_plain = isinstance(value, str | int | float) and not isinstance(value, bool)
+    return cast(Value, value) if is_plain else json.dumps(value).replace('"', "")
 
 
 def _words(override: Override) -> list[str]:
