@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 
 from sceneslam.config.check import check_keys
 from sceneslam.sweep.__main__ import main
-from sceneslam.sweep.backends import Basic, Joblib, Ray
+from sceneslam.sweep.backends import Basic, Joblib, Ray, Submitit
 from sceneslam.sweep.status import State, Status
 from sceneslam.sweep.supervise import Order
 from sceneslam.types.errors import ConfigError
@@ -190,11 +190,28 @@ def test_jobs_are_told_how_many_cores_they_may_take(backend, cores, tmp_path, mo
         (lambda: Joblib(n_jobs=1, cpus_per_job=0), "cpus_per_job"),
         (lambda: Joblib(n_jobs=1, cpus_per_job=None), "cpus_per_job"),
         (lambda: Ray(address=None, num_cpus=None, cpus_per_job=None), "cpus_per_job"),
+        (lambda: Ray(address=None, num_cpus=-1, cpus_per_job=1), "num_cpus"),
+        (lambda: Submitit("local", array_parallelism=-1, parameters={}), "array_parallelism"),
+        (lambda: Submitit("local", array_parallelism=1, parameters=None), "parameters"),
     ],
 )
 def test_impossible_worker_is_named(make, key):
     with pytest.raises(ConfigError, match=key):
         make()
+
+
+@pytest.mark.parametrize(
+    ("backend", "sentence"),
+    [
+        (Submitit("slurm", None, {}), "hydra.launcher.cluster: got 'slurm'"),
+        (Submitit("local", None, {"nodez": 2}), "hydra.launcher.parameters: got {'nodez': 2}"),
+        (Ray("nowhere", None, 1), "hydra.launcher.address: got 'nowhere'"),
+    ],
+)
+def test_cluster_that_cannot_be_used_is_named(backend, sentence, tmp_path):
+    order = Order(folder=tmp_path, code=tmp_path, began_in=tmp_path, stop=tmp_path / "stop")
+    with pytest.raises(ConfigError, match=re.escape(sentence)):
+        backend.run([order])
 
 
 def test_status_is_read_as_it_was_written(tmp_path):

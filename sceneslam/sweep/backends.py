@@ -10,6 +10,7 @@ from functools import partial
 from time import sleep
 from typing import Any, Protocol
 
+from sceneslam.config.check import first_line
 from sceneslam.sweep.status import State, Status
 from sceneslam.sweep.supervise import Order, run_job, settle
 from sceneslam.types.errors import ConfigError
@@ -40,8 +41,7 @@ class Joblib:
     def __init__(self, n_jobs: int, cpus_per_job: int) -> None:
         if not isinstance(n_jobs, int) or n_jobs == 0:
             raise ConfigError("n_jobs", n_jobs, "1 or more; -1: one per core")
-        if not isinstance(cpus_per_job, int) or cpus_per_job < 1:
-            raise ConfigError("cpus_per_job", cpus_per_job, "1 or more")
+        _check_count("cpus_per_job", cpus_per_job)
         self._n_jobs, self._cpus_per_job = n_jobs, cpus_per_job
 
     def run(self, orders: Sequence[Order]) -> None:
@@ -68,6 +68,10 @@ class Submitit:
     ) -> None:
         if cluster not in ("local", "slurm"):
             raise ConfigError("cluster", cluster, "local | slurm")
+        if array_parallelism is not None:
+            _check_count("array_parallelism", array_parallelism)
+        if not isinstance(parameters, Mapping):
+            raise ConfigError("parameters", parameters, "a table of submitit's parameters")
         self._cluster = cluster
         self._at_once = array_parallelism or _cores()
         self._parameters = dict(parameters)
@@ -79,8 +83,17 @@ class Submitit:
         except ImportError as error:
             raise _missing("submitit", "sweep", error) from error
 
-        executor = AutoExecutor(orders[0].stop.parent / "submitit", cluster=self._cluster)
-        executor.update_parameters(**self._parameters)
+        try:
+            executor = AutoExecutor(orders[0].stop.parent / "submitit", cluster=self._cluster)
+        except RuntimeError as error:  # there is no such cluster here
+            raise ConfigError(
+                "hydra.launcher.cluster", self._cluster, f"one that answers ({error})"
+            ) from error
+        try:
+            executor.update_parameters(**self._parameters)
+        except (NameError, TypeError, ValueError) as error:
+            key = "hydra.launcher.parameters"
+            raise ConfigError(key, self._parameters, f"submitit's ({error})") from error
         told = _with_cores(orders, self._parameters.get("cpus_per_task") or 1)
         waiting, running = deque(told), dict[Order, Any]()
         if self._cluster == "slurm":
@@ -106,6 +119,8 @@ class Ray:
     def __init__(self, address: str | None, num_cpus: int | None, cpus_per_job: float) -> None:
         if not isinstance(cpus_per_job, int | float) or not cpus_per_job > 0:
             raise ConfigError("cpus_per_job", cpus_per_job, "above 0")
+        if num_cpus is not None:
+            _check_count("num_cpus", num_cpus)
         self._address, self._num_cpus = address, num_cpus
         self._cpus_per_job = cpus_per_job
 
@@ -118,7 +133,11 @@ class Ray:
             raise _missing("ray", "ray", error) from error
 
         num_cpus = None if self._address else self._num_cpus or _cores()
-        ray.init(self._address, num_cpus=num_cpus, include_dashboard=False, log_to_driver=False)
+        try:
+            ray.init(self._address, num_cpus=num_cpus, include_dashboard=False, log_to_driver=False)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            reason = f"a Ray cluster that answers; null: one of its own ({first_line(error)})"
+            raise ConfigError("hydra.launcher.address", self._address, reason) from error
         try:
             task = ray.remote(num_cpus=self._cpus_per_job, max_retries=0)(run_job)
             told = _with_cores(orders, int(self._cpus_per_job))
@@ -129,6 +148,11 @@ class Ray:
                     _note(running.pop(reference), partial(ray.get, reference))
         finally:
             ray.shutdown()
+
+
+def _check_count(name: str, value: object) -> None:
+    if not isinstance(value, int) or value < 1:
+        raise ConfigError(name, value, "1 or more")
 
 
 def _cores() -> int:
