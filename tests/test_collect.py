@@ -193,3 +193,23 @@ def test_no_front_is_drawn_where_nothing_false_was_seen():
     ]
     told = " ".join(charts(groups_of(rows)))
     assert "Every setting" not in told and "Detection delay" in told
+
+
+def test_front_weighs_settings_over_all_recordings():
+    told = {
+        ("easy", 1): (0.0, 0),
+        ("hard", 1): (2.0, 4),
+        ("easy", 2): (2.0, 0),
+        ("hard", 2): (4, 1),
+    }
+    rows = [
+        Row(
+            name=f"{story}{window}",
+            status="done",
+            keys={"story": story, "window": window},
+            metrics={"detection.delay_s": delay_s, "detection.false": false},
+        )
+        for (story, window), (delay_s, false) in told.items()
+    ]
+    page = " ".join(charts(groups_of(rows)))
+    assert "no other is better than: window=1: 1 s, 2 false; window=2: 3 s, 0.5 false." in page

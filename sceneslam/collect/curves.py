@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from sceneslam.collect.chart import Line, Point, draw_front, draw_lines
-from sceneslam.collect.rows import Value
+from sceneslam.collect.chart import Line, Point, draw_front, draw_lines, front
+from sceneslam.collect.rows import Row, Value
 from sceneslam.collect.summary import SEED, Group, mean_of
 from sceneslam.evaluation.figure_style import PALETTE
 from sceneslam.evaluation.markup import figure
@@ -16,6 +16,8 @@ _SHOWN = {  # metric -> name of the axis
     "detection.false": "false detections",
     "detection.missed": "missed changes",
 }
+_RECORDING = ("story", "scenario", "source", "effects", "lights")  # beginnings of keys
+_BEST_MAX = 8  # of the front, in words
 _LINES_MAX = len(PALETTE)  # colours that can be told apart
 _POINTS_MAX = 600
 
@@ -37,7 +39,7 @@ def charts(groups: Sequence[Group]) -> Iterator[str]:
 
 def _front(groups: Sequence[Group]) -> str:
     points = []
-    for group in groups:
+    for group in _settings(groups):
         delay, false = group.mean("detection.delay_s"), group.mean("detection.false")
         missed = group.mean("detection.missed")
         if delay and false and not (missed and missed.mean):
@@ -48,11 +50,22 @@ def _front(groups: Sequence[Group]) -> str:
     drawn = draw_front(
         points, x_label=_SHOWN["detection.delay_s"], y_label=_SHOWN["detection.false"]
     )
+    best = [f"{one.label}: {one.x:.3g} s, {one.y:.3g} false" for one in front(points)]
     return figure(
         drawn,
         "Every setting that found all true changes: how late it found them, and how many it saw "
-        "that were none. The line joins those that no other is better than.",
+        "that were none, on average over recordings. The line joins those that no other is better "
+        f"than: {'; '.join(best[:_BEST_MAX])}{'; ...' if len(best) > _BEST_MAX else '.'}",
     )
+
+
+def _settings(groups: Sequence[Group]) -> list[Group]:
+    """Return the groups without regard to the recording: a setting is to suit all of them."""
+    found: dict[tuple[tuple[str, Value], ...], list[Row]] = {}
+    for group in groups:
+        keys = tuple(one for one in group.keys.items() if not one[0].startswith(_RECORDING))
+        found.setdefault(keys, []).extend(group.rows)
+    return [Group(keys=dict(keys), rows=rows) for keys, rows in found.items()]
 
 
 def _lines(groups: Sequence[Group], key: str, metric: str) -> Iterator[Line]:
