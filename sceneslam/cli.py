@@ -134,7 +134,8 @@ def carry_out(config: DictConfig) -> Ended:
 
 def _run(config: DictConfig, folder: Path) -> Finished:
     """Run the reference, if there is one, then the configuration itself."""
-    title = str(HydraConfig.get().runtime.choices.get("scenario") or "sceneslam")
+    choices = HydraConfig.get().runtime.choices
+    title = str(choices.get("scenario") or choices.get("experiment") or "sceneslam")
     reference: Trajectory | None = None
     if config.get("reference"):
         finished = run(_reference(config), folder / "reference", title="reference")

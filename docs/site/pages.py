@@ -73,4 +73,4 @@ def _borrowed() -> dict[str, str]:
 
 
 def _is_experiment(path: str) -> bool:
-    return path.startswith("experiments/")
+    return path.startswith("experiments/") and "/results/" not in path  # tables alone
