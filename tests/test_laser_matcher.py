@@ -1,7 +1,7 @@
 """The laser's scan matching alone: what may pull a pose, and how much."""
 
 import numpy as np
-from test_laser_world import room, scan_at
+from test_laser_world import box, room, scan_at
 
 from sceneslam.modules.slam.laser.field import LikelihoodField
 from sceneslam.modules.slam.laser.matcher import Matcher
@@ -45,3 +45,21 @@ def test_wall_beyond_the_end_of_the_map_hardly_pulls():
     prior = np.diag([0.05**2, 0.05**2, 0.01**2])
     match = matcher.match(points(np.concatenate([seen, new])), field, np.zeros(3), prior)
     assert np.hypot(*match.T_local_base[:2]) < 0.01  # 13 mm when it does
+
+
+def test_wall_that_comes_into_view_behind_a_post_hardly_pulls():
+    """What ends the map there is the post, which holds the pose in all directions."""
+    seen = np.concatenate([[[[1.5, -1.0], [1.5, 0.4]]], box(1.39, 0.4, 1.44, 0.45)])
+    new = np.array([[[1.5, 0.4], [1.5, 0.75]]])
+    reader = SurfaceReader(
+        T_base_laser=se3.identity(), range_max_m=25.0, noise_m=0.01, noise_per_m=0.0
+    )
+
+    def points(walls):
+        return reader.read(scan_at(walls, se3.identity(), stamp_ns=0, beams=1440))
+
+    field = LikelihoodField(points(seen), 0.05)
+    matcher = Matcher(window_m=0.5, window_rad=0.5, degeneracy_ratio=0.01, shift_m=0.0)
+    prior = np.diag([0.05**2, 0.05**2, 0.01**2])
+    match = matcher.match(points(np.concatenate([seen, new])), field, np.zeros(3), prior)
+    assert np.hypot(*match.T_local_base[:2]) < 0.03  # 30 cm when it does

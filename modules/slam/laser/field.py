@@ -12,6 +12,8 @@ from .surface import SurfacePoints
 
 _REACH_M = 0.3  # the likelihood falls to 0 at this distance from a surface
 _MARGIN_CELLS = 8
+_AROUND_CELLS = 2  # a surface goes on, or ends, in the cells so near
+_END_RATIO = 0.4  # of a cell: so far from the middle of these is a point at the very end
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -20,6 +22,7 @@ class Nearest:
 
     points: NDArray[np.float64]  # (N, 2) [m], local
     shape: NDArray[np.float64]  # (N, 3)
+    outward: NDArray[np.float64]  # (N, 2), out of the map: 1 long at its end, 0 amid it
 
 
 class LikelihoodField:
@@ -43,6 +46,7 @@ class LikelihoodField:
         self._labels = labels
         self._surface_of_label = np.zeros(len(occupied) + 1, dtype=np.int64)
         self._surface_of_label[labels.reshape(-1)[occupied]] = np.arange(len(occupied))
+        self._outward = self._out_of_map(image, occupied)
         self._likelihood = np.maximum(
             np.float32(1.0) - distance_px * np.float32(resolution_m / _REACH_M), np.float32(0.0)
         )
@@ -51,7 +55,11 @@ class LikelihoodField:
         """Return the nearest surfaces of points (N, 2) [m]."""
         column, row = self._cells(points_local)
         surface = self._surface_of_label[self._labels[row, column]]
-        return Nearest(points=self._points[surface], shape=self._shape[surface])
+        return Nearest(
+            points=self._points[surface],
+            shape=self._shape[surface],
+            outward=self._outward[surface],
+        )
 
     def likelihood(
         self, points_local: NDArray[np.float64], offsets_m: NDArray[np.float64]
@@ -90,6 +98,19 @@ class LikelihoodField:
 
         self._points = np.column_stack([mean(values) for values in surfaces.points.T])
         self._shape = np.column_stack([mean(values) for values in surfaces.shape.T])
+
+    def _out_of_map(
+        self, image: NDArray[np.uint8], occupied: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Return per surface the direction (M, 2) in which the map does not go on."""
+        steps = np.arange(-_AROUND_CELLS, _AROUND_CELLS + 1)
+        around = occupied[:, None] + (steps[:, None] * image.shape[1] + steps).reshape(-1)
+        is_mapped = image.reshape(-1)[around] == 0
+        surface = self._surface_of_label[self._labels.reshape(-1)[around]]
+        total = np.where(is_mapped[..., None], self._points[surface], 0.0).sum(axis=1)
+        out = self._points - total / is_mapped.sum(axis=1)[:, None]
+        away_m = np.linalg.norm(out, axis=1, keepdims=True)
+        return np.asarray(out / np.maximum(away_m, _END_RATIO * self.resolution_m))
 
     def _cells(
         self, points_local: NDArray[np.float64]
