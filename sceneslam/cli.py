@@ -84,9 +84,11 @@ def _said(error: Exception) -> str:
     said = str(error)
     if isinstance(error, OverrideParseException) and error.override not in said:
         said = f"{error.override}: {said}"
-    return re.sub(
-        r"To append to your config use \+(.*)", r"There is no such key; --cfg job shows all", said
-    )
+    missing = str(getattr(error.__cause__, "full_key", None) or "of that name")
+    if missing.startswith("scenes."):  # a table that may have more rows
+        return said
+    there = f"There is no key {missing}; --cfg job shows all"
+    return re.sub(r"To append to your config use \+(.*)", there, said)
 
 
 def _meant(error: Exception) -> str | None:
