@@ -9,13 +9,14 @@ from typing import Any, cast
 
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
 from sceneslam.app import run
 from sceneslam.config.build import make_source
-from sceneslam.config.check import check_given
+from sceneslam.config.check import check_given, first_line
 from sceneslam.config.component import Builder
 from sceneslam.config.overlay import command_of, comment_of
 from sceneslam.config.provenance import provenance, save_config
@@ -110,7 +111,11 @@ class _Trials:
 
     def _compose(self, trial: Trial) -> dict[str, Any]:
         """Return a trial's configuration: the user's, what it overrides, then its values."""
-        config = compose("config", overrides=[*self._overrides, *trial.overrides])
+        try:
+            config = compose("config", overrides=[*self._overrides, *trial.overrides])
+        except HydraException as error:
+            allowed = f"overrides that compose ({first_line(error)})"
+            raise ConfigError(self._key, list(trial.overrides), allowed) from error
         try:
             merged = cast(DictConfig, OmegaConf.merge(config, dict(trial.values)))
         except OmegaConfBaseException as error:

@@ -170,8 +170,17 @@ def test_a_mistake_is_one_sentence(folder, overrides, sentence):
     assert "Traceback" not in done.stderr
 
 
-def test_an_input_that_cannot_be_opened_is_told_before_the_first_run(tmp_path):
-    stories = "matrix.stories=[bright_to_dark,there_and_bak]"
-    done = call(tmp_path, stories, "matrix.seeds=[0]", name="matrix")
-    assert done.returncode == 2 and "source.story: got 'there_and_bak'" in done.stderr
+@pytest.mark.parametrize(
+    ("experiment", "overrides", "sentence"),
+    [
+        ("matrix", ("matrix.stories=[there_and_bak]", "matrix.seeds=[0]"), "source.story: got"),
+        ("table", ("+table.recordings.x=['source=tum_rgbd','source.path=no']",), "a folder: no"),
+        ("table", ("table.modules=[depht]",), "Could not find 'slam/depht'"),
+        ("tune", ("tune.space.window.key=policy.windw_s",), "override 'policy.windw_s'"),
+    ],
+)
+def test_what_cannot_be_run_is_told_before_the_first_run(tmp_path, experiment, overrides, sentence):
+    done = call(tmp_path, *overrides, name=experiment)
+    assert done.returncode == 2 and sentence in done.stderr
+    assert "Error executing" not in done.stderr
     assert not list(tmp_path.glob("out/runs/*"))

@@ -65,8 +65,9 @@ def test_another_seed_is_another_search(tmp_path):
 
 
 def test_a_folder_is_not_taken_for_another_search(tmp_path):
-    search(tmp_path)
-    with pytest.raises(ConfigError, match="another search"):
+    search(tmp_path)  # nothing was tried yet: it may be mended
+    search(tmp_path, about="off by more").run(1, off)
+    with pytest.raises(ConfigError, match=r"hydra\.run\.dir: got 'a folder with another search'"):
         search(tmp_path, about="something else")
 
 
@@ -149,6 +150,7 @@ def test_tuning_reports_both_splits_and_never_learns_from_what_is_held_out(tmp_p
     assert train.bound == 30.0 and train.value < 3.0
     assert held_out.bound == 20.0 and held_out.value == pytest.approx(10.0, abs=3.0)
     assert not any("unseen" in name for name in asked if name.startswith("trial_"))
+    assert asked[:3] == ["trial_000/seen", "default/seen", "default/unseen"]  # all can be read
     assert len(verdict.table.rows) == 2
     assert (tmp_path / "search.png").stat().st_size > 5000
     lines = (tmp_path / "study.jsonl").read_text().splitlines()

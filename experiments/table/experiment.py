@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import median
 
@@ -17,7 +17,7 @@ from sceneslam.experiments.table.figure import draw_scores
 from sceneslam.experiments.table.overlay import write_scenario
 from sceneslam.experiments.table.stretch import Motions, measure
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, Verdict
+from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
 from sceneslam.types.ranges import check_above, check_between, check_some
 
 
@@ -68,14 +68,7 @@ class TableExperiment:
         motions: dict[str, list[Motions]] = defaultdict(list)
         shown: dict[str, set[str]] = defaultdict(set)
         costs_ms = []
-        for name, overrides in self._recordings.items():
-            words = (*overrides, f"slam@slam.only={module}")
-            try:
-                (outcome,) = run_trials([Trial(name=f"{name}/{module}", overrides=words)])
-            except ConfigError as error:
-                if error.key.startswith("slam.only"):
-                    continue  # not its sensors
-                raise
+        for name, outcome in self._outcomes(run_trials, module):
             for one in measure(outcome, self._interval_s):
                 motions[one.scene].append(one)
                 shown[one.scene].add(name)
@@ -92,6 +85,23 @@ class TableExperiment:
             )
             for scene, found in motions.items()
         ]
+
+    def _outcomes(self, run_trials: RunTrials, module: str) -> Iterator[tuple[str, Outcome]]:
+        """Yield what the module did on each recording that has its sensors."""
+        left = {
+            name: Trial(name=f"{name}/{module}", overrides=(*words, f"slam@slam.only={module}"))
+            for name, words in self._recordings.items()
+        }
+        while left:
+            try:
+                for outcome in run_trials(list(left.values())):
+                    name = next(iter(left))
+                    del left[name]
+                    yield name, outcome
+            except ConfigError as error:
+                if not error.key.startswith("slam.only"):
+                    raise
+                del left[next(iter(left))]  # not its sensors
 
 
 def _table(evidence: Sequence[Evidence], table: Mapping[str, Sequence[str]]) -> Table:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -51,8 +52,10 @@ class TuneExperiment:
         """Search, then run default and winner on all recordings; write the winner's overlay."""
         about = f"{self._objective.weights} {self._splits['train']}"
         search = Search(folder, self._space, seed=self._seed, about=about)
-        search.run(self._trials, lambda number, drawn: self._try(run_trials, number, drawn))
-        defaults = self._run(run_trials, "default", {})
+        score = partial(self._try, run_trials)
+        search.run(1, score)  # a key that is misspelt is found before anything else is run ...
+        defaults = self._run(run_trials, "default", {})  # ... a recording before the search
+        search.run(self._trials, score)
         tuned = self._run(run_trials, "tuned", search.best)
         scores = {split: self._scores(split, defaults, tuned) for split in self._splits}
         draw_search(folder / "search.png", search.scores, default=scores["train"][0])

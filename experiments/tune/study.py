@@ -6,13 +6,10 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sceneslam.experiments.tune.space import Parameter, Value
 from sceneslam.types.errors import ConfigError
-
-if TYPE_CHECKING:
-    pass
 
 Drawn = Mapping[str, Value]  # key -> value
 
@@ -76,9 +73,8 @@ class Search:
     def _check(self, about: str) -> None:
         """Raise ConfigError where the folder holds another search."""
         before = self._study.user_attrs.get("about")
-        if before is None:
+        if before is None or not self.scores:
             self._study.set_user_attr("about", about)
         elif before != about:
-            raise ConfigError(
-                "", "a folder with another search", "the same search, or a new folder"
-            )
+            held = "a folder with another search"
+            raise ConfigError("hydra.run.dir", held, "the same search, or a new folder")
