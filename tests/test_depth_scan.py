@@ -107,6 +107,20 @@ def test_noise_does_not_shorten_the_range():
     assert abs(np.nanmean(scan.ranges_m * np.cos(scan.angles_rad)) - 3.0) < 0.01
 
 
+def test_wall_at_the_limit_of_depth_is_not_seen_rather_than_seen_too_near():
+    camera, rng = camera_at(), np.random.default_rng(0)
+
+    def scan_of(distance_m):
+        depth = depth_of_wall(camera, distance_m)
+        depth += rng.normal(0.0, 0.05, depth.shape).astype(np.float32)
+        depth[depth > 6.0] = 0.0
+        return scan_from_depth(depth, camera, stamp_ns=0)
+
+    assert np.isnan(scan_of(5.98).ranges_m).all()  # 4 cm too near when it is
+    scan = scan_of(5.8)
+    assert abs(np.mean(scan.ranges_m * np.cos(scan.angles_rad)) - 5.8) < 0.005
+
+
 def test_missing_and_broken_depth_gives_beams_without_measurement():
     camera = replace(camera_at(), depth_range_m=(0.0, 6.0))
     for value in (0.0, np.nan, np.inf, -np.inf, -1.0, 100.0):

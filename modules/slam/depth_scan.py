@@ -90,6 +90,7 @@ class DepthScanner:
         """Return the scan of a depth image (H, W) [m] in `laser`.
 
         A beam without a return in the band is NaN: a depth camera does not tell far from blind.
+        So is one at the camera's limit, where only those are seen that noise makes too near.
         Raises InputError when the image has another size than the camera.
         """
         width, height = self._camera.size_wh
@@ -102,7 +103,8 @@ class DepthScanner:
         valid &= (heights >= self.band_m[0]) & (heights <= self.band_m[1])
         beam = self._beam[valid]
         ranges_m = (self._range_ratio * depths)[valid]
-        nearest_m = self._nearest(beam, ranges_m, self._height_per_m[valid] * ranges_m)
+        heights_m = self._height_per_m[valid] * ranges_m
+        nearest_m = self._nearest(beam, depths[valid], ranges_m, heights_m)
         ratio_max = float(self._range_ratio.max(initial=1.0))
         return LaserScan(
             stamp_ns=stamp_ns,
@@ -116,6 +118,7 @@ class DepthScanner:
     def _nearest(
         self,
         beam: NDArray[np.int64],
+        depths_m: NDArray[np.float32],
         ranges_m: NDArray[np.float32],
         heights_m: NDArray[np.float32],
     ) -> NDArray[np.float32]:
@@ -137,7 +140,10 @@ class DepthScanner:
             total_m = np.bincount(beam[agrees], ranges_m[agrees], minlength=self._beams)
             number = np.bincount(beam[agrees], minlength=self._beams)
             mean_m = np.where(number > 0, total_m / np.maximum(number, 1), np.nan)
-        scan = mean_m.astype(np.float32)
+        z_max_m = self._camera.depth_range_m[1]
+        far_m = (z_max_m - _NOISE_M - _NOISE_PER_M * z_max_m * z_max_m) * number
+        total_m = np.bincount(beam[agrees], depths_m[agrees], minlength=self._beams)
+        scan = np.where(total_m <= far_m, mean_m, np.nan).astype(np.float32)
         scan.flags.writeable = False
         return scan
 
