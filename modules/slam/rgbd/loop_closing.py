@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
+from .cores import thread_beside
 from .loop_detection import Loop, LoopDetector, Query
 from .loop_fusion import fuse_duplicates
 from .pose_graph import PoseGraph, solve
@@ -25,7 +26,7 @@ class LoopCloser:
 
     def __init__(self, visual_map: VisualMap, detector: LoopDetector, graph: PoseGraph) -> None:
         self._map, self._detector, self._graph = visual_map, detector, graph
-        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="pose_graph")
+        self._worker = thread_beside("pose_graph")
         self._queries: deque[Query] = deque(maxlen=_QUEUE)
         self._candidate: int | None = None  # of the first query, once it was looked up
         self._solution: Future[dict[int, Transform]] | None = None
