@@ -23,6 +23,8 @@ _LEVEL_TOLERANCE = 1
 _RATIO = 0.8
 _STEPS = 3
 _NEAREST_M = 0.1
+_NEAREST_SHARE = 0.05  # of what a keyframe shows is known to be nearer than the rest ...
+_NEARER_RATIO = 0.5  # ... and what seems half as far as that is a wrong match
 _CORRELATED = 10.0  # errors of one pair of images that say the same
 _MAX_DOUBT_RATIO = 0.3  # of its distance: a landmark less well known waits for another keyframe
 
@@ -36,6 +38,7 @@ class _Eye:
     T_cam_local: Transform
     rays: NDArray[np.float64]  # (N, 3), in cam, z = 1
     sigma_px: NDArray[np.float64]  # (N,)
+    nearest_m: float  # [m] ahead: nothing that it shows is nearer
 
     @property
     def features(self) -> Features:
@@ -114,13 +117,28 @@ def _eye(visual_map: VisualMap, keyframe: Keyframe) -> _Eye:
     camera, features = visual_map.camera, keyframe.features
     rows = np.flatnonzero(keyframe.landmark_ids == NO_LANDMARK)
     flat = (features.uv_px[rows] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    T_cam_local = se3.inverse(keyframe.T_local_base @ camera.T_base_cam)
     return _Eye(
         keyframe=keyframe,
         rows=rows,
-        T_cam_local=se3.inverse(keyframe.T_local_base @ camera.T_base_cam),
+        T_cam_local=T_cam_local,
         rays=np.column_stack([flat, np.ones(len(rows))]),
         sigma_px=visual_map.sigma_px(features.levels[rows]),
+        nearest_m=_nearest_m(visual_map, keyframe, T_cam_local),
     )
+
+
+def _nearest_m(visual_map: VisualMap, keyframe: Keyframe, T_cam_local: Transform) -> float:
+    """Return how near the camera a keyframe may show anything, by the landmarks that it shows.
+
+    A wrong match that seems to be right before the camera is no small error: as a landmark it
+    outweighs hundreds that are some metres away, and no pose that follows it contradicts it.
+    """
+    known = keyframe.landmark_ids[keyframe.landmark_ids != NO_LANDMARK]
+    if len(known) * _NEAREST_SHARE < 1.0:
+        return _NEAREST_M
+    ahead_m = se3.apply(T_cam_local, visual_map.landmarks.points_local[known])[:, 2]
+    return max(_NEAREST_M, _NEARER_RATIO * float(np.quantile(ahead_m, _NEAREST_SHARE)))
 
 
 def _match(visual_map: VisualMap, new: _Eye, other: _Eye) -> Matches:
@@ -154,7 +172,7 @@ def _intersect(visual_map: VisualMap, new: _Eye, other: _Eye, matches: Matches) 
             by_point = np.moveaxis(found.by_point, 2, 0) @ eye.T_cam_local[:3, :3]
             information += np.swapaxes(by_point, 1, 2) @ by_point
             slopes += np.einsum("nri,rn->ni", by_point, found.of)
-            agrees &= found.pixels_agree() & (points_cam[:, 2] > _NEAREST_M)
+            agrees &= found.pixels_agree() & (points_cam[:, 2] > eye.nearest_m)
         information += 1e-9 * np.eye(3)
         points = points - np.linalg.solve(information, slopes[:, :, None])[:, :, 0]
     distance_m = np.linalg.norm(points @ new.T_cam_local[:3, :3].T + new.T_cam_local[:3, 3], axis=1)
