@@ -19,6 +19,7 @@ from sceneslam.types.rig import Camera
 # A beam's return is something that stands: boards and table tops come and go with the distance.
 _UPRIGHT_M, _UPRIGHT_RATIO = 0.1, 1 / 3  # so high, or so much of the band where that is less
 _NOISE_M, _NOISE_PER_M = 0.005, 0.003  # of a range, its square's growing as a triangulation's does
+_LIMIT_RATIO = 0.1  # of the farthest depth at most: noise does not reach a limit that is none
 _PER_BIN, _RATIO = np.sqrt(_NOISE_M * _NOISE_PER_M), np.sqrt(_NOISE_PER_M / _NOISE_M)
 
 
@@ -140,10 +141,8 @@ class DepthScanner:
             total_m = np.bincount(beam[agrees], ranges_m[agrees], minlength=self._beams)
             number = np.bincount(beam[agrees], minlength=self._beams)
             mean_m = np.where(number > 0, total_m / np.maximum(number, 1), np.nan)
-        z_max_m = self._camera.depth_range_m[1]
-        far_m = (z_max_m - _NOISE_M - _NOISE_PER_M * z_max_m * z_max_m) * number
         total_m = np.bincount(beam[agrees], depths_m[agrees], minlength=self._beams)
-        scan = np.where(total_m <= far_m, mean_m, np.nan).astype(np.float32)
+        scan = np.where(total_m <= self._far_m * number, mean_m, np.nan).astype(np.float32)
         scan.flags.writeable = False
         return scan
 
@@ -169,6 +168,9 @@ class DepthScanner:
         self._beam = np.clip(beam, 0, self._beams - 1)
         self._range_ratio = np.hypot(rays_base[:, 0], rays_base[:, 1]).astype(np.float32)
         self._height_ratio = rays_base[:, 2].astype(np.float32)
+        z_max_m = self._camera.depth_range_m[1]
+        noise_m = _NOISE_M + _NOISE_PER_M * z_max_m * z_max_m
+        self._far_m = z_max_m - min(noise_m, _LIMIT_RATIO * z_max_m)
         # A pixel's share of an upright surface at 1 m, as a height over the width of a beam.
         solid = self._stride_px**2 / (self._camera.fx * self._camera.fy)
         self._height_per_m = (solid / self._step_rad / self._range_ratio**3).astype(np.float32)
