@@ -101,7 +101,7 @@ def _meant(error: Exception) -> str | None:
         near = bytes(error.object[max(0, error.start - 30) : error.start + 10])
         return f"a YAML file is not UTF-8 text, at {near.decode('ascii', 'replace')!r}"
     if str(error).startswith("Config group override must be"):
-        empty = [word for word in sys.argv[1:] if word.endswith(("=null", "="))]
+        empty = [word for word in sys.argv[1:] if re.fullmatch(r"[^.=]+(@[^=]+)?=(null)?", word)]
         return f"{', '.join(empty)}: a group holds options; ~GROUP removes"
     return str(error) if str(error).startswith("Invalid defaults list") else None
 
