@@ -1,6 +1,7 @@
 """SE(3): the laws that every transform obeys."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -68,3 +69,14 @@ def test_points_move_with_their_frame():
     points_a = se3.apply(se3.from_xy_yaw(1.0, 0.0, np.pi / 2), points_b)
     np.testing.assert_allclose(points_a, [[1.0, 1.0, 0.0]], atol=1e-6)
     assert points_a.dtype == np.float32
+
+
+def test_no_rounding_adds_up_in_a_chain():
+    step = se3.exp(np.array([0.01, 0.0, 0.002, 0.003, -0.002, 0.01]))
+    step[:3, :3] *= 1.0 + 1e-12
+    chain = product = se3.identity()
+    for _ in range(10_000):
+        chain, product = se3.chained(chain, step), product @ step
+    off = [np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max() for T in (chain, product)]
+    assert off[0] < 1e-11 < 1e-9 < off[1]
+    assert chain == pytest.approx(product, abs=1e-6)

@@ -41,7 +41,7 @@ class Gyrodometry:
             apart_radps = (float(turn[2]) - se3.yaw_rad(T_prev_curr)) / duration_s
             missed_rad = (apart_radps - self._bias_with(apart_radps)) * duration_s
             T_prev_curr = T_prev_curr @ se3.from_xy_yaw(0.0, 0.0, missed_rad)
-        self._T_odom_base = self._T_odom_base @ T_prev_curr
+        self._T_odom_base = se3.chained(self._T_odom_base, T_prev_curr)
         return replace(observation, T_odom_base=self._T_odom_base)
 
     def shift(self, bias_radps: float) -> None:

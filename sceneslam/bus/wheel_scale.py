@@ -68,7 +68,7 @@ class WheelScale:
         T_prev_curr = se3.inverse(before) @ T_told
         self._turned_rad += float(se3.rotation_angle_rad(T_prev_curr))
         T_prev_curr[:3, 3] *= self.scale
-        self._T_odom_base = self._T_odom_base @ T_prev_curr
+        self._T_odom_base = se3.chained(self._T_odom_base, T_prev_curr)
         self._T_odom_base.setflags(write=False)
         return replace(observation, T_odom_base=self._T_odom_base)
 

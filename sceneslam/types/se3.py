@@ -176,6 +176,18 @@ def to_quat_xyzw(T_a_b: Transform) -> NDArray[np.float64]:
     return np.asarray(np.where(quat[..., 3:] < 0, -quat, quat))
 
 
+def chained(T_a_b: Transform, T_b_c: Transform) -> Transform:
+    """Return T_a_c, in which no rounding adds up however many transforms are chained.
+
+    One step of Newton's iteration to the nearest rotation (Higham, "Computing the polar
+    decomposition", 1986): what is off by e comes out off by e^2.
+    """
+    T_a_c = T_a_b @ T_b_c
+    rotation = T_a_c[:3, :3]
+    T_a_c[:3, :3] = 1.5 * rotation - 0.5 * rotation @ (rotation.T @ rotation)
+    return np.asarray(T_a_c)
+
+
 def orthonormal(T_a_b: Transform) -> Transform:
     """Return the transform without the rounding that many products leave in its rotation."""
     return from_quat_xyzw(T_a_b[..., :3, 3], to_quat_xyzw(T_a_b))
