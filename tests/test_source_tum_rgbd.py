@@ -63,6 +63,13 @@ def test_depth_is_metres_and_cut_to_its_range(tmp_path: Path) -> None:
     assert not first.depth_m.any()
 
 
+@pytest.mark.parametrize("range_m", [[0.3, float("inf")], [2.0, 1.0], [0.3], "far"])
+def test_a_range_of_depth_has_two_ends(tmp_path: Path, range_m: object) -> None:
+    with pytest.raises(ConfigError) as caught:
+        make(make_folder(tmp_path / "a"), depth_range_m=range_m)
+    assert caught.value.key == "depth_range_m"
+
+
 def test_depth_beyond_the_tolerance_is_left_out(tmp_path: Path) -> None:
     found = list(make(make_folder(tmp_path / "a", depth_delay_s=0.03)))
     assert len(found) == 4

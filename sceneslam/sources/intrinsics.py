@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -51,14 +52,14 @@ def given_intrinsics(camera: Mapping[str, Any]) -> Intrinsics | None:
 
 
 def checked_range_m(key: str, range_m: object) -> tuple[float, float]:
-    """Return [low, high] as a pair; raises ConfigError for `key` unless 0 <= low < high."""
-    allowed = "[low, high] with 0 <= low < high [m]"
+    """Return [low, high] as a pair; raises ConfigError for `key` unless 0 <= low < high < inf."""
+    allowed = "[low, high] with 0 <= low < high < inf [m]"
     if not isinstance(range_m, list | tuple) or len(range_m) != 2:
         raise ConfigError(key, range_m, allowed)
     low, high = range_m
     if not isinstance(low, int | float) or not isinstance(high, int | float):
         raise ConfigError(key, list(range_m), allowed)
-    if not 0 <= low < high:
+    if not 0 <= low < high < math.inf:
         raise ConfigError(key, list(range_m), allowed)
     return float(low), float(high)
 
