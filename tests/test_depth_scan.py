@@ -121,8 +121,9 @@ def test_wall_at_the_limit_of_depth_is_not_seen_rather_than_seen_too_near():
     assert abs(np.mean(scan.ranges_m * np.cos(scan.angles_rad)) - 5.8) < 0.005
 
 
-def test_limit_far_beyond_what_a_camera_sees_hides_nothing():
-    camera = replace(camera_at(), depth_range_m=(0.4, 1000.0))
+@pytest.mark.parametrize("limit_m", [1000.0, np.inf])
+def test_limit_far_beyond_what_a_camera_sees_hides_nothing(limit_m):
+    camera = replace(camera_at(), depth_range_m=(0.4, limit_m))
     assert np.isfinite(
         scan_from_depth(depth_of_wall(camera, 5.0), camera, stamp_ns=0).ranges_m
     ).all()

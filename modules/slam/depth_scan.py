@@ -20,6 +20,7 @@ from sceneslam.types.rig import Camera
 _UPRIGHT_M, _UPRIGHT_RATIO = 0.1, 1 / 3  # so high, or so much of the band where that is less
 _NOISE_M, _NOISE_PER_M = 0.005, 0.003  # of a range, its square's growing as a triangulation's does
 _LIMIT_RATIO = 0.1  # of the farthest depth at most: noise does not reach a limit that is none
+_FARTHEST_M = 1e6  # instead of a limit that is infinite
 _PER_BIN, _RATIO = np.sqrt(_NOISE_M * _NOISE_PER_M), np.sqrt(_NOISE_PER_M / _NOISE_M)
 
 
@@ -149,8 +150,9 @@ class DepthScanner:
     def _tabulate(self) -> None:
         rays_base = _rays_cam(self._camera, self._stride_px) @ self._camera.T_base_cam[:3, :3].T
         low_m, high_m = (limit - self._camera_height_m for limit in self.band_m)
-        farthest = rays_base[:, 2] * self._camera.depth_range_m[1]
-        nearest = rays_base[:, 2] * self._camera.depth_range_m[0]
+        z_min_m, z_max_m = self._camera.depth_range_m
+        z_max_m = min(z_max_m, _FARTHEST_M)
+        farthest, nearest = rays_base[:, 2] * z_max_m, rays_base[:, 2] * z_min_m
         # A ray that passes the band at none of its depths never gives a return.
         crosses = (np.minimum(nearest, farthest) <= high_m) & (
             np.maximum(nearest, farthest) >= low_m
@@ -168,7 +170,6 @@ class DepthScanner:
         self._beam = np.clip(beam, 0, self._beams - 1)
         self._range_ratio = np.hypot(rays_base[:, 0], rays_base[:, 1]).astype(np.float32)
         self._height_ratio = rays_base[:, 2].astype(np.float32)
-        z_max_m = self._camera.depth_range_m[1]
         noise_m = _NOISE_M + _NOISE_PER_M * z_max_m * z_max_m
         self._far_m = z_max_m - min(noise_m, _LIMIT_RATIO * z_max_m)
         # A pixel's share of an upright surface at 1 m, as a height over the width of a beam.
