@@ -13,6 +13,7 @@ from .surface import SurfacePoints
 _REACH_M = 0.3  # the likelihood falls to 0 at this distance from a surface
 _MARGIN_CELLS = 8
 _AROUND_CELLS = 2  # a surface goes on, or ends, in the cells so near
+_POST = 1.1  # trace of the shape: a line's is 1, and from here on it holds along itself, too
 _END_RATIO = 0.4  # of a cell: so far from the middle of these is a point at the very end
 
 
@@ -22,7 +23,7 @@ class Nearest:
 
     points: NDArray[np.float64]  # (N, 2) [m], local
     shape: NDArray[np.float64]  # (N, 3)
-    outward: NDArray[np.float64]  # (N, 2), out of the map: 1 long at its end, 0 amid it
+    outward: NDArray[np.float64]  # (N, 2), out of the map: 1 long for a post at its end, else 0
 
 
 class LikelihoodField:
@@ -102,15 +103,18 @@ class LikelihoodField:
     def _out_of_map(
         self, image: NDArray[np.uint8], occupied: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return per surface the direction (M, 2) in which the map does not go on."""
+        """Return per surface the direction (M, 2) in which the map does not go on, 0 for a line."""
+        is_post = self._shape[:, 0] + self._shape[:, 2] >= _POST
         steps = np.arange(-_AROUND_CELLS, _AROUND_CELLS + 1)
-        around = occupied[:, None] + (steps[:, None] * image.shape[1] + steps).reshape(-1)
+        around = occupied[is_post, None] + (steps[:, None] * image.shape[1] + steps).reshape(-1)
         is_mapped = image.reshape(-1)[around] == 0
         surface = self._surface_of_label[self._labels.reshape(-1)[around]]
         total = np.where(is_mapped[..., None], self._points[surface], 0.0).sum(axis=1)
-        out = self._points - total / is_mapped.sum(axis=1)[:, None]
+        out = self._points[is_post] - total / is_mapped.sum(axis=1)[:, None]
         away_m = np.linalg.norm(out, axis=1, keepdims=True)
-        return np.asarray(out / np.maximum(away_m, _END_RATIO * self.resolution_m))
+        outward = np.zeros_like(self._points)
+        outward[is_post] = out / np.maximum(away_m, _END_RATIO * self.resolution_m)
+        return outward
 
     def _cells(
         self, points_local: NDArray[np.float64]

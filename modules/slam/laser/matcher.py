@@ -35,7 +35,6 @@ _ITERATIONS = (3, 3, 8)  # at most, per kernel
 _CONVERGED = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: a step this small is the last
 _INLIER_M = 0.1
 _END_M = 0.1  # a mapped surface may go on so far, or twice as far as the beams are apart
-_POST = 1.1  # trace of the shape: a line's is 1, and from here on it holds along itself, too
 _CORRELATION = 4.0  # neighbouring beams share their errors: information is this much less
 _VIEW_M, _VIEW_RAD = 0.1, 0.1  # scans taken so far apart err each in its own way
 _NOVELTY_MIN = 1e-3
@@ -180,7 +179,7 @@ class Matcher:
         gate &= along < np.maximum(_END_M, 2.0 * scan_base.spacing_m) ** 2
         beyond = near.outward[:, 0] * ex + near.outward[:, 1] * ey
         is_dense = scan_base.spacing_m < field.resolution_m  # else cells between beams are empty
-        gate &= (xx + yy < _POST) | (beyond < 0.5 * field.resolution_m) | ~is_dense
+        gate &= (beyond < 0.5 * field.resolution_m) | ~is_dense
         weight = scan_base.weight * robust * gate / _CORRELATION
         total = float(weight.sum())
         centre = (weight @ arms) / max(total, 1e-12)
