@@ -111,6 +111,23 @@ def test_missing_depth_is_bridged_by_the_map(depth_m):
     assert doubt[1] > 2 * max(doubt[0], doubt[2])
 
 
+def test_missing_depth_is_no_surface_at_the_camera_where_its_range_begins_at_0():
+    near = replace(RIG, camera=replace(RIG.camera, depth_range_m=(0.0, 8.0)))
+    holes = np.random.default_rng(0).random(camera_only(0).depth_m.shape) < 0.05
+
+    def seen(index):
+        observation = camera_only(index)
+        depth_m = np.where(holes, np.float32(0.0), observation.depth_m)
+        return replace(observation, depth_m=depth_m)
+
+    usual, other = make(), make(near)
+    for module in (usual, other):
+        drive(module, map(seen, range(3)))
+    np.testing.assert_array_equal(other.get_pose(), usual.get_pose())
+    clouds = [module.get_map().points.points for module in (other, usual)]
+    np.testing.assert_array_equal(*clouds)
+
+
 def test_nothing_to_start_from_is_lost_at_the_identity():
     module = make()
     for index in range(3):

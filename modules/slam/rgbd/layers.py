@@ -49,7 +49,7 @@ class LayerBuilder:
         camera, step = self._camera, self._stride_px
         depth = depth_m[step // 2 :: step, step // 2 :: step]
         low_m, high_m = camera.depth_range_m
-        row, column = np.nonzero((depth >= low_m) & (depth <= high_m))
+        row, column = np.nonzero((depth > 0) & (depth >= low_m) & (depth <= high_m))
         z = depth[row, column]
         v, u = row * step + step // 2, column * step + step // 2
         x, y = (u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z
