@@ -195,12 +195,13 @@ def test_no_front_is_drawn_where_nothing_false_was_seen():
     assert "Every setting" not in told and "Detection delay" in told
 
 
-def test_front_weighs_settings_over_all_recordings():
+def test_front_weighs_settings_over_all_recordings_where_they_ran_to_the_end():
     told = {
         ("easy", 1): (0.0, 0),
         ("hard", 1): (2.0, 4),
         ("easy", 2): (2.0, 0),
         ("hard", 2): (4, 1),
+        ("easy", 3): (0.5, 0),
     }
     rows = [
         Row(
@@ -211,5 +212,6 @@ def test_front_weighs_settings_over_all_recordings():
         )
         for (story, window), (delay_s, false) in told.items()
     ]
+    rows.append(Row(name="3", status="failed", keys={"story": "hard", "window": 3}, metrics={}))
     page = " ".join(charts(groups_of(rows)))
     assert "no other is better than: window=1: 1 s, 2 false; window=2: 3 s, 0.5 false." in page

@@ -24,9 +24,9 @@ _POINTS_MAX = 600
 
 def charts(groups: Sequence[Group]) -> Iterator[str]:
     """Yield the charts as SVG, each with its caption."""
-    front = _front(groups)
-    if front:
-        yield front
+    weighed = _front(groups)
+    if weighed:
+        yield weighed
     numeric = [key for key in groups[0].keys if _is_numeric(groups, key)]
     for key in numeric:
         for metric, name in _SHOWN.items():
@@ -38,11 +38,13 @@ def charts(groups: Sequence[Group]) -> Iterator[str]:
 
 
 def _front(groups: Sequence[Group]) -> str:
-    points = []
-    for group in _settings(groups):
-        delay, false = group.mean("detection.delay_s"), group.mean("detection.false")
-        missed = group.mean("detection.missed")
-        if delay and false and not (missed and missed.mean):
+    points, settings = [], _settings(groups)
+    falses = [group.mean("detection.false") for group in settings]
+    most = max((false.count for false in falses if false), default=0)
+    for group, false in zip(settings, falses, strict=True):
+        delay, missed = group.mean("detection.delay_s"), group.mean("detection.missed")
+        # A setting that failed on a recording is not better for that.
+        if delay and false and false.count == most and not (missed and missed.mean):
             label = ", ".join(f"{key}={value}" for key, value in group.keys.items())
             points.append(Point(x=delay.mean, y=false.mean, label=label))
     if len({point.y for point in points}) < 2:  # nothing to weigh against the delay
@@ -53,9 +55,10 @@ def _front(groups: Sequence[Group]) -> str:
     best = [f"{one.label}: {one.x:.3g} s, {one.y:.3g} false" for one in front(points)]
     return figure(
         drawn,
-        "Every setting that found all true changes: how late it found them, and how many it saw "
-        "that were none, on average over recordings. The line joins those that no other is better "
-        f"than: {'; '.join(best[:_BEST_MAX])}{'; ...' if len(best) > _BEST_MAX else '.'}",
+        "Every setting that ran wherever others did and found all true changes: how late it found "
+        "them, and how many it saw that were none, on average over recordings. The line joins "
+        "those that no other is better than: "
+        f"{'; '.join(best[:_BEST_MAX])}{'; ...' if len(best) > _BEST_MAX else '.'}",
     )
 
 
