@@ -173,7 +173,7 @@ def test_command_sweeps_settings_and_recordings_into_one_table(cache, tmp_path):
 
 
 def test_lists_and_flags_are_swept_like_numbers(cache, tmp_path):
-    lists = "detector.features=[grey_mean,corner_count,depth_ratio],[grey_mean,depth_ratio]"
+    lists = "detector.features=[grey_mean,'corner_count',depth_ratio],[grey_mean,depth_ratio]"
     flags = "policy.turn_by_gyro=true,false"
     _, rows = swept(cache, tmp_path, "detector=rules", lists, flags, "run.max_observations=20")
     assert [row["policy.turn_by_gyro"] for row in rows] == ["true", "false"] * 2

@@ -83,10 +83,20 @@ def _words(override: Override) -> list[str]:
 
 
 def _values(override: Override) -> Iterator[Any]:
-    """Yield an override's values."""
+    """Return an override's values."""
     if override.is_sweep_override():
         found: Iterator[Any] = override.sweep_iterator(Transformer.identity)
     else:
         found = iter([override.value()])
-    for value in found:
-        yield value.text if isinstance(value, QuotedString) else value
+    return map(_plain, found)
+
+
+def _plain(value: Any) -> Any:
+    """Return a value without the quotes that the command line gave it, or what is in it."""
+    if isinstance(value, QuotedString):
+        return value.text
+    if isinstance(value, list):
+        return [_plain(one) for one in value]
+    if isinstance(value, dict):
+        return {_plain(key): _plain(one) for key, one in value.items()}
+    return value
