@@ -115,11 +115,12 @@ def test_each_scene_gets_the_module_that_served_it_best(tmp_path):
     assert "  Bright: [seeing, feeling]\n  Dark: [feeling]\n" in text
 
 
-def test_a_mistake_in_a_recording_is_not_taken_for_a_missing_sensor(tmp_path):
+@pytest.mark.parametrize("key", ["story", "slam.only.voxel_m"])
+def test_a_mistake_in_a_setting_is_not_taken_for_a_missing_sensor(tmp_path, key):
     def tell(trial):
-        raise ConfigError("story", "drive", "a story")
+        raise ConfigError(key, -1, "something else")
 
-    with pytest.raises(ConfigError, match="story"):
+    with pytest.raises(ConfigError, match=key):
         experiment().run(teller(tmp_path / "runs", tell), tmp_path)
 
 
