@@ -208,7 +208,8 @@ def test_impossible_worker_is_named(make, key):
         (Ray("nowhere", None, 1), "hydra.launcher.address: got 'nowhere'"),
     ],
 )
-def test_cluster_that_cannot_be_used_is_named(backend, sentence, tmp_path):
+def test_cluster_that_cannot_be_used_is_named(backend, sentence, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))  # a machine that has SLURM has none here
     order = Order(folder=tmp_path, code=tmp_path, began_in=tmp_path, stop=tmp_path / "stop")
     with pytest.raises(ConfigError, match=re.escape(sentence)):
         backend.run([order])
