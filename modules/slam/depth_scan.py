@@ -99,9 +99,8 @@ class DepthScanner:
         if depth_m.shape != (height, width):
             raise InputError(f"depth_m: expected ({height}, {width}), got {depth_m.shape}")
         depths = depth_m[:: self._stride_px, :: self._stride_px].ravel()[self._pixels]
-        z_min_m, z_max_m = self._camera.depth_range_m
         heights = self._camera_height_m + self._height_ratio * depths
-        valid = (depths > 0) & (depths >= z_min_m) & (depths <= z_max_m)  # false for NaN
+        valid = self._camera.measures(depths)
         valid &= (heights >= self.band_m[0]) & (heights <= self.band_m[1])
         beam = self._beam[valid]
         ranges_m = (self._range_ratio * depths)[valid]
@@ -114,7 +113,7 @@ class DepthScanner:
             angle_min_rad=self._angle_min_rad + 0.5 * self._step_rad,
             angle_step_rad=self._step_rad,
             range_min_m=0.0,
-            range_max_m=z_max_m * ratio_max,
+            range_max_m=self._camera.depth_range_m[1] * ratio_max,
         )
 
     def _nearest(

@@ -100,8 +100,7 @@ class FeatureExtractor:
         columns, rows = column + _CROSS_PX[0, :, None], row + _CROSS_PX[1, :, None]
         at = np.clip(rows, 0, height - 1) * width + np.clip(columns, 0, width - 1)
         depths = np.take(depth_m, at).astype(np.float64)  # (5, N), the corner's own first
-        low_m, high_m = self._camera.depth_range_m
-        usable = (depths > 0) & (depths >= low_m) & (depths <= high_m)  # False for NaN
+        usable = self._camera.measures(depths)
         depth = np.where(usable[0], depths[0], 0.0)
         step = np.where(usable, np.abs(depths - depth), 0.0).max(axis=0)
         is_smooth = step <= _DEPTH_SPREAD_RATIO * depth * np.maximum(depth, 1.0)

@@ -48,8 +48,7 @@ class LayerBuilder:
             return nothing_seen()
         camera, step = self._camera, self._stride_px
         depth = depth_m[step // 2 :: step, step // 2 :: step]
-        low_m, high_m = camera.depth_range_m
-        row, column = np.nonzero((depth > 0) & (depth >= low_m) & (depth <= high_m))
+        row, column = np.nonzero(camera.measures(depth))
         z = depth[row, column]
         v, u = row * step + step // 2, column * step + step // 2
         x, y = (u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z

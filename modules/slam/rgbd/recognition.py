@@ -70,17 +70,16 @@ class PlaceRecognizer:
         camera = self._map.depth_camera
         if not len(keyframe.view.points_base):
             return True
-        low_m, high_m = camera.depth_range_m
         T_cam_keyframe = se3.inverse(T_local_base @ camera.T_base_cam) @ keyframe.T_local_base
         points_cam = se3.apply(T_cam_keyframe, keyframe.view.points_base)
-        points_cam = points_cam[points_cam[:, 2] > low_m]
+        points_cam = points_cam[points_cam[:, 2] > camera.depth_range_m[0]]
         z = points_cam[:, 2]
         uv_px = points_cam[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         column, row = np.rint(uv_px).astype(np.int64).T
         inside = (column >= 0) & (column < camera.size_wh[0])
         inside &= (row >= 0) & (row < camera.size_wh[1])
         seen_m, z = depth_m[row[inside], column[inside]], z[inside]
-        measured = (seen_m > 0) & (seen_m >= low_m) & (seen_m <= high_m)
+        measured = camera.measures(seen_m)
         if measured.sum() < _MIN_SURFACE_POINTS:
             return False
         seen_m, z = seen_m[measured], z[measured]
