@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sceneslam.bus.gate import Gate, GateSettings, Judgement, Verdict, with_heading
 from sceneslam.config.resolve import resolved
 from sceneslam.evaluation.accuracy import absolute_errors
-from sceneslam.evaluation.correctness import correct_rate
+from sceneslam.evaluation.correctness import CorrectLimits, correct_rate
 from sceneslam.experiments.openloris.dataset import Dataset, Sequence
 from sceneslam.modules.slam.recorded import Recorded
 from sceneslam.types import se3
@@ -158,7 +158,9 @@ def _scenes(data: Dataset) -> list[str]:
 
 
 def _scores(driven: Driven, truth: Trajectory, limit_m: float) -> NDArray[np.float64]:
-    rate = correct_rate(driven.trajectory, truth, limit_m=limit_m, limit_rad=np.pi / 6)
+    rate = correct_rate(
+        driven.trajectory, truth, CorrectLimits(limit_m=limit_m, limit_rad=np.pi / 6)
+    )
     ate_m = absolute_errors(driven.trajectory, truth, 0.02).rmse_m
     return np.array([rate, ate_m, driven.trusted_ratio])
 

@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 from time import perf_counter, sleep
 
-from sceneslam.sweep.status import State, Status
+from sceneslam.collect.status import State, Status
 
 _LAUNCHERS = ("basic", "joblib", "submitit_local", "ray")
 _SWEEP = (sys.executable, "-m", "sceneslam", "-m", "+experiment=threshold_sweep")

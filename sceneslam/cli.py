@@ -1,7 +1,7 @@
 """The command line: composes the configuration, runs it, and says in a few lines what happened.
 
-Exit codes: 0 all well; 1 the run ended early or its input was damaged, and what was computed is
-saved; 2 nothing was run because the configuration or the input cannot be used.
+Exit codes: 0 all of the input was used and nothing failed; 1 there is a result, but something is
+missing or failed, as each `error:` says; 2 nothing was run, and one sentence says why.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -20,13 +21,18 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+import sceneslam
 from sceneslam.app import Finished, run
+from sceneslam.config import files
 from sceneslam.config.resolve import resolved
 from sceneslam.config.settings import DETECT_ONLY
+from sceneslam.config.words import check_trust, how_to_quote, is_override, readable, shortened
 from sceneslam.detection.run import detect
 from sceneslam.evaluation.summary import summary_lines
 from sceneslam.evaluation.verdict import verdict_lines
 from sceneslam.experiment import run_experiment
+from sceneslam.storage.folder import give_back
+from sceneslam.streams import lost_output
 from sceneslam.types.errors import ConfigError, SceneSlamError, told
 from sceneslam.types.trajectory import Trajectory
 
@@ -44,51 +50,63 @@ class Ended:
 
 def main() -> None:
     """Run `python -m sceneslam` and exit."""
-    from sceneslam.sweep.plugin import register
-
+    if "--version" in sys.argv[1:]:
+        print(f"SceneSLAM {sceneslam.__version__}")
+        sys.exit(OK)
     codes: list[int] = []
-    register()
+    files.register()
 
     @hydra.main(version_base="1.3", config_path=CONFIG, config_name="config")
     def job(config: DictConfig) -> None:
         codes.append(OK)  # it has begun
         codes.append(carry_out(config).code)
 
-    sys.argv[1:] = sorted(sys.argv[1:], key=_is_override)  # Hydra takes no option between them
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises then, and does not exit
     try:
+        sys.argv[1:] = _words(sys.argv[1:])
         job()
-        sys.stdout.flush()
-    except (HydraException, OmegaConfBaseException, YAMLError) as error:
-        print(f"error: {_said(error)}", file=sys.stderr)
-        codes.append(UNUSABLE)
-    except BrokenPipeError:  # as of `| head`: what was said went where it was wanted
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (OSError, RecursionError, ValueError) as error:  # Hydra's, before the job
-        said = _meant(error)
-        if codes or said is None:  # a run's own are handled in it
+    except Exception as error:
+        if codes and not isinstance(error, HydraException):  # a run's own are handled in it
             raise
-        print(f"error: {said}", file=sys.stderr)
-        codes.append(UNUSABLE)
+        codes.append(_say(error))
     except KeyboardInterrupt:  # ends a sweep as well
+        codes.append(INCOMPLETE)
+    if not codes and (lost := lost_output()):  # a run has its results elsewhere
+        print(f"error: standard output: {told(lost)}", file=sys.stderr)
         codes.append(INCOMPLETE)
     sys.exit(max(codes, default=OK))
 
 
-def _is_override(word: str) -> bool:
-    return not word.startswith("-") and ("=" in word or word.startswith("~"))
+def _words(words: list[str]) -> list[str]:
+    """Return the command line as Hydra takes it: no option between overrides, paths in quotes."""
+    is_sweep = bool({"-m", "--multirun"} & set(words))
+    return [readable(word, is_sweep=is_sweep) for word in sorted(words, key=is_override)]
+
+
+def _say(error: Exception) -> int:
+    """Say what keeps a job from being run, or its configuration from being shown."""
+    print(f"error: {_said(error)}", file=sys.stderr)
+    return UNUSABLE
 
 
 def _said(error: Exception) -> str:
-    """Return what Hydra says, with the words that it is about, and no advice that leads astray."""
-    said = str(error)
-    if isinstance(error, OverrideParseException) and error.override not in said:
-        said = f"{error.override}: {said}"
+    """Return what an error before the first job means, in words about what was typed."""
+    if isinstance(error, OverrideParseException):
+        return how_to_quote(error.override, str(error).removeprefix(f"{error.override}: "))
+    if isinstance(error, HydraException):
+        return _without_advice(error)
+    if isinstance(error, SceneSlamError | OmegaConfBaseException | YAMLError):
+        return str(error)
+    return _meant(error) or f"the configuration cannot be composed: {shortened(told(error))}"
+
+
+def _without_advice(error: HydraException) -> str:
+    """Return what Hydra says without an advice that leads astray."""
     missing = str(getattr(error.__cause__, "full_key", None) or "of that name")
     if missing.startswith("scenes."):  # a table that may have more rows
-        return said
+        return str(error)
     there = f"There is no key {missing}; --cfg job shows all"
-    return re.sub(r"To append to your config use \+(.*)", there, said)
+    return re.sub(r"To append to your config use \+(.*)", there, str(error))
 
 
 def _meant(error: Exception) -> str | None:
@@ -103,6 +121,8 @@ def _meant(error: Exception) -> str | None:
     if str(error).startswith("Config group override must be"):
         empty = [word for word in sys.argv[1:] if re.fullmatch(r"[^.=]+(@[^=]+)?=(null)?", word)]
         return f"{', '.join(empty)}: a group holds options; ~GROUP removes"
+    if str(error).startswith("Unable to configure"):
+        return f"hydra.job_logging or hydra.hydra_logging: {error}: {error.__cause__}"
     return str(error) if str(error).startswith("Invalid defaults list") else None
 
 
@@ -110,6 +130,7 @@ def carry_out(config: DictConfig) -> Ended:
     """Run one job, say how it went and return how it ended; raises KeyboardInterrupt if stopped."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     try:
+        check_trust(config, HydraConfig.get().overrides.task)
         if config.get("experiment"):
             verdict = run_experiment(config, folder)
             print("\n".join([*verdict_lines(verdict), f"report  {_short(folder)}/report.html"]))
@@ -120,18 +141,32 @@ def carry_out(config: DictConfig) -> Ended:
         finished = _run(config, folder)
     except SceneSlamError as error:
         print(f"error: {error}", file=sys.stderr)
+        give_back(folder)
         return Ended(code=UNUSABLE, errors=(str(error),))
     except KeyboardInterrupt:
         print("error: stopped before the first observation", file=sys.stderr)
         raise
-    for fault in finished.faults:
-        print(f"error: {fault}", file=sys.stderr)
+    errors = (*finished.faults, *finished.metrics["shortfalls"])
+    for sentence in errors:
+        print(f"error: {sentence}", file=sys.stderr)
     page = folder / "report.html"
     where = f"report   {_short(page)}" if page.exists() else f"results  {_short(folder)}"
     print("\n".join([*summary_lines(finished.metrics), where]))
     if finished.is_interrupted:
         raise KeyboardInterrupt
-    return Ended(code=INCOMPLETE if finished.faults else OK, errors=finished.faults)
+    return Ended(code=_code(finished, errors), errors=errors)
+
+
+def _code(finished: Finished, errors: Sequence[str]) -> int:
+    """Return the exit code of a run that was not interrupted."""
+    if not errors:
+        return OK
+    return INCOMPLETE if finished.metrics["observations"] else UNUSABLE
+
+
+def _say_before(lines: str) -> None:
+    """Show what is known of the input before it is run."""
+    print(lines, file=sys.stderr)
 
 
 def _run(config: DictConfig, folder: Path) -> Finished:
@@ -145,7 +180,7 @@ def _run(config: DictConfig, folder: Path) -> Finished:
             faults = tuple(f"reference: {fault}" for fault in finished.faults)
             return replace(finished, faults=faults)
         reference = finished.trajectory
-    return run(resolved(config), folder, title=title, reference=reference)
+    return run(resolved(config), folder, title=title, reference=reference, say=_say_before)
 
 
 def _reference(config: DictConfig) -> dict[str, Any]:
@@ -158,6 +193,7 @@ def _reference(config: DictConfig) -> dict[str, Any]:
     except OmegaConfBaseException as error:
         key = f"reference.{getattr(error, 'full_key', '') or ''}".rstrip(".")
         raise ConfigError(key, OmegaConf.to_container(config.reference), allowed) from error
+    check_trust(cast(DictConfig, other), HydraConfig.get().overrides.task)
     return resolved(cast(DictConfig, other))
 
 

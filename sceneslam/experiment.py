@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, cast
 
@@ -22,12 +24,15 @@ from sceneslam.config.overlay import command_of, comment_of
 from sceneslam.config.provenance import provenance, save_config
 from sceneslam.config.resolve import resolved
 from sceneslam.config.settings import DETECT_ONLY
+from sceneslam.config.words import check_trust
 from sceneslam.detection.run import detect
 from sceneslam.evaluation.verdict import write_verdict
 from sceneslam.evaluation.verdict_page import Asked, Ran, write_verdict_page
 from sceneslam.interfaces import Experiment
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.experiment import Outcome, Trial, Verdict
+from sceneslam.types.files import replacing
+from sceneslam.types.ranges import check_least
 from sceneslam.types.trajectory import Trajectory
 
 _END = "finished.json"  # written into a trial's folder when it has run to its end
@@ -46,8 +51,9 @@ def run_experiment(config: DictConfig, folder: Path) -> Verdict:
     experiment = Builder(plain).make(key, Experiment)
     folder.mkdir(parents=True, exist_ok=True)
     hydra = HydraConfig.get()
-    trials = _Trials(key, folder / "runs", hydra.overrides.task)
-    verdict = experiment.run(trials.run, folder)
+    with tqdm(desc=key, unit="run", leave=False) as bar:
+        trials = _Trials(key, folder / "runs", hydra.overrides.task, int(config.jobs), bar)
+        verdict = experiment.run(trials.run, folder)
     write_verdict(folder, key, verdict)
     save_config(plain, folder / "config.yaml")
     asked = Asked(
@@ -63,23 +69,49 @@ def run_experiment(config: DictConfig, folder: Path) -> Verdict:
 class _Trials:
     """Composes and runs what an experiment asks for."""
 
-    def __init__(self, key: str, folder: Path, overrides: Sequence[str]) -> None:
-        self._key, self._folder, self._overrides = key, folder, overrides
+    def __init__(
+        self, key: str, folder: Path, overrides: Sequence[str], jobs: int, bar: Any
+    ) -> None:
+        check_least(1, jobs=jobs)
+        self._key, self._folder, self._overrides, self._jobs = key, folder, overrides, jobs
+        self._bar = bar  # of all runs: some experiments ask for one after the other
         self.done: list[Ran] = []
 
     def run(self, trials: Iterable[Trial]) -> Iterator[Outcome]:
         """Yield the outcomes in order.
 
-        Before the first is run all are composed, and each input is opened once.
+        Before the first is run all are composed, and each input is opened once. With several
+        `jobs`, so many run at a time, each in a process of its own.
         """
         configs = [(trial, self._compose(trial)) for trial in trials]
         _try_sources([config for _, config in configs])
-        for trial, config in tqdm(configs, desc=self._key, unit="run", leave=False):
+        self._bar.total = self._bar.n + len(configs)
+        for (trial, config), _ in zip(configs, self._made(configs), strict=True):
+            self._bar.update()
             folder = self._folder / trial.name
-            made_by = provenance(config)
-            if _finished_by(folder) != made_by:
-                self._run(config, folder, trial.name, made_by)
             yield self._outcome(trial, folder, config["run"]["mode"] != DETECT_ONLY)
+
+    def _made(self, configs: Sequence[tuple[Trial, dict[str, Any]]]) -> Iterator[None]:
+        """Make the runs, in order; yield after each."""
+        folders = [self._folder / trial.name for trial, _ in configs]
+        if self._jobs == 1:
+            for (trial, config), folder in zip(configs, folders, strict=True):
+                _run_unless_finished(config, folder, trial.name)
+                yield
+            return
+        context = get_context("spawn")  # libraries with threads of their own do not survive a fork
+        with ProcessPoolExecutor(self._jobs, context) as pool:
+            # What is rendered for an input is rendered once, by the first that reads it.
+            inputs = {
+                _input_of(config): config
+                for (_, config), folder in zip(configs, folders, strict=True)
+                if _finished_by(folder) != provenance(config)
+            }
+            for _ in pool.map(_prepare, inputs.values()):
+                pass
+            names = [trial.name for trial, _ in configs]
+            plain = [config for _, config in configs]
+            yield from pool.map(_run_unless_finished, plain, folders, names)
 
     def _outcome(self, trial: Trial, folder: Path, has_poses: bool) -> Outcome:
         metrics = json.loads((folder / "metrics.json").read_text())
@@ -94,21 +126,6 @@ class _Trials:
             faults=faults,
         )
 
-    def _run(
-        self, config: dict[str, Any], folder: Path, name: str, made_by: dict[str, str]
-    ) -> None:
-        (folder / _END).unlink(missing_ok=True)
-        faults: tuple[str, ...] = ()
-        if config["run"]["mode"] == DETECT_ONLY:
-            detect(config, folder)
-        else:
-            finished = run(config, folder, title=name)
-            if finished.is_interrupted:
-                raise KeyboardInterrupt
-            faults = finished.faults
-        end = {"made_by": made_by, "faults": faults}
-        (folder / _END).write_text(json.dumps(end, indent=2))
-
     def _compose(self, trial: Trial) -> dict[str, Any]:
         """Return a trial's configuration: the user's, what it overrides, then its values."""
         try:
@@ -121,21 +138,45 @@ class _Trials:
         except OmegaConfBaseException as error:
             reason = str(error).splitlines()[0]
             raise ConfigError(self._key, trial.name, f"values that fit ({reason})") from error
+        check_trust(merged, self._overrides)
         plain = resolved(merged)
         return {
             name: value for name, value in plain.items() if name not in ("experiment", self._key)
         }
 
 
+def _run_unless_finished(config: dict[str, Any], folder: Path, name: str) -> None:
+    """Run a configuration, unless the same is finished in the folder."""
+    made_by = provenance(config)
+    if _finished_by(folder) == made_by:
+        return
+    (folder / _END).unlink(missing_ok=True)
+    faults: tuple[str, ...] = ()
+    if config["run"]["mode"] == DETECT_ONLY:
+        detect(config, folder)
+    else:
+        finished = run(config, folder, title=name)
+        if finished.is_interrupted:
+            raise KeyboardInterrupt
+        faults = finished.faults
+    end = {"made_by": made_by, "faults": faults}
+    with replacing(folder / _END) as file:
+        file.write(json.dumps(end, indent=2))
+
+
+def _prepare(config: dict[str, Any]) -> None:
+    """Read a first observation: the simulator renders its whole story for it, and keeps it."""
+    next(iter(make_source(config, Builder(config))), None)
+
+
 def _try_sources(configs: Iterable[Mapping[str, Any]]) -> None:
     """Raise the error of any source that cannot be opened."""
-    inputs: dict[str, Mapping[str, Any]] = {}
-    for config in configs:
-        inputs.setdefault(
-            json.dumps([config["source"], config.get("effects")], default=str), config
-        )
-    for config in inputs.values():
+    for config in {_input_of(config): config for config in configs}.values():
         make_source(config, Builder(config))
+
+
+def _input_of(config: Mapping[str, Any]) -> str:
+    return json.dumps([config["source"], config.get("effects")], default=str)
 
 
 def _read(path: Path, is_there: bool) -> Trajectory:

@@ -204,6 +204,51 @@ class Concurrent(Protocol):
         ...
 
 
+class BackEnd(Protocol):
+    """Keeps one trajectory, and what every activation of a module contributes to it.
+
+    What the bus tells of the way goes here and nowhere else.
+    """
+
+    @property
+    def last_stamp_ns(self) -> int | None:
+        """Return the stamp of the newest pose, None before the first."""
+        ...
+
+    def begin_session(self, module: str, T_map_local: Transform) -> int:
+        """Open a session of a module that was placed in the map (Eq. 1); return its number."""
+        ...
+
+    def add_local(self, stamp_ns: int, T_local_base: Transform) -> None:
+        """Add a pose to the current session's own trajectory."""
+        ...
+
+    def add(
+        self,
+        stamp_ns: int,
+        T_map_base: Transform,
+        module: str,
+        covariance: NDArray[np.float64] | None = None,
+    ) -> None:
+        """Add a pose to the trajectory; a stamp has one pose, the first.
+
+        `module` is "" where none gave it, `covariance` (6, 6) that of T_local_base in base, where
+        the module tells it.
+        """
+        ...
+
+    def rewind(self, stamp_ns: int) -> None:
+        """Take the poses from an instant on back, for better ones."""
+        ...
+
+    def close_session(self, session: int, layers: MapLayers, revised: Trajectory) -> None:
+        """Take the map that a session leaves behind, and its poses (T_local_base) at the end.
+
+        `revised` is empty where the module stands by what it told.
+        """
+        ...
+
+
 @runtime_checkable
 class Experiment(Protocol):
     """Asks a question of many runs."""
@@ -248,4 +293,37 @@ class ResultSink(Protocol):
 
     def write_result(self, result: RunResult) -> None:
         """Take the revised trajectory and the map, once, after the truth, before `close`."""
+        ...
+
+
+class TrajectoryLog(Protocol):
+    """What the atlas is told, in order; told again to another atlas, it gives the same.
+
+    Poses and transforms are (4, 4), covariances (6, 6) or None, as the atlas takes them.
+    """
+
+    def add_session(self, module: str, T_map_local: Transform) -> None:
+        """Take that a session of a module begins."""
+        ...
+
+    def add_local(self, stamp_ns: int, T_local_base: Transform) -> None:
+        """Take a pose of the session's own trajectory."""
+        ...
+
+    def add_pose(
+        self,
+        stamp_ns: int,
+        T_map_base: Transform,
+        module: str,
+        covariance: NDArray[np.float64] | None,
+    ) -> None:
+        """Take a pose of the global trajectory; module "" where none gave it."""
+        ...
+
+    def add_rewind(self, stamp_ns: int) -> None:
+        """Take that the poses from an instant on are taken back."""
+        ...
+
+    def add_end(self, session: int, revised: Trajectory) -> None:
+        """Take how a module revised its session's poses; empty where it did not."""
         ...

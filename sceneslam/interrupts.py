@@ -1,50 +1,58 @@
-"""Ctrl-C and SIGTERM: both end a run, neither spoils what is being saved."""
+"""Ctrl-C, SIGTERM and SIGHUP: each ends a run, none spoils what is being saved."""
 
 from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
+
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @contextmanager
 def termination_as_interrupt() -> Iterator[None]:
-    """Let SIGTERM end a run as Ctrl-C does, and SIGINT also where a shell's `&` left it ignored."""
+    """Let SIGTERM, and SIGHUP (a closed terminal), end a run as Ctrl-C does.
+
+    SIGINT also where a shell's `&` left it ignored; SIGHUP not where `nohup` did.
+    """
 
     def interrupt(number: int, frame: object) -> None:
         raise KeyboardInterrupt
 
-    with _handler(signal.SIGTERM, interrupt), _handler(signal.SIGINT, interrupt):
+    with _handler(interrupt):
         yield
 
 
 @contextmanager
 def termination_noted(note: Callable[[], None]) -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM do no more than `note`."""
+    """Let Ctrl-C, SIGTERM and SIGHUP do no more than `note`."""
 
     def handle(number: int, frame: object) -> None:
         note()
 
-    with _handler(signal.SIGTERM, handle), _handler(signal.SIGINT, handle):
+    with _handler(handle):
         yield
 
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Finish saving although Ctrl-C is pressed again or SIGTERM comes."""
-    with _handler(signal.SIGINT, signal.SIG_IGN), _handler(signal.SIGTERM, signal.SIG_IGN):
+    """Finish saving although one of them comes (again)."""
+    with _handler(signal.SIG_IGN):
         yield
 
 
 @contextmanager
-def _handler(number: int, handler: Any) -> Iterator[None]:
-    try:
-        previous = signal.signal(number, handler)
-    except ValueError:  # not the main thread: signals are not ours
+def _handler(handler: Any) -> Iterator[None]:
+    """Handle all of them so; where this is not the main thread, signals are not ours."""
+    with ExitStack() as stack:
+        for number in _ENDING:
+            is_nohup = number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN
+            if is_nohup:
+                continue
+            try:
+                previous = signal.signal(number, handler)
+            except ValueError:
+                break
+            stack.callback(signal.signal, number, previous)
         yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(number, previous)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import chain, islice
 from pathlib import Path
 from time import perf_counter
@@ -14,11 +15,15 @@ import numpy as np
 from tqdm import tqdm
 
 from sceneslam.bus.bus import Bus
-from sceneslam.bus.events import EventLog
 from sceneslam.bus.handover_log import log_uncertainty
 from sceneslam.bus.live import run_live
 from sceneslam.config.build import Parts
 from sceneslam.interfaces import ResultSink, Sink
+from sceneslam.keeping import Keeping
+from sceneslam.results import Results
+from sceneslam.sources.survey.preflight import preflight
+from sceneslam.sources.survey.survey import Surveyed
+from sceneslam.sources.survey.tally import Tally
 from sceneslam.types.errors import InputError, told
 from sceneslam.types.maps import HybridMap, PointLayer
 from sceneslam.types.observation import Observation
@@ -34,13 +39,18 @@ _log = logging.getLogger(__name__)
 class Loop:
     """Feeds the bus and the sinks; `faults` says what went wrong on the way."""
 
-    def __init__(self, parts: Parts, folder: Path, title: str) -> None:
-        self.faults: list[str] = []
+    def __init__(
+        self, parts: Parts, results: Results, say: Callable[[str], None] | None = None
+    ) -> None:
+        self._say = say  # what a user reads before the run
+        self._warnings: tuple[str, ...] = ()
+        self._tally = Tally(parts.rig.sensors)
         self.is_interrupted = False
         self.truth: GroundTruth | None = None
         self._result: RunResult | None = None
-        self._parts, self._title = parts, title
-        self._log = EventLog(folder / "events.jsonl")
+        self._parts, self._title, self.faults = parts, results.title, results.faults
+        self._keeping = Keeping(parts, results)
+        self._log = self._keeping.events
         self._events_written = 0
         self._observed_ns: list[int] = []
         self._dropped = 0
@@ -52,17 +62,22 @@ class Loop:
             scenes=parts.scenes,
             policy=parts.policy,
             rig=parts.rig,
-            atlas=parts.atlas,
+            back_end=parts.atlas,
             log=self._log,
             catch_up_steps=parts.run.catch_up_steps,
         )
         self._sinks: dict[str, Sink] = {}
-        for key, sink in parts.sinks.items():
-            self._open_sink(key, sink, folder)
+        try:
+            for key, sink in parts.sinks.items():
+                self._open_sink(key, sink, results.folder)
+        except InputError:
+            self.close(is_saved=True)
+            raise
 
     def run(self) -> None:
         """Feed all observations; an error or Ctrl-C ends the run, not the program."""
         try:
+            self._survey()
             self._feed()
         except KeyboardInterrupt:
             self.is_interrupted = True
@@ -74,24 +89,36 @@ class Loop:
             self.faults.append(f"unexpected {told(error)}; saved so far, traceback in the log")
         self._wall_s = perf_counter() - self._began_s
 
-    def close(self) -> None:
-        """Shut everything down, in reverse order, and gather what was wrong."""
+    def finish(self) -> None:
+        """Shut everything down but the sinks, in reverse order, and gather what was wrong."""
         if self._bus.state == "terminate":
             self.faults.append(self._why_over())
         self._bus.close(self._last_ns())
         has_odometry = Sensor.ODOMETRY in self._parts.rig.sensors
         self._covariances = self._parts.atlas.covariances(has_odometry)
-        log_uncertainty(self._log, self._parts.atlas, self._covariances)
+        log_uncertainty(self._log, self._parts.atlas.session_starts(), self._covariances)
         if not len(self._parts.atlas.online) and not self.faults:
             self.faults.append(self._why_no_pose())
         self.faults += self._parts.source.faults
-        if self._observed_ns:  # else it may have to be rendered first, for nothing
-            self._read_truth()
+        self._keeping.finish()
+
+    def read_truth(self) -> None:
+        """Read what is known to be true."""
+        if not self._observed_ns:  # it may have to be rendered first, for nothing
+            return
+        try:
+            self.truth = self._parts.source.ground_truth()
+        except InputError as error:
+            self.faults.append(f"no ground truth: {error}")
+
+    def close_sinks(self) -> None:
+        """Give the sinks what is known at the end, and close them."""
         for key in list(self._sinks):
             self._close_sink(key)
-        self._log.close()
-        if self._log.fault:
-            self.faults.append(self._log.fault)
+
+    def close(self, *, is_saved: bool) -> None:
+        """Close what kept the run on disk; it goes where the results are saved."""
+        self._keeping.close(is_saved=is_saved)
 
     def result(self) -> RunResult:
         """Return everything the run produced, once it is closed."""
@@ -110,6 +137,7 @@ class Loop:
             sessions=atlas.sessions,
             map=self._fused(),
             events=self._log.events,
+            missing=self._tally.missing,
             dropped=self._dropped,
             timings=Timings(
                 detector_us=np.array(bus.detector_us),
@@ -128,6 +156,23 @@ class Loop:
             self.faults.append(f"the maps could not be fused: {told(error)}")
             nothing = PointLayer(points=np.zeros((0, 3), np.float32))
             return HybridMap(points=nothing, point_modules=np.zeros(0, np.uint8), modules=())
+
+    def _survey(self) -> None:
+        """Say what the recording holds, and what is implausible in it."""
+        source = self._parts.source
+        try:
+            found = source.survey() if isinstance(source, Surveyed) else None
+        except Exception as error:  # what is wrong with the input shows when it is read
+            _log.info("the source could not be surveyed", exc_info=error)
+            return
+        if found is None:
+            return
+        checked = preflight(found, self._parts.rig)
+        self._warnings = checked.warnings
+        for what in checked.warnings:
+            self._log.add("warning", 0, what=what)
+        if self._say is not None:
+            self._say("\n".join([*checked.lines, *(f"warning: {one}" for one in checked.warnings)]))
 
     def _feed(self) -> None:
         observations = islice(self._parts.source, self._parts.run.max_observations)
@@ -158,6 +203,9 @@ class Loop:
         """Feed one observation; return whether the run goes on."""
         self._bus.step(observation)
         self._observed_ns.append(observation.stamp_ns)
+        module = self._parts.modules.get(self._bus.active)
+        self._tally.add(observation, () if module is None else module.requires)
+        self._keeping.keep(observation.stamp_ns)
         if self._sinks:
             self._write(observation)
         self._bar.update()
@@ -165,6 +213,9 @@ class Loop:
 
     def _write(self, observation: Observation) -> None:
         """Give the sinks the observation with its pose, and the events since the last one."""
+        if not self._keeping.has_room(len(self._observed_ns)):
+            for key in list(self._sinks):
+                self._drop_sink(key, OSError(errno.ENOSPC, "what is left is for the results"))
         T_map_base = self._parts.atlas.pose_at(observation.stamp_ns)
         events = self._log.since(self._events_written)
         self._events_written += len(events)
@@ -175,12 +226,6 @@ class Loop:
                     sink.write_event(event)
             except Exception as error:
                 self._drop_sink(key, error)
-
-    def _read_truth(self) -> None:
-        try:
-            self.truth = self._parts.source.ground_truth()
-        except InputError as error:
-            self.faults.append(f"no ground truth: {error}")
 
     def _open_sink(self, key: str, sink: Sink, folder: Path) -> None:
         try:
@@ -219,4 +264,8 @@ class Loop:
             return "no pose: the source gave no observation"
         if self._bus.state == "init" or not self._bus.scene:
             return "no pose: no scene was confirmed (policy.first_confirm_window_s, detector)"
-        return f"no pose: module {self._bus.active} was lost from the first observation on"
+        tried = [str(e["to"]) for e in self._log.events if e["event"] in ("decision", "refused")]
+        names = " and ".join(dict.fromkeys(tried)) or self._bus.active or "none"
+        said = f"no pose: module {names} was lost from the first observation on"
+        said = f"{said}; {self._tally.words()}"
+        return f"{said}. Most likely: {'; '.join(self._warnings)}" if self._warnings else said

@@ -6,9 +6,9 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `python -m sceneslam` sets it
 
 import pytest
-from scenery import RIG, room_observation
 
 from sceneslam.ros.writer import ObservationWriter
+from sceneslam.testing.room import RIG, room_observation
 
 _SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -6,6 +6,7 @@ import os
 import re
 import runpy
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,9 +14,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scenery import RIG, room_observation
 
 from sceneslam.ros.writer import ObservationWriter
+from sceneslam.testing.room import RIG, room_observation
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -58,8 +59,18 @@ def write_recordings(folder: Path) -> None:
             cv2.imwrite(str(path), picture)
             lists[name].append(f"{observation.stamp_ns * 1e-9:.6f} {name}/{index}.png")
     writer.close()
+    _write_film(folder / "clip.mp4")
+    shutil.copy(ROOT / "modules" / "detectors" / "bright_dark.yaml", folder / "my_scenes.yaml")
     for name, lines in lists.items():
         (folder / "freiburg1" / f"{name}.txt").write_text("\n".join(lines) + "\n")
+
+
+def _write_film(path: Path) -> None:
+    """Write a film of the same images."""
+    film = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 30.0, RIG.camera.size_wh)
+    for index in range(OBSERVATIONS):
+        film.write(room_observation(index).image_bgr)
+    film.release()
 
 
 def as_run_here(command: str) -> list[str]:

@@ -19,7 +19,13 @@ from sceneslam.types.truth import GroundTruth, SceneChange
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 100_000_000
 SETTINGS = EvaluationSettings(
-    association_gap_s=0.01, rpe_interval_s=1.0, correct_limit_m=0.25, correct_limit_rad=0.1745
+    association_gap_s=0.01,
+    rpe_interval_s=1.0,
+    segment_m=2.0,
+    correct_limit_m=0.25,
+    correct_limit_ratio=0.0,
+    correct_limit_rad=0.1745,
+    coverage_min_ratio=0.9,
 )
 
 

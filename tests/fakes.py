@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -225,3 +228,76 @@ class FullDisk(IdleSink):
 
     def write(self, observation, T_map_base, module):
         raise OSError("no space left on device")
+
+
+class ClosedSink:
+    """Cannot be opened."""
+
+    def open(self, rig, folder):
+        raise OSError("no such device")
+
+    def write(self, observation, T_map_base, module):
+        pass
+
+    def write_event(self, event):
+        pass
+
+    def write_truth(self, truth):
+        pass
+
+    def close(self):
+        pass
+
+
+class Intruder(ClosedSink):
+    """Somebody who puts a file of his own into the run's folder while it runs."""
+
+    def __init__(self, name):
+        self._name = name
+
+    def open(self, rig, folder):
+        (folder / self._name).write_text("mine")
+
+
+class Killer(ClosedSink):
+    """Sends its process a signal at an observation; SIGKILL, as where no memory is left."""
+
+    def __init__(self, at, number=signal.SIGKILL):
+        self._left, self._number = at, number
+
+    def open(self, rig, folder):
+        pass
+
+    def write(self, observation, T_map_base, module):
+        if self._left == 0:
+            os.kill(os.getpid(), self._number)
+        self._left -= 1
+
+
+class Waiter(ClosedSink):
+    """Waits at an observation until a pipe is closed."""
+
+    def __init__(self, at, until):
+        self._left, self._until = at, until
+
+    def open(self, rig, folder):
+        self._folder = folder
+
+    def write(self, observation, T_map_base, module):
+        if self._left == 0:
+            (self._folder / "waiting").touch()
+            os.read(self._until, 1)
+        self._left -= 1
+
+
+class SourceWhoseTruthNeedsTheTrajectory(FakeSource):
+    """Fails where the trajectory is not on disk before what is true is asked for."""
+
+    def __init__(self, steps, dark_from, folder):
+        super().__init__(steps, dark_from)
+        self._folder = Path(folder)
+
+    def ground_truth(self):
+        if not (self._folder / "trajectory.tum").exists():
+            raise InputError("asked too early")
+        return super().ground_truth()

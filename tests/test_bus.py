@@ -6,7 +6,7 @@ import numpy as np
 from driving import assert_exact, dark_from, drive, events
 from fakes import PERIOD_NS, ExactModule, observation, true_pose
 
-from sceneslam.atlas.atlas import BRIDGED
+from sceneslam.types.run import BRIDGED
 
 
 def test_first_scene_starts_its_module_at_the_origin():

@@ -7,9 +7,9 @@ import pytest
 from driving import GATE, drive, events
 from fakes import PERIOD_NS, RIG, TWIST, ExactModule, observation, true_pose
 
-from sceneslam.atlas.atlas import BRIDGED
 from sceneslam.types import se3
 from sceneslam.types.rig import Sensor
+from sceneslam.types.run import BRIDGED
 
 ONE = {"Bright": ["bright"], "Dark": ["bright"]}
 

@@ -54,7 +54,10 @@ def test_sensor_that_falls_silent_calls_in_the_fallback():
 
     modules = {"bright": ExactModule(), "dark": Blind()}
     _, atlas, log, _ = drive(modules, feed=feed)
-    assert events(log, "decision")[1]["reason"] == "silent"
+    decision = events(log, "decision")[1]
+    assert decision["reason"] == "silent"
+    # The last image is 49: two periods of silence, then the patience of 0.3 s.
+    assert decision["stamp_ns"] in range(53 * PERIOD_NS, 57 * PERIOD_NS)
     assert_exact(atlas)
 
 

@@ -16,8 +16,8 @@ from sceneslam.collect.chart import Line, Point, draw_lines, front
 from sceneslam.collect.curves import charts
 from sceneslam.collect.flatten import flat
 from sceneslam.collect.rows import Row, read_rows
+from sceneslam.collect.status import State, Status
 from sceneslam.collect.summary import groups_of, mean_of, student_t
-from sceneslam.sweep.status import State, Status
 
 SWITCH = {"confirm_delay_s": 2.0, "gap_s": 0.0, "jump_m": 0.1, "jump_rad": None, "cost_ms": 3.0}
 

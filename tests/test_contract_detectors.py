@@ -1,57 +1,45 @@
 """What every detector in `conf/detector` must do: the contract of `interfaces.Detector`."""
 
+from functools import partial
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
-from omegaconf import OmegaConf
-from scenery import RIG, room_observation
+from networks import SIZE_WH, write_network
 
-from sceneslam.interfaces import Detector, FeatureDetector
-from sceneslam.types.observation import UNSURE, Observation
+from sceneslam.interfaces import FeatureDetector
+from sceneslam.testing import DETECTOR_CHECKS, ContractError, check_detector
+from sceneslam.types.observation import SceneVote
 
 COMPONENTS = sorted((Path(__file__).parents[1] / "conf" / "detector").glob("*.yaml"))
 
 
 @pytest.fixture(params=COMPONENTS, ids=lambda path: path.stem)
-def detector(request):
-    found = instantiate(OmegaConf.load(request.param), _convert_="all")
-    found.activate(RIG)
-    yield found
-    found.shutdown()
-    found.shutdown()
+def make(request, tmp_path):
+    """Give a function that builds the detector anew from its YAML."""
+    with initialize_config_module("sceneslam.conf", version_base="1.3"):
+        node = compose("config", overrides=[f"detector={request.param.stem}"]).detector
+    if "rate_hz" in node:  # a network: it votes on every image here
+        node.path, node.rate_hz = str(write_network(tmp_path / "network.onnx")), None
+        node.probability_min, node.size_wh = 0.0, SIZE_WH
+        node.scenes = {"Indoor": [0], "Outdoor": [1], "Dark": [2]}
+    return partial(instantiate, node, _convert_="all")
 
 
-def test_detector_fulfils_the_protocol(detector):
-    assert isinstance(detector, Detector)
-    assert detector.scenes and UNSURE not in detector.scenes
+@pytest.mark.parametrize("check", DETECTOR_CHECKS, ids=lambda check: check.__name__)
+def test_detector_keeps_its_contract(make, check):
+    check(make)
 
 
-def test_votes_are_known_scenes_at_the_observation_stamp(detector):
-    for index in range(3):
-        observation = room_observation(index)
-        vote = detector.get_scene(observation)
-        assert vote.stamp_ns == observation.stamp_ns
-        assert vote.scene in detector.scenes
+def test_all_that_are_shipped_vote_by_features(make):
+    assert isinstance(make(), FeatureDetector)
 
 
-def test_same_observation_gets_the_same_vote(detector):
-    observation = room_observation(0)
-    assert detector.get_scene(observation).scene == detector.get_scene(observation).scene
-
-
-def test_empty_observation_is_survived(detector):
-    assert detector.get_scene(Observation(stamp_ns=1)).scene in (*detector.scenes, UNSURE)
-
-
-def test_vote_follows_from_features_that_can_be_kept(detector):
-    """What holds for a detector with features holds for all that are shipped."""
-    assert isinstance(detector, FeatureDetector)
-    observations = [room_observation(index) for index in range(3)]
-    observations.insert(2, Observation(stamp_ns=observations[1].stamp_ns + 1))
-    kept = [(one.stamp_ns, detector.get_features(one)) for one in observations]
-    told = [detector.get_scene(one) for one in observations]
-    detector.shutdown()
-    detector.activate(RIG)
-    again = [detector.decide(stamp_ns, features) for stamp_ns, features in kept]
-    assert [repr(vote) for vote in again] == [repr(vote) for vote in told]
+def test_a_detector_that_votes_for_what_it_does_not_name_is_found(make):
+    detector = make()
+    detector.get_scene = lambda observation: SceneVote(
+        stamp_ns=observation.stamp_ns, scene="Twilight"
+    )
+    with pytest.raises(ContractError, match="Twilight"):
+        check_detector(lambda: detector)

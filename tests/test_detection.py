@@ -56,6 +56,7 @@ def told(folder, *kinds):
         (),
         ("policy.confirm_window_s=0.3", "detector.threshold=110"),
         ("policy.confirm_window_s=0.0", "detector.threshold=130", "run.max_observations=150"),
+        ("policy=bayes", "policy.scene_filter.correlation_s=0.1"),
     ],
 )
 def test_votes_and_scenes_are_those_of_the_full_run(config, tmp_path, words):
@@ -172,10 +173,20 @@ def test_command_sweeps_settings_and_recordings_into_one_table(cache, tmp_path):
     assert (tmp_path / "out" / "index.html").is_file()
 
 
+def test_one_limit_of_a_rule_and_places_of_lists_are_swept(config):
+    limits = Axis(key="detector.rules.dark.when.grey_mean", values=[[None, 1.0], [None, 250.0]])
+    tried = list(try_all(config(*TINY, "run=detect_only", "detector=rules"), [limits]))
+    assert [one.error for one in tried] == ["", ""] and tried[0].metrics != tried[1].metrics
+    words = (*TINY, "run=detect_only", "detector=manual", "detector.schedule=[[0.0,Dark]]")
+    names = Axis(key="detector.schedule.0.1", values=["Bright", "Dark"])
+    found = [one.metrics["detection"] for one in try_all(config(*words), [names])]
+    assert found[0]["false"] != found[1]["false"]
+
+
 def test_lists_and_flags_are_swept_like_numbers(cache, tmp_path):
     lists = "detector.features=[grey_mean,'corner_count',depth_ratio],[grey_mean,depth_ratio]"
-    flags = "policy.turn_by_gyro=true,false"
+    flags = "run.progress=true,false"
     _, rows = swept(cache, tmp_path, "detector=rules", lists, flags, "run.max_observations=20")
-    assert [row["policy.turn_by_gyro"] for row in rows] == ["true", "false"] * 2
+    assert [row["run.progress"] for row in rows] == ["True"] * 2 + ["False"] * 2
     assert rows[0]["detector.features"] == "[grey_mean, corner_count, depth_ratio]"
-    assert [row["status"] for row in rows] == ["done"] * 2 + ["failed"] * 2
+    assert [row["status"] for row in rows] == ["done", "failed"] * 2

@@ -16,15 +16,19 @@ from sceneslam.types.observation import UNSURE, LaserScan, Observation
 from sceneslam.types.rig import Rig, Sensor
 
 FEATURES = ["grey_mean", "depth_ratio"]
-RULES = [
-    {"scene": "Dark", "when": {"grey_mean": [None, 50.0]}},
-    {"scene": "Blinded", "when": {"depth_ratio": [None, 0.2], "grey_mean": [100.0, None]}},
-    {"scene": "Bright", "when": {}},
-]
+RULES = {
+    "dark": {"scene": "Dark", "when": {"grey_mean": [None, 50.0]}},
+    "blinded": {
+        "scene": "Blinded",
+        "when": {"depth_ratio": [None, 0.2], "grey_mean": [100.0, None]},
+    },
+}
 
 
-def detector(rules=RULES, features=FEATURES, hysteresis_ratio=0.0):
-    found = Rules(features=features, rules=rules, hysteresis_ratio=hysteresis_ratio)
+def detector(rules=RULES, features=FEATURES, hysteresis_ratio=0.0, otherwise="Bright"):
+    found = Rules(
+        features=features, rules=rules, otherwise=otherwise, hysteresis_ratio=hysteresis_ratio
+    )
     found.activate(Rig(sensors=frozenset()))
     return found
 
@@ -33,7 +37,7 @@ def seen(grey, depth_m=1.0):
     return Observation(
         stamp_ns=3,
         image_bgr=None if grey is None else np.full((40, 60, 3), grey, np.uint8),
-        depth_m=None if depth_m is None else np.full((40, 60), depth_m, np.float32),
+        depth_m=None if depth_m is None else np.broadcast_to(np.float32(depth_m), (40, 60)),
     )
 
 
@@ -55,11 +59,26 @@ def scan_of(points):
 
 @pytest.mark.parametrize(
     ("grey", "depth_m", "scene"),
-    [(49, 1.0, "Dark"), (50, 1.0, "Bright"), (120, 0.0, "Blinded"), (90, 0.0, "Bright")],
+    [
+        (49, 1.0, "Dark"),
+        (50, 1.0, "Bright"),
+        (120, 0.0, "Blinded"),
+        (90, 0.0, "Bright"),
+        (101, 0.0, "Blinded"),
+        (99, 0.0, "Bright"),
+    ],
 )
 def test_first_rule_that_holds_names_the_scene(grey, depth_m, scene):
     vote = detector().get_scene(seen(grey, depth_m))
     assert (vote.scene, vote.stamp_ns) == (scene, 3)
+
+
+def test_a_limit_holds_at_its_low_end_and_not_at_its_high_end():
+    half = {"scene": "Half", "when": {"depth_ratio": [0.5, 1.0]}}
+    rules = detector(rules={"half": half}, otherwise=None)
+    depths_m = [np.repeat([0.0, 1.0], [missing, 60 - missing]) for missing in (31, 30, 1, 0)]
+    votes = [rules.get_scene(seen(120, np.tile(row, (40, 1)))).scene for row in depths_m]
+    assert votes == [UNSURE, "Half", "Half", UNSURE]
 
 
 def test_what_was_not_measured_is_no_vote_where_it_matters():
@@ -67,7 +86,13 @@ def test_what_was_not_measured_is_no_vote_where_it_matters():
     assert rules.get_scene(seen(None, 1.0)).scene == UNSURE
     assert rules.get_scene(seen(20, None)).scene == "Dark"  # told by the first rule already
     assert rules.get_scene(seen(120, None)).scene == UNSURE
-    assert detector(rules=RULES[:2]).get_scene(seen(90)).scene == UNSURE  # no rule holds
+    assert detector(otherwise=None).get_scene(seen(90)).scene == UNSURE  # no rule holds
+
+
+def test_rule_that_is_null_is_left_out():
+    rules = detector(rules={**RULES, "dark": None})
+    assert rules.scenes == ("Blinded", "Bright")
+    assert rules.get_scene(seen(20)).scene == "Bright"
 
 
 def test_hysteresis_widens_the_limits_of_the_scene_voted_last():
@@ -120,17 +145,21 @@ def test_corner_holds_a_scan_and_a_bare_wall_does_not():
         ("features", {"features": ["grey_mean", "smell"]}),
         ("features", {"features": []}),
         ("hysteresis_ratio", {"hysteresis_ratio": 1.0}),
-        ("rules", {"rules": []}),
-        ("rules[0]", {"rules": [{"scene": UNSURE, "when": {}}]}),
-        ("rules[0]", {"rules": [{"scene": "Dark"}]}),
-        ("rules[0].when", {"rules": [{"scene": "Dark", "when": {"corner_count": [0, 1]}}]}),
+        ("rules", {"rules": {}}),
+        ("rules", {"rules": {"dark": None}}),
+        ("otherwise", {"otherwise": UNSURE}),
+        ("rules.a", {"rules": {"a": {"scene": UNSURE, "when": {}}}}),
+        ("rules.a", {"rules": {"a": {"scene": "Dark"}}}),
+        ("rules.a", {"rules": {"a": {"scene": "Dark", "when": {"depth_ratio": [0, 1]}, "if": {}}}}),
+        ("rules.a.when", {"rules": {"a": {"scene": "Dark", "when": {}}}}),
+        ("rules.a.when", {"rules": {"a": {"scene": "Dark", "when": {"corner_count": [0, 1]}}}}),
         (
-            "rules[0].when.grey_mean",
-            {"rules": [{"scene": "Dark", "when": {"grey_mean": [50.0, 20.0]}}]},
+            "rules.a.when.grey_mean",
+            {"rules": {"a": {"scene": "Dark", "when": {"grey_mean": [50.0, 20.0]}}}},
         ),
         (
-            "rules[0].when.grey_mean",
-            {"rules": [{"scene": "Dark", "when": {"grey_mean": [None, None]}}]},
+            "rules.a.when.grey_mean",
+            {"rules": {"a": {"scene": "Dark", "when": {"grey_mean": [None, None]}}}},
         ),
     ],
 )

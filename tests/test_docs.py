@@ -68,7 +68,7 @@ def test_command_runs(workshop, monkeypatch, capfd, page, command):
         code = run_inside(command)
         said, errors = capfd.readouterr()
     assert code == 0, errors
-    if re.search(r"-m sceneslam (?!-m|--help|.*--cfg|.* -m )", command):
+    if re.search(r"-m sceneslam (?!-m|--help|.*--cfg|.* -m |.*detect_only)", command):
         assert f"{OBSERVATIONS} poses (coverage 100.0 %)" in said
 
 

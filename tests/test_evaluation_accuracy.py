@@ -8,12 +8,18 @@ from evaluation_runs import START_NS, loop, moved, shaken, stamps
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneslam.evaluation.accuracy import absolute_errors, relative_errors, root_mean_square
+from sceneslam.evaluation.accuracy import (
+    absolute_errors,
+    relative_errors,
+    root_mean_square,
+    rotation_rmse_rad,
+)
 from sceneslam.evaluation.alignment import align
 from sceneslam.evaluation.association import associate, covered, interpolated, nearest
 from sceneslam.evaluation.comparison import compare
-from sceneslam.evaluation.correctness import correct_rate
+from sceneslam.evaluation.correctness import CorrectLimits, correct_rate
 from sceneslam.evaluation.files import read_poses
+from sceneslam.evaluation.path import length_ratio, segment_errors
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.trajectory import Trajectory
@@ -116,7 +122,7 @@ def test_lateral_noise_on_a_straight_path_does_not_roll_the_robot_over():
     estimate = Trajectory(stamps_ns=truth.stamps_ns, T_world_base=truth.T_world_base.copy())
     truth.T_world_base[:, 1, 3] = true_y_m
     estimate.T_world_base[:, 1, 3] = -true_y_m  # positions alone: best turned upside down
-    assert correct_rate(estimate, truth, limit_m=0.1, limit_rad=0.2) == 1.0
+    assert correct_rate(estimate, truth, CorrectLimits(limit_m=0.1, limit_rad=0.2)) == 1.0
 
 
 def test_correct_rate_counts_time_within_both_limits():
@@ -124,20 +130,83 @@ def test_correct_rate_counts_time_within_both_limits():
     T_world_base = truth.T_world_base.copy()
     T_world_base[80:, :3, 3] += [0.0, 0.0, 50.0]
     estimate = Trajectory(stamps_ns=truth.stamps_ns, T_world_base=T_world_base)
-    assert correct_rate(estimate, truth, limit_m=30.0, limit_rad=3.2) == pytest.approx(0.8)
-    assert correct_rate(truth, truth, limit_m=0.1, limit_rad=0.1) == 1.0
+    assert correct_rate(
+        estimate, truth, CorrectLimits(limit_m=30.0, limit_rad=3.2)
+    ) == pytest.approx(0.8)
+    assert correct_rate(truth, truth, CorrectLimits(limit_m=0.1, limit_rad=0.1)) == 1.0
+
+
+def test_correct_rate_allows_more_the_further_was_driven():
+    truth = straight(np.full(100, 1.0))  # 100 m
+    bent = straight(np.full(100, 1.0), y_m=np.linspace(0.0, 1.0, 101))
+    T_world_base = bent.T_world_base.copy()
+    T_world_base[::2, 1, 3] *= -1.0  # off by 1 % of the distance, to either side in turn
+    estimate = Trajectory(stamps_ns=bent.stamps_ns, T_world_base=T_world_base)
+    limits = [
+        CorrectLimits(limit_m=0.25, limit_rad=0.2, limit_ratio=ratio)
+        for ratio in (0.0, 0.004, 0.01)
+    ]
+    rates = [correct_rate(estimate, truth, one) for one in limits]
+    assert rates == pytest.approx([0.25, 0.42, 1.0], abs=0.03)
+
+
+def straight(steps_m, y_m=0.0):
+    """Return a drive along x, a step per tenth of a second."""
+    T_world_base = np.tile(np.eye(4), (len(steps_m) + 1, 1, 1))
+    T_world_base[1:, 0, 3] = np.cumsum(steps_m)
+    T_world_base[:, 1, 3] = y_m
+    return Trajectory(stamps_ns=stamps(len(T_world_base)), T_world_base=T_world_base)
+
+
+def test_segment_error_is_the_motions_error_over_each_stretch_of_the_true_path():
+    truth = straight(np.full(300, 0.1))  # 30 m
+    steps_m = np.where(np.arange(300) < 150, 0.1, 0.11)  # 10 % too long from half-way on
+    found = segment_errors(straight(steps_m), truth, 0.01, 9.95)
+    assert len(found.trans_m) in (200, 201)  # the last by rounding
+    np.testing.assert_allclose(found.trans_m[:50], 0.0, atol=1e-9)
+    np.testing.assert_allclose(found.trans_m[150:], 1.0, atol=0.02)
+    assert not len(segment_errors(straight(steps_m), truth, 0.01, 31.0).trans_m)
+    T_gt_map = se3.exp(np.array([3.0, -2.0, 0.5, 0.1, -0.2, 2.0]))
+    aside = segment_errors(straight(steps_m), moved(truth, T_gt_map), 0.01, 9.95)
+    np.testing.assert_allclose(aside.trans_m, found.trans_m, atol=1e-9)
+
+
+def test_length_ratio_tells_a_scale_and_ignores_what_was_not_estimated():
+    truth, twice = loop(100), loop(100)
+    twice.T_world_base[:, :3, 3] *= 1.05
+    assert length_ratio(twice, truth, 0.01) == pytest.approx(1.05)
+    part = Trajectory(stamps_ns=twice.stamps_ns[:30], T_world_base=twice.T_world_base[:30])
+    assert length_ratio(part, truth, 0.01) == pytest.approx(1.05)
+    assert np.isnan(length_ratio(Trajectory.empty(), truth, 0.01))
+    assert np.isnan(length_ratio(truth, straight(np.zeros(99)), 0.01))
+
+
+def test_rotation_error_is_what_one_alignment_leaves():
+    truth = loop(100)
+    turned = truth.T_world_base.copy()
+    turned[::2] = turned[::2] @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.2]))
+    turned[1::2] = turned[1::2] @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, -0.2]))
+    estimate = Trajectory(stamps_ns=truth.stamps_ns, T_world_base=turned)
+    T_gt_map = se3.exp(np.array([3.0, -2.0, 0.5, 0.1, -0.2, 2.0]))
+    assert rotation_rmse_rad(estimate, moved(truth, T_gt_map), 0.01) == pytest.approx(0.2, abs=1e-3)
+    assert absolute_errors(estimate, truth, 0.01).rmse_m == pytest.approx(0.0, abs=1e-9)
+    assert np.isnan(rotation_rmse_rad(Trajectory.empty(), truth, 0.01))
 
 
 def test_correct_rate_lets_a_pose_vouch_for_one_second():
     truth = loop(101)
     index = np.array([0, 5, 100])  # 0.5 s and 9.5 s to the next
     estimate = Trajectory(stamps_ns=truth.stamps_ns[index], T_world_base=truth.T_world_base[index])
-    assert correct_rate(estimate, truth, limit_m=0.1, limit_rad=0.1) == pytest.approx(0.15)
+    assert correct_rate(
+        estimate, truth, CorrectLimits(limit_m=0.1, limit_rad=0.1)
+    ) == pytest.approx(0.15)
 
 
 def test_correct_rate_of_no_poses_is_zero_and_without_truth_unknown():
-    assert correct_rate(Trajectory.empty(), loop(50), limit_m=1, limit_rad=1) == 0.0
-    assert np.isnan(correct_rate(loop(50), Trajectory.empty(), limit_m=1, limit_rad=1))
+    assert correct_rate(Trajectory.empty(), loop(50), CorrectLimits(limit_m=1, limit_rad=1)) == 0.0
+    assert np.isnan(
+        correct_rate(loop(50), Trajectory.empty(), CorrectLimits(limit_m=1, limit_rad=1))
+    )
 
 
 def test_correct_rate_of_recorded_wheel_odometry_is_high(shared_data):
@@ -145,7 +214,7 @@ def test_correct_rate_of_recorded_wheel_odometry_is_high(shared_data):
     folder = shared_data / "openloris"
     truth = _openloris(folder / "gt" / "gt_home_1.txt")
     odometry = _openloris(folder / "recorded" / "odom" / "home-1-1-odom.txt")
-    rate = correct_rate(odometry, truth, limit_m=3.0, limit_rad=np.pi / 6)
+    rate = correct_rate(odometry, truth, CorrectLimits(limit_m=3.0, limit_rad=np.pi / 6))
     assert rate == pytest.approx(1.0, abs=0.001)
 
 

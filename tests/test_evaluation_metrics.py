@@ -34,6 +34,10 @@ KEYS = {
     "ate_max_m",
     "rpe_trans_m",
     "rpe_rot_rad",
+    "ate_rot_rad",
+    "segment_trans_m",
+    "segment_rot_rad",
+    "length_ratio",
     "coverage",
     "correct_rate",
     "switches",
@@ -69,6 +73,9 @@ TRUTH_KEYS = (
     "ate_max_m",
     "rpe_trans_m",
     "rpe_rot_rad",
+    "ate_rot_rad",
+    "segment_trans_m",
+    "length_ratio",
     "correct_rate",
     "false_switches",
 )
@@ -201,16 +208,26 @@ def test_metrics_of_the_same_run_are_the_same():
     assert first == evaluate(switched_run(), true_loop(), settings=SETTINGS)
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
-def test_settings_out_of_range_are_named(value):
-    with pytest.raises(ConfigError, match="correct_limit_m: got"):
-        EvaluationSettings(
-            association_gap_s=0.01, rpe_interval_s=1, correct_limit_m=value, correct_limit_rad=1
-        )
-
-
-def test_default_settings_are_valid():
+def default_settings():
     path = Path(__file__).parents[1] / "conf" / "evaluation" / "default.yaml"
     arguments = yaml.safe_load(path.read_text())
     assert arguments.pop("_target_") == "sceneslam.evaluation.settings.EvaluationSettings"
+    return arguments
+
+
+@pytest.mark.parametrize("key", ["correct_limit_m", "correct_limit_ratio"])
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
+def test_settings_out_of_range_are_named(key, value):
+    with pytest.raises(ConfigError, match=f"{key}: got"):
+        EvaluationSettings(**default_settings() | {key: value})
+
+
+def test_only_a_share_may_be_zero():
+    assert EvaluationSettings(**default_settings() | {"correct_limit_ratio": 0.0})
+    with pytest.raises(ConfigError, match="correct_limit_m: got"):
+        EvaluationSettings(**default_settings() | {"correct_limit_m": 0.0})
+
+
+def test_default_settings_are_valid():
+    arguments = default_settings()
     assert EvaluationSettings(**arguments).association_gap_s == 0.01

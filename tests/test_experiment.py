@@ -41,6 +41,18 @@ def test_a_figure_holds_on_its_side_of_the_bound(value, relation, bound, holds):
     assert figure(value, relation, bound).holds is holds
 
 
+@pytest.mark.parametrize(
+    ("value", "holds"),
+    [(0.4, False), (0.5, True), (2.0, True), (2.1, False), (float("nan"), False)],
+)
+def test_a_figure_between_two_bounds_holds_within_both(value, holds, tmp_path):
+    one = Figure.between("error squared", value, 0.5, 2.0)
+    assert one.holds is holds
+    write_verdict(tmp_path, "trial", Verdict(figures=[one], table=Table(columns=(), rows=[])))
+    (plain,) = json.loads((tmp_path / "verdict.json").read_text())["figures"]
+    assert (plain["relation"], plain["low"], plain["bound"]) == ("in", 0.5, 2.0)
+
+
 def test_verdict_is_written_beside_its_table(tmp_path):
     figures = [figure(0.5, AT_MOST, 1.0), figure(float("nan"), AT_MOST, 1.0)]
     table = Table(columns=("run", "error [m]"), rows=[("one, two", 0.25), ("three", None)])
@@ -121,10 +133,10 @@ def test_a_frame_without_extrinsics_is_named(folder):
         Dataset(folder / "data")
 
 
-def call(folder, *overrides, name="openloris"):
+def call(folder, *overrides, name="openloris", out="out"):
     words = [sys.executable, "-m", "sceneslam", f"+experiment={name}", *overrides]
     return subprocess.run(
-        [*words, "hydra.run.dir=out"],
+        [*words, f"hydra.run.dir={out}"],
         cwd=folder,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
@@ -143,7 +155,8 @@ def test_openloris_says_for_every_system_and_scene_whether_harm_was_done(folder)
     assert values[f"{VINS}, cafe: together above the better of the two"] == pytest.approx(
         0.0, abs=0.1
     )
-    assert len(values) == 4 and (folder / "out" / "rates.png").stat().st_size > 5000
+    assert values[f"{VINS}, home-1-1: together above the better of the two"] > -1.0
+    assert len(values) == 6 and (folder / "out" / "rates.png").stat().st_size > 5000
     with (folder / "out" / "table.csv").open() as file:
         rows = {row["sequences"]: row for row in csv.DictReader(file)}
     assert float(rows["home-1-1"]["odometry [%]"]) == 100.0
@@ -155,10 +168,25 @@ def test_openloris_says_for_every_system_and_scene_whether_harm_was_done(folder)
     assert f"<pre>{command}</pre>" in page
 
 
+def test_runs_beside_each_other_give_what_runs_in_turn_give_and_go_on_where_they_stopped(folder):
+    for out, jobs in (("in_turn", 1), ("beside", 2)):
+        done = call(folder, "openloris.path=data", f"jobs={jobs}", out=out)
+        assert done.returncode == 0, done.stderr
+    tables = {(folder / out / "table.csv").read_text() for out in ("in_turn", "beside")}
+    assert len(tables) == 1
+    first, *others = sorted((folder / "beside" / "runs").rglob("finished.json"))
+    first.unlink()
+    was = {path: path.stat().st_mtime_ns for path in others}
+    done = call(folder, "openloris.path=data", "jobs=2", out="beside")
+    assert done.returncode == 0 and first.is_file()
+    assert {path: path.stat().st_mtime_ns for path in others} == was
+
+
 @pytest.mark.parametrize(
     ("overrides", "sentence"),
     [
         ((), "openloris.path: got nothing"),
+        (("openloris.path=data", "jobs=0"), "jobs: got 0"),
         (("openloris.path=nowhere",), "expected a folder: nowhere"),
         (("openloris.path=data", "openloris.limits_m=null"), "openloris.limits_m: got None"),
         (("openloris.path=data", "policy.confirm_window_s=-1"), "policy.confirm_window_s: got -1"),

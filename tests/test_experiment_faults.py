@@ -11,6 +11,7 @@ from configured import config
 from sceneslam.app import run
 from sceneslam.experiments.faults.experiment import FaultsExperiment
 from sceneslam.experiments.faults.survival import survival
+from sceneslam.experiments.faults.torn import torn_files
 from sceneslam.experiments.faults.witness import TOLD
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.experiment import Outcome
@@ -23,6 +24,9 @@ SETTINGS = {
     "faults_min": 3,
     "availability_min": 0.999,
     "recovery_max_s": 30.0,
+    "cut_offs": {"kill": 3, "broken pipe": 1},
+    "cut_off_observations": 60,
+    "lost_max_s": 1.0,
 }
 
 
@@ -73,7 +77,8 @@ def test_a_run_with_faults_in_processes_costs_no_pose_and_tears_no_file(found):
     verdict, _ = found
     assert [figure for figure in verdict.figures if not figure.holds] == []
     assert {figure.name for figure in verdict.figures} >= {"bus deaths", "pose availability"}
-    assert {row[0] for row in verdict.table.rows} <= set(FAULTS)
+    cut_off = {"program: kill", "program: broken pipe"}
+    assert cut_off <= {row[0] for row in verdict.table.rows} <= {*FAULTS, *cut_off}
 
 
 def survived(folder):
@@ -89,7 +94,8 @@ def test_every_strike_in_the_record_is_judged(found):
     lines = [line for path in records(folder) for line in path.read_text().splitlines()]
     strikes = survived(folder).strikes
     assert [strike.kind for strike in strikes] == [json.loads(line)["kind"] for line in lines]
-    assert all(0 < strike.recovery_s < 30.0 for strike in strikes)
+    assert all(0 <= strike.recovery_s < 30.0 for strike in strikes)
+    assert all(0 < strike.clock_s < 30.0 for strike in strikes)
 
 
 def test_poses_that_stay_wrong_are_no_recovery(found, tmp_path):
@@ -126,3 +132,18 @@ def test_a_torn_file_is_damage(found, tmp_path, name, torn):
 def test_no_runs_are_refused():
     with pytest.raises(ConfigError, match="runs"):
         FaultsExperiment(runs=0, **SETTINGS)
+
+
+def test_files_that_are_cut_off_are_torn_and_foreign_ones_are_not(tmp_path):
+    (tmp_path / "trajectory.tum").write_text("# stamp\n1.0 0.0 0")
+    (tmp_path / "metrics.json").write_text('{"a": ')
+    (tmp_path / "run.mcap").write_bytes(b"\x89MCAP0\r\nhalf")
+    (tmp_path / "map.png").write_bytes(b"\x89PNG half")
+    (tmp_path / "notes.txt").write_text("notes.txt")
+    (tmp_path / "run.rrd.part").write_bytes(b"half")
+    assert torn_files(tmp_path) == ("map.png", "metrics.json", "run.mcap", "trajectory.tum")
+
+
+def test_cut_offs_of_an_unknown_kind_are_refused():
+    with pytest.raises(ConfigError, match=r"cut_offs\.meteorite"):
+        FaultsExperiment(runs=1, **{**SETTINGS, "cut_offs": {"meteorite": 1}})

@@ -7,7 +7,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 from driving import GATE
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sceneslam.bus.gate import Gate, GateSettings, Verdict, with_heading
@@ -62,6 +62,16 @@ def test_a_module_that_moves_like_the_wheels_is_trusted_after_its_probation():
 
 def test_a_scale_off_by_a_few_percent_is_what_wheels_have_themselves():
     assert judged(scaled(1.05))[-1].is_trusted
+
+
+def test_a_scale_off_by_less_than_the_bounds_costs_the_distance_when_it_lasts():
+    judgements = judged(scaled(1.1), steps=400)
+    assert judgements[50].is_trusted
+    assert judgements[-1].distance is DISAGREE and judgements[-1].turn is AGREE
+
+
+def test_a_jump_is_no_scale():
+    assert judged(jumping(100, 1.0), steps=400)[-1].is_trusted
 
 
 def test_a_wrong_scale_costs_the_trust_in_the_distance_but_not_in_the_turn():
@@ -130,6 +140,7 @@ def test_a_corrected_past_is_no_motion():
     assert all(trusted(judged(jumping(30, 1.0), revised_at=30))[10:])
 
 
+@settings(deadline=None)
 @given(st.lists(st.floats(-3, 3), min_size=12, max_size=12))
 def test_judgement_does_not_depend_on_where_the_frames_are(values):
     T_a, T_b = se3.exp(np.array(values[:6])), se3.exp(np.array(values[6:]))
@@ -161,3 +172,65 @@ def test_impossible_setting_is_named(name, value):
 def test_a_past_corrected_at_the_end_of_a_loss_is_no_motion():
     module = lost_between(jumping(70, 2.0), 40, 70)
     assert all(trusted(judged(module, revised_at=70))[70:])
+
+
+def witnessed(module, *, odometry=arc, steps=100, deviation_m=0.005):
+    """Return the judgements of a module that states how certain it is."""
+    gate = Gate(GATE)
+    return [
+        gate.update(
+            round(step * PERIOD_S * 1e9),
+            T_local_base=module(step),
+            T_odom_base=odometry(step),
+            deviation_m=deviation_m,
+        )
+        for step in range(steps)
+    ]
+
+
+def frozen(first, last):
+    """Stand still between two steps of an arc, and go on from there."""
+
+    def pose(step):
+        return arc(min(step, first) + max(step - last, 0))
+
+    return pose
+
+
+def reversing(first, last):
+    """Drive backwards instead of forwards between two steps."""
+    T_back = se3.exp(np.array([-0.05, 0, 0, 0, 0, 0.02]))
+    poses = [np.eye(4)]
+    for step in range(300):
+        poses.append(poses[-1] @ (T_back if first <= step < last else arc(1)))
+    return lambda step: poses[step]
+
+
+@pytest.mark.parametrize("lie", [frozen(40, 90), reversing(40, 80)])
+def test_wheels_that_begin_to_lie_do_not_cost_a_certain_module_its_trust(lie):
+    judgements = witnessed(arc, odometry=lie, steps=200)
+    assert DISAGREE not in [judgement.distance for judgement in judgements]
+    assert any(judgement.wheels_lie for judgement in judgements)
+    assert not judgements[-1].wheels_lie
+
+
+@pytest.mark.parametrize("lie", [frozen(40, 90), reversing(40, 80), jumping(40, 1.0)])
+def test_a_module_that_begins_to_lie_is_found_however_certain_it_is(lie):
+    judgements = witnessed(lie, steps=200)
+    assert not any(trusted(judgements)[55:80])
+    assert not any(judgement.wheels_lie for judgement in judgements)
+
+
+@pytest.mark.parametrize("ratio", [0.7, 1.3])
+def test_wheels_of_another_size_are_less_certain_than_a_module(ratio):
+    judgements = witnessed(arc, odometry=scaled(ratio))
+    assert all(trusted(judgements)[10:]) and judgements[-1].wheels_lie
+
+
+def test_a_module_that_is_less_certain_than_wheels_are_is_not_believed_against_them():
+    assert not witnessed(scaled(0.75), deviation_m=0.5)[-1].is_trusted
+
+
+def test_a_module_that_jumps_is_found_though_the_wheels_have_another_size():
+    judgements = witnessed(jumping(60, 1.0), odometry=scaled(0.7))
+    assert trusted(judgements)[59] and not any(trusted(judgements)[61:])

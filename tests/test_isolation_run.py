@@ -104,6 +104,8 @@ def test_a_module_that_harms_its_process_costs_no_pose(tmp_path, how, leaves_no_
     assert finished.faults == () and len(finished.trajectory) == 100
     faults = [event for event in decisions(tmp_path) if event["event"] == "fault"]
     assert faults and "slam.bright failed while tracking" in faults[0]["what"]
+    is_told = any("slam.bright could not give its map, which is lost" in e["what"] for e in faults)
+    assert is_told is (how != "no_such_thing")  # a process that lives has its map
 
 
 def test_ctrl_c_ends_the_run_and_its_processes(tmp_path, leaves_no_process):

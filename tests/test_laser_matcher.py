@@ -4,7 +4,7 @@ import numpy as np
 from test_laser_world import box, room, scan_at
 
 from sceneslam.modules.slam.laser.field import LikelihoodField
-from sceneslam.modules.slam.laser.matcher import Matcher
+from sceneslam.modules.slam.laser.matcher import Matcher, Prior
 from sceneslam.modules.slam.laser.surface import SurfaceReader
 from sceneslam.types import se3
 
@@ -20,7 +20,7 @@ def test_scans_that_err_together_leave_the_pose_to_the_prediction():
 
     def told_m(shift_m, novelty):
         matcher = Matcher(window_m=0.5, window_rad=0.5, degeneracy_ratio=0.01, shift_m=shift_m)
-        match = matcher.match(seen, field, predicted, prior, novelty=novelty)
+        match = matcher.match(seen, field, [Prior.of(predicted, prior)], novelty=novelty)
         return float(match.T_local_base[0])
 
     assert abs(told_m(0.0, 1.0)) < 0.002
@@ -41,7 +41,9 @@ def pull_m(seen, new, *, beams):
     field = LikelihoodField(points(seen), 0.05)
     matcher = Matcher(window_m=0.5, window_rad=0.5, degeneracy_ratio=0.01, shift_m=0.0)
     prior = np.diag([0.05**2, 0.05**2, 0.01**2])
-    match = matcher.match(points(np.concatenate([seen, new])), field, np.zeros(3), prior)
+    match = matcher.match(
+        points(np.concatenate([seen, new])), field, [Prior.of(np.zeros(3), prior)]
+    )
     return np.hypot(*match.T_local_base[:2])
 
 

@@ -1,40 +1,164 @@
-"""The experiment `matrix`: its oracle, and its sweep of the detector."""
+"""The experiment `matrix`: its oracle, its promises, and its sweep of the detector."""
 
 import json
 
 import numpy as np
 import pytest
+from told_runs import Told, teller
 
+from sceneslam.evaluation.accuracy import absolute_errors
+from sceneslam.experiments.matrix.cell import Cell
+from sceneslam.experiments.matrix.experiment import MatrixExperiment
 from sceneslam.experiments.matrix.oracle import best_of
+from sceneslam.experiments.matrix.promises import Promises
 from sceneslam.experiments.matrix.sweep import Grid, sweep
 from sceneslam.types import se3
 from sceneslam.types.experiment import Outcome, Trial
 from sceneslam.types.trajectory import Trajectory
 
 RATE_HZ = 10
+NAN = float("nan")
 
 
-def driven(speeds_m_s):
+def driven(speeds_m_s, y_m=0.0):
     """Return a drive along x at RATE_HZ, one speed per second; NaN: no pose in that second."""
     steps = np.repeat(np.array(speeds_m_s, float), RATE_HZ) / RATE_HZ
     x_m = np.concatenate([[0.0], np.cumsum(np.nan_to_num(steps))])
     known = np.concatenate([[True], ~np.isnan(steps)])
     stamps_ns = np.arange(len(x_m)) * (10**9 // RATE_HZ)
-    poses = np.stack([se3.from_xy_yaw(x, 0.0, 0.0) for x in x_m])
+    poses = np.stack([se3.from_xy_yaw(x, y_m, 0.0) for x in x_m])
     return Trajectory(stamps_ns=stamps_ns[known], T_world_base=poses[known])
 
 
-def test_oracle_takes_each_second_from_the_module_that_errs_least():
+def at_seconds(trajectory):
+    """Return x at every whole second."""
+    return trajectory.positions_m[:: round(1e9 / np.diff(trajectory.stamps_ns[:2])[0]), 0]
+
+
+def test_oracle_takes_each_piece_from_the_module_that_errs_least():
     truth = driven([1.0, 1.0, 1.0])
-    oracle = best_of([driven([1.0, 1.5, 1.2]), driven([1.3, 1.1, 1.0])], truth)
-    assert oracle.stamps_ns.tolist() == [0, 10**9, 2 * 10**9, 3 * 10**9]
-    np.testing.assert_allclose(oracle.positions_m[:, 0], [0.0, 1.0, 2.1, 3.1])
+    oracle = best_of([driven([1.0, 1.5, 1.2]), driven([1.3, 1.1, 1.0])], truth, 1.0)
+    np.testing.assert_allclose(at_seconds(oracle), [0.0, 1.0, 2.1, 3.1])
 
 
-def test_oracle_knows_the_way_where_no_module_does():
+def test_oracle_weighs_a_choice_by_where_it_leads_not_by_its_own_error():
+    truth = driven([1.0, 1.0, 1.0])
+    ahead, behind = driven([1.1, 1.1, 1.0]), driven([1.1, 0.88, 1.0])
+    oracle = best_of([ahead, behind], truth, 1.0)  # 0.12 short makes up for 0.1 too far
+    np.testing.assert_allclose(at_seconds(oracle), [0.0, 1.1, 1.98, 2.98])
+
+
+def test_oracle_lets_a_module_go_on_in_the_frame_that_it_had():
+    truth = driven([1.0] * 5)
+    right = driven([1.0, NAN, NAN, 1.0, 1.0])
+    found_itself = Trajectory(
+        stamps_ns=right.stamps_ns,
+        T_world_base=truth.T_world_base[np.isin(truth.stamps_ns, right.stamps_ns)],
+    )
+    oracle = best_of([found_itself, driven([1.2] * 5)], truth, 1.0)
+    np.testing.assert_allclose(at_seconds(oracle)[:3], [0.0, 1.0, 2.2])
+    assert oracle.positions_m[-1, 0] == pytest.approx(5.0)
+
+
+def test_oracle_knows_the_path_where_no_module_does():
     truth = driven([1.0, 1.0, 1.0, 1.0])
-    oracle = best_of([driven([1.1, float("nan"), float("nan"), 1.0])], truth)
-    np.testing.assert_allclose(oracle.positions_m[:, 0], [0.0, 1.1, 2.1, 3.1, 4.1])
+    oracle = best_of([driven([1.1, NAN, NAN, 1.0])], truth, 1.0)
+    np.testing.assert_allclose(at_seconds(oracle), [0.0, 1.1, 2.1, 3.1, 4.1])
+
+
+def test_oracle_is_no_worse_than_any_module_alone_however_long_the_pieces():
+    rng = np.random.default_rng(0)
+    truth = driven(np.ones(12))
+    modules = [driven(1.0 + rng.normal(0, 0.1, 12)) for _ in range(3)]
+    for piece_s in (0.5, 3.0, 100.0):
+        error_m = rmse_m(best_of(modules, truth, piece_s), truth)
+        assert all(error_m <= rmse_m(module, truth) + 1e-3 for module in modules), piece_s
+
+
+def rmse_m(estimate, truth):
+    return absolute_errors(estimate, truth, 0.02).rmse_m
+
+
+def cell(strategy, **values):
+    numbers = {
+        "coverage": 1.0,
+        "correct_rate": 1.0,
+        "segment_m": 0.1,
+        "ate_m": 0.1,
+        "ate_rot_rad": 0.01,
+        "length_ratio": 1.0,
+        "switches": 2.0,
+        "false_switches": 0.0,
+        "regret": 0.1,
+    }
+    return Cell(story="tour", seed=0, strategy=strategy, **numbers | values)
+
+
+@pytest.mark.parametrize(
+    ("ours", "alone", "failed"),
+    [
+        ({}, {}, []),
+        ({"correct_rate": 0.98}, {}, ["tour: Correct Rate, rewind"]),
+        ({}, {"correct_rate": 0.81}, ["tour: Correct Rate, bright alone"]),
+        ({"regret": 0.3}, {}, ["rewind: regret, mean over stories"]),
+        ({}, {"regret": -0.01}, ["least regret of any strategy, any seed"]),
+        ({}, {"regret": -0.01, "coverage": 0.5}, []),
+        ({"false_switches": 1.0}, {}, ["rewind: false switches, any seed"]),
+        ({"regret": NAN}, {}, ["rewind: regret, mean over stories"]),
+    ],
+)
+def test_a_promise_fails_when_it_is_broken(ours, alone, failed):
+    promises = Promises(
+        judged="rewind", regret_max=0.25, correct_min=0.99, alone_correct_max=0.8, false_max=0.0
+    )
+    cells = [cell("bright alone", **{"correct_rate": 0.5} | alone), cell("rewind", **ours)]
+    figures = list(promises.figures(cells, ["bright alone"]))
+    assert [figure.name for figure in figures if not figure.holds] == failed
+
+
+def test_every_strategy_is_run_with_every_seed_and_lies_in_the_table(tmp_path):
+    asked = {}
+
+    def tell(trial):
+        asked[trial.name] = trial
+        speed_m_s = {"a_alone": 1.02, "b_alone": 1.05}.get(trial.name.split("/")[1], 1.03)
+        rate = 1.0 if "rewind" in trial.name else 0.5
+        metrics = {
+            "ate_rmse_m": speed_m_s - 1.0,
+            "ate_rot_rad": 0.0,
+            "segment_trans_m": 0.1,
+            "length_ratio": speed_m_s,
+            "correct_rate": rate,
+            "coverage": 1.0,
+            "switches": [],
+            "false_switches": 0,
+            "observations": 10 if trial.name == "tour/b_alone/1" else 30,  # it ended early
+        }
+        return Told(metrics=metrics, trajectory=driven([speed_m_s] * 3), truth=driven([1.0] * 3))
+
+    experiment = MatrixExperiment(
+        stories=["tour"],
+        seeds=[0, 1],
+        modules=["a", "b"],
+        scenes={"Bright": ["a", "b"], "Dark": ["b", "a"]},
+        alone=["policy.gate=null"],
+        strategies={"rewind": ["policy.handover=rewind"]},
+        piece_s=1.0,
+        correct_limits={"limit_m": 0.25, "limit_rad": 0.17, "limit_ratio": 0.01},
+        segment_m=1.0,
+        promises={"judged": "rewind", "regret_max": 10.0},
+        votes=None,
+    )
+    verdict = experiment.run(teller(tmp_path / "runs", tell), tmp_path)
+    assert len(asked) == 6 and verdict.holds
+    alone = asked["tour/b_alone/1"]
+    table = "scenes={Bright: [b], Dark: [b]}"
+    assert alone.overrides == ("story=tour", "seed=1", "policy.gate=null", table)
+    assert [row[1] for row in verdict.table.rows] == ["a alone", "b alone", "rewind", "oracle"]
+    assert verdict.table.rows[2][3] == "100.0 ± 0.0"
+    assert verdict.table.rows[1][2:4] == ("66.7 ± 33.3", "33.3 ± 16.7")
+    assert len((tmp_path / "cells.csv").read_text().splitlines()) == 9
+    assert (tmp_path / "paths.png").stat().st_size > 5000
 
 
 def outcome_of(folder, greys):

@@ -58,7 +58,9 @@ def test_every_shipped_component_and_scenario_is_mutated(recordings):
     assert {f"+scenario={name}" for name in (*SCENARIOS, "single")} <= with_options
     named = {word.rpartition("=")[2] for word in with_options}
     named |= {"two_rooms", "one_scene", "default", "recording", "rerun", "none"}  # by default
-    named.add("detect_only")  # builds no modules
+    named |= {"detect_only", "video"}  # builds no modules; none lives on images alone
+    named |= {"onnx", "indoor_outdoor"}  # need a network's file
+    named |= {"process", "orb_slam3"}  # need a program that the user's word allows
     for group in ("source", "detector", "effects", "policy", "atlas", "run", "slam", "sinks"):
         assert options(group) <= named, group
 

@@ -8,9 +8,9 @@ from driving import assert_exact, dark_from, drive, events
 from fakes import PERIOD_NS, ExactModule, observation
 from test_handover import errors_m, slipping
 
-from sceneslam.atlas.atlas import BRIDGED
 from sceneslam.bus.pace import Pace, PaceSettings
 from sceneslam.types.errors import ConfigError
+from sceneslam.types.run import BRIDGED
 
 EVERY_THIRD = PaceSettings(period_s=0.3, step_m=10.0, turn_rad=3.0)
 SWITCHED = {"scene_at": dark_from(40), "handover": "rewind"}  # confirmed at 60

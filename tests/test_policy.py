@@ -7,7 +7,7 @@ from driving import policy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sceneslam.bus.scene_filter import SceneFilter
+from sceneslam.bus.scene_filter import WindowFilter
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import UNSURE, SceneVote
 
@@ -16,7 +16,7 @@ PERIOD_NS = 33_333_333
 
 def confirm(scenes, *, window_s=2.0, first_window_s=0.0, period_ns=PERIOD_NS):
     """Return what the filter confirms at each vote."""
-    scene_filter = SceneFilter(window_s=window_s, first_window_s=first_window_s)
+    scene_filter = WindowFilter(window_s=window_s, first_window_s=first_window_s)
     votes = (SceneVote(stamp_ns=i * period_ns, scene=scene) for i, scene in enumerate(scenes))
     return [scene_filter.update(vote) for vote in votes]
 
@@ -40,7 +40,7 @@ def test_change_is_confirmed_within_a_frame_of_the_window():
 
 
 def test_silence_longer_than_the_window_is_no_agreement():
-    scene_filter = SceneFilter(window_s=2.0, first_window_s=0.0)
+    scene_filter = WindowFilter(window_s=2.0, first_window_s=0.0)
     scene_filter.update(SceneVote(stamp_ns=0, scene="Bright"))
     for stamp_s in (1, 4, 7):
         vote = SceneVote(stamp_ns=stamp_s * 10**9, scene="Dark")

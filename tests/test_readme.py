@@ -34,7 +34,15 @@ def test_main_commands_are_targets_of_the_makefile():
 def test_everything_linked_is_there():
     for target in re.findall(r"\]\(([^)]+)\)", README):
         if not target.startswith("http"):
-            assert (ROOT / target).exists(), target
+            page, _, anchor = target.partition("#")
+            assert (ROOT / page).exists(), target
+            assert not anchor or anchor in anchors(ROOT / page), target
+
+
+def anchors(page):
+    """Return what the headings of a page are linked by."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), re.M)
+    return {re.sub(r"[^\w\s-]", "", one).strip().lower().replace(" ", "-") for one in headings}
 
 
 def test_every_option_is_listed():

@@ -4,9 +4,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sceneslam.atlas.atlas import BRIDGED, Atlas
+from sceneslam.atlas.atlas import Atlas
 from sceneslam.types import se3
 from sceneslam.types.maps import MapLayers
+from sceneslam.types.run import BRIDGED
 from sceneslam.types.trajectory import Trajectory
 
 twists = st.lists(st.floats(-2, 2), min_size=6, max_size=6).map(np.array)

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from scenery import RIG, room_observation
 
 from sceneslam.modules.slam.rgbd.module import RgbdSlam
+from sceneslam.testing.room import RIG, room_observation
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import Observation, TrackingStatus

@@ -5,11 +5,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-import scenery
-from scenery import observation_at
 from test_rgbd import make
 
 from sceneslam.modules.slam.rgbd import loop_detection
+from sceneslam.testing import room as scenery
+from sceneslam.testing.room import observation_at
 from sceneslam.types import se3
 from sceneslam.types.observation import TrackingStatus
 

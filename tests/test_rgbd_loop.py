@@ -6,9 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from scenery import CAMERA, RIG, observation_at
 from test_rgbd import make
 
+from sceneslam.testing.room import CAMERA, RIG, observation_at
 from sceneslam.types import se3
 
 TURN_STEPS = 72

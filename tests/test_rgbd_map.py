@@ -99,13 +99,28 @@ def test_corrected_keyframes_take_along_the_landmarks_that_they_saw_first():
     shared_m = table.points_local[second.landmark_ids[:20]]
     moved = second.T_local_base @ se3.exp(np.array([0.3, -0.1, 0.2, 0.1, 0.2, -0.3]))
     visual_map.correct({1: moved})
-    assert (second.T_local_base == moved).all()
+    assert second.T_local_base == pytest.approx(moved, abs=1e-15)
     assert (table.points_local[second.landmark_ids[:20]] == shared_m).all()
     after = visual_map.predict(moved, second.landmark_ids[20:])
     assert after.uv_px == pytest.approx(before.uv_px)
     assert (after.levels == before.levels).all()
     product = table.covariance[second.landmark_ids] @ table.information[second.landmark_ids]
     assert product == pytest.approx(np.repeat(np.eye(3)[None], 60, axis=0), abs=1e-6)
+
+
+def test_rotations_stay_rotations_over_many_corrections():
+    visual_map = empty_map(CAMERA)
+    for step in range(2):
+        visual_map.insert(keyframe_at(0.1 * step), deep_rows=np.zeros(0, np.int64))
+    rng = np.random.default_rng(0)
+    store = visual_map.keyframes
+    for step in range(60):  # as after a local bundle adjustment: the newer moves with the older
+        older, newer = step % 2, 1 - step % 2
+        adjusted = store[older].T_local_base @ se3.exp(0.01 * rng.standard_normal(6))
+        T_new_old = adjusted @ se3.inverse(store[older].T_local_base)
+        visual_map.correct({older: adjusted, newer: T_new_old @ store[newer].T_local_base})
+    rotation = store[1].T_local_base[:3, :3]
+    assert rotation.T @ rotation == pytest.approx(np.eye(3), abs=1e-13)
 
 
 def test_landmarks_are_predicted_where_they_were_seen():
@@ -255,3 +270,14 @@ def test_a_pose_is_told_only_where_a_tenth_of_what_should_show_is_found(shown, i
     ids = visual_map.keyframes.landmarks_of([0])
     fix = localizer.near(features, se3.identity(), ids)
     assert (fix is not None) == is_found
+
+
+def test_a_predicted_pose_stays_a_rotation_over_many_corrections():
+    motion = MotionModel()
+    rng = np.random.default_rng(0)
+    for _ in range(60):  # a keyframe at the prediction is adjusted, and the prediction follows it
+        keyframe = motion.predict(Observation(stamp_ns=0))
+        adjusted = keyframe @ se3.exp(0.01 * rng.standard_normal(6))
+        motion.correct(adjusted @ se3.inverse(keyframe))
+    rotation = motion.predict(Observation(stamp_ns=0))[:3, :3]
+    assert rotation.T @ rotation == pytest.approx(np.eye(3), abs=1e-13)

@@ -5,10 +5,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scenery import observation_at
 from test_rgbd import drive, make
 
 from sceneslam.bus.runner import Runner
+from sceneslam.testing.room import observation_at
 from sceneslam.types import se3
 from sceneslam.types.observation import TrackingStatus
 

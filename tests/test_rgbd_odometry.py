@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
-from scenery import RIG, observation_at, room_observation
 
 from sceneslam.modules.slam.rgbd.motion import MotionModel
+from sceneslam.testing.room import RIG, observation_at, room_observation
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, TrackingStatus
 

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenery import RIG, room_observation
 from test_rgbd import make
 
+from sceneslam.testing.room import RIG, room_observation
 from sceneslam.types import se3
 from sceneslam.types.observation import TrackingStatus
 

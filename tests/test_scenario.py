@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SMALL = "source.camera.size_wh=[480,360] run.progress=false"
+SMALL = "source.camera.size_wh=[480,360] run.progress=false seed=50"  # a seed of its own
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +43,11 @@ def test_bright_to_dark_is_one_switch_and_an_accurate_trajectory(runs):
     metrics = metrics_of(runs / "first")
     (switch,) = metrics["switches"]
     assert (switch["from"], switch["to"], switch["scene"]) == ("bright", "dark", "Dark")
-    assert switch["confirm_delay_s"] <= 2.3 and switch["gap_s"] == 0.0
+    assert 1.4 <= switch["confirm_delay_s"] <= 2.3 and switch["gap_s"] == 0.0  # 1.8
     assert metrics["coverage"] == 1.0 and metrics["false_switches"] == 0
-    assert metrics["ate_rmse_m"] <= 0.05
+    # Twice what was measured: 0.0030 m, 0.0026 rad, 1.014.
+    assert metrics["ate_rmse_m"] <= 0.006 and metrics["ate_rot_rad"] <= 0.0053
+    assert abs(metrics["length_ratio"] - 1.0) <= 0.028
 
 
 @pytest.mark.slow

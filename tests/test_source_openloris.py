@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from ros_recordings import make_source
 
-from sceneslam.evaluation.correctness import correct_rate
+from sceneslam.evaluation.correctness import CorrectLimits, correct_rate
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.rig import Sensor
 from sceneslam.types.trajectory import Trajectory
@@ -62,5 +62,5 @@ def test_wheel_odometry_has_the_rate_of_the_official_rule(shared_data, sequence,
         stamps_ns=np.array([one.stamp_ns for one in source]),
         T_world_base=np.stack([one.T_odom_base for one in source]),
     )
-    found = correct_rate(odometry, truth, limit_m=limit_m, limit_rad=np.pi / 6)
+    found = correct_rate(odometry, truth, CorrectLimits(limit_m=limit_m, limit_rad=np.pi / 6))
     assert found == pytest.approx(rate, abs=0.002)

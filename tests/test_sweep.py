@@ -19,10 +19,10 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
+from sceneslam.collect.status import State, Status
 from sceneslam.config.check import check_keys
 from sceneslam.sweep.__main__ import main
 from sceneslam.sweep.backends import Basic, Joblib, Ray, Submitit
-from sceneslam.sweep.status import State, Status
 from sceneslam.sweep.supervise import Order
 from sceneslam.types.errors import ConfigError
 
@@ -104,7 +104,7 @@ def test_every_launcher_gives_the_same_table_to_the_bit(folder, basic, launcher,
 
 
 def test_killed_job_takes_nobody_along_and_is_resumed(folder, capsys):
-    jobs = (*JOBS, "policy.dwell_s=0,1,2")
+    jobs = (*JOBS, "policy.retry_s=0,1,2")
     words = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=out")
     process = start(folder, *jobs, *words)
     status = wait_for(folder / "out" / "1", State.RUNNING)
@@ -137,24 +137,24 @@ def test_stopped_sweep_goes_on_where_it_was_by_the_same_command(folder):
 
 def test_job_whose_configuration_changed_is_run_again(folder):
     words = (*JOBS, "hydra.sweep.dir=out")
-    assert sweep(folder, *words, "policy.dwell_s=0,1")[0] == 0
-    code, out, _ = sweep(folder, *words, "policy.dwell_s=0,2")
+    assert sweep(folder, *words, "policy.retry_s=0,1")[0] == 0
+    code, out, _ = sweep(folder, *words, "policy.retry_s=0,2")
     assert code == 0 and "2 jobs: 2 done (1 of them before)" in out
-    assert [row["policy.dwell_s"] for row in table(folder / "out")] == ["0", "2"]
+    assert [row["policy.retry_s"] for row in table(folder / "out")] == ["0", "2"]
 
 
 def test_running_sweep_does_not_see_later_edits(folder):
     mine = folder / "mine" / "policy" / "mine.yaml"
     mine.parent.mkdir(parents=True)
-    mine.write_text("defaults: [default]\ndwell_s: 0.25\n")
+    mine.write_text("defaults: [default]\nretry_s: 0.25\n")
     words = ("--config-dir", "mine", *SLOW, "policy=mine", "slam.only.use_gyro=true,false")
     process = start(folder, *words, "hydra.sweep.dir=out")
     wait_for(folder / "out" / "0", State.RUNNING)
-    mine.write_text("defaults: [default]\ndwell_s: 0.75\n")
+    mine.write_text("defaults: [default]\nretry_s: 0.75\n")
     _, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors
     for job in ("0", "1"):
-        assert "dwell_s: 0.25" in (folder / "out" / job / "config.yaml").read_text()
+        assert "retry_s: 0.25" in (folder / "out" / job / "config.yaml").read_text()
     (code,) = (folder / "out" / ".sweep" / "code").iterdir()
     assert (code / "sceneslam" / "sweep" / "job.py").is_file()
 

@@ -112,7 +112,7 @@ def test_objective_weighs_metrics_by_their_dotted_names():
 
 
 def test_the_overlay_composes_to_what_was_drawn(tmp_path):
-    drawn = {"detector.threshold": 87.3, "policy.handover": "cold", "policy.dwell_s": 0.5}
+    drawn = {"detector.threshold": 87.3, "policy.handover": "cold", "policy.retry_s": 0.5}
     path = tmp_path / "experiment" / "tuned.yaml"
     write_overlay(path, drawn, {"train": [2.0, 1.0], "held out": [3.0, 2.5]})
     assert "# held out: score 2.5, of the defaults 3\n" in path.read_text()

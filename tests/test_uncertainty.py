@@ -95,7 +95,7 @@ def test_a_run_logs_how_sure_every_session_was_where_it_began():
     modules = {"bright": ExactModule(), "dark": ExactModule()}
     _, atlas, log, _ = drive(modules, scene_at=lambda i: "Dark" if i >= 40 else "Bright")
     covariances = atlas.covariances(True)
-    log_uncertainty(log, atlas, covariances)
+    log_uncertainty(log, atlas.session_starts(), covariances)
     told = events(log, "uncertainty")
     assert [event["module"] for event in told] == ["bright", "dark"]
     assert told[0]["deviation_m"] == 0.0 < told[1]["deviation_m"] < 0.2

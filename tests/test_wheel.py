@@ -8,9 +8,9 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from scenery import RIG, room_observation
 
 from sceneslam.ros.writer import ObservationWriter
+from sceneslam.testing.room import RIG, room_observation
 
 ROOT = Path(__file__).parents[1]
 SOURCES = ("pyproject.toml", "README.md", "LICENSE", "conf", "modules", "experiments", "sceneslam")

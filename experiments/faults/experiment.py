@@ -5,14 +5,25 @@
 
 from __future__ import annotations
 
+import logging
+import shutil
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from omegaconf import OmegaConf
+from tqdm import tqdm
 
+from sceneslam.experiments.faults.cut_off import KINDS, Cut, Program, can_mount
 from sceneslam.experiments.faults.survival import Survival, survival
+from sceneslam.types.errors import ConfigError
 from sceneslam.types.experiment import Figure, Outcome, Relation, RunTrials, Table, Trial, Verdict
 from sceneslam.types.ranges import check_above, check_between, check_least, check_some
+
+_AT_ONCE = 4  # runs that are struck; each waits for the disk most of the time
+_log = logging.getLogger(__name__)
 
 
 class FaultsExperiment:
@@ -32,12 +43,22 @@ class FaultsExperiment:
         faults_min: int,
         availability_min: float,
         recovery_max_s: float,
+        cut_offs: dict[str, int],
+        cut_off_observations: int,
+        lost_max_s: float,
     ) -> None:
         check_least(1, runs=runs)
         check_least(0, seed=seed, faults_min=faults_min)
         check_above(0, right_m=right_m, recovery_max_s=recovery_max_s)
         check_between(0, 1, availability_min=availability_min)
         check_some(struck=struck)
+        check_least(0, **{f"cut_offs.{kind}": count for kind, count in cut_offs.items()})
+        check_least(1, cut_off_observations=cut_off_observations)
+        check_above(0, lost_max_s=lost_max_s)
+        for kind in set(cut_offs) - set(KINDS):
+            raise ConfigError(f"cut_offs.{kind}", cut_offs[kind], f"a count of {', '.join(KINDS)}")
+        self._cut_offs, self._lost_max_s = cut_offs, lost_max_s
+        self._cut_off_observations = cut_off_observations
         self._runs, self._struck, self._seed, self._right_m = runs, struck, seed, right_m
         self._faults_min = faults_min
         self._availability_min, self._recovery_max_s = availability_min, recovery_max_s
@@ -46,7 +67,49 @@ class FaultsExperiment:
         """Run them; return what was struck and what held."""
         trials = [self._trial(index, folder.resolve()) for index in range(self._runs)]
         found = [self._survival(outcome) for outcome in run_trials(trials)]
-        return Verdict(figures=self._figures(found), table=_table(found))
+        cuts = self._cut_off(folder, folder / "runs" / trials[0].name / "config.yaml")
+        figures = [*self._figures(found), *self._cut_figures(cuts)]
+        return Verdict(figures=figures, table=_table(found, cuts))
+
+    def _cut_off(self, folder: Path, config: Path) -> list[Cut]:
+        """Strike runs of the first trial's configuration, without its own faults, from outside."""
+        if not any(self._cut_offs.values()):
+            return []
+        plain: Any = OmegaConf.to_container(OmegaConf.load(config))
+        # The last module for all scenes, which is a cheap one: it is the program that is struck.
+        module = [node["module"] for node in plain["slam"].values()][-1]
+        plain["slam"] = dict.fromkeys(plain["slam"], module)
+        plain["effects"] = None
+        plain["run"] |= {"isolation": "inline", "max_observations": self._cut_off_observations}
+        plain["run"] |= {"progress": True}
+        mcap = {"_target_": "sceneslam.sinks.mcap.McapSink", "path": "run.mcap"}
+        plain["sinks"] = {"mcap": mcap | {"image_format": "png"}}
+        place = folder / "cut_offs"
+        counts = {**self._cut_offs}
+        if counts.get("disk") and not can_mount(place / "disk"):
+            _log.warning("faults.cut_offs.disk: left out, disks are the administrator's to make")
+            counts["disk"] = 0
+        cases = [(kind, number) for kind, count in counts.items() for number in range(count)]
+        shutil.rmtree(place, ignore_errors=True)
+        place.mkdir(parents=True)
+        program = Program(config=plain, folder=place)
+        with ThreadPoolExecutor(_AT_ONCE) as pool:
+            cuts = pool.map(lambda case: program.strike(case[0], self._seed + case[1]), cases)
+            return list(tqdm(cuts, "cut off", len(cases), unit="run", leave=False))
+
+    def _cut_figures(self, cuts: Sequence[Cut]) -> list[Figure]:
+        if not cuts:
+            return []
+        lost_s = max(cut.lost_s for cut in cuts)
+        wrong = sum(not cut.is_right for cut in cuts)
+        at_most = Figure.at_most
+        return [
+            Figure.at_least("programs struck", len(cuts), sum(self._cut_offs.values())),
+            at_most("reported poses lost, most of all", lost_s, self._lost_max_s, "s"),
+            at_most("results other than undisturbed", wrong, 0),
+            at_most("foreign files touched", sum(cut.foreign for cut in cuts), 0),
+            at_most("torn files", sum(len(cut.torn) for cut in cuts), 0),
+        ]
 
     def _trial(self, index: int, folder: Path) -> Trial:
         name = f"run_{index:03d}"
@@ -113,15 +176,23 @@ def _put(values: dict[str, object], key: str, content: object) -> None:
     _put(inner, rest, content)
 
 
-def _table(found: Sequence[Survival]) -> Table:
-    """Return one row per kind of fault."""
+def _table(found: Sequence[Survival], cuts: Sequence[Cut]) -> Table:
+    """Return one row per kind of fault; of the program's, how many runs it cut off."""
     kinds = sorted({strike.kind for one in found for strike in one.strikes})
     rows: list[list[str | float | None]] = []
     for kind in kinds:
-        took_s = [s.recovery_s for one in found for s in one.strikes if s.kind == kind]
+        strikes = [strike for one in found for strike in one.strikes if strike.kind == kind]
+        took_s = [strike.recovery_s for strike in strikes]
+        clock_ms = 1e3 * float(np.quantile([strike.clock_s for strike in strikes], 0.95))
         finite_s = [value for value in took_s if np.isfinite(value)]
         never = len(took_s) - len(finite_s)
         spread_ms = np.quantile(finite_s or [np.nan], [0.5, 0.95, 1.0]) * 1e3
-        rows.append([kind, float(len(took_s)), *spread_ms.tolist(), float(never)])
-    columns = ["fault", "times", "median [ms]", "p95 [ms]", "max [ms]", "not before the end"]
+        rows.append([kind, float(len(took_s)), *spread_ms.tolist(), float(never), clock_ms])
+    for kind in dict.fromkeys(cut.kind for cut in cuts):
+        of_kind = [cut for cut in cuts if cut.kind == kind]
+        lost_ms = np.quantile([cut.lost_s for cut in of_kind], [0.5, 0.95, 1.0]) * 1e3
+        was_cut = float(sum(cut.was_cut for cut in of_kind))
+        rows.append([f"program: {kind}", float(len(of_kind)), *lost_ms.tolist(), was_cut, None])
+    columns = ["fault", "times", "median [ms]", "p95 [ms]", "max [ms]"]
+    columns += ["not before the end", "p95 by the clock [ms]"]
     return Table(columns=columns, rows=rows)

@@ -19,7 +19,8 @@ class Strike:
     """One fault, and how long it was until a right pose was out again."""
 
     kind: str
-    recovery_s: float  # by the clock and in recorded time, added; inf: never in this run
+    recovery_s: float  # in the recording's time; inf: never in this run
+    clock_s: float  # by the clock: deadlines, and what a process takes to start on this machine
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,9 +48,15 @@ def survival(name: str, folder: Path, records: Sequence[Path], *, right_m: float
         struck_ns = max([line["stamp_ns"], *stamps_ns[~is_later][-1:]])
         is_right = _is_within(errors_m, is_later, right_m)
         over = np.flatnonzero(is_later & is_right & (stamps_ns >= line["stamp_ns"]))[:1]
-        later_ns = told["clocks_ns"][over] - line["clock_ns"] + stamps_ns[over] - struck_ns
-        recovery_s = float(later_ns[0]) * 1e-9 if len(later_ns) else np.inf
-        strikes.append(Strike(kind=line["kind"], recovery_s=recovery_s))
+        later_s = [float(ns) * 1e-9 for ns in stamps_ns[over] - struck_ns]
+        clock_s = [float(ns) * 1e-9 for ns in told["clocks_ns"][over] - line["clock_ns"]]
+        strikes.append(
+            Strike(
+                kind=line["kind"],
+                recovery_s=later_s[0] if later_s else np.inf,
+                clock_s=clock_s[0] if clock_s else np.inf,
+            )
+        )
     return Survival(
         name=name,
         observations=len(stamps_ns),

@@ -6,6 +6,7 @@ from pathlib import Path
 from time import monotonic_ns
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
@@ -52,3 +53,30 @@ class Witness:
                 clocks_ns=np.array(self._clocks_ns, np.int64),
                 positions_m=np.array(self._positions_m).reshape(-1, 3),
             )
+
+
+class Outliving(Witness):
+    """Notes the stamps of poses in a file that outlives the process, outside the run's folder."""
+
+    def __init__(self, path: str) -> None:
+        super().__init__()
+        self._told = Path(path)
+
+    def open(self, rig: Rig, folder: Path) -> None:
+        """Begin the file."""
+        self._told.write_bytes(b"")
+
+    def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
+        """Note a pose at once."""
+        if T_map_base is not None:
+            with self._told.open("ab") as file:
+                file.write(observation.stamp_ns.to_bytes(8, "little"))
+
+    def write_truth(self, truth: GroundTruth) -> None:
+        """Do nothing."""
+
+
+def reported_ns(path: Path) -> NDArray[np.int64]:
+    """Return the stamps that `Outliving` noted."""
+    data = path.read_bytes() if path.exists() else b""
+    return np.frombuffer(data[: len(data) // 8 * 8], np.int64)

@@ -1,88 +1,127 @@
-"""One run of the matrix in numbers, and their mean over seeds."""
+"""One run of the matrix in numbers, and their mean and deviation over seeds."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
-from sceneslam.evaluation.accuracy import absolute_errors
-from sceneslam.evaluation.correctness import correct_rate
+from sceneslam.evaluation.accuracy import absolute_errors, root_mean_square
+from sceneslam.evaluation.correctness import CorrectLimits, correct_rate
+from sceneslam.evaluation.path import segment_errors
 from sceneslam.types.experiment import Outcome
 from sceneslam.types.trajectory import Trajectory
 
-_LIMIT_M, _LIMIT_RAD = 0.25, np.deg2rad(10.0)  # of `conf/evaluation/default.yaml`
 _GAP_S = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Strategy:
-    """A way to drive: one module alone (then nothing is bridged), or a kind of hand-over."""
-
-    name: str
-    module: str = ""
-    handover: str = "cold"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Cell:
-    """A story under a strategy."""
+    """A story under a strategy, with one seed or as the mean (or deviation) over seeds."""
 
     story: str
     seed: int | None  # None in a mean over seeds
     strategy: str
-    ate_m: float
-    correct_rate: float
     coverage: float
+    correct_rate: float
+    segment_m: float  # error of the motion over a stretch of the path
+    ate_m: float
+    ate_rot_rad: float
+    length_ratio: float
     switches: float
     false_switches: float
+    regret: float = float("nan")  # ATE over the oracle's, minus 1
 
     @classmethod
-    def of(cls, story: str, seed: int, strategy: str, outcome: Outcome) -> Cell:
-        """Return a run's numbers; what it could not have (no pose) is NaN."""
+    def of(
+        cls, story: str, seed: int, strategy: str, outcome: Outcome, *, observations: int
+    ) -> Cell:
+        """Return a run's numbers; what it could not have (no pose) is NaN.
+
+        A run that ended before it had seen all `observations` has no pose for the others.
+        """
         metrics = outcome.metrics
-        values = {name: metrics[name] for name in ("correct_rate", "coverage", "false_switches")}
+        share = metrics["observations"] / max(observations, 1)
+        names = ("ate_rot_rad", "length_ratio", "false_switches")
         return cls(
             story=story,
             seed=seed,
             strategy=strategy,
+            coverage=share * _number(metrics["coverage"]),
+            correct_rate=share * _number(metrics["correct_rate"]),
             ate_m=_number(metrics["ate_rmse_m"]),
+            segment_m=_number(metrics["segment_trans_m"]),
             switches=float(len(metrics["switches"])),
-            **{name: _number(value) for name, value in values.items()},
+            **{name: _number(metrics[name]) for name in names},
         )
 
+    def beside(self, oracle: Cell) -> Cell:
+        """Return the cell with its regret."""
+        return replace(self, regret=self.ate_m / oracle.ate_m - 1.0)
 
-def judge(story: str, seed: int, strategy: str, estimate: Trajectory, truth: Trajectory) -> Cell:
-    """Return the numbers of a trajectory that no run gave."""
-    rate = correct_rate(estimate, truth, limit_m=_LIMIT_M, limit_rad=float(_LIMIT_RAD))
-    return Cell(
-        story=story,
-        seed=seed,
-        strategy=strategy,
-        ate_m=absolute_errors(estimate, truth, _GAP_S).rmse_m,
-        correct_rate=rate,
-        coverage=1.0,
-        switches=0.0,
-        false_switches=0.0,
-    )
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judge:
+    """How a trajectory that no run gave is judged, as the runs are."""
+
+    limits: CorrectLimits
+    segment_m: float
+
+    def cell(
+        self, story: str, seed: int, strategy: str, estimate: Trajectory, truth: Trajectory
+    ) -> Cell:
+        """Return its numbers; it has a pose wherever it was asked."""
+        segments = segment_errors(estimate, truth, _GAP_S, self.segment_m)
+        nan = float("nan")
+        return Cell(
+            story=story,
+            seed=seed,
+            strategy=strategy,
+            coverage=1.0,
+            correct_rate=correct_rate(estimate, truth, self.limits),
+            segment_m=root_mean_square(segments.trans_m),
+            ate_m=absolute_errors(estimate, truth, _GAP_S).rmse_m,
+            ate_rot_rad=nan,
+            length_ratio=nan,
+            switches=nan,
+            false_switches=nan,
+            regret=0.0,
+        )
 
 
 def mean(cells: Sequence[Cell]) -> list[Cell]:
     """Return the means over seeds, one per story and strategy."""
+    return [_over(group, np.mean) for group in _groups(cells)]
+
+
+def deviation(cells: Sequence[Cell]) -> list[Cell]:
+    """Return the standard deviations over seeds, one per story and strategy (0 of one seed)."""
+    return [_over(group, np.std) for group in _groups(cells)]
+
+
+def rows_of(cells: Iterable[Cell]) -> Iterator[list[str | float | None]]:
+    """Yield the cells as rows of a table, their field names first."""
+    names = [field.name for field in fields(Cell)]
+    yield [*names]
+    for cell in cells:
+        yield [getattr(cell, name) for name in names]
+
+
+def _groups(cells: Sequence[Cell]) -> list[list[Cell]]:
     groups: dict[tuple[str, str], list[Cell]] = {}
     for cell in cells:
         groups.setdefault((cell.story, cell.strategy), []).append(cell)
+    return [*groups.values()]
+
+
+def _over(group: Sequence[Cell], reduce: Callable[[list[float]], Any]) -> Cell:
     numbers = [field.name for field in fields(Cell) if field.type == "float"]
-    return [
-        Cell(
-            story=story,
-            seed=None,
-            strategy=strategy,
-            **{name: float(np.mean([getattr(one, name) for one in group])) for name in numbers},
-        )
-        for (story, strategy), group in groups.items()
-    ]
+    values: dict[str, Any] = {
+        name: float(reduce([getattr(one, name) for one in group])) for name in numbers
+    }
+    return replace(group[0], **values, seed=None)
 
 
 def _number(value: float | None) -> float:

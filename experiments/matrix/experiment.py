@@ -1,29 +1,47 @@
-"""The experiment `matrix`: story x strategy x seed.
+"""The experiment `matrix`: stories x strategies x seeds. The experiment `tour` is one of these.
 
-`conf/experiment/matrix.yaml` says how it is called, `experiments/matrix.md` what was found.
+`conf/experiment/matrix.yaml` and `tour.yaml` say how they are called, `experiments/matrix.md` and
+`tour.md` what was found.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import csv
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-
-from sceneslam.experiments.matrix.cell import Cell, Strategy, judge, mean
+from sceneslam.evaluation.correctness import CorrectLimits
+from sceneslam.evaluation.figure_paths import draw_paths
+from sceneslam.experiments.matrix.cell import Cell, Judge, deviation, mean, rows_of
 from sceneslam.experiments.matrix.figure import draw_errors, draw_sweep
 from sceneslam.experiments.matrix.oracle import best_of
+from sceneslam.experiments.matrix.promises import Promises
 from sceneslam.experiments.matrix.sweep import Grid, sweep
-from sceneslam.types.experiment import Figure, Outcome, Relation, RunTrials, Table, Trial, Verdict
-from sceneslam.types.ranges import check_above, check_among, check_between, check_least, check_some
-from sceneslam.types.run import HANDOVERS
+from sceneslam.types.experiment import Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.ranges import check_above, check_among, check_least, check_some
 from sceneslam.types.trajectory import Trajectory
 
-_ORACLE = Strategy(name="oracle")
+ORACLE = "oracle"
+_COLUMNS = {  # of the table: (field, factor, digits)
+    "coverage [%]": ("coverage", 100.0, 1),
+    "correct [%]": ("correct_rate", 100.0, 1),
+    "error per 10 m [cm]": ("segment_m", 100.0, 2),
+    "ATE [cm]": ("ate_m", 100.0, 2),
+    "switches": ("switches", 1.0, 1),
+    "false": ("false_switches", 1.0, 1),
+    "regret": ("regret", 1.0, 2),
+}
 
 
 class MatrixExperiment:
-    """Compares hand-overs with every module alone and with an oracle."""
+    """Compares strategies with every module alone and with an oracle.
+
+    A strategy is what it overrides in the configuration; a module alone is asked for in every scene
+    of the table `scenes`, with the overrides `alone`.
+    """
 
     def __init__(
         self,
@@ -31,103 +49,110 @@ class MatrixExperiment:
         stories: Sequence[str],
         seeds: Sequence[int],
         modules: Sequence[str],
-        handovers: Sequence[str],
-        judged: str,
-        regret_limit: float,
-        thresholds: Sequence[float],
-        hystereses: Sequence[float],
-        windows_s: Sequence[float],
+        scenes: Mapping[str, Sequence[str]],
+        alone: Sequence[str],
+        strategies: Mapping[str, Sequence[str]],
+        piece_s: float,
+        correct_limits: Mapping[str, float],
+        segment_m: float,
+        promises: Mapping[str, Any],
+        votes: Mapping[str, Sequence[float]] | None,
     ) -> None:
-        check_some(stories=stories, seeds=seeds, modules=modules, handovers=handovers)
-        check_some(thresholds=thresholds, hystereses=hystereses, windows_s=windows_s)
-        check_among(HANDOVERS, handovers=handovers)
-        check_among(handovers, judged=judged)
-        check_least(0, seeds=seeds, hystereses=hystereses, windows_s=windows_s)
-        check_between(0, 255, thresholds=thresholds)
-        check_above(0, regret_limit=regret_limit)
-        self._places = [(story, seed) for story in stories for seed in seeds]
-        self._alone = [Strategy(name=f"{key} alone", module=key) for key in modules]
-        self._strategies = [
-            *self._alone,
-            *(Strategy(name=kind, handover=kind) for kind in handovers),
-        ]
-        self._judged, self._regret_limit = judged, regret_limit
-        self._grid = Grid(thresholds=thresholds, hystereses=hystereses, windows_s=windows_s)
+        check_some(stories=stories, seeds=seeds, modules=modules, strategies=strategies)
+        check_least(0, seeds=seeds)
+        check_above(0, piece_s=piece_s, segment_m=segment_m)
+        self._places = list(product(stories, seeds))
+        self._alone = [f"{key} alone" for key in modules]
+        tables = {key: ", ".join(f"{scene}: [{key}]" for scene in scenes) for key in modules}
+        self._strategies = {
+            **{f"{key} alone": [*alone, f"scenes={{{tables[key]}}}"] for key in modules},
+            **strategies,
+        }
+        self._piece_s = piece_s
+        self._judge = Judge(limits=CorrectLimits(**correct_limits), segment_m=segment_m)
+        self._promises = Promises(**promises)
+        check_among([*strategies], judged=self._promises.judged)
+        self._grid = None if votes is None else Grid(**votes)
 
     def run(self, run_trials: RunTrials, folder: Path) -> Verdict:
-        """Run every cell; return the table over stories and what holds of `rewind`."""
-        pairs = [(place, strategy) for place in self._places for strategy in self._strategies]
-        outcomes = list(run_trials(_trial(*pair) for pair in pairs))
-        cells: list[Cell] = []
+        """Run every cell; return the table over stories and what holds of the judged strategy."""
+        pairs = list(product(self._places, self._strategies))
+        outcomes = list(run_trials([self._trial(*pair) for pair in pairs]))
         count = len(self._strategies)
-        for number, (story, seed) in enumerate(self._places):
-            group = outcomes[number * count : (number + 1) * count]
-            cells += [
-                Cell.of(story, seed, strategy.name, one)
-                for strategy, one in zip(self._strategies, group, strict=True)
-            ]
-            cells.append(self._oracle(story, seed, group))
-        means = mean(cells)
-        draw_errors(folder / "errors.png", means)
-        draw_sweep(folder / "sweep.png", sweep(outcomes, self._grid))
+        groups = [
+            dict(zip(self._strategies, outcomes[k * count : (k + 1) * count], strict=True))
+            for k in range(len(self._places))
+        ]
+        oracles = [self._oracle(group) for group in groups]
+        cells = [
+            cell
+            for place, group, oracle in zip(self._places, groups, oracles, strict=True)
+            for cell in self._cells(*place, group, oracle)
+        ]
+        with (folder / "cells.csv").open("w", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows(rows_of(cells))
         return Verdict(
-            figures=list(self._figures(means)),
-            table=_table(means),
-            pictures={
-                "errors.png": "The error of every strategy, story by story.",
-                "sweep.png": "Which changes a threshold, hysteresis and window confirm.",
-            },
+            figures=list(self._promises.figures(cells, self._alone)),
+            table=_table(mean(cells), deviation(cells)),
+            pictures=self._draw(folder, cells, groups[0], oracles[0], outcomes),
         )
 
-    def _oracle(self, story: str, seed: int, group: Sequence[Outcome]) -> Cell:
-        truth = Trajectory.read_tum(group[0].folder / "groundtruth.tum")
-        alone = [outcome.trajectory for outcome in group[: len(self._alone)]]
-        return judge(story, seed, _ORACLE.name, best_of(alone, truth), truth)
+    def _trial(self, place: tuple[str, int], strategy: str) -> Trial:
+        story, seed = place
+        name = f"{story}/{strategy.replace(' ', '_')}/{seed}"
+        overrides = (f"story={story}", f"seed={seed}", *self._strategies[strategy])
+        return Trial(name=name, overrides=overrides)
 
-    def _figures(self, means: Sequence[Cell]) -> Iterator[Figure]:
-        regrets = []
-        for story in dict.fromkeys(cell.story for cell in means):
-            of = {cell.strategy: cell for cell in means if cell.story == story}
-            ours, oracle = of[self._judged], of[_ORACLE.name]
-            yield Figure(
-                name=f"{story}: Correct Rate of {self._judged}, and of the best module alone",
-                value=ours.correct_rate,
-                relation=Relation.AT_LEAST,
-                bound=max(of[one.name].correct_rate for one in self._alone),
-            )
-            regrets.append(ours.ate_m / oracle.ate_m - 1.0)
-            if story == "flicker":
-                yield _at_most("flicker: switches", ours.switches, 0.0)
-        yield _at_most(
-            "regret against the oracle, mean", float(np.mean(regrets)), self._regret_limit
-        )
+    def _oracle(self, group: Mapping[str, Outcome]) -> Trajectory:
+        alone = [group[name].trajectory for name in self._alone]
+        best: Trajectory = best_of(alone, _truth(group), self._piece_s)
+        return best
+
+    def _cells(
+        self, story: str, seed: int, group: Mapping[str, Outcome], oracle: Trajectory
+    ) -> Iterator[Cell]:
+        best = self._judge.cell(story, seed, ORACLE, oracle, _truth(group))
+        most = max(outcome.metrics["observations"] for outcome in group.values())
+        for name, outcome in group.items():
+            yield Cell.of(story, seed, name, outcome, observations=most).beside(best)
+        yield best
+
+    def _draw(
+        self,
+        folder: Path,
+        cells: Sequence[Cell],
+        group: Mapping[str, Outcome],
+        oracle: Trajectory,
+        outcomes: Sequence[Outcome],
+    ) -> dict[str, str]:
+        """Draw the pictures; return them with their captions."""
+        draw_errors(folder / "errors.png", mean(cells))
+        paths = {**{name: one.trajectory for name, one in group.items()}, ORACLE: oracle}
+        draw_paths(folder / "paths.png", paths, _truth(group))
+        pictures = {
+            "errors.png": "The error of every strategy, story by story.",
+            "paths.png": "Every strategy's path from above: the first story, the first seed.",
+        }
+        if self._grid is not None:
+            draw_sweep(folder / "sweep.png", sweep(outcomes, self._grid))
+            pictures["sweep.png"] = "Which changes a threshold, hysteresis and window confirm."
+        return pictures
 
 
-def _at_most(name: str, value: float, bound: float) -> Figure:
-    return Figure(name=name, value=value, relation=Relation.AT_MOST, bound=bound)
+def _truth(group: Mapping[str, Outcome]) -> Trajectory:
+    first = next(iter(group.values()))
+    return Trajectory.read_tum(first.folder / "groundtruth.tum")
 
 
-def _trial(place: tuple[str, int], strategy: Strategy) -> Trial:
-    story, seed = place
-    overrides = [f"story={story}", f"seed={seed}", f"policy.handover={strategy.handover}"]
-    if strategy.module:
-        overrides.append(f"scenes={{Bright: [{strategy.module}], Dark: [{strategy.module}]}}")
-    name = f"{story}/{strategy.name.replace(' ', '_')}/{seed}"
-    return Trial(name=name, overrides=tuple(overrides))
+def _table(means: Sequence[Cell], deviations: Sequence[Cell]) -> Table:
+    """Return mean and deviation over the seeds, a row per story and strategy."""
 
+    def shown(at: int, name: str, scale: float, digits: int) -> str:
+        middle, spread = (scale * getattr(one[at], name) for one in (means, deviations))
+        return "-" if math.isnan(middle) else f"{middle:.{digits}f} ± {spread:.{digits}f}"
 
-def _table(means: Sequence[Cell]) -> Table:
-    columns = ("story", "strategy", "ATE [cm]", "correct [%]", "coverage [%]", "switches", "false")
     rows = [
-        (
-            one.story,
-            one.strategy,
-            100 * one.ate_m,
-            100 * one.correct_rate,
-            100 * one.coverage,
-            one.switches,
-            one.false_switches,
-        )
-        for one in means
+        (one.story, one.strategy, *(shown(at, *how) for how in _COLUMNS.values()))
+        for at, one in enumerate(means)
     ]
-    return Table(columns=columns, rows=rows)
+    return Table(columns=("story", "strategy", *_COLUMNS), rows=rows)

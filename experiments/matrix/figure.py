@@ -33,7 +33,7 @@ def draw_errors(path: Path, means: Sequence[Cell]) -> None:
     axes.set_xticks(_TICKS_CM, [f"{tick:g}" for tick in _TICKS_CM])
     axes.minorticks_off()
     errors_cm = [100 * cell.ate_m for cell in means]
-    axes.set_xlim(0.8 * min(errors_cm), 1.2 * max(errors_cm))
+    axes.set_xlim(0.8 * np.nanmin(errors_cm), 1.2 * np.nanmax(errors_cm))
     look.style(axes, x_label="ATE RMSE [cm]")
     figure.legend(loc="outside upper center", ncols=3, frameon=False, fontsize=11)
     look.save(figure, path)

@@ -10,9 +10,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.bus.scene_filter import SceneFilter
+from sceneslam.bus.scene_filter import WindowFilter
 from sceneslam.modules.detectors.grey_mean import GreyMean
 from sceneslam.types.experiment import Outcome
+from sceneslam.types.ranges import check_between, check_least, check_some
 
 Votes = Sequence[tuple[int, NDArray[np.float64] | None]]  # stamp [ns], mean of grey
 
@@ -35,6 +36,12 @@ class Grid:
     thresholds: Sequence[float]
     hystereses: Sequence[float]
     windows_s: Sequence[float]
+
+    def __post_init__(self) -> None:
+        for name in ("thresholds", "hystereses", "windows_s"):
+            check_some(**{name: getattr(self, name)})
+        check_between(0, 255, thresholds=self.thresholds)
+        check_least(0, hystereses=self.hystereses, windows_s=self.windows_s)
 
 
 def sweep(outcomes: Sequence[Outcome], grid: Grid) -> list[Setting]:
@@ -69,6 +76,6 @@ def _read(outcome: Outcome) -> Votes:
 
 def _changes(votes: Votes, threshold: float, hysteresis: float, window_s: float) -> int:
     detector = GreyMean(threshold=threshold, hysteresis=hysteresis, scenes=("Bright", "Dark"))
-    scenes = SceneFilter(window_s=window_s, first_window_s=0.0)
+    scenes = WindowFilter(window_s=window_s, first_window_s=0.0)
     confirmed = [scenes.update(detector.decide(*vote)) for vote in votes]
     return sum(one is not None for one in confirmed) - 1

@@ -62,6 +62,7 @@ def bases(folder: Path) -> list[Base]:
             "recorded", "slam.only", "slam@slam.only=recorded", f"slam.only.path={folder}/path.tum"
         ),
         _single("two_rooms", "source"),
+        _single("building", "source", "source=building"),
         *(
             _single(
                 name,
@@ -79,6 +80,7 @@ def bases(folder: Path) -> list[Base]:
         ),
         _single("manual", "detector", "detector=manual", "+scenes={Bright:[only],Dark:[only]}"),
         _single("one_scene", "detector"),
+        _single("learned", "detector", "detector=learned", "+scenes={Bright:[only],Dark:[only]}"),
         _single(
             "rules",
             "detector",
@@ -94,7 +96,9 @@ def bases(folder: Path) -> list[Base]:
             *_CAMERA,
         ),
         _single("faults", "effects", "effects=faults"),
+        _single("liars", "effects", "effects=liars"),
         _single("policy", "policy"),
+        _single("bayes", "policy", "policy=bayes"),
         _single("atlas", "atlas"),
         _single("recording", "run"),
         _single("live", "run", "run=live"),

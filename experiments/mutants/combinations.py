@@ -11,6 +11,7 @@ from sceneslam.experiments.mutants.bases import Base, bases
 
 _SENSORS = {  # source -> what it has
     "two_rooms": "image depth odometry",
+    "building": "image depth odometry",
     "tum_rgbd": "image depth",
     "rosbag": "image depth scan odometry",
     "mcap": "image depth scan odometry",

@@ -2,36 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from sceneslam.experiments.paper.images import draw_images
 from sceneslam.experiments.paper.runs import events_of, keep_figure, number
 from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
 from sceneslam.types.ranges import check_above, check_least
 
-Row = tuple[str, float, float, float | None, float, float]
+Row = tuple[str, float, float, float | None, float, float, float | None]
 
 
 class DetectionExperiment:
     """Runs the detector alone; every module is dead reckoning, which costs nothing."""
 
-    def __init__(self, *, window_s: float, late_max_s: float, vote_max_ms: float) -> None:
+    def __init__(
+        self,
+        *,
+        window_s: float,
+        late_max_s: float,
+        vote_max_ms: float,
+        paper_s: Sequence[float],
+    ) -> None:
         check_above(0, vote_max_ms=vote_max_ms)
-        check_least(0, window_s=window_s, late_max_s=late_max_s)
+        check_least(0, window_s=window_s, late_max_s=late_max_s, paper_s=paper_s)
+        self._paper_s = paper_s
         self._window_s, self._late_max_s, self._vote_max_ms = window_s, late_max_s, vote_max_ms
 
     def run(self, run_trials: RunTrials, folder: Path) -> Verdict:
         """Return when every change was confirmed, how late, and what a vote costs."""
         (outcome,) = run_trials([Trial(name="detection")])
         keep_figure(outcome, "grey_mean", folder / "grey_mean.png")
+        rows = self._rows(outcome)
+        draw_images(folder / "images.png", outcome.folder, list(self._shown_ns(outcome)))
         columns = ("confirmed", "first image [s]", "confirmed at [s]", "after the true change [s]")
         grey = (f"grey {self._window_s:g} s before", "grey when confirmed")
         return Verdict(
             figures=list(self._figures(outcome)),
-            table=Table(columns=(*columns, *grey), rows=self._rows(outcome)),
-            pictures={"grey_mean.png": "The mean of grey, the threshold, and confirmed changes."},
+            table=Table(columns=(*columns, *grey, "the paper's second"), rows=rows),
+            pictures={
+                "grey_mean.png": "The mean of grey, the threshold, and confirmed changes.",
+                "images.png": "The camera's image before and after each change, and where it was.",
+            },
         )
 
     def _figures(self, outcome: Outcome) -> Iterator[Figure]:
@@ -62,7 +78,18 @@ class DetectionExperiment:
                 delays_s.get(event["stamp_ns"]),
                 grey(event["since_ns"] - round(self._window_s * 1e9)),
                 grey(event["stamp_ns"]),
+                paper_s,
             )
-            for event in events_of(outcome, "scene")
-            if event["previous"] is not None
+            for event, paper_s in zip_longest(_changes(outcome), self._paper_s)
+            if event is not None
         ]
+
+    def _shown_ns(self, outcome: Outcome) -> Iterator[int]:
+        """Yield, of every change, an instant before it and the one at which it was confirmed."""
+        for event in _changes(outcome):
+            yield event["since_ns"] - round(self._window_s * 1e9)
+            yield event["stamp_ns"]
+
+
+def _changes(outcome: Outcome) -> list[Mapping[str, Any]]:
+    return [event for event in events_of(outcome, "scene") if event["previous"] is not None]

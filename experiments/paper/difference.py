@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +16,15 @@ from sceneslam.types.ranges import check_above, check_some
 
 
 class DifferenceExperiment:
-    """Compares each story's switched run with one module that has all lights on."""
+    """Compares the switched run of stories with one module that has all lights on.
 
-    def __init__(self, *, stories: Sequence[str], lit_module: str, difference_max_m: float) -> None:
-        check_some(stories=stories)
+    `difference_max_m` names the stories, each with its bound.
+    """
+
+    def __init__(self, *, lit_module: str, difference_max_m: Mapping[str, float]) -> None:
+        check_some(difference_max_m=difference_max_m)
         check_above(0, difference_max_m=difference_max_m)
-        self._stories, self._lit_module = stories, lit_module
+        self._stories, self._lit_module = [*difference_max_m], lit_module
         self._difference_max_m = difference_max_m
 
     def run(self, run_trials: RunTrials, folder: Path) -> Verdict:
@@ -36,7 +39,9 @@ class DifferenceExperiment:
         found = {name: compare(a.trajectory, b.trajectory) for name, (a, b) in pairs.items()}
         draw_differences(folder / "difference.png", found)
         figures = [
-            Figure.at_most(f"{name}: largest difference", one.max_m, self._difference_max_m, "m")
+            Figure.at_most(
+                f"{name}: largest difference", one.max_m, self._difference_max_m[name], "m"
+            )
             for name, one in found.items()
         ]
         columns = ("story", "largest difference [cm]", "RMS [cm]", "poses compared")

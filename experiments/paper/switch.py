@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from sceneslam.evaluation import figure_style as look
 from sceneslam.experiments.paper.runs import keep_figure, number
+from sceneslam.experiments.paper.views import cloud_of, draw_third_person, modules_of, read_ply
 from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
 from sceneslam.types.ranges import check_above, check_among, check_least, check_some
 from sceneslam.types.run import HANDOVERS
@@ -31,6 +33,7 @@ class SwitchExperiment:
         """Return what each kind gives; the map of the first is kept as a figure."""
         outcomes = list(run_trials([self._trial(kind) for kind in self._handovers]))
         keep_figure(outcomes[0], "map", folder / "map.png")
+        _draw_map(outcomes[0], folder / "third_person.png")
         metrics = outcomes[0].metrics
         figures = [
             Figure.at_most(
@@ -44,7 +47,10 @@ class SwitchExperiment:
         return Verdict(
             figures=figures,
             table=Table(columns=(*columns, "max [cm]", "points"), rows=rows),
-            pictures={"map.png": "One map of both modules, and one trajectory."},
+            pictures={
+                "map.png": "One map of both modules, and one trajectory, from above.",
+                "third_person.png": "The same in the third person, with the robot at its end.",
+            },
         )
 
     def _trial(self, kind: str) -> Trial:
@@ -52,6 +58,19 @@ class SwitchExperiment:
         waits = self._startup_s.items() if kind == "cold" else ()
         starts = [f"++policy.startup_s.{key}={time_s}" for key, time_s in waits]
         return Trial(name=kind, overrides=(f"policy.handover={kind}", *starts))
+
+
+def _draw_map(outcome: Outcome, path: Path) -> None:
+    """Draw the points of every module in its colour, the path, and the robot."""
+    points, trajectory = outcome.folder / "map" / "points.ply", outcome.trajectory
+    if not points.is_file() or not len(trajectory):
+        return
+    rows = read_ply(points)
+    clouds = [
+        cloud_of(rows[rows["module"] == number], look.PALETTE[number], name)
+        for number, name in enumerate(modules_of(points))
+    ]
+    draw_third_person(path, clouds, {"path": trajectory}, [trajectory.T_world_base[-1]])
 
 
 def _row(kind: str, outcome: Outcome) -> tuple[str | float, ...]:

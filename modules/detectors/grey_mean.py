@@ -1,4 +1,4 @@
-"""The paper's scene detector: the mean of grey against a threshold (Sec. III-A)."""
+"""The paper's scene detector: the mean of grey against a threshold (Sec. III-B)."""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,11 +41,12 @@ class _Rule:
 
 
 class Rules:
-    """Votes for the first scene, in the rules' order, whose conditions all hold; else UNSURE.
+    """Votes for the first scene, in the rules' order, whose conditions all hold.
 
-    Each rule is `{scene: NAME, when: {FEATURE: [low, high], ...}}` with null for no limit; `when:
-    {}` always holds. The scene voted last keeps until its limits, wider by `hysteresis_ratio` of
-    themselves, are left, or a rule before it holds.
+    Each rule has a name of its own, by which an overlay can change it, and is `{scene: NAME, when:
+    {FEATURE: [low, high], ...}}` with null for no limit; a rule that is null is none. Where no rule
+    holds it votes for `otherwise` (null: UNSURE). The scene voted last keeps until its limits,
+    wider by `hysteresis_ratio` of themselves, are left, or a rule before it holds.
     """
 
     quantity = ""
@@ -53,7 +55,8 @@ class Rules:
     def __init__(
         self,
         features: Sequence[str],
-        rules: Sequence[Mapping[str, str | Limits]],
+        rules: dict[str, dict[str, Any] | None],
+        otherwise: str | None,
         hysteresis_ratio: float,
     ) -> None:
         if not features or not set(features) <= set(FEATURES) or len(set(features)) < len(features):
@@ -62,13 +65,18 @@ class Rules:
             )
         if not 0 <= hysteresis_ratio < 1:
             raise ConfigError("hysteresis_ratio", hysteresis_ratio, "0 to below 1")
-        if not rules:
-            raise ConfigError("rules", [], "one rule or more")
+        used = {name: rule for name, rule in rules.items() if rule is not None}
+        if not used:
+            raise ConfigError("rules", rules, "one rule or more that is not null")
+        if otherwise in ("", UNSURE):
+            raise ConfigError("otherwise", otherwise, f"a scene, not {UNSURE}, or null")
         self._features = tuple(features)
-        self._rules = [self._read(number, rule) for number, rule in enumerate(rules)]
+        self._rules = [self._read(f"rules.{name}", rule) for name, rule in used.items()]
+        self._otherwise = otherwise or UNSURE
         self._hysteresis_ratio = hysteresis_ratio
         self._voted: str | None = None
-        self.scenes = tuple(dict.fromkeys(rule.scene for rule in self._rules))
+        named = [*(rule.scene for rule in self._rules), *([otherwise] if otherwise else [])]
+        self.scenes = tuple(dict.fromkeys(named))
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
@@ -89,7 +97,7 @@ class Rules:
         return None if np.isnan(told).all() else told
 
     def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
-        """Return the vote; UNSURE where no rule holds, or one that comes first cannot be judged."""
+        """Return the vote; UNSURE where a rule that comes first cannot be judged."""
         scene = UNSURE if features is None else self._first(features)
         if scene == UNSURE:
             return SceneVote(stamp_ns=stamp_ns, scene=UNSURE)
@@ -107,14 +115,13 @@ class Rules:
                 return UNSURE
             if holds:
                 return rule.scene
-        return UNSURE
+        return self._otherwise
 
-    def _read(self, number: int, rule: Mapping[str, str | Limits]) -> _Rule:
-        key = f"rules[{number}]"
+    def _read(self, key: str, rule: Mapping[str, str | Limits]) -> _Rule:
         scene, when = rule.get("scene"), rule.get("when")
         if set(rule) != {"scene", "when"} or not isinstance(scene, str) or scene in ("", UNSURE):
             raise ConfigError(key, dict(rule), f"a scene, not {UNSURE}, and when")
-        if not isinstance(when, Mapping) or not set(when) <= set(self._features):
+        if not isinstance(when, Mapping) or not when or not set(when) <= set(self._features):
             raise ConfigError(f"{key}.when", when, f"limits of {', '.join(self._features)}")
         for name, limits in when.items():
             _check(f"{key}.when.{name}", limits)

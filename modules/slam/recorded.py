@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
+from sceneslam.types.input_files import given_path
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.recorded import RecordedTrajectory, read_recorded
@@ -37,7 +36,7 @@ class Recorded:
             raise ConfigError("startup_s", startup_s, "seconds, 0 or more")
         if not 1 <= gap_periods < np.inf:
             raise ConfigError("gap_periods", gap_periods, "1 or more")
-        recorded = _chosen(read_recorded(Path(path)), sequence)
+        recorded = _chosen(read_recorded(given_path(path)), sequence)
         T_frame_base = se3.inverse(_extrinsics(T_base_frame, recorded.frame))
         self._stamps_ns = recorded.trajectory.stamps_ns
         self._T_world_base = recorded.trajectory.T_world_base @ T_frame_base

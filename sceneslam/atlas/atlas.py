@@ -5,7 +5,6 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +12,12 @@ from numpy.typing import NDArray
 from sceneslam.atlas.fusion import fuse
 from sceneslam.atlas.revision import Revised, Told, revise
 from sceneslam.atlas.uncertainty import VELOCITY, WHEELS, Covariance, Step, propagate
+from sceneslam.interfaces import TrajectoryLog
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import HybridMap, MapLayers
-from sceneslam.types.run import Session
+from sceneslam.types.run import BRIDGED, Session, SessionStart
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
-
-BRIDGED = ""  # the module of a pose that no module gave
 
 
 @dataclass(slots=True)
@@ -82,15 +80,6 @@ class _Path:
             del values[keep:]
 
 
-class Start(NamedTuple):
-    """Where a session begins in the trajectory."""
-
-    row: int
-    session: int
-    module: str
-    stamp_ns: int
-
-
 class Atlas:
     """Keeps one trajectory and one map in `map` through every change of module."""
 
@@ -101,14 +90,23 @@ class Atlas:
         self._sessions: list[_Open] = []
         self._online = _Path()  # as told at the time
         self._path = _Path()  # as known now
+        self._journal: TrajectoryLog | None = None
+
+    def keep_journal(self, journal: TrajectoryLog) -> None:
+        """Note there, from now on, what it is told: the same, told again, gives the same."""
+        self._journal = journal
 
     def begin_session(self, module: str, T_map_local: Transform) -> int:
         """Open a session of a module that was placed in the map (Eq. 1); return its number."""
+        if self._journal is not None:
+            self._journal.add_session(module, T_map_local)
         self._sessions.append(_Open(module, T_map_local))
         return len(self._sessions) - 1
 
     def add_local(self, stamp_ns: int, T_local_base: Transform) -> None:
         """Add a pose to the current session's own trajectory."""
+        if self._journal is not None:
+            self._journal.add_local(stamp_ns, T_local_base)
         self._sessions[-1].stamps_ns.append(stamp_ns)
         self._sessions[-1].poses.append(T_local_base)
 
@@ -123,12 +121,16 @@ class Atlas:
 
         `covariance` is that of T_local_base, where the module tells it.
         """
+        if self._journal is not None:
+            self._journal.add_pose(stamp_ns, T_map_base, module, covariance)
         session = len(self._sessions) - 1
         self._online.add(stamp_ns, T_map_base, module, session, covariance)
         self._path.add(stamp_ns, T_map_base, module, session, covariance)
 
     def rewind(self, stamp_ns: int) -> None:
         """Take the poses from an instant on back, for better ones; `online` keeps them."""
+        if self._journal is not None:
+            self._journal.add_rewind(stamp_ns)
         self._path.cut(stamp_ns)
 
     def close_session(self, session: int, layers: MapLayers, revised: Trajectory) -> None:
@@ -136,6 +138,8 @@ class Atlas:
 
         `revised` is empty where the module stands by what it told.
         """
+        if self._journal is not None:
+            self._journal.add_end(session, revised)
         self._sessions[session].layers, self._sessions[session].revised = layers, revised
 
     def pose_at(self, stamp_ns: int) -> Transform | None:
@@ -160,13 +164,16 @@ class Atlas:
         stamps_ns = np.array(self._path.stamps_ns, np.int64)
         return Trajectory(stamps_ns=stamps_ns, T_world_base=self._revise().T_map_base)
 
-    def session_starts(self) -> list[Start]:
+    def session_starts(self) -> list[SessionStart]:
         """Return, per session, the first pose of the trajectory that its module gave."""
         path = self._path
-        starts: dict[int, Start] = {}
-        for row, told in enumerate(zip(path.sessions, path.modules, path.stamps_ns, strict=True)):
-            if told[1] != BRIDGED:
-                starts.setdefault(told[0], Start(row, *told))
+        starts: dict[int, SessionStart] = {}
+        told = zip(path.sessions, path.modules, path.stamps_ns, strict=True)
+        for row, (session, module, stamp_ns) in enumerate(told):
+            if module != BRIDGED and session not in starts:
+                starts[session] = SessionStart(
+                    row=row, session=session, module=module, stamp_ns=stamp_ns
+                )
         return list(starts.values())
 
     def covariances(self, has_odometry: bool) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
+from sceneslam.types.files import replacing
 from sceneslam.types.maps import GridLayer, HybridMap, PoseGraphLayer
 from sceneslam.types.trajectory import Trajectory
 
@@ -62,7 +63,7 @@ def save_pose_graph(graph: PoseGraphLayer, path: Path) -> None:
     """Write the graph as g2o, information in the order translation, rotation vector (as gtsam
     reads it), and its vertices with their stamps as TUM beside it.
     """
-    with path.open("w") as file:
+    with replacing(path) as file:
         for row, numbers in enumerate(_quat_rows(graph.T_world_base)):
             file.write(f"VERTEX_SE3:QUAT {row} {numbers}\n")
         upper = graph.information[:, *np.triu_indices(6)].tolist()
@@ -82,18 +83,19 @@ def save_grid(grid: GridLayer, path: Path) -> None:
     image[occupied > OCCUPIED_THRESHOLD] = 0
     image[occupied < FREE_THRESHOLD] = 254
     rows, columns = grid.log_odds.shape
-    with path.with_suffix(".pgm").open("wb") as file:
+    with replacing(path.with_suffix(".pgm"), "wb") as file:
         file.write(f"P5\n{columns} {rows}\n255\n".encode())
         file.write(np.flipud(image).tobytes())
     x_m, y_m = grid.origin_xy_m
-    path.write_text(
-        f"image: {path.with_suffix('.pgm').name}\n"
-        f"resolution: {grid.resolution_m:g}\n"
-        f"origin: [{x_m:.6f}, {y_m:.6f}, 0.0]\n"
-        "negate: 0\n"
-        f"occupied_thresh: {OCCUPIED_THRESHOLD}\n"
-        f"free_thresh: {FREE_THRESHOLD}\n"
-    )
+    with replacing(path) as file:
+        file.write(
+            f"image: {path.with_suffix('.pgm').name}\n"
+            f"resolution: {grid.resolution_m:g}\n"
+            f"origin: [{x_m:.6f}, {y_m:.6f}, 0.0]\n"
+            "negate: 0\n"
+            f"occupied_thresh: {OCCUPIED_THRESHOLD}\n"
+            f"free_thresh: {FREE_THRESHOLD}\n"
+        )
 
 
 def _axes(points: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
@@ -110,7 +112,7 @@ def _write_ply(path: Path, columns: Mapping[str, NDArray[Any]], modules: Sequenc
     header += [f"comment module {i} {name}" for i, name in enumerate(modules)]
     header += [f"element vertex {len(rows)}"]
     header += [f"property {word} {name}" for name, (_, word) in fields]
-    with path.open("wb") as file:
+    with replacing(path, "wb") as file:
         file.write(("\n".join([*header, "end_header"]) + "\n").encode())
         file.write(rows.tobytes())
 

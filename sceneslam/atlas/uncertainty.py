@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
+from sceneslam.types.files import replacing
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import parse_stamp_ns
 
@@ -113,7 +114,7 @@ def write_covariances(
     Of x y z [m] and the rotation vector [rad] in `base`: T_true = T_told exp(xi).
     """
     rows = covariances[:, *np.triu_indices(6)].tolist()
-    with path.open("w") as file:
+    with replacing(path) as file:
         file.write("# stamp_s xx xy xz xr xp xw yy yz yr yp yw zz zr zp zw rr rp rw pp pw ww\n")
         for stamp_ns, row in zip(stamps_ns.tolist(), rows, strict=True):
             numbers = " ".join(f"{value:.6e}" for value in row)

@@ -3,27 +3,83 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter_ns
+from typing import Protocol
 
-from sceneslam.atlas.atlas import Atlas
-from sceneslam.bus.candidates import Candidates
-from sceneslam.bus.changeover import Changeover, Outcome, Plan
+from statemachine import State, StateMachine
+
+from sceneslam.bus.changeover import Candidates, Changeover, Outcome, Plan
 from sceneslam.bus.decision import Action, Health, Situation, Verdict, decide
 from sceneslam.bus.decision_log import DecisionLog
 from sceneslam.bus.estimator import Estimator
 from sceneslam.bus.events import EventLog
-from sceneslam.bus.machine import BusMachine
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.reckoning import Reckoning
 from sceneslam.bus.runner import Runner
 from sceneslam.bus.watch import Watch
-from sceneslam.interfaces import Detector, SlamModule
+from sceneslam.interfaces import BackEnd, Detector, SlamModule
 from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 
 _log = logging.getLogger(__name__)
+
+
+class Guards(Protocol):
+    """What the machine asks before it takes a failure's way out."""
+
+    def candidate_left(self) -> bool:
+        """Tell whether another module could still be started."""
+        ...
+
+    def fallback_active(self) -> bool:
+        """Tell whether a fallback runs in place of the module that could not."""
+        ...
+
+
+class BusMachine(StateMachine):
+    """Success and failure lead from state to state (Fig. 2); `stop` ends the run from anywhere.
+
+    | state     | success          | failure                                             |
+    |-----------|------------------|-----------------------------------------------------|
+    | init      | start            | terminate                                           |
+    | start     | run              | start with the next candidate; run without while one |
+    |           |                  | may come back, terminate if none                    |
+    | run       | - (it goes on)   | switch: the scene changed or the module is unhealthy |
+    | switch    | run              | run with the fallback, terminate if none            |
+
+    What a state does is said by the owner's `on_enter_STATE`, if it has one.
+    """
+
+    init = State(initial=True)
+    start = State()
+    run = State()
+    switch = State()
+    terminate = State(final=True)
+
+    success = init.to(start) | start.to(run) | switch.to(run)
+    failure = (
+        init.to(terminate)
+        | start.to(start, cond="candidate_left")
+        | start.to(run, cond="fallback_active")
+        | start.to(terminate)
+        | run.to(switch)
+        | switch.to(run, cond="fallback_active")
+        | switch.to(terminate)
+    )
+    stop = terminate.from_(init, start, run, switch)
+
+    def __init__(self, owner: Guards) -> None:
+        super().__init__(listeners=[owner])
+
+    @property
+    def state(self) -> str:
+        """Return the name of the state the machine is in."""
+        return str(next(iter(self.configuration)).id)
+
+
+_Step = Callable[[Observation], Outcome | None]  # None: the state goes on
 
 
 class Bus:
@@ -41,7 +97,7 @@ class Bus:
         scenes: Mapping[str, Sequence[str]],
         policy: Policy,
         rig: Rig,
-        atlas: Atlas,
+        back_end: BackEnd,
         log: EventLog,
         catch_up_steps: int | None = None,
     ) -> None:
@@ -52,15 +108,12 @@ class Bus:
             detector,
             rig,
             log,
-            window_s=policy.confirm_window_s,
-            first_window_s=policy.first_confirm_window_s,
+            scene_filter=policy.make_scene_filter(detector.scenes),
         )
         self._reckoning = Reckoning(policy, rig)
         self._estimator = Estimator(
-            policy=policy, rig=rig, atlas=atlas, log=log, has_choice=len(modules) > 1
+            policy=policy, rig=rig, back_end=back_end, log=log, has_choice=len(modules) > 1
         )
-        self._machine = BusMachine(self)
-        self._state = self._machine.state
         waits = catch_up_steps is None  # a recording does, a robot does not
         self._candidates = Candidates(scenes, self.runners, policy.retry_s, waits=waits)
         self._changeover = Changeover(
@@ -72,6 +125,10 @@ class Bus:
             catch_up_steps=catch_up_steps,
         )
         self._decisions = DecisionLog(log)
+        self._do: _Step  # what the state does with an observation ...
+        self._go_on: _Step  # ... and with the one that it was entered at
+        self._machine = BusMachine(self)
+        self._state = self._machine.state
 
     @property
     def detector_us(self) -> list[float]:
@@ -98,21 +155,20 @@ class Bus:
         began_ns = perf_counter_ns()
         spent_ns = self._spent_ns()
         self._watch.look(observation)
-        observation = self._reckoning.correct(observation)
-        if self._state == "run":
-            self._changeover.submit(observation)
+        observation = self._reckoning.correct(observation, self.active)
+        self._changeover.submit(observation)
         self._track(observation)
-        self._reckoning.learn(self._estimator.hold)
+        self._reckoning.learn(self._estimator.hold, self.active)
         outcome = self._do(observation)
         while outcome is not None:
             self._send(outcome.value, observation.stamp_ns)
-            outcome = self._enter(observation)
+            outcome = self._go_on(observation)
         own_ns = perf_counter_ns() - began_ns - (self._spent_ns() - spent_ns)
         self.bus_us.append(own_ns / 1e3 - self._watch.spent_us[-1])
 
     def close(self, stamp_ns: int) -> None:
         """End the run: shut the module down, then the detector. May be called twice."""
-        if self._state != "terminate":
+        if not self._machine.is_terminated:
             self._send("stop", stamp_ns)
         self._reckoning.close(stamp_ns, self._log)
         self._changeover.close()
@@ -129,37 +185,45 @@ class Bus:
         """Tell whether a module runs, though not the first choice, or will again."""
         return self._estimator.active is not None or bool(self._candidates.returning(self.scene))
 
-    # The states.
+    # What the states do.
 
-    def _do(self, observation: Observation) -> Outcome | None:
-        """Do what the state asks for at every observation; None while it goes on."""
-        if self._state == "init":
-            return self._init(observation.stamp_ns)
-        if self._state == "run":
-            return self._run(observation)
-        return self._changeover.go_on(observation.stamp_ns)
-
-    def _enter(self, observation: Observation) -> Outcome | None:
-        """Do what the state just entered does with the observation it was entered at."""
-        if self._state in ("start", "switch"):
-            return self._changeover.go_on(observation.stamp_ns)
-        return None
-
-    def _init(self, stamp_ns: int) -> Outcome | None:
+    def on_enter_init(self) -> None:
         """Wait for the first confirmed scene."""
+        self._do, self._go_on = self._await_scene, _wait
+
+    def on_enter_start(self) -> None:
+        """Start the scene's module, or the next candidate."""
+        self._do = self._go_on = self._change_over
+
+    def on_enter_run(self) -> None:
+        """Track, until the scene calls for another module or the active one is unhealthy."""
+        self._do, self._go_on = self._decide, _wait
+
+    def on_enter_switch(self) -> None:
+        """Hand over to the next module."""
+        self._do = self._go_on = self._change_over
+
+    def on_enter_terminate(self) -> None:
+        """Do nothing any more."""
+        self._do = self._go_on = _wait
+
+    def _await_scene(self, observation: Observation) -> Outcome | None:
         if not self._watch.is_working:
             return Outcome.FAILURE
         if self._watch.scene is None:
             return None
         self._candidates.serve(self._watch.scene)
         keys = self._candidates.of(self._watch.scene)
+        at_ns = observation.stamp_ns
         self._changeover.begin(
-            Plan(keys=keys, reason="first", at_ns=stamp_ns, since_ns=None, held_ns=0)
+            Plan(keys=keys, reason="first", at_ns=at_ns, since_ns=None, held_ns=0)
         )
         return Outcome.SUCCESS
 
-    def _run(self, observation: Observation) -> Outcome | None:
-        """Fail when the scene calls for another module or the active one is unhealthy."""
+    def _change_over(self, observation: Observation) -> Outcome | None:
+        return self._changeover.go_on(observation.stamp_ns)
+
+    def _decide(self, observation: Observation) -> Outcome | None:
         self._changeover.try_on(observation.stamp_ns)
         situation = self._look(observation)
         verdict = decide(self._policy, situation)
@@ -171,11 +235,11 @@ class Bus:
         elif verdict.action is Action.TRY:
             self._changeover.begin_trial(verdict.to[0], observation.stamp_ns)
         elif verdict.action is Action.SWITCH:
-            self._change(situation, verdict)
+            self._plan(situation, verdict)
             return Outcome.FAILURE
         return None
 
-    def _change(self, now: Situation, verdict: Verdict) -> None:
+    def _plan(self, now: Situation, verdict: Verdict) -> None:
         """Set out to carry a verdict out."""
         is_scene = verdict.reason == "scene"
         if is_scene:
@@ -220,7 +284,6 @@ class Bus:
             served_choices=self._candidates.of(self.scene),
             tried=self._candidates.tried,
             rounds=self._candidates.rounds,
-            switched_ns=self._changeover.switched_ns,
             trial=self._changeover.trial,
             retry_ns=self._candidates.retry_ns,
             may_return=bool(self._candidates.returning(self.scene)),
@@ -247,3 +310,8 @@ class Bus:
     def _spent_ns(self) -> int:
         """Return what all modules have cost so far."""
         return sum(runner.spent_ns for runner in self.runners.values())
+
+
+def _wait(observation: Observation) -> Outcome | None:
+    """Leave a state as it is until the next observation."""
+    return None

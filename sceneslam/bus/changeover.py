@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from sceneslam.bus.candidates import Candidates
 from sceneslam.bus.decision import Trial
 from sceneslam.bus.estimator import Estimator
 from sceneslam.bus.events import EventLog
@@ -15,9 +14,11 @@ from sceneslam.bus.handover import Handover
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.runner import Runner
 from sceneslam.types.errors import ModuleError
-from sceneslam.types.observation import Observation, TrackingStatus
+from sceneslam.types.observation import Observation
 
 _log = logging.getLogger(__name__)
+_TRIAL_NS = 1_000_000_000  # so long the first choice tracks beside the fallback, to come back
+_DOUBLINGS = 5  # of the time until the first choice is tried again
 
 
 class Outcome(Enum):
@@ -36,6 +37,60 @@ class Plan:
     at_ns: int
     since_ns: int | None  # when the scene that calls for it began, None where it is not the scene
     held_ns: int  # how long the active module had held its pose
+
+
+class Candidates:
+    """The table scene -> modules, and which of the served scene's modules were tried."""
+
+    def __init__(
+        self,
+        scenes: Mapping[str, Sequence[str]],
+        runners: Mapping[str, Runner],
+        retry_s: float,
+        *,
+        waits: bool,
+    ) -> None:
+        self.scene = ""  # the confirmed scene that the active module serves
+        self.tried: frozenset[str] = frozenset()
+        self.rounds = 0  # how often all were tried in vain
+        self.retry_ns = 0  # when the first choice may be tried again
+        self._scenes, self._runners, self._waits = scenes, runners, waits
+        self._retry_ns, self._retries = round(retry_s * 1e9), 0
+
+    def of(self, scene: str) -> tuple[str, ...]:
+        """Return the modules of a scene that can run, in the table's order.
+
+        Those that must be waited for are among them where that is allowed.
+        """
+        if self._waits:
+            return self.returning(scene)
+        return tuple(key for key in self._scenes.get(scene, ()) if self._runners[key].can_run)
+
+    def returning(self, scene: str) -> tuple[str, ...]:
+        """Return the modules of a scene that can run, at once or later."""
+        return tuple(key for key in self._scenes.get(scene, ()) if self._runners[key].may_return)
+
+    def serve(self, scene: str) -> None:
+        """Start with all modules of a scene."""
+        if scene != self.scene:
+            self.scene, self.rounds, self._retries = scene, 0, 0
+
+    def limit(self, keys: Sequence[str], rounds: int) -> None:
+        """Leave only some of the scene's modules to be tried."""
+        self.tried, self.rounds = frozenset(self._scenes[self.scene]) - frozenset(keys), rounds
+
+    def use(self, key: str) -> None:
+        """Note that a module is being tried."""
+        self.tried |= {key}
+
+    def left(self) -> list[str]:
+        """Return the modules that were not tried and have not failed, in the table's order."""
+        return [key for key in self.of(self.scene) if key not in self.tried]
+
+    def postpone(self, stamp_ns: int, *, is_in_vain: bool) -> None:
+        """Let the first choice be tried again after a while, longer after each vain trial."""
+        self._retries = self._retries + 1 if is_in_vain else 0
+        self.retry_ns = stamp_ns + (self._retry_ns << min(self._retries, _DOUBLINGS))
 
 
 @dataclass(slots=True, kw_only=True)
@@ -60,7 +115,6 @@ class Changeover:
         log: EventLog,
         catch_up_steps: int | None,
     ) -> None:
-        self.switched_ns = 0
         self._runners, self._candidates, self._estimator = runners, candidates, estimator
         self._policy, self._log, self._limit = policy, log, catch_up_steps
         self._run_began_ns: int | None = None
@@ -76,12 +130,8 @@ class Changeover:
         if self._trial is None:
             return Trial.NONE
         handover = self._trial.handover
-        is_tracking = handover is not None and handover.hold.status is TrackingStatus.TRACKING
-        if handover is None or not is_tracking or handover.hold.held_since_ns is None:
-            return Trial.RUNNING
-        held_ns = self._estimator.now_ns - handover.hold.held_since_ns
-        is_long = held_ns >= round(self._policy.trial_s * 1e9)
-        return Trial.PASSED if is_long else Trial.RUNNING
+        tracked_ns = -1 if handover is None else handover.tracked_ns(self._estimator.now_ns)
+        return Trial.PASSED if tracked_ns >= _TRIAL_NS else Trial.RUNNING
 
     def begin(self, plan: Plan) -> None:
         """Set out to change the module."""
@@ -192,7 +242,6 @@ class Changeover:
         if attempt.handover.is_lost and self._can_refuse():
             return self._refuse(runner, stamp_ns, "lost")
         self._estimator.accept(attempt.handover)
-        self.switched_ns = stamp_ns
         is_in_vain = self._plan.held_ns < round(self._policy.confirm_window_s * 1e9)
         self._candidates.postpone(stamp_ns, is_in_vain=is_in_vain)
         self._log_choice("decision", stamp_ns, attempt.key)

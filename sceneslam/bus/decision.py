@@ -46,7 +46,6 @@ class Situation:
     served_choices: tuple[str, ...]  # the same of `served_scene`
     tried: frozenset[str]  # of these, since the scene was confirmed or one held its pose long
     rounds: int  # how often all were tried in vain
-    switched_ns: int
     trial: Trial
     retry_ns: int  # when the first choice may be tried again
     may_return: bool  # a module that failed will be there again: going on without any is worth it
@@ -71,13 +70,13 @@ class Verdict:
     rounds: int = 0  # of vain tries, from now on
 
 
+_BLIND = 0.1  # of the patience: a guessed velocity errs more than ten times as wheels do
 GO_ON = Verdict(action=Action.GO_ON)
 
 
 def decide(policy: Policy, now: Situation) -> Verdict:
     """Return what to do at an observation: the scene first, then the module's health."""
-    has_dwelt = now.stamp_ns - now.switched_ns >= round(policy.dwell_s * 1e9)
-    if now.scene != now.served_scene and has_dwelt and now.choices:
+    if now.scene != now.served_scene and now.choices:
         if now.choices[0] == now.active and now.health is not Health.FAILED:
             return Verdict(action=Action.TELL, reason="scene")
         return Verdict(action=Action.SWITCH, to=now.choices, reason="scene")
@@ -121,5 +120,5 @@ def _decide_on_loss(policy: Policy, now: Situation) -> Verdict:
 
 
 def _patience_ns(policy: Policy, now: Situation) -> int:
-    patience_s = policy.blind_patience_s if now.is_blind else policy.lost_patience_s
-    return round(patience_s * 1e9)
+    share = _BLIND if now.is_blind else 1.0
+    return round(share * policy.lost_patience_s * 1e9)

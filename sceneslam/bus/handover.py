@@ -1,4 +1,4 @@
-"""A module on its way to become the active one: started, placed (Eq. 1), and caught up."""
+"""A session on its way to become the active one: started, placed (Eq. 1), and caught up."""
 
 from __future__ import annotations
 
@@ -7,19 +7,18 @@ from contextlib import contextmanager
 from dataclasses import replace
 from time import perf_counter_ns
 
-from sceneslam.atlas.atlas import BRIDGED
-from sceneslam.bus.hold import Hold
 from sceneslam.bus.memory import Memory, Moment
 from sceneslam.bus.pace import Pace
-from sceneslam.bus.runner import Runner
+from sceneslam.bus.session import Session
 from sceneslam.types import se3
-from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.rig import Rig
+from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
 
 
 class Handover:
-    """Leads a module from a remembered moment to now; nothing is changed until it is accepted.
+    """Leads a session from a remembered moment to now; nothing is changed until it is accepted.
 
     The module is placed at the pose of the last trusted moment at which it holds its own. From
     there on its poses are the robot's, and what it does not hold is bridged as ever.
@@ -27,40 +26,58 @@ class Handover:
 
     def __init__(
         self,
-        runner: Runner,
+        session: Session,
         memory: Memory,
         *,
         anchor: Moment,
-        hold: Hold,
         pace: Pace,
         scene: str,
         rig: Rig,
     ) -> None:
-        self.runner, self.anchor, self.hold = runner, anchor, hold
-        self._pace = pace
-        self._spared: list[Moment] = []  # since the last that the module was given ...
-        self._given_ns = anchor.stamp_ns  # ... and held its pose
-        self.began_at = anchor
+        assert session.runner is not None
+        self.session, self.runner, self.anchor = session, session.runner, anchor
         self.trail: list[Moment] = []  # all after the anchor, and itself if no module gave its pose
-        self.tracked: list[Tracking] = []  # what it said from the anchor on, where it holds
-        self.cost_ns = 0  # that it took so far; what is waited for between is not counted ...
-        self.first_cost_ns = 0  # ... and until the first pose
-        self._memory, self._bridge = memory, anchor.bridge.copy()
-        self._done_ns = anchor.stamp_ns - 1
-        self.is_placed = False
-        self._told: Transform | None = None  # the pose of the moment before, as told at the time
+        self.tracked: list[Tracking] = []  # what the module said from the anchor on, where it holds
+        self._pace, self._memory = pace, memory
+        self._spared = 0  # observations since the last that the module was given ...
+        self._given_ns = anchor.stamp_ns  # ... and held its pose
+        self._began_ns, self._done_ns = anchor.stamp_ns, anchor.stamp_ns - 1
+        self._reported: Transform | None = None  # the pose of the moment before, as known then
+        self._cost_ns = 0  # that it took so far; what is waited for between is not counted ...
+        self._first_cost_ns = 0  # ... and until the first pose
         with self._timed():
-            runner.activate(rig, scene)
+            self.runner.activate(rig, scene)
+
+    @property
+    def is_placed(self) -> bool:
+        """Tell whether the module has a place in the map."""
+        return self.session.is_placed
 
     @property
     def is_lost(self) -> bool:
         """Tell whether the module's last word was of no use."""
-        return self.hold.status is TrackingStatus.LOST or self.hold.is_suspect
+        hold = self.session.hold
+        return hold.status is TrackingStatus.LOST or hold.is_suspect
 
     @property
     def T_map_base(self) -> Transform | None:
         """Return the newest pose, None when there is none."""
         return self.trail[-1].T_map_base if self.trail else self.anchor.T_map_base
+
+    def tracked_ns(self, stamp_ns: int) -> int:
+        """Return for how long the module has tracked without a break."""
+        hold = self.session.hold
+        is_tracking = hold.status is TrackingStatus.TRACKING and hold.held_since_ns is not None
+        return stamp_ns - (hold.held_since_ns or 0) if is_tracking else -1
+
+    def cost(self, stamp_ns: int) -> dict[str, object]:
+        """Return what it took, for the log; never part of what is reproducible."""
+        return {
+            "module": self.runner.key,
+            "handover_ms": self._cost_ns / 1e6,
+            "first_pose_ms": self._first_cost_ns / 1e6,
+            "catch_up_s": (stamp_ns - self._began_ns) / 1e9,
+        }
 
     def advance(self, limit: int | None) -> bool:
         """Give the module up to `limit` observations; return whether it has caught up.
@@ -81,12 +98,12 @@ class Handover:
         What it did before was its trial, not the hand-over.
         """
         last = self.tracked[-1]
-        self.began_at, self.cost_ns = anchor, 0
+        self._began_ns, self._cost_ns = anchor.stamp_ns, 0
         self.anchor, self.trail, self.tracked = anchor, [], [last]
-        self._bridge = anchor.bridge.copy()
+        bridge = self.session.bridge = anchor.bridge.copy()
         with self._timed():
-            self.runner.place(self._bridge.T_map_base @ se3.inverse(last.T_local_base))
-        self.first_cost_ns = self.cost_ns
+            self.runner.place(bridge.T_map_base @ se3.inverse(last.T_local_base))
+        self._first_cost_ns = self._cost_ns
 
     @contextmanager
     def _timed(self) -> Iterator[None]:
@@ -94,63 +111,59 @@ class Handover:
         try:
             yield
         finally:
-            self.cost_ns += perf_counter_ns() - self._since_ns
+            self._cost_ns += perf_counter_ns() - self._since_ns
 
     def _go_on_to(self, moment: Moment) -> bool:
         """Give the module a moment's observation, or spare it that; return whether it was given."""
-        if not self.is_placed and moment.is_trusted:
-            self.anchor, self._bridge, self.trail = moment, moment.bridge.copy(), []
+        session, motion = self.session, self._motion_to(moment)
+        self._done_ns, self._reported = moment.stamp_ns, moment.T_map_base
+        if not session.is_placed and moment.is_trusted:
+            self.anchor, self.trail, session.bridge = moment, [], moment.bridge.copy()
         is_newest = moment is self._memory.newest
-        is_sure = self.is_placed and self.hold.is_held
+        is_sure = session.is_placed and session.hold.is_held
         if is_sure and not is_newest and self._pace.spares(moment.observation):
-            self._spare(moment)
+            self._pace.spare(moment.observation)
+            self._spared += 1
+            self._remember(moment, session.skip(moment.observation, motion))
             return False
-        tracking = self._ask(moment.observation)
-        spared, self._spared = self._spared, []
-        for each in spared:
-            self._note(each, self._bridge_to(each))
-        if tracking is None:
-            self._note(moment, self._bridge_to(moment))
-            self.is_placed = self.is_placed and not self.hold.is_suspect
-        else:
-            T_map_told = self._bridge.copy().predict(moment.observation, by_velocity=False)
-            T_map_base = self._place(moment, tracking)
-            if spared and T_map_told is not None and not self.hold.is_revised:
-                self._bend(len(spared), tracking, se3.inverse(T_map_told) @ T_map_base)
-            self._note(moment, T_map_base, tracking)
-            self._given_ns = moment.stamp_ns
+        self._ask(moment, motion)
         return True
 
-    def _spare(self, moment: Moment) -> None:
-        self._pace.spare(moment.observation)
-        self.hold.spare(moment.observation)
-        self._spared.append(moment)
-        self._done_ns = moment.stamp_ns
+    def _ask(self, moment: Moment, motion: Transform | None) -> None:
+        """Give the module a moment's observation, with the gyro samples that it was spared."""
+        session, given = self.session, moment.observation
+        was_placed = session.is_placed
+        if self.runner.can_use(given):
+            given = self._pace.give(given)
+        else:
+            self._pace.spare(given)
+        T_map_told = session.bridge.copy().predict(given, by_velocity=False)
+        found = session.advance(given, by_velocity=True, T_prev_curr=motion)
+        if session.fault is not None:
+            raise session.fault
+        spared, self._spared = self._spared, 0
+        if session.tracking is not None:
+            if not was_placed:
+                self.tracked = []
+                self._first_cost_ns = self._cost_ns + perf_counter_ns() - self._since_ns
+            self.tracked.append(session.tracking)
+            assert found.T_map_base is not None
+            if spared and T_map_told is not None and not session.hold.is_revised:
+                T_told_base = se3.inverse(T_map_told) @ found.T_map_base
+                self._bend(spared, session.tracking, T_told_base)
+            self._given_ns = moment.stamp_ns
+        self._remember(moment, replace(found, observation=moment.observation))
 
-    def _ask(self, observation: Observation) -> Tracking | None:
-        """Return what the module says, with the gyro samples since it was last given any."""
-        if self.runner.can_use(observation):
-            return self.hold.ask(self.runner, self._pace.give(observation))
-        self._pace.spare(observation)
-        return self.hold.ask(self.runner, observation)
+    def _motion_to(self, moment: Moment) -> Transform | None:
+        """Return the motion since the moment before as it was known then: better than none."""
+        if self._reported is None or moment.T_map_base is None:
+            return None
+        return se3.inverse(self._reported) @ moment.T_map_base
 
-    def _note(
-        self, moment: Moment, T_map_base: Transform | None, tracking: Tracking | None = None
-    ) -> None:
-        """Go on to a moment with its pose, and what the module said where it is the module's."""
+    def _remember(self, moment: Moment, found: Moment) -> None:
+        """Go on to a moment with its pose as it is now known."""
         if moment is not self.anchor or moment.module == BRIDGED:
-            self.trail.append(
-                Moment(
-                    observation=moment.observation,
-                    T_map_base=T_map_base,
-                    module=BRIDGED if tracking is None else self.runner.key,
-                    bridge=self._bridge.copy(),
-                    turn=self.hold.turn,
-                    covariance=None if tracking is None else tracking.covariance,
-                    is_trusted=tracking is not None and self.hold.is_trusted,
-                )
-            )
-        self._done_ns, self._told = moment.stamp_ns, moment.T_map_base
+            self.trail.append(found)
 
     def _bend(self, count: int, tracking: Tracking, T_told_base: Transform) -> None:
         """Lay the last poses of the trail, odometry's, between the module's before and after them.
@@ -167,25 +180,3 @@ class Handover:
                 module=self.runner.key,
                 covariance=tracking.covariance,
             )
-
-    def _bridge_to(self, moment: Moment) -> Transform | None:
-        """Return a pose that the module did not give: the old one's motion is better than none."""
-        observation = moment.observation
-        T_map_base = self._bridge.predict(observation, by_velocity=True, turn=self.hold.turn)
-        if T_map_base is None and self._told is not None and moment.T_map_base is not None:
-            T_prev_curr = se3.inverse(self._told) @ moment.T_map_base
-            T_map_base = self._bridge.follow(observation, T_prev_curr)
-        return T_map_base
-
-    def _place(self, moment: Moment, tracking: Tracking) -> Transform:
-        """Return the pose of a module that holds one; its first is the pose handed over (Eq. 1)."""
-        if not self.is_placed:
-            self.first_cost_ns = self.cost_ns + perf_counter_ns() - self._since_ns
-            self._bridge.predict(moment.observation, by_velocity=True)
-            self.runner.place(self._bridge.T_map_base @ se3.inverse(tracking.T_local_base))
-            self.tracked, self.is_placed = [], True
-        assert self.runner.T_map_local is not None
-        T_map_base = self.runner.T_map_local @ tracking.T_local_base
-        self._bridge.update(moment.observation, T_map_base, is_jump=self.hold.is_revised)
-        self.tracked.append(tracking)
-        return T_map_base

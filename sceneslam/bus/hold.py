@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.bus.decision import Health
 from sceneslam.bus.gate import Gate, GateSettings, Verdict
 from sceneslam.bus.runner import Runner
 from sceneslam.bus.sureness import Sureness
+from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.se3 import Transform
 
@@ -20,6 +24,7 @@ class Hold:
         self.is_suspect = False  # from a disagreement on until it has agreed for long enough
         self.suspect_since_ns: int | None = None  # from when on it may have been wrong
         self.is_trusted = False  # another module may start from its last pose
+        self.wheels_lie = False  # by all that the module, and the robot's inertia, say
         self.is_asked = False  # it was given the last observation
         self.inliers = 0  # measurements that agreed with its last pose
         self.is_revised = False  # its last pose jumped, for it corrected its past
@@ -29,6 +34,8 @@ class Hold:
         self.turn: NDArray[np.float64] | None = None  # its last (3, 3) rotation, where believed
         self.covariance: NDArray[np.float64] | None = None  # of its pose, where that may be used
         self.T_local_base: Transform | None = None  # at the last observation, where it told one
+        self._T_odom_prev: Transform | None = None
+        self._agreed: tuple[Transform, Transform] | None = None  # local, odom, when turns did last
         self._gate = Gate(gate) if gate is not None else None
         self._sureness = Sureness()
         self._revision = 0
@@ -39,6 +46,15 @@ class Hold:
     def is_held(self) -> bool:
         """Tell whether the module holds its pose, as far as is known."""
         return self.held_since_ns is not None
+
+    @property
+    def health(self) -> Health:
+        """Return what the module's pose is worth."""
+        if self.unheld_since_ns is None:
+            return Health.HELD
+        if self.is_suspect:
+            return Health.SUSPECT
+        return Health.LOST if self.status is TrackingStatus.LOST else Health.SILENT
 
     def ask(self, runner: Runner, observation: Observation) -> Tracking | None:
         """Return a module's answer where its pose may be used; raises ModuleError as the runner."""
@@ -51,13 +67,15 @@ class Hold:
         tracking = runner.track(observation)
         self._feed(tracking)
         is_lost = tracking.status is TrackingStatus.LOST
-        self._judge(observation, None if is_lost else tracking.T_local_base)
+        is_tracking = tracking.status is TrackingStatus.TRACKING
+        covariance = tracking.covariance if is_tracking else None
+        self._judge(observation, None if is_lost else tracking.T_local_base, covariance)
         if is_lost or self.is_suspect:
             self._lose(tracking.stamp_ns)
             return None
         self.covariance = tracking.covariance
         is_sure = self._sureness.is_usual(tracking.covariance)
-        self.is_trusted = is_sure and tracking.status is TrackingStatus.TRACKING
+        self.is_trusted = is_sure and is_tracking
         self.unheld_since_ns = None
         if self.held_since_ns is None:
             self.held_since_ns = tracking.stamp_ns
@@ -76,9 +94,15 @@ class Hold:
         self.is_revised = tracking.revision != self._revision
         self._revision = tracking.revision
 
-    def _judge(self, observation: Observation, T_local_base: Transform | None) -> None:
+    def _judge(
+        self,
+        observation: Observation,
+        T_local_base: Transform | None,
+        covariance: NDArray[np.float64] | None = None,
+    ) -> None:
         """Hold the module's motion against the odometry's."""
-        before, self.T_local_base, self.turn = self.T_local_base, T_local_base, None
+        self.T_local_base, self.turn = T_local_base, None
+        T_odom_prev, self._T_odom_prev = self._T_odom_prev, observation.T_odom_base
         if self._gate is None:
             return
         judgement = self._gate.update(
@@ -86,16 +110,23 @@ class Hold:
             T_local_base=T_local_base,
             T_odom_base=observation.T_odom_base,
             is_revised=self.is_revised,
+            deviation_m=None if covariance is None else _deviation_m(covariance),
         )
+        if T_local_base is not None:
+            self.wheels_lie = judgement.wheels_lie
         if Verdict.DISAGREE in (judgement.distance, judgement.turn):
             self.suspect_since_ns = None if self.is_suspect else judgement.since_ns
             self.is_suspect = True
         elif judgement.is_trusted:
             self.is_suspect, self.suspect_since_ns = False, None
-        if before is None or T_local_base is None or self.is_revised:
-            return
-        if judgement.turn is Verdict.AGREE:
-            self.turn = before[:3, :3].T @ T_local_base[:3, :3]
+        if self.is_revised:
+            self._agreed = None  # what it said then is not what it would say now
+        if judgement.turn is Verdict.AGREE and T_local_base is not None:
+            assert observation.T_odom_base is not None
+            now = (T_local_base, observation.T_odom_base)
+            if self._agreed is not None and T_odom_prev is not None:
+                self.turn = _turn(*self._agreed, *now, T_odom_prev)
+            self._agreed = now
 
     def _wait(self, stamp_ns: int) -> None:
         """Take note of an observation in which none of the module's sensors spoke."""
@@ -107,3 +138,27 @@ class Hold:
             self.unheld_since_ns = stamp_ns
             held_since_ns, self.held_since_ns = self.held_since_ns, None
             self.held_ns = stamp_ns - held_since_ns if held_since_ns is not None else 0
+
+
+def _turn(
+    T_local_then: Transform,
+    T_odom_then: Transform,
+    T_local_now: Transform,
+    T_odom_now: Transform,
+    T_odom_prev: Transform,
+) -> NDArray[np.float64]:
+    """Return the last step's (3, 3) turn by a module: the wheels', and what they missed since then.
+
+    A module that was lost or doubted meanwhile knows its heading better than the wheels do.
+    """
+    if T_odom_then is T_odom_prev:
+        return np.asarray(T_local_then[:3, :3].T @ T_local_now[:3, :3])  # nothing was missed
+    by_module = se3.yaw_rad(se3.inverse(T_local_then) @ T_local_now)
+    missed_rad = by_module - se3.yaw_rad(se3.inverse(T_odom_then) @ T_odom_now)
+    step_rad = se3.yaw_rad(se3.inverse(T_odom_prev) @ T_odom_now)
+    return se3.from_xy_yaw(0.0, 0.0, step_rad + missed_rad)[:3, :3]
+
+
+def _deviation_m(covariance: NDArray[np.float64]) -> float:
+    """Return the standard deviation of the position [m] of a (6, 6) covariance."""
+    return math.sqrt(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.atlas.atlas import BRIDGED
 from sceneslam.bus.bridge import Bridge
 from sceneslam.types.observation import Observation
+from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
 
 _BULKY = ("image_bgr", "depth_m", "points_lidar", "point_times_s")

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
+from sceneslam.bus.bayes_filter import BayesFilter, BayesSettings
 from sceneslam.bus.gate import GateSettings
 from sceneslam.bus.pace import PaceSettings
+from sceneslam.bus.scene_filter import SceneFilter, WindowFilter
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.run import HANDOVERS
 
 _OTHERS = (  # settings that are no durations
     "handover",
     "catch_up",
-    "calibrate_odometry",
-    "turn_by_gyro",
     "gate",
+    "scene_filter",
 )
 
 
@@ -26,17 +27,12 @@ class Policy:
     handover: str  # how the pose passes from module to module
     confirm_window_s: float  # all images of this window must agree on a new scene
     first_confirm_window_s: float  # the same for the first scene
-    dwell_s: float  # a module that was switched to stays this long, whatever the scene
-    lost_patience_s: float  # a lost module is bridged this long before its fallback takes over ...
-    blind_patience_s: float  # ... and this long where no odometry bridges
-    bridge_s: float  # without odometry, constant velocity fills gaps up to this long
+    scene_filter: BayesSettings | None  # confirms scenes in place of the window; None: the window
+    lost_patience_s: float  # a lost module is bridged this long before its fallback takes over
     retry_s: float  # a fallback runs this long before the scene's first choice is tried again
-    trial_s: float  # it has to hold its pose this long, beside the fallback, to come back
     buffer_s: float  # observations are remembered this long, for `rewind` ...
     buffer_mb: float  # ... and up to this much; beyond it the older, the thinner
     catch_up: PaceSettings  # what a module that is led through them is spared
-    calibrate_odometry: bool  # by what trusted modules say of its way, and by rests
-    turn_by_gyro: bool  # what bridges and judges, where there is a gyro; else by the wheels
     gate: GateSettings | None  # how far a module's motion may differ from odometry's, None: any
     startup_s: dict[str, float]  # slam key -> time its start takes on the recording's clock
 
@@ -50,6 +46,14 @@ class Policy:
             elif field.name not in _OTHERS and not 0 <= value < float("inf"):
                 unit = "megabytes" if field.name.endswith("_mb") else "seconds"
                 raise ConfigError(field.name, value, f"{unit}, 0 or more")
+
+    def make_scene_filter(self, scenes: Sequence[str]) -> SceneFilter:
+        """Return a new filter of votes for `scenes`."""
+        if self.scene_filter is not None:
+            return BayesFilter(scenes, self.scene_filter)
+        return WindowFilter(
+            window_s=self.confirm_window_s, first_window_s=self.first_confirm_window_s
+        )
 
 
 def _check_startups(startup_s: Mapping[str, float]) -> None:

@@ -26,6 +26,7 @@ class Legacy:
 
     layers: MapLayers
     trajectory: Trajectory  # T_local_base as revised, empty where nothing was
+    lost: tuple[str, ...] = ()  # what it could not give, in a sentence each
 
 
 class Runner:
@@ -100,17 +101,17 @@ class Runner:
 
     def retire(self) -> Legacy:
         """Shut the module down and return what it leaves, empty where it cannot give it."""
-        layers, trajectory = MapLayers(), Trajectory.empty()
+        layers, trajectory, lost = MapLayers(), Trajectory.empty(), list[str]()
         self._drain()
         if self._is_active:
-            with self._parting("could not give its trajectory"):
+            with self._parting("could not give its revised trajectory, which is lost", lost):
                 trajectory = checked_trajectory(self._module.get_trajectory())
-            with self._parting("could not give its map"):
+            with self._parting("could not give its map, which is lost", lost):
                 layers = checked_layers(self._module.get_map())
-        with self._parting("could not be shut down"):
+        with self._parting("could not be shut down", []):
             self._module.shutdown()
         self._is_active = False
-        return Legacy(layers=layers, trajectory=trajectory)
+        return Legacy(layers=layers, trajectory=trajectory, lost=tuple(lost[-1:]))
 
     def _answer(self, observation: Observation) -> Tracking:
         submitted, self._submitted = self._submitted, None
@@ -140,13 +141,14 @@ class Runner:
             raise
 
     @contextmanager
-    def _parting(self, what: str) -> Iterator[None]:
-        """Go on without what a module cannot give any more."""
+    def _parting(self, what: str, lost: list[str]) -> Iterator[None]:
+        """Go on without what a module cannot give any more, which is added to `lost`."""
         try:
             with self._calling(what):
                 yield
         except ModuleError as error:
             _log.warning(str(error))
+            lost.append(str(error))
 
     @contextmanager
     def _calling(self, what: str) -> Iterator[None]:

@@ -1,24 +1,47 @@
-"""Confirms a scene when all images of a window agree."""
+"""Which scene is confirmed, by the votes so far: the contract, and the paper's window."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 from sceneslam.types.observation import UNSURE, SceneVote
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConfirmedScene:
-    """A scene on which all images of a window agreed."""
+    """A scene that the votes so far confirm."""
 
-    stamp_ns: int  # when the window was full
-    since_ns: int  # the first image of the window that says so
+    stamp_ns: int  # of the vote that confirmed it
+    since_ns: int  # of the first vote that speaks for it
     scene: str
     previous: str | None
 
 
-class SceneFilter:
-    """Confirms a scene when all images of a window agree (paper Sec. III-A)."""
+class SceneFilter(Protocol):
+    """Turns votes, given by rising stamp, into confirmed scenes."""
+
+    scene: str | None  # confirmed last, None before the first
+    since_ns: int  # the first vote that spoke for it
+
+    @property
+    def posterior(self) -> Mapping[str, float] | None:
+        """Return the probability of every scene after the last vote, None where it has none."""
+        ...
+
+    def update(self, vote: SceneVote) -> ConfirmedScene | None:
+        """Return the scene that this vote confirms, None when nothing changes.
+
+        An UNSURE vote is none: it speaks neither for a scene nor against it.
+        """
+        ...
+
+
+class WindowFilter:
+    """Confirms a scene when all images of a window agree (paper Sec. III-B)."""
+
+    posterior = None
 
     def __init__(self, *, window_s: float, first_window_s: float) -> None:
         self._window_ns = round(window_s * 1e9)
@@ -27,12 +50,11 @@ class SceneFilter:
         self._candidate_since_ns = 0
         self._last_ns = 0
         self.scene: str | None = None
-        self.since_ns = 0  # the first image that said so
+        self.since_ns = 0
 
     def update(self, vote: SceneVote) -> ConfirmedScene | None:
         """Return the scene that this vote confirms, None when nothing changes.
 
-        Observations without an image (UNSURE) are not images: they neither agree nor disagree.
         A silence longer than the window holds no evidence, so that the window starts anew.
         """
         if vote.scene == UNSURE:

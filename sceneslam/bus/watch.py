@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import math
+from collections.abc import Mapping, Sequence
 from time import perf_counter_ns
 
 from sceneslam.bus.events import EventLog
@@ -15,9 +17,15 @@ from sceneslam.types.rig import Rig
 _log = logging.getLogger(__name__)
 
 
-def log_vote(log: EventLog, vote: SceneVote, confirmed: ConfirmedScene | None) -> None:
-    """Log a vote, and the scene that it confirmed."""
-    log.add("vote", vote.stamp_ns, scene=vote.scene, value=vote.value)
+def log_vote(
+    log: EventLog,
+    vote: SceneVote,
+    confirmed: ConfirmedScene | None,
+    posterior: Mapping[str, float] | None,
+) -> None:
+    """Log a vote with the scenes' probabilities after it, and the scene that it confirmed."""
+    told = {} if posterior is None else {"posterior": posterior}
+    log.add("vote", vote.stamp_ns, scene=vote.scene, value=vote.value, **told)
     if confirmed is not None:
         log.add(
             "scene",
@@ -32,12 +40,12 @@ class Watch:
     """A detector under the bus's care: where it fails, the last scene stays."""
 
     def __init__(
-        self, detector: Detector, rig: Rig, log: EventLog, *, window_s: float, first_window_s: float
+        self, detector: Detector, rig: Rig, log: EventLog, *, scene_filter: SceneFilter
     ) -> None:
         self.spent_us: list[float] = []
         self.is_working = True
         self._detector, self._log = detector, log
-        self._filter = SceneFilter(window_s=window_s, first_window_s=first_window_s)
+        self._filter = scene_filter
         try:
             detector.activate(rig)
         except Exception as error:
@@ -70,7 +78,8 @@ class Watch:
         self.spent_us.append((perf_counter_ns() - began_ns) / 1e3)
         if vote is None:
             return
-        log_vote(self._log, vote, self._filter.update(vote))
+        confirmed = self._filter.update(vote)
+        log_vote(self._log, vote, confirmed, self._filter.posterior)
 
     def close(self) -> None:
         """Shut the detector down. May be called twice."""
@@ -86,4 +95,15 @@ class Watch:
         if vote.scene not in (*self._detector.scenes, UNSURE):
             scenes = ", ".join(self._detector.scenes)
             raise ValueError(f"scene: got {vote.scene!r}, expected {scenes} or {UNSURE}")
+        _check_likelihoods(vote.likelihoods, self._detector.scenes)
         return vote
+
+
+def _check_likelihoods(told: Mapping[str, float] | None, scenes: Sequence[str]) -> None:
+    """Raise ValueError unless they are of known scenes, 0 or more, and not all 0."""
+    if told is None:
+        return
+    values = list(told.values())
+    is_good = all(0 <= value < math.inf for value in values) and sum(values) > 0
+    if not is_good or not set(told) <= set(scenes):
+        raise ValueError(f"likelihoods: got {dict(told)}, expected 0 or more for each scene")

@@ -11,7 +11,7 @@ from pathlib import Path
 import yaml
 
 from sceneslam.collect.flatten import flat
-from sceneslam.sweep.status import State, Status
+from sceneslam.collect.status import State, Status
 from sceneslam.types.errors import InputError
 
 ROWS = "rows.jsonl"  # rows that are no runs of their own: settings that were tried in one go

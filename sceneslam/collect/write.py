@@ -11,6 +11,7 @@ from pathlib import Path
 from sceneslam.collect.page import write_page
 from sceneslam.collect.rows import Row, Value, read_rows, swept_keys
 from sceneslam.collect.summary import Group, groups_of
+from sceneslam.types.files import replacing
 
 _log = logging.getLogger(__name__)
 
@@ -72,7 +73,7 @@ def _summary(groups: Sequence[Group]) -> Table:
 
 
 def _write_csv(path: Path, table: Table) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with replacing(path, newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(table.columns)
         writer.writerows(table.rows)

@@ -6,15 +6,20 @@ import difflib
 import inspect
 import math
 import pkgutil
+import re
+import sys
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import Any
 
 from sceneslam.types.errors import ConfigError
+from sceneslam.types.run import Command
 
 OWN_PREFIX = "sceneslam."
+NOT_GIVEN = "???"  # a value that a configuration leaves to its user
 TOP_LEVEL = (
     "allow_targets",
     "atlas",
@@ -22,6 +27,7 @@ TOP_LEVEL = (
     "effects",
     "evaluation",
     "experiment",
+    "jobs",
     "lights",
     "policy",
     "reference",
@@ -33,6 +39,18 @@ TOP_LEVEL = (
     "source",
     "story",
 )
+
+
+_MOST = {  # no recording, robot or machine has more; what is larger overflows or takes for ever
+    "s": 1e9,  # 32 years; 64 bits hold 292 years of nanoseconds
+    "m": 1e8,  # more than twice around the Earth
+    "deg": 1e4,
+    "rad": 1e4,
+    "hz": 1e6,
+    "px": 1e6,
+    "mb": 1e7,
+    "count": 1e6,
+}
 
 
 class _Nothing:
@@ -87,6 +105,9 @@ def check_node(node: object, key: str, *, allow: Sequence[str], positional: int 
             continue
         if name in hints and not fits(value, hints[name]):
             raise ConfigError(f"{key}.{name}", value, describe(hints[name]))
+        if hints.get(name) is Command and value != NOT_GIVEN and not set(value[:1]) <= set(allow):
+            allowed = f"a program that the command line allows: allow_targets=[{value[0]}]"
+            raise ConfigError(f"{key}.{name}", value, allowed)
 
 
 def _check_inner(value: object, key: str, allow: Sequence[str]) -> bool:
@@ -100,9 +121,19 @@ def _check_inner(value: object, key: str, allow: Sequence[str]) -> bool:
     elif isinstance(value, list):
         for index, item in enumerate(value):
             _check_inner(item, f"{key}[{index}]", allow)
-    elif isinstance(value, float) and not math.isfinite(value):
-        raise ConfigError(key, value, "a finite number")
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        _check_number(value, key)
     return True
+
+
+def _check_number(value: float, key: str) -> None:
+    """Raise ConfigError for a number that no quantity of the key's unit has."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(key, value, "a finite number")
+    unit = re.search(r"_([a-z]+)(\[\d+\])*$", key)
+    most = _MOST.get(unit[1]) if unit else None
+    if most is not None and abs(value) > most:
+        raise ConfigError(key, value, f"at most {most:g} in either direction")
 
 
 def hints_of(target: Callable[..., object]) -> dict[str, Any]:
@@ -118,21 +149,20 @@ def check_given(value: object, key: str) -> None:
     if isinstance(value, Mapping):
         for name, item in value.items():
             check_given(item, f"{key}.{name}" if key else str(name))
-    elif value == "???":
+    elif value == NOT_GIVEN:
         raise ConfigError(key, NOTHING, f"a value, as in {key}=...")
 
 
 def locate(target: object, key: str, allow: Sequence[str]) -> Callable[..., object]:
-    """Return the class or function that a `_target_` names; raises ConfigError for any other."""
+    """Return the class or function that a `_target_` names; raises ConfigError for any other.
+
+    Of our own package only classes are components: a function could build what the configuration
+    of its choice names, without these checks.
+    """
     prefixes = (OWN_PREFIX, *(f"{prefix.rstrip('.')}." for prefix in allow))
     if not isinstance(target, str) or not target.startswith(prefixes):
-        package = str(target).partition(".")[0]
-        raise ConfigError(
-            key,
-            target,
-            f"a name under {' or '.join(prefixes)} "
-            f"(a target is code: allow your own by allow_targets=[{package}])",
-        )
+        where = f"a name under {' or '.join(prefixes)}"
+        raise ConfigError(key, target, f"{where} ({_how_to_allow(str(target))})")
     try:
         found = pkgutil.resolve_name(target)
     except Exception as error:
@@ -143,7 +173,18 @@ def locate(target: object, key: str, allow: Sequence[str]) -> Callable[..., obje
     home = f"{found.__module__}."  # a name may lead through an allowed module to another's code
     if not home.startswith(prefixes):
         raise ConfigError(key, target, f"what is defined under {' or '.join(prefixes)}")
+    if home.startswith(OWN_PREFIX) and not inspect.isclass(found):
+        raise ConfigError(key, target, f"a class under {OWN_PREFIX}, which builds itself")
     return typing.cast("Callable[..., object]", found)
+
+
+def _how_to_allow(target: str) -> str:
+    """Return how to vouch for code of one's own; a library's name is not for us to propose."""
+    package = target.partition(".")[0]
+    is_own = package.isidentifier() and package not in sys.stdlib_module_names
+    if is_own and package not in packages_distributions():
+        return f"a target is code: allow your own on the command line, allow_targets=[{package}]"
+    return "a target is code: only packages that the command line names in allow_targets are run"
 
 
 def first_line(error: BaseException) -> str:
@@ -156,6 +197,9 @@ def fits(value: object, hint: Any) -> bool:
 
     Hints that are not known accept all.
     """
+    if value == NOT_GIVEN:
+        return True  # which `check_given` names
+    hint = getattr(hint, "__supertype__", hint)
     origin = typing.get_origin(hint)
     if origin in (typing.Union, types.UnionType):
         return any(fits(value, part) for part in typing.get_args(hint))
@@ -196,6 +240,7 @@ _WORDS = {
     int: "a whole number",
     str: "text",
     bool: "true or false",
+    Any: "any value",
     type(None): "null",
     Path: "a path",
 }
@@ -203,6 +248,7 @@ _WORDS = {
 
 def describe(hint: Any) -> str:
     """Return in words what an annotation accepts."""
+    hint = getattr(hint, "__supertype__", hint)
     if hint in _WORDS:
         return _WORDS[hint]
     origin, parts = typing.get_origin(hint), typing.get_args(hint)

@@ -13,6 +13,8 @@ from typing import Any
 from omegaconf import OmegaConf
 
 import sceneslam
+from sceneslam.types.files import replacing
+from sceneslam.types.input_files import given_path
 
 _EDGE_BYTES = 32 << 20  # of the head and the tail of an input file that are hashed
 
@@ -22,7 +24,8 @@ def save_config(config: Mapping[str, Any], path: Path) -> dict[str, str]:
     made_by = provenance(config)
     lines = "".join(f"#   {key}: {value}\n" for key, value in made_by.items())
     text = OmegaConf.to_yaml(OmegaConf.create(dict(config)))
-    path.write_text(f"# Resolved configuration. Made by:\n{lines}{text}")
+    with replacing(path) as file:
+        file.write(f"# Resolved configuration. Made by:\n{lines}{text}")
     return made_by
 
 
@@ -76,8 +79,9 @@ def input_sha256(source: Mapping[str, Any]) -> str:
 
     Of files above 64 MiB it takes the first and last 32, so that a long recording does not wait.
     """
-    root = Path(str(source.get("path") or ""))
-    if not source.get("path") or not root.exists():
+    path = str(source.get("path") or "")
+    root = given_path(path) if path else None
+    if root is None or not root.exists():
         return "none"
     digest = hashlib.sha256()
     for file in sorted(root.rglob("*")) if root.is_dir() else [root]:

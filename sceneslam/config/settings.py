@@ -10,6 +10,7 @@ from sceneslam.types.errors import ConfigError
 DETECT_ONLY = "detect_only"
 MODES = ("recording", "live", DETECT_ONLY)
 ISOLATIONS = ("inline", "process")
+_MOST_THREADS = 256  # of OpenCV; it starts as many as it is told, and no machine of ours has more
 
 
 @dataclass(slots=True, kw_only=True)
@@ -36,8 +37,8 @@ class RunSettings:
             raise ConfigError("mode", self.mode, " | ".join(MODES))
         if self.isolation not in ISOLATIONS:
             raise ConfigError("isolation", self.isolation, " | ".join(ISOLATIONS))
-        if self.threads < 1:
-            raise ConfigError("threads", self.threads, "1 or more")
+        if not 1 <= self.threads <= _MOST_THREADS:
+            raise ConfigError("threads", self.threads, f"1 to {_MOST_THREADS}")
         _ = self.limits  # checks them
         for name in ("max_observations", "catch_up_steps"):
             value = getattr(self, name)

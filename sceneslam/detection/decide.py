@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.scene_filter import ConfirmedScene, SceneFilter
@@ -10,6 +11,15 @@ from sceneslam.detection.features import Features
 from sceneslam.interfaces import FeatureDetector
 from sceneslam.types.observation import SceneVote
 from sceneslam.types.rig import Rig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Filtered:
+    """A vote, and what was made of it."""
+
+    vote: SceneVote
+    confirmed: ConfirmedScene | None
+    posterior: Mapping[str, float] | None
 
 
 def vote(detector: FeatureDetector, rig: Rig, features: Features) -> list[SceneVote]:
@@ -23,9 +33,16 @@ def vote(detector: FeatureDetector, rig: Rig, features: Features) -> list[SceneV
     return votes
 
 
-def confirm(votes: Iterable[SceneVote], policy: Policy) -> list[ConfirmedScene]:
-    """Return the scenes that the policy confirms by votes."""
-    scenes = SceneFilter(
-        window_s=policy.confirm_window_s, first_window_s=policy.first_confirm_window_s
-    )
-    return [found for found in map(scenes.update, votes) if found is not None]
+def filtered(votes: Iterable[SceneVote], scenes: SceneFilter) -> Iterator[Filtered]:
+    """Yield what a filter makes of each vote."""
+    for one in votes:
+        confirmed = scenes.update(one)
+        yield Filtered(vote=one, confirmed=confirmed, posterior=scenes.posterior)
+
+
+def confirm(
+    votes: Iterable[SceneVote], policy: Policy, scenes: Sequence[str]
+) -> list[ConfirmedScene]:
+    """Return the scenes that the policy confirms by votes for `scenes`."""
+    found = map(policy.make_scene_filter(scenes).update, votes)
+    return [scene for scene in found if scene is not None]

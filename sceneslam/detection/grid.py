@@ -38,6 +38,15 @@ class Tried:
     error: str = ""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Ballot:
+    """What a detector's setting votes on a recording."""
+
+    watched: Watched
+    votes: Sequence[SceneVote]
+    scenes: Sequence[str]
+
+
 def try_all(config: Mapping[str, Any], axes: Sequence[Axis]) -> Iterator[Tried]:
     """Yield every combination of the axes' values in a resolved configuration, the last fastest.
 
@@ -49,7 +58,7 @@ def try_all(config: Mapping[str, Any], axes: Sequence[Axis]) -> Iterator[Tried]:
     watched: dict[str, Watched] = {}
     for setting in detectors:
         try:
-            seen, votes = _votes(_with(config, setting), watched)
+            ballot = _votes(_with(config, setting), watched)
         except SceneSlamError as error:
             yield from (
                 Tried(setting={**setting, **other}, error=str(error)) for other, _ in policies
@@ -60,17 +69,18 @@ def try_all(config: Mapping[str, Any], axes: Sequence[Axis]) -> Iterator[Tried]:
             if isinstance(policy, SceneSlamError):
                 yield Tried(setting=both, error=str(policy))
             else:
-                yield Tried(setting=both, metrics=score(seen.features, confirm(votes, policy)))
+                confirmed = confirm(ballot.votes, policy, ballot.scenes)
+                yield Tried(setting=both, metrics=score(ballot.watched.features, confirmed))
 
 
-def _votes(
-    config: Mapping[str, Any], watched: dict[str, Watched]
-) -> tuple[Watched, list[SceneVote]]:
+def _votes(config: Mapping[str, Any], watched: dict[str, Watched]) -> _Ballot:
     detector = Builder(config).make("detector", FeatureDetector)
     kind = json.dumps([config["detector"].get(name) for name in detector.feature_settings])
     if kind not in watched:
         watched[kind] = watch(config)
-    return watched[kind], vote(detector, watched[kind].rig, watched[kind].features)
+    seen = watched[kind]
+    votes = vote(detector, seen.rig, seen.features)
+    return _Ballot(watched=seen, votes=votes, scenes=detector.scenes)
 
 
 def _built(config: Mapping[str, Any], setting: Setting) -> tuple[Setting, Policy | SceneSlamError]:
@@ -86,6 +96,11 @@ def _settings(axes: Sequence[Axis], prefix: str) -> Iterator[Setting]:
         yield dict(zip((axis.key for axis in own), values, strict=True))
 
 
+def _place(node: Any, part: str) -> str | int:
+    """Return a part of a key as its node takes it: the places of a list are numbers."""
+    return int(part) if isinstance(node, list) else part
+
+
 def _with(config: Mapping[str, Any], setting: Setting) -> dict[str, Any]:
     """Return a copy of a configuration with other values at some keys."""
     changed = {
@@ -95,8 +110,8 @@ def _with(config: Mapping[str, Any], setting: Setting) -> dict[str, Any]:
     }
     for key, value in setting.items():
         *path, name = key.split(".")
-        node = changed
+        node: Any = changed
         for part in path:
-            node = node[part]
-        node[name] = value
+            node = node[_place(node, part)]
+        node[_place(node, name)] = value
     return changed

@@ -52,6 +52,7 @@ def _path(config: Mapping[str, Any], detector: FeatureDetector) -> Path:
         "detector": {name: node.get(name) for name in ("_target_", *detector.feature_settings)},
         "max_observations": config["run"].get("max_observations"),
         "input": input_sha256(source),
+        "model": input_sha256(node),  # of a detector that reads one
         "code": code_sha256(),
     }
     text = json.dumps(depends_on, sort_keys=True, default=str)

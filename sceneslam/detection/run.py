@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,15 +17,17 @@ from sceneslam.config.check import check_keys
 from sceneslam.config.component import Builder
 from sceneslam.config.provenance import save_config
 from sceneslam.config.settings import RunSettings
-from sceneslam.detection.decide import confirm, vote
+from sceneslam.detection.decide import Filtered, filtered, vote
 from sceneslam.detection.features import Features
 from sceneslam.detection.recall import recall
 from sceneslam.evaluation.detection import score_detection
 from sceneslam.evaluation.metrics import Metrics, write_metrics
 from sceneslam.evaluation.summary import number
+from sceneslam.evaluation.switches import true_scene
 from sceneslam.interfaces import FeatureDetector
-from sceneslam.types.observation import SceneVote
+from sceneslam.types.observation import UNSURE, SceneVote
 from sceneslam.types.rig import Rig
+from sceneslam.types.truth import GroundTruth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,16 +56,20 @@ def detect(config: Mapping[str, Any], folder: Path) -> list[str]:
     """Write a folder with events, metrics and configuration; return what to tell in short lines."""
     watched = watch(config)
     builder = Builder(config)
-    votes = vote(builder.make("detector", FeatureDetector), watched.rig, watched.features)
-    confirmed = confirm(votes, builder.make("policy", Policy))
+    detector = builder.make("detector", FeatureDetector)
+    votes = vote(detector, watched.rig, watched.features)
+    scene_filter = builder.make("policy", Policy).make_scene_filter(detector.scenes)
+    told = list(filtered(votes, scene_filter))
+    confirmed = [one.confirmed for one in told if one.confirmed is not None]
     folder.mkdir(parents=True, exist_ok=True)
-    _write_events(folder / "events.jsonl", votes, confirmed)
+    _write_events(folder / "events.jsonl", told)
     save_config(config, folder / "config.yaml")
     metrics = score(watched.features, confirmed)
     write_metrics(folder / "metrics.json", metrics)
     scores = metrics["detection"]
     return [
         f"{metrics['observations']} observations, {scores['confirmed']} scenes confirmed",
+        f"votes: {_shares(votes, watched.features.truth)}",
         f"false {number(scores['false'], 0)}, missed {number(scores['missed'], 0)}, "
         f"found {number(scores['delay_s'], 2, ' s')} after the change "
         f"(at most {number(scores['delay_max_s'], 2, ' s')}), "
@@ -81,12 +88,20 @@ def score(features: Features, confirmed: Sequence[ConfirmedScene]) -> Metrics:
     }
 
 
-def _write_events(
-    path: Path, votes: Sequence[SceneVote], confirmed: Sequence[ConfirmedScene]
-) -> None:
+def _shares(votes: Sequence[SceneVote], truth: GroundTruth | None) -> str:
+    """Return in words which share of the votes each scene got, and how many named the true one."""
+    counts = Counter(one.scene for one in votes)
+    told = [f"{scene} {100 * count / len(votes):.1f} %" for scene, count in counts.most_common()]
+    cast = [one for one in votes if one.scene != UNSURE]
+    if truth is not None and cast:
+        right = sum(true_scene(truth, one.stamp_ns) == one.scene for one in cast)
+        told.append(f"{100 * right / len(cast):.1f} % right")
+    return ", ".join(told) or "none"
+
+
+def _write_events(path: Path, told: Sequence[Filtered]) -> None:
     """Write votes and confirmed scenes as a run with SLAM does."""
     log = EventLog(path)
-    scenes = {scene.stamp_ns: scene for scene in confirmed}
-    for one in votes:
-        log_vote(log, one, scenes.get(one.stamp_ns))
+    for one in told:
+        log_vote(log, one.vote, one.confirmed, one.posterior)
     log.close()

@@ -59,6 +59,21 @@ def absolute_errors(estimate: Trajectory, truth: Trajectory, max_gap_s: float) -
     return AbsoluteErrors(stamps_ns=matched.stamps_ns, errors_m=errors_m, T_gt_map=T_gt_map)
 
 
+def rotation_rmse_rad(estimate: Trajectory, truth: Trajectory, max_gap_s: float) -> float:
+    """Return the rotation error that is left after one rigid alignment [rad], NaN of nothing.
+
+    The alignment counts each pose as a body of 0.1 m, as Correct Rate's does: positions on a
+    straight line alone leave the rotation about it open.
+    """
+    matches = associate(estimate, truth, max_gap_s)
+    if not len(matches):
+        return float("nan")
+    T_map_base = estimate.T_world_base[matches.first]
+    T_gt_base = truth.T_world_base[matches.second]
+    T_gt_map = align(T_map_base, T_gt_base, lever_m=0.1)
+    return root_mean_square(se3.rotation_angle_rad(se3.inverse(T_gt_base) @ T_gt_map @ T_map_base))
+
+
 def relative_errors(
     estimate: Trajectory, truth: Trajectory, max_gap_s: float, interval_s: float
 ) -> RelativeErrors:

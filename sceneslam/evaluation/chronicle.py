@@ -101,9 +101,19 @@ class _Writer:
             what, agreed = f"First scene: {event['scene']}", ""
         else:
             what = f"The scene changed from {event['previous']} to {event['scene']}"
-            agreed = f"All images since {self._seconds(since_ns):.2f} s agree"
+            agreed = self._why_confirmed(event, since_ns)
         why = ", ".join(filter(None, [agreed, values]))
         self._add(event["stamp_ns"], "scene", what, f"{why}." if why else "")
+
+    def _why_confirmed(self, event: Event, since_ns: int) -> str:
+        """Return in words what spoke for a scene: all images of a window, or its probability."""
+        votes = (e for e in self._events if e["event"] == "vote" and "posterior" in e)
+        cast = next((e for e in votes if e["stamp_ns"] == event["stamp_ns"]), None)
+        since = f"since {self._seconds(since_ns):.2f} s"
+        if cast is None:
+            return f"All images {since} agree"
+        probability = 100.0 * float(cast["posterior"][event["scene"]])
+        return f"Its probability has risen {since}, to {probability:.1f} %"
 
     def _tell_situation(self, event: Event) -> None:
         action = event["verdict"]["action"]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sceneslam.evaluation.alignment import align
 from sceneslam.evaluation.association import covered, interpolated, select
+from sceneslam.evaluation.path import driven_m
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
 
@@ -24,9 +25,16 @@ class _Judged:
     is_correct: NDArray[np.bool_]  # (N,)
 
 
-def correct_rate(
-    estimate: Trajectory, truth: Trajectory, *, limit_m: float, limit_rad: float
-) -> float:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CorrectLimits:
+    """Within which error a pose is correct."""
+
+    limit_m: float
+    limit_rad: float
+    limit_ratio: float = 0.0  # of the distance driven so far, added to `limit_m`
+
+
+def correct_rate(estimate: Trajectory, truth: Trajectory, limits: CorrectLimits) -> float:
     """Return the share of the truth's time span with a correct pose, in [0, 1].
 
     The definition of OpenLORIS-Scene (Shi et al., ICRA 2020): the estimate is aligned as a whole
@@ -36,7 +44,7 @@ def correct_rate(
     """
     if len(truth) < 2 or truth.stamps_ns[0] == truth.stamps_ns[-1]:
         return float("nan")
-    judged = _judge(estimate, truth, limit_m, limit_rad)
+    judged = _judge(estimate, truth, limits)
     if not len(judged.stamps_ns):
         return 0.0
     end_ns = max(truth.stamps_ns[-1], judged.stamps_ns[-1])
@@ -45,12 +53,7 @@ def correct_rate(
 
 
 def correct_rate_observed(
-    estimate: Trajectory,
-    truth: Trajectory,
-    observed_ns: NDArray[np.int64],
-    *,
-    limit_m: float,
-    limit_rad: float,
+    estimate: Trajectory, truth: Trajectory, observed_ns: NDArray[np.int64], limits: CorrectLimits
 ) -> float:
     """Return the share of the time of a run with a correct pose, in [0, 1].
 
@@ -63,7 +66,7 @@ def correct_rate_observed(
     lasts_ns = observed_ns[begins + 1] - observed_ns[begins]
     if not lasts_ns.sum():
         return float("nan")
-    judged = _judge(estimate, truth, limit_m, limit_rad)
+    judged = _judge(estimate, truth, limits)
     if not len(judged.stamps_ns):
         return 0.0
     newest = np.searchsorted(judged.stamps_ns, observed_ns[begins], side="right") - 1
@@ -72,7 +75,7 @@ def correct_rate_observed(
     return float(lasts_ns[holds].sum() / lasts_ns.sum())
 
 
-def _judge(estimate: Trajectory, truth: Trajectory, limit_m: float, limit_rad: float) -> _Judged:
+def _judge(estimate: Trajectory, truth: Trajectory, limits: CorrectLimits) -> _Judged:
     index = covered(truth, estimate.stamps_ns, _TRUTH_GAP_S)
     if not len(index):
         return _Judged(stamps_ns=np.zeros(0, np.int64), is_correct=np.zeros(0, bool))
@@ -83,5 +86,6 @@ def _judge(estimate: Trajectory, truth: Trajectory, limit_m: float, limit_rad: f
     T_gt_base = T_gt_map @ matched.T_world_base
     distance_m = np.linalg.norm(T_gt_base[:, :3, 3] - true.positions_m, axis=1)
     angle_rad = se3.rotation_angle_rad(se3.inverse(true.T_world_base) @ T_gt_base)
-    is_correct = (distance_m <= limit_m) & (angle_rad <= limit_rad)
+    limit_m = limits.limit_m + limits.limit_ratio * driven_m(truth, matched.stamps_ns)
+    is_correct = (distance_m <= limit_m) & (angle_rad <= limits.limit_rad)
     return _Judged(stamps_ns=matched.stamps_ns, is_correct=is_correct)

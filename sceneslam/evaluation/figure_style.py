@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types.files import replacing
 from sceneslam.types.run import RunResult
 from sceneslam.types.truth import GroundTruth
 
@@ -75,7 +76,8 @@ def save(figure: Any, path: Path) -> Path:
     figure.canvas.draw()
     image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[:, :, :3])
     palette = image.quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    palette.save(path, optimize=True)
+    with replacing(path, "wb") as file:
+        palette.save(file, format="PNG", optimize=True)
     return path
 
 

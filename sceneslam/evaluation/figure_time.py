@@ -46,6 +46,29 @@ def draw_votes(
     return figure
 
 
+def draw_posterior(result: RunResult, truth: GroundTruth | None) -> Any:
+    """Return the scenes' probabilities over time, None where the scene filter has none."""
+    votes = [event for event in result.events if event["event"] == "vote" and "posterior" in event]
+    if not votes:
+        return None
+    times_s = look.elapsed_s(result, np.array([e["stamp_ns"] for e in votes], np.int64))
+    figure = look.new_figure()
+    axes = figure.add_subplot()
+    bands = look.true_scene_spans(result, truth)
+    look.draw_bands(axes, bands, look.scene_tints(b.label for b in bands), 0.9)
+    for number, scene in enumerate(votes[0]["posterior"]):
+        values = np.array([event["posterior"][scene] for event in votes])
+        color = look.PALETTE[number % len(look.PALETTE)]
+        curve = look.thinned(times_s, values)
+        axes.plot(*curve, color=color, linewidth=1.4, label=f"P({scene})")
+    _mark_confirmed(axes, result)
+    look.style(axes, y_label="probability")
+    axes.set_xlim(0.0, max(look.duration_s(result), 1e-3))
+    _leave_room(axes)
+    _legend_below(figure, axes)
+    return figure
+
+
 def draw_series(
     result: RunResult,
     stamps_ns: NDArray[np.int64],

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +15,14 @@ from sceneslam.evaluation import figure_style as look
 from sceneslam.evaluation.accuracy import AbsoluteErrors, absolute_errors
 from sceneslam.evaluation.comparison import compare
 from sceneslam.evaluation.figure_map import draw_map, draw_path
-from sceneslam.evaluation.figure_time import draw_series, draw_timeline, draw_votes
+from sceneslam.evaluation.figure_time import draw_posterior, draw_series, draw_timeline, draw_votes
 from sceneslam.types import se3
+from sceneslam.types.errors import told
 from sceneslam.types.run import RunResult
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
+_log = logging.getLogger(__name__)
 _PAPER_DIFFERENCE_M = 0.10  # "less than 10 cm" between the switched and the unswitched run
 _ONLINE_DIFFERS_M = 1e-3  # below, what was told online is not drawn apart
 
@@ -40,23 +45,27 @@ def write_figures(
     value_label: str = "detector value",
     reference: Trajectory | None = None,
     association_gap_s: float = 0.01,
+    faults: list[str] | None = None,
 ) -> list[Drawn]:
     """Write what can be drawn of a run; return the figures, in the order of the story.
 
-    `map`, `path` (where it is small in the map), `timeline`, `grey_mean`, `error` (with ground
-    truth), `difference` (with a reference).
+    A figure that fails (no memory is left, say) is left out, with a sentence in `faults`.
+
+    `map`, `path` (where it is small in the map), `timeline`, `grey_mean`, `posterior` (of a
+    Bayes filter), `error` (with ground truth), `difference` (with a reference).
     """
     folder.mkdir(parents=True, exist_ok=True)
     true = truth.trajectory if truth else Trajectory.empty()
     errors = absolute_errors(result.trajectory, true, association_gap_s)
     online = absolute_errors(result.online, true, association_gap_s)
     T_map_gt = se3.inverse(errors.T_gt_map) if len(errors.errors_m) else None
-    drawn = {
-        "map": draw_map(result, truth, T_map_gt),
-        "path": draw_path(result, truth, T_map_gt),
-        "timeline": draw_timeline(result, truth),
-        "grey_mean": draw_votes(result, truth, threshold, value_label),
-        "error": draw_series(
+    drawn: dict[str, Callable[[], Any]] = {
+        "map": lambda: draw_map(result, truth, T_map_gt),
+        "path": lambda: draw_path(result, truth, T_map_gt),
+        "timeline": lambda: draw_timeline(result, truth),
+        "grey_mean": lambda: draw_votes(result, truth, threshold, value_label),
+        "posterior": lambda: draw_posterior(result, truth),
+        "error": lambda: draw_series(
             result,
             errors.stamps_ns,
             errors.errors_m,
@@ -66,7 +75,7 @@ def write_figures(
     }
     if reference is not None:
         difference = compare(result.trajectory, reference, association_gap_s)
-        drawn["difference"] = draw_series(
+        drawn["difference"] = lambda: draw_series(
             result,
             difference.stamps_ns,
             difference.differences_m,
@@ -74,12 +83,24 @@ def write_figures(
             limit_m=_PAPER_DIFFERENCE_M,
         )
     return [
-        Drawn(
-            name=name, png=look.save(figure, folder / f"{name}.png"), svg=look.to_svg(figure, name)
-        )
-        for name, figure in drawn.items()
-        if figure is not None
+        figure
+        for name, draw in drawn.items()
+        if (figure := _written(folder, name, draw, [] if faults is None else faults)) is not None
     ]
+
+
+def _written(folder: Path, name: str, draw: Callable[[], Any], faults: list[str]) -> Drawn | None:
+    """Draw and write one figure; None where there is nothing to draw, or it fails."""
+    try:
+        figure = draw()
+        if figure is None:
+            return None
+        png = look.save(figure, folder / f"{name}.png")
+        return Drawn(name=name, png=png, svg=look.to_svg(figure, name))
+    except Exception as error:
+        _log.info("the figure %s", name, exc_info=error)
+        faults.append(f"the figure {name} could not be drawn: {told(error)}")
+        return None
 
 
 def _online(errors: AbsoluteErrors, online: AbsoluteErrors) -> NDArray[np.float64] | None:

@@ -11,13 +11,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.evaluation.accuracy import absolute_errors, relative_errors, root_mean_square
+from sceneslam.evaluation.accuracy import (
+    absolute_errors,
+    relative_errors,
+    root_mean_square,
+    rotation_rmse_rad,
+)
 from sceneslam.evaluation.association import clip
 from sceneslam.evaluation.comparison import compare
 from sceneslam.evaluation.correctness import correct_rate_observed
 from sceneslam.evaluation.detection import score_detection
+from sceneslam.evaluation.gaps import why_bridged
+from sceneslam.evaluation.path import length_ratio, segment_errors
 from sceneslam.evaluation.settings import EvaluationSettings
+from sceneslam.evaluation.shortfalls import shortfalls
 from sceneslam.evaluation.switches import count_false, list_switches
+from sceneslam.types.files import replacing
 from sceneslam.types.run import RunResult
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
@@ -36,7 +45,8 @@ def evaluate(
     """Return all metrics of a run; what cannot be known (no ground truth) is None.
 
     `reference` is another run's trajectory over the same path, compared without alignment.
-    `notes` says in sentences why a number is missing although it could be expected.
+    `notes` says in sentences why a number is missing although it could be expected, `shortfalls`
+    what a run that is complete would not have: they make the exit code 1.
     """
     switches = list_switches(result, truth)
     told = {str(e["scene"]) for e in result.events if e["event"] == "scene"}
@@ -50,9 +60,12 @@ def evaluate(
         **_costs(result),
         "modules": _per_module(result),
         "bridged": sum(module == "" for module in result.modules),
+        "bridged_why": why_bridged(result),
         "peak_rss_mb": peak_rss_mb,
         "faults": [str(e["what"]) for e in result.events if e["event"] == "fault"],
         "notes": _notes(result, truth, settings),
+        "warnings": [str(e["what"]) for e in result.events if e["event"] == "warning"],
+        "shortfalls": shortfalls(result, settings.coverage_min_ratio),
     }
     if reference is not None:
         difference = compare(result.trajectory, reference, settings.association_gap_s)
@@ -66,7 +79,8 @@ def evaluate(
 
 def write_metrics(path: Path, metrics: Metrics) -> None:
     """Write the metrics as JSON that any reader takes (no NaN)."""
-    path.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n")
+    with replacing(path) as file:
+        file.write(json.dumps(metrics, indent=2, allow_nan=False) + "\n")
 
 
 def coverage(result: RunResult) -> float | None:
@@ -91,20 +105,19 @@ def _accuracy(
     estimate, gap_s = result.trajectory, settings.association_gap_s
     absolute = absolute_errors(estimate, true, gap_s)
     relative = relative_errors(estimate, true, gap_s, settings.rpe_interval_s)
-    rate = correct_rate_observed(
-        estimate,
-        true,
-        observed_ns,
-        limit_m=settings.correct_limit_m,
-        limit_rad=settings.correct_limit_rad,
-    )
+    segments = segment_errors(estimate, true, gap_s, settings.segment_m)
     return {
         "ate_rmse_m": absolute.rmse_m,
         "ate_max_m": absolute.max_m,
         "ate_online_m": absolute_errors(result.online, true, gap_s).rmse_m,
+        "ate_rot_rad": rotation_rmse_rad(estimate, true, gap_s),
         "rpe_trans_m": root_mean_square(relative.trans_m),
         "rpe_rot_rad": root_mean_square(relative.rot_rad),
-        "correct_rate": rate,
+        "segment_m": settings.segment_m,
+        "segment_trans_m": root_mean_square(segments.trans_m),
+        "segment_rot_rad": root_mean_square(segments.rot_rad),
+        "length_ratio": length_ratio(estimate, true, gap_s),
+        "correct_rate": correct_rate_observed(estimate, true, observed_ns, settings.limits),
         "truth_matched": len(absolute.errors_m),
         "association_gap_s": gap_s,
     }

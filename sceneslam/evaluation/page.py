@@ -7,10 +7,13 @@ from importlib.resources import files
 from pathlib import Path
 from string import Template
 
+from sceneslam.types.files import replacing
+
 
 def fill_page(path: Path, package: str, template: str, told: Mapping[str, str]) -> Path:
     """Fill a template that lies in a package, which is given the style as well; return its path."""
     page = Template(files(package).joinpath(template).read_text("utf-8"))
     style = files("sceneslam.evaluation").joinpath("page.css").read_text("utf-8")
-    path.write_text(page.substitute(told, style=style), encoding="utf-8")
+    with replacing(path, encoding="utf-8") as file:
+        file.write(page.substitute(told, style=style))
     return path

@@ -27,6 +27,7 @@ _CAPTIONS = {
     "timeline": "Which module gave the poses, and when it was in trouble.",
     "grey_mean": "What the detector measured. Shading: the true scene, where it is known; "
     "dash-dotted: the instant at which a change of scene was confirmed.",
+    "posterior": "How probable each scene is by the votes so far. Shading and lines as above.",
     "error": "Distance from the true position after one rigid alignment of the whole trajectory. "
     "Shading: who gave the pose; dash-dotted: a change of module.",
     "difference": "Distance from the reference run over the same path, without any alignment.",
@@ -44,13 +45,14 @@ def write_report(
     config_yaml: str,
     threshold: float | None,
     versions: Mapping[str, str],
-    faults: Sequence[str],
+    faults: list[str],
     reference: Trajectory | None = None,
     value_label: str = "detector value",
 ) -> Path:
     """Write `figures/*.png` and `report.html` into the run's folder; return the report's path.
 
-    `threshold` is drawn with the detector's values, `faults` are sentences about the input.
+    `threshold` is drawn with the detector's values, `faults` are sentences about the run: those
+    of figures that could not be drawn are added.
     """
     figures = write_figures(
         folder / "figures",
@@ -60,13 +62,14 @@ def write_report(
         value_label=value_label,
         reference=reference,
         association_gap_s=metrics["association_gap_s"],
+        faults=faults,
     )
     entries = chronicle(result, metrics["switches"], value_label=value_label)
     told = {
         **_told(metrics),
         "title": escape(_titled(title, config)),
         "made_of": markup.bullets(_made_of(config)),
-        "faults": _faults([*faults, *metrics["faults"], *metrics["notes"]]),
+        "faults": _faults(_amiss(faults, metrics)),
         "figures": "".join(markup.figure(f.svg, _CAPTIONS[f.name]) for f in figures),
         "chronicle": _chronicle(entries),
         "modules": _modules(metrics, config.get("slam") or {}),
@@ -133,6 +136,11 @@ def _numbers(metrics: Metrics) -> str:
         "position error, root mean square (ATE)": number(metrics["ate_rmse_m"], 4, " m"),
         "the same, as told online": number(online_m, 4, " m"),
         "largest error": number(metrics["ate_max_m"], 3, " m"),
+        "rotation error, root mean square": degrees(metrics["ate_rot_rad"]),
+        f"error over {metrics['segment_m']:g} m of path": number(
+            metrics["segment_trans_m"], 3, " m"
+        ),
+        "estimated over true length": number(metrics["length_ratio"], 4),
         "error of the motion over 1 s": number(metrics["rpe_trans_m"], 4, " m"),
         "turn's error over 1 s": degrees(metrics["rpe_rot_rad"]),
         "of the time correct": percent(metrics["correct_rate"]),
@@ -146,6 +154,12 @@ def _numbers(metrics: Metrics) -> str:
         largest_m = metrics["reference"]["max_difference_m"]
         entries["largest difference from the reference"] = number(largest_m, 3, " m")
     return markup.tiles(entries)
+
+
+def _amiss(faults: Sequence[str], metrics: Metrics) -> list[str]:
+    """Return all that is not as it should be, what weighs most first."""
+    kinds = ("shortfalls", "warnings", "faults", "notes")
+    return [*faults, *(sentence for kind in kinds for sentence in metrics[kind])]
 
 
 def _faults(faults: Sequence[str]) -> str:

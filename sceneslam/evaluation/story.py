@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from sceneslam.evaluation.gaps import in_words
 from sceneslam.evaluation.metrics import Metrics
 from sceneslam.evaluation.summary import degrees, number, percent, seconds
 
@@ -42,7 +43,8 @@ def _opening(metrics: Metrics) -> str:
         f"got a pose; the path is {metrics['path_length_m']:.2f} m long."
     )
     if metrics["bridged"]:
-        text += f" {metrics['bridged']} poses were bridged: no module gave them."
+        why = in_words(metrics["bridged_why"])
+        text += f" {metrics['bridged']} poses were bridged, since no module gave them: {why}."
     if not metrics["switches"]:
         worked = [key for key, module in metrics["modules"].items() if module["poses"]]
         text += f" {_names(worked)} gave the poses; nothing was switched."

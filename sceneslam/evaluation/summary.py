@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from sceneslam.evaluation.gaps import in_words
 from sceneslam.evaluation.metrics import Metrics
 
 _MAX_LINES, _MAX_COLUMNS = 9, 120
@@ -55,7 +56,9 @@ def _what_was_seen(metrics: Metrics) -> str:
 
 def _who_worked(metrics: Metrics) -> str:
     shares = [f"{key} {percent(module['share'], 0)}" for key, module in metrics["modules"].items()]
-    return f"modules: {', '.join(shares) or 'none'}; {metrics['bridged']} poses bridged"
+    why = in_words(metrics["bridged_why"])
+    bridged = f"{metrics['bridged']} poses bridged{f' ({why})' if why else ''}"
+    return f"modules: {', '.join(shares) or 'none'}; {bridged}"
 
 
 def _switch_lines(metrics: Metrics, room: int) -> list[str]:
@@ -89,6 +92,7 @@ def _accuracy_line(metrics: Metrics) -> str:
     return (
         f"against ground truth: ATE {number(metrics['ate_rmse_m'], 4, ' m')} "
         f"(max {number(metrics['ate_max_m'], 3)}), "
+        f"rotation {degrees(metrics['ate_rot_rad'])}, "
         f"RPE {number(metrics['rpe_trans_m'], 4, ' m')} {degrees(metrics['rpe_rot_rad'])}, "
         f"correct {percent(metrics['correct_rate'])}, "
         f"false switches {number(metrics['false_switches'], 0)}"

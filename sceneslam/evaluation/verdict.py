@@ -7,7 +7,8 @@ import json
 import math
 from pathlib import Path
 
-from sceneslam.types.experiment import Figure, Table, Verdict
+from sceneslam.types.experiment import Figure, Relation, Table, Verdict
+from sceneslam.types.files import replacing
 
 
 def write_verdict(folder: Path, experiment: str, verdict: Verdict) -> None:
@@ -17,11 +18,13 @@ def write_verdict(folder: Path, experiment: str, verdict: Verdict) -> None:
         "holds": verdict.holds,
         "figures": [_plain(figure) for figure in verdict.figures],
     }
-    (folder / "verdict.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
-    with (folder / "table.csv").open("w", newline="") as file:
+    with replacing(folder / "verdict.json") as file:
+        file.write(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    with replacing(folder / "table.csv", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerows([verdict.table.columns, *verdict.table.rows])
-    (folder / "table.md").write_text(markdown(verdict.table))
+    with replacing(folder / "table.md") as file:
+        file.write(markdown(verdict.table))
 
 
 def markdown(table: Table) -> str:
@@ -34,17 +37,29 @@ def verdict_lines(verdict: Verdict) -> list[str]:
     """Return one line per figure, for the command line."""
     return [
         f"{'holds' if figure.holds else 'FAILS'}  {figure.name}: {rounded(figure.value)} "
-        f"{figure.unit} ({figure.relation.value} {rounded(figure.bound)})"
+        f"{figure.unit} ({promised(figure)})"
         for figure in verdict.figures
     ]
 
 
+def promised(figure: Figure) -> str:
+    """Return a figure's bound in words."""
+    bound = rounded(figure.bound)
+    return {
+        Relation.AT_LEAST: f"at least {bound}",
+        Relation.AT_MOST: f"at most {bound}",
+        Relation.BETWEEN: f"{rounded(figure.low)} to {bound}",
+    }[figure.relation]
+
+
 def _plain(figure: Figure) -> dict[str, str | float | bool | None]:
+    low = {"low": figure.low} if figure.relation is Relation.BETWEEN else {}
     return {
         "name": figure.name,
         "value": figure.value if math.isfinite(figure.value) else None,
         "unit": figure.unit,
         "relation": figure.relation.value,
+        **low,
         "bound": figure.bound,
         "holds": figure.holds,
     }

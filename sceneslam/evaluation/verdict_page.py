@@ -11,7 +11,7 @@ from typing import Any
 from sceneslam.evaluation import markup
 from sceneslam.evaluation.page import fill_page
 from sceneslam.evaluation.summary import number, percent
-from sceneslam.evaluation.verdict import rounded
+from sceneslam.evaluation.verdict import promised, rounded
 from sceneslam.types.experiment import Figure, Trial, Verdict
 
 _OPEN_RUNS = 12  # a longer list is folded
@@ -77,9 +77,7 @@ def _promises(figures: Sequence[Figure]) -> str:
 
 
 def _measured(figure: Figure) -> str:
-    side = {">=": "at least", "<=": "at most"}[figure.relation.value]
-    value, bound = rounded(figure.value), rounded(figure.bound)
-    return f"{value} {figure.unit}".rstrip() + f" ({side} {bound})"
+    return f"{rounded(figure.value)} {figure.unit}".rstrip() + f" ({promised(figure)})"
 
 
 def _runs(folder: Path, runs: Sequence[Ran]) -> str:

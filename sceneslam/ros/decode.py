@@ -119,6 +119,11 @@ def depth_m(message: Any, units: pixels.DepthUnits) -> NDArray[np.float32] | Non
     return _integers(stored, units)
 
 
+def is_metric_depth(message: Any) -> bool:
+    """Tell whether an image of depth holds metres, not whole units."""
+    return _encoding(message)[0].startswith("32FC1")
+
+
 def is_blank_depth(message: Any) -> bool:
     """Tell whether an image of float depth, not compressed, holds not one finite value."""
     encoding, is_compressed = _encoding(message)

@@ -50,6 +50,13 @@ class DepthUnits:
         count = np.arange(1 << 16, dtype=np.float32)
         self._table_m = self._cut(count / np.float32(units_per_m))
 
+    @classmethod
+    def unlimited(cls, units_per_m: float) -> DepthUnits:
+        """Return units that keep every depth but the largest number, which means "missing"."""
+        units = cls(units_per_m, (0.0, float("inf")))
+        units._table_m[-1] = 0.0
+        return units
+
     def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
         """Return metres (H, W) of whole units."""
         return locked(np.take(self._table_m, stored))

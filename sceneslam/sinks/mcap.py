@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sceneslam.ros.writer import ObservationWriter
 from sceneslam.types.errors import ConfigError
+from sceneslam.types.files import finish, part_of
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.run import Event
@@ -20,15 +21,17 @@ class McapSink:
     def __init__(self, path: str, image_format: str) -> None:
         if image_format not in ("jpeg", "png"):
             raise ConfigError("image_format", image_format, "jpeg or png")
-        self._path = Path(path)
+        self._path = self._file = Path(path)
         self._image_format = image_format
         self._writer: ObservationWriter | None = None
         self._module = ""
 
     def open(self, rig: Rig, folder: Path) -> None:
-        """Begin the file; a relative path is one in `folder`."""
-        path = folder / self._path
-        self._writer = ObservationWriter(path, rig=rig, image_format=self._image_format)
+        """Begin the file, which gets its name by `close`; a relative path is one in `folder`."""
+        self._file = folder / self._path
+        self._file.parent.mkdir(parents=True, exist_ok=True)
+        part = part_of(self._file)
+        self._writer = ObservationWriter(part, rig=rig, image_format=self._image_format)
         self._module = ""
 
     def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
@@ -56,5 +59,6 @@ class McapSink:
     def close(self) -> None:
         """Finish the file."""
         if self._writer is not None:
-            self._writer.close()
-            self._writer = None
+            writer, self._writer = self._writer, None
+            writer.close()
+            finish(self._file)

@@ -14,6 +14,7 @@ from sceneslam.sinks.rerun_sensors import SensorLog
 from sceneslam.sinks.rerun_viewer import Viewer
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
+from sceneslam.types.files import finish, part_of
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.run import Event, RunResult
@@ -54,6 +55,7 @@ class RerunSink:
         every = {"image": image_every, "depth": depth_every, "scan": scan_every}
         self._sensors = SensorLog(every, jpeg_quality)
         self._path, self._viewer = path, viewer
+        self._file: Path | None = None
         self._recording: rr.RecordingStream | None = None
         self._colors: dict[str, tuple[int, int, int]] = {"": at.BRIDGED_RGB}
         self._start_ns: int | None = None
@@ -73,9 +75,9 @@ class RerunSink:
             sys.stderr.write(f"{self._viewer.open()}\n")
             self._recording.connect_grpc(self._viewer.url, default_blueprint=at.layout(rig))
         else:
-            path = folder / str(self._path)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._recording.save(path, default_blueprint=at.layout(rig))
+            self._file = folder / str(self._path)
+            self._file.parent.mkdir(parents=True, exist_ok=True)
+            self._recording.save(part_of(self._file), default_blueprint=at.layout(rig))
         self._recording.log("world", self._rr.ViewCoordinates.FLU, static=True)
         self._sensors.place(self._recording, rig)
 
@@ -124,6 +126,8 @@ class RerunSink:
             self._recording.flush()
             self._recording.disconnect()
             self._recording = None
+            if self._file is not None:
+                finish(self._file)
 
     def _set_time(self, recording: rr.RecordingStream, stamp_ns: int) -> None:
         if self._start_ns is None:
@@ -146,6 +150,8 @@ class RerunSink:
         if value is not None and math.isfinite(value):
             recording.log(at.VALUE, self._rr.Scalars([value]))
         self._write_level(recording, at.VOTES, event["scene"], None)
+        for scene, probability in event.get("posterior", {}).items():
+            recording.log(f"{at.POSTERIOR}/{scene}", self._rr.Scalars([probability]))
 
     def _write_level(
         self, recording: rr.RecordingStream, path: str, scene: str, previous: str | None

@@ -10,6 +10,7 @@ BASE, CAMERA, LASER = "world/base", "world/base/camera", "world/base/laser"
 ONLINE, REVISED = "world/trajectory/online", "world/trajectory/revised"
 TRUTH, MAP = "world/ground_truth", "world/map"
 VALUE, VOTES, CONFIRMED, ERRORS = "plots/value", "plots/votes", "plots/confirmed", "plots/error"
+POSTERIOR = "plots/posterior"
 DECISIONS = "decisions"
 TIMELINE = "time"
 
@@ -54,4 +55,4 @@ def _image(name: str) -> Any:
 
 
 def _scenes() -> list[str]:
-    return [f"/{VOTES}/**", f"/{CONFIRMED}/**"]
+    return [f"/{VOTES}/**", f"/{POSTERIOR}/**", f"/{CONFIRMED}/**"]

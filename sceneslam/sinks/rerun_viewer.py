@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import socket
 import subprocess
 import sys
@@ -39,6 +40,7 @@ class Viewer:
         if not _listens(self._port):
             if self._web_port is not None and _listens(self._web_port):
                 raise ConfigError("web_port", self._web_port, "a port that nothing else listens on")
+            self._check_display()
             self.process = subprocess.Popen(
                 self._command(),
                 stdin=subprocess.DEVNULL,
@@ -53,6 +55,13 @@ class Viewer:
             where = f"http://{HOST}:{self._web_port}/?url={address}"
         stays = f"; it stays open: `kill -- -{self.process.pid}` ends it" if self.process else ""
         return f"Rerun: {where}{stays}"
+
+    def _check_display(self) -> None:
+        """Raise ConfigError where a window has nowhere to open."""
+        is_linux = sys.platform.startswith("linux")
+        has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+        if self._web_port is None and is_linux and not has_display:
+            raise ConfigError("web_port", None, "a port, as 9090: there is no display for a window")
 
     def _command(self) -> list[str]:
         command = [sys.executable, "-m", "rerun", "--bind", HOST, "--port", str(self._port)]

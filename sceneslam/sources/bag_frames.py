@@ -26,10 +26,9 @@ class FrameTree:
                 for entry in getattr(recording.decode(message), "transforms", ()):
                     self._add(entry)
         frames = {*self._up, *(parent for parent, _ in self._up.values())}
-        if base_frame is not None and frames and base_frame not in frames:
-            raise ConfigError(
-                "base_frame", base_frame, f"null or one of {', '.join(sorted(frames))}"
-            )
+        if base_frame is not None and base_frame not in frames:
+            known = ", ".join(sorted(frames)) or "it has no /tf_static and no /tf"
+            raise ConfigError("base_frame", base_frame, f"null or one of the recording's: {known}")
         self.base = base_frame or next((name for name in _BASES if name in frames), None)
 
     def T_base(self, frame: str) -> Transform | None:

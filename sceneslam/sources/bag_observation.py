@@ -39,9 +39,13 @@ class BundleDecoder:
         self._sensors = sensors
         self._size_wh = size_wh
         self._units = units
+        self._has_depth = False  # of the image's size
 
     def observe(self, bundle: Bundle) -> Decoded:
-        """Return the bundle's observation; raises InputError when an image changes its size."""
+        """Return the bundle's observation; an image of another size is as good as damaged.
+
+        Raises InputError where the first depth image has another size than the image.
+        """
         problems: list[str] = []
         stamp_ns = bundle.primary.stamp_ns
         scan, points = self._scan(bundle, problems), self._points(bundle, problems)
@@ -78,8 +82,7 @@ class BundleDecoder:
         if image is None:
             problems.append("a colour image could not be decoded")
             return None
-        self._check_size("image", sample.stamp_ns, image)
-        return image
+        return image if self._has_size("a colour image", image, problems) else None
 
     def _depth(self, bundle: Bundle, problems: list[str]) -> NDArray[np.float32] | None:
         sample = self._sample(Sensor.DEPTH, bundle)
@@ -89,16 +92,28 @@ class BundleDecoder:
         if depth_m is None:
             problems.append("a depth image could not be decoded")
             return None
-        self._check_size("depth", sample.stamp_ns, depth_m)
+        if not self._has_size("a depth image", depth_m, problems):
+            self._refuse_first(sample.stamp_ns, depth_m)
+            return None
+        self._has_depth = True
         if decode.is_blank_depth(sample.value):
             problems.append("depth image without one finite value")
         return depth_m
 
-    def _check_size(self, name: str, stamp_ns: int, picture: NDArray[np.generic]) -> None:
+    def _has_size(self, name: str, picture: NDArray[np.generic], problems: list[str]) -> bool:
         height, width = picture.shape[:2]
-        if self._size_wh and (width, height) != self._size_wh:
+        if self._size_wh is None or (width, height) == self._size_wh:
+            return True
+        expected = f"{self._size_wh[0]}x{self._size_wh[1]}"
+        problems.append(f"{name} was left out, it has {width}x{height} pixels, not {expected}")
+        return False
+
+    def _refuse_first(self, stamp_ns: int, depth_m: NDArray[np.float32]) -> None:
+        """Raise InputError where no depth so far had the image's size: no other will."""
+        if not self._has_depth and self._size_wh is not None:
+            height, width = depth_m.shape
             raise InputError(
-                f"{name} at stamp {stamp_ns * 1e-9:.6f} s: expected {self._size_wh[0]}x"
+                f"depth at stamp {stamp_ns * 1e-9:.6f} s: expected {self._size_wh[0]}x"
                 f"{self._size_wh[1]} pixels as in the first image, got {width}x{height}"
             )
 

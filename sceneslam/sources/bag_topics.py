@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +11,7 @@ from sceneslam.ros import decode, names
 from sceneslam.sources.recording import Recording
 from sceneslam.types.errors import ConfigError, InputError
 
+_log = logging.getLogger(__name__)
 NONE = "none"  # as a topic's name: do without
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _POSES = (
@@ -62,6 +64,9 @@ def choose_topics(recording: Recording, given: Mapping[str, str | None]) -> Topi
     firsts = {name: first(recording, name) for name in images}
     depths = [name for name in images if firsts[name] and decode.is_depth(firsts[name], name)]
     colors = [name for name in images if firsts[name] and name not in depths]
+    for name in [name for name in colors if _is_8_bit_depth(name, firsts[name])]:
+        _log.warning("%s holds 8-bit images (8UC1), no depth: that is 16UC1 or 32FC1", name)
+        colors.remove(name)
     found = {
         "image": _without_grey(_one_transport(colors), firsts),
         "depth": _prefer(_one_transport(depths), lambda name: "align" in name or "regist" in name),
@@ -115,6 +120,12 @@ def _of_type(recording: Recording, types: Collection[str]) -> list[str]:
 
 def _is_truth(name: str) -> bool:
     return "ground_truth" in name or "groundtruth" in name
+
+
+def _is_8_bit_depth(name: str, message: Any) -> bool:
+    """Tell whether this is a picture of depth for people: its unit is lost."""
+    is_colour = "color" in name or "rgb" in name
+    return "depth" in name and not is_colour and decode.is_grey(message)
 
 
 def _one_transport(topics: Sequence[str]) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +15,17 @@ from sceneslam.sources.faults import FaultLog
 from sceneslam.sources.intrinsics import checked_above_zero
 from sceneslam.sources.rising import rising_order, rising_stamps
 from sceneslam.sources.spanned import Span
+from sceneslam.sources.survey.survey import Stream, Survey, spread
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
+from sceneslam.types.input_files import given_file
 from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Laser, Rig, Sensor
 from sceneslam.types.truth import GroundTruth
 
 _LOG = logging.getLogger(__name__)
 _LATE_MAX_S = 2.0  # messages overtake each other by less; a clock that is set jumps farther
+_SAMPLES = 20  # scans of a survey
 _OFFSET = b"robot_frontlaser_offset"
 
 
@@ -37,9 +40,7 @@ class Carmen:
 
     def __init__(self, path: str, range_max_m: float) -> None:
         self._range_max_m = checked_above_zero("range_max_m", range_max_m)
-        self._path = Path(path)
-        if not self._path.is_file():
-            raise InputError(f"recording not found, expected a CARMEN log: {path}")
+        self._path = given_file(path, "a CARMEN log")
         self._lines = self._scan_lines()
         first = next((scan for scan in map(parse_scan, self._lines) if scan), None)
         if first is None:
@@ -89,6 +90,27 @@ class Carmen:
                 )
             else:
                 yield self._observation(scan, stamp_ns)
+
+    def survey(self) -> Survey:
+        """Return the scans, some of them and their odometry parsed."""
+        places = spread(len(self._lines), _SAMPLES)
+        pairs = sorted({place for at in places for place in (at, min(at + 1, places[-1]))})
+        parsed = [(int(self._stamps_ns[at]), parse_scan(self._lines[at])) for at in pairs]
+        whole = [(stamp_ns, scan) for stamp_ns, scan in parsed if scan is not None]
+        laser = Stream(
+            sensor=Sensor.SCAN,
+            place=self._path.name,
+            count=len(self._lines),
+            stamps_ns=self._stamps_ns,
+        )
+        wheels = replace(laser, sensor=Sensor.ODOMETRY)
+        observations = [self._observation(scan, stamp_ns) for stamp_ns, scan in whole]
+        return Survey(
+            streams=[laser, wheels],
+            scans=[one.scan for one in observations if one.scan is not None],
+            odometry_ns=np.array([stamp_ns for stamp_ns, _ in whole], np.int64),
+            T_odom_base=[scan.T_odom_base for _, scan in whole],
+        )
 
     def ground_truth(self) -> GroundTruth | None:
         """Return None: a log has no truth of its own (relations are for the evaluation)."""

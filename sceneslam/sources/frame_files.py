@@ -38,12 +38,12 @@ class FrameReader:
     def __init__(self, size_wh: tuple[int, int], units: pixels.DepthUnits) -> None:
         self._size_wh = size_wh
         self._units = units
+        self._has_depth = False  # of the first image's size
 
     def read(self, frame: FrameFiles) -> ReadFrame:
-        """Return the frame's observation.
+        """Return the frame's observation; an image of another size is as good as damaged.
 
-        Raises InputError for an image of another size than the first, and for depth that is not
-        16 bit.
+        Raises InputError for depth that is not 16 bit, and where the first is of another size.
         """
         problems: dict[str, Path] = {}
         image_bgr = self._image(frame.color, problems)
@@ -53,14 +53,18 @@ class FrameReader:
         observation = Observation(stamp_ns=frame.stamp_ns, image_bgr=image_bgr, depth_m=depth_m)
         return ReadFrame(observation=observation, problems=problems)
 
+    def depth_m(self, path: Path) -> NDArray[np.float32] | None:
+        """Return a depth image [m], None when it cannot be read; raises InputError as `read`."""
+        return self._depth(path, {})
+
     def _image(self, path: Path, problems: dict[str, Path]) -> NDArray[np.uint8] | None:
         data = _bytes(path, "colour image is missing", problems)
         image_bgr = None if data is None else pixels.decode_bgr(data)
-        if image_bgr is not None:
-            self._check_size(path, image_bgr)
-        elif data is not None:
-            problems["colour image is damaged"] = path
-        return image_bgr
+        if image_bgr is None:
+            if data is not None:
+                problems["colour image is damaged"] = path
+            return None
+        return image_bgr if self._has_size(path, image_bgr, problems) else None
 
     def _depth(self, path: Path, problems: dict[str, Path]) -> NDArray[np.float32] | None:
         data = _bytes(path, "depth image is missing", problems)
@@ -75,16 +79,21 @@ class FrameReader:
                 f"depth image: expected 16 bit in one channel, got {8 * stored.itemsize} bit "
                 f"in {channels}: {path}"
             )
-        self._check_size(path, stored)
+        if not self._has_size(path, stored, problems):
+            if not self._has_depth:  # no other will
+                raise InputError(f"depth: {next(reversed(problems))}: {path}")
+            return None
+        self._has_depth = True
         return self._units.of_integers(stored)
 
-    def _check_size(self, path: Path, picture: NDArray[np.generic]) -> None:
+    def _has_size(
+        self, path: Path, picture: NDArray[np.generic], problems: dict[str, Path]
+    ) -> bool:
         height, width = picture.shape[:2]
+        expected = f"{self._size_wh[0]}x{self._size_wh[1]}"
         if (width, height) != self._size_wh:
-            raise InputError(
-                f"image size: expected {self._size_wh[0]}x{self._size_wh[1]} as the first image, "
-                f"got {width}x{height}: {path}"
-            )
+            problems[f"image left out, it has {width}x{height} pixels, not {expected}"] = path
+        return (width, height) == self._size_wh
 
 
 def first_size_wh(frames: Iterable[FrameFiles]) -> tuple[int, int]:
@@ -101,7 +110,10 @@ def first_size_wh(frames: Iterable[FrameFiles]) -> tuple[int, int]:
 
 def _bytes(path: Path, problem: str, problems: dict[str, Path]) -> bytes | None:
     try:
-        return path.read_bytes()
+        if path.is_file():  # no pipe: reading one may never end
+            return path.read_bytes()
+        problems[problem] = path
+        return None
     except OSError:
         problems[problem] = path
         return None

@@ -15,8 +15,10 @@ from sceneslam.sources.intrinsics import checked_range_m
 from sceneslam.sources.kitti_times import read_times_ns
 from sceneslam.sources.prefetch import prefetched
 from sceneslam.sources.spanned import Span
+from sceneslam.sources.survey.survey import Stream, Survey, spread
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
+from sceneslam.types.input_files import given_folder
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Lidar, Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
@@ -24,6 +26,7 @@ from sceneslam.types.truth import GroundTruth
 
 _FOLDERS = ("velodyne", "velodyne_points/data", ".")
 _POINT_BYTES = 16  # float32 x y z reflectance
+_SAMPLES = 3  # scans of a survey
 
 
 class Kitti:
@@ -36,9 +39,7 @@ class Kitti:
 
     def __init__(self, path: str, range_m: list[float]) -> None:
         low_m, high_m = checked_range_m("range_m", range_m)
-        self._folder = Path(path)
-        if not self._folder.is_dir():
-            raise InputError(f"recording not found, expected a folder: {path}")
+        self._folder = given_folder(path)
         self._files = _scan_files(self._folder)
         self._stamps_ns = read_times_ns(self._folder, len(self._files))
         self._rig = Rig(sensors=frozenset({Sensor.POINTS}), lidar=Lidar(range_m=(low_m, high_m)))
@@ -75,6 +76,17 @@ class Kitti:
                 self._faults.add("scan is empty or cut off", str(path))
             else:
                 yield Observation(stamp_ns=stamp_ns, points_lidar=points)
+
+    def survey(self) -> Survey:
+        """Return the scans, some of them read."""
+        lidar = Stream(
+            sensor=Sensor.POINTS,
+            place=str(self._files[0].parent),
+            count=len(self._files),
+            stamps_ns=self._stamps_ns,
+        )
+        scans = [_read_scan(self._files[at]) for at in spread(len(self._files), _SAMPLES)]
+        return Survey(streams=[lidar], clouds=[points for points in scans if points is not None])
 
     def ground_truth(self) -> GroundTruth | None:
         """Return the drive's poses, None when it has none."""
@@ -115,7 +127,10 @@ def _scan_files(folder: Path) -> Sequence[Path]:
 
 def _read_scan(path: Path) -> NDArray[np.float32] | None:
     """Return the finite points (N, 3) [m] of a file, None when it is empty or cut off."""
-    data = path.read_bytes()
+    try:
+        data = path.read_bytes() if path.is_file() else b""
+    except OSError:
+        return None
     if not data or len(data) % _POINT_BYTES:
         return None
     points = np.frombuffer(data, dtype="<f4").reshape(-1, 4)[:, :3]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types.errors import InputError
+from sceneslam.types.input_files import read_text
 
 _PERIOD_NS = 100_000_000
 _NAMES = ("times.txt", "velodyne_points/timestamps.txt", "timestamps.txt")
@@ -22,7 +23,7 @@ def read_times_ns(folder: Path, count: int) -> NDArray[np.int64]:
     for name in _NAMES:
         path = folder / name
         if path.is_file():
-            lines = [line.strip() for line in path.read_text(errors="replace").splitlines()]
+            lines = [line.strip() for line in read_text(path).splitlines()]
             stamps = [_stamp_ns(line, path) for line in lines if line and line[0] != "#"]
             if len(stamps) != count:
                 raise InputError(

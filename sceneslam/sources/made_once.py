@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from sceneslam.interfaces import Source
+from sceneslam.sources.cache_folder import writable
 from sceneslam.sources.wrapped import Wrapped
+from sceneslam.types.input_files import given_path
 from sceneslam.types.observation import Observation
 from sceneslam.types.truth import GroundTruth
+
+_log = logging.getLogger(__name__)
 
 
 class MadeOnce(Wrapped):
@@ -20,7 +25,7 @@ class MadeOnce(Wrapped):
 
     def __init__(self, source: Source, folder: Path) -> None:
         super().__init__(source)
-        self._folder = folder.expanduser()
+        self._folder = given_path(str(folder))
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the source's observations."""
@@ -44,7 +49,15 @@ class MadeOnce(Wrapped):
         except ImportError:  # Windows: everyone makes its own, and the last one stays
             yield
             return
-        self._folder.mkdir(parents=True, exist_ok=True)
-        with (self._folder / ".lock").open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
+        with writable(self._folder):
+            self._folder.mkdir(parents=True, exist_ok=True)
+            file = (self._folder / ".lock").open("w")
+        with file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                _log.warning("another process makes a recording in %s: waiting", self._folder)
+                fcntl.flock(file, fcntl.LOCK_EX)
+            except OSError:  # a file system without locks: everyone makes its own
+                _log.info("%s cannot be locked", self._folder)
             yield

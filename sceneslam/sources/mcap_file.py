@@ -113,13 +113,14 @@ class McapFile:
         `note` says what is wrong with the index.
         """
         content, spans, lost = records.Content(), [], 0
-        position, is_complete = len(records.MAGIC), False
+        position, is_complete, is_cut = len(records.MAGIC), False, not records.has_end(file)
         while position + records.RECORD_HEAD.size <= size and not is_complete:
             file.seek(position)
             opcode, length = records.RECORD_HEAD.unpack(file.read(records.RECORD_HEAD.size))
             whole = records.RECORD_HEAD.size + length
-            if position + whole > size:
+            if position + whole > size and not (is_cut and opcode == records.CHUNK):
                 break
+            whole = min(whole, size - position)
             is_complete = opcode == records.DATA_END
             if opcode in _KEPT:
                 file.seek(position)
@@ -140,7 +141,7 @@ class McapFile:
             for offset, length, span in spans
             if span
         ]
-        if not is_complete and records.has_end(file):
+        if not is_complete and not is_cut:
             lost += size - position  # the damage is inside
         elif not is_complete:
             note = cut_off(chunks, topics)

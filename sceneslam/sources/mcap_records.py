@@ -14,6 +14,7 @@ MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA, DATA_END = 2, 3, 4, 5, 6, 12, 15
+_CHUNK_HEAD = struct.Struct("<QQQII")  # times, size, checksum, length of the compression's name
 _FOOTER_BODY = struct.Struct("<QQI")  # summary start, summary offset start, summary checksum
 
 
@@ -61,12 +62,17 @@ class Content:
 
 
 def read_records(data: bytes) -> Sequence[Record] | None:
-    """Return the records in the bytes of one record (a chunk's own), None when it is damaged."""
+    """Return the records in the bytes of one record (a chunk's own), None when it is damaged.
+
+    Of a chunk that is cut off they are those that are whole.
+    """
     view = memoryview(data)
     if len(view) < RECORD_HEAD.size:
         return None
     opcode, length = RECORD_HEAD.unpack_from(view)
     body = view[RECORD_HEAD.size :]
+    if len(body) < length and opcode == CHUNK:
+        return _split(memoryview(_unpack_cut_chunk(body)), is_cut=True)
     if len(body) != length:
         return None
     if opcode != CHUNK:
@@ -118,13 +124,35 @@ def _unpack_chunk(body: memoryview) -> bytes | None:
         return None
 
 
-def _split(view: memoryview) -> Sequence[Record] | None:
-    records, position = [], 0
+def _unpack_cut_chunk(body: memoryview) -> bytes:
+    """Return what can be unpacked of the beginning of a chunk."""
+    import lz4.frame  # type: ignore[import-untyped]
+    import zstandard
+
+    # Its head: first and last time, size, checksum, compression, length of what is packed.
+    if len(body) < _CHUNK_HEAD.size:
+        return b""
+    *_, length = _CHUNK_HEAD.unpack_from(body)
+    compression = bytes(body[_CHUNK_HEAD.size :][:length])
+    packed = bytes(body[_CHUNK_HEAD.size + length + 8 :])
+    try:
+        if compression == b"lz4":
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed))
+        if compression == b"zstd":
+            return bytes(zstandard.ZstdDecompressor().decompressobj().decompress(packed))
+    except (RuntimeError, ValueError, EOFError, zstandard.ZstdError):
+        return b""
+    return packed if not compression else b""
+
+
+def _split(view: memoryview, *, is_cut: bool = False) -> Sequence[Record] | None:
+    records: list[Record] = []
+    position = 0
     while position + RECORD_HEAD.size <= len(view):
         opcode, length = RECORD_HEAD.unpack_from(view, position)
         start = position + RECORD_HEAD.size
         position = start + length
         if position > len(view) or (opcode == MESSAGE and length < MESSAGE_HEAD.size):
-            return None
+            return records if is_cut else None
         records.append(Record(opcode=opcode, body=view[start:position]))
     return records

@@ -13,7 +13,8 @@ from sceneslam.sources import bag_records, mcap_records
 from sceneslam.sources.bag_file import open_bag
 from sceneslam.sources.mcap_file import open_mcap
 from sceneslam.sources.recording import Message, Recording
-from sceneslam.types.errors import InputError
+from sceneslam.types.errors import InputError, told
+from sceneslam.types.input_files import check_regular
 
 _FIRST_LOOK_BACK_NS = 2_000_000_000
 
@@ -24,8 +25,12 @@ def open_recording(path: Path) -> Recording:
         raise InputError(f"recording not found: {path}")
     if path.is_dir():
         return _open_folder(path)
-    with path.open("rb") as file:
-        start = file.read(16)
+    check_regular(path, "a ROS 1 bag, rosbag2 folder or MCAP file")
+    try:
+        with path.open("rb") as file:
+            start = file.read(16)
+    except OSError as error:
+        raise InputError(f"recording cannot be read ({told(error)}): {path}") from error
     if not start:
         raise InputError(f"recording: the file is empty: {path}")
     if start.startswith(bag_records.MAGIC):
@@ -52,17 +57,26 @@ class FolderRecording:
     def __init__(self, path: Path) -> None:
         self._path = path
         self.faults: Sequence[str] = ()
+        self.is_slow = False
         self.metadata: Mapping[str, Mapping[str, str]] = {}
         self.topics = self._read_topics()
         self._decoder = MessageDecoder(self.topics)
 
-    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """Return the first and last log time."""
+        from rosbags.rosbag2 import Reader
+
+        with self._guarded(), Reader(self._path) as reader:
+            return int(reader.start_time), int(reader.end_time)
+
+    def messages(self, topics: Collection[str], from_ns: int | None = None) -> Iterator[Message]:
         """Yield the messages of `topics` by log time."""
         from rosbags.rosbag2 import Reader
 
         with self._guarded(), Reader(self._path) as reader:
             wanted = [entry for entry in reader.connections if entry.topic in topics]
-            for entry, log_ns, data in reader.messages(wanted) if wanted else ():
+            for entry, log_ns, data in reader.messages(wanted, start=from_ns) if wanted else ():
                 yield Message(topic=entry.topic, log_ns=log_ns, data=bytes(data))
 
     def last(self, topic: str) -> Message | None:

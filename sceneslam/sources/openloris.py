@@ -8,7 +8,9 @@ from pathlib import Path
 
 from sceneslam.ros.pixels import locked
 from sceneslam.sources.spanned import Span
+from sceneslam.sources.survey.survey import Stream, Survey
 from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.input_files import given_folder
 from sceneslam.types.observation import Observation
 from sceneslam.types.recorded import RecordedTrajectory, read_recorded
 from sceneslam.types.rig import Rig, Sensor
@@ -30,9 +32,7 @@ class OpenLoris:
         named = re.fullmatch(r"([a-z]+)-(\d+)-(\d+)", sequence)
         if named is None:
             raise ConfigError("sequence", sequence, "scene-package-number, as in home-1-3")
-        self._folder = Path(path)
-        if not self._folder.is_dir():
-            raise InputError(f"recording not found, expected a folder: {path}")
+        self._folder = given_folder(path)
         self._scene, self._number = named[1], int(named[3])
         self._odometry = self._find(_ODOMETRY)
         if not len(self._odometry):
@@ -66,6 +66,20 @@ class OpenLoris:
         )
         for stamp_ns, T_odom_base in poses:
             yield Observation(stamp_ns=stamp_ns, T_odom_base=locked(T_odom_base))
+
+    def survey(self) -> Survey:
+        """Return the odometry's poses."""
+        wheels = Stream(
+            sensor=Sensor.ODOMETRY,
+            place=f"{self._scene} {_ODOMETRY}",
+            count=len(self._odometry),
+            stamps_ns=self._odometry.stamps_ns,
+        )
+        return Survey(
+            streams=[wheels],
+            odometry_ns=self._odometry.stamps_ns,
+            T_odom_base=list(self._odometry.T_world_base),
+        )
 
     def ground_truth(self) -> GroundTruth | None:
         """Return the sequence's true poses of base, None when the folder has none."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from numbers import Integral
 from typing import Any
@@ -10,11 +11,13 @@ from sceneslam.interfaces import Source
 from sceneslam.sources.clean import cleaned
 from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.sources.odometer import Odometer
+from sceneslam.sources.rests import Rests
 from sceneslam.sources.wrapped import Wrapped
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
 from sceneslam.types.truth import GroundTruth
 
+_LOG = logging.getLogger(__name__)
 _STAMP_MAX_NS = 2**62  # 146 years: differences of two stamps fit into 64 bits
 _PERIODS = 4  # one or two frames lost in a row are common
 
@@ -25,7 +28,8 @@ class Ordered(Wrapped):
     Odometry that was reset goes on from where it was.
 
     A single stamp ahead of its neighbours, by more than a few of the source's own periods, is left
-    out too, rather than all that follow it. A gap longer than `max_gap_s` is reported.
+    out too, rather than all that follow it. A gap longer than `max_gap_s` is a fault, but for a
+    rest: over it odometry moved no farther than it did between two observations before.
     """
 
     def __init__(self, source: Source, max_gap_s: float = 5.0) -> None:
@@ -43,7 +47,8 @@ class Ordered(Wrapped):
     def __iter__(self) -> Iterator[Observation]:
         """Yield the source's observations by rising stamp."""
         self._log.clear()
-        self._odometer = Odometer()
+        self._rested_s: list[float] = []
+        self._odometer, self._rests = Odometer(), Rests(self._max_gap_ns)
         last_ns: int | None = None
         period_ns = self._max_gap_ns // _PERIODS  # the longest of late
         held: Observation | None = None  # after a jump: it may be the jump that is wrong
@@ -54,9 +59,10 @@ class Ordered(Wrapped):
                 if is_back and (last_ns is None or stamp_ns > last_ns):
                     self._skip(held)
                 else:
-                    self._note_gap(last_ns, held.stamp_ns)
+                    mended = self._mended(held)
+                    self._note_gap(last_ns, mended)
                     last_ns = held.stamp_ns
-                    yield self._mended(held)
+                    yield mended
                 held = None
             if last_ns is not None and stamp_ns <= last_ns:
                 self._skip(observation)
@@ -67,15 +73,19 @@ class Ordered(Wrapped):
                 last_ns = stamp_ns
                 yield self._mended(observation)
         if held is not None:
-            self._note_gap(last_ns, held.stamp_ns)
-            yield self._mended(held)
+            mended = self._mended(held)
+            self._note_gap(last_ns, mended)
+            yield mended
+        self._tell_of_rests()
 
     def ground_truth(self) -> GroundTruth | None:
         """Return the source's ground truth."""
         return self._source.ground_truth()
 
     def _mended(self, observation: Observation) -> Observation:
-        return self._odometer.smooth(cleaned(observation, self._log), self._log)
+        mended = self._odometer.smooth(cleaned(observation, self._log), self._log)
+        self._rests.take(mended)
+        return mended
 
     def _is_stamped(self, observation: object) -> bool:
         """Tell whether this is an observation with a stamp that a recording can hold."""
@@ -89,8 +99,21 @@ class Ordered(Wrapped):
         kind = "observation left out, its stamp repeats, runs backwards or jumps"
         self._log.add(kind, at_stamp(observation.stamp_ns))
 
-    def _note_gap(self, last_ns: int | None, stamp_ns: int) -> None:
-        if last_ns is not None and stamp_ns - last_ns > self._max_gap_ns:
-            self._log.add(
-                f"no observation for {(stamp_ns - last_ns) * 1e-9:.1f} s", at_stamp(last_ns)
+    def _note_gap(self, last_ns: int | None, observation: Observation) -> None:
+        """Note a gap before an observation that was taken."""
+        if last_ns is None or observation.stamp_ns - last_ns <= self._max_gap_ns:
+            return
+        gap_s = (observation.stamp_ns - last_ns) * 1e-9
+        if self._rests.is_after_rest:
+            self._rested_s.append(gap_s)
+        else:
+            self._log.add(f"no observation for {gap_s:.1f} s", at_stamp(last_ns))
+
+    def _tell_of_rests(self) -> None:
+        """Tell of gaps in which the robot stood: nothing is lost, so they are no fault."""
+        if self._rested_s:
+            _LOG.warning(
+                "the robot rested and nothing was recorded, %d times, at most for %.1f s",
+                len(self._rested_s),
+                max(self._rested_s),
             )

@@ -36,12 +36,22 @@ class Recording(Protocol):
         ...
 
     @property
+    def is_slow(self) -> bool:
+        """Tell whether it is packed so that a second of it takes seconds to read."""
+        ...
+
+    @property
     def metadata(self) -> Mapping[str, Mapping[str, str]]:
         """Return named texts that were recorded beside the messages."""
         ...
 
-    def messages(self, topics: Collection[str]) -> Iterator[Message]:
-        """Yield the messages of `topics` by log time, from the beginning."""
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """Return when the first and the last message were recorded."""
+        ...
+
+    def messages(self, topics: Collection[str], from_ns: int | None = None) -> Iterator[Message]:
+        """Yield the messages of `topics` by log time, from the beginning or an instant."""
         ...
 
     def last(self, topic: str) -> Message | None:
@@ -112,7 +122,7 @@ class ChunkedRecording:
     def __init__(
         self, layouts: Sequence[Layout], read_chunk: ChunkReader, *, is_slow: bool = False
     ) -> None:
-        self._is_slow = is_slow  # to unpack: worth threads
+        self.is_slow = is_slow  # to unpack: worth threads
         self._chunks = sorted(
             (chunk for layout in layouts for chunk in layout.chunks),
             key=lambda chunk: (chunk.start_ns, chunk.file, chunk.offset),
@@ -132,22 +142,32 @@ class ChunkedRecording:
         lost = sum(layout.lost_bytes for layout in self._layouts) + sum(self._damaged.values())
         if lost:
             size = sum(path.stat().st_size for path in {chunk.file for chunk in self._chunks})
-            notes.append(
-                f"{100 * lost / max(size, 1):.1f} % of the file ({_amount(lost)} of "
-                f"{_amount(size)}) is damaged and could not be read"
-            )
+            share = f"{100 * lost / size:.1f} % of the file (" if size else ""
+            amount = f"{_amount(lost)} of {_amount(size)})" if size else _amount(lost)
+            notes.append(f"{share}{amount} is damaged and could not be read")
         return ["; ".join(notes)] if notes else []
 
-    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """Return the first and last log time, by the index."""
+        starts = (chunk.start_ns for chunk in self._chunks)
+        return min(starts, default=0), max((chunk.end_ns for chunk in self._chunks), default=0)
+
+    def messages(self, topics: Collection[str], from_ns: int | None = None) -> Iterator[Message]:
         """Yield by log time, holding only chunks that overlap."""
         waiting: list[tuple[int, int, int, Message]] = []
-        chunks = [chunk for chunk in self._chunks if not chunk.topics.isdisjoint(topics)]
+        least_ns = -(2**63) if from_ns is None else from_ns
+        chunks = [
+            chunk
+            for chunk in self._chunks
+            if chunk.end_ns >= least_ns and not chunk.topics.isdisjoint(topics)
+        ]
         contents = self._contents(chunks)
         for number, chunk in enumerate(chunks):
             while waiting and waiting[0][0] < chunk.start_ns:
                 yield heapq.heappop(waiting)[3]
             for index, message in enumerate(next(contents).messages):
-                if message.topic in topics:
+                if message.topic in topics and message.log_ns >= least_ns:
                     heapq.heappush(waiting, (message.log_ns, number, index, message))
         while waiting:
             yield heapq.heappop(waiting)[3]
@@ -173,9 +193,7 @@ class ChunkedRecording:
 
     def _contents(self, chunks: Sequence[Chunk]) -> Iterator[ChunkContent]:
         """Yield what is in the chunks; slow ones are read ahead."""
-        begin = (
-            1 if self._is_slow else len(chunks)
-        )  # who looks at the first message only stops here
+        begin = 1 if self.is_slow else len(chunks)  # who looks at the first message only stops here
         yield from map(self._read, chunks[:begin])
         jobs = (partial(self._read_chunk, chunk) for chunk in chunks[begin:])
         if begin < len(chunks):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,8 +21,11 @@ from sceneslam.sources.open_recording import open_recording
 from sceneslam.sources.prefetch import prefetched
 from sceneslam.sources.recording import Message
 from sceneslam.sources.spanned import Span
+from sceneslam.sources.survey.bag_sample import survey_recording
+from sceneslam.sources.survey.survey import Survey
 from sceneslam.sources.synchronise import Bundle, Sample, Synchroniser
 from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.input_files import given_path
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.truth import GroundTruth
@@ -58,7 +60,7 @@ class RosBag:
             depth_range_m=given_range_m("depth_range_m", depth_range_m),
             lidar_range_m=given_range_m("lidar_range_m", lidar_range_m),
         )
-        self._path = Path(path)
+        self._path = given_path(path)
         self._depth_scale = depth_scale
         self._sync_tolerance_s = sync_tolerance_s
         self._truth_frame = ground_truth_frame
@@ -111,6 +113,15 @@ class RosBag:
                     yield decoded.observation
         except InputError as err:
             raise InputError(f"{err}: {self._path}") from err
+
+    def survey(self) -> Survey:
+        """Return the topics, and samples of some stretches."""
+        return survey_recording(
+            self._recording,
+            {sensor: self._by_sensor[sensor] for sensor in Sensor if sensor in self._by_sensor},
+            depth_scale=self._depth_scale,
+            sync_tolerance_s=self._sync_tolerance_s,
+        )
 
     def ground_truth(self) -> GroundTruth | None:
         """Return the poses and scenes of the ground-truth topics."""

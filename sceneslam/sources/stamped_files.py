@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sceneslam.types.errors import InputError
+from sceneslam.types.input_files import read_text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,7 +29,7 @@ def read_list(path: Path) -> Sequence[StampedFile]:
     if not path.is_file():
         raise InputError(f"{path.name} is missing: {path.parent}")
     files = []
-    for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         words = line.split(maxsplit=1)
         if not words or words[0].startswith("#"):
             continue

@@ -7,6 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sceneslam.ros.pixels import DepthUnits
 from sceneslam.sources.faults import FaultLog
 from sceneslam.sources.frame_files import FrameFiles, FrameReader, ReadFrame, first_size_wh
@@ -19,13 +21,16 @@ from sceneslam.sources.intrinsics import (
 from sceneslam.sources.prefetch import prefetched
 from sceneslam.sources.spanned import Span
 from sceneslam.sources.stamped_files import StampedFile, nearest_once, read_list
+from sceneslam.sources.survey.survey import Stream, Survey, spread
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.input_files import given_folder
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
+_SAMPLES = 8  # depth images of a survey
 _NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 _KNOWN = {  # the calibrations that the benchmark publishes
     ("freiburg1", "fr1"): Intrinsics(
@@ -67,15 +72,15 @@ class TumRgbd:
         checked_above_zero("sync_tolerance_s", sync_tolerance_s)
         range_m = checked_range_m("depth_range_m", depth_range_m)
         given = given_intrinsics(camera)
-        self._folder = Path(path)
-        if not self._folder.is_dir():
-            raise InputError(f"recording not found, expected a folder: {path}")
+        self._folder = given_folder(path)
         colors = read_list(self._folder / "rgb.txt")
         if not colors:
             raise InputError(f"the list has no images: {self._folder / 'rgb.txt'}")
         intrinsics = given or _known_intrinsics(self._folder)
         has_depth = (self._folder / "depth.txt").is_file()
         depths = read_list(self._folder / "depth.txt") if has_depth else ()
+        self._colors, self._depths = colors, depths
+        self._depth_scale, self._sync_tolerance_s = depth_scale, sync_tolerance_s
         stamps_ns = [color.stamp_ns for color in colors]
         matches = nearest_once(stamps_ns, depths, round(sync_tolerance_s * 1e9))
         self._frames = [
@@ -124,6 +129,33 @@ class TumRgbd:
                 self._faults.add(kind, str(path))
             if frame.observation is not None:
                 yield frame.observation
+
+    def survey(self) -> Survey:
+        """Return both lists, with some depth images read."""
+        units = DepthUnits.unlimited(self._depth_scale)
+        reader = FrameReader(self._camera.size_wh, units)
+        depths = [reader.depth_m(self._depths[at].path) for at in self._sampled()]
+        return Survey(
+            streams=[
+                Stream(
+                    sensor=sensor,
+                    place=name,
+                    count=len(files),
+                    stamps_ns=np.array(sorted(one.stamp_ns for one in files), np.int64),
+                )
+                for sensor, name, files in (
+                    (Sensor.IMAGE, "rgb.txt", self._colors),
+                    (Sensor.DEPTH, "depth.txt", self._depths),
+                )
+                if files
+            ],
+            sync_tolerance_s=self._sync_tolerance_s,
+            depth_scale=self._depth_scale,
+            depths_m=[depth_m for depth_m in depths if depth_m is not None],
+        )
+
+    def _sampled(self) -> Sequence[int]:
+        return spread(len(self._depths), _SAMPLES) if self._depths else ()
 
     def ground_truth(self) -> GroundTruth | None:
         """Return groundtruth.txt (poses of the camera's optical frame) as poses of base."""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from sceneslam.interfaces import Source
 from sceneslam.sources.spanned import Span, Spanned
+from sceneslam.sources.survey.survey import Survey, Surveyed
 from sceneslam.types.rig import Rig
 
 
@@ -34,3 +35,7 @@ class Wrapped:
     def span(self) -> Span | None:
         """Return the source's span where it knows one."""
         return self._source.span if isinstance(self._source, Spanned) else None
+
+    def survey(self) -> Survey | None:
+        """Return what the source holds where it can be looked at; effects are not in it."""
+        return self._source.survey() if isinstance(self._source, Surveyed) else None

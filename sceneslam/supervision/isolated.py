@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable
-from time import monotonic, sleep
+from time import monotonic
 from typing import Any, cast
 
 from sceneslam.interfaces import SlamModule
@@ -129,7 +129,7 @@ class IsolatedModule:
         self._process, self._is_active = None, False
 
     def _begin(self, rig: Rig) -> None:
-        self._wait_for_budget()
+        self._restarts.await_start()
         if self._process is None:
             self._start()
         self._await_built()
@@ -183,13 +183,3 @@ class IsolatedModule:
         self._process, self._is_active, self._is_built = None, False, False
         if self._restarts.wait_s(monotonic()) == 0 and self._requires is not None:
             self._start()
-
-    def _wait_for_budget(self) -> None:
-        """Sleep through the back-off; raises ModuleError where the budget is spent."""
-        wait_s = self._restarts.wait_s(monotonic())
-        if self._restarts.is_spent(monotonic()):
-            raise ModuleError(
-                f"it failed more than {self._limits.restarts_max} times within "
-                f"{self._limits.restart_window_s:g} s; not started again for {wait_s:.0f} s"
-            )
-        sleep(wait_s)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from time import monotonic, sleep
 
-from sceneslam.types.errors import ConfigError
+from sceneslam.types.errors import ConfigError, ModuleError
 
 _DOUBLINGS = 30  # more are years
 
@@ -33,7 +34,7 @@ class Limits:
 
 
 class Restarts:
-    """Says when a module that failed may be started again; pure but for the clock it is told."""
+    """Says when a module that failed may be started again; all but `await_start` pure."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
@@ -62,6 +63,16 @@ class Restarts:
         else:
             return 0.0
         return max(due_s - now_s, 0.0)
+
+    def await_start(self) -> None:
+        """Sleep until it may be started; raises ModuleError where it failed too often."""
+        wait_s = self.wait_s(monotonic())
+        if self.is_spent(monotonic()):
+            raise ModuleError(
+                f"it failed more than {self._limits.restarts_max} times within "
+                f"{self._limits.restart_window_s:g} s; not started again for {wait_s:.0f} s"
+            )
+        sleep(wait_s)
 
     def _forget(self, now_s: float) -> None:
         """Drop the failures that left the window."""

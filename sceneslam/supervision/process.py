@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import socket
 import subprocess
 import sys
 from contextlib import suppress
-from pathlib import Path
 from time import monotonic
 from typing import Any
 from uuid import uuid4
 from weakref import finalize
 
+from sceneslam.supervision.ending import MARK, how_it_ended, kill_all
 from sceneslam.supervision.limits import Limits
 from sceneslam.supervision.messages import Reply, Request
 from sceneslam.supervision.transport import Channel
 from sceneslam.types.errors import ModuleError, told
 
-_MARK = "SCENESLAM_PROCESS"  # in the environment of all that a module starts
 _END_PATIENCE_S = 1.0  # for a process that hung up, or was hung up on, to be gone
 # The path is set when the interpreter is up: what lies in a user's folder must not shadow its own.
 _MAIN = """
@@ -50,7 +48,7 @@ class Process:
         self._popen = subprocess.Popen(
             [sys.executable, "-P", "-c", _MAIN, str(far.fileno()), str(lifeline), *sys.path],
             # All else about threads is the parent's: with more of BLAS's, sums differ in a bit.
-            env={**os.environ, "OPENCV_FOR_THREADS_NUM": str(limits.threads), _MARK: mark},
+            env={**os.environ, "OPENCV_FOR_THREADS_NUM": str(limits.threads), MARK: mark},
             stdin=subprocess.DEVNULL,
             pass_fds=(far.fileno(), lifeline),
             process_group=0,  # a terminal's Ctrl-C is the parent's to handle
@@ -127,10 +125,7 @@ class Process:
         with suppress(subprocess.TimeoutExpired):
             self._popen.wait(_END_PATIENCE_S)
         self._end()
-        code = self._popen.returncode
-        if code < 0:
-            return ProcessDeathError(f"was killed by signal {-code} ({signal.Signals(-code).name})")
-        return ProcessDeathError(f"ended by itself with exit code {code}")
+        return ProcessDeathError(how_it_ended(self._popen.returncode))
 
 
 class _Elsewhere(Exception):  # noqa: N818 - not an error, but where one came from
@@ -141,13 +136,7 @@ class _Elsewhere(Exception):  # noqa: N818 - not an error, but where one came fr
 
 
 def _end(popen: subprocess.Popen[bytes], channel: Channel, lifeline: int, mark: str) -> None:
-    """Kill a process with all that it started, and leave no zombie."""
-    with suppress(ProcessLookupError):
-        os.killpg(popen.pid, signal.SIGKILL)
-    popen.wait()
+    """Kill a process with all that it started, and close what led to it."""
+    kill_all(popen, mark)
     channel.close()
     os.close(lifeline)
-    for path in Path("/proc").glob("[0-9]*/environ"):  # what left the group has its mark still
-        with suppress(OSError):
-            if f"{_MARK}={mark}".encode() in path.read_bytes():
-                os.kill(int(path.parent.name), signal.SIGKILL)

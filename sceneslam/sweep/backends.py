@@ -10,8 +10,8 @@ from functools import partial
 from time import sleep
 from typing import Any, Protocol
 
+from sceneslam.collect.status import State, Status
 from sceneslam.config.check import first_line
-from sceneslam.sweep.status import State, Status
 from sceneslam.sweep.supervise import Order, run_job, settle
 from sceneslam.types.errors import ConfigError
 

@@ -19,10 +19,10 @@ from tqdm import tqdm
 from sceneslam.collect.flatten import flat
 from sceneslam.collect.overview import overview
 from sceneslam.collect.rows import ROWS, Row, Value, parsed
+from sceneslam.collect.status import State
 from sceneslam.collect.write import write_rows
 from sceneslam.config.resolve import resolved, without_hydra
 from sceneslam.detection.grid import Axis, Tried, try_all
-from sceneslam.sweep.status import State
 
 _INNER = ("detector.", "policy.")  # what can be changed without composing or reading again
 _TOLD_ERRORS = 5  # the table has all of them

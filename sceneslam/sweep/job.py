@@ -21,8 +21,8 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig
 
 from sceneslam.cli import CONFIG, INCOMPLETE, OK, Ended, carry_out
+from sceneslam.collect.status import State, Status
 from sceneslam.sweep.plugin import COMPOSED
-from sceneslam.sweep.status import State, Status
 
 _STATES = {OK: State.DONE, INCOMPLETE: State.INCOMPLETE}
 

@@ -6,6 +6,7 @@ import hashlib
 import pickle
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,11 +20,13 @@ from hydra.plugins.launcher import Launcher
 from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
 
+from sceneslam.collect.status import State, Status
 from sceneslam.config.resolve import without_hydra
 from sceneslam.config.settings import DETECT_ONLY
+from sceneslam.storage.folder import RunFolder, give_back
 from sceneslam.sweep.detection import sweep_detection
-from sceneslam.sweep.status import State, Status
 from sceneslam.sweep.sweep import run_sweep
 from sceneslam.types.errors import ConfigError, SceneSlamError
 
@@ -100,7 +103,11 @@ class GridSweeper(Sweeper):
             return self._launch(words)
         except SceneSlamError as error:
             print(f"error: {error}", file=sys.stderr)
+            give_back(folder)
             raise SystemExit(UNUSABLE) from error
+        except (HydraException, OmegaConfBaseException):
+            give_back(folder)
+            raise
 
     def _launch(self, words: list[str]) -> Sequence[JobReturn]:
         parser = OverridesParser.create(config_loader=self._context.config_loader)
@@ -139,11 +146,11 @@ def _prepare(folder: Path, config: DictConfig) -> None:
     before = Status.read(folder)
     if before is not None and before.is_finished and before.config_sha256 == digest:
         return
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / COMPOSED).open("wb") as file:
-        pickle.dump(config, file)
-    overrides = [str(word) for word in config.hydra.overrides.task]
-    Status(state=State.WAITING, config_sha256=digest, overrides=overrides).write(folder)
+    with closing(RunFolder.claim(folder, key="hydra.sweep.subdir")):
+        with (folder / COMPOSED).open("wb") as file:
+            pickle.dump(config, file)
+        overrides = [str(word) for word in config.hydra.overrides.task]
+        Status(state=State.WAITING, config_sha256=digest, overrides=overrides).write(folder)
 
 
 def _returned(folder: Path, config: DictConfig) -> JobReturn:

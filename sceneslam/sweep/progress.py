@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from sceneslam.sweep.status import State, Status
+from sceneslam.collect.status import State, Status
 
 _LOOK_S = 0.5
 _TOLD = (State.RUNNING, State.INCOMPLETE, State.FAILED, State.KILLED, State.STOPPED)

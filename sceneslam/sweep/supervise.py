@@ -11,7 +11,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import BinaryIO
 
-from sceneslam.sweep.status import State, Status
+from sceneslam.collect.status import State, Status
 
 _LOOK_S = 0.2  # between two looks at whether the sweep is to stop
 _PATIENCE_S = 30.0  # for a job that is to stop to save what it has

@@ -11,12 +11,12 @@ from typing import Any
 
 from sceneslam.collect.overview import overview
 from sceneslam.collect.rows import read_rows
+from sceneslam.collect.status import State, Status
 from sceneslam.collect.write import write_rows
 from sceneslam.interrupts import termination_noted
 from sceneslam.sweep.backends import BACKENDS, Backend
 from sceneslam.sweep.progress import Progress
 from sceneslam.sweep.snapshot import keep_code
-from sceneslam.sweep.status import State, Status
 from sceneslam.sweep.supervise import Order, settle
 from sceneslam.types.errors import ConfigError, InputError
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+_SHOWN = 400  # characters of a value in a message
+
 
 class SceneSlamError(Exception):
     """Root of all errors that SceneSLAM raises on purpose."""
@@ -19,7 +21,9 @@ class ConfigError(SceneSlamError):
         self.key, self.value, self.allowed = key, value, allowed
 
     def __str__(self) -> str:
-        return f"{self.key}: got {self.value!r}, allowed: {self.allowed}"
+        got = repr(self.value)
+        got = got if len(got) <= _SHOWN else f"{got[:_SHOWN]}..."
+        return f"{self.key}: got {got}, allowed: {self.allowed}"
 
     def under(self, prefix: str) -> ConfigError:
         """Return the same error with its key below `prefix` (`policy` + `confirm_window_s`)."""

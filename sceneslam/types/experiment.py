@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -40,6 +41,7 @@ class Relation(Enum):
 
     AT_LEAST = ">="
     AT_MOST = "<="
+    BETWEEN = "in"  # from `low` to `bound`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,6 +53,7 @@ class Figure:
     relation: Relation
     bound: float
     unit: str = ""
+    low: float = -math.inf  # of BETWEEN
 
     @classmethod
     def at_most(cls, name: str, value: float, bound: float, unit: str = "") -> Figure:
@@ -62,12 +65,19 @@ class Figure:
         """Return the promise that a value reaches its bound."""
         return cls(name=name, value=value, relation=Relation.AT_LEAST, bound=bound, unit=unit)
 
+    @classmethod
+    def between(cls, name: str, value: float, low: float, high: float, unit: str = "") -> Figure:
+        """Return the promise of a range, where one side alone can be had for nothing."""
+        return cls(
+            name=name, value=value, relation=Relation.BETWEEN, bound=high, unit=unit, low=low
+        )
+
     @property
     def holds(self) -> bool:
         """Tell whether the promise is kept; a figure that could not be had (NaN) keeps none."""
         if self.relation is Relation.AT_LEAST:
             return self.value >= self.bound
-        return self.value <= self.bound
+        return self.low <= self.value <= self.bound
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
@@ -88,6 +89,7 @@ class SceneVote:
     stamp_ns: int
     scene: str  # one of the detector's scenes, or UNSURE
     value: float = float("nan")  # what the detector measured (grey mean, probability, ...)
+    likelihoods: Mapping[str, float] | None = None  # scene -> P(measured | scene), up to a factor
 
 
 class TrackingStatus(Enum):

@@ -9,6 +9,7 @@ import numpy as np
 
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
+from sceneslam.types.input_files import read_text
 from sceneslam.types.trajectory import Trajectory, parse_stamp_ns
 
 
@@ -34,7 +35,7 @@ def read_recorded(path: Path) -> tuple[RecordedTrajectory, ...]:
         raise InputError(f"trajectory file not found: {path}")
     headers: dict[str, str] = {}
     found: list[_Rows] = []
-    for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         text = line.partition("#")[0].strip()
         key, colon, value = text.partition(":")
         if colon:

@@ -66,6 +66,26 @@ class Lidar:
     T_base_lidar: Transform = field(default_factory=identity)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wheels:
+    """How far wheel odometry is off, as standard deviations, before anything is learnt of it."""
+
+    noise_ratio: float = 0.1  # per metre and per radian; and half as many radians per metre
+    drift_ratio: float = 0.02  # of that, what goes on alike and does not average out
+    drift_rad_per_m: float = 0.01
+    floor_m: float = 0.0005  # of any step: encoders tick
+    floor_rad: float = 0.0005
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gyro:
+    """A rate gyro's errors, as standard deviations."""
+
+    bias_radps: float = 0.02  # before it is learnt
+    noise_rad: float = 3e-4  # of the turn between two observations, at least
+    scale_ratio: float = 0.01  # per radian turned
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rig:
     """The sensors of a source. `sensors` names what its observations can hold."""
@@ -74,3 +94,5 @@ class Rig:
     camera: Camera | None = None
     laser: Laser | None = None
     lidar: Lidar | None = None
+    wheels: Wheels = Wheels()
+    gyro: Gyro = Gyro()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, NewType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,21 @@ from sceneslam.types.maps import HybridMap
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
+BRIDGED = ""  # the module of a pose that no module gave
 HANDOVERS = ("cold", "warm", "rewind")  # how a pose can pass from module to module
+# A program and its arguments: code, that only the command line can allow.
+Command = NewType("Command", list[str])
 Event = Mapping[str, Any]  # one line of events.jsonl: `event` (kind), `stamp_ns`, and its own keys
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SessionStart:
+    """Where a session begins in the trajectory."""
+
+    row: int  # of the trajectory
+    session: int
+    module: str
+    stamp_ns: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,4 +63,5 @@ class RunResult:
     map: HybridMap
     events: Sequence[Event]
     timings: Timings
+    missing: Mapping[int, str] = field(default_factory=dict)  # stamp -> what the module lacked
     dropped: int = 0  # observations that live mode did not take

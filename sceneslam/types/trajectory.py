@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
+from sceneslam.types.files import replacing
+from sceneslam.types.input_files import read_text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,12 +39,13 @@ class Trajectory:
         """Return the poses of a TUM file: `stamp_s tx ty tz qx qy qz qw`, `#` for comments.
 
         Poses are sorted by stamp; stamps keep their nanoseconds.
-        Raises InputError when the file is missing or a line is not eight finite numbers.
+        Raises InputError when the file is missing or a line is not eight finite numbers, the last
+        four a quaternion.
         """
         if not path.is_file():
             raise InputError(f"trajectory file not found: {path}")
         stamps_ns, rows = [], []
-        for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
+        for number, line in enumerate(read_text(path).splitlines(), start=1):
             words = line.replace(",", " ").split()
             if not words or words[0].startswith("#"):
                 continue
@@ -51,7 +54,7 @@ class Trajectory:
                 rows.append([float(word) for word in words[1:8]])
             except ValueError:
                 rows.append([])
-            if len(rows[-1]) != 7 or not np.isfinite(rows[-1]).all():
+            if not _is_pose(rows[-1]):
                 raise InputError(
                     f"line {number}: expected `stamp tx ty tz qx qy qz qw`, "
                     f"got {line.strip()[:60]!r}: {path}"
@@ -66,7 +69,7 @@ class Trajectory:
     def write_tum(self, path: Path) -> None:
         """Write the poses as a TUM file (stamps with nine decimals)."""
         quats_xyzw = se3.to_quat_xyzw(self.T_world_base) if len(self) else np.zeros((0, 4))
-        with path.open("w") as file:
+        with replacing(path) as file:
             file.write("# stamp_s tx ty tz qx qy qz qw\n")
             for stamp_ns, position, quat in zip(
                 self.stamps_ns.tolist(), self.positions_m, quats_xyzw, strict=True
@@ -82,3 +85,9 @@ def parse_stamp_ns(text: str) -> int:
     whole, _, fraction = text.partition(".")
     sign = -1 if whole.startswith("-") else 1
     return int(whole or "0") * 10**9 + sign * int((fraction + "000000000")[:9])
+
+
+def _is_pose(numbers: list[float]) -> bool:
+    """Tell whether these are x y z qx qy qz qw, the quaternion of about length 1."""
+    is_complete = len(numbers) == 7 and bool(np.isfinite(numbers).all())
+    return is_complete and 0.5 < float(np.linalg.norm(numbers[3:])) < 2.0

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 
-from .keyframe import Keyframe
-from .registration import Samples, compare
-from .surface import Floats, Grid, Surface
+from ..surfaces.keyframe import Keyframe
+from ..surfaces.registration import Samples, compare
+from ..surfaces.surface import Floats, Grid, Surface
 
 _PROBES = 300  # points by which an overlap is measured
 _PROBE_GATE_M = 0.1

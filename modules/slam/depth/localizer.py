@@ -6,9 +6,9 @@ import numpy as np
 
 from sceneslam.types import se3
 
+from ..surfaces.registration import Prior, Registration, Samples, register
+from ..surfaces.surface import Surface
 from .keyframe_map import KeyframeMap
-from .registration import Prior, Registration, Samples, register
-from .surface import Surface
 
 _TOGETHER = 3  # keyframes that an image is registered with
 _USEFUL_OVERLAP = 0.2

@@ -13,13 +13,13 @@ from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
+from ..surfaces.registration import Prior, Registration, Samples, samples_of
+from ..surfaces.surface import Surface, SurfaceReader
 from .history import History
 from .keyframe_map import KeyframeMap
 from .localizer import Localizer
 from .motion import Motion, Prediction
 from .pose_graph import PoseGraph
-from .registration import Prior, Registration, Samples, samples_of
-from .surface import Surface, SurfaceReader
 
 _SAMPLES_MIN = 100
 _COAST_S = 0.5  # without depth for longer, a guessed pose is no pose

@@ -10,7 +10,7 @@ from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
-from .surface import Doubles
+from ..surfaces.surface import Doubles
 
 _NS = 1e-9
 _GAP_MAX_S = 0.5  # beyond, a velocity says nothing any more

@@ -13,9 +13,9 @@ import numpy as np
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
+from ..surfaces.registration import Prior, register, samples_of
+from ..surfaces.surface import Doubles
 from .keyframe_map import KeyframeMap
-from .registration import Prior, register, samples_of
-from .surface import Doubles
 
 _MATCHED_MIN_RATIO = 0.5
 _OVERLAP_MIN_RATIO = 0.25

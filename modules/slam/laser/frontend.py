@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sceneslam.motion.model import Motion, MotionModel
 from sceneslam.types.observation import LaserScan, Observation, TrackingStatus
 
 from .back_end import BackEnd
@@ -13,15 +14,26 @@ from .field import LikelihoodField
 from .history import History
 from .keyframes import Keyframe, Keyframes
 from .loop_search import LoopSearch
-from .matcher import Match, Matcher, novelty
-from .motion import Motion, MotionModel
-from .planar import Matrix, Planar, between, compose, propagate, turn
+from .matcher import Match, Matcher, Prior, novelty
+from .planar import (
+    Matrix,
+    Planar,
+    between,
+    compose,
+    from_transform,
+    planar_covariance,
+    propagate,
+    spatial_covariance,
+    to_transform,
+    turn,
+)
 from .surface import SurfacePoints
 
 _OVERLAP_MIN_RATIO = 0.5  # with less, the map does not reach here yet
 _FAILURES_MAX = 10  # matches that fail in a row before the map goes on from dead reckoning
 _LOST_WINDOW_M, _LOST_WINDOW_RAD, _LOST_SCORE_MIN = 3.0, 0.8, 0.5
 _STEP_MIN = np.array([5e-3, 5e-3, 2e-3])  # m, m, rad: of the motion between two keyframes
+_UNSEEN = np.diag([1e-2, 1e-2, 1e-1])  # 1/m^2, 1/rad^2: information of what a scan does not hold
 _DEVIATION_MIN = np.array([1e-3, 1e-3, 5e-4])  # m, m, rad: no pose is believed to be better
 
 
@@ -61,9 +73,9 @@ class FrontEnd:
     _step: Matrix = field(default_factory=lambda: np.zeros((3, 3)), init=False)  # since a keyframe
     _stamp_ns: int | None = field(default=None, init=False)
     _held_pose: Planar = field(default_factory=lambda: np.zeros(3), init=False)
+    _held_covariance: Matrix = field(default_factory=lambda: np.diag(_DEVIATION_MIN**2), init=False)
     _held_ns: int | None = field(default=None, init=False)
     _seen_pose: Planar = field(default_factory=lambda: np.zeros(3), init=False)  # of its scan
-    _is_measured: bool = field(default=True, init=False)  # all motion since a scan held the pose
     _failures: int = field(default=0, init=False)
     _field: LikelihoodField | None = field(default=None, init=False)
 
@@ -75,34 +87,42 @@ class FrontEnd:
         return estimate
 
     def _track(self, observation: Observation, scan: LaserScan | None) -> Estimate:
-        before, before_ns = self._pose, self._stamp_ns
-        motion = self.motion.step(observation)
+        before, before_ns, known = self._pose, self._stamp_ns, self._covariance
+        motion = self.motion.predict(observation)
         self._stamp_ns = observation.stamp_ns
-        self._is_measured = self._is_measured and motion.is_measured
-        predicted = compose(before, motion.T_prev_curr)
-        self._covariance, self._step = (
-            propagate(known, before, motion.T_prev_curr, motion.covariance)
-            for known in (self._covariance, self._step)
-        )
+        T_prev_curr = from_transform(motion.T_prev_curr)
+        predicted = compose(before, T_prev_curr)
+        noise = planar_covariance(motion.covariance)
+        self._covariance = propagate(known, before, T_prev_curr, noise)
+        self._step = propagate(self._step, before, T_prev_curr, noise)
         surfaces = self._read(scan)
         if scan is None or surfaces is None:
             return self._predict(observation, predicted, motion)
         # The sweep may be older than the observation: match where the robot was then.
         ratio = _share(scan.stamp_ns, before_ns, observation.stamp_ns)
-        predicted_then = compose(before, ratio * motion.T_prev_curr)
+        predicted_then = compose(before, ratio * T_prev_curr)
         T_then_now = between(predicted_then, predicted)
         if self._field is None:
             self._extend(predicted_then, None, scan, surfaces)
             return self._hold(observation, predicted, None)
-        is_measured = self._is_measured and motion.is_measured
-        new = novelty(between(self._seen_pose, predicted_then)) if is_measured else 1.0
-        match = self.matcher.match(
-            surfaces, self._field, predicted_then, self._covariance, novelty=new
-        )
-        if not is_measured and not self._believes(match):
+        priors = [Prior.of(predicted_then, self._covariance, motion.probability)]
+        if motion.rival is not None:
+            T_rival, noise = (
+                from_transform(motion.rival.T_prev_curr),
+                planar_covariance(motion.rival.covariance),
+            )
+            there = propagate(known, before, T_rival, noise)
+            priors.append(
+                Prior.of(compose(before, ratio * T_rival), there, motion.rival.probability)
+            )
+        is_known = motion.is_measured and not motion.is_doubted
+        new = novelty(between(self._seen_pose, predicted_then)) if is_known else 1.0
+        match = self.matcher.match(surfaces, self._field, priors, novelty=new)
+        if not is_known and not self._believes(match):
             match = self._find_again(surfaces, self._field, predicted_then) or match
         if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
+        self._teach(match, T_then_now)
         estimate = self._hold(observation, compose(match.T_local_base, T_then_now), match)
         if self.keyframes.is_due(match.T_local_base):
             self._extend(match.T_local_base, match, scan, surfaces)
@@ -137,19 +157,26 @@ class FrontEnd:
             and bool(np.isfinite(match.T_local_base).all())
         )
 
+    def _teach(self, match: Match, T_then_now: Planar) -> None:
+        """Let the motion model learn from the motion since a scan last held the pose."""
+        G = turn(-float(match.T_local_base[2]))
+        known = np.linalg.inv(match.information + _UNSEEN) + self._held_covariance
+        alone = compose(match.T_local_alone, T_then_now)
+        self.motion.learn(
+            to_transform(between(self._held_pose, alone)),
+            spatial_covariance(G @ known @ G.T),
+        )
+
     def _hold(self, observation: Observation, pose: Planar, match: Match | None) -> Estimate:
         """Take over a pose that a scan holds."""
         weak = match is not None and match.weak_directions > 0
-        if self._held_ns is None or match is None or weak:
+        if match is None:
             self.motion.skip()
-        else:
-            duration_s = (observation.stamp_ns - self._held_ns) * 1e-9
-            deviation_rad = float(np.sqrt(match.covariance[2, 2]))
-            self.motion.learn(between(self._held_pose, pose), duration_s, deviation_rad)
         self._pose, self._held_pose, self._held_ns = pose, pose, observation.stamp_ns
-        self._is_measured, self._failures = True, 0
+        self._failures = 0
         if match is not None:
             self._covariance = match.covariance + np.diag(_DEVIATION_MIN**2)
+            self._held_covariance = self._covariance
             self._seen_pose = match.T_local_base
         return Estimate(
             T_local_base=pose,
@@ -164,7 +191,7 @@ class FrontEnd:
         since_ns = None if self._held_ns is None else observation.stamp_ns - self._held_ns
         if since_ns is not None and since_ns <= self.settings.predict_max_s * 1e9:
             return self._guess(predicted, TrackingStatus.TRACKING)
-        if self._is_measured and motion.is_measured:
+        if motion.is_measured:
             return self._guess(predicted, TrackingStatus.DEGRADED)
         return self._lose()
 
@@ -179,7 +206,7 @@ class FrontEnd:
     ) -> Estimate:
         """Go on without the match: dead reckoning holds the pose, or nothing does."""
         self._failures += 1
-        if not (self._is_measured and motion.is_measured):
+        if not motion.is_measured:
             return self._lose()
         unknown = match.overlap_ratio < _OVERLAP_MIN_RATIO or self._failures >= _FAILURES_MAX
         if unknown and self.keyframes.is_due(predicted):
@@ -199,7 +226,7 @@ class FrontEnd:
 
     def _lose(self) -> Estimate:
         """Stay at the last held pose and look for it in the whole window from now on."""
-        self._pose, self._is_measured = self._held_pose, False
+        self._pose = self._held_pose
         window = np.array([self.matcher.window_m, self.matcher.window_m, self.matcher.window_rad])
         self._covariance = np.diag(window**2)
         self.motion.stop()
@@ -216,10 +243,10 @@ class FrontEnd:
     ) -> None:
         """Make the scan a keyframe; where that closes a loop, go on from the corrected map."""
         frames = self.keyframes.frames
-        covariance = self._step + np.diag(_STEP_MIN**2)
+        information = np.linalg.inv(self._step + np.diag(_STEP_MIN**2)) + _UNSEEN
         if match is not None:
-            information = match.information + np.linalg.inv(covariance)
-            covariance = np.linalg.inv(information) + np.diag(_STEP_MIN**2)
+            information = information + match.information
+        covariance = np.linalg.inv(information) + np.diag(_STEP_MIN**2)
         G = turn(-float(T_local_base[2]))
         T_local_prev = frames[-1].T_local_base if frames else T_local_base
         T_prev_curr = between(T_local_prev, T_local_base)

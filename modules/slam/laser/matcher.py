@@ -17,6 +17,7 @@ that turns against its turn: on that side of the view there is always more than 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,14 +29,19 @@ from .surface import SurfacePoints
 
 _SEARCH_POINTS = 120  # more do not change the coarse answer
 _SEARCH_STEP_M = 0.1
-_SEARCH_SIGMAS = 3.0
-_PRIOR_WEIGHT = 0.01  # likelihood per squared sigma from the prediction
+_SEARCH_SIGMAS = (
+    10.0  # beyond, there is less than a thousandth of the prior, heavy as its tails are
+)
+_PRIOR_WEIGHT = 0.02  # mean likelihood of a point that outweighs one nat of the prior
 _KERNELS_M = (0.25, 0.12, 0.06)  # of the robust weight: coarse to fine
 _ITERATIONS = (3, 3, 8)  # at most, per kernel
 _CONVERGED = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: a step this small is the last
 _INLIER_M = 0.1
 _END_M = 0.1  # a mapped surface may go on so far, or twice as far as the beams are apart
 _CORRELATION = 4.0  # neighbouring beams share their errors: information is this much less
+_STUDENT = 4.0  # degrees of freedom of the prior: an error of ten deviations weighs a twentieth
+_NORMAL = 1e6  # so many make it normal
+_APART_M, _APART_RAD = 0.06, 0.02  # nearer starts end in the same place
 _VIEW_M, _VIEW_RAD = 0.1, 0.1  # scans taken so far apart err each in its own way
 _NOVELTY_MIN = 1e-3
 
@@ -51,6 +57,66 @@ class Match:
     inlier_ratio: float
     overlap_ratio: float  # share of points where the map has anything near
     weak_directions: int  # 0 to 3: how many the geometry does not hold
+    T_local_alone: Planar  # where the laser alone has it, but for weak directions
+    cost: float  # negative log-likelihood of scan and pose, less a constant
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Prior:
+    """Where a scan should have been taken, if one of the witnesses of motion is right.
+
+    That of wheels has heavy tails, Student's distribution: a scan that contradicts it wins.
+    Position and heading are weighed on their own: wheels that slip may turn rightly.
+    """
+
+    pose: Planar
+    covariance: Matrix
+    information: Matrix
+    cost: float  # negative logarithm of the probability that it is this one, and of its spread
+    freedom: float  # degrees of freedom of Student's distribution
+
+    @classmethod
+    def of(cls, pose: Planar, covariance: Matrix, probability: float = 1.0) -> Prior:
+        """Return the prior of a pose with its covariance; normal where it is the only one."""
+        information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+        spread = 0.5 * float(np.linalg.slogdet(covariance)[1])
+        return cls(
+            pose=pose,
+            covariance=covariance,
+            information=information,
+            cost=spread - float(np.log(probability)),
+            freedom=_NORMAL if probability == 1.0 else _STUDENT,
+        )
+
+    def off(self, pose: Planar) -> Planar:
+        """Return how far a pose is from this."""
+        off = pose - self.pose
+        off[2] = wrap(float(off[2]))
+        return off
+
+    def weighed(self, pose: Planar) -> Matrix:
+        """Return the information that is left of this at a pose."""
+        squared = self._squared(pose)
+        weight = [min((self.freedom + n) / (self.freedom + squared[n]), 1.0) for n in (2, 1)]
+        root = np.sqrt([weight[0], weight[0], weight[1]])
+        return np.asarray(self.information * np.outer(root, root))
+
+    def cost_at(self, pose: Planar) -> float:
+        """Return the negative log-likelihood of a pose, less a constant."""
+        return self.cost + sum(
+            float(_tail(each, n, self.freedom)) for n, each in self._squared(pose).items()
+        )
+
+    def is_apart(self, pose: Planar) -> bool:
+        """Tell whether a refinement from here might end elsewhere than from a pose."""
+        off = np.abs(self.off(pose))
+        return bool(max(off[0], off[1]) > _APART_M or off[2] > _APART_RAD)
+
+    def _squared(self, pose: Planar) -> dict[int, float]:
+        """Return the squared deviations of position and heading by their number of axes."""
+        off, information = self.off(pose), self.information
+        position = float(off[:2] @ information[:2, :2] @ off[:2])
+        return {2: position, 1: float(off[2] ** 2 * information[2, 2])}
 
 
 @dataclass(slots=True)
@@ -66,40 +132,36 @@ class Matcher:
         self,
         scan_base: SurfacePoints,
         field: LikelihoodField,
-        predicted: Planar,
-        prior: Matrix,
+        priors: Sequence[Prior],
         *,
         novelty: float = 1.0,
     ) -> Match:
-        """Return the pose of a scan near `predicted`, whose covariance is `prior`.
+        """Return the likeliest pose of a scan, near the first prior or where another one has it.
 
-        `novelty` (0 to 1): how much of its error it does not share with the scan before; 1 where
-        the prediction is a guess, which outweighs no scan.
+        `novelty` (0 to 1): how much of its error the scan does not share with the scan before; 1
+        where the prediction is a guess, which outweighs no scan.
         """
-        information = np.asarray(np.linalg.inv(prior), dtype=np.float64)
-        found = self._search(scan_base, field, predicted, prior)
-        candidates = [predicted] if np.array_equal(found, predicted) else [predicted, found]
+        first = priors[0]
+        starts = [first.pose, self._search(scan_base, field, first)]
+        starts += [other.pose for other in priors[1:] if other.is_apart(first.pose)]
+        if np.array_equal(starts[0], starts[1]):
+            del starts[1]
         shift_m = self.shift_m / float(np.sqrt(novelty))
-        refined = [
-            self._refine(scan_base, field, start, predicted, information, shift_m)
-            for start in candidates
-        ]
-        return max(refined, key=lambda match: match.inlier_ratio)
+        refined = [self._refine(scan_base, field, start, priors, shift_m) for start in starts]
+        return min(refined, key=lambda match: match.cost)
 
     def refine(
         self, scan_base: SurfacePoints, field: LikelihoodField, start: Planar, prior: Matrix
     ) -> Match:
         """Return the pose of a scan at `start`, whose covariance is `prior`, without a search."""
-        information = np.asarray(np.linalg.inv(prior), dtype=np.float64)
-        return self._refine(scan_base, field, start, start, information, self.shift_m)
+        return self._refine(scan_base, field, start, [Prior.of(start, prior)], self.shift_m)
 
-    def _search(
-        self, scan_base: SurfacePoints, field: LikelihoodField, predicted: Planar, prior: Matrix
-    ) -> Planar:
+    def _search(self, scan_base: SurfacePoints, field: LikelihoodField, prior: Prior) -> Planar:
         """Return the likeliest pose on a grid around the prediction."""
+        predicted, sigma = prior.pose, np.sqrt(np.diag(prior.covariance))
         stride = max(1, len(scan_base) // _SEARCH_POINTS)
         points = scan_base.points[::stride]
-        reach = _SEARCH_SIGMAS * np.sqrt(np.diag(prior))
+        reach = _SEARCH_SIGMAS * sigma
         half_m = float(np.clip(max(reach[0], reach[1]), _SEARCH_STEP_M, self.window_m))
         radius_m = float(np.median(np.linalg.norm(points, axis=1))) + 0.1
         step_rad = _SEARCH_STEP_M / radius_m
@@ -112,10 +174,9 @@ class Matcher:
         x, y = points.T
         rotated = np.stack([c * x - s * y, s * x + c * y], axis=-1) + predicted[:2]
         scores = field.likelihood(rotated, offsets)
-        scaled = np.concatenate([offsets / max(reach[0], reach[1]) * _SEARCH_SIGMAS])
-        penalty = (
-            np.sum(scaled**2, axis=1)[None] + (turns / reach[2] * _SEARCH_SIGMAS)[:, None] ** 2
-        )
+        near = np.sum(offsets**2, axis=1) / max(sigma[0], sigma[1]) ** 2
+        penalty = _tail(near, 2, prior.freedom)[None]
+        penalty = penalty + _tail((turns / sigma[2]) ** 2, 1, prior.freedom)[:, None]
         best = int(np.argmax(scores - _PRIOR_WEIGHT * penalty))
         turn, offset = divmod(best, len(offsets))
         return np.array([*(predicted[:2] + offsets[offset]), wrap(float(yaws[turn]))])
@@ -125,17 +186,17 @@ class Matcher:
         scan_base: SurfacePoints,
         field: LikelihoodField,
         start: Planar,
-        predicted: Planar,
-        information: Matrix,
+        priors: Sequence[Prior],
         shift_m: float,
     ) -> Match:
+        """Return the pose that Gauss-Newton finds from a start, under its likeliest prior."""
+        expected = min(priors, key=lambda prior: prior.cost_at(start))
         pose = start.copy()
         for kernel_m, iterations in zip(_KERNELS_M, _ITERATIONS, strict=True):
             for _ in range(iterations):
                 H, g, _ = self._laser_equations(scan_base, field, pose, kernel_m, shift_m)
-                off = pose - predicted
-                off[2] = wrap(off[2])
-                step = -np.linalg.solve(H + information, g + information @ off)
+                prior = expected.weighed(pose)
+                step = -np.linalg.solve(H + prior, g + prior @ expected.off(pose))
                 pose = pose + step
                 pose[2] = wrap(pose[2])
                 if np.all(np.abs(step) < _CONVERGED):
@@ -146,17 +207,20 @@ class Matcher:
             alone, _, _ = self._laser_equations(
                 scan_base, field, pose, _KERNELS_M[-1], self.shift_m
             )
-        residual, far = _residuals(scan_base, field, pose)
+        residual, far, evident = _residuals(scan_base, field, pose)
         inlier = residual < _INLIER_M
         count = max(len(scan_base), 1)
+        prior, off = expected.weighed(pose), expected.off(pose)
         return Match(
             T_local_base=pose,
             information=alone,
-            covariance=np.asarray(np.linalg.inv(H + information), dtype=np.float64),
+            covariance=np.asarray(np.linalg.inv(H + prior), dtype=np.float64),
             inliers=int(inlier.sum()),
             inlier_ratio=float(inlier.sum() / count),
             overlap_ratio=float((far < 0.5).sum() / count),
             weak_directions=weak,
+            T_local_alone=pose + np.linalg.pinv(H, rcond=1e-9, hermitian=True) @ prior @ off,
+            cost=_scan_cost(scan_base, evident) + expected.cost_at(pose),
         )
 
     def _laser_equations(
@@ -227,17 +291,33 @@ def novelty(T_before_now: Planar) -> float:
 
 def _residuals(
     scan_base: SurfacePoints, field: LikelihoodField, pose: Planar
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the distances [m] to the nearest surface, and to its nearest point."""
+) -> tuple[Planar, Planar, Planar]:
+    """Return the points' distances [m] to the nearest surface, to its nearest point, and the first
+    of those that are evidence: where beams are sparse, surfaces are only near by chance.
+    """
     points = scan_base.points @ rotation(pose[2]).T + pose[:2]
     near = field.nearest(points)
     error = points - near.points
     xx, xy, yy = near.shape.T
     across = xx * error[:, 0] ** 2 + 2 * xy * error[:, 0] * error[:, 1] + yy * error[:, 1] ** 2
+    across = np.sqrt(np.maximum(across, 0.0))
     far = np.linalg.norm(error, axis=1)
     unknown = xx + yy == 0
-    across = np.where(unknown, far, np.sqrt(np.maximum(across, 0.0)))
-    return np.where(far < 4 * _INLIER_M, across, far), far
+    is_near = far < 4 * _INLIER_M
+    evident = np.where(is_near | (far < 2.0 * scan_base.spacing_m), across, far)
+    return np.where(is_near & ~unknown, across, far), far, np.where(unknown, 0.0, evident)
+
+
+def _tail(squared: NDArray[np.float64] | float, size: int, freedom: float) -> NDArray[np.float64]:
+    """Return the negative log-density of Student's distribution by squared deviations."""
+    return np.asarray(0.5 * (freedom + size) * np.log1p(squared / freedom))
+
+
+def _scan_cost(scan_base: SurfacePoints, residual: NDArray[np.float64]) -> float:
+    """Return the negative log-likelihood of the points, none of which counts more than it may."""
+    squared, limit = residual**2, _KERNELS_M[-1] ** 2
+    each = 0.5 * scan_base.weight * limit * squared / (limit + squared)
+    return float(each.sum()) / _CORRELATION
 
 
 def _steps(half: float, step: float) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.motion.model import MotionModel
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers
@@ -23,16 +24,15 @@ from .keyframes import Keyframes
 from .layers import covariance_6, map_layers
 from .loop_closure import LoopCloser
 from .matcher import Matcher
-from .motion import MotionModel
 from .places import Places
 from .planar import to_transform, turn
 from .surface import SurfaceReader
 
 _ABOVE_0 = (
     "resolution_m range_max_m laser_noise_m depth_noise_m window_m window_rad "
-    "keyframe_distance_m keyframe_angle_rad odometry_noise_ratio gyro_noise_rad_s"
+    "keyframe_distance_m keyframe_angle_rad"
 )
-_NOT_BELOW_0 = "depth_noise_per_m depth_shift_m odometry_turn_rad_per_m predict_max_s"
+_NOT_BELOW_0 = "depth_noise_per_m depth_shift_m predict_max_s"
 _AT_LEAST_1 = "beams_min submap_keyframes depth_beams depth_stride_px lidar_beams"
 _RATIO = "inlier_min_ratio degeneracy_ratio"
 
@@ -59,9 +59,6 @@ class LaserSlam:
     keyframe_angle_rad: float
     submap_keyframes: int
     close_loops: bool
-    odometry_noise_ratio: float
-    odometry_turn_rad_per_m: float
-    gyro_noise_rad_s: float
     predict_max_s: float
     height_min_m: float | None
     height_max_m: float | None
@@ -105,7 +102,7 @@ class LaserSlam:
             self._T_base_laser = self._scanner.T_base_laser
         else:
             self._T_base_laser = se3.identity() if rig.laser is None else rig.laser.T_base_laser
-        self._front_end = self._make_front_end()
+        self._front_end = self._make_front_end(rig)
         self._T_map_local = se3.identity()
         self._T_local_base = se3.identity()
 
@@ -185,7 +182,7 @@ class LaserSlam:
             stride_px=self.depth_stride_px,
         )
 
-    def _make_front_end(self) -> FrontEnd:
+    def _make_front_end(self, rig: Rig) -> FrontEnd:
         from_depth = isinstance(self._scanner, DepthScanner)
         keyframes = Keyframes(
             reader=SurfaceReader(
@@ -213,12 +210,7 @@ class LaserSlam:
                 predict_max_s=self.predict_max_s,
             ),
             matcher=matcher,
-            motion=MotionModel(
-                odometry_noise_ratio=self.odometry_noise_ratio,
-                odometry_turn_rad_per_m=self.odometry_turn_rad_per_m,
-                gyro_noise_rad_s=self.gyro_noise_rad_s,
-                speed_max_m_s=self.range_max_m,  # no robot leaves in a second all that it sees
-            ),
+            motion=MotionModel(rig),
             keyframes=keyframes,
             history=History(keyframes),
             back_end=BackEnd(keyframes, closer if self.close_loops else None),

@@ -9,6 +9,7 @@ from sceneslam.types import se3
 
 Planar = NDArray[np.float64]  # (3,)
 Matrix = NDArray[np.float64]  # (3, 3), covariance or information of a Planar
+_PLANAR = [0, 1, 5]  # x, y, yaw in se3.log order
 
 
 def to_transform(pose: Planar) -> se3.Transform:
@@ -85,3 +86,15 @@ def turn(yaw_rad: float) -> Matrix:
     G = np.eye(3)
     G[:2, :2] = rotation(yaw_rad)
     return G
+
+
+def planar_covariance(covariance: NDArray[np.float64]) -> Matrix:
+    """Return the planar part of a (6, 6) covariance of se3.log order."""
+    return np.asarray(covariance[np.ix_(_PLANAR, _PLANAR)])
+
+
+def spatial_covariance(covariance: Matrix) -> NDArray[np.float64]:
+    """Return the (6, 6) covariance of se3.log order; what a planar one does not know is 0."""
+    spatial = np.zeros((6, 6))
+    spatial[np.ix_(_PLANAR, _PLANAR)] = covariance
+    return spatial

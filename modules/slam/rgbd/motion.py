@@ -90,8 +90,12 @@ class MotionModel:
         self.is_reckoned = observation.T_odom_base is not None
 
     def correct(self, T_new_old: Transform) -> None:
-        """Hear that the map around the last pose was moved."""
-        self._T_local_base = T_new_old @ self._T_local_base
+        """Hear that the map around the last pose was moved.
+
+        The move is a product of this pose where the last keyframe was inserted at a prediction:
+        what rounding leaves in the rotation would triple with every correction.
+        """
+        self._T_local_base = se3.orthonormal(T_new_old @ self._T_local_base)
 
     def lose(self, observation: Observation, T_predicted: Transform) -> None:
         """Go on from a prediction; without odometry or gyro, as if at rest."""

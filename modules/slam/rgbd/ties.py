@@ -16,9 +16,9 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
-from ..depth.keyframe import Keyframe as DepthKeyframe
-from ..depth.registration import Prior, Samples, register, samples_of
-from ..depth.surface import SurfaceReader
+from ..surfaces.keyframe import Keyframe as DepthKeyframe
+from ..surfaces.registration import Prior, Samples, register, samples_of
+from ..surfaces.surface import SurfaceReader
 
 _MIN_MATCHED_RATIO = 0.5  # of what both images show, on the same surface
 _WEAK_RATIO = 0.005  # localizability below which surfaces do not hold a direction

@@ -160,7 +160,12 @@ class VisualMap:
         return keyframe_id
 
     def correct(self, T_local_base: Mapping[int, Transform]) -> None:
-        """Give keyframes, by id, new poses; each landmark moves along with its first keyframe."""
+        """Give keyframes, by id, new poses; each landmark moves along with its first keyframe.
+
+        Poses are often products of those that they replace: what rounding leaves in the rotations
+        would double with every correction.
+        """
+        T_local_base = {k: se3.orthonormal(T_new) for k, T_new in T_local_base.items()}
         T_new_old = {
             keyframe_id: T_new @ se3.inverse(self.keyframes[keyframe_id].T_local_base)
             for keyframe_id, T_new in T_local_base.items()

@@ -1,0 +1,34 @@
+"""Where a map of ORB-SLAM3 lies in `local`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Transform = NDArray[np.float64]
+
+
+def inverse(T_a_b: Transform) -> Transform:
+    """Return T_b_a."""
+    T_b_a = np.eye(4)
+    T_b_a[:3, :3] = T_a_b[:3, :3].T
+    T_b_a[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
+    return T_b_a
+
+
+class Anchor:
+    """Places one map: T_local_cam = T_local_world @ T_world_cam."""
+
+    def __init__(self, T_local_cam: Transform, T_world_cam: Transform) -> None:
+        self._T_local_world = T_local_cam @ inverse(T_world_cam)
+
+    def place(self, T_world_cam: Transform) -> Transform:
+        """Return T_local_cam."""
+        return np.asarray(self._T_local_world @ T_world_cam)
+
+    def place_points(self, points_world: NDArray[Any]) -> NDArray[np.float32]:
+        """Return points (N, 3) in local."""
+        T = self._T_local_world
+        return np.asarray(points_world @ T[:3, :3].T + T[:3, 3], np.float32)

@@ -1,0 +1,171 @@
+"""The program that runs ORB-SLAM3: the only file that imports pyorbslam3, which is GPL-3.
+
+It is never imported: `module.py` starts it in a process of its own, and both exchange bytes.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.errors import InputError
+from sceneslam.vocabulary import describe, train
+
+from ..process.client import LOST, TRACKING, pose, poses, serve
+from ..process.protocol import Fields
+from .anchor import Anchor, Transform, inverse
+from .settings import write_settings
+
+_POINTS_EVERY = 10  # images
+_POINT_M = 0.02  # of several points within a cube of this edge one is kept
+
+
+class OrbSlam3:
+    """Tracks with ORB-SLAM3; `pyorbslam3` and a folder for its files are given."""
+
+    requires = "image depth"
+
+    def __init__(self, orb: Any, folder: Path, settings: dict[str, Any]) -> None:
+        self._orb, self._folder, self._settings = orb, folder, settings
+        self._slam: Any = None
+        self._anchors: list[Anchor] = []  # of the maps, the current one last
+        self._is_new_map = True
+        self._T_local_base: Transform = np.eye(4)
+        self._T_odom_base: Transform | None = None  # at that pose
+        self._revision, self._images = 0, 0
+        self._points: list[NDArray[np.float32]] = []
+
+    def activate(self, rig: Fields) -> None:
+        """Write the settings; with a vocabulary, start ORB-SLAM3."""
+        self._T_base_cam = rig["camera.T_base_cam"]
+        names = ("features", "fast")
+        values = {name: self._settings[name] for name in names}
+        write_settings(rig, self._folder / "settings.yaml", **values)
+        if self._settings["vocabulary"] is not None:
+            self._start(Path(self._settings["vocabulary"]))
+
+    def set_scene(self, scene: str) -> None:
+        """Do nothing."""
+
+    def track(self, observation: Fields) -> dict[str, Any]:
+        """Return the pose; none without image or depth: odometry carries it on meanwhile."""
+        image = observation.get("image_bgr")
+        depth = observation.get("depth_m")
+        if image is None or depth is None:
+            return poses([], [])
+        stamp_ns = int(observation["stamp_ns"])
+        if self._slam is None:
+            try:
+                self._start(self._trained(image))
+            except InputError:  # nothing to be seen yet
+                return pose(stamp_ns, self._T_local_base, LOST)
+        found = self._slam.track_rgbd(image, depth, stamp_ns * 1e-9)
+        return self._answer(stamp_ns, found, observation.get("T_odom_base"))
+
+    def trajectory(self) -> dict[str, Any]:
+        """Return the frames' poses as corrected by loops, where there was one map only."""
+        if len(self._anchors) != 1:
+            return poses([], [])
+        path = self._folder / "trajectory.txt"
+        self._slam.save_trajectory_tum(str(path))
+        rows = np.loadtxt(path, ndmin=2)
+        if not len(rows):
+            return poses([], [])
+        T_cam_base = inverse(self._T_base_cam)
+        placed = [self._anchors[0].place(T) @ T_cam_base for T in _transforms(rows[:, 1:])]
+        return poses([round(stamp_s * 1e9) for stamp_s in rows[:, 0]], placed)
+
+    def map(self) -> dict[str, Any]:
+        """Return the map points that were tracked."""
+        if not self._points:
+            return {}
+        points = np.concatenate(self._points)
+        cubes = np.floor(points / _POINT_M).astype(np.int64)
+        first = np.unique(cubes, axis=0, return_index=True)[1]
+        return {"points.points": points[np.sort(first)]}
+
+    def _start(self, vocabulary: Path) -> None:
+        settings = self._folder / "settings.yaml"
+        self._slam = self._orb.Slam(vocabulary, settings, self._orb.Sensor.RGBD)
+
+    def _trained(self, image: NDArray[np.uint8]) -> Path:
+        """Return a vocabulary of the first image alone: good enough to match features by."""
+        path = self._folder / "vocabulary.txt"
+        train([describe(image)], seed=0).write(path)
+        return path
+
+    def _answer(self, stamp_ns: int, found: Any, T_odom_base: Any) -> dict[str, Any]:
+        state = self._orb.TrackingState
+        self._images += 1
+        if found.state in (state.NO_IMAGES_YET, state.NOT_INITIALIZED, state.SYSTEM_NOT_READY):
+            self._is_new_map = True
+        is_tracked = found.pose_valid and found.state in (state.OK, state.OK_KLT)
+        T_expected_base = self._expected(T_odom_base)
+        if is_tracked:
+            self._place(found.pose_wc, T_expected_base @ self._T_base_cam)
+            T_local_cam = self._anchors[-1].place(found.pose_wc)
+            self._T_local_base = T_local_cam @ inverse(self._T_base_cam)
+            self._T_odom_base = T_odom_base
+            self._keep_points()
+        inliers = int(found.num_tracked_points) if is_tracked else 0
+        status = TRACKING if is_tracked else LOST
+        reply = pose(stamp_ns, self._T_local_base, status, inliers=inliers)
+        return {**reply, "revision": self._revision}
+
+    def _place(self, T_world_cam: Transform, T_expected_cam: Transform) -> None:
+        """Find where the current map lies: a new one where the camera is expected to be."""
+        if self._is_new_map:
+            self._anchors.append(Anchor(T_expected_cam, T_world_cam))
+            self._is_new_map = False
+        elif self._slam.map_changed():
+            self._revision += 1
+            # A loop was closed, or two maps were merged: then the pose is one of the older map's.
+            self._anchors.sort(key=lambda one: -_distance(one.place(T_world_cam), T_expected_cam))
+
+    def _expected(self, T_odom_base: Any) -> Transform:
+        """Return the last pose, moved as odometry says."""
+        if T_odom_base is None:
+            return self._T_local_base
+        if self._T_odom_base is None:
+            self._T_odom_base = T_odom_base
+        return np.asarray(self._T_local_base @ inverse(self._T_odom_base) @ T_odom_base)
+
+    def _keep_points(self) -> None:
+        if self._images % _POINTS_EVERY == 1:  # the first among them
+            points_world = self._slam.tracked_map_points()
+            self._points.append(self._anchors[-1].place_points(points_world))
+
+
+def _distance(T_a: Transform, T_b: Transform) -> float:
+    return float(np.linalg.norm(T_a[:3, 3] - T_b[:3, 3]))
+
+
+def _transforms(rows: NDArray[np.float64]) -> list[Transform]:
+    """Return x y z qx qy qz qw as matrices."""
+    found = []
+    for x, y, z, qx, qy, qz, qw in rows:
+        T = np.eye(4)
+        T[:3, :3] = [
+            [1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qz * qw), 2 * (qx * qz + qy * qw)],
+            [2 * (qx * qy + qz * qw), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qx * qw)],
+            [2 * (qx * qz - qy * qw), 2 * (qy * qz + qx * qw), 1 - 2 * (qx * qx + qy * qy)],
+        ]
+        T[:3, 3] = x, y, z
+        found.append(T)
+    return found
+
+
+def main(settings: dict[str, Any]) -> None:
+    """Serve until the input is closed."""
+    import pyorbslam3
+
+    with tempfile.TemporaryDirectory(prefix="orb_slam3_") as folder:
+        serve(OrbSlam3(pyorbslam3, Path(folder), settings))
+    sys.stderr.flush()
+    os._exit(0)  # its threads would go on

@@ -1,0 +1,171 @@
+"""A rig and its observations as named arrays, and what a program answers as values of ours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.maps import GridLayer, LandmarkLayer, MapLayers, PointLayer, PoseGraphLayer
+from sceneslam.types.observation import Observation, TrackingStatus
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
+
+from .protocol import Fields, ProtocolError, as_text, text
+
+_STATUSES = (TrackingStatus.TRACKING, TrackingStatus.DEGRADED, TrackingStatus.LOST)
+_LAYERS = {
+    "points": PointLayer,
+    "grid": GridLayer,
+    "pose_graph": PoseGraphLayer,
+    "landmarks": LandmarkLayer,
+}
+_SKEW_MAX = 1e-3  # as the bus allows
+Layer = TypeVar("Layer")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Answer:
+    """One pose of a program."""
+
+    stamp_ns: int
+    T_local_base: se3.Transform
+    status: TrackingStatus
+    covariance: NDArray[np.float64] | None
+    quality_ratio: float
+    inliers: int
+
+
+def rig_fields(rig: Rig) -> dict[str, NDArray[Any]]:
+    """Return the sensors, and each part's values under its name: `camera.fx`, ..."""
+    found = {"sensors": text(" ".join(sorted(sensor.value for sensor in rig.sensors)))}
+    for name in ("camera", "laser", "lidar"):
+        found |= _flat(getattr(rig, name), name)
+    return found
+
+
+def observation_fields(observation: Observation) -> dict[str, NDArray[Any]]:
+    """Return what was measured; a silent sensor's fields are missing."""
+    found: dict[str, NDArray[Any]] = {}
+    for field in fields(observation):
+        found |= _flat(getattr(observation, field.name), field.name)
+    return found
+
+
+def required(answer: Fields) -> tuple[frozenset[Sensor], ...]:
+    """Return the sets of sensors of a greeting: a line per set, such as `scan odometry`."""
+    known = {sensor.value: sensor for sensor in Sensor}
+    lines = [line.split() for line in as_text(_of(answer, "requires")).splitlines()]
+    unknown = {name for line in lines for name in line} - set(known)
+    if unknown or not all(lines) or not lines:
+        raise ProtocolError(
+            f"requires {' | '.join(map(' '.join, lines)) or 'nothing'}, "
+            f"allowed: lines of sensors, each one of {', '.join(known)}"
+        )
+    return tuple(frozenset(known[name] for name in line) for line in lines)
+
+
+def answers(reply: Fields) -> list[Answer]:
+    """Return the poses of a reply to `track`, none where the program is not that far yet."""
+    stamps_ns = _of(reply, "stamps_ns").reshape(-1)
+    count = len(stamps_ns)
+    T_local_base = _rigid(_of(reply, "T_local_base"), count)
+    statuses = _optional(reply, "status", (count,))
+    covariances = _optional(reply, "covariance", (count, 6, 6))
+    qualities = _optional(reply, "quality_ratio", (count,))
+    inliers = _optional(reply, "inliers", (count,))
+    return [
+        Answer(
+            stamp_ns=int(stamps_ns[index]),
+            T_local_base=T_local_base[index],
+            status=_STATUSES[0] if statuses is None else _status(statuses[index]),
+            covariance=None if covariances is None else covariances[index].astype(np.float64),
+            quality_ratio=1.0 if qualities is None else float(qualities[index]),
+            inliers=0 if inliers is None else int(inliers[index]),
+        )
+        for index in range(count)
+    ]
+
+
+def trajectory(reply: Fields) -> Trajectory:
+    """Return the poses that a program revised."""
+    stamps_ns = _of(reply, "stamps_ns").reshape(-1).astype(np.int64)
+    T_world_base = _rigid(_of(reply, "T_local_base"), len(stamps_ns))
+    return Trajectory(stamps_ns=stamps_ns, T_world_base=T_world_base)
+
+
+def layers(reply: Fields) -> MapLayers:
+    """Return the map's layers: `points.points`, `grid.log_odds`, ...; other fields are unused."""
+    found = {name: _layer(reply, name, kind) for name, kind in _LAYERS.items()}
+    return MapLayers(**found)
+
+
+def _layer(reply: Fields, name: str, kind: type[Layer]) -> Layer | None:
+    prefix = f"{name}."
+    values = {key.removeprefix(prefix): reply[key] for key in reply if key.startswith(prefix)}
+    if not values:
+        return None
+    known = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
+    for key, value in values.items():
+        if key == "is_loop":
+            values[key] = value.astype(np.bool_)
+        elif key == "resolution_m":
+            values[key] = float(value)  # type: ignore[assignment]
+        elif key == "origin_xy_m":
+            values[key] = tuple(value.astype(float).tolist())  # type: ignore[assignment]
+    try:
+        return kind(**{key: value for key, value in values.items() if key in known})
+    except TypeError as error:
+        raise ProtocolError(f"wrote a map whose {name} is incomplete: {error}") from error
+
+
+def _flat(value: object, name: str) -> dict[str, NDArray[Any]]:
+    """Return a value's arrays by dotted names, nothing for None."""
+    if value is None:
+        return {}
+    if is_dataclass(value):
+        parts = [
+            _flat(getattr(value, field.name), f"{name}.{field.name}") for field in fields(value)
+        ]
+        return {key: array for part in parts for key, array in part.items()}
+    array = np.asarray(value)
+    return {name: array.astype(np.int64) if isinstance(value, int) else array}
+
+
+def _of(reply: Fields, name: str) -> NDArray[Any]:
+    if name not in reply:
+        raise ProtocolError(f"answered without {name!r}; it gave: {', '.join(reply) or 'nothing'}")
+    return reply[name]
+
+
+def _optional(reply: Fields, name: str, shape: tuple[int, ...]) -> NDArray[Any] | None:
+    if name not in reply:
+        return None
+    if reply[name].shape != shape or not np.isfinite(reply[name]).all():
+        raise ProtocolError(f"answered {name} {reply[name].shape}, expected finite {shape}")
+    return reply[name]
+
+
+def _rigid(array: NDArray[Any], count: int) -> NDArray[np.float64]:
+    """Return `count` rigid transforms; raises ProtocolError for any other array."""
+    if array.shape != (count, 4, 4):
+        raise ProtocolError(f"answered T_local_base {array.shape}, expected {(count, 4, 4)}")
+    T_local_base = array.astype(np.float64)
+    if not np.isfinite(T_local_base).all():
+        raise ProtocolError("answered a T_local_base that is not finite")
+    rotations = T_local_base[:, :3, :3]
+    skew = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(initial=0.0)
+    if skew > _SKEW_MAX or (np.linalg.det(rotations) < 0).any():
+        raise ProtocolError("answered a T_local_base that is no rotation")
+    if (T_local_base[:, 3] != (0, 0, 0, 1)).any():
+        raise ProtocolError("answered a T_local_base whose last row is not 0 0 0 1")
+    return T_local_base
+
+
+def _status(code: Any) -> TrackingStatus:
+    if not 0 <= code < len(_STATUSES):
+        raise ProtocolError(f"answered the status {code}, allowed: 0 tracking, 1 degraded, 2 lost")
+    return _STATUSES[int(code)]

@@ -1,0 +1,118 @@
+"""Poses that come later than their observations: where the robot is meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sceneslam.types import se3
+from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.trajectory import Trajectory
+
+from .fields import Answer
+from .protocol import ProtocolError
+
+
+class Pipeline:
+    """Matches answers with observations; the newest pose is carried on by odometry until the next.
+
+    Without odometry it is carried on at constant velocity. Either way the pose is DEGRADED, and
+    LOST when the newest answer is older than `late_max_s`.
+    """
+
+    def __init__(self, late_max_s: float) -> None:
+        self._late_max_s = late_max_s
+        self._waiting: dict[int, se3.Transform | None] = {}  # stamp -> T_odom_base
+        self._is_late = False
+        self._newest: Answer | None = None
+        self._T_odom_newest: se3.Transform | None = None
+        self._first_ns: int | None = None
+        self._T_local_base = se3.identity()  # as reported last
+        self._twist_s = np.zeros(6)
+        self._stamps_ns: list[int] = []
+        self._poses: list[se3.Transform] = []
+
+    @property
+    def T_local_base(self) -> se3.Transform:
+        """Return the pose as reported last."""
+        return self._T_local_base
+
+    def note(self, observation: Observation) -> None:
+        """Remember an observation that the program was given."""
+        T_odom_base = observation.T_odom_base
+        if T_odom_base is not None and not np.isfinite(T_odom_base).all():
+            T_odom_base = None
+        self._waiting[observation.stamp_ns] = T_odom_base
+        if self._first_ns is None:
+            self._first_ns, self._T_odom_newest = observation.stamp_ns, T_odom_base
+
+    def take(self, answers: Sequence[Answer]) -> None:
+        """Take answers by rising stamp; raises ProtocolError for one that nobody waits for."""
+        for answer in answers:
+            if answer.stamp_ns not in self._waiting:
+                given = f"the last was {max(self._waiting, default=None)}"
+                raise ProtocolError(
+                    f"answered for the stamp {answer.stamp_ns}, which is not waiting ({given})"
+                )
+            if answer.status is not TrackingStatus.LOST:
+                self._keep(answer)
+                self._T_odom_newest = self._waiting[answer.stamp_ns]
+            self._newest = answer
+            self._waiting = {ns: T for ns, T in self._waiting.items() if ns > answer.stamp_ns}
+        self._is_late = self._is_late or bool(self._waiting)
+
+    def report(self, observation: Observation, revision: int) -> Tracking:
+        """Return the pose at an observation that was noted."""
+        newest = self._newest
+        if newest is not None and newest.status is TrackingStatus.LOST:
+            status = TrackingStatus.LOST
+        elif newest is not None and newest.stamp_ns == observation.stamp_ns:
+            status = newest.status
+            self._T_local_base = newest.T_local_base
+        else:
+            status = self._carry_on(observation)
+        is_exact = newest is not None and newest.stamp_ns == observation.stamp_ns
+        return Tracking(
+            stamp_ns=observation.stamp_ns,
+            T_local_base=self._T_local_base.copy(),
+            status=status,
+            covariance=newest.covariance if newest is not None and is_exact else None,
+            quality_ratio=newest.quality_ratio if newest is not None else 0.0,
+            inliers=newest.inliers if newest is not None else 0,
+            revision=revision,
+        )
+
+    def trajectory(self) -> Trajectory:
+        """Return the poses as the program gave them, nothing where all were in time."""
+        if not self._is_late or not self._stamps_ns:
+            return Trajectory.empty()
+        return Trajectory(
+            stamps_ns=np.array(self._stamps_ns, np.int64), T_world_base=np.stack(self._poses)
+        )
+
+    def _carry_on(self, observation: Observation) -> TrackingStatus:
+        """Carry the newest pose on to an observation that has none yet."""
+        since_ns = self._stamps_ns[-1] if self._stamps_ns else self._first_ns
+        assert since_ns is not None
+        gap_s = (observation.stamp_ns - since_ns) * 1e-9
+        T_odom_base = self._waiting[observation.stamp_ns]
+        if gap_s > self._late_max_s:
+            return TrackingStatus.LOST
+        T_local_newest = self._poses[-1] if self._poses else se3.identity()
+        if T_odom_base is not None and self._T_odom_newest is not None:
+            T_newest_base = se3.inverse(self._T_odom_newest) @ T_odom_base
+        elif len(self._poses) > 1 or gap_s == 0:
+            T_newest_base = se3.exp(self._twist_s * gap_s)
+        else:
+            return TrackingStatus.LOST
+        self._T_local_base = se3.orthonormal(T_local_newest @ T_newest_base)
+        return TrackingStatus.DEGRADED
+
+    def _keep(self, answer: Answer) -> None:
+        if self._poses:
+            T_prev_curr = se3.inverse(self._poses[-1]) @ answer.T_local_base
+            gap_s = (answer.stamp_ns - self._stamps_ns[-1]) * 1e-9
+            self._twist_s = se3.log(T_prev_curr) / gap_s
+        self._stamps_ns.append(answer.stamp_ns)
+        self._poses.append(answer.T_local_base)

@@ -1,0 +1,214 @@
+"""The `process` SLAM module: a program in any language that answers on its standard output."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from time import monotonic
+from typing import Any, TypeVar
+
+import numpy as np
+
+from sceneslam.supervision.limits import Limits, Restarts
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError, ModuleError
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.observation import Observation, Tracking
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.run import Command
+from sceneslam.types.trajectory import Trajectory
+
+from .fields import answers, layers, observation_fields, required, rig_fields, trajectory
+from .late import Pipeline
+from .program import Program
+from .protocol import Fields, ProtocolError, text
+
+Value = TypeVar("Value")
+
+
+class ProcessSlam:
+    """Fulfils `SlamModule`, `Restartable` and `Concurrent` by one run of a program per session.
+
+    Whatever the program does wrong ends it, and the call raises ModuleError with one sentence.
+    The next run of it is started at once, so that it loads while nobody waits for it.
+    """
+
+    def __init__(self, *, command: Command, late_max_s: float, limits: Limits) -> None:
+        if not command or shutil.which(command[0]) is None:
+            raise ConfigError("command", command, "a program that can be run, and its arguments")
+        if not 0 <= late_max_s < np.inf:
+            raise ConfigError("late_max_s", late_max_s, "seconds, 0 or more")
+        self._command, self._late_max_s, self._limits = command, late_max_s, limits
+        self._restarts = Restarts(limits)
+        self._requires: tuple[frozenset[Sensor], ...] | None = None
+        self._program: Program | None = None
+        self._is_greeted = self._is_active = False
+        self._pipeline = Pipeline(late_max_s)
+        self._revision = 0
+        self._observation: Observation | None = None  # its answer was not collected yet
+        self._layers: MapLayers | None = None  # as asked for last, None where outdated
+        self._T_map_local = se3.identity()
+        self._start()
+
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return the sets of sensors that the program names when it is greeted."""
+        if self._requires is None:
+            try:
+                self._greet()
+            except ModuleError as error:
+                allowed = f"a program that answers a greeting ({error})"
+                raise ConfigError("command", self._command, allowed) from error
+        assert self._requires is not None
+        return self._requires
+
+    @property
+    def is_ready(self) -> bool:
+        """Tell whether `activate` would not have to wait, and start the program where it may be."""
+        self._bury()
+        if self._restarts.wait_s(monotonic()) > 0:
+            return False
+        if self._program is None:
+            self._start()
+        return self._is_greeted or (self._program is not None and self._program.has_answer())
+
+    @property
+    def is_spent(self) -> bool:
+        """Tell whether it failed too often to be started again, for now."""
+        return self._restarts.is_spent(monotonic())
+
+    def note_failure(self) -> None:
+        """Take that a session failed: the next may begin after a while, longer each time."""
+        self._kill()
+        if not self.is_spent:
+            self._restarts.note_failure(monotonic())
+
+    def activate(self, rig: Rig) -> None:
+        """Start anew, in a run of the program that no session has used."""
+        self._bury()
+        if self._is_active:
+            self._close()
+        self._restarts.await_start()
+        if self._program is None:
+            self._start()
+        self._greet()
+        self._pipeline, self._revision = Pipeline(self._late_max_s), 0
+        self._layers, self._T_map_local = None, se3.identity()
+        self._is_active = True
+        self._ask("activate", rig_fields(rig), self._limits.start_deadline_s, lambda _: None)
+
+    def set_pose(self, T_map_local: se3.Transform) -> None:
+        """Place `local` in the map; the program knows nothing of it."""
+        self._T_map_local = np.array(T_map_local, dtype=np.float64)
+
+    def set_scene(self, scene: str) -> None:
+        """Tell the program of the scene."""
+        fields = {"scene": text(scene)}
+        self._ask("scene", fields, self._limits.step_deadline_s, lambda _: None)
+
+    def track(self, observation: Observation) -> Tracking:
+        """Return T_local_base at the observation."""
+        self.submit(observation)
+        return self.collect()
+
+    def submit(self, observation: Observation) -> None:
+        """Hand the observation over; others may be given work before `collect`."""
+        self._pipeline.note(observation)
+        self._observation, self._layers = observation, None
+        fields = observation_fields(observation)
+        self._session().send("track", fields, self._limits.step_deadline_s)
+
+    def collect(self) -> Tracking:
+        """Return the pose at the observation submitted last."""
+        observation, self._observation = self._observation, None
+        assert observation is not None
+        self._receive("track", self._limits.step_deadline_s, self._take)
+        return self._pipeline.report(observation, self._revision)
+
+    def get_pose(self) -> se3.Transform:
+        """Return T_map_base of the last observation."""
+        return self._T_map_local @ self._pipeline.T_local_base
+
+    def get_trajectory(self) -> Trajectory:
+        """Return the poses that the program revised, else those that it gave late, if any."""
+        if not self._is_active:
+            return self._pipeline.trajectory()
+        revised = self._ask("trajectory", {}, self._limits.start_deadline_s, trajectory)
+        return revised if len(revised.stamps_ns) else self._pipeline.trajectory()
+
+    def get_map(self) -> MapLayers:
+        """Return the program's map in `local`; the last one after `shutdown`."""
+        if self._layers is None and self._is_active:
+            self._layers = self._ask("map", {}, self._limits.start_deadline_s, layers)
+        return self._layers or MapLayers()
+
+    def shutdown(self) -> None:
+        """Keep the map, end this run of the program, and start the next."""
+        if not self._is_active:
+            return
+        try:
+            if self._program is not None:
+                self.get_map()
+        finally:
+            self._close()
+        if self._restarts.wait_s(monotonic()) == 0:
+            self._start()
+
+    def _start(self) -> None:
+        """Start the program and greet it, without waiting."""
+        self._is_greeted = self._is_active = False
+        self._program = Program(self._command, self._limits)
+        self._program.send("hello", {}, self._limits.start_deadline_s)
+
+    def _greet(self) -> None:
+        if not self._is_greeted:
+            found = self._receive("hello", self._limits.start_deadline_s, required)
+            if self._requires is not None and found != self._requires:
+                raise self._running().refuse(
+                    "requires other sensors than when it was started first"
+                )
+            self._requires, self._is_greeted = found, True
+
+    def _bury(self) -> None:
+        """Notice a program that ended while nobody asked it for anything."""
+        if self._program is not None and not self._program.is_alive:
+            self.note_failure()
+
+    def _close(self) -> None:
+        if self._program is not None:
+            self._program.end()
+        self._program, self._is_active, self._is_greeted = None, False, False
+
+    def _kill(self) -> None:
+        if self._program is not None:
+            self._program.refuse("failed")
+        self._close()
+
+    def _running(self) -> Program:
+        if self._program is None:
+            raise ModuleError("the program ended, and the session with it")
+        return self._program
+
+    def _session(self) -> Program:
+        if not self._is_active:
+            raise ModuleError("the program ended, and the session with it")
+        return self._running()
+
+    def _ask(
+        self, kind: str, fields: Fields, deadline_s: float, read: Callable[[Fields], Value]
+    ) -> Value:
+        self._session().send(kind, fields, deadline_s)
+        return self._receive(kind, deadline_s, read)
+
+    def _receive(self, kind: str, deadline_s: float, read: Callable[[Fields], Value]) -> Value:
+        """Return what an answer says; what is no answer ends the program."""
+        reply = self._running().receive(kind, deadline_s)
+        try:
+            return read(reply)
+        except (ProtocolError, ValueError, TypeError) as error:
+            raise self._running().refuse(str(error)) from error
+
+    def _take(self, reply: Fields) -> None:
+        self._pipeline.take(answers(reply))
+        revision: Any = reply.get("revision", self._revision)
+        self._revision = int(revision)

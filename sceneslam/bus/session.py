@@ -1,0 +1,109 @@
+"""One activation of a module: it is asked and judged, then placed or bridged, and remembered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from sceneslam.bus.bridge import Bridge
+from sceneslam.bus.hold import Hold
+from sceneslam.bus.memory import Moment
+from sceneslam.bus.runner import Runner
+from sceneslam.types import se3
+from sceneslam.types.errors import ModuleError
+from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.run import BRIDGED
+from sceneslam.types.se3 import Transform
+
+
+class Session:
+    """Advances by one observation at a time: live, and in the past while it catches up.
+
+    Without a runner there is no module, and every pose is bridged.
+    """
+
+    def __init__(self, runner: Runner | None, hold: Hold, bridge: Bridge) -> None:
+        self.runner, self.hold, self.bridge = runner, hold, bridge
+        self.is_placed = False
+        self.tracking: Tracking | None = None  # of the last observation, where its pose is used
+        self.fault: ModuleError | None = None  # that the last observation led to
+
+    @property
+    def key(self) -> str:
+        """Return the module's key in `slam`."""
+        return BRIDGED if self.runner is None else self.runner.key
+
+    @property
+    def is_running(self) -> bool:
+        """Tell whether there is a module that did not fail."""
+        return self.runner is not None and not self.runner.is_failed
+
+    def advance(
+        self,
+        observation: Observation,
+        *,
+        by_velocity: bool,
+        T_prev_curr: Transform | None = None,
+    ) -> Moment:
+        """Return the observation with its pose: the module's, or a bridged one.
+
+        Odometry bridges; else constant velocity, if `by_velocity` or while the module's sensors
+        are silent; else `T_prev_curr`, the motion as it was known at the time.
+        """
+        self.fault, self.tracking = None, None
+        try:
+            self.tracking = self._ask(observation)
+            if self.tracking is not None:
+                return self._moment(observation, self._place(observation, self.tracking))
+        except ModuleError as error:
+            self.fault, self.tracking = error, None
+        is_silent = self.hold.status is not TrackingStatus.LOST
+        return self._bridged(observation, by_velocity or is_silent, T_prev_curr)
+
+    def skip(self, observation: Observation, T_prev_curr: Transform | None) -> Moment:
+        """Return an observation with a bridged pose; the module is spared it."""
+        self.hold.spare(observation)
+        return self._bridged(observation, True, T_prev_curr)
+
+    def _ask(self, observation: Observation) -> Tracking | None:
+        """Return the module's answer where it may be used; raises ModuleError as the runner."""
+        if self.runner is None or self.runner.is_failed:
+            return None
+        tracking = self.hold.ask(self.runner, observation)
+        if self.hold.is_suspect:
+            self.is_placed = False  # it is placed anew where the robot then is
+        return tracking
+
+    def _place(self, observation: Observation, tracking: Tracking) -> Transform:
+        """Return T_map_base; a module's first pose is the one handed over (Eq. 1)."""
+        assert self.runner is not None
+        if not self.is_placed:
+            self.bridge.predict(observation, by_velocity=True)
+            self.runner.place(self.bridge.T_map_base @ se3.inverse(tracking.T_local_base))
+            self.is_placed = True
+        assert self.runner.T_map_local is not None
+        T_map_base = self.runner.T_map_local @ tracking.T_local_base
+        self.bridge.update(observation, T_map_base, is_jump=self.hold.is_revised)
+        return T_map_base
+
+    def _bridged(
+        self, observation: Observation, by_velocity: bool, T_prev_curr: Transform | None
+    ) -> Moment:
+        if self.hold.wheels_lie and self.is_running:
+            observation = replace(observation, T_odom_base=None)
+        turn = self.hold.turn if self.is_running else None
+        T_map_base = self.bridge.predict(observation, by_velocity=by_velocity, turn=turn)
+        if T_map_base is None and T_prev_curr is not None:
+            T_map_base = self.bridge.follow(observation, T_prev_curr)
+        return self._moment(observation, T_map_base)
+
+    def _moment(self, observation: Observation, T_map_base: Transform | None) -> Moment:
+        tracking = self.tracking
+        return Moment(
+            observation=observation,
+            T_map_base=T_map_base,
+            module=BRIDGED if tracking is None else self.key,
+            bridge=self.bridge.copy(),
+            turn=self.hold.turn if self.is_running else None,
+            covariance=None if tracking is None else tracking.covariance,
+            is_trusted=tracking is not None and self.hold.is_trusted,
+        )

@@ -1,0 +1,43 @@
+"""Claims the folder of a run or sweep before Hydra writes into it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+
+from sceneslam.storage.folder import RunFolder
+from sceneslam.types.errors import ConfigError
+
+_UNUSABLE = 2  # exit code: nothing was run
+
+
+class ClaimFolder(Callback):
+    """Called by Hydra between composing and running (`hydra.callbacks`)."""
+
+    def on_run_start(self, config: DictConfig, **_: Any) -> None:
+        """Claim `hydra.run.dir`."""
+        self._claim(config, "run")
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """Claim `hydra.sweep.dir`."""
+        self._claim(config, "sweep")
+
+    def _claim(self, config: DictConfig, kind: str) -> None:
+        """Make the folder this run's own; where its name is an instant that is taken, rename it.
+
+        Hydra makes a warning of any exception but this one.
+        """
+        key = f"hydra.{kind}.dir"
+        node = config.hydra[kind]
+        raw = str(OmegaConf.to_container(node, resolve=False)["dir"])  # type: ignore[index,call-overload]
+        try:
+            self._folder = RunFolder.claim(Path(node.dir), is_stamped="${now:" in raw, key=key)
+        except ConfigError as error:
+            sys.stderr.write(f"error: {error}\n")
+            raise SystemExit(_UNUSABLE) from error
+        with read_write(config), open_dict(config):
+            node.dir = str(self._folder.path)

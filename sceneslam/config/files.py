@@ -1,0 +1,73 @@
+"""The YAML files of a user's folder: read only if they are of a size that a person writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import yaml
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigResult
+
+from sceneslam.types.errors import InputError
+
+_MOST_BYTES = 1 << 20
+_MOST_VALUES = 20_000  # with what aliases stand for; the largest of ours has a hundred
+_DEEPEST = 32
+
+
+class CheckedFiles(FileConfigSource):
+    """Hydra's reader of `--config-dir` and `hydra.searchpath`, which refuses absurd files."""
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """Return what a file holds; raises InputError where reading it would take minutes."""
+        path = Path(self.path) / self._normalize_file_name(config_path)
+        if path.is_file():
+            check_yaml(path)
+        return super().load_config(config_path)
+
+
+def register() -> None:
+    """Have Hydra read files by the class above."""
+    Plugins.instance()  # it registers Hydra's own reader
+    SourcesRegistry.instance().types[CheckedFiles.scheme()] = CheckedFiles
+
+
+def check_yaml(path: Path) -> None:
+    """Raise InputError for a file that is huge, or becomes so when its aliases are followed."""
+    size = path.stat().st_size
+    if size > _MOST_BYTES:
+        raise InputError(f"a YAML file has {size} bytes, at most {_MOST_BYTES} are read: {path}")
+    with path.open("rb") as file:
+        try:
+            _count_values(file.read(), path)
+        except yaml.YAMLError:
+            return  # whoever reads it says where
+        except UnicodeDecodeError:
+            return
+
+
+def _count_values(text: bytes, path: Path) -> None:
+    """Go through a file's events, adding up what every alias stands for."""
+    sizes: dict[str, int] = {}  # of anchored values
+    opened: list[tuple[str | None, int]] = []  # anchor, values before it
+    count = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            count += sizes.get(event.anchor, 1)
+        elif isinstance(event, yaml.ScalarEvent):
+            count += 1
+            if event.anchor:
+                sizes[event.anchor] = 1
+        elif isinstance(event, yaml.CollectionStartEvent):
+            opened.append((event.anchor, count))
+            count += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = opened.pop()
+            if anchor:
+                sizes[anchor] = count - before
+        if count > _MOST_VALUES:
+            raise InputError(f"a YAML file holds more than {_MOST_VALUES} values: {path}")
+        if len(opened) > _DEEPEST:
+            raise InputError(f"a YAML file is nested deeper than {_DEEPEST} levels: {path}")

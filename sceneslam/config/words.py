@@ -1,0 +1,108 @@
+"""The words of a command line: paths as people type them, and the code that they vouch for."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Sequence
+from itertools import accumulate
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, QuotedString
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+
+from sceneslam.types.errors import ConfigError
+
+_PATH = re.compile(r"(\+{0,2}[\w.@/]*(?:path|dir))=(.*)", re.DOTALL)
+_LONGEST = 4000  # characters: Hydra takes seconds to parse twice as many
+_DEEPEST = 32  # brackets
+_SHOWN = 120  # characters of a word in a message
+_TRUST = "allow_targets"
+
+
+def is_override(word: str) -> bool:
+    """Tell whether a word of the command line sets or removes a key."""
+    return not word.startswith("-") and ("=" in word or word.startswith("~"))
+
+
+def readable(word: str, *, is_sweep: bool) -> str:
+    """Return a word as Hydra reads it: a path that it cannot read is put into quotes.
+
+    In a sweep a comma stands between values, in a path alone it is part of the name. Raises
+    ConfigError for a word that takes longer than some seconds to be parsed.
+    """
+    if not is_override(word):
+        return word
+    _check_extent(word)
+    path = _PATH.fullmatch(word)
+    if path is None or (is_sweep and "," in word):
+        return word
+    parsed = _parsed(word)
+    is_read = parsed is not None and not parsed.is_sweep_override()
+    return word if is_read else f"{path[1]}={quoted(path[2])}"
+
+
+def _check_extent(word: str) -> None:
+    key, _, value = word.partition("=")
+    if len(word) > _LONGEST:
+        allowed = f"at most {_LONGEST} characters; a longer value belongs in a YAML file"
+        raise ConfigError(key, f"{len(word)} characters", allowed)
+    steps = ((char in "[{(") - (char in "]})") for char in value)
+    if max(accumulate(steps), default=0) > _DEEPEST:
+        raise ConfigError(key, shortened(value), f"brackets up to {_DEEPEST} deep")
+
+
+def quoted(text: str) -> str:
+    """Return text as Hydra's grammar takes any: in double quotes."""
+    inner = re.sub(r'(\\*)"', r'\1\1\\"', text)
+    ends = len(inner) - len(inner.rstrip("\\"))
+    return f'"{inner}{ends * chr(92)}"'
+
+
+def how_to_quote(word: str, reason: str) -> str:
+    """Return a sentence on a word that Hydra cannot parse, with the word as it can be typed."""
+    key, equals, value = word.partition("=")
+    said = f"{shortened(word)}: {shortened(reason)}"
+    if not equals or len(value) > _SHOWN:
+        return said
+    return f"{said}; if this is text, type it in quotes: {shlex.quote(f'{key}={quoted(value)}')}"
+
+
+def shortened(text: str) -> str:
+    """Return the beginning of a text in one line."""
+    line = " ".join(text.split())
+    return line if len(line) <= _SHOWN else f"{line[:_SHOWN]}..."
+
+
+def check_trust(config: DictConfig, words: Sequence[str]) -> None:
+    """Raise ConfigError where `allow_targets` says anything but what the command line says.
+
+    A `_target_` is code. A file that somebody shares must not vouch for its own code: only the
+    person who types the command does.
+    """
+    typed = [one.value() for one in map(_parsed, words) if one and one.key_or_group == _TRUST]
+    vouched = _plain(typed[-1]) if typed else []
+    node = OmegaConf.select(config, _TRUST)
+    given = OmegaConf.to_container(node) if OmegaConf.is_config(node) else node
+    if given != vouched:
+        raise ConfigError(
+            _TRUST,
+            given,
+            "the packages named on the command line itself; a file cannot allow its own code",
+        )
+
+
+def _parsed(word: str) -> Override | None:
+    """Return what Hydra reads in a word, None where it cannot."""
+    try:
+        return OverridesParser.create().parse_override(word)
+    except HydraException:
+        return None
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_plain(one) for one in value]
+    return value.text if isinstance(value, QuotedString) else value

@@ -1,0 +1,333 @@
+"""The one motion model: how the base moved from one observation to the next.
+
+Wheel odometry where there is any, else constant velocity; a gyro turns either (Borenstein and Feng,
+"Gyrodometry", ICRA 1996). What the wheels and the gyro are off by is learnt from motions that
+another sensor measured, and from one another; so is how far they can be trusted, and whether the
+wheels lie just now. Every user has a model of its own: a judge's is not taught by whom it judges.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.motion.trust import LieDetector, NoiseRatio, log_likelihood
+from sceneslam.motion.turn_errors import TurnErrors
+from sceneslam.types import se3
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.se3 import Transform
+
+_ACCELERATION = np.array([1.5, 4.0])  # m/s^2, rad/s^2: of a robot
+_FADE_S = {False: 0.5, True: 5.0}  # in which a velocity that nothing measures is forgotten
+_JUMP = 3.0  # of these is no acceleration any more
+_KEPT_S = 0.5  # no velocity is kept for longer than this
+_UNKNOWN = np.array([1.0, 2.0])  # m/s, rad/s: of a base of which no velocity is known
+_STEP = np.array([1e-4, 1e-4])  # m, rad: no guess is better
+_STILL_M, _STILL_RAD = 1e-5, 1e-5  # of a step: less than a tick of any encoder
+_FASTEST = np.array([25.0, 20.0])  # m/s, rad/s: a velocity measured worse is not measured
+_AT_REST = 0.3  # of the wheels' floor: wheels that do not turn say so
+_TURN_PER_METRE = 0.5  # rad/m per unit of noise: a wheel base of a metre or two
+_METRE_PER_TURN = 1.0  # a turn about a point that is not quite base moves base sideways
+_LATE_M, _SPEED_MAX_M_S = 1.0, 25.0  # odometry that moves further has jumped: it was reset
+_BELIEVED = 0.5  # wheels that lie with this probability or more are not
+_RIVAL_MIN = 0.01  # the probability of the rival, at least
+_TAUGHT_MIN = 0.25  # what noisy wheels that are taken for lying teach, beside honest ones
+_PLANAR = np.array([0, 1, 5])  # forward, left, yaw
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Motion:
+    """The base's motion since the last observation."""
+
+    T_prev_curr: Transform
+    covariance: NDArray[np.float64]  # (6, 6) of se3.log order [m, rad], axes of curr
+    is_measured: bool  # wheels told all of the motion since another sensor measured; else guessed
+    is_doubted: bool = False  # the wheels seem to lie: the motion is a guess nevertheless
+    probability: float = 1.0  # that it is this motion and not the rival
+    rival: Motion | None = None  # the motion if whoever is not believed is right after all
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Step:
+    """A motion as one witness has it. Pairs are of the distance and of the turn."""
+
+    T: Transform
+    variance: NDArray[np.float64]  # (2,) [m^2, rad^2]
+    amounts: NDArray[np.float64]  # (2,): what its noise is a ratio of
+    causes: NDArray[np.float64]  # (3,): metres, radians, seconds, of the turn's systematic error
+
+    def then(self, step: _Step) -> _Step:
+        """Return both in a row."""
+        return _Step(
+            T=self.T @ step.T,
+            variance=self.variance + step.variance,
+            amounts=np.sqrt(self.amounts**2 + step.amounts**2),
+            causes=self.causes + step.causes,
+        )
+
+    def turned(self, turn: NDArray[np.float64], noise_rad: float, duration_s: float) -> _Step:
+        """Return the step with the gyro's turn."""
+        return _Step(
+            T=se3.from_parts(se3.so3_exp(turn), self.T[:3, 3]),
+            variance=np.array([self.variance[0], noise_rad**2]),
+            amounts=np.array([self.amounts[0], 0.0]),
+            causes=np.array([0.0, 0.0, duration_s]),
+        )
+
+
+def _still() -> _Step:
+    return _Step(T=se3.identity(), variance=np.zeros(2), amounts=np.zeros(2), causes=np.zeros(3))
+
+
+class MotionModel:
+    """Predicts the motion to one observation after the other; learns from `learn` alone."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._wheels, self._gyro = rig.wheels, rig.gyro
+        self._floors = np.array([rig.wheels.floor_m, rig.wheels.floor_rad])
+        self._has_wheels = Sensor.ODOMETRY in rig.sensors
+        self._fade_s = _FADE_S[self._has_wheels]
+        self._noise = [NoiseRatio(rig.wheels.noise_ratio) for _ in range(2)]  # distance, turn
+        self._lies = [LieDetector() for _ in range(2)]
+        self._turns = TurnErrors(rig.gyro.bias_radps)
+        self._twist_s: NDArray[np.float64] | None = None  # motion per second, as last measured
+        self._twist_variance = np.zeros(2)
+        self._unknown_s = 0.0  # for so long there is none
+        self._stamp_ns: int | None = None
+        self._T_odom_base: Transform | None = None  # the last there was ...
+        self._silent_s = 0.0  # ... so long ago
+        self._gap: Transform | None = None  # the motion returned since then; None: it is not silent
+        self._since_s = 0.0  # since the last measured motion; by wheels, if they told all of it
+        self._since_wheels: _Step | None = _still()
+        self._since_guess = _still()
+        self._is_followed = True  # not stopped since then
+        self._is_measured = True  # the wheels told of all motion since then
+
+    @property
+    def noise_ratios(self) -> NDArray[np.float64]:
+        """Return the wheels' deviation per metre and per radian (2,), as learnt so far."""
+        return np.array([noise.ratio for noise in self._noise])
+
+    @property
+    def lying(self) -> NDArray[np.float64]:
+        """Return the probability that the wheels lie now: of the distance, of the turn (2,)."""
+        return np.array([lie.lying for lie in self._lies])
+
+    @property
+    def gyro_bias(self) -> NDArray[np.float64]:
+        """Return the gyro's bias (3,) [rad/s], base axes, as learnt so far."""
+        return self._turns.gyro_bias
+
+    @property
+    def velocity(self) -> NDArray[np.float64]:
+        """Return the base's twist per second (6,), 0 where it is not known."""
+        return np.zeros(6) if self._twist_s is None else self._twist_s
+
+    def copy(self) -> MotionModel:
+        """Return a model that knows the same and learns on its own."""
+        return copy.deepcopy(self)
+
+    def predict(self, observation: Observation) -> Motion:
+        """Return the motion from the observation before to this one, and go on from here."""
+        before_ns, self._stamp_ns = self._stamp_ns, observation.stamp_ns
+        if before_ns is None:
+            self._take_odometry(observation, 0.0)
+            self._forget()
+            return Motion(
+                T_prev_curr=se3.identity(),
+                covariance=np.zeros((6, 6)),
+                is_measured=self._T_odom_base is not None,
+            )
+        duration_s = max((observation.stamp_ns - before_ns) * 1e-9, 0.0)
+        for lie in self._lies:
+            lie.wait(duration_s)
+        gap = self._gap
+        wheels, guess = self._take_odometry(observation, duration_s), self._by_velocity(duration_s)
+        turn = self._turns.by_gyro(observation, duration_s)
+        if turn is not None:
+            noise_rad = self._gyro.bias_radps * duration_s + self._gyro.noise_rad
+            guess = guess.turned(turn, noise_rad, duration_s)
+            if wheels is not None and gap is None:
+                self._compare(turn, wheels, duration_s)
+                wheels = wheels.turned(turn, noise_rad, duration_s)
+        self._since_s += duration_s
+        self._since_guess = self._since_guess.then(guess)
+        if wheels is not None and self._since_wheels is not None:
+            self._since_wheels = self._since_wheels.then(wheels)
+        if wheels is not None and gap is not None:  # of the gap, the guesses were taken already
+            wheels = replace(wheels, T=se3.inverse(gap) @ wheels.T)
+        motion = self._joined(wheels, guess)
+        if self._gap is not None:
+            self._gap = self._gap @ motion.T_prev_curr
+        return motion
+
+    def learn(self, T_before_now: Transform, covariance: NDArray[np.float64]) -> None:
+        """Learn from the motion since the last call, as measured by another sensor alone.
+
+        `covariance` (6, 6) is its own, without any prediction in it: large where the sensor
+        measured nothing. Axes of `now`.
+        """
+        duration_s, wheels, guess = self._since_s, self._since_wheels, self._since_guess
+        had_velocity = self._twist_s is not None
+        if duration_s <= 0.0 or not self._is_followed:  # nobody knows since when it moved so
+            self.skip()
+            return
+        before = self._twist_variance * duration_s**2
+        self._note_velocity(se3.log(T_before_now) / duration_s, covariance / duration_s**2)
+        self._forget()
+        if wheels is None:
+            return
+        measured = covariance[np.ix_(_PLANAR, _PLANAR)]
+        off, off_guess = (
+            se3.log(se3.inverse(step.T) @ T_before_now)[_PLANAR] for step in (wheels, guess)
+        )
+        for channel, axes in enumerate((slice(0, 2), slice(2, 3))):
+            R = measured[axes, axes]
+            if had_velocity:
+                unit = np.eye(len(R))
+                evidence = log_likelihood(
+                    off_guess[axes], (guess.variance + before)[channel] * unit + R
+                )
+                evidence -= log_likelihood(off[axes], wheels.variance[channel] * unit + R)
+                self._lies[channel].judge(evidence)
+            for missed, variance in zip(off[axes].tolist(), np.diag(R).tolist(), strict=True):
+                self._noise[channel].learn(
+                    missed,
+                    float(wheels.amounts[channel]),
+                    floor=float(self._floors[channel]),
+                    variance=variance,
+                    share=max(1.0 - self._lies[channel].lying, _TAUGHT_MIN) / len(R),
+                )
+        if self._lies[1].lying < _BELIEVED:
+            self._turns.learn(
+                float(off[2]), wheels.causes, float(wheels.variance[1] + measured[2, 2])
+            )
+
+    def skip(self) -> None:
+        """Learn nothing from the motion since the last call: it was not measured."""
+        self._forget()
+        self._is_followed = True
+
+    def stop(self) -> None:
+        """Forget the velocity, too, and that wheels told all: the base is no longer followed."""
+        self.slow_down()
+        self._forget()
+        self._is_measured, self._is_followed = False, False
+
+    def slow_down(self) -> None:
+        """Forget the velocity alone."""
+        self._twist_s = None
+
+    def _note_velocity(self, twist_s: NDArray[np.float64], covariance: NDArray[np.float64]) -> None:
+        """Take a velocity; what the sensor did not measure of it is forgotten after a while."""
+        unknown = np.diag(np.repeat(_FASTEST**2, 3))
+        gain = unknown @ np.linalg.inv(unknown + covariance)
+        kept = self.velocity * math.exp(-self._since_s / self._fade_s)
+        twist_s = kept + gain @ (twist_s - kept)
+        if self._has_wheels and self._twist_s is not None:  # else nothing else can tell a jump
+            reach = np.repeat(_JUMP * _ACCELERATION * self._since_s, 3)
+            twist_s = self._twist_s + np.clip(twist_s - self._twist_s, -reach, reach)
+        self._twist_s = twist_s
+        self._twist_variance = np.diag(covariance)[[0, 5]]
+        self._unknown_s = 0.0
+
+    def _forget(self) -> None:
+        """Begin anew to compare; odometry that is silent just now has to begin anew, too."""
+        if self._gap is not None:
+            self._T_odom_base, self._gap = None, None
+        self._since_s, self._since_wheels, self._since_guess = 0.0, _still(), _still()
+        self._is_measured = True
+
+    def _take_odometry(self, observation: Observation, duration_s: float) -> _Step | None:
+        """Return the motion since the last odometry, None where there is none now or was none."""
+        self._silent_s += duration_s
+        T_before, T_odom_base = self._T_odom_base, _finite(observation.T_odom_base)
+        if T_odom_base is None:
+            if T_before is None:
+                self._since_wheels, self._is_measured = None, False
+            elif self._gap is None:
+                self._gap = se3.identity()
+            return None
+        step = None
+        if T_before is not None:
+            step = self._by_wheels(se3.inverse(T_before) @ T_odom_base, self._silent_s)
+        if step is None:
+            self._since_wheels, self._is_measured = None, False
+        self._T_odom_base, self._gap, self._silent_s = T_odom_base, None, 0.0
+        return step
+
+    def _by_wheels(self, T_prev_curr: Transform, duration_s: float) -> _Step | None:
+        """Return a motion as odometry has it, None where it jumped."""
+        forward_m, yaw_rad = float(T_prev_curr[0, 3]), se3.yaw_rad(T_prev_curr)
+        distance_m = float(np.linalg.norm(T_prev_curr[:3, 3]))
+        angle_rad = float(se3.rotation_angle_rad(T_prev_curr))
+        if distance_m > _LATE_M + _SPEED_MAX_M_S * duration_s:
+            return None
+        if distance_m < _STILL_M and angle_rad < _STILL_RAD:
+            return replace(_still(), variance=(_AT_REST * self._floors) ** 2)
+        amounts = np.array(
+            [distance_m + _METRE_PER_TURN * angle_rad, angle_rad + _TURN_PER_METRE * distance_m]
+        )
+        missed_rad = self._turns.of_wheels(forward_m, yaw_rad)
+        return _Step(
+            T=T_prev_curr @ se3.from_xy_yaw(0.0, 0.0, missed_rad),
+            variance=(self.noise_ratios * amounts) ** 2 + self._floors**2,
+            amounts=amounts,
+            causes=np.array([forward_m, yaw_rad, 0.0]),
+        )
+
+    def _by_velocity(self, duration_s: float) -> _Step:
+        """Return the motion if the base went on as it moved last."""
+        if self._twist_s is None:  # its deviation adds up, not its variance
+            before_s, self._unknown_s = self._unknown_s, self._unknown_s + duration_s
+            variance = _UNKNOWN**2 * (self._unknown_s**2 - before_s**2) + _STEP**2
+            return replace(_still(), variance=variance)
+        kept_s = min(duration_s, _KEPT_S)
+        deviation = _STEP + 0.5 * _ACCELERATION * kept_s * duration_s
+        return replace(
+            _still(),
+            T=se3.exp(self._twist_s * kept_s),
+            variance=deviation**2,
+        )
+
+    def _compare(self, turn: NDArray[np.float64], wheels: _Step, duration_s: float) -> None:
+        self._turns.compare(
+            turn,
+            se3.yaw_rad(wheels.T),
+            causes=wheels.causes,
+            variance=float(wheels.variance[1]),
+            duration_s=duration_s,
+        )
+
+    def _joined(self, wheels: _Step | None, guess: _Step) -> Motion:
+        """Return distance and turn by whom each is believed: the wheels unless they lie."""
+        if wheels is None:
+            return _motion(guess, guess, is_measured=False)
+        lies = self.lying >= _BELIEVED
+        distance, turn = (guess if lie else wheels for lie in lies)
+        probability = float(np.maximum(self.lying, 1.0 - self.lying).prod())
+        rival = _motion(wheels if lies.any() else guess, wheels, is_measured=False)
+        return replace(
+            _motion(distance, turn, is_measured=self._is_measured),
+            is_doubted=bool(lies.any()),
+            probability=probability,
+            rival=replace(rival, probability=max(1.0 - probability, _RIVAL_MIN)),
+        )
+
+
+def _motion(distance: _Step, turn: _Step, *, is_measured: bool) -> Motion:
+    variance = np.repeat([distance.variance[0], turn.variance[1]], 3)
+    return Motion(
+        T_prev_curr=se3.from_parts(turn.T[:3, :3], distance.T[:3, 3]),
+        covariance=np.diag(variance),
+        is_measured=is_measured,
+    )
+
+
+def _finite(T_odom_base: Transform | None) -> Transform | None:
+    return T_odom_base if T_odom_base is not None and np.isfinite(T_odom_base).all() else None

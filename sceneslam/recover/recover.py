@@ -1,0 +1,184 @@
+"""The results of a run that was killed, from its journal and events, by the code of every run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from contextlib import chdir, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from sceneslam.atlas.atlas import Atlas
+from sceneslam.config.build import make_source
+from sceneslam.config.component import Builder
+from sceneslam.config.provenance import provenance
+from sceneslam.evaluation.metrics import Metrics
+from sceneslam.evaluation.settings import EvaluationSettings
+from sceneslam.results import Results
+from sceneslam.storage.journal import JOURNAL, Kept, read_journal
+from sceneslam.types.errors import InputError, SceneSlamError, told
+from sceneslam.types.files import PART, owned, replacing
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.run import Event, RunResult, Timings
+from sceneslam.types.se3 import Transform
+from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import GroundTruth
+
+_NEVER_KEPT = (
+    "the map that the active module had when the run was cut off, and what it would have revised",
+    "what detector, bus and modules cost",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recovered:
+    """What could be made of a run, and what could not."""
+
+    metrics: Metrics
+    missing: tuple[str, ...]  # that no run which is cut off leaves behind, or that was torn
+    faults: tuple[str, ...]  # what could not be saved now
+
+
+def recover(folder: Path) -> Recovered:
+    """Write the results of a run that was cut off; raises InputError where it left no journal."""
+    config = _read_config(folder)
+    # The code that a configuration names is run at the user's word alone, not at a file's.
+    builder = Builder(config | {"allow_targets": []})
+    atlas = builder.make("atlas", Atlas)
+    kept = read_journal(folder / JOURNAL, _Retold(atlas))
+    missing = list(_NEVER_KEPT)
+    if kept.torn_bytes:
+        missing.append(f"the last {kept.torn_bytes} bytes of {JOURNAL}, which are torn")
+    events = _events(folder, missing)
+    with chdir(kept.head.began_in) if Path(kept.head.began_in).is_dir() else nullcontext():
+        truth = _truth(config, builder, missing)
+        versions = provenance(config)
+    results = Results(
+        folder=folder,
+        config=config,
+        versions=versions,
+        title=kept.head.title,
+        evaluation=builder.make("evaluation", EvaluationSettings),
+        has_report=bool((config.get("run") or {}).get("report", True)),
+        value_label=kept.head.value_label,
+        faults=[_sentence(atlas, kept), *(f"recovered without {what}" for what in missing)],
+    )
+    told_before = len(results.faults)
+    result = _result(atlas, kept, events)
+    results.save_trajectories(result)
+    reference = folder / "reference" / "trajectory.tum"
+    metrics = results.save_rest(
+        result,
+        truth,
+        reference=Trajectory.read_tum(reference) if reference.is_file() else None,
+        has_costs=False,
+    )
+    faults = tuple(results.faults[told_before:])
+    if not faults:
+        _tidy(folder)
+    return Recovered(metrics=metrics, missing=tuple(missing), faults=faults)
+
+
+class _Retold:
+    """Tells an atlas what a journal says that another was told."""
+
+    def __init__(self, atlas: Atlas) -> None:
+        self._atlas = atlas
+
+    def add_session(self, module: str, T_map_local: Transform) -> None:
+        self._atlas.begin_session(module, T_map_local)
+
+    def add_local(self, stamp_ns: int, T_local_base: Transform) -> None:
+        self._atlas.add_local(stamp_ns, T_local_base)
+
+    def add_pose(
+        self,
+        stamp_ns: int,
+        T_map_base: Transform,
+        module: str,
+        covariance: NDArray[np.float64] | None,
+    ) -> None:
+        self._atlas.add(stamp_ns, T_map_base, module, covariance)
+
+    def add_rewind(self, stamp_ns: int) -> None:
+        self._atlas.rewind(stamp_ns)
+
+    def add_end(self, session: int, revised: Trajectory) -> None:
+        self._atlas.close_session(session, MapLayers(), revised)
+
+
+def _read_config(folder: Path) -> dict[str, Any]:
+    path = folder / "config.yaml"
+    if not path.is_file():
+        raise InputError(f"nothing to recover, there is no configuration: {path}")
+    try:
+        plain: Any = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+    except (OmegaConfBaseException, YAMLError, ValueError) as error:
+        raise InputError(f"not a configuration ({error}): {path}") from error
+    if not isinstance(plain, dict):
+        raise InputError(f"not a configuration (no table): {path}")
+    return {str(key): value for key, value in plain.items()}
+
+
+def _events(folder: Path, missing: list[str]) -> list[Event]:
+    """Return the events as far as they are whole; a torn last line is taken off the file."""
+    path = folder / "events.jsonl"
+    lines = path.read_bytes().split(b"\n") if path.is_file() else []
+    events: list[Event] = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            events.append(json.loads(line))
+        except ValueError:
+            if any(lines[number - 1 :]):
+                missing.append(f"the events from line {number} of events.jsonl on, which is torn")
+            break
+    with replacing(path) as file:
+        file.writelines(json.dumps(event) + "\n" for event in events)
+    return events
+
+
+def _truth(config: Mapping[str, Any], builder: Builder, missing: list[str]) -> GroundTruth | None:
+    try:
+        return make_source(config, builder).ground_truth()
+    except SceneSlamError as error:
+        missing.append(f"the ground truth: {error}")
+    except Exception as error:  # a reader's own, of a recording that has changed meanwhile
+        missing.append(f"the ground truth: {told(error)}")
+    return None
+
+
+def _sentence(atlas: Atlas, kept: Kept) -> str:
+    return (
+        f"the run was cut off after {len(kept.observed_ns)} observations; these results, of "
+        f"{len(atlas.online)} poses, were recovered from its journal"
+    )
+
+
+def _result(atlas: Atlas, kept: Kept, events: list[Event]) -> RunResult:
+    nothing: NDArray[np.float64] = np.zeros(0)
+    return RunResult(
+        observed_ns=kept.observed_ns,
+        trajectory=atlas.trajectory,
+        online=atlas.online,
+        covariances=atlas.covariances(kept.head.has_odometry),
+        modules=atlas.pose_modules,
+        sessions=atlas.sessions,
+        map=atlas.fuse_maps(),
+        events=events,
+        timings=Timings(detector_us=nothing, bus_us=nothing, module_ms={}, wall_s=0.0),
+    )
+
+
+def _tidy(folder: Path) -> None:
+    """Remove what the run kept for this, and files that it did not come to finish."""
+    unfinished = [name for name in owned(folder) if name.endswith(PART)]
+    sinks = [name for name in unfinished if (folder / name.removesuffix(PART)).suffix == ".mcap"]
+    for name in [JOURNAL, "reserve.bin", *(one for one in unfinished if one not in sinks)]:
+        (folder / name).unlink(missing_ok=True)

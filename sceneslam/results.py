@@ -1,0 +1,117 @@
+"""Writes what came of a run into its folder, what matters most first."""
+
+from __future__ import annotations
+
+import logging
+import resource
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sceneslam.atlas.save import save_map
+from sceneslam.atlas.uncertainty import write_covariances
+from sceneslam.evaluation.metrics import Metrics, evaluate, write_metrics
+from sceneslam.evaluation.report import write_report
+from sceneslam.evaluation.settings import EvaluationSettings
+from sceneslam.types.errors import told
+from sceneslam.types.run import RunResult
+from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import GroundTruth
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Results:
+    """What the files of a run's results need beside the result; `faults` takes what fails."""
+
+    folder: Path
+    config: Mapping[str, Any]
+    versions: Mapping[str, str]
+    title: str
+    evaluation: EvaluationSettings
+    has_report: bool
+    value_label: str  # of the detector's votes, for the figures
+    faults: list[str]  # of the run; each is told in the report
+
+    def save_trajectories(self, result: RunResult) -> None:
+        """Write the trajectories: nothing is worth as much, and nothing else is waited for."""
+        folder = self.folder
+        with self._noting("the trajectory"):
+            result.trajectory.write_tum(folder / "trajectory.tum")
+        with self._noting("the other trajectories"):
+            result.online.write_tum(folder / "trajectory_online.tum")
+            for session in result.sessions:
+                name = f"trajectory_{session.index}_{session.module}.tum"
+                session.trajectory.write_tum(folder / name)
+            write_covariances(
+                folder / "trajectory_covariance.txt",
+                result.trajectory.stamps_ns,
+                result.covariances,
+            )
+
+    def save_rest(
+        self,
+        result: RunResult,
+        truth: GroundTruth | None,
+        *,
+        reference: Trajectory | None = None,
+        has_costs: bool = True,
+    ) -> Metrics:
+        """Write map, metrics and report; return the metrics."""
+        metrics = evaluate(
+            result,
+            truth,
+            settings=self.evaluation,
+            peak_rss_mb=_peak_rss_mb() if has_costs else None,
+            reference=reference,
+        )
+        with self._noting("the metrics"):
+            if truth is not None and len(truth.trajectory):
+                truth.trajectory.write_tum(self.folder / "groundtruth.tum")
+            write_metrics(self.folder / "metrics.json", metrics)
+        with self._noting("the map"):
+            save_map(result.map, self.folder / "map")
+        if self.has_report:
+            with self._noting("the report"):
+                self._write_report(result, truth, metrics, reference)
+        return metrics
+
+    def _write_report(
+        self,
+        result: RunResult,
+        truth: GroundTruth | None,
+        metrics: Metrics,
+        reference: Trajectory | None,
+    ) -> None:
+        write_report(
+            self.folder,
+            result,
+            truth,
+            metrics,
+            title=self.title,
+            config=self.config,
+            threshold=(self.config.get("detector") or {}).get("threshold"),
+            config_yaml=(self.folder / "config.yaml").read_text(),
+            versions=self.versions,
+            faults=self.faults,
+            reference=reference,
+            value_label=self.value_label,
+        )
+
+    @contextmanager
+    def _noting(self, what: str) -> Iterator[None]:
+        """Note what a full disk, a lack of memory or the like keeps from being saved; go on."""
+        try:
+            yield
+        except Exception as error:
+            _log.info("%s could not all be saved", what, exc_info=error)
+            self.faults.append(f"{what} could not all be saved: {told(error)}")
+
+
+def _peak_rss_mb() -> float:
+    """Return the most memory of this process and, added, of the largest that it started."""
+    who = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    return sum(resource.getrusage(one).ru_maxrss for one in who) / 1024

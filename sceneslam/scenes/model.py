@@ -1,0 +1,122 @@
+"""A trained model: which features speak for which scene, as a small YAML file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from sceneslam.types.errors import ConfigError, InputError
+
+_DIGITS = 5  # significant ones that are written
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Model:
+    """A softmax regression on features that are brought to mean 0 and deviation 1."""
+
+    scenes: tuple[str, ...]
+    features: tuple[str, ...]
+    mean: NDArray[np.float64]  # (F,)
+    scale: NDArray[np.float64]  # (F,)
+    weights: NDArray[np.float64]  # (S, F)
+    bias: NDArray[np.float64]  # (S,)
+
+    def scores(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (N, S), the scenes' logarithmic odds for (N, F) features."""
+        return np.asarray((features - self.mean) / self.scale @ self.weights.T + self.bias)
+
+    def cooled(self, temperature: float) -> Model:
+        """Return the model with its scores divided by a temperature: more certain below 1."""
+        return Model(
+            scenes=self.scenes,
+            features=self.features,
+            mean=self.mean,
+            scale=self.scale,
+            weights=self.weights / temperature,
+            bias=self.bias / temperature,
+        )
+
+    def write(self, path: Path, comment: Sequence[str]) -> None:
+        """Write a file that a person can read."""
+        node = {
+            "scenes": list(self.scenes),
+            "features": list(self.features),
+            "mean": _rounded(self.mean),
+            "scale": _rounded(self.scale),
+            "weights": {
+                scene: _rounded(row) for scene, row in zip(self.scenes, self.weights, strict=True)
+            },
+            "bias": dict(zip(self.scenes, _rounded(self.bias), strict=True)),
+        }
+        text = "".join(f"# {line}\n" for line in comment)
+        text += yaml.safe_dump(node, sort_keys=False, default_flow_style=None, width=100)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+    @classmethod
+    def read(cls, path: Path) -> Model:
+        """Return the model in a file; raises InputError where there is none."""
+        if not path.is_file():
+            raise InputError(f"model not found: {path}")
+        try:
+            node: Mapping[str, Any] = yaml.safe_load(path.read_text())
+            scenes = tuple(node["scenes"])
+            return cls(
+                scenes=scenes,
+                features=tuple(node["features"]),
+                mean=np.array(node["mean"], np.float64),
+                scale=np.array(node["scale"], np.float64),
+                weights=np.array([node["weights"][scene] for scene in scenes], np.float64),
+                bias=np.array([node["bias"][scene] for scene in scenes], np.float64),
+            )
+        except (KeyError, TypeError, ValueError, yaml.YAMLError) as error:
+            raise InputError(f"not a model ({type(error).__name__}): {path}") from error
+
+
+def shares(scores: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (N, S) the probabilities of scenes by their scores."""
+    powers = np.exp(scores - scores.max(axis=1, keepdims=True))
+    return np.asarray(powers / powers.sum(axis=1, keepdims=True))
+
+
+def fit(
+    features: NDArray[np.float64],
+    labels: Sequence[str],
+    weights: NDArray[np.float64],
+    names: Sequence[str],
+) -> Model:
+    """Return the model of (N, F) features with a scene and a weight each.
+
+    Raises ConfigError where scikit-learn is not installed.
+    """
+    try:
+        from sklearn.linear_model import LogisticRegression
+    except ImportError as error:
+        allowed = "what the extra installs: pip install 'sceneslam[learn]'"
+        raise ConfigError("scikit-learn", "nothing", allowed) from error
+    mean = np.average(features, axis=0, weights=weights)
+    scale = np.sqrt(np.average((features - mean) ** 2, axis=0, weights=weights))
+    scale = np.where(scale > 0, scale, 1.0)
+    regression: Any = LogisticRegression(max_iter=5000)  # type: ignore[no-untyped-call]
+    regression.fit((features - mean) / scale, np.array(labels), sample_weight=weights)
+    rows, bias = np.asarray(regression.coef_), np.asarray(regression.intercept_)
+    if len(rows) == 1:  # of two scenes it fits the second's odds against the first
+        rows, bias = np.concatenate([-rows, rows]) / 2, np.concatenate([-bias, bias]) / 2
+    return Model(
+        scenes=tuple(map(str, regression.classes_)),
+        features=tuple(names),
+        mean=mean,
+        scale=scale,
+        weights=rows,
+        bias=bias,
+    )
+
+
+def _rounded(values: NDArray[np.float64]) -> list[float]:
+    return [float(f"{value:.{_DIGITS}g}") for value in values.tolist()]

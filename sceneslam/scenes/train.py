@@ -1,0 +1,111 @@
+"""Trains a model on examples, and tells by held-out recordings what it is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.scenes.examples import Seen
+from sceneslam.scenes.model import Model, fit, shares
+from sceneslam.types.errors import InputError
+
+_IMAGES_PER_SCENE = 10.0  # neighbouring images are alike: all of a scene weigh as so many
+_TEMPERATURES = np.geomspace(1.0, 10.0, 65)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Judged:
+    """An example with the probabilities that a model gave it that was not trained on it."""
+
+    seen: Seen
+    scenes: tuple[str, ...]
+    scores: NDArray[np.float64]  # (N, S)
+
+    @property
+    def probabilities(self) -> NDArray[np.float64]:
+        """Return (N, S)."""
+        return shares(self.scores)
+
+    @property
+    def votes(self) -> NDArray[np.str_]:
+        """Return (N,) the most probable scenes."""
+        return np.array([self.scenes[place] for place in self.scores.argmax(axis=1)])
+
+    @property
+    def is_right(self) -> NDArray[np.bool_]:
+        """Return (N,) whether the vote is the example's scene."""
+        return np.asarray(self.votes == self.seen.example.scene)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Trained:
+    """A model, and how models like it did on the recordings that they were not shown."""
+
+    model: Model
+    held_out: Sequence[Judged]  # empty where no recording could be held out
+    temperature: float
+
+
+def train(all_seen: Sequence[Seen], names: Sequence[str]) -> Trained:
+    """Return the model of examples whose features have these names.
+
+    Its probabilities are calibrated on groups of recordings that were held out in turn: those
+    without which every scene still has an example. Raises InputError for fewer than two scenes.
+    """
+    if len({seen.example.scene for seen in all_seen}) < 2:
+        raise InputError("examples: of two scenes or more")
+    held_out: list[Judged] = []
+    for group in dict.fromkeys(seen.example.group for seen in all_seen):
+        inside = [seen for seen in all_seen if seen.example.group == group]
+        others = [seen for seen in all_seen if seen.example.group != group]
+        if _scenes(others) == _scenes(all_seen):
+            model = _fit(others, names)
+            held_out += [judge(model, seen) for seen in inside]
+    temperature = _temperature(held_out)
+    cooled = [
+        Judged(seen=one.seen, scenes=one.scenes, scores=one.scores / temperature)
+        for one in held_out
+    ]
+    model = _fit(all_seen, names).cooled(temperature)
+    return Trained(model=model, held_out=cooled, temperature=temperature)
+
+
+def judge(model: Model, seen: Seen) -> Judged:
+    """Return what a model says of an example."""
+    return Judged(seen=seen, scenes=model.scenes, scores=model.scores(seen.features))
+
+
+def _scenes(all_seen: Sequence[Seen]) -> set[str]:
+    return {seen.example.scene for seen in all_seen}
+
+
+def _fit(all_seen: Sequence[Seen], names: Sequence[str]) -> Model:
+    """Fit a model in which every scene weighs the same, and in it every example."""
+    labels: list[str] = []
+    weights: list[float] = []
+    for seen in all_seen:
+        scene, count = seen.example.scene, len(seen.features)
+        examples = sum(other.example.scene == scene for other in all_seen)
+        labels += [scene] * count
+        weights += [_IMAGES_PER_SCENE / examples / count] * count
+    features = np.concatenate([seen.features for seen in all_seen])
+    return fit(features, labels, np.array(weights), names)
+
+
+def _temperature(held_out: Sequence[Judged]) -> float:
+    """Return by what scores are to be divided so that held-out scenes are the most likely.
+
+    One number, so that no vote changes (temperature scaling; Guo et al., ICML 2017). It is 1 or
+    more: that a few recordings were all right is no reason to be more certain than the fit is.
+    """
+    losses = [sum(_loss(one, temperature) for one in held_out) for temperature in _TEMPERATURES]
+    return float(_TEMPERATURES[int(np.argmin(losses))])
+
+
+def _loss(one: Judged, temperature: float) -> float:
+    """Return the mean negative logarithm of the true scene's probability."""
+    true = shares(one.scores / temperature)[:, one.scenes.index(one.seen.example.scene)]
+    return float(-np.log(np.maximum(true, 1e-12)).mean())

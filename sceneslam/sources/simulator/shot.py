@@ -1,0 +1,152 @@
+"""One frame of a story: what camera and laser measure, from nothing but the frame's number."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.sources.simulator.optics.camera import Eye
+from sceneslam.sources.simulator.optics.exposure import Shutter, split
+from sceneslam.sources.simulator.optics.lighting import LightMap, bake
+from sceneslam.sources.simulator.optics.noise_table import NoiseTable
+from sceneslam.sources.simulator.optics.rays import RayCaster
+from sceneslam.sources.simulator.optics.sensor_noise import expose, measure_depth
+from sceneslam.sources.simulator.places import building, rooms
+from sceneslam.sources.simulator.places.floor import FloorPlan
+from sceneslam.sources.simulator.places.place import Place
+from sceneslam.sources.simulator.robot.motion import Path
+from sceneslam.sources.simulator.settings import ExposureSettings, LaserSettings
+from sceneslam.sources.simulator.stories import Story
+from sceneslam.types.rig import Camera
+
+_METERED = 64  # frames that are metered at a time, in the light of the first of them
+_PLACE_STREAM, _FRAME_STREAM, _SWEEP_STREAM = 1, 2, 3  # of random numbers, below the seed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Shot:
+    """All that the frames of a story have in common; passed to every worker."""
+
+    story: Story
+    lights: str
+    seed: int
+    path: Path
+    rate_hz: float
+    camera: Camera
+    scanner: LaserSettings | None  # None: switched off
+    place: Place
+    light: LightMap
+    exposure: ExposureSettings
+    exposures: NDArray[np.float64]  # (frames,), time ratio x gain
+
+    def time_s(self, index: int) -> float:
+        """Return when a frame is taken, since the story's start."""
+        return index / self.rate_hz
+
+    def levels(self, time_s: float) -> dict[str, float]:
+        """Return the level of each lamp group at a time."""
+        return self.story.levels(self.place.groups, time_s, self.lights)
+
+    def sweep_time_s(self, index: int) -> float | None:
+        """Return the time of a laser sweep that ended since the frame before, None without."""
+        if self.scanner is None:
+            return None
+        sweep = int(self.time_s(index) * self.scanner.rate_hz + 1e-6)
+        if index > 0 and sweep == int(self.time_s(index - 1) * self.scanner.rate_hz + 1e-6):
+            return None
+        return sweep / self.scanner.rate_hz
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Frame:
+    """What camera and laser measured."""
+
+    image_bgr: NDArray[np.uint8]  # (H, W, 3)
+    depth_mm: NDArray[np.uint16]  # (H, W), 0 = missing
+    ranges_m: NDArray[np.float32] | None  # (beams,), inf: no return
+
+
+class Photographer:
+    """Renders any frame of a shot; the same frame is the same bytes, whoever renders it."""
+
+    def __init__(self, shot: Shot) -> None:
+        self._shot = shot
+        self._caster = RayCaster(shot.place.panels)
+        self._noise = NoiseTable(np.random.default_rng([shot.seed, _FRAME_STREAM]))
+        self._eye = Eye(shot.place, shot.light, self._caster, shot.camera)
+
+    def take(self, index: int) -> Frame:
+        """Return frame `index`."""
+        shot, time_s = self._shot, self._shot.time_s(index)
+        T_gt_cam = shot.path.pose(time_s) @ shot.camera.T_base_cam
+        view = self._eye.look(T_gt_cam, shot.levels(time_s))
+        rng = np.random.default_rng([shot.seed, _FRAME_STREAM, index])
+        return Frame(
+            image_bgr=expose(view, self._noise, rng, self._shutter(index)),
+            depth_mm=measure_depth(view, shot.camera, self._noise, rng),
+            ranges_m=self._sweep(index),
+        )
+
+    def _shutter(self, index: int) -> Shutter:
+        """Return how a frame is exposed; only turning blurs, since driving moves little."""
+        shot, settings = self._shot, self._shot.exposure
+        if not settings.is_automatic:
+            return Shutter()
+        time_ratio, gain = split(float(shot.exposures[index]), settings)
+        T_base_cam = shot.camera.T_base_cam
+        turn_cam = T_base_cam[:3, :3].T @ shot.path.turn_rates_radps(shot.time_s(index))
+        open_s = time_ratio * settings.nominal_s
+        motion_px = (-turn_cam[1] * shot.camera.fx * open_s, turn_cam[0] * shot.camera.fy * open_s)
+        return Shutter(time_ratio=time_ratio, gain=gain, motion_px=motion_px)
+
+    def _sweep(self, index: int) -> NDArray[np.float32] | None:
+        """Return the ranges of the sweep that belongs to a frame; its beams leave at once."""
+        time_s, scanner = self._shot.sweep_time_s(index), self._shot.scanner
+        if time_s is None or scanner is None:
+            return None
+        T_gt_laser = self._shot.path.pose(time_s) @ scanner.laser().T_base_laser
+        angles_rad = scanner.angles_rad()
+        ways_laser = np.stack([np.cos(angles_rad), np.sin(angles_rad), 0 * angles_rad], axis=1)
+        rays = np.empty((len(angles_rad), 6), np.float32)
+        rays[:, :3], rays[:, 3:] = T_gt_laser[:3, 3], ways_laser @ T_gt_laser[:3, :3].T
+        rng = np.random.default_rng([self._shot.seed, _SWEEP_STREAM, index])
+        noise_m = scanner.noise_m * rng.standard_normal(len(rays), dtype=np.float32)
+        ranges_m = self._caster.first_hits(rays).reach + noise_m
+        near_m, far_m = scanner.range_m
+        returned = (ranges_m >= near_m) & (ranges_m <= far_m)
+        return np.where(returned, ranges_m, np.inf).astype(np.float32)
+
+
+def meter(shot: Shot, count: int) -> list[NDArray[np.float32]]:
+    """Return the grey of a coarse grid of each frame, before exposure."""
+    eye = Eye(shot.place, shot.light, RayCaster(shot.place.panels), shot.camera)
+    greys: list[NDArray[np.float32]] = []
+    for first in range(0, count, _METERED):
+        times_s = [shot.time_s(index) for index in range(first, min(first + _METERED, count))]
+        poses = [shot.path.pose(time_s) @ shot.camera.T_base_cam for time_s in times_s]
+        levels = shot.levels(times_s[0])
+        greys += eye.meter(poses, levels, max(1, shot.camera.size_wh[0] // 32))
+    return greys
+
+
+def build_place(kind: str, seed: int, order: int | None) -> Place:
+    """Return a story's place: `two_rooms`, `sunny_rooms`, `bare_rooms`, `corridor`, `building`."""
+    rng = np.random.default_rng([seed, _PLACE_STREAM, 0])
+    if kind == "building":
+        return building.build(rng, order)
+    if kind == "corridor":
+        return rooms.corridor(rng)
+    return rooms.two_rooms(rng, sunny=kind == "sunny_rooms", bare=kind == "bare_rooms")
+
+
+def floor_plan(kind: str, order: int | None) -> FloorPlan:
+    """Return a story's place from above."""
+    return building.floor_plan(order) if kind == "building" else rooms.floor_plan()
+
+
+def light_place(place: Place, seed: int) -> LightMap:
+    """Return the light of a place."""
+    rng = np.random.default_rng([seed, _PLACE_STREAM, 1])
+    return bake(place, RayCaster(place.panels), rng)

@@ -1,0 +1,1 @@
+"""What a recording holds, before and while it is run."""

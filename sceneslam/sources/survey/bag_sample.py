@@ -1,0 +1,128 @@
+"""A few seconds of a ROS recording, from its beginning to its end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from sceneslam.ros import decode
+from sceneslam.ros.clouds import cloud
+from sceneslam.ros.pixels import DepthUnits
+from sceneslam.sources.recording import Message, Recording
+from sceneslam.sources.survey.survey import Stream, Survey
+from sceneslam.types.rig import Sensor
+
+_STRETCHES, _STRETCH_NS = 5, 1_000_000_000
+_SLOW_STRETCHES, _SLOW_STRETCH_NS = 1, 200_000_000  # bzip2 unpacks some megabytes per second
+_MOST_MESSAGES = 400  # of a stretch
+_MOST_SAMPLES = 2  # depth images, scans and clouds of a stretch that are decoded
+
+
+def survey_recording(
+    recording: Recording,
+    topics: Mapping[Sensor, str],
+    *,
+    depth_scale: float,
+    sync_tolerance_s: float,
+) -> Survey:
+    """Return the streams of a recording, sampled in stretches of a second."""
+    taken: dict[Sensor, list[int]] = {sensor: [] for sensor in topics}
+    samples = _Samples(DepthUnits.unlimited(depth_scale))
+    by_topic = {topic: sensor for sensor, topic in topics.items()}
+    for stretch in _stretches(recording, topics):
+        samples.begin()
+        for message in stretch:
+            value = recording.decode(message)
+            if value is None:
+                continue
+            sensor = by_topic[message.topic]
+            stamp_ns = decode.stamp_ns(value) or message.log_ns
+            taken[sensor].append(stamp_ns)
+            samples.take(sensor, stamp_ns, value)
+    streams = [
+        Stream(
+            sensor=sensor,
+            place=topic,
+            count=recording.topics[topic].count,
+            stamps_ns=np.array(sorted(taken[sensor]), np.int64),
+        )
+        for sensor, topic in topics.items()
+    ]
+    return Survey(
+        streams=streams,
+        sync_tolerance_s=sync_tolerance_s,
+        depth_scale=depth_scale if samples.is_scaled else None,
+        depths_m=samples.depths_m,
+        scans=samples.scans,
+        clouds=samples.clouds,
+        odometry_ns=np.array(samples.odometry_ns, np.int64),
+        T_odom_base=samples.T_odom_base,
+        gyro_radps=samples.gyro_radps,
+    )
+
+
+def _stretches(recording: Recording, topics: Mapping[Sensor, str]) -> Iterator[Iterator[Message]]:
+    count, length_ns = _STRETCHES, _STRETCH_NS
+    if recording.is_slow:
+        count, length_ns = _SLOW_STRETCHES, _SLOW_STRETCH_NS
+    start_ns, end_ns = recording.span_ns
+    last_ns = max(start_ns, end_ns - length_ns)
+    for from_ns in sorted({int(at) for at in np.linspace(start_ns, last_ns, count)}):
+        yield _stretch(recording, topics, from_ns, from_ns + length_ns)
+
+
+def _stretch(
+    recording: Recording, topics: Mapping[Sensor, str], from_ns: int, to_ns: int
+) -> Iterator[Message]:
+    messages = recording.messages(set(topics.values()), from_ns)
+    for _, message in zip(range(_MOST_MESSAGES), messages, strict=False):
+        if message.log_ns > to_ns:
+            return
+        yield message
+
+
+class _Samples:
+    """What some messages hold."""
+
+    def __init__(self, units: DepthUnits) -> None:
+        self._units = units
+        self._counts: dict[Sensor, int] = {}
+        self.is_scaled = False  # depth is in whole units
+        self.depths_m: list[Any] = []
+        self.scans: list[Any] = []
+        self.clouds: list[Any] = []
+        self.odometry_ns: list[int] = []
+        self.T_odom_base: list[Any] = []
+        self.gyro_radps: list[Any] = []
+
+    def begin(self) -> None:
+        """Begin a stretch."""
+        self._counts = {}
+
+    def take(self, sensor: Sensor, stamp_ns: int, value: Any) -> None:
+        """Keep what a message holds, where it is one of the first of its stretch."""
+        if sensor is Sensor.ODOMETRY:
+            T_odom_base = decode.transform(value.pose.pose.position, value.pose.pose.orientation)
+            if T_odom_base is not None:
+                self.odometry_ns.append(stamp_ns)
+                self.T_odom_base.append(T_odom_base)
+        elif sensor is Sensor.GYRO:
+            rate = value.angular_velocity
+            self.gyro_radps.append(np.array([rate.x, rate.y, rate.z]))
+        elif self._counts.get(sensor, 0) < _MOST_SAMPLES:
+            self._counts[sensor] = self._counts.get(sensor, 0) + 1
+            self._decode(sensor, stamp_ns, value)
+
+    def _decode(self, sensor: Sensor, stamp_ns: int, value: Any) -> None:
+        if sensor is Sensor.DEPTH:
+            depth_m = decode.depth_m(value, self._units)
+            self.depths_m += [] if depth_m is None else [depth_m]
+            self.is_scaled |= not decode.is_metric_depth(value)
+        elif sensor is Sensor.SCAN:
+            scan = decode.scan(value)
+            self.scans += [] if scan is None else [scan]
+        elif sensor is Sensor.POINTS:
+            found = cloud(value, stamp_ns)
+            self.clouds += [] if found is None else [found.points_lidar]

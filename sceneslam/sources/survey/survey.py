@@ -1,0 +1,84 @@
+"""What a recording holds, by a few samples: taken before it is run, in about a second."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.observation import LaserScan
+from sceneslam.types.rig import Sensor
+from sceneslam.types.se3 import Transform
+
+Stamps = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Stream:
+    """The measurements of one sensor."""
+
+    sensor: Sensor
+    place: str  # the topic or file
+    count: int  # in the whole recording
+    stamps_ns: Stamps  # (N,) rising; all of them, or those in the stretches that were read
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Return the rate by the median period, None for fewer than two measurements."""
+        periods_ns = np.diff(self.stamps_ns)
+        periods_ns = periods_ns[periods_ns > 0]
+        return 1e9 / float(np.median(periods_ns)) if len(periods_ns) else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Survey:
+    """Streams and samples of what they hold; a source leaves out what it does not have."""
+
+    streams: Sequence[Stream]
+    sync_tolerance_s: float | None = None  # between an image and its depth
+    depth_scale: float | None = None  # units per metre; None where depth is stored in metres
+    depths_m: Sequence[NDArray[np.float32]] = ()  # (H, W), also out of range; 0 = missing
+    scans: Sequence[LaserScan] = ()
+    clouds: Sequence[NDArray[np.float32]] = ()  # (N, 3) [m]
+    odometry_ns: Stamps | None = None  # (N,) of ...
+    T_odom_base: Sequence[Transform] = ()  # ... these N poses
+    gyro_radps: Sequence[NDArray[np.float64]] = ()  # (3,) each
+
+    def stream(self, sensor: Sensor) -> Stream | None:
+        """Return a sensor's stream, None where the recording has none."""
+        return next((one for one in self.streams if one.sensor is sensor), None)
+
+    def apart_s(self) -> NDArray[np.float64]:
+        """Return how far each image is from the depth image nearest in time (N,) [s]."""
+        image, depth = self.stream(Sensor.IMAGE), self.stream(Sensor.DEPTH)
+        if image is None or depth is None or not len(depth.stamps_ns):
+            return np.zeros(0)
+        depth_ns = np.sort(depth.stamps_ns)
+        after = np.searchsorted(depth_ns, image.stamps_ns)
+        near = np.clip(np.stack([after - 1, after]), 0, len(depth_ns) - 1)
+        apart_ns = np.abs(depth_ns[near] - image.stamps_ns).min(axis=0)
+        return np.asarray(apart_ns * 1e-9)
+
+    def paired_ratio(self) -> float | None:
+        """Return the share of images with depth within the tolerance, None where unknown."""
+        apart_s = self.apart_s()
+        if not len(apart_s) or self.sync_tolerance_s is None:
+            return None
+        return float((apart_s <= self.sync_tolerance_s).mean())
+
+
+@runtime_checkable
+class Surveyed(Protocol):
+    """A source that can be looked at before it is run."""
+
+    def survey(self) -> Survey | None:
+        """Return what it holds, None when unknown; reads a few stretches of it."""
+        ...
+
+
+def spread(count: int, samples: int) -> list[int]:
+    """Return at most `samples` places of `count`, evenly from the first to the last."""
+    return sorted({round(at) for at in np.linspace(0, count - 1, min(count, samples))})

@@ -1,0 +1,228 @@
+"""The journal of a run: what the atlas is told, on disk at once, so that a run can be recovered.
+
+`journal.bin` begins with `MAGIC`; records follow, little endian: kind (1 byte), length of the body
+(4), CRC-32 of kind and body (4), body. A pose is the upper three rows of its matrix, 12 float64.
+
+| kind | body |
+|---|---|
+| `H` | JSON: what the results need beside the configuration (`Head`) |
+| `O` | stamp [ns] of an observation |
+| `S` | T_map_local of a new session, key of its module |
+| `L` | stamp, T_local_base of the session |
+| `P` | stamp, T_map_base, covariance (upper triangle, 21; or none), key of the module |
+| `R` | stamp from which on poses are taken back |
+| `C` | a session's number; stamps and T_local_base as its module revised them at its end |
+
+A pose takes about 410 bytes. The file goes when the run's results are written.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.interfaces import TrajectoryLog
+from sceneslam.types.errors import InputError
+from sceneslam.types.files import LogFile
+from sceneslam.types.se3 import Transform
+from sceneslam.types.trajectory import Trajectory
+
+JOURNAL = "journal.bin"
+MAGIC = b"SceneSLAM journal 1\n"
+_HEAD = struct.Struct("<cII")
+_STAMP = struct.Struct("<q")
+_UPPER = np.triu_indices(6)
+_POSE_BYTES = 12 * 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Head:
+    """What the results of a run need beside its configuration."""
+
+    title: str
+    value_label: str  # of the detector's votes
+    has_odometry: bool
+    began_in: str  # the folder that relative paths are meant from
+
+
+class Journal:
+    """Writes the journal: `flush` hands the records to the system, `sync` waits for the disk.
+
+    Where the disk does not take them, the run goes on without, and `fault` says so.
+    """
+
+    def __init__(
+        self, path: Path, head: Head, make_room: Callable[[], bool] = lambda: False
+    ) -> None:
+        self._path = path
+        self._waiting = bytearray(MAGIC)
+        self._file = LogFile(path, make_room)
+        self._add(b"H", json.dumps(asdict(head)).encode())
+
+    @property
+    def fault(self) -> str:
+        """Return why the file ends before the run did, "" where it does not."""
+        return self._file.fault
+
+    def add_observation(self, stamp_ns: int) -> None:
+        """Note that an observation was taken."""
+        self._add(b"O", _STAMP.pack(stamp_ns))
+
+    def add_session(self, module: str, T_map_local: Transform) -> None:
+        """Note that a session begins."""
+        self._add(b"S", _pose(T_map_local) + module.encode())
+
+    def add_local(self, stamp_ns: int, T_local_base: Transform) -> None:
+        """Note a pose of the session's own trajectory."""
+        self._add(b"L", _STAMP.pack(stamp_ns) + _pose(T_local_base))
+
+    def add_pose(
+        self,
+        stamp_ns: int,
+        T_map_base: Transform,
+        module: str,
+        covariance: NDArray[np.float64] | None,
+    ) -> None:
+        """Note a pose of the global trajectory."""
+        known = b"" if covariance is None else covariance[_UPPER].tobytes()
+        body = _STAMP.pack(stamp_ns) + _pose(T_map_base) + bytes([len(known)]) + known
+        self._add(b"P", body + module.encode())
+
+    def add_rewind(self, stamp_ns: int) -> None:
+        """Note that poses are taken back."""
+        self._add(b"R", _STAMP.pack(stamp_ns))
+
+    def add_end(self, session: int, revised: Trajectory) -> None:
+        """Note how a module revised its session."""
+        poses = np.ascontiguousarray(revised.T_world_base[:, :3]).tobytes()
+        self._add(b"C", _STAMP.pack(session) + revised.stamps_ns.tobytes() + poses)
+
+    def flush(self) -> None:
+        """Hand what was noted to the system."""
+        self._file.append(bytes(self._waiting))
+        self._waiting.clear()
+
+    def sync(self) -> None:
+        """Wait until what was handed over outlives a loss of power; may be called by a thread."""
+        self._file.sync()
+
+    def close(self) -> None:
+        """Close the file. May be called twice."""
+        self.flush()
+        self._file.close()
+
+    def remove(self) -> None:
+        """Remove the file, once the run's results say all that it says."""
+        self.close()
+        self._path.unlink(missing_ok=True)
+
+    def _add(self, kind: bytes, body: bytes) -> None:
+        if self._file.is_open:
+            self._waiting += _HEAD.pack(kind, len(body), _crc(kind, body)) + body
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kept:
+    """What a journal says beside what the atlas was told."""
+
+    head: Head
+    observed_ns: NDArray[np.int64]
+    torn_bytes: int  # after the last whole record
+
+
+def read_journal(path: Path, log: TrajectoryLog) -> Kept:
+    """Tell `log` what a journal holds as far as it is whole; raises InputError where it is none."""
+    data = path.read_bytes()
+    if not data.startswith(MAGIC):
+        raise InputError(f"not a journal of this version: {path}")
+    head, observed_ns, read = None, [], len(MAGIC)
+    for kind, body in _records(data):
+        read += _HEAD.size + len(body)
+        if kind == b"H":
+            head = Head(**json.loads(body))
+        elif kind == b"O":
+            observed_ns.append(_number(body))
+        else:
+            _TELL[kind](log, body)
+    if head is None:
+        raise InputError(f"the journal ends within its first record: {path}")
+    stamps_ns = np.array(observed_ns, np.int64)
+    return Kept(head=head, observed_ns=stamps_ns, torn_bytes=len(data) - read)
+
+
+def _records(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Yield kind and body of every record, until one is torn."""
+    at = len(MAGIC)
+    while at + _HEAD.size <= len(data):
+        kind, length, crc = _HEAD.unpack_from(data, at)
+        body = data[at + _HEAD.size : at + _HEAD.size + length]
+        if len(body) < length or _crc(kind, body) != crc:
+            return
+        yield kind, body
+        at += _HEAD.size + length
+
+
+def _tell_session(log: TrajectoryLog, body: bytes) -> None:
+    log.add_session(body[_POSE_BYTES:].decode(), _transform(body))
+
+
+def _tell_local(log: TrajectoryLog, body: bytes) -> None:
+    log.add_local(_number(body), _transform(body[_STAMP.size :]))
+
+
+def _tell_pose(log: TrajectoryLog, body: bytes) -> None:
+    rest = body[_STAMP.size + _POSE_BYTES :]
+    known, module = rest[1 : 1 + rest[0]], rest[1 + rest[0] :].decode()
+    covariance: NDArray[np.float64] | None = None
+    if known:
+        covariance = np.zeros((6, 6))
+        covariance[_UPPER] = np.frombuffer(known)
+        covariance.T[_UPPER] = covariance[_UPPER]
+    log.add_pose(_number(body), _transform(body[_STAMP.size :]), module, covariance)
+
+
+def _tell_rewind(log: TrajectoryLog, body: bytes) -> None:
+    log.add_rewind(_number(body))
+
+
+def _tell_end(log: TrajectoryLog, body: bytes) -> None:
+    rest = body[_STAMP.size :]
+    count = len(rest) // (_STAMP.size + _POSE_BYTES)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3] = np.frombuffer(rest, offset=count * _STAMP.size).reshape(-1, 3, 4)
+    stamps_ns = np.frombuffer(rest, np.int64, count)
+    log.add_end(_number(body), Trajectory(stamps_ns=stamps_ns, T_world_base=poses))
+
+
+_TELL = {
+    b"S": _tell_session,
+    b"L": _tell_local,
+    b"P": _tell_pose,
+    b"R": _tell_rewind,
+    b"C": _tell_end,
+}
+
+
+def _number(body: bytes) -> int:
+    return int(_STAMP.unpack_from(body)[0])
+
+
+def _crc(kind: bytes, body: bytes) -> int:
+    return zlib.crc32(body, zlib.crc32(kind))
+
+
+def _pose(T_a_b: Transform) -> bytes:
+    return T_a_b[:3].tobytes()
+
+
+def _transform(body: bytes) -> Transform:
+    T_a_b = np.eye(4)
+    T_a_b[:3] = np.frombuffer(body, count=12).reshape(3, 4)
+    return T_a_b

@@ -1,0 +1,29 @@
+"""Do your own components keep their contracts? For the tests of your own package.
+
+    from sceneslam.testing import check_module
+
+    def test_my_module_keeps_the_contract():
+        check_module(lambda: MySlam(max_depth_m=4.0))
+
+Every check raises ContractError, an AssertionError, with a sentence on what was promised in
+`sceneslam.interfaces` and what came instead. The lists hold the single checks, for those who want a
+test of each.
+"""
+
+from sceneslam.testing.detectors import DETECTOR_CHECKS, check_detector
+from sceneslam.testing.modules import MODULE_CHECKS, check_module
+from sceneslam.testing.promise import ContractError
+from sceneslam.testing.room import RIG, room_observation
+from sceneslam.testing.sources import SOURCE_CHECKS, check_source
+
+__all__ = [
+    "DETECTOR_CHECKS",
+    "MODULE_CHECKS",
+    "RIG",
+    "SOURCE_CHECKS",
+    "ContractError",
+    "check_detector",
+    "check_module",
+    "check_source",
+    "room_observation",
+]

@@ -1,0 +1,186 @@
+"""The one motion model: what it predicts, learns, and whom it believes."""
+
+import numpy as np
+import pytest
+
+from sceneslam.motion.model import MotionModel
+from sceneslam.types import se3
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig, Sensor
+
+PERIOD_S = 0.1
+SCAN = np.diag([0.004, 0.004, 1e-4, 1e-4, 1e-4, 0.002]) ** 2  # of a scan's motion
+WHEELED = Rig(sensors=frozenset({Sensor.ODOMETRY, Sensor.SCAN}))
+FREE = Rig(sensors=frozenset({Sensor.DEPTH}))
+
+
+class Drive:
+    """A robot that drives, its wheels, and a model that scans teach."""
+
+    def __init__(self, *, noise=0.02, seed=0, rig=WHEELED):
+        self.rng = np.random.default_rng(seed)
+        self.model = MotionModel(rig)
+        self.noise = noise
+        self.stamp_ns, self.T_odom_base = 0, se3.from_xy_yaw(3.0, -1.0, 2.0)
+        self.model.predict(self.observation())
+
+    def observation(self, gyro=None):
+        return Observation(stamp_ns=self.stamp_ns, T_odom_base=self.T_odom_base, gyro_base=gyro)
+
+    def step(self, speed=0.5, rate=0.2, *, factor=1.0, pull=0.0, gyro=None, teaches=True):
+        """Drive one step; return the prediction's error in the direction of driving [m]."""
+        forward_m, turn_rad = speed * PERIOD_S, rate * PERIOD_S
+        T_true = se3.from_xy_yaw(forward_m, 0.0, turn_rad)
+        wheels = np.array([factor * forward_m, 0.0, turn_rad + pull * forward_m])
+        amounts = np.array([forward_m, forward_m, turn_rad])
+        wheels += self.noise * np.abs(amounts) * self.rng.standard_normal(3)
+        self.T_odom_base = self.T_odom_base @ se3.from_xy_yaw(*wheels)
+        self.stamp_ns += round(PERIOD_S * 1e9)
+        motion = self.model.predict(self.observation(gyro))
+        if teaches:
+            seen = np.sqrt(np.diag(SCAN)) * self.rng.standard_normal(6)
+            self.model.learn(T_true @ se3.exp(seen), SCAN)
+        self.last = motion
+        return abs(float(motion.T_prev_curr[0, 3]) - forward_m)
+
+
+def constant_rate(rate_radps, bias_radps=0.0):
+    times_s = np.linspace(-0.09, 0.0, 10)
+    rates = np.zeros((10, 3))
+    rates[:, 2] = rate_radps
+    return np.column_stack([times_s, rates + bias_radps])
+
+
+def test_wheels_give_the_motion_and_a_covariance_that_grows_with_it():
+    drive = Drive(noise=0.0)
+    near_m = drive.step(speed=0.2)
+    near = drive.last.covariance
+    far_m = drive.step(speed=2.0)
+    assert max(near_m, far_m) < 1e-9
+    assert drive.last.is_measured
+    assert drive.last.covariance[0, 0] > 4.0 * near[0, 0]
+
+
+@pytest.mark.parametrize("noise", [0.04, 0.3])
+def test_noise_of_the_wheels_is_learnt_in_either_direction(noise):
+    for channel, speed, rate in ((0, 1.0, 0.0), (1, 0.0, 1.0)):
+        drive = Drive(noise=noise)
+        for _ in range(400):
+            drive.step(speed=2.0 * speed, rate=2.0 * rate)
+        assert drive.model.noise_ratios[channel] == pytest.approx(noise, rel=0.5)
+
+
+def test_lie_of_some_seconds_does_not_spoil_what_was_learnt():
+    drive = Drive()
+    for _ in range(300):
+        drive.step()
+    before = drive.model.noise_ratios
+    for _ in range(50):
+        drive.step(factor=-1.0)
+    assert drive.model.noise_ratios == pytest.approx(before, rel=0.3)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.0, 2.0])
+def test_lying_wheels_are_found_out_and_believed_again(factor):
+    drive = Drive()
+    for _ in range(100):
+        drive.step()
+    missed_m = [drive.step(factor=factor) for _ in range(50)]
+    assert drive.last.is_doubted
+    assert max(missed_m[5:]) < 0.02  # by the wheels 0.05 and more
+    for _ in range(20):
+        drive.step()
+    assert not drive.last.is_doubted
+
+
+def test_lie_about_the_distance_leaves_the_turn_to_the_wheels():
+    drive = Drive()
+    for _ in range(100):
+        drive.step()
+    for index in range(20):
+        drive.step(factor=-1.0, rate=0.2 + 0.5 * np.sin(index))
+    distance, turn = drive.model.lying
+    assert distance > 0.9
+    assert turn < 0.2
+    turned_rad = se3.yaw_rad(drive.last.T_prev_curr)
+    assert turned_rad == pytest.approx((0.2 + 0.5 * np.sin(19)) * PERIOD_S, abs=0.01)
+
+
+def test_rival_is_the_motion_by_whoever_is_not_believed():
+    drive = Drive()
+    for _ in range(100):
+        drive.step()
+    drive.step(factor=-1.0)
+    assert drive.last.T_prev_curr[0, 3] == pytest.approx(-0.05, abs=0.005)
+    assert drive.last.rival.T_prev_curr[0, 3] == pytest.approx(0.05, abs=0.01)
+
+
+def test_what_no_scan_sees_teaches_nothing():
+    drive = Drive()
+    for _ in range(100):
+        drive.step()
+    before, blind = drive.model.noise_ratios, SCAN + np.diag([1e2, 1e2, 0, 0, 0, 0])
+    for _ in range(30):
+        drive.step(factor=-1.0, teaches=False)
+        drive.model.learn(se3.from_xy_yaw(0.05, 0.0, 0.02), blind)
+    assert drive.model.noise_ratios[0] == pytest.approx(before[0], rel=0.05)
+    assert drive.model.lying[0] < 0.1
+
+
+def test_wheels_that_pull_to_one_side_are_corrected():
+    drive = Drive()
+    for _ in range(300):
+        drive.step(pull=0.1, rate=0.0)
+    drive.step(pull=0.1, rate=0.0)
+    assert abs(se3.yaw_rad(drive.last.T_prev_curr)) < 0.001  # 0.005 by the wheels
+
+
+def test_gyro_turns_the_base_without_its_bias():
+    drive = Drive()
+    for _ in range(200):  # at rest: nobody teaches
+        drive.step(speed=0.0, rate=0.0, gyro=constant_rate(0.0, 0.01), teaches=False)
+    assert drive.model.gyro_bias == pytest.approx([0.01] * 3, abs=0.001)
+    drive.step(speed=0.0, rate=0.0, gyro=constant_rate(0.5, 0.01), teaches=False)  # wheels slip
+    assert se3.yaw_rad(drive.last.T_prev_curr) == pytest.approx(0.05, abs=2e-4)
+
+
+def test_robot_that_is_carried_does_not_teach_the_gyro_a_bias():
+    drive = Drive()
+    for _ in range(100):
+        drive.step(speed=0.0, rate=0.0, gyro=constant_rate(0.3), teaches=False)
+    assert np.abs(drive.model.gyro_bias).max() < 0.002
+
+
+def test_without_wheels_the_velocity_goes_on_and_the_gyro_turns_it():
+    model = MotionModel(FREE)
+    for index in range(3):
+        model.predict(Observation(stamp_ns=index * 100_000_000))
+        model.learn(se3.from_xy_yaw(0.1, 0.0, 0.05), SCAN)
+    motion = model.predict(Observation(stamp_ns=300_000_000))
+    np.testing.assert_allclose(motion.T_prev_curr, se3.from_xy_yaw(0.1, 0.0, 0.05), atol=1e-4)
+    assert not motion.is_measured
+    assert motion.rival is None
+    gyro = constant_rate(-0.5)
+    motion = model.predict(Observation(stamp_ns=400_000_000, gyro_base=gyro))
+    assert se3.yaw_rad(motion.T_prev_curr) == pytest.approx(-0.05)
+
+
+def test_copy_learns_on_its_own():
+    drive = Drive(noise=0.3)
+    twin = drive.model.copy()
+    for _ in range(50):
+        drive.step()
+    assert twin.noise_ratios[0] == WHEELED.wheels.noise_ratio
+    assert drive.model.noise_ratios[0] != twin.noise_ratios[0]
+
+
+def test_first_motion_after_a_stop_is_no_velocity():
+    model = MotionModel(FREE)
+    model.predict(Observation(stamp_ns=0))
+    model.stop()
+    model.predict(Observation(stamp_ns=100_000_000))
+    model.learn(se3.from_xy_yaw(2.0, 0.0, 0.0), SCAN)  # of longer than the one step
+    assert not model.velocity.any()
+    model.predict(Observation(stamp_ns=200_000_000))
+    model.learn(se3.from_xy_yaw(0.1, 0.0, 0.0), SCAN)
+    assert model.velocity[0] == pytest.approx(1.0, rel=0.01)

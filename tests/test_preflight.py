@@ -1,0 +1,193 @@
+"""What is said of a recording before it is run, and of a run that found no pose."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from configured import config
+
+from sceneslam.app import run
+from sceneslam.sources.carmen import Carmen
+from sceneslam.sources.kitti import Kitti
+from sceneslam.sources.rosbag import RosBag
+from sceneslam.sources.survey.preflight import preflight
+from sceneslam.sources.survey.survey import Stream, Survey
+from sceneslam.sources.tum_rgbd import TumRgbd
+from sceneslam.types.observation import LaserScan
+from sceneslam.types.rig import Camera, Lidar, Rig, Sensor
+from sceneslam.types.se3 import from_xy_yaw
+
+CAMERA = {"fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5, "distortion": None}
+TOPICS = dict.fromkeys(
+    ("image", "depth", "camera_info", "scan", "points", "odometry", "imu", "ground_truth", "scene")
+)
+
+
+def write_folder(folder, *, units_per_m=5000, apart_s=0.005, count=20):
+    """Write a TUM folder of a wall that is 1 to 3 m away, its depth `apart_s` late."""
+    random = np.random.default_rng(1)
+    lists = {"rgb": [], "depth": []}
+    for index in range(count):
+        image = random.integers(0, 255, (48, 64, 3), np.uint8)
+        depth_m = np.tile(np.linspace(1.0, 3.0, 64), (48, 1))
+        cv2.imwrite(str(folder / f"rgb{index}.png"), image)
+        stored = np.round(depth_m * units_per_m).astype(np.uint16)
+        cv2.imwrite(str(folder / f"depth{index}.png"), stored)
+        stamp_s = 100.0 + index / 10
+        lists["rgb"].append(f"{stamp_s:.4f} rgb{index}.png\n")
+        lists["depth"].append(f"{stamp_s + apart_s:.4f} depth{index}.png\n")
+    for name, lines in lists.items():
+        (folder / f"{name}.txt").write_text("".join(lines))
+    return folder
+
+
+def tum(folder, depth_scale=5000.0, camera=CAMERA):
+    return TumRgbd(str(folder), camera, depth_scale, [0.3, 8.0], 0.02)
+
+
+def bag(path):
+    return RosBag(str(path), TOPICS, {}, 1000.0, None, None, 0.02, None, None)
+
+
+def told(source):
+    return preflight(source.survey(), source.rig)
+
+
+def test_every_sensor_has_a_line(tmp_path):
+    found = told(tum(write_folder(tmp_path)))
+    assert found.warnings == ()
+    image, depth = found.lines
+    assert "rgb.txt: 20 messages, 10 Hz" in image and "100% with depth" in image
+    assert "100.000 to 101.900 s" in image and "median depth 1.95 m" in depth
+
+
+@pytest.mark.parametrize(("stored", "read"), [(1000, 5000.0), (5000, 1000.0)])
+def test_depth_in_another_unit_is_noticed_and_the_right_one_proposed(tmp_path, stored, read):
+    (warning,) = told(tum(write_folder(tmp_path, units_per_m=stored), read)).warnings
+    assert f"is source.depth_scale {read:g} right? With {stored} it would be 100%" in warning
+
+
+def test_images_that_never_meet_their_depth_are_noticed(tmp_path):
+    (warning,) = told(tum(write_folder(tmp_path, apart_s=0.04))).warnings
+    assert "only 0% of the images have depth within source.sync_tolerance_s 0.02" in warning
+    assert "the nearest depth image is 0.04 s away" in warning
+
+
+def test_depth_at_half_the_rate_of_the_images_is_no_cause_for_a_warning(tmp_path):
+    write_folder(tmp_path)
+    lines = (tmp_path / "depth.txt").read_text().splitlines(keepends=True)
+    (tmp_path / "depth.txt").write_text("".join(lines[::2]))
+    assert told(tum(tmp_path)).warnings == ()
+
+
+def test_intrinsics_of_another_resolution_are_noticed(tmp_path):
+    camera = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "distortion": None}
+    warnings = told(tum(write_folder(tmp_path), camera=camera)).warnings
+    assert len(warnings) == 2 and all("of another resolution" in one for one in warnings)
+
+
+STAMPS_NS = np.arange(50, dtype=np.int64) * 100_000_000
+
+
+def stream(sensor, stamps_ns=STAMPS_NS):
+    return Stream(sensor=sensor, place="/topic", count=len(stamps_ns), stamps_ns=stamps_ns)
+
+
+def scan(ranges_m):
+    return LaserScan(
+        stamp_ns=0,
+        ranges_m=np.array(ranges_m, np.float32),
+        angle_min_rad=0.0,
+        angle_step_rad=0.01,
+        range_min_m=0.1,
+        range_max_m=30.0,
+    )
+
+
+def poses(speed_mps):
+    return [from_xy_yaw(speed_mps * stamp_ns * 1e-9, 0.0, 0.0) for stamp_ns in STAMPS_NS.tolist()]
+
+
+def cloud(scale):
+    return np.random.default_rng(2).uniform(-20, 20, (500, 3)).astype(np.float32) * scale
+
+
+SURVEYS = {  # sensor -> what is plausible, what is not, what is said of it
+    Sensor.SCAN: ({"scans": [scan([2, 3, 4])]}, {"scans": [scan([np.inf] * 3)]}, "beams return"),
+    Sensor.POINTS: ({"clouds": [cloud(1)]}, {"clouds": [cloud(1000)]}, "0% of the points"),
+    Sensor.ODOMETRY: (
+        {"T_odom_base": poses(20.0), "odometry_ns": STAMPS_NS},
+        {"T_odom_base": poses(1000.0), "odometry_ns": STAMPS_NS},
+        "1e+03 m/s are implausible",
+    ),
+    Sensor.GYRO: (
+        {"gyro_radps": [np.array([0.0, 0.0, 3.0])]},
+        {"gyro_radps": [np.array([0.0, 0.0, 172.0])]},
+        "172 rad/s are implausible; is its unit degrees?",
+    ),
+}
+
+
+@pytest.mark.parametrize("sensor", SURVEYS)
+def test_sensor_in_another_unit_is_noticed(sensor):
+    right, wrong, said = SURVEYS[sensor]
+    rig = Rig(sensors=frozenset({sensor}), lidar=Lidar())
+    assert preflight(Survey(streams=[stream(sensor)], **right), rig).warnings == ()
+    (warning,) = preflight(Survey(streams=[stream(sensor)], **wrong), rig).warnings
+    assert said in warning
+
+
+@pytest.mark.parametrize("factor", [1000, 10**6])
+def test_stamps_in_another_unit_are_noticed(factor):
+    rig = Rig(
+        sensors=frozenset({Sensor.IMAGE}),
+        camera=Camera(size_wh=(64, 48), fx=60.0, fy=60.0, cx=32.0, cy=24.0),
+    )
+    (warning,) = preflight(Survey(streams=[stream(Sensor.IMAGE, STAMPS_NS * factor)]), rig).warnings
+    assert "are the stamps in seconds?" in warning
+
+
+def test_sensors_without_a_common_time_are_noticed():
+    streams = [stream(Sensor.IMAGE), stream(Sensor.DEPTH, STAMPS_NS + 10**15)]
+    rig = Rig(sensors=frozenset({Sensor.IMAGE, Sensor.DEPTH}))
+    assert "have no time in common" in preflight(Survey(streams=streams), rig).warnings[0]
+
+
+def test_real_recordings_with_their_own_settings_give_no_warning(shared_data):
+    kinect = {"fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0, "distortion": None}
+    names = ("fx", "fy", "cx", "cy", "distortion")
+    sources = [
+        tum(shared_data / "tum_fr1_rpy", camera=dict.fromkeys(names)),
+        tum(shared_data / "7scenes_redkitchen", 1000.0, kinect),
+        Kitti(str(shared_data / "kitti_raw_2011_09_26_drive_0001"), [1.0, 100.0]),
+        *(Carmen(str(path), 80.0) for path in sorted(shared_data.glob("carmen_*/*.clf"))),
+        *(bag(shared_data / "bags" / name) for name in ("hokuyo_scan.bag", "hokuyo_scan_db3")),
+        *(bag(shared_data / "bags" / name) for name in ("rgbd_3s.bag", "rgbd_3s_ros2.mcap")),
+    ]
+    found = [told(source) for source in sources]
+    assert len(found) == 10 and all(one.lines for one in found)
+    assert [one.warnings for one in found] == [()] * len(found)
+    (warning,) = told(tum(shared_data / "7scenes_redkitchen", 5000.0, kinect)).warnings
+    assert "With 1000 it would be 100%" in warning
+
+
+def test_run_without_a_pose_names_module_and_cause(tmp_path):
+    write_folder(tmp_path, apart_s=0.04)
+    source = {
+        "_target_": "sceneslam.sources.tum_rgbd.TumRgbd",
+        "path": str(tmp_path),
+        "camera": CAMERA,
+        "depth_scale": 5000.0,
+        "depth_range_m": [0.3, 8.0],
+        "sync_tolerance_s": 0.02,
+    }
+    said = []
+    lost = {"_target_": "fakes.DepthModule"}
+    made = config(source=source, slam={"bright": lost, "dark": lost}, run__report=False)
+    finished = run(made, tmp_path / "out", say=said.append)
+    (fault,) = finished.faults
+    assert fault.startswith("no pose: module bright and dark was lost") or "bright" in fault
+    assert "of 20 observations, 20 with an image, 0 with depth. Most likely: only 0%" in fault
+    assert "warning: only 0% of the images have depth" in said[0]
+    assert finished.metrics["warnings"] == [fault.partition("Most likely: ")[2]]

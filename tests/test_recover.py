@@ -1,0 +1,229 @@
+"""What a run that is cut off leaves on disk, and the results that are made of it."""
+
+import json
+import os
+import shutil
+import signal
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+from configured import config
+
+from sceneslam.app import run
+from sceneslam.atlas.atlas import Atlas
+from sceneslam.recover.__main__ import main
+from sceneslam.recover.recover import _Retold
+from sceneslam.storage.journal import Head, Journal, read_journal
+from sceneslam.types import se3
+from sceneslam.types.errors import InputError
+from sceneslam.types.files import AppendedFile
+from sceneslam.types.trajectory import Trajectory
+
+RESULTS = ("trajectory.tum", "trajectory_online.tum", "metrics.json", "report.html")
+HEAD = Head(title="test", value_label="grey", has_odometry=True, began_in="/")
+
+
+def killed(tmp_path, at, has_report=False, **changes):
+    """Run in a process that is killed at an observation; return the run's folder."""
+    folder = tmp_path / "run"
+    child = os.fork()
+    if child == 0:
+        sink = {"_target_": "fakes.Killer", "at": at}
+        run(config(sinks={"killer": sink}, run__report=has_report, **changes), folder)
+        os._exit(0)
+    _, status = os.waitpid(child, 0)
+    assert os.WTERMSIG(status) == signal.SIGKILL
+    return folder
+
+
+@pytest.mark.parametrize("handover", ["cold", "rewind"])
+def test_a_killed_run_is_recovered_as_it_would_have_been_written(tmp_path, handover):
+    folder = killed(tmp_path, 80, has_report=True, policy__handover=handover)
+    assert not any((folder / name).exists() for name in RESULTS)
+    assert main([str(folder)]) == 0
+    whole = tmp_path / "whole"
+    run(config(run__max_observations=81, policy__handover=handover, run__report=False), whole)
+    names = [path.name for path in whole.glob("traj*")]
+    assert len(names) == 5
+    for name in names:
+        assert (folder / name).read_bytes() == (whole / name).read_bytes()
+    metrics, expected = (json.loads((one / "metrics.json").read_text()) for one in (folder, whole))
+    told = ("poses", "observations", "coverage", "path_length_m", "bridged")
+    assert [metrics[name] for name in told] == [expected[name] for name in told]
+    page = (folder / "report.html").read_text()
+    assert "recovered from its journal" in page and "what detector, bus and modules cost" in page
+
+
+def test_a_run_at_its_end_has_no_journal_and_is_not_recovered(tmp_path, capsys):
+    run(config(run__report=False), tmp_path)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    assert not (tmp_path / "journal.bin").exists() and not (tmp_path / "reserve.bin").exists()
+    assert main([str(tmp_path)]) == 0
+    assert "came to its end" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
+
+
+def test_a_second_recovery_finds_nothing_left_to_do(tmp_path, capsys):
+    folder = killed(tmp_path, 20)
+    assert main([str(folder)]) == 0
+    capsys.readouterr()
+    assert main([str(folder)]) == 0
+    assert "came to its end" in capsys.readouterr().out
+    assert not [path for path in folder.rglob("*") if path.suffix == ".part"]
+
+
+@pytest.mark.parametrize("cut_bytes", [1, 60, 5000])
+def test_torn_ends_cost_what_is_torn_and_are_told(tmp_path, capsys, cut_bytes):
+    folder = killed(tmp_path, 80)
+    for name in ("journal.bin", "events.jsonl"):
+        data = (folder / name).read_bytes()
+        (folder / name).write_bytes(data[:-cut_bytes] + b"\0" * (cut_bytes // 2))
+    assert main([str(folder)]) == 0
+    assert "journal.bin, which are torn" in capsys.readouterr().err
+    assert len(Trajectory.read_tum(folder / "trajectory.tum")) >= 81 - 1 - cut_bytes // 250
+    lines = (folder / "events.jsonl").read_text().splitlines()
+    assert all(json.loads(line)["event"] for line in lines)
+
+
+def test_a_recording_that_is_gone_costs_the_ground_truth_alone(tmp_path, capsys):
+    folder = killed(tmp_path, 20)
+    text = (folder / "config.yaml").read_text()
+    (folder / "config.yaml").write_text(text.replace("_target_: fakes.FakeSource", "_target_: x.Y"))
+    assert main([str(folder)]) == 0
+    assert "missing: the ground truth" in capsys.readouterr().err
+    assert len(Trajectory.read_tum(folder / "trajectory.tum")) == 21
+
+
+@pytest.mark.parametrize("what", ["nothing", "empty", "no_config", "garbage"])
+def test_what_is_no_run_is_told_and_left_alone(tmp_path, capsys, what):
+    folder = tmp_path / "run"
+    if what != "nothing":
+        folder = killed(tmp_path, 5) if what != "empty" else folder
+        folder.mkdir(exist_ok=True)
+    if what == "no_config":
+        (folder / "config.yaml").unlink()
+    if what == "garbage":
+        (folder / "journal.bin").write_bytes(b"garbage")
+    assert main([str(folder)]) == 2
+    assert capsys.readouterr().err.startswith("error: ")
+    assert not (folder / "trajectory.tum").exists()
+
+
+def test_a_run_that_is_under_way_is_not_recovered(tmp_path):
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(writing)
+        sink = {"_target_": "fakes.Waiter", "until": reading, "at": 5}
+        run(config(sinks={"waiter": sink}, run__report=False), tmp_path / "run")
+        os._exit(0)
+    os.close(reading)
+    try:
+        while not (tmp_path / "run" / "waiting").exists():
+            os.sched_yield()
+        assert main([str(tmp_path / "run")]) == 2
+    finally:
+        os.close(writing)
+        os.waitpid(child, 0)
+    assert len(Trajectory.read_tum(tmp_path / "run" / "trajectory.tum")) == 100
+
+
+def told_atlas(journal, seed):
+    """Tell an atlas at random what a run may tell it, and keep the journal of it."""
+    draw = np.random.default_rng(seed)
+    atlas = Atlas(voxel_m=0.1)
+    atlas.keep_journal(journal)
+    for stamp_ns in range(0, 3000, 10):
+        kind = draw.integers(20)
+        if stamp_ns == 0 or kind == 0:
+            session = atlas.begin_session(f"möd_{kind}", se3.exp(draw.normal(size=6)))
+        if kind == 1:
+            atlas.rewind(stamp_ns - 50)
+        if kind == 2:
+            atlas.close_session(session, None, atlas.online)
+        known = draw.normal(size=(6, 6))
+        covariance = known @ known.T if kind > 5 else None
+        atlas.add_local(stamp_ns, se3.exp(draw.normal(size=6)))
+        atlas.add(stamp_ns, se3.exp(draw.normal(size=6)), "" if kind == 3 else "möd", covariance)
+        journal.add_observation(stamp_ns)
+        journal.flush()
+    return atlas
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_atlas_that_is_told_a_journal_is_the_one_it_was_kept_of(tmp_path, seed):
+    journal = Journal(tmp_path / "journal.bin", HEAD)
+    atlas = told_atlas(journal, seed)
+    journal.close()
+    again = Atlas(voxel_m=0.1)
+    kept = read_journal(tmp_path / "journal.bin", _Retold(again))
+    assert asdict(kept.head) == asdict(HEAD) and kept.torn_bytes == 0
+    assert kept.observed_ns.tolist() == list(range(0, 3000, 10))
+    for name in ("trajectory", "online"):
+        one, two = getattr(atlas, name), getattr(again, name)
+        np.testing.assert_array_equal(one.stamps_ns, two.stamps_ns)
+        np.testing.assert_array_equal(one.T_world_base, two.T_world_base)
+    assert atlas.pose_modules == again.pose_modules
+    np.testing.assert_allclose(atlas.covariances(True), again.covariances(True), rtol=1e-12)
+
+
+def test_a_journal_read_up_to_any_byte_is_the_beginning_of_what_was_told(tmp_path):
+    journal = Journal(tmp_path / "journal.bin", HEAD)
+    told_atlas(journal, 0)
+    journal.close()
+    data = (tmp_path / "journal.bin").read_bytes()
+    path, counts = tmp_path / "cut.bin", []
+    for end in range(len(data) // 3, len(data) // 3 + 700, 7):
+        path.write_bytes(data[:end])
+        counts.append(len(read_journal(path, _Retold(Atlas(voxel_m=0.1))).observed_ns))
+    assert counts == sorted(counts) and 1 <= counts[-1] - counts[0] <= 3
+
+
+def test_a_journal_takes_at_most_450_bytes_a_pose(tmp_path):
+    journal = Journal(tmp_path / "journal.bin", HEAD)
+    for stamp_ns in range(1000):
+        journal.add_local(stamp_ns, np.eye(4))
+        journal.add_pose(stamp_ns, np.eye(4), "bright", np.eye(6))
+        journal.add_observation(stamp_ns)
+    journal.close()
+    assert 300_000 < (tmp_path / "journal.bin").stat().st_size < 450_000
+
+
+def test_a_journal_that_cannot_be_read_says_so(tmp_path):
+    (tmp_path / "journal.bin").write_bytes(b"SceneSLAM journal 1\nH")
+    with pytest.raises(InputError, match="first record"):
+        read_journal(tmp_path / "journal.bin", _Retold(Atlas(voxel_m=0.1)))
+
+
+def test_a_file_that_is_appended_to_a_full_disk_ends_with_a_whole_piece(tmp_path):
+    room = [False, True, True]
+    with pytest.MonkeyPatch.context() as patch:
+        write, left = os.write, [10]
+
+        def full(fd, data):
+            if not left[0]:
+                raise OSError(28, "No space left on device")
+            done = write(fd, bytes(data)[: left[0]])
+            left[0] -= done
+            return done
+
+        def make_room():
+            left[0] = 10 * room[-1]
+            return room.pop()
+
+        patch.setattr("sceneslam.types.files.os.write", full)
+        file = AppendedFile(tmp_path / "a", make_room)
+        file.append(b"12345678")
+        file.append(b"abcdefgh")  # makes room once
+        with pytest.raises(OSError, match="No space"):
+            file.append(b"x" * 40)
+        file.close()
+    assert (tmp_path / "a").read_bytes() == b"12345678abcdefgh"
+
+
+def test_a_killed_run_in_a_folder_is_replaced_by_the_next(tmp_path):
+    folder = killed(tmp_path, 20)
+    finished = run(config(run__report=False), folder)
+    assert finished.faults == () and not (folder / "journal.bin").exists()
+    shutil.rmtree(folder)

@@ -1,0 +1,212 @@
+"""A detector that is trained on folders of images, and tested on others."""
+
+from __future__ import annotations
+
+import re
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from hydra import compose, initialize_config_module
+from networks import footage
+from ros_recordings import make_source
+
+from sceneslam.config.component import Builder
+from sceneslam.config.resolve import resolved
+from sceneslam.detection.run import detect
+from sceneslam.interfaces import FeatureDetector
+from sceneslam.scenes.__main__ import main
+from sceneslam.scenes.examples import Example
+from sceneslam.scenes.model import Model
+from sceneslam.types.errors import InputError
+from sceneslam.types.observation import UNSURE, Observation
+
+pytest.importorskip("sklearn", reason="the extra `learn` is not installed")
+KINDS = {"Bright": "Indoor", "Dark": "Dark"}
+
+
+def write_images(folder: Path, kind: str, seeds: range) -> Path:
+    folder.mkdir(parents=True)
+    for seed in seeds:
+        cv2.imwrite(str(folder / f"{seed:03d}.png"), footage(kind, seed))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("footage")
+    for number in range(3):
+        for scene, kind in KINDS.items():
+            seeds = range(100 * number, 100 * number + 8)
+            write_images(root / f"{scene}_{number}", kind, seeds)
+    return root
+
+
+@pytest.fixture(scope="module")
+def model(folders) -> Path:
+    words = [f"{scene}={folders}/{scene}_{k}" for k in (0, 1) for scene in KINDS]
+    assert main(["train", str(folders / "model.yaml"), *words]) == 0
+    return folders / "model.yaml"
+
+
+def learned(path: Path | None, name: str = "detector") -> FeatureDetector:
+    target = "sceneslam.modules.detectors.learned.Learned"
+    node = {"_target_": target, "path": None if path is None else str(path)}
+    return Builder({name: node}).make(name, FeatureDetector)
+
+
+def test_recordings_that_it_was_not_trained_on_get_their_scene(folders, model, capsys):
+    sheet = folders / "wrong.png"
+    words = [f"{scene}={folders}/{scene}_2" for scene in KINDS]
+    assert main(["test", str(model), *words, "--sheet", str(sheet)]) == 0
+    said = capsys.readouterr().out
+    assert "all 16 images: 100.0 % right" in said and "wrong    0 images" in said
+    assert not sheet.exists()
+    assert [line.split() for line in said.splitlines()][-6:-3] == [
+        ["true,", "voted", "Bright", "Dark"],
+        ["Bright", "8", "0"],
+        ["Dark", "0", "8"],
+    ]
+
+
+def test_images_that_are_wrong_are_counted_and_shown(folders, model, capsys, tmp_path):
+    words = [f"Bright={folders}/Dark_2", f"Dark={folders}/Dark_1"]
+    assert main(["test", str(model), *words, "--sheet", str(tmp_path / "wrong.png")]) == 0
+    said = capsys.readouterr().out
+    assert "all 16 images: 50.0 % right" in said and "wrong    8 images" in said
+    sheet = cv2.imread(str(tmp_path / "wrong.png"))
+    assert sheet.shape == (300, 960, 3) and sheet[:120, :160].mean() < 30  # a dark one
+
+
+def test_detector_votes_as_the_model_does_with_probabilities_that_sum_to_one(folders, model):
+    detector, read = learned(model), Model.read(model)
+    for folder in ("Bright_2", "Dark_2"):
+        for observation in make_source("video", folders / folder):
+            vote = detector.get_scene(observation)
+            scores = read.scores(detector.get_features(observation)[None])[0]
+            odds = np.log(vote.likelihoods["Bright"]) - np.log(vote.likelihoods["Dark"])
+            at = [read.scenes.index(scene) for scene in ("Bright", "Dark")]
+            assert odds == pytest.approx(scores[at[0]] - scores[at[1]], abs=1e-6)
+            assert vote.scene == folder[:-2] and vote.value == max(vote.likelihoods.values())
+    assert detector.get_scene(Observation(stamp_ns=1)).scene == UNSURE
+
+
+def test_what_was_recorded_together_is_held_out_together(folders, tmp_path, capsys):
+    words = ["Bright:a={}/Bright_0", "Dark:a={}/Dark_0", "Bright:b={}/Bright_1", "Dark:b={}/Dark_1"]
+    words = [word.format(folders) for word in words]
+    assert main(["train", str(tmp_path / "model.yaml"), *words]) == 0
+    assert "all 32 images" in capsys.readouterr().out
+    assert main(["train", str(tmp_path / "one.yaml"), *words[:2]]) == 0
+    assert "not calibrated" in capsys.readouterr().out  # nothing would be left to train on
+
+
+def test_probabilities_are_no_more_certain_than_held_out_recordings_bear(folders, tmp_path):
+    """One of three recordings of a scene is labelled wrongly: certainty cannot be had."""
+    words = [f"{scene}={folders}/{scene}_{k}" for k in (0, 1, 2) for scene in KINDS]
+    assert main(["train", str(tmp_path / "right.yaml"), *words]) == 0
+    write_images(tmp_path / "odd", "Dark", range(900, 908))
+    assert main(["train", str(tmp_path / "odd.yaml"), *words, f"Bright={tmp_path}/odd"]) == 0
+    image = next(iter(make_source("video", folders / "Bright_0")))
+    right, odd = (learned(tmp_path / f"{name}.yaml").get_scene(image) for name in ("right", "odd"))
+    assert right.scene == odd.scene == "Bright" and odd.value < right.value - 0.02
+
+
+def test_part_of_a_film_is_an_example(tmp_path, folders, capsys):
+    film = cv2.VideoWriter(
+        str(tmp_path / "clip.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (160, 120)
+    )
+    for index in range(40):
+        film.write(footage("Indoor" if index < 20 else "Dark", index))
+    film.release()
+    clip = tmp_path / "clip.mp4"
+    words = [f"Bright={clip}@0:2", f"Dark={clip}@2:4"]
+    assert main(["train", str(tmp_path / "model.yaml"), *words]) == 0
+    assert main(["test", str(tmp_path / "model.yaml"), *words]) == 0
+    said = capsys.readouterr().out
+    assert "all 40 images: 100.0 % right" in said
+
+
+def test_effects_make_an_example_of_a_recording(folders, model, capsys, tmp_path):
+    dimmed = f"Dark={folders}/Bright_2 effects=lights_out lights=off"
+    assert main(["test", str(model), dimmed, "--sheet", str(tmp_path / "wrong.png")]) == 0
+    assert "all 8 images: 100.0 % right" in capsys.readouterr().out
+
+
+def test_features_are_taken_anew_where_the_model_changed(folders, tmp_path, monkeypatch):
+    monkeypatch.setenv("SCENESLAM_CACHE_DIR", str(tmp_path / "cache"))
+    model = tmp_path / "model.yaml"
+    words = [f"{scene}={folders}/{scene}_0" for scene in KINDS]
+    for features in ("q50", "q50,q98,colour"):
+        assert main(["train", str(model), *words, "--features", features]) == 0
+        given = ["source=video", f"source.path={folders}/Dark_2", "run=detect_only"]
+        given += ["detector=learned", f"detector.path={model}", "run.progress=false"]
+        with initialize_config_module("sceneslam.conf", version_base="1.3"):
+            config = resolved(compose("config", overrides=given))
+        assert "votes: Dark 100.0 %" in detect(config, tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("word", "told"),
+    [
+        ("Bright", "example: got 'Bright', allowed: SCENE=PATH"),
+        ("=folder", "example: got '=folder'"),
+        ("Bright=nothing", "film not found.*nothing"),
+        ("Bright=FOLDER effects=fog", "effects/fog.*FOLDER"),
+        ("Unsure=FOLDER", "example: got 'Unsure=FOLDER'"),
+        ("Dusk=FOLDER", "example: got 'Dusk', the model knows: Bright, Dark"),
+        ("Bright=FOLDER@7:8", "no observation of Bright has all features.*@7:8"),
+    ],
+)
+def test_example_that_makes_no_sense_is_one_sentence(folders, model, capsys, word, told):
+    path = str(folders / "Bright_0")
+    assert main(["test", str(model), word.replace("FOLDER", path)]) == 2
+    said = capsys.readouterr().err.replace(path, "FOLDER")
+    assert re.search(told, said) and said.count("\n") == 1, said
+
+
+def test_training_asks_for_two_scenes_and_known_features(folders, capsys, tmp_path):
+    one = ["train", str(tmp_path / "model.yaml"), f"Bright={folders}/Bright_0"]
+    assert main(one) == 2 and "two scenes" in capsys.readouterr().err
+    assert main([*one, "--features", "q50,shape"]) == 2
+    assert "names: got ['q50', 'shape'], allowed: different ones of q10" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["[]", "scenes: [A, B]", "a: [", "\x00"])
+def test_file_that_is_no_model_is_refused(tmp_path, text):
+    (tmp_path / "model.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"model.*model\.yaml"):
+        learned(tmp_path / "model.yaml")
+    with pytest.raises(InputError, match="model not found"):
+        learned(tmp_path / "nothing.yaml")
+
+
+def test_weights_that_do_not_fit_the_features_are_refused(model, tmp_path):
+    node = yaml.safe_load(model.read_text())
+    node["weights"]["Dark"] = [1.0]
+    (tmp_path / "model.yaml").write_text(yaml.safe_dump(node))
+    with pytest.raises(InputError, match="do not fit each other"):
+        learned(tmp_path / "model.yaml")
+
+
+def test_words_are_read_as_documented():
+    example = Example.of("Dark:robot='my clip.mp4@1.5:20' effects=lights_out lights=off")
+    assert (example.scene, example.group, example.path) == ("Dark", "robot", "my clip.mp4")
+    assert (example.start_s, example.end_s) == (1.5, 20.0)
+    assert example.overrides == ("effects=lights_out", "lights=off")
+    assert Example.of("Dark=a/b/").group == Example.of("Dark=a/b@0:5").group == "a/b"
+
+
+def test_model_that_ships_knows_rooms_and_streets(shared_data):
+    """It was trained on these; that it does as well on others is measured in experiments."""
+    detector = learned(None)
+    footage = {
+        "Bright": ["robot_light/perfect", "day_night/guoqi_normal.mp4"],
+        "Dark": ["robot_light/too_dark", "day_night/guoqi_dark.mp4"],
+    }
+    for scene, paths in footage.items():
+        for path in paths:
+            seen = islice(make_source("video", shared_data / path), 3)
+            assert {detector.get_scene(one).scene for one in seen} == {scene}, path
