@@ -6,7 +6,6 @@ import threading
 from collections.abc import Callable, Iterator
 from time import monotonic_ns
 
-from sceneslam.bus.pace import with_gyro_of
 from sceneslam.types.observation import Observation
 
 
@@ -20,11 +19,11 @@ class Mailbox:
         self._changed = threading.Condition()
 
     def put(self, observation: Observation) -> None:
-        """Leave an observation; gyro samples of one that it replaces are kept."""
+        """Leave an observation; a gyro's samples of one that it replaces are kept."""
         with self._changed:
             if self._waiting is not None:
                 self.dropped += 1
-                observation = with_gyro_of(self._waiting, observation)
+                observation = observation.with_samples_of(self._waiting)
             self._waiting = observation
             self._changed.notify()
 

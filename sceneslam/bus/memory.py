@@ -153,9 +153,4 @@ def _size(observation: Observation) -> int:
 
 
 def _stripped(observation: Observation) -> Observation:
-    return Observation(
-        stamp_ns=observation.stamp_ns,
-        scan=observation.scan,
-        T_odom_base=observation.T_odom_base,
-        gyro_base=observation.gyro_base,
-    )
+    return replace(observation, **dict.fromkeys(_BULKY))  # type: ignore[arg-type]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -51,18 +51,8 @@ class Pace:
         self._spared.append(observation)
 
     def give(self, observation: Observation) -> Observation:
-        """Return an observation for the module, with the gyro samples since its last."""
+        """Return an observation for the module, with the samples since its last."""
         spared, self._spared, self._last = self._spared, [], observation
         for older in reversed(spared):
-            observation = with_gyro_of(older, observation)
+            observation = observation.with_samples_of(older)
         return observation
-
-
-def with_gyro_of(older: Observation, newer: Observation) -> Observation:
-    """Return the newer observation with the gyro samples of both."""
-    if older.gyro_base is None:
-        return newer
-    shift_s = (older.stamp_ns - newer.stamp_ns) / 1e9
-    before = older.gyro_base + np.array([shift_s, 0.0, 0.0, 0.0])
-    samples = before if newer.gyro_base is None else np.concatenate([before, newer.gyro_base])
-    return replace(newer, gyro_base=samples)

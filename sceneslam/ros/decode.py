@@ -12,7 +12,7 @@ from sceneslam.ros import pixels
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.observation import LaserScan
-from sceneslam.types.rig import Camera
+from sceneslam.types.rig import Camera, Sensor
 from sceneslam.types.se3 import Transform
 
 # Encoding -> (dtype, channels, OpenCV conversion to BGR, None where it is BGR already).
@@ -129,6 +129,19 @@ def is_blank_depth(message: Any) -> bool:
     encoding, is_compressed = _encoding(message)
     raw = None if is_compressed or encoding != "32FC1" else _raw(message, "f4", 1)
     return raw is not None and not np.isfinite(raw).any()
+
+
+def inertial(imu: Any) -> dict[Sensor, NDArray[np.float64]]:
+    """Return what an Imu measures, in its frame: rate (3,) [rad/s], acceleration (3,) [m/s^2]."""
+    measured = {
+        Sensor.GYRO: (imu.angular_velocity, imu.angular_velocity_covariance),
+        Sensor.ACCELEROMETER: (imu.linear_acceleration, imu.linear_acceleration_covariance),
+    }
+    return {
+        sensor: np.array([vector.x, vector.y, vector.z])
+        for sensor, (vector, covariance) in measured.items()
+        if covariance[0] != -1  # as the message marks what it does not hold
+    }
 
 
 def scan(message: Any) -> LaserScan | None:

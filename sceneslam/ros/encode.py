@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from sceneslam.ros import names
 from sceneslam.types import se3
 from sceneslam.types.observation import LaserScan
-from sceneslam.types.rig import Camera
+from sceneslam.types.rig import Camera, Sensor
 from sceneslam.types.se3 import Transform
 
 FLOAT32, FLOAT64 = 7, 8  # sensor_msgs/PointField
@@ -134,21 +135,24 @@ class Encoder:
             ),
         )
 
-    def imu(self, stamp_ns: int, gyro_base: NDArray[np.float64]) -> bytes:
-        """Return an Imu with the rate (3,) [rad/s]; the rest is marked as not measured."""
+    def imu(self, stamp_ns: int, measured: Mapping[Sensor, NDArray[np.float64]]) -> bytes:
+        """Return an Imu with what its gyro and accelerometer measured (3,); the rest is marked."""
         unknown = np.zeros(9)
         unknown[0] = -1.0
-        x, y, z = gyro_base.tolist()
-        zero = self._new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        vectors, covariances = {}, {}
+        for sensor in (Sensor.GYRO, Sensor.ACCELEROMETER):
+            x, y, z = measured[sensor].tolist() if sensor in measured else (0.0, 0.0, 0.0)
+            vectors[sensor] = self._new("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+            covariances[sensor] = np.zeros(9) if sensor in measured else unknown
         return self._cdr(
             names.TYPES[names.IMU],
             header=self._header(stamp_ns, names.BASE),
             orientation=self._new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
             orientation_covariance=unknown,
-            angular_velocity=self._new("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-            angular_velocity_covariance=np.zeros(9),
-            linear_acceleration=zero,
-            linear_acceleration_covariance=unknown,
+            angular_velocity=vectors[Sensor.GYRO],
+            angular_velocity_covariance=covariances[Sensor.GYRO],
+            linear_acceleration=vectors[Sensor.ACCELEROMETER],
+            linear_acceleration_covariance=covariances[Sensor.ACCELEROMETER],
         )
 
     def transforms(self, stamp_ns: int, parent: str, children: dict[str, Transform]) -> bytes:

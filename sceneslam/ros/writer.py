@@ -14,7 +14,7 @@ from sceneslam.ros import names
 from sceneslam.ros.encode import Encoder
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Rig
+from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import GroundTruth
 
@@ -59,10 +59,8 @@ class ObservationWriter:
         """Add all that the observation holds, at its stamp."""
         stamp_ns, encoder = observation.stamp_ns, self._encoder
         self._write_frames(stamp_ns)
-        if observation.gyro_base is not None:
-            for row in observation.gyro_base:
-                at_ns = stamp_ns + round(float(row[0]) * 1e9)
-                self._add(names.IMU, at_ns, encoder.imu(at_ns, row[1:]))
+        for at_ns, measured in _inertial(observation).items():
+            self._add(names.IMU, at_ns, encoder.imu(at_ns, measured))
         if observation.T_odom_base is not None:
             data = encoder.odometry(stamp_ns, observation.T_odom_base, names.ODOM)
             self._add(names.ODOMETRY, stamp_ns, data)
@@ -179,6 +177,16 @@ def depth_png(depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
     if not done:
         raise InputError(f"depth image could not be written: {depth_m.shape}")
     return np.asarray(data, np.uint8)
+
+
+def _inertial(observation: Observation) -> dict[int, dict[Sensor, NDArray[np.float64]]]:
+    """Return what gyro and accelerometer measured, by stamp [ns]."""
+    found: dict[int, dict[Sensor, NDArray[np.float64]]] = {}
+    for sensor in (sensor for sensor in Sensor if sensor.is_sampled and observation.has(sensor)):
+        for row in getattr(observation, sensor.field):
+            at_ns = observation.stamp_ns + round(float(row[0]) * 1e9)
+            found.setdefault(at_ns, {})[sensor] = row[1:]
+    return dict(sorted(found.items()))
 
 
 def _rig_metadata(rig: Rig) -> dict[str, str]:

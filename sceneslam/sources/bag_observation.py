@@ -57,7 +57,7 @@ class BundleDecoder:
             points_lidar=None if points is None else points.points_lidar,
             point_times_s=None if points is None else points.point_times_s,
             T_odom_base=self._odometry(bundle),
-            gyro_base=_gyro(bundle),
+            **{sensor.field: _samples(bundle, sensor) for sensor in bundle.samples},
         )
         is_empty = not any(observation.has(sensor) for sensor in self._sensors)
         return Decoded(
@@ -143,12 +143,12 @@ class BundleDecoder:
         return None if T_odom_base is None else locked(np.array(T_odom_base))
 
 
-def _gyro(bundle: Bundle) -> NDArray[np.float64] | None:
-    """Return (M, 4): seconds after the stamp, rates [rad/s] in base."""
-    if not bundle.gyro:
+def _samples(bundle: Bundle, sensor: Sensor) -> NDArray[np.float64] | None:
+    """Return (M, 4): seconds after the stamp, values in base."""
+    if not bundle.samples[sensor]:
         return None
     rows = [
         [(sample.stamp_ns - bundle.primary.stamp_ns) * 1e-9, *sample.value]
-        for sample in bundle.gyro
+        for sample in bundle.samples[sensor]
     ]
     return locked(np.array(rows, dtype=np.float64))

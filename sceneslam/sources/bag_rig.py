@@ -16,13 +16,14 @@ from sceneslam.types.errors import InputError
 from sceneslam.types.rig import Camera, Laser, Lidar, Rig, Sensor, optical_to_rep103
 from sceneslam.types.se3 import Transform
 
-_SENSORS = {
-    "image": Sensor.IMAGE,
-    "depth": Sensor.DEPTH,
-    "scan": Sensor.SCAN,
-    "points": Sensor.POINTS,
-    "odometry": Sensor.ODOMETRY,
-    "imu": Sensor.GYRO,
+_NEEDS = {  # sensor -> whose topic it comes from
+    Sensor.IMAGE: "image",
+    Sensor.DEPTH: "depth",
+    Sensor.SCAN: "scan",
+    Sensor.POINTS: "points",
+    Sensor.ODOMETRY: "odometry",
+    Sensor.GYRO: "imu",
+    Sensor.ACCELEROMETER: "imu",
 }
 _DEPTH_RANGE_M, _LIDAR_RANGE_M = (0.3, 8.0), (1.0, 100.0)
 
@@ -36,10 +37,16 @@ class Given:
     lidar_range_m: tuple[float, float] | None
 
 
-def sensor_topics(topics: Topics) -> dict[Sensor, str]:
-    """Return the topic of each sensor that the recording has."""
-    chosen = {sensor: getattr(topics, need) for need, sensor in _SENSORS.items()}
-    return {sensor: name for sensor, name in chosen.items() if name is not None}
+def sensor_topics(recording: Recording, topics: Topics) -> dict[Sensor, str]:
+    """Return the topic of each sensor that the recording has; an Imu may be two of them."""
+    chosen = {sensor: getattr(topics, need) for sensor, need in _NEEDS.items()}
+    imu = first(recording, topics.imu) if topics.imu else None
+    measured = {} if imu is None else decode.inertial(imu)
+    return {
+        sensor: name
+        for sensor, name in chosen.items()
+        if name is not None and (name != topics.imu or sensor in measured)
+    }
 
 
 def make_rig(recording: Recording, topics: Topics, frames: FrameTree, given: Given) -> Rig:
@@ -57,7 +64,7 @@ def make_rig(recording: Recording, topics: Topics, frames: FrameTree, given: Giv
     if topics.image or topics.depth:
         depth_range_m = given.depth_range_m or _said(said, "depth_range_m") or _DEPTH_RANGE_M
         camera = _camera(recording, topics, frames, given.intrinsics, depth_range_m)
-    sensors = frozenset(sensor_topics(topics))
+    sensors = frozenset(sensor_topics(recording, topics))
     return Rig(sensors=sensors, camera=camera, laser=laser, lidar=lidar)
 
 

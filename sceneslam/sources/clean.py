@@ -10,6 +10,7 @@ import numpy as np
 from sceneslam.ros.pixels import locked
 from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Sensor
 from sceneslam.types.se3 import Transform, orthonormal
 
 _FAR_M = 1e8  # more than twice around the Earth
@@ -63,7 +64,7 @@ def _points(observation: Observation, log: FaultLog) -> Mapping[str, object]:
 
 def _motion(observation: Observation, log: FaultLog) -> Mapping[str, object]:
     changes: dict[str, object] = {}
-    T_odom_base, gyro_base = observation.T_odom_base, observation.gyro_base
+    T_odom_base = observation.T_odom_base
     if T_odom_base is not None and not np.isfinite(T_odom_base).all():
         log.add("odometry that is not finite", at_stamp(observation.stamp_ns))
         changes["T_odom_base"] = None
@@ -74,11 +75,15 @@ def _motion(observation: Observation, log: FaultLog) -> Mapping[str, object]:
             changes["T_odom_base"] = None
         elif skew > _ROUNDED:
             changes["T_odom_base"] = locked(orthonormal(T_odom_base))
-    if gyro_base is not None and not np.isfinite(gyro_base).all():
-        is_good = np.isfinite(gyro_base).all(axis=1)
-        bad = int(np.count_nonzero(~is_good))
-        log.add("gyro sample that is not finite", at_stamp(observation.stamp_ns), bad)
-        changes["gyro_base"] = locked(gyro_base[is_good]) if is_good.any() else None
+    for sensor in (sensor for sensor in Sensor if sensor.is_sampled):
+        samples = getattr(observation, sensor.field)
+        if samples is not None and not np.isfinite(samples).all():
+            is_good = np.isfinite(samples).all(axis=1)
+            bad = int(np.count_nonzero(~is_good))
+            log.add(
+                f"{sensor.value} sample that is not finite", at_stamp(observation.stamp_ns), bad
+            )
+            changes[sensor.field] = locked(samples[is_good]) if is_good.any() else None
     return changes
 
 

@@ -14,10 +14,11 @@ from sceneslam.types import se3
 from sceneslam.types.fault_plan import FaultPlan
 from sceneslam.types.observation import Observation
 from sceneslam.types.ranges import check_least
+from sceneslam.types.rig import Sensor
 from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import GroundTruth
 
-SENSORS = ("image_bgr", "depth_m", "scan", "points_lidar", "T_odom_base", "gyro_base")
+SENSORS = tuple(sensor.field for sensor in Sensor)
 FAULTS = ("dropout", "blackout", "nan", "clock", "duplicate", "disorder", "reset")
 
 

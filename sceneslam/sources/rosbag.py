@@ -68,7 +68,7 @@ class RosBag:
         self._recording = open_recording(self._path)
         try:
             self._topics = choose_topics(self._recording, topics)
-            self._by_sensor = sensor_topics(self._topics)
+            self._by_sensor = sensor_topics(self._recording, self._topics)
             self._primary = self._choose_primary()
             self._frames = FrameTree(self._recording, base_frame)
             self._rig = make_rig(self._recording, self._topics, self._frames, given)
@@ -138,40 +138,39 @@ class RosBag:
             yield partial(decoder.observe, bundle)
 
     def _bundles(self) -> Iterator[Bundle]:
-        sensors = {topic: sensor for sensor, topic in self._by_sensor.items()}
+        topics = frozenset(self._by_sensor.values())
         synchroniser = Synchroniser(
-            self._primary, frozenset(sensors.values()), self._sync_tolerance_s
+            self._primary, frozenset(self._by_sensor), self._sync_tolerance_s
         )
         T_base_imu = np.eye(4)
         if self._topics.imu:
             T_base_imu = place(self._recording, self._topics.imu, self._frames)
-        for message in self._recording.messages(sensors.keys()):
-            sensor = sensors[message.topic]
-            sample = self._sample(message, sensor, T_base_imu)
-            if sample is not None:
+        for message in self._recording.messages(topics):
+            for sensor, sample in self._samples(message, T_base_imu):
                 yield from synchroniser.add(sensor, sample)
         yield from synchroniser.flush()
 
-    def _sample(self, message: Message, sensor: Sensor, T_base_imu: Any) -> Sample | None:
-        """Return a message's sample, None (and a fault) when it makes no sense."""
+    def _samples(self, message: Message, T_base_imu: Any) -> Iterator[tuple[Sensor, Sample]]:
+        """Yield what a message holds, nothing (and a fault) when it makes no sense."""
         value = self._recording.decode(message)
         if value is None:
             self._faults.add(
                 f"a message of {message.topic} makes no sense", at_stamp(message.log_ns)
             )
-            return None
+            return
         stamp_ns = decode.stamp_ns(value) or message.log_ns
-        if sensor is Sensor.ODOMETRY:
-            value = decode.transform(value.pose.pose.position, value.pose.pose.orientation)
-            if value is None:
-                self._faults.add(
-                    f"a pose of {message.topic} is no rigid motion", at_stamp(stamp_ns)
-                )
-                return None
-        elif sensor is Sensor.GYRO:
-            rate = value.angular_velocity
-            value = T_base_imu[:3, :3] @ np.array([rate.x, rate.y, rate.z])
-        return Sample(stamp_ns=stamp_ns, value=value)
+        for sensor in (one for one, topic in self._by_sensor.items() if topic == message.topic):
+            held = value
+            if sensor is Sensor.ODOMETRY:
+                held = decode.transform(value.pose.pose.position, value.pose.pose.orientation)
+                if held is None:
+                    fault = f"a pose of {message.topic} is no rigid motion"
+                    self._faults.add(fault, at_stamp(stamp_ns))
+            elif sensor.is_sampled:
+                measured = decode.inertial(value).get(sensor)
+                held = None if measured is None else T_base_imu[:3, :3] @ measured
+            if held is not None:
+                yield sensor, Sample(stamp_ns=stamp_ns, value=held)
 
     def _stamp_ns(self, message: Message) -> int:
         decoded = self._recording.decode(message)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,7 +36,7 @@ class Bundle:
     scan: Sample | None = None  # the last since the bundle before
     points: Sample | None = None  # the last since the bundle before
     T_odom_base: Transform | None = None  # interpolated
-    gyro: Sequence[Sample] = field(default_factory=tuple)  # all since the bundle before
+    samples: Mapping[Sensor, Sequence[Sample]] = field(default_factory=dict)  # since the one before
 
 
 class Synchroniser:
@@ -88,7 +88,11 @@ class Synchroniser:
             scan=self._last_since(Sensor.SCAN, stamp_ns),
             points=self._last_since(Sensor.POINTS, stamp_ns),
             T_odom_base=self._odometry_at(stamp_ns),
-            gyro=self._take_until(Sensor.GYRO, stamp_ns),
+            samples={
+                sensor: self._take_until(sensor, stamp_ns)
+                for sensor in self._held
+                if sensor.is_sampled
+            },
         )
         self._previous_ns = stamp_ns
         return bundle

@@ -50,6 +50,7 @@ def observation_at(T_room_base: se3.Transform, t_s: float) -> Observation:
         points_lidar=cloud.astype(np.float32),
         T_odom_base=T_room_base,
         gyro_base=np.array([[-0.01, 0.0, 0.0, 0.15]]),
+        accelerometer_base=np.array([[-0.01, 0.0, 0.0, 9.81]]),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -49,10 +49,23 @@ class Observation:
     point_times_s: NDArray[np.float64] | None = None  # (N,) after stamp_ns, for deskewing
     T_odom_base: Transform | None = None  # wheel odometry: smooth, drifting frame `odom`
     gyro_base: NDArray[np.float64] | None = None  # (M, 4): t - stamp [s], rate [rad/s]
+    accelerometer_base: NDArray[np.float64] | None = None  # (M, 4): t - stamp [s], specific force
+    # [m/s^2]: (0, 0, 9.8) at rest on level ground
 
     def has(self, sensor: Sensor) -> bool:
         """Tell whether this observation holds a measurement of `sensor`."""
-        return getattr(self, _FIELD[sensor]) is not None
+        return getattr(self, sensor.field) is not None
+
+    def with_samples_of(self, older: Observation) -> Observation:
+        """Return this observation with the gyro's and the like's samples of an older one, too."""
+        shift = np.array([(older.stamp_ns - self.stamp_ns) / 1e9, 0.0, 0.0, 0.0])
+        joined: dict[str, NDArray[np.float64]] = {}
+        for name in (sensor.field for sensor in Sensor if sensor.is_sampled):
+            before, after = getattr(older, name), getattr(self, name)
+            if before is not None:
+                parts = [before + shift] if after is None else [before + shift, after]
+                joined[name] = np.concatenate(parts)
+        return replace(self, **joined) if joined else self  # type: ignore[arg-type]
 
     def turn_by_gyro(self, duration_s: float) -> NDArray[np.float64] | None:
         """Return the base's rotation vector (3,) [rad] over the last `duration_s`.
@@ -70,16 +83,6 @@ class Observation:
             return None
         rates = np.concatenate([gyro[:1, 1:], gyro[:, 1:], gyro[-1:, 1:]])
         return np.asarray(np.trapezoid(rates, times, axis=0))
-
-
-_FIELD = {
-    Sensor.IMAGE: "image_bgr",
-    Sensor.DEPTH: "depth_m",
-    Sensor.SCAN: "scan",
-    Sensor.POINTS: "points_lidar",
-    Sensor.ODOMETRY: "T_odom_base",
-    Sensor.GYRO: "gyro_base",
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

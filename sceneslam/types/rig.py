@@ -12,14 +12,32 @@ from sceneslam.types.se3 import Transform, identity
 
 
 class Sensor(Enum):
-    """One kind of measurement that an observation can hold."""
+    """One kind of measurement that an observation can hold.
 
-    IMAGE = "image"
-    DEPTH = "depth"
-    SCAN = "scan"
-    POINTS = "points"
-    ODOMETRY = "odometry"
-    GYRO = "gyro"
+    The table of all sensors: name, field of `Observation`, words for messages, and whether it is
+    sampled: then the field holds all samples since the observation before, (M, 4) rows of the time
+    after the stamp [s] and three values along base's axes. A new sensor is a row here, its field,
+    and the readers that know it.
+    """
+
+    IMAGE = "image", "image_bgr", "an image"
+    DEPTH = "depth", "depth_m", "depth"
+    SCAN = "scan", "scan", "a scan"
+    POINTS = "points", "points_lidar", "lidar points"
+    ODOMETRY = "odometry", "T_odom_base", "odometry"
+    GYRO = "gyro", "gyro_base", "a gyro", True
+    ACCELEROMETER = "accelerometer", "accelerometer_base", "an accelerometer", True
+
+    field: str
+    words: str
+    is_sampled: bool
+
+    def __new__(cls, name: str, field: str, words: str, is_sampled: bool = False) -> Sensor:
+        """Return the member of a row; its value is its name."""
+        sensor = object.__new__(cls)
+        sensor._value_ = name
+        sensor.field, sensor.words, sensor.is_sampled = field, words, is_sampled
+        return sensor
 
 
 def optical_to_rep103() -> Transform:

@@ -30,17 +30,16 @@ def survey_recording(
     """Return the streams of a recording, sampled in stretches of a second."""
     taken: dict[Sensor, list[int]] = {sensor: [] for sensor in topics}
     samples = _Samples(DepthUnits.unlimited(depth_scale))
-    by_topic = {topic: sensor for sensor, topic in topics.items()}
     for stretch in _stretches(recording, topics):
         samples.begin()
         for message in stretch:
             value = recording.decode(message)
             if value is None:
                 continue
-            sensor = by_topic[message.topic]
             stamp_ns = decode.stamp_ns(value) or message.log_ns
-            taken[sensor].append(stamp_ns)
-            samples.take(sensor, stamp_ns, value)
+            for sensor in (one for one, topic in topics.items() if topic == message.topic):
+                taken[sensor].append(stamp_ns)
+                samples.take(sensor, stamp_ns, value)
     streams = [
         Stream(
             sensor=sensor,
@@ -109,8 +108,7 @@ class _Samples:
                 self.odometry_ns.append(stamp_ns)
                 self.T_odom_base.append(T_odom_base)
         elif sensor is Sensor.GYRO:
-            rate = value.angular_velocity
-            self.gyro_radps.append(np.array([rate.x, rate.y, rate.z]))
+            self.gyro_radps.append(decode.inertial(value)[sensor])
         elif self._counts.get(sensor, 0) < _MOST_SAMPLES:
             self._counts[sensor] = self._counts.get(sensor, 0) + 1
             self._decode(sensor, stamp_ns, value)

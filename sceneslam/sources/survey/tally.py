@@ -11,14 +11,6 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Sensor
 
 _EVERY = 30  # depth image or scan is looked into
-_NAMES = {
-    Sensor.IMAGE: "an image",
-    Sensor.DEPTH: "depth",
-    Sensor.SCAN: "a scan",
-    Sensor.POINTS: "lidar points",
-    Sensor.ODOMETRY: "odometry",
-    Sensor.GYRO: "a gyro",
-}
 
 
 class Tally:
@@ -58,7 +50,7 @@ class Tally:
             self._returns.append(float(np.isfinite(scan.ranges_m).mean()))
 
     def _named(self, sensor: Sensor) -> str:
-        name = _NAMES[sensor]
+        name = sensor.words
         if sensor is Sensor.DEPTH and self._depths:
             medians_m, shares = np.array(self._depths).T
             known = medians_m[np.isfinite(medians_m)]
@@ -70,4 +62,4 @@ class Tally:
 
 
 def _named(sensors: frozenset[Sensor]) -> str:
-    return " and ".join(_NAMES[sensor] for sensor in Sensor if sensor in sensors)
+    return " and ".join(sensor.words for sensor in Sensor if sensor in sensors)

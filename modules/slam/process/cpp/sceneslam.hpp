@@ -114,7 +114,7 @@ struct Pose {
 class Slam {
  public:
   virtual ~Slam() = default;
-  // The sets of sensors that suffice, one per line: image depth scan points odometry gyro.
+  // The sets of sensors that suffice, one per line: image depth scan points odometry gyro accelerometer.
   virtual std::string sensors() const = 0;
   virtual void activate(const Fields& rig) = 0;
   // The pose at the observation; nothing where it is not known yet: it may come with a later one.
