@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from configured import config
-from fakes import FakeSource, observation
+from fakes import FakeSource
 from ros_recordings import make_source
 from test_preflight import CAMERA, write_folder
 
@@ -16,7 +16,6 @@ from sceneslam.app import run
 from sceneslam.evaluation.summary import summary_lines
 from sceneslam.ros.writer import ObservationWriter
 from sceneslam.sources.bag_frames import FrameTree
-from sceneslam.sources.made_once import MadeOnce
 from sceneslam.sources.ordered import Ordered
 from sceneslam.sources.recording import ChunkedRecording
 from sceneslam.sources.simulator.cache import Cache
@@ -213,11 +212,3 @@ def test_cache_that_cannot_be_written_names_what_to_set(tmp_path, obstacle):
     with pytest.raises(InputError, match=r"source.cache_dir.*SCENESLAM_CACHE_DIR=FOLDER"):
         Cache(folder).fetch("a", {}, make)
     assert len(made) == (obstacle == "full")  # else before anything is rendered
-
-
-def test_lock_in_a_folder_that_cannot_be_made_names_what_to_set(tmp_path):
-    (tmp_path / "cache").write_text("")
-    source = MadeOnce(FakeSource(steps=3, dark_from=1), tmp_path / "cache")
-    with pytest.raises(InputError, match="SCENESLAM_CACHE_DIR=FOLDER"):
-        next(iter(source))
-    assert observation(0).stamp_ns == 0

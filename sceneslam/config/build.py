@@ -6,7 +6,6 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from sceneslam.atlas.atlas import Atlas
@@ -16,7 +15,6 @@ from sceneslam.config.component import Builder
 from sceneslam.config.settings import DETECT_ONLY, RunSettings
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.interfaces import Detector, Sink, SlamModule, Source
-from sceneslam.sources.made_once import MadeOnce
 from sceneslam.sources.ordered import Ordered
 from sceneslam.supervision.isolated import IsolatedModule
 from sceneslam.types.errors import ConfigError, ModuleError, told
@@ -87,10 +85,8 @@ def build(config: Mapping[str, Any]) -> Parts:
 
 
 def make_source(config: Mapping[str, Any], builder: Builder) -> Source:
-    """Return the source with its effects; one that is made first is made by one process only."""
+    """Return the source with its effects."""
     source = builder.make("source", Source)
-    if config["source"].get("cache_dir"):
-        source = MadeOnce(source, Path(config["source"]["cache_dir"]))
     if config.get("effects"):
         source = builder.make("effects", Source, source)
     return Ordered(source)

@@ -37,6 +37,7 @@ from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
 _START_NS = 1_000 * 10**9  # stamps count from here: zero means "unset" to many readers
+_OF_ROOMS, _OF_BUILDING = {"rooms.py"}, {"building.py", "zones.py", "zone_kind.py"}
 _LIGHTS = ("story", "on", "off")
 
 
@@ -145,9 +146,9 @@ class Simulator:
         return self._reader
 
     def _dependencies(self) -> Mapping[str, object]:
-        """Return all that the cached file depends on, the simulator's own code with it."""
+        """Return all that the cached file depends on, the code that draws its place with it."""
         return {
-            "story": self._story_name,
+            "story": self._story,
             "seed": self._seed,
             "lights": self._lights,
             "frames": self.length,
@@ -158,7 +159,7 @@ class Simulator:
             "wheels": self._wheels,
             "order": self._order,
             "exposure": self._exposure,
-            "code": code_digest(*Path(__file__).parent.rglob("*.py"), Path(ros_writer.__file__)),
+            "code": code_digest(*_code_of(self._story.place), Path(ros_writer.__file__)),
         }
 
     def _record(self, path: Path) -> None:
@@ -241,6 +242,14 @@ class Simulator:
 
     def _generator(self, stream: int) -> np.random.Generator:
         return np.random.default_rng([self._seed, stream, 0])
+
+
+def _code_of(place: str) -> Iterator[Path]:
+    """Yield the code that a recording depends on; its story counts by value."""
+    of_others = _OF_ROOMS if place == "building" else _OF_BUILDING
+    for file in Path(__file__).parent.rglob("*.py"):
+        if file.name not in {"cache.py", "stories.py", *of_others}:
+            yield file
 
 
 def _stamp_ns(time_s: float) -> int:

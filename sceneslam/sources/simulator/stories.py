@@ -1,50 +1,23 @@
-"""The stories: which place, which way, and what happens to the light."""
+"""The stories by name."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-
-import numpy as np
+from collections.abc import Mapping
 
 from sceneslam.sources.simulator.places import building
-from sceneslam.sources.simulator.places.place import NIGHT, SUN
-from sceneslam.sources.simulator.robot.motion import Drive, Face, Move, Shift, Wait
+from sceneslam.sources.simulator.places.place import SUN
+from sceneslam.sources.simulator.robot.motion import Drive, Face, Shift, Wait
+from sceneslam.sources.simulator.story import OFF, Knots, Story
 
-Knots = tuple[tuple[float, float], ...]  # (time [s], level 0..1): linear between, flat outside
-
-_OFF: Knots = ((0.0, 0.0),)
 OFFICE_TOUR = "office_tour"
 _TOUR_SPEED_MPS = 0.6
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Story:
-    """One drive. Lamps that are not named are at full power."""
-
-    about: str
-    place: str = "two_rooms"  # or sunny_rooms, bare_rooms, corridor, building
-    start_x_y_deg: tuple[float, float, float] = (3.0, 2.9, -150.0)
-    moves: tuple[Move, ...]
-    lamps: Mapping[str, Knots] = field(default_factory=lambda: {"b": _OFF})
-
-    def levels(self, groups: Iterable[str], time_s: float, lights: str) -> dict[str, float]:
-        """Return the level of each lamp group; `lights` (on, off) overrides all with a switch."""
-        levels = {group: 0.0 if group == SUN else 1.0 for group in groups}
-        for group, knots in self.lamps.items():
-            times, values = zip(*knots, strict=True)
-            levels[group] = float(np.interp(time_s, times, values))
-        if lights != "story":
-            switched = levels.keys() - {NIGHT, SUN}
-            levels |= dict.fromkeys(switched, 1.0 if lights == "on" else 0.0)
-        return levels
 
 
 def find(name: str, order: int | None) -> Story:
     """Return a story by its name; `order` shuffles the rooms of the building."""
     if name != OFFICE_TOUR:
         return STORIES[name]
-    dark = dict.fromkeys(building.dark_groups(), _OFF)
+    dark = dict.fromkeys(building.dark_groups(), OFF)
     return Story(
         about="through a building in which every sensor fails somewhere, and back to the start",
         place="building",
@@ -111,7 +84,7 @@ STORIES: Mapping[str, Story] = {
     "lights_out": Story(
         about="the lamp is switched off while the robot drives",
         moves=(Wait(1.5), Drive(_ROUND_A), Face(-120.0), Drive(((2.75, 1.6),)), Wait(0.5)),
-        lamps={"a": ((12.0, 1.0), (12.15, 0.0)), "b": _OFF},
+        lamps={"a": ((12.0, 1.0), (12.15, 0.0)), "b": OFF},
     ),
     "flicker": Story(
         about="the lamp fails for less than a second, again and again",
@@ -120,7 +93,7 @@ STORIES: Mapping[str, Story] = {
             "a": _drop_outs(
                 (4.0, 0.3), (7.5, 0.8), (9.3, 0.5), (13.0, 0.2), (13.9, 0.6), (19.0, 0.8)
             ),
-            "b": _OFF,
+            "b": OFF,
         },
     ),
     "white_wall": Story(
@@ -149,7 +122,7 @@ STORIES: Mapping[str, Story] = {
         about="sunlight through a window blinds the depth camera for some seconds",
         place="sunny_rooms",
         moves=(Wait(1.5), Drive(_ROUND_A), Face(-120.0), Drive(((2.75, 1.6),)), Wait(0.5)),
-        lamps={"b": _OFF, SUN: ((9.0, 0.02), (9.6, 1.0), (14.0, 1.0), (14.6, 0.02))},
+        lamps={"b": OFF, SUN: ((9.0, 0.02), (9.6, 1.0), (14.0, 1.0), (14.6, 0.02))},
     ),
 }
 
