@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 
 from sceneslam.sources.simulator import stories
-from sceneslam.sources.simulator.optics.camera import Eye
+from sceneslam.sources.simulator.optics.camera import Eye, View
 from sceneslam.sources.simulator.optics.exposure import Shutter, split
 from sceneslam.sources.simulator.optics.noise_table import NoiseTable
+from sceneslam.sources.simulator.optics.people import add_people, reach_people
 from sceneslam.sources.simulator.optics.rays import RayCaster
 from sceneslam.sources.simulator.optics.sensor_noise import expose, measure_depth
 from sceneslam.sources.simulator.places import building
 from sceneslam.sources.simulator.places.building import floor_plan
+from sceneslam.sources.simulator.places.walker import Walker
 from sceneslam.sources.simulator.robot.motion import STEP_HZ, Drive, Path, plan
 from sceneslam.sources.simulator.robot.wheels import Gyro, WheelOdometry
 from sceneslam.sources.simulator.settings import (
@@ -27,6 +29,8 @@ from sceneslam.sources.simulator.settings import (
 )
 from sceneslam.sources.simulator.shot import light_place
 from sceneslam.sources.simulator.truth import changes_of, scene_at
+from sceneslam.types import se3
+from sceneslam.types.rig import optical_to_rep103
 
 _RATE_HZ = 2.0
 _CAMERA = CameraSettings(
@@ -195,3 +199,35 @@ def test_the_gyro_feels_the_ramp_and_its_bias_walks() -> None:
     walked = Gyro(tour(), walking, np.random.default_rng(0)).samples(-1.0, tour().duration_s)
     assert np.std((walked - clean)[-1000:, 3]) < 3e-3
     assert 1e-3 < np.abs((walked - clean)[-1, 1:]).max() < 0.1
+
+
+def test_nobody_walks_where_the_robot_drives() -> None:
+    (person,) = building.build(np.random.default_rng(0), None).people
+    x_y = tour().x_y_yaw[:: STEP_HZ // 10, :2]
+    nearest_m = [
+        np.linalg.norm(x_y - person.position_m(time_s), axis=1).min()
+        for time_s in np.arange(0.0, 5.0, 0.2)
+    ]
+    assert min(nearest_m) > 0.6
+    assert np.ptp([person.position_m(time_s)[0] for time_s in (0.0, 1.0)]) > 0.3
+
+
+def test_a_person_is_seen_by_image_and_depth() -> None:
+    person = Walker(start_m=(3.0, 0.0), end_m=(3.0, 1.0), group="a", light=0.5)
+    shape = (_CAMERA.size_wh[1], _CAMERA.size_wh[0])
+    view = View(
+        image_bgr=np.zeros((*shape, 3), np.float32),
+        depth_m=np.full(shape, 4.0, np.float32),
+        cosine=np.zeros(shape, np.float32),
+        blinded=np.ones(shape, np.bool_),
+    )
+    x, y = np.meshgrid(np.arange(shape[1]) - _CAMERA.cx, np.arange(shape[0]) - _CAMERA.cy)
+    ways = np.dstack([x / _CAMERA.fx, y / _CAMERA.fy, np.ones(shape)]).astype(np.float32)
+    T_gt_cam = se3.from_parts(optical_to_rep103()[:3, :3], np.array([0.0, 0.0, 1.0]))
+    add_people(view, [person], 0.0, T_gt_cam, ways, {"a": 1.0})
+    middle = shape[0] // 2, shape[1] // 2
+    assert view.depth_m[middle] == pytest.approx(2.8, abs=0.01)  # its front
+    assert view.image_bgr[middle].min() > 0 and not view.blinded[middle]
+    assert view.depth_m[middle[0], 0] == 4.0 and view.blinded[middle[0], 0]  # beside it
+    rays = np.array([[0, 0, 1.0, 1, 0, 0], [0, 0, 1.0, 0, 1, 0]], np.float32)
+    assert reach_people([person], 0.0, rays).tolist() == pytest.approx([2.8, np.inf])

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.sources.simulator.optics.camera import Eye
+from sceneslam.sources.simulator.optics.camera import Eye, View
 from sceneslam.sources.simulator.optics.exposure import Shutter, split
 from sceneslam.sources.simulator.optics.lighting import LightMap, bake
 from sceneslam.sources.simulator.optics.noise_table import NoiseTable
+from sceneslam.sources.simulator.optics.people import add_people, reach_people
 from sceneslam.sources.simulator.optics.rays import RayCaster
 from sceneslam.sources.simulator.optics.sensor_noise import expose, measure_depth
 from sceneslam.sources.simulator.places import building, rooms
@@ -18,8 +19,9 @@ from sceneslam.sources.simulator.places.floor import FloorPlan
 from sceneslam.sources.simulator.places.place import Place
 from sceneslam.sources.simulator.robot.motion import Path
 from sceneslam.sources.simulator.settings import ExposureSettings, LaserSettings
-from sceneslam.sources.simulator.stories import Story
+from sceneslam.sources.simulator.story import Story
 from sceneslam.types.rig import Camera
+from sceneslam.types.se3 import Transform
 
 _METERED = 64  # frames that are metered at a time, in the light of the first of them
 _PLACE_STREAM, _FRAME_STREAM, _SWEEP_STREAM = 1, 2, 3  # of random numbers, below the seed
@@ -82,12 +84,17 @@ class Photographer:
         shot, time_s = self._shot, self._shot.time_s(index)
         T_gt_cam = shot.path.pose(time_s) @ shot.camera.T_base_cam
         view = self._eye.look(T_gt_cam, shot.levels(time_s))
+        self._add_people(view, time_s, T_gt_cam)
         rng = np.random.default_rng([shot.seed, _FRAME_STREAM, index])
         return Frame(
             image_bgr=expose(view, self._noise, rng, self._shutter(index)),
             depth_mm=measure_depth(view, shot.camera, self._noise, rng),
             ranges_m=self._sweep(index),
         )
+
+    def _add_people(self, view: View, time_s: float, T_gt_cam: Transform) -> None:
+        shot, rays = self._shot, self._eye.directions
+        add_people(view, shot.place.people, time_s, T_gt_cam, rays, shot.levels(time_s))
 
     def _shutter(self, index: int) -> Shutter:
         """Return how a frame is exposed; only turning blurs, since driving moves little."""
@@ -113,7 +120,8 @@ class Photographer:
         rays[:, :3], rays[:, 3:] = T_gt_laser[:3, 3], ways_laser @ T_gt_laser[:3, :3].T
         rng = np.random.default_rng([self._shot.seed, _SWEEP_STREAM, index])
         noise_m = scanner.noise_m * rng.standard_normal(len(rays), dtype=np.float32)
-        ranges_m = self._caster.first_hits(rays).reach + noise_m
+        reach = reach_people(self._shot.place.people, time_s, rays)
+        ranges_m = np.minimum(self._caster.first_hits(rays).reach, reach) + noise_m
         near_m, far_m = scanner.range_m
         returned = (ranges_m >= near_m) & (ranges_m <= far_m)
         return np.where(returned, ranges_m, np.inf).astype(np.float32)

@@ -60,6 +60,11 @@ class Eye:
         self._lit_at: tuple[float, ...] = ()
         self._lit_sheet = np.zeros((1, 1, 4), np.float32)
 
+    @property
+    def directions(self) -> Image:
+        """Return the rays' directions (H, W, 3) in `cam`, with z = 1."""
+        return self._directions
+
     def look(self, T_gt_cam: Transform, levels: Mapping[str, float]) -> View:
         """Return the view from a pose, each group of lamps at its level (0 off, 1 full)."""
         panels = self._find_panels(T_gt_cam)

@@ -6,6 +6,7 @@ one back west along y = 20. Any order of the zones closes: a lobby fills up the 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from sceneslam.sources.simulator.places import zones
 from sceneslam.sources.simulator.places.floor import Door, Floor, FloorPlan, Profile, Slippery, Zone
 from sceneslam.sources.simulator.places.place import NIGHT, Builder, Lamp, Place, Sun
+from sceneslam.sources.simulator.places.walker import Walker
 from sceneslam.sources.simulator.places.zone_kind import DOOR_WIDTH_M, WALL_M, Kind, line_door
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
@@ -22,6 +24,7 @@ _IN_FIRST_ROW = 3
 _LOBBY_M = 4.0  # the shortest
 _NIGHT_POWER = 0.002  # exit signs: a camera at its longest exposure sees noise
 _CELL_M = 0.12
+_ON_PEOPLE = 0.5  # light, as on the lit walls
 _SUN_POWER, _SKY = 8.0, 6.0
 _BLINDING = 0.03 * _SUN_POWER  # some 3000 of the sun's 100,000 lux
 
@@ -94,6 +97,7 @@ def build(rng: np.random.Generator, order_seed: int | None) -> Place:
         panels=tuple(builder.panels),
         lamps=tuple(lamps),
         sun=sun,
+        people=tuple(person for one in placed for person in _people(one)),
         cell_m=_CELL_M,
     )
 
@@ -160,6 +164,13 @@ def _night(one: Placed) -> Lamp:
         points_per_side=2,
         reach_m=14.0,
     )
+
+
+def _people(one: Placed) -> Iterator[Walker]:
+    for start_m, end_m in one.kind.walks:
+        yield Walker(
+            start_m=one.gt(start_m), end_m=one.gt(end_m), group=one.kind.group, light=_ON_PEOPLE
+        )
 
 
 def _floor(placed: tuple[Placed, ...]) -> Floor:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.sources.simulator.places.surfaces import TEXEL_M, Material, Texture
+from sceneslam.sources.simulator.places.walker import Walker
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
@@ -66,6 +67,7 @@ class Place:
     panels: tuple[Panel, ...]
     lamps: tuple[Lamp, ...]
     sun: Sun | None = None
+    people: tuple[Walker, ...] = ()
     cell_m: float = 0.06  # of the light map
 
     @property

@@ -47,6 +47,7 @@ class Kind:
     has_polished_floor: bool = False
     slippery: tuple[tuple[Point, Point, float], ...] = ()  # x and y of a rectangle, slip ratio
     heights: tuple[Point, ...] = ()  # of the floor: (x, height) knots
+    walks: tuple[tuple[Point, Point], ...] = ()  # of people, to and fro
 
     @property
     def group(self) -> str:
