@@ -63,7 +63,7 @@ def observations(count: int) -> list[Observation]:
                 point_times_s=np.linspace(0, 0.1, 40),
                 T_odom_base=se3.exp(rng.normal(size=6) * 0.3),
                 gyro_base=gyro,
-                accelerometer_base=gyro + [0.0, 0.0, 0.0, 9.81],
+                accelerometer_base=gyro + np.array([0.0, 0.0, 0.0, 9.81]),
             )
         )
     return made

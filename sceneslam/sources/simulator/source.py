@@ -159,7 +159,7 @@ class Simulator:
             "wheels": self._wheels,
             "order": self._order,
             "exposure": self._exposure,
-            "code": code_digest(*_code_of(self._story.place), Path(ros_writer.__file__)),
+            "code": code_digest(*_code_of(self._story.place)),
         }
 
     def _record(self, path: Path) -> None:
