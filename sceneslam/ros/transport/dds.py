@@ -1,0 +1,271 @@
+"""ROS 2 topics over Cyclone DDS: no ROS has to be installed.
+
+ROS 2 maps topic `/a` to DDS topic `rt/a`, and type `pkg/msg/Name` to `pkg::msg::dds_::Name_`.
+Messages stay the bytes that they are: every type is a placeholder of the right name. The other side
+matches by that name alone, and an image costs a copy. Fast DDS 3 (ROS 2 Kilted) compares what types
+hold as well; it matches where its profile says `fastdds.type_propagation` `disabled`.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from time import monotonic_ns
+from typing import Any
+
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+from cyclonedds.core import (
+    DDSException,
+    InstanceState,
+    Policy,
+    ReadCondition,
+    SampleState,
+    ViewState,
+    WaitSet,
+)
+from cyclonedds.core import Qos as Policies
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl import IdlStruct, make_idl_struct
+from cyclonedds.idl.types import uint8
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+from sceneslam.ros.transport.transport import (
+    DEPTHS,
+    LOCALHOST,
+    Arrival,
+    Heard,
+    Network,
+    Publisher,
+    Qos,
+)
+from sceneslam.types.errors import ConfigError, told
+
+_log = logging.getLogger(__name__)
+_WAKE_S = 0.1  # how long `close` may take
+_BATCH = 64  # messages taken at once
+_ENDPOINTS = 1000  # announcements taken at once
+_CONFIG = "CYCLONEDDS_URI"
+_environment = threading.Lock()  # a domain reads it when its first participant joins
+# This machine alone: by the loopback interface, with multicast for participants that know no more
+# than that (a robot's drivers as they are started), and by number for those that avoid it.
+_ON_LOOPBACK = (
+    '<General><Interfaces><NetworkInterface name="lo" multicast="true"/></Interfaces>'
+    "<AllowMulticast>spdp</AllowMulticast></General>"
+    "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
+    "<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+    '<Peers><Peer address="127.0.0.1"/></Peers></Discovery>'
+)
+
+
+class DdsTransport:
+    """A participant of Cyclone DDS; a user's own CYCLONEDDS_URI comes before `discovery`."""
+
+    def __init__(self, network: Network) -> None:
+        domain = network.domain()
+        try:
+            with _configured(is_local=network.reach() == LOCALHOST):
+                self._participant: Any = DomainParticipant(domain)
+            self._announced = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+        except DDSException as error:
+            allowed = f"a domain that can be joined ({told(error)})"
+            raise ConfigError("domain_id", domain, allowed) from error
+        self._lock = threading.RLock()
+        self._readers: dict[str, tuple[Any, Heard]] = {}
+        self._writers: dict[str, _Writer] = {}
+        self._topics: dict[str, Any] = {}
+        self._published: dict[Any, tuple[str, str]] = {}  # by endpoint
+        self._is_closed = False
+        self._waitset = WaitSet(self._participant)
+        self._thread: threading.Thread | None = None
+
+    def topics(self) -> Mapping[str, str]:
+        """Return the ROS topics that others announced, and not yet withdrew."""
+        with self._lock:
+            for endpoint in self._announced.take(_ENDPOINTS):
+                name = endpoint.topic_name or ""  # a writer that left has none
+                if not _is_alive(endpoint):
+                    self._published.pop(endpoint.key, None)
+                elif name.startswith("rt/") and endpoint.key not in self._own_keys():
+                    self._published[endpoint.key] = (name[2:], _ros_type(endpoint.type_name))
+            return dict(self._published.values())
+
+    def subscribe(self, topic: str, msgtype: str, heard: Heard, qos: Qos = Qos.SENSOR) -> None:
+        """Deliver the topic's messages to `heard`, in the transport's thread."""
+        with self._lock:
+            reader = DataReader(self._participant, self._topic(topic, msgtype), _qos(qos))
+            mask = SampleState.NotRead | ViewState.Any | InstanceState.Any
+            self._readers[topic] = (reader, heard)
+            self._waitset.attach(ReadCondition(reader, mask))
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._listen, name="dds", daemon=True)
+                self._thread.start()
+
+    def publisher(self, topic: str, msgtype: str, qos: Qos = Qos.RELIABLE) -> Publisher:
+        """Return the topic's writer."""
+        with self._lock:
+            if topic not in self._writers:
+                named = self._topic(topic, msgtype)
+                writer = DataWriter(self._participant, named, _qos(qos))
+                self._writers[topic] = _Writer(writer, named.data_type)
+            return self._writers[topic]
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self._is_closed = True
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+        with self._lock:
+            for writer in self._writers.values():
+                writer.close()
+            self._readers, self._writers, self._topics = {}, {}, {}
+            if self._participant is not None:  # with all that is in it, which no destructor does
+                self._participant._delete(self._participant._ref)
+                self._participant = None
+
+    def _listen(self) -> None:
+        while not self._is_closed:
+            self._waitset.wait(timeout=duration(seconds=_WAKE_S))
+            with self._lock:
+                readers = list(self._readers.items())
+            for topic, (reader, heard) in readers:
+                for sample in reader.take(_BATCH):
+                    cdr = getattr(sample, "cdr", b"")
+                    if cdr and not self._is_closed:
+                        _deliver(heard, Arrival(topic=topic, cdr=cdr, arrived_ns=monotonic_ns()))
+
+    def _topic(self, topic: str, msgtype: str) -> Any:
+        if topic not in self._topics:
+            named = Topic(self._participant, f"rt{topic}", _named(_dds_type(msgtype)))
+            self._topics[topic] = named
+        return self._topics[topic]
+
+    def _own_keys(self) -> set[Any]:
+        return {writer.key for writer in self._writers.values()}
+
+
+class _Bytes(IdlStruct):  # type: ignore[misc]
+    """A message as the bytes that it is sent as."""
+
+    def __init__(self, cdr: bytes) -> None:
+        self.cdr = cdr
+
+    def serialize(self, *_: Any, **__: Any) -> bytes:
+        return self.cdr
+
+    @classmethod
+    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Any:
+        return cls(bytes(data))
+
+    @classmethod
+    def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Any:
+        return cls(b"")  # a writer that left
+
+
+class _Writer:
+    """Sends the bytes of one type."""
+
+    def __init__(self, writer: Any, data_type: Any) -> None:
+        self._writer, self._data_type = writer, data_type
+        self.key = writer.guid
+
+    def publish(self, cdr: bytes) -> None:
+        """Send; after `close`, to nobody."""
+        writer = self._writer
+        if writer is not None:
+            writer.write(self._data_type(cdr))
+
+    def close(self) -> None:
+        """Leave the topic."""
+        self._writer = None
+
+
+def _deliver(heard: Heard, arrival: Arrival) -> None:
+    try:
+        heard(arrival)
+    except Exception as error:
+        _log.warning("a message of %s could not be taken: %s", arrival.topic, told(error))
+        _log.debug("the whole error", exc_info=error)
+
+
+@contextmanager
+def _configured(*, is_local: bool) -> Iterator[None]:
+    """Have a domain that is joined meanwhile stay on this machine, but for a user's own word."""
+    with _environment:
+        is_ours = is_local and not os.environ.get(_CONFIG)
+        before = _sockets()
+        if is_ours:
+            os.environ[_CONFIG] = f"<CycloneDDS><Domain>{_ON_LOOPBACK}</Domain></CycloneDDS>"
+        try:
+            yield
+        finally:
+            if is_ours:
+                del os.environ[_CONFIG]
+        if is_ours:
+            _keep_local(_sockets() - before)
+
+
+def _sockets() -> set[int]:
+    """Return this process's descriptors of datagram sockets; none where there is no /proc."""
+    found = set()
+    for entry in Path("/proc/self/fd").glob("*"):
+        try:
+            if entry.is_socket():
+                with socket.socket(fileno=os.dup(int(entry.name))) as one:
+                    if one.family == socket.AF_INET and one.type == socket.SOCK_DGRAM:
+                        found.add(int(entry.name))
+        except OSError:  # closed meanwhile
+            continue
+    return found
+
+
+def _keep_local(descriptors: set[int]) -> None:
+    """Bind sockets to the loopback interface: the library listens on all addresses."""
+    for descriptor in descriptors:
+        try:
+            with socket.socket(fileno=os.dup(descriptor)) as one:
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo\0")
+        except OSError as error:
+            _log.warning("DDS can be reached from other machines: %s", told(error))
+
+
+def _named(typename: str) -> Any:
+    """Return a type of that name whose samples are bytes."""
+    return make_idl_struct(
+        "Named", typename, {"placeholder": uint8}, bases=(_Bytes,), dataclassify=False
+    )
+
+
+def _qos(qos: Qos) -> Any:
+
+    policies = [
+        Policy.Reliability.BestEffort
+        if qos is Qos.SENSOR
+        else Policy.Reliability.Reliable(duration(milliseconds=100)),
+        Policy.History.KeepLast(DEPTHS[qos]),
+        Policy.Durability.TransientLocal
+        if qos in (Qos.LATCHED, Qos.HISTORY)
+        else Policy.Durability.Volatile,
+    ]
+    return Policies(*policies)
+
+
+def _dds_type(msgtype: str) -> str:
+    package, _, name = msgtype.replace("/msg/", "/").partition("/")
+    return f"{package}::msg::dds_::{name}_"
+
+
+def _ros_type(dds_type: str) -> str:
+    return dds_type.replace("::dds_::", "::").removesuffix("_").replace("::", "/")
+
+
+def _is_alive(endpoint: Any) -> bool:
+
+    return bool(endpoint.sample_info.instance_state == InstanceState.Alive)

@@ -1,0 +1,122 @@
+"""ROS 2 topics through rclpy, where a ROS of this Python is installed: any vendor, any release."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import threading
+from collections.abc import Mapping
+from time import monotonic_ns
+from typing import Any
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from sceneslam.ros.transport.transport import (
+    DEPTHS,
+    LOCALHOST,
+    Arrival,
+    Heard,
+    Network,
+    Publisher,
+    Qos,
+)
+from sceneslam.types.errors import ConfigError, told
+
+_log = logging.getLogger(__name__)
+_SPIN_S = 0.1
+
+
+class RclpyTransport:
+    """A node `sceneslam`; messages stay serialised (raw subscriptions)."""
+
+    def __init__(self, network: Network) -> None:
+        if network.reach() == LOCALHOST:  # rclpy takes it from nowhere else
+            os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=network.domain())
+        self._node = Node("sceneslam", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._publishers: dict[str, _Publisher] = {}
+        self._is_closed = False
+        self._thread = threading.Thread(target=self._spin, name="rclpy", daemon=True)
+        self._thread.start()
+
+    def topics(self) -> Mapping[str, str]:
+        """Return the topics that other nodes publish."""
+        found = {}
+        for name, types in self._node.get_topic_names_and_types():
+            others = self._node.get_publishers_info_by_topic(name)
+            if any(one.node_name != self._node.get_name() for one in others):
+                found[name] = types[0]
+        return found
+
+    def subscribe(self, topic: str, msgtype: str, heard: Heard, qos: Qos = Qos.SENSOR) -> None:
+        """Deliver the topic's messages to `heard`, in the node's thread."""
+
+        def deliver(cdr: bytes) -> None:
+            if self._is_closed:
+                return
+            try:
+                heard(Arrival(topic=topic, cdr=bytes(cdr), arrived_ns=monotonic_ns()))
+            except Exception as error:
+                _log.warning("a message of %s could not be taken: %s", topic, told(error))
+
+        self._node.create_subscription(_type(msgtype), topic, deliver, _profile(qos), raw=True)
+        self._executor.wake()
+
+    def publisher(self, topic: str, msgtype: str, qos: Qos = Qos.RELIABLE) -> Publisher:
+        """Return the topic's publisher."""
+        if topic not in self._publishers:
+            made = self._node.create_publisher(_type(msgtype), topic, _profile(qos))
+            self._publishers[topic] = _Publisher(made)
+        return self._publishers[topic]
+
+    def close(self) -> None:
+        """Destroy the node."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        self._executor.wake()
+        self._thread.join()
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def _spin(self) -> None:
+        while not self._is_closed:
+            self._executor.spin_once(timeout_sec=_SPIN_S)
+
+
+class _Publisher:
+    def __init__(self, publisher: Any) -> None:
+        self._publisher = publisher
+
+    def publish(self, cdr: bytes) -> None:
+        """Send bytes as they are."""
+        self._publisher.publish(cdr)
+
+
+def _type(msgtype: str) -> Any:
+    package, _, name = msgtype.replace("/msg/", "/").partition("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError) as error:
+        allowed = f"dds, or a ROS that has {msgtype} ({told(error)})"
+        raise ConfigError("transport", "rclpy", allowed) from error
+
+
+def _profile(qos: Qos) -> QoSProfile:
+    is_kept = qos in (Qos.LATCHED, Qos.HISTORY)
+    return QoSProfile(
+        depth=DEPTHS[qos],
+        reliability=ReliabilityPolicy.BEST_EFFORT
+        if qos is Qos.SENSOR
+        else ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if is_kept else DurabilityPolicy.VOLATILE,
+    )

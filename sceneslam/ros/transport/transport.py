@@ -1,0 +1,127 @@
+"""What a ROS 2 transport does, and how one is opened."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+from sceneslam.types.errors import ConfigError, told
+
+DDS, RCLPY = "dds", "rclpy"
+LOCALHOST, SUBNET = "localhost", "subnet"
+_DOMAIN_MAX = 232  # the DDS port numbers end there
+
+
+class Qos(Enum):
+    """How messages are kept and sent, by ROS 2's names for it."""
+
+    SENSOR = "sensor data: best effort, the last few"
+    RELIABLE = "reliable, the last ten"
+    LATCHED = "reliable and transient local: who comes later gets the last one"
+    HISTORY = "reliable and transient local, a hundred: as /tf_static is sent by several"
+
+
+DEPTHS = {Qos.SENSOR: 5, Qos.RELIABLE: 10, Qos.LATCHED: 1, Qos.HISTORY: 100}  # messages kept
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Arrival:
+    """One message as it came."""
+
+    topic: str
+    cdr: bytes  # with its four bytes of header
+    arrived_ns: int  # CLOCK_MONOTONIC
+
+
+Heard = Callable[[Arrival], None]
+
+
+class Publisher(Protocol):
+    """Sends messages on one topic."""
+
+    def publish(self, cdr: bytes) -> None:
+        """Send a serialised message; returns at once."""
+        ...
+
+
+class Transport(Protocol):
+    """A participant of a ROS 2 domain. All methods may be called from any thread.
+
+    Topics are named as in ROS (`/scan`), types as `sensor_msgs/msg/LaserScan`. What a callback
+    raises ends nothing: it is logged, and the next message is delivered.
+    """
+
+    def topics(self) -> Mapping[str, str]:
+        """Return the type of every topic that another participant publishes, as known by now."""
+        ...
+
+    def subscribe(self, topic: str, msgtype: str, heard: Heard, qos: Qos = Qos.SENSOR) -> None:
+        """Call `heard` for every message from now on, in a thread of the transport's own."""
+        ...
+
+    def publisher(self, topic: str, msgtype: str, qos: Qos = Qos.RELIABLE) -> Publisher:
+        """Return what sends on a topic; the same one for the same topic."""
+        ...
+
+    def close(self) -> None:
+        """Leave the domain; no callback runs afterwards. May be called twice."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Network:
+    """Which participants are talked to."""
+
+    transport: str = DDS
+    domain_id: int | None = None  # None: ROS_DOMAIN_ID, else 0
+    discovery: str | None = None  # None: ROS_AUTOMATIC_DISCOVERY_RANGE, else localhost
+
+    def __post_init__(self) -> None:
+        if self.transport not in (DDS, RCLPY):
+            raise ConfigError("transport", self.transport, f"{DDS} or {RCLPY}")
+        if self.domain_id is not None and not _is_domain(self.domain_id):
+            raise ConfigError("domain_id", self.domain_id, f"null or 0 to {_DOMAIN_MAX}")
+        if self.discovery not in (None, LOCALHOST, SUBNET):
+            raise ConfigError("discovery", self.discovery, f"null, {LOCALHOST} or {SUBNET}")
+
+    def domain(self) -> int:
+        """Return the domain's number; raises ConfigError where ROS_DOMAIN_ID is none."""
+        if self.domain_id is not None:
+            return self.domain_id
+        text = os.environ.get("ROS_DOMAIN_ID") or "0"
+        if not text.isdecimal() or not _is_domain(int(text)):
+            raise ConfigError("ROS_DOMAIN_ID", text, f"0 to {_DOMAIN_MAX}")
+        return int(text)
+
+    def reach(self) -> str:
+        """Return `localhost` or `subnet`; this machine alone where nobody asks for more."""
+        if self.discovery is not None:
+            return self.discovery
+        text = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", LOCALHOST).lower()
+        return SUBNET if text == SUBNET else LOCALHOST
+
+
+def open_transport(network: Network) -> Transport:
+    """Join the domain.
+
+    Raises ConfigError where the library is missing or the domain cannot be joined.
+    """
+    try:
+        if network.transport == RCLPY:
+            from sceneslam.ros.transport.rclpy_node import RclpyTransport
+
+            return RclpyTransport(network)
+        from sceneslam.ros.transport.dds import DdsTransport
+
+        return DdsTransport(network)
+    except ImportError as error:
+        installs = "pip install 'sceneslam[ros2]' for dds; a ROS of this Python for rclpy"
+        allowed = f"{DDS} | {RCLPY}, installed ({told(error)}; {installs})"
+        raise ConfigError("transport", network.transport, allowed) from error
+
+
+def _is_domain(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= _DOMAIN_MAX
