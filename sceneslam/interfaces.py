@@ -56,6 +56,36 @@ class Source(Protocol):
         ...
 
 
+class LiveFeed(Protocol):
+    """What a live run asks of a source that measures now; may be asked from any thread."""
+
+    def measured_ns(self, observation: Observation) -> int:
+        """Return when an observation was measured, by this machine's monotonic clock [ns]."""
+        ...
+
+    def notices(self) -> Sequence[Event]:
+        """Return what happened to the input since the last call, oldest first.
+
+        Such as `clock_jump` (`shift_ns`: from here on added to the robot's stamps, so that they
+        rise), `stream_silent`, `stream_returned`, `late`, `unordered`.
+        """
+        ...
+
+    def close(self) -> None:
+        """End the iteration, wherever it waits, and free what it took. May be called twice."""
+        ...
+
+
+@runtime_checkable
+class Live(Protocol):
+    """A source that may measure now: a robot, a camera."""
+
+    @property
+    def live(self) -> LiveFeed | None:
+        """Return the feed, None where what the source gives is recorded."""
+        ...
+
+
 @runtime_checkable
 class Detector(Protocol):
     """Names the scene around the robot."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
 from time import perf_counter
@@ -16,9 +16,9 @@ from tqdm import tqdm
 
 from sceneslam.bus.bus import Bus
 from sceneslam.bus.handover_log import log_uncertainty
-from sceneslam.bus.live import run_live
 from sceneslam.config.build import Parts
-from sceneslam.interfaces import ResultSink, Sink
+from sceneslam.engine.live import LiveTally, run_live
+from sceneslam.interfaces import Live, LiveFeed, ResultSink, Sink
 from sceneslam.keeping import Keeping
 from sceneslam.results import Results
 from sceneslam.sources.survey.preflight import preflight
@@ -28,7 +28,7 @@ from sceneslam.types.errors import InputError, told
 from sceneslam.types.maps import HybridMap, PointLayer
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Sensor
-from sceneslam.types.run import RunResult, Timings
+from sceneslam.types.run import Event, RunResult, Timings
 from sceneslam.types.truth import GroundTruth
 
 _BAR_S = 0.5  # between two updates of the progress bar
@@ -53,7 +53,7 @@ class Loop:
         self._log = self._keeping.events
         self._events_written = 0
         self._observed_ns: list[int] = []
-        self._dropped = 0
+        self._live = LiveTally()
         self._covariances = np.zeros((0, 6, 6))
         self._began_s, self._wall_s = perf_counter(), 0.0
         self._bus = Bus(
@@ -138,12 +138,14 @@ class Loop:
             map=self._fused(),
             events=self._log.events,
             missing=self._tally.missing,
-            dropped=self._dropped,
+            dropped=self._live.dropped,
+            dropped_images=self._live.dropped_images,
             timings=Timings(
                 detector_us=np.array(bus.detector_us),
                 bus_us=np.array(bus.bus_us),
                 module_ms={key: np.array(runner.track_ms) for key, runner in bus.runners.items()},
                 wall_s=self._wall_s,
+                latency_ms=np.array(self._live.latencies_ms),
             ),
         )
 
@@ -175,19 +177,41 @@ class Loop:
             self._say("\n".join([*checked.lines, *(f"warning: {one}" for one in checked.warnings)]))
 
     def _feed(self) -> None:
-        observations = islice(self._parts.source, self._parts.run.max_observations)
+        source = self._parts.source
+        observations = islice(source, self._parts.run.max_observations)
+        if isinstance(source, Live) and source.live is not None:
+            with self._progress() as self._bar:
+                self._run_live(observations, source.live)
+            return
         first = next(observations, None)  # a simulator renders, a bag is indexed: not our time
         if first is None:
             return
         self._began_s = perf_counter()
         with self._progress() as self._bar:
             if self._parts.run.mode == "live":
-                self._dropped = run_live(chain([first], observations), self._step)
-                self._log.add("dropped", self._last_ns(), count=self._dropped)
+                self._run_live(chain([first], observations), None)
                 return
             for observation in chain([first], observations):
                 if not self._step(observation):
                     return
+
+    def _run_live(self, observations: Iterator[Observation], feed: LiveFeed | None) -> None:
+        self._live = run_live(
+            observations,
+            self._step,
+            self._note,
+            settings=self._parts.run.live,
+            feed=feed,
+        )
+        images = self._live.dropped_images
+        self._log.add("dropped", self._last_ns(), count=self._live.dropped, images=images)
+
+    def _note(self, event: Event) -> None:
+        """Take what happened to the input of a live run."""
+        fields = {key: value for key, value in event.items() if key not in ("event", "stamp_ns")}
+        self._log.add(event["event"], event["stamp_ns"], **fields)
+        if event["event"] == "given_up":
+            self.faults.append(f"the source was silent for {event['for_s']:g} s")
 
     def _progress(self) -> Any:
         limits = [self._parts.run.max_observations, self._parts.source.length]

@@ -19,6 +19,7 @@ ALLOWED = {  # package -> what of ours it may import
     "sceneslam/testing": {"types", "interfaces", "testing"},
     "sceneslam/supervision": {"types", "interfaces", "supervision"},
     "sceneslam/storage": {"types", "interfaces", "storage"},
+    "sceneslam/engine": {"types", "interfaces", "engine"},
     "sceneslam/bus": {"types", "interfaces", "motion", "bus"},
     "sceneslam/evaluation": {"types", "interfaces", "evaluation"},
     "sceneslam/scenes": {"types", "interfaces", "config", "scenes"},

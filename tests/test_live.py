@@ -1,4 +1,4 @@
-"""Live mode: paced, newest observation first, every loss counted."""
+"""Live mode: paced, the newest of every sensor first, every loss counted, silence named."""
 
 import threading
 from time import monotonic
@@ -6,21 +6,70 @@ from time import monotonic
 import numpy as np
 import pytest
 
-from sceneslam.bus.live import Mailbox, run_live
-from sceneslam.types.observation import Observation
+from sceneslam.engine.live import LiveSettings, run_live
+from sceneslam.engine.mailbox import Mailbox, Waited
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.observation import LaserScan, Observation
+
+IMAGE = np.zeros((2, 2, 3), np.uint8)
+AT_ONCE = LiveSettings(rate=100.0)
+GYRO = np.array([[-0.01, 0.0, 0.0, 1.0]])
 
 
-def observations(count, period_ns):
+def observations(count, period_ns, **fields):
     for index in range(count):
-        yield Observation(stamp_ns=index * period_ns)
+        yield Observation(stamp_ns=index * period_ns, **fields)
 
 
-def test_observations_come_at_the_pace_of_their_stamps():
+def scan(stamp_ns):
+    return LaserScan(
+        stamp_ns=stamp_ns,
+        ranges_m=np.ones(3, np.float32),
+        angle_min_rad=0.0,
+        angle_step_rad=0.1,
+        range_min_m=0.1,
+        range_max_m=10.0,
+    )
+
+
+class Run:
+    """What was taken, and what was noted of the input."""
+
+    def __init__(self, source, *, settings=AT_ONCE, step=None, feed=None):
+        self.taken, self.events = [], []
+        self.tally = run_live(
+            iter(source), step or self.take, self.events.append, settings=settings, feed=feed
+        )
+
+    def take(self, observation):
+        self.taken.append(observation)
+        return True
+
+
+class Feed:
+    """Measured a second before it came; closing it ends the source."""
+
+    def __init__(self):
+        self.noticed, self.is_closed = [], threading.Event()
+
+    def measured_ns(self, observation):
+        return 0
+
+    def notices(self):
+        told, self.noticed = self.noticed, []
+        return told
+
+    def close(self):
+        self.is_closed.set()
+
+
+@pytest.mark.parametrize(("rate", "least_s"), [(1.0, 0.1), (2.0, 0.05)])
+def test_observations_come_at_the_pace_of_their_stamps(rate, least_s):
     began_s = monotonic()
-    taken = []
-    dropped = run_live(observations(6, 20_000_000), lambda o: taken.append(o.stamp_ns) or True)
-    assert monotonic() - began_s >= 0.1
-    assert len(taken) + dropped == 6
+    run = Run(observations(6, 20_000_000), settings=LiveSettings(rate=rate))
+    assert monotonic() - began_s >= least_s
+    assert len(run.taken) + run.tally.dropped == 6
+    assert len(run.tally.latencies_ms) == len(run.taken) and min(run.tally.latencies_ms) >= 0.0
 
 
 def test_slow_step_gets_the_newest_and_the_rest_are_counted():
@@ -32,11 +81,12 @@ def test_slow_step_gets_the_newest_and_the_rest_are_counted():
         return True
 
     def feed():
-        yield from observations(50, 1)
+        yield from observations(50, 1, image_bgr=IMAGE)
         gate.set()
 
-    dropped = run_live(feed(), slow_step)
-    assert taken[-1] == 49 and len(taken) + dropped == 50 and dropped > 0
+    tally = Run(feed(), step=slow_step).tally
+    assert taken[-1] == 49 and len(taken) + tally.dropped == 50 and tally.dropped > 0
+    assert tally.dropped_images == tally.dropped
 
 
 def test_step_runs_in_its_own_thread_and_its_error_is_raised():
@@ -44,25 +94,126 @@ def test_step_runs_in_its_own_thread_and_its_error_is_raised():
         raise ValueError(threading.current_thread().name)
 
     with pytest.raises(ValueError, match="bus"):
-        run_live(observations(5, 1), step)
+        Run(observations(5, 1), step=step)
 
 
-def test_step_can_end_the_run():
+def test_error_of_the_source_is_raised_after_what_came_before_it():
     taken = []
 
-    def step(observation):
-        taken.append(observation.stamp_ns)
-        return False
+    def broken():
+        yield from observations(1, 1)
+        raise ValueError(threading.current_thread().name)
 
-    run_live(observations(1000, 1_000_000), step)
+    with pytest.raises(ValueError, match="source"):
+        Run(broken(), step=lambda o: taken.append(o) or True)
     assert len(taken) == 1
 
 
-def test_gyro_of_a_dropped_observation_is_kept():
+def test_step_can_end_the_run_while_the_source_is_silent():
+    """A driver that hangs does not hold the end of the run."""
+    feed = Feed()
+
+    def hangs():
+        yield Observation(stamp_ns=0)
+        feed.is_closed.wait(60.0)
+
+    began_s = monotonic()
+    Run(hangs(), step=lambda o: False, feed=feed)
+    assert feed.is_closed.is_set() and monotonic() - began_s < 2.0
+
+
+def test_silent_source_is_named_and_named_again_when_it_is_back():
+    feed, gate = Feed(), threading.Event()
+
+    def pauses():
+        yield Observation(stamp_ns=5)
+        gate.wait(5.0)
+        yield Observation(stamp_ns=7)
+
+    settings = LiveSettings(silent_after_s=0.05)
+    events = []
+
+    def note(event):
+        events.append(event)
+        gate.set()  # once it is told silent
+
+    run_live(iter(pauses()), lambda o: True, note, settings=settings, feed=feed)
+    assert events == [
+        {"event": "silent", "stamp_ns": 5, "for_s": 0.05},
+        {"event": "returned", "stamp_ns": 7},
+    ]
+
+
+def test_source_that_stays_silent_ends_the_run_where_that_is_wanted():
+    feed = Feed()
+
+    def ends():
+        yield Observation(stamp_ns=0)
+        feed.is_closed.wait(60.0)
+
+    run = Run(ends(), settings=LiveSettings(silent_after_s=0.05, end_after_s=0.1), feed=feed)
+    assert [event["event"] for event in run.events] == ["silent", "given_up"]
+
+
+def test_what_the_feed_tells_is_noted_before_the_observation_after_it():
+    feed, order = Feed(), []
+
+    def jumps():
+        feed.noticed = [{"event": "clock_jump", "stamp_ns": 1}]
+        yield Observation(stamp_ns=1)
+
+    run_live(
+        jumps(),
+        lambda o: order.append("step") or True,
+        lambda event: order.append(event["event"]),
+        settings=AT_ONCE,
+        feed=feed,
+    )
+    assert order == ["clock_jump", "step"]
+
+
+def test_samples_and_scan_of_a_dropped_observation_are_kept():
     mailbox = Mailbox()
-    sample = np.array([[-0.01, 0.0, 0.0, 1.0]])
-    mailbox.put(Observation(stamp_ns=0, gyro_base=sample))
-    mailbox.put(Observation(stamp_ns=100_000_000, gyro_base=sample))
-    merged = mailbox.take().gyro_base
-    np.testing.assert_allclose(merged[:, 0], [-0.11, -0.01])
-    assert mailbox.dropped == 1
+    mailbox.put(Observation(stamp_ns=0, gyro_base=GYRO, scan=scan(0), image_bgr=IMAGE))
+    mailbox.put(Observation(stamp_ns=100_000_000, gyro_base=GYRO, image_bgr=IMAGE))
+    merged = mailbox.take()
+    np.testing.assert_allclose(merged.gyro_base[:, 0], [-0.11, -0.01])
+    assert merged.scan.stamp_ns == 0 and merged.stamp_ns == 100_000_000
+    assert (mailbox.dropped, mailbox.dropped_images) == (1, 1)
+
+
+def test_every_third_image_still_brings_every_scan():
+    """Images at 30 Hz, scans at 10 Hz, between the images that are taken."""
+    mailbox, scans = Mailbox(), 0
+    for index in range(90):
+        stamp_ns = index * 33_333_333
+        held = scan(stamp_ns - 10_000_000) if index % 3 == 1 else None
+        mailbox.put(Observation(stamp_ns=stamp_ns, image_bgr=IMAGE, scan=held))
+        if index % 3 == 0:
+            scans += mailbox.take().scan is not None
+    assert scans == 29
+
+
+def test_image_is_not_replaced_by_an_observation_without_one():
+    mailbox = Mailbox()
+    mailbox.put(Observation(stamp_ns=0, image_bgr=IMAGE))
+    mailbox.put(Observation(stamp_ns=1, scan=scan(1)))
+    mailbox.put(Observation(stamp_ns=2, scan=scan(2)))
+    assert [mailbox.take().stamp_ns for _ in range(2)] == [0, 2]
+    assert mailbox.dropped == 1 and mailbox.take(0.0) is Waited.SILENCE
+    mailbox.close()
+    assert mailbox.take() is Waited.END
+
+
+@pytest.mark.parametrize(
+    ("words", "key"),
+    [
+        ({"rate": 0.0}, "rate"),
+        ({"silent_after_s": 0.0}, "silent_after_s"),
+        ({"silent_after_s": float("nan")}, "silent_after_s"),
+        ({"end_after_s": 0.5}, "end_after_s"),
+    ],
+)
+def test_impossible_times_are_refused(words, key):
+    with pytest.raises(ConfigError, match=key):
+        LiveSettings(**words)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
+from sceneslam.engine.live import LiveSettings
 from sceneslam.supervision.limits import Limits
 from sceneslam.types.errors import ConfigError
 
@@ -30,6 +32,9 @@ class RunSettings:
     progress: bool  # show a progress bar
     report: bool  # draw figures and write report.html
     max_observations: int | None  # stop after so many, null: all
+    rate: float  # live, of a recording: so many times as fast as it was recorded
+    silent_after_s: float  # live: the events name a source that gave nothing for so long ...
+    end_after_s: float | None  # ... and the run ends after so long; null: never
     catch_up_steps: int | None  # remembered observations per new one, at a hand-over; null: all
 
     def __post_init__(self) -> None:
@@ -39,7 +44,7 @@ class RunSettings:
             raise ConfigError("isolation", self.isolation, " | ".join(ISOLATIONS))
         if not 1 <= self.threads <= _MOST_THREADS:
             raise ConfigError("threads", self.threads, f"1 to {_MOST_THREADS}")
-        _ = self.limits  # checks them
+        _ = self.limits, self.live  # checks them
         for name in ("max_observations", "catch_up_steps"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -50,5 +55,12 @@ class RunSettings:
     @property
     def limits(self) -> Limits:
         """Return the limits of a module's process; raises ConfigError where one makes no sense."""
-        names = (field.name for field in fields(Limits))
-        return Limits(**{name: getattr(self, name) for name in names})
+        return Limits(**self._part(Limits))
+
+    @property
+    def live(self) -> LiveSettings:
+        """Return how time passes in a live run; raises ConfigError where that makes no sense."""
+        return LiveSettings(**self._part(LiveSettings))
+
+    def _part(self, settings: type[Limits] | type[LiveSettings]) -> dict[str, Any]:
+        return {one.name: getattr(self, one.name) for one in fields(settings)}

@@ -137,6 +137,7 @@ def _extent(result: RunResult) -> Metrics:
     return {
         "observations": len(observed_ns),
         "dropped": result.dropped,
+        "dropped_images": result.dropped_images,
         "poses": len(result.trajectory),
         "start_ns": int(observed_ns[0]) if len(observed_ns) else None,
         "duration_s": duration_s,
@@ -149,6 +150,7 @@ def _costs(result: RunResult) -> Metrics:
     return {
         "bus_overhead_us": _median_p95(result.timings.bus_us),
         "detector_us": _median_p95(result.timings.detector_us),
+        "latency_ms": _percentiles(result.timings.latency_ms, p50=50, p99=99),
     }
 
 
@@ -167,9 +169,16 @@ def _per_module(result: RunResult) -> Metrics:
 
 
 def _median_p95(values: NDArray[np.float64]) -> Metrics:
-    if not len(values):
-        return {"median": None, "p95": None}
-    return {"median": float(np.median(values)), "p95": float(np.percentile(values, 95))}
+    return _percentiles(values, median=50, p95=95)
+
+
+def _percentiles(values: NDArray[np.float64], **percents: float) -> Metrics:
+    """Return the percentiles under their names; None of nothing."""
+    known = len(values) > 0
+    return {
+        name: float(np.percentile(values, percent)) if known else None
+        for name, percent in percents.items()
+    }
 
 
 def _notes(result: RunResult, truth: GroundTruth | None, settings: EvaluationSettings) -> list[str]:

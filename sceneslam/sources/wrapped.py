@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sceneslam.interfaces import Source
+from sceneslam.interfaces import Live, LiveFeed, Source
 from sceneslam.sources.spanned import Span, Spanned
 from sceneslam.sources.survey.survey import Survey, Surveyed
 from sceneslam.types.rig import Rig
 
 
 class Wrapped:
-    """Passes on the rig, length, faults and span of its source."""
+    """Passes on the rig, length, faults, feed and span of its source."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
@@ -30,6 +30,11 @@ class Wrapped:
     def faults(self) -> Sequence[str]:
         """Return the source's faults."""
         return self._source.faults
+
+    @property
+    def live(self) -> LiveFeed | None:
+        """Return the source's feed where it measures now."""
+        return self._source.live if isinstance(self._source, Live) else None
 
     @property
     def span(self) -> Span | None:

@@ -48,6 +48,9 @@ class Timings:
     bus_us: NDArray[np.float64]  # per observation, all but detector and module
     module_ms: Mapping[str, NDArray[np.float64]]  # per observation that the module tracked
     wall_s: float  # the whole loop, reading included
+    latency_ms: NDArray[np.float64] = field(
+        default_factory=lambda: np.zeros(0)
+    )  # live: stamp to pose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,4 +67,5 @@ class RunResult:
     events: Sequence[Event]
     timings: Timings
     missing: Mapping[int, str] = field(default_factory=dict)  # stamp -> what the module lacked
-    dropped: int = 0  # observations that live mode did not take
+    dropped: int = 0  # observations that live mode did not take ...
+    dropped_images: int = 0  # ... and those of them that held an image

@@ -151,7 +151,7 @@ class DdsTransport:
         return {writer.key for writer in self._writers.values()}
 
 
-class _Bytes(IdlStruct):  # type: ignore[misc]
+class _Bytes(IdlStruct):
     """A message as the bytes that it is sent as."""
 
     def __init__(self, cdr: bytes) -> None:

@@ -1,0 +1,159 @@
+"""A run at the pace of the clock: the source and the bus in a thread each, a mailbox between."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from time import monotonic_ns
+
+from sceneslam.engine.mailbox import Mailbox, Waited
+from sceneslam.interfaces import LiveFeed
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.observation import Observation
+from sceneslam.types.run import Event
+
+_LOOK_S = 0.2  # how late Ctrl-C may be noticed
+_LEAVE_S = 2.0  # a source that does not end by then is left to itself
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveSettings:
+    """How time passes in a live run; seconds of the wall clock."""
+
+    rate: float = 1.0  # of a recording: twice as fast by 2
+    silent_after_s: float = 1.0  # without an observation, the events say that the source is silent
+    end_after_s: float | None = None  # of silence the run ends; None: never
+
+    def __post_init__(self) -> None:
+        if not 0.01 <= self.rate <= 100:
+            raise ConfigError("rate", self.rate, "0.01 to 100")
+        if not 0 < self.silent_after_s < float("inf"):
+            raise ConfigError("silent_after_s", self.silent_after_s, "a number above 0 [s]")
+        if self.end_after_s is not None and not self.end_after_s >= self.silent_after_s:
+            allowed = f"null, or no less than silent_after_s ({self.silent_after_s:g}) [s]"
+            raise ConfigError("end_after_s", self.end_after_s, allowed)
+
+
+@dataclass(slots=True, kw_only=True)
+class LiveTally:
+    """What a live run cost its input."""
+
+    dropped: int = 0  # observations, for newer ones had come
+    dropped_images: int = 0  # those of them that held an image
+    latencies_ms: list[float] = field(default_factory=list)  # stamp to pose, of each that was taken
+
+
+def run_live(
+    observations: Iterator[Observation],
+    step: Callable[[Observation], bool],
+    note: Callable[[Event], None],
+    *,
+    settings: LiveSettings,
+    feed: LiveFeed | None = None,
+) -> LiveTally:
+    """Run `step` on the observations as they come until it returns False; return what it cost.
+
+    Without a `feed` they are a recording's and paced by their stamps. `note` takes what happens to
+    the input: `silent`, `returned`, and what the feed tells. Both run in the thread `bus`, the
+    source in another. What they raise is raised here; Ctrl-C ends both.
+    """
+    run = _LiveRun(observations, step, note, settings=settings, feed=feed)
+    return run.carry_out()
+
+
+class _LiveRun:
+    def __init__(
+        self,
+        observations: Iterator[Observation],
+        step: Callable[[Observation], bool],
+        note: Callable[[Event], None],
+        *,
+        settings: LiveSettings,
+        feed: LiveFeed | None,
+    ) -> None:
+        self._observations, self._step, self._note = observations, step, note
+        self._settings, self._feed = settings, feed
+        self._mailbox, self._is_over = Mailbox(), threading.Event()
+        self._tally, self._errors = LiveTally(), list[BaseException]()
+        self._lag_ns: int | None = None  # clock - stamp / rate, of the first observation
+        self._last_ns = 0
+
+    def carry_out(self) -> LiveTally:
+        source = threading.Thread(target=self._guard, args=(self._read,), name="source")
+        source.daemon = True  # a driver that hangs does not hold the program
+        bus = threading.Thread(target=self._guard, args=(self._work,), name="bus")
+        source.start()
+        bus.start()
+        try:
+            while bus.is_alive():
+                bus.join(_LOOK_S)
+        finally:
+            self._is_over.set()
+            self._mailbox.close(is_emptied=True)
+            bus.join()
+            if self._feed is not None:
+                self._feed.close()
+            source.join(_LEAVE_S)
+        if self._errors:
+            raise self._errors[0]
+        self._tally.dropped = self._mailbox.dropped
+        self._tally.dropped_images = self._mailbox.dropped_images
+        return self._tally
+
+    def _guard(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except BaseException as error:
+            self._errors.append(error)
+        finally:
+            self._mailbox.close()
+
+    def _read(self) -> None:
+        """Put every observation into the mailbox when its time has come."""
+        for observation in self._observations:
+            wait_s = 0.0 if self._feed else (self._due_ns(observation) - monotonic_ns()) / 1e9
+            if self._is_over.wait(max(wait_s, 0.0)):
+                return
+            self._mailbox.put(observation)
+
+    def _work(self) -> None:
+        """Lead what comes through the bus."""
+        silent_s, settings = 0.0, self._settings
+        while True:
+            taken = self._mailbox.take(settings.silent_after_s)
+            self._tell_notices()
+            if taken is Waited.END:
+                break
+            if taken is Waited.SILENCE:
+                if not silent_s:
+                    self._tell("silent", for_s=settings.silent_after_s)
+                silent_s += settings.silent_after_s
+                if settings.end_after_s is not None and silent_s >= settings.end_after_s:
+                    self._tell("given_up", for_s=silent_s)
+                    break
+                continue
+            assert isinstance(taken, Observation)
+            self._last_ns = taken.stamp_ns
+            if silent_s:
+                self._tell("returned")
+                silent_s = 0.0
+            if not self._step(taken):
+                break
+            measured_ns = self._feed.measured_ns(taken) if self._feed else self._due_ns(taken)
+            self._tally.latencies_ms.append((monotonic_ns() - measured_ns) / 1e6)
+        self._is_over.set()
+
+    def _due_ns(self, observation: Observation) -> int:
+        """Return when a recorded observation is due, on this machine's monotonic clock."""
+        elapsed_ns = round(observation.stamp_ns / self._settings.rate)
+        if self._lag_ns is None:
+            self._lag_ns = monotonic_ns() - elapsed_ns
+        return elapsed_ns + self._lag_ns
+
+    def _tell_notices(self) -> None:
+        for notice in self._feed.notices() if self._feed else ():
+            self._note(notice)
+
+    def _tell(self, event: str, **fields: object) -> None:
+        self._note({"event": event, "stamp_ns": self._last_ns, **fields})
