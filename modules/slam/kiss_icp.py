@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sceneslam.motion.predictor import Prediction, Predictor
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers, PointLayer
@@ -27,11 +28,8 @@ _COAST_S = 0.5  # without a good cloud for longer, a guessed pose is no pose
 _DEPTH_VOXEL_M = 0.1
 _POSITIVE = (
     "voxel_m initial_threshold_m motion_min_m points_per_voxel iterations_max "
-    "depth_range_max_m depth_stride_px noise_m noise_rad odometry_noise_ratio "
-    "speed_max_m_s turn_max_rad_s"
+    "depth_range_max_m depth_stride_px noise_m noise_rad speed_max_m_s turn_max_rad_s"
 )
-_STEP_DEVIATION = np.array([2e-4, 2e-4])  # m, rad: floor of odometry's per step
-_JERKED = np.array([3.0, 3.0])  # m/s^2, rad/s^2: how fast an unmeasured velocity changes
 _DIFFUSE = 1e6  # variances of a cloud: a prediction that ICP alone decides against
 
 
@@ -49,7 +47,6 @@ class KissIcp:
     deskew: bool
     noise_m: float | None
     noise_rad: float
-    odometry_noise_ratio: float
     overlap_min_ratio: float
     weak_ratio: float
     speed_max_m_s: float | None
@@ -58,6 +55,7 @@ class KissIcp:
     _icp: IcpMap | None = field(default=None, init=False)
     _T_map_local: se3.Transform = field(default_factory=se3.identity, init=False)
     _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
+    _predictor: Predictor = field(init=False)
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -94,14 +92,9 @@ class KissIcp:
         self._speed_max_m_s = self.speed_max_m_s or 0.5 * range_max_m
         noise = np.array([self.noise_m or 0.2 * voxel_m, self.noise_rad]) ** 2
         self._noise = np.repeat(noise, 3)  # variances of a registration
-        self._covariance = 1e-8 * np.eye(6)  # of the pose in base, beside the map around
+        self._predictor = Predictor(rig)
         self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
-        self._T_local_held = se3.identity()  # by the latest good cloud
-        self._held_ns: int | None = None
-        self._twist_s = np.zeros(6)  # base's motion per second
-        self._stamp_ns: int | None = None
-        self._T_odom_prev: se3.Transform | None = None
-        self._is_measured = True  # all motion since the latest good cloud is odometry's
+        self._has_map = False
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
         """Place `local` in the map."""
@@ -114,24 +107,24 @@ class KissIcp:
         """Return T_local_base at the observation."""
         if self._reader is None or self._icp is None:
             raise RuntimeError("track() before activate()")
-        T_local_guess = se3.orthonormal(self._T_local_base @ self._predict(observation))
-        twist_s = self._twist_s if self.deskew else np.zeros(6)
+        prediction = self._predictor.predict(observation)
+        twist_s = self._predictor.model.velocity if self.deskew else np.zeros(6)
         cloud = self._reader.read_unswept(observation, twist_s)
         if cloud is None:
-            return self._bridge(observation, T_local_guess, can_coast=True)
+            return self._bridge(observation, prediction, can_coast=True)
         if len(cloud) < _POINTS_MIN:
-            return self._bridge(observation, T_local_guess, can_coast=False)
-        T_local_base = self._icp.register(cloud, T_local_guess)
-        overlap_ratio, inliers = self._icp.overlap(T_local_base)
-        if self._held_ns is not None and not (
+            return self._bridge(observation, prediction, can_coast=False)
+        T_local_icp = self._icp.register(cloud, prediction.T_local_base)
+        overlap_ratio, inliers = self._icp.overlap(T_local_icp)
+        if self._has_map and not (
             overlap_ratio >= self.overlap_min_ratio
-            and self._is_plausible(observation.stamp_ns, T_local_guess, T_local_base)
+            and self._is_plausible(observation, prediction, T_local_icp)
         ):
-            return self._bridge(observation, T_local_guess, can_coast=False)
+            return self._bridge(observation, prediction, can_coast=False)
         shape = self._icp.localizability()
-        T_local_base = self._fuse(T_local_guess, T_local_base, shape)
-        self._icp.accept(T_local_guess, T_local_base)
-        self._hold(observation.stamp_ns, T_local_base)
+        self._T_local_base = self._fuse(observation, prediction, T_local_icp, shape)
+        self._icp.accept(prediction.T_local_base, self._T_local_base)
+        self._has_map = True
         is_open = shape.ratios[0] < self.weak_ratio
         status = TrackingStatus.DEGRADED if is_open else TrackingStatus.TRACKING
         return self._answer(observation, status, overlap_ratio, inliers)
@@ -154,87 +147,62 @@ class KissIcp:
         """Free the ray table; the map stays."""
         self._reader = None
 
-    def _predict(self, observation: Observation) -> se3.Transform:
-        """Return the motion since the last observation: odometry's, else on as before."""
-        before_ns, T_odom_prev = self._stamp_ns, self._T_odom_prev
-        T_odom_base = observation.T_odom_base
-        if T_odom_base is not None and not np.isfinite(T_odom_base).all():
-            T_odom_base = None
-        self._stamp_ns, self._T_odom_prev = observation.stamp_ns, T_odom_base
-        if before_ns is None:
-            self._is_measured = T_odom_base is not None
-            return se3.identity()
-        if T_odom_base is not None and T_odom_prev is not None:
-            T_prev_curr = se3.inverse(T_odom_prev) @ T_odom_base
-            moved = float(np.linalg.norm(T_prev_curr[:3, 3]))
-            # A wheel's error per metre turns as many radians.
-            turned = float(se3.rotation_angle_rad(T_prev_curr)) + moved
-            deviation = self.odometry_noise_ratio * np.array([moved, turned]) + _STEP_DEVIATION
-        else:
-            gap_s = (observation.stamp_ns - before_ns) * 1e-9
-            self._is_measured = False
-            T_prev_curr = se3.exp(self._twist_s * gap_s)
-            deviation = 0.5 * _JERKED * gap_s**2 + _STEP_DEVIATION
-        carry = se3.adjoint(se3.inverse(T_prev_curr))
-        grown = np.diag(np.repeat(deviation**2, 3))
-        self._covariance = carry @ self._covariance @ carry.T + grown
-        return T_prev_curr
-
     def _fuse(
-        self, T_local_guess: se3.Transform, T_local_icp: se3.Transform, shape: Localizability
+        self,
+        observation: Observation,
+        prediction: Prediction,
+        T_local_icp: se3.Transform,
+        shape: Localizability,
     ) -> se3.Transform:
-        """Return the pose between odometry's and ICP's, by the doubt in each.
+        """Return the pose between odometry's and ICP's, by the covariance of each.
 
         Point-to-point registration drags along smooth planes. Without odometry its answer stands,
         but for the directions that the cloud's shape leaves open: there the prediction does.
         """
-        held, predicted = shape.held(self.weak_ratio), self._covariance
+        held = shape.held(self.weak_ratio)
         information = held.T @ np.diag(1.0 / self._noise) @ held
-        fused = np.linalg.inv(np.linalg.inv(predicted) + information)
-        self._covariance = np.asarray(fused, np.float64)
-        if self._held_ns is None:
+        covariance = np.linalg.inv(np.linalg.inv(prediction.covariance) + information)
+        if not self._has_map:
+            self._predictor.measure(observation, T_local_icp, covariance)
             return T_local_icp
-        if not self._is_measured:
-            predicted = _DIFFUSE * np.diag(self._noise)
+        is_known = prediction.is_measured
+        predicted = prediction.covariance if is_known else _DIFFUSE * np.diag(self._noise)
         gain = np.linalg.solve(np.linalg.inv(predicted) + information, information)
-        off = se3.log(se3.inverse(T_local_guess) @ T_local_icp)
-        return np.asarray(T_local_guess @ se3.exp(gain @ off))
+        off = se3.log(se3.inverse(prediction.T_local_base) @ T_local_icp)
+        T_local_base = np.asarray(prediction.T_local_base @ se3.exp(gain @ off))
+        self._predictor.measure(observation, T_local_base, covariance, information)
+        return T_local_base
 
     def _is_plausible(
-        self, stamp_ns: int, T_local_guess: se3.Transform, T_local_base: se3.Transform
+        self, observation: Observation, prediction: Prediction, T_local_icp: se3.Transform
     ) -> bool:
         """Tell whether a robot can have moved so, in the time since the last good cloud."""
-        if not np.isfinite(T_local_base).all():
+        if not np.isfinite(T_local_icp).all():
             return False
         # Of a motion that odometry knows, the difference has to be small.
-        T_before = T_local_guess if self._is_measured else self._T_local_held
-        moved = se3.inverse(T_before) @ T_local_base
-        share = 0.2 if self._is_measured else 1.0
-        duration_s = max((stamp_ns - (self._held_ns or 0)) * 1e-9, 0.02)
+        is_known = prediction.is_measured
+        T_before = prediction.T_local_base if is_known else self._predictor.T_local_measured
+        moved = se3.inverse(T_before) @ T_local_icp
+        share = 0.2 if is_known else 1.0
+        duration_s = max(self._predictor.unmeasured_s(observation), 0.02)
         return bool(
             np.linalg.norm(moved[:3, 3]) <= share * self._speed_max_m_s * duration_s + 0.05
             and se3.rotation_angle_rad(moved) <= share * self.turn_max_rad_s * duration_s + 0.05
         )
 
-    def _hold(self, stamp_ns: int, T_local_base: se3.Transform) -> None:
-        if self._held_ns is not None and stamp_ns > self._held_ns:
-            duration_s = (stamp_ns - self._held_ns) * 1e-9
-            self._twist_s = se3.log(se3.inverse(self._T_local_held) @ T_local_base) / duration_s
-        self._T_local_base = self._T_local_held = T_local_base
-        self._held_ns, self._is_measured = stamp_ns, True
-
     def _bridge(
-        self, observation: Observation, T_local_guess: se3.Transform, *, can_coast: bool
+        self, observation: Observation, prediction: Prediction, *, can_coast: bool
     ) -> Tracking:
         """Go on without a cloud: by odometry, for a moment as before, else not at all."""
-        if self._is_measured:
-            self._T_local_base = T_local_guess
-            return self._answer(observation, TrackingStatus.DEGRADED, 0.0, 0)
-        since_ns = observation.stamp_ns - (self._held_ns or 0)
-        if can_coast and self._held_ns is not None and since_ns <= _COAST_S * 1e9:
-            self._T_local_base = T_local_guess
-            return self._answer(observation, TrackingStatus.TRACKING, 0.0, 0)
-        self._T_local_base, self._twist_s = self._T_local_held, np.zeros(6)
+        is_brief = self._has_map and self._predictor.unmeasured_s(observation) <= _COAST_S
+        if prediction.is_measured or (can_coast and is_brief):
+            self._predictor.coast(prediction)
+            self._T_local_base = prediction.T_local_base
+            is_known = prediction.is_measured
+            status = TrackingStatus.DEGRADED if is_known else TrackingStatus.TRACKING
+            return self._answer(observation, status, 0.0, 0)
+        self._predictor.lose(prediction)
+        self._T_local_base = self._predictor.T_local_measured
         return self._answer(observation, TrackingStatus.LOST, 0.0, 0)
 
     def _answer(
@@ -244,7 +212,7 @@ class KissIcp:
             stamp_ns=observation.stamp_ns,
             T_local_base=self._T_local_base.copy(),
             status=status,
-            covariance=None if status is TrackingStatus.LOST else self._covariance.copy(),
+            covariance=None if status is TrackingStatus.LOST else self._predictor.covariance.copy(),
             quality_ratio=quality_ratio,
             inliers=inliers,
         )

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.motion.trust import LieDetector, NoiseRatio, log_likelihood
+from sceneslam.motion.trust import LieDetector, NoiseRatio, evidence_of_a_lie
 from sceneslam.motion.turn_errors import TurnErrors
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
@@ -61,6 +61,11 @@ class _Step:
     amounts: NDArray[np.float64]  # (2,): what its noise is a ratio of
     causes: NDArray[np.float64]  # (3,): metres, radians, seconds, of the turn's systematic error
 
+    @property
+    def moved(self) -> tuple[float, float]:
+        """Return the distance [m] and the turn [rad]."""
+        return float(np.linalg.norm(self.T[:3, 3])), float(se3.rotation_angle_rad(self.T))
+
     def then(self, step: _Step) -> _Step:
         """Return both in a row."""
         return _Step(
@@ -97,7 +102,7 @@ class MotionModel:
         self._turns = TurnErrors(rig.gyro.bias_radps)
         self._twist_s: NDArray[np.float64] | None = None  # motion per second, as last measured
         self._twist_variance = np.zeros(2)
-        self._unknown_s = 0.0  # for so long there is none
+        self._unmeasured_s = np.zeros(2)  # for so long nothing measured it: distance, turn
         self._stamp_ns: int | None = None
         self._T_odom_base: Transform | None = None  # the last there was ...
         self._silent_s = 0.0  # ... so long ago
@@ -190,11 +195,16 @@ class MotionModel:
             R = measured[axes, axes]
             if had_velocity:
                 unit = np.eye(len(R))
-                evidence = log_likelihood(
-                    off_guess[axes], (guess.variance + before)[channel] * unit + R
+                self._lies[channel].judge(
+                    evidence_of_a_lie(
+                        wheels=off[axes],
+                        guess=off_guess[axes],
+                        wheels_covariance=wheels.variance[channel] * unit,
+                        guess_covariance=(guess.variance + before)[channel] * unit,
+                        covariance=R,
+                        amount=max(wheels.moved[channel], guess.moved[channel]),
+                    )
                 )
-                evidence -= log_likelihood(off[axes], wheels.variance[channel] * unit + R)
-                self._lies[channel].judge(evidence)
             for missed, variance in zip(off[axes].tolist(), np.diag(R).tolist(), strict=True):
                 self._noise[channel].learn(
                     missed,
@@ -234,7 +244,8 @@ class MotionModel:
             twist_s = self._twist_s + np.clip(twist_s - self._twist_s, -reach, reach)
         self._twist_s = twist_s
         self._twist_variance = np.diag(covariance)[[0, 5]]
-        self._unknown_s = 0.0
+        is_measured = np.diag(gain).reshape(2, 3).min(axis=1) > 0.5
+        self._unmeasured_s = np.where(is_measured, 0.0, self._unmeasured_s)
 
     def _forget(self) -> None:
         """Begin anew to compare; odometry that is silent just now has to begin anew, too."""
@@ -283,17 +294,17 @@ class MotionModel:
 
     def _by_velocity(self, duration_s: float) -> _Step:
         """Return the motion if the base went on as it moved last."""
-        if self._twist_s is None:  # its deviation adds up, not its variance
-            before_s, self._unknown_s = self._unknown_s, self._unknown_s + duration_s
-            variance = _UNKNOWN**2 * (self._unknown_s**2 - before_s**2) + _STEP**2
-            return replace(_still(), variance=variance)
-        kept_s = min(duration_s, _KEPT_S)
-        deviation = _STEP + 0.5 * _ACCELERATION * kept_s * duration_s
-        return replace(
-            _still(),
-            T=se3.exp(self._twist_s * kept_s),
-            variance=deviation**2,
-        )
+        before_s, self._unmeasured_s = self._unmeasured_s, self._unmeasured_s + duration_s
+        variance = self._reach(self._unmeasured_s) ** 2 - self._reach(before_s) ** 2 + _STEP**2
+        T_prev_curr = se3.exp(self.velocity * min(duration_s, _KEPT_S))
+        return replace(_still(), T=T_prev_curr, variance=variance)
+
+    def _reach(self, unmeasured_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return by how much (2,) a guess is off after a while: deviations add up in a guess."""
+        reach = _UNKNOWN * unmeasured_s
+        if self._twist_s is None:
+            return reach
+        return np.minimum(reach, 0.5 * _ACCELERATION * unmeasured_s**2)
 
     def _compare(self, turn: NDArray[np.float64], wheels: _Step, duration_s: float) -> None:
         self._turns.compare(

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sceneslam.motion.predictor import Prediction, Predictor
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.maps import MapLayers, PointLayer
@@ -18,7 +19,6 @@ from ..surfaces.surface import Surface, SurfaceReader
 from .history import History
 from .keyframe_map import KeyframeMap
 from .localizer import Localizer
-from .motion import Motion, Prediction
 from .pose_graph import PoseGraph
 
 _SAMPLES_MIN = 100
@@ -34,7 +34,8 @@ class DepthSlam:
     weak_ratio: float
     cloud_voxel_m: float
     _T_map_local: se3.Transform = field(default_factory=se3.identity, init=False)
-    _motion: Motion = field(default_factory=Motion, init=False)
+    _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
+    _predictor: Predictor = field(init=False)
     _map: KeyframeMap = field(init=False)
 
     def __post_init__(self) -> None:
@@ -67,11 +68,9 @@ class DepthSlam:
             self._map, matched_min_ratio=self.matched_min_ratio, weak_ratio=self.weak_ratio
         )
         self._history = History(self._map)
-        self._motion = Motion()
-        self._T_map_local = se3.identity()
+        self._predictor = Predictor(rig)
+        self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
         self._reference, self._revision = 0, 0
-        self._seen_ns: int | None = None  # when depth last held the pose
-        self._is_lost = False
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
         """Place `local` in the map (Eq. 1)."""
@@ -82,7 +81,7 @@ class DepthSlam:
 
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base at the observation."""
-        prediction = self._motion.predict(observation)
+        prediction = self._predictor.predict(observation)
         if observation.depth_m is None:
             return self._bridge(observation, prediction, can_coast=True)
         width, height = self._camera.size_wh
@@ -103,7 +102,7 @@ class DepthSlam:
 
     def get_pose(self) -> se3.Transform:
         """Return T_map_base of the last observation."""
-        return self._T_map_local @ self._motion.T_local_base
+        return self._T_map_local @ self._T_local_base
 
     def get_trajectory(self) -> Trajectory:
         """Return all poses after a last optimisation."""
@@ -123,8 +122,9 @@ class DepthSlam:
         """Make the first keyframe, or the first of a place that odometry alone leads to."""
         T_local_cam = prediction.T_local_base @ self._camera.T_base_cam
         self._add_keyframe(observation, surface, T_local_cam)
-        self._motion.coast(observation, prediction)
-        is_first = len(self._map) == 1 and not self._is_lost
+        is_first = len(self._map) == 1 and not self._predictor.is_lost
+        self._T_local_base = prediction.T_local_base
+        self._predictor.measure(observation, self._T_local_base, prediction.covariance)
         status = TrackingStatus.TRACKING if is_first else TrackingStatus.DEGRADED
         return self._answer(observation, status, 1.0, len(samples))
 
@@ -134,7 +134,7 @@ class DepthSlam:
         prior = self._prior(prediction)
         before = None
         if not prediction.is_measured:
-            before = self._motion.T_local_base @ self._camera.T_base_cam
+            before = self._predictor.T_local_measured @ self._camera.T_base_cam
         found = self._localizer.near(samples, prior, before)
         return found or self._localizer.alike(samples, surface, prior)
 
@@ -154,12 +154,16 @@ class DepthSlam:
         found: Registration,
     ) -> Tracking:
         T_base_cam = self._camera.T_base_cam
-        turned = se3.adjoint(T_base_cam)
+        turned, back = se3.adjoint(T_base_cam), se3.adjoint(se3.inverse(T_base_cam))
         covariance = np.linalg.inv(found.information + self._prior(prediction).information)
-        weak = found.localizability.weak_twists(self.weak_ratio) @ turned.T
-        T_local_base = found.T_local_cam @ se3.inverse(T_base_cam)
-        self._motion.hold(observation, T_local_base, turned @ covariance @ turned.T, weak)
-        self._seen_ns, self._is_lost = observation.stamp_ns, False
+        self._T_local_base = found.T_local_cam @ se3.inverse(T_base_cam)
+        self._predictor.measure(
+            observation,
+            self._T_local_base,
+            turned @ covariance @ turned.T,
+            information=back.T @ found.information @ back,
+        )
+        weak = found.localizability.weak_twists(self.weak_ratio)
         self._extend(observation, surface, samples, found.T_local_cam)
         status = TrackingStatus.DEGRADED if len(weak) else TrackingStatus.TRACKING
         return self._answer(observation, status, found.matched_ratio, found.matched)
@@ -180,9 +184,11 @@ class DepthSlam:
             return
         self._map[best.index].fuse(surface, T_local_cam, self._map.grid)
         if self._graph.advance():
-            T_key_base = self._map[best.index].T_cam_local @ self._motion.T_local_base
+            T_cam_local = self._map[best.index].T_cam_local
             self._graph.solve()
-            self._motion.jump(self._map[best.index].T_local_cam @ T_key_base)
+            T_new_old = self._map[best.index].T_local_cam @ T_cam_local
+            self._predictor.correct(T_new_old)
+            self._T_local_base = self._predictor.T_local_base
             self._revision += 1
 
     def _add_keyframe(
@@ -195,29 +201,30 @@ class DepthSlam:
         self, observation: Observation, prediction: Prediction, *, can_coast: bool
     ) -> Tracking:
         """Go on without depth: by odometry, for a moment as before, else not at all."""
-        since_ns = observation.stamp_ns - (self._seen_ns or 0)
-        is_brief = self._seen_ns is not None and since_ns <= _COAST_S * 1e9
-        if prediction.is_measured:
-            self._motion.coast(observation, prediction)
-            return self._answer(observation, TrackingStatus.DEGRADED, 0.0, 0)
-        if can_coast and is_brief:
-            self._motion.coast(observation, prediction)
-            return self._answer(observation, TrackingStatus.TRACKING, 0.0, 0)
-        self._motion.stop()
-        self._is_lost = True
+        is_brief = len(self._map) > 0 and self._predictor.unmeasured_s(observation) <= _COAST_S
+        if prediction.is_measured or (can_coast and is_brief):
+            self._coast(prediction)
+            is_known = prediction.is_measured
+            status = TrackingStatus.DEGRADED if is_known else TrackingStatus.TRACKING
+            return self._answer(observation, status, 0.0, 0)
+        self._predictor.lose(prediction)
         return self._answer(observation, TrackingStatus.LOST, 0.0, 0)
+
+    def _coast(self, prediction: Prediction) -> None:
+        self._predictor.coast(prediction)
+        self._T_local_base = prediction.T_local_base
 
     def _answer(
         self, observation: Observation, status: TrackingStatus, quality_ratio: float, inliers: int
     ) -> Tracking:
         is_lost = status is TrackingStatus.LOST
         if not is_lost and len(self._map):
-            self._history.add(observation.stamp_ns, self._reference, self._motion.T_local_base)
+            self._history.add(observation.stamp_ns, self._reference, self._T_local_base)
         return Tracking(
             stamp_ns=observation.stamp_ns,
-            T_local_base=self._motion.T_local_base.copy(),
+            T_local_base=self._T_local_base.copy(),
             status=status,
-            covariance=None if is_lost else self._motion.covariance.copy(),
+            covariance=None if is_lost else self._predictor.covariance.copy(),
             quality_ratio=quality_ratio,
             inliers=inliers,
             revision=self._revision,
