@@ -13,10 +13,8 @@ from sceneslam.modules.slam.rgbd.keyframes import DepthView, Keyframe, KeyframeS
 from sceneslam.modules.slam.rgbd.landmarks import LandmarkTable, Looks
 from sceneslam.modules.slam.rgbd.layers import LayerBuilder
 from sceneslam.modules.slam.rgbd.localizer import Localizer
-from sceneslam.modules.slam.rgbd.motion import MotionModel
 from sceneslam.modules.slam.rgbd.pose_solver import PoseSolver
 from sceneslam.types import se3
-from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera
 
 CAMERA = Camera(size_wh=(640, 480), fx=525.0, fy=520.0, cx=319.0, cy=241.0)
@@ -134,40 +132,6 @@ def test_landmarks_are_predicted_where_they_were_seen():
     assert len(visual_map.predict(behind, keyframe.landmark_ids).ids) == 0
 
 
-def at(second, **fields):
-    return Observation(stamp_ns=round(second * 1e9), **fields)
-
-
-def test_motion_goes_on_at_constant_velocity_and_stops_when_lost():
-    motion = MotionModel()
-    motion.hold(at(0.0), se3.identity())
-    motion.hold(at(0.1), se3.from_xy_yaw(0.1, 0, 0))
-    assert motion.predict(at(0.3))[0, 3] == pytest.approx(0.3)
-    assert motion.predict(at(5.0))[0, 3] == pytest.approx(0.1)
-    motion.lose(at(0.2), motion.predict(at(0.2)))
-    assert motion.predict(at(0.3))[0, 3] == pytest.approx(0.2)
-
-
-def test_way_back_of_a_lost_camera_is_no_velocity():
-    motion = MotionModel()
-    motion.hold(at(0.0), se3.identity())
-    motion.lose(at(0.1), se3.identity())
-    motion.hold(at(0.2), se3.from_xy_yaw(5.0, 0, 0))
-    assert motion.predict(at(0.3))[0, 3] == pytest.approx(5.0)
-    motion.hold(at(0.3), se3.from_xy_yaw(5.1, 0, 0))
-    assert motion.predict(at(0.4))[0, 3] == pytest.approx(5.2)
-
-
-def test_motion_prefers_odometry_and_takes_rotation_from_the_gyro():
-    odometry, gyro = MotionModel(), MotionModel()
-    odometry.hold(at(0.0, T_odom_base=se3.from_xy_yaw(7, 0, 0)), se3.identity())
-    T_local_base = odometry.predict(at(0.1, T_odom_base=se3.from_xy_yaw(7.2, 0, 0.1)))
-    assert T_local_base == pytest.approx(se3.from_xy_yaw(0.2, 0, 0.1))
-    gyro.hold(at(0.0), se3.identity())
-    rates = np.array([[-0.05, 0, 0, 1.0], [0.0, 0, 0, 1.0]])
-    assert se3.yaw_rad(gyro.predict(at(0.1, gyro_base=rates))) == pytest.approx(0.1)
-
-
 def patchwork(rng, fine_px=24, coarse_px=48):
     """Return a grey image whose left half has small patches, the right half large ones."""
     halves = [
@@ -270,14 +234,3 @@ def test_a_pose_is_told_only_where_a_tenth_of_what_should_show_is_found(shown, i
     ids = visual_map.keyframes.landmarks_of([0])
     fix = localizer.near(features, se3.identity(), ids)
     assert (fix is not None) == is_found
-
-
-def test_a_predicted_pose_stays_a_rotation_over_many_corrections():
-    motion = MotionModel()
-    rng = np.random.default_rng(0)
-    for _ in range(60):  # a keyframe at the prediction is adjusted, and the prediction follows it
-        keyframe = motion.predict(Observation(stamp_ns=0))
-        adjusted = keyframe @ se3.exp(0.01 * rng.standard_normal(6))
-        motion.correct(adjusted @ se3.inverse(keyframe))
-    rotation = motion.predict(Observation(stamp_ns=0))[:3, :3]
-    assert rotation.T @ rotation == pytest.approx(np.eye(3), abs=1e-13)

@@ -7,10 +7,9 @@ import numpy as np
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from sceneslam.modules.slam.rgbd.motion import MotionModel
 from sceneslam.testing.room import RIG, observation_at, room_observation
 from sceneslam.types import se3
-from sceneslam.types.observation import Observation, TrackingStatus
+from sceneslam.types.observation import TrackingStatus
 
 YAML = Path(__file__).parents[1] / "conf" / "slam" / "rgbd.yaml"
 
@@ -50,14 +49,3 @@ def test_new_place_is_hung_on_odometry_after_it_was_looked_for_in_the_map():
 def test_new_place_stays_lost_without_odometry():
     answers, _ = drive_away_in_the_dark(has_odometry=False)
     assert {answer.status for answer in answers[6:]} == {TrackingStatus.LOST}
-
-
-def test_heading_is_the_gyro_s_and_the_way_the_wheels():
-    motion = MotionModel()
-    motion.hold(Observation(stamp_ns=0, T_odom_base=se3.identity()), se3.identity())
-    turning = np.array([[-0.1, 0.0, 0.0, 0.5], [0.0, 0.0, 0.0, 0.5]])
-    slipped = se3.from_xy_yaw(0.04, 0.0, 0.2)
-    predicted = motion.predict(
-        Observation(stamp_ns=100_000_000, T_odom_base=slipped, gyro_base=turning)
-    )
-    np.testing.assert_allclose(predicted, se3.from_xy_yaw(0.04, 0.0, 0.05), atol=1e-12)

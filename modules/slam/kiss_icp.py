@@ -161,7 +161,7 @@ class KissIcp:
         """
         held = shape.held(self.weak_ratio)
         information = held.T @ np.diag(1.0 / self._noise) @ held
-        covariance = np.linalg.inv(np.linalg.inv(prediction.covariance) + information)
+        covariance = np.asarray(np.linalg.inv(np.linalg.inv(prediction.covariance) + information))
         if not self._has_map:
             self._predictor.measure(observation, T_local_icp, covariance)
             return T_local_icp

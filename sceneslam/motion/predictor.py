@@ -85,7 +85,7 @@ class Predictor:
             self.model.skip()
             alone = covariance
         else:
-            alone = np.linalg.inv(information + _UNMEASURED * np.eye(6))
+            alone = np.asarray(np.linalg.inv(information + _UNMEASURED * np.eye(6)))
             T_before_now = se3.inverse(self.T_local_measured) @ T_local_base
             carried = se3.adjoint(se3.inverse(T_before_now))
             self.model.learn(T_before_now, alone + carried @ self._alone @ carried.T)
@@ -98,8 +98,11 @@ class Predictor:
         self.T_local_base, self.covariance = prediction.T_local_base, prediction.covariance
 
     def lose(self, prediction: Prediction) -> None:
-        """Go on from a prediction; where only the velocity told of it, as if at rest."""
+        """Go on from a prediction; where no wheels told of it, as if the base only turned."""
+        rotation, position = prediction.T_local_base[:3, :3], self.T_local_base[:3, 3]
         self.coast(prediction)
+        if not prediction.is_measured:
+            self.T_local_base = se3.from_parts(rotation, position)
         self.model.slow_down()
         self._is_lost = True
 

@@ -8,15 +8,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.motion.predictor import Predictor
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
 from .features import FeatureExtractor
 from .localizer import Fix, Localizer
-from .motion import MotionModel, TurnRate
 from .shifts import shifts_px_per_s
 from .shutter import RollingShutter, Turning, moves_px_per_s
+from .turn_rate import TurnRate, measured_rate
 from .view import View
 from .visual_map import VisualMap
 
@@ -69,9 +70,9 @@ class Eye:
             turning=turning,
         )
 
-    def settle(self, view: View, fix: Fix, motion: MotionModel) -> tuple[View, Fix]:
+    def settle(self, view: View, fix: Fix, predictor: Predictor) -> tuple[View, Fix]:
         """Return a view and the pose that it led to, now that it tells how the camera turned."""
-        turn = motion.turning(view.observation, fix.estimate.T_local_base)
+        turn = measured_rate(view.observation, predictor, fix.estimate.T_local_base)
         if self._shutter.readout_s and turn.is_unknown:
             for _ in range(_ROUNDS):
                 view, fix = self._turn(view, fix, turn)

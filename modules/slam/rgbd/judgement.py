@@ -7,12 +7,12 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.motion.predictor import Prediction
 from sceneslam.types.observation import TrackingStatus
 from sceneslam.types.se3 import Transform
 
 from .keyframes import KeyframeStore
 from .localizer import Fix
-from .motion import MotionModel
 from .pose_solver import PoseEstimate
 from .view import View
 
@@ -95,7 +95,9 @@ class PlaceRule:
         """Hear that there is a pose."""
         self._images = 0
 
-    def wants(self, view: View, motion: MotionModel, *, is_far: bool) -> bool:
+    def wants(
+        self, view: View, prediction: Prediction, *, unmeasured_s: float, is_far: bool
+    ) -> bool:
         """Tell whether the place was often enough looked for in the map.
 
         Where odometry led there, and else once the patience is over, for that is a guess. Without
@@ -104,6 +106,6 @@ class PlaceRule:
         self._images += view.shows_enough
         if self._images <= _SEARCHED_IMAGES:
             return False
-        if motion.is_reckoned:
+        if prediction.is_measured:
             return is_far or not view.is_monocular
-        return motion.unheld_s(view.observation) >= self._patience_s and not view.is_monocular
+        return unmeasured_s >= self._patience_s and not view.is_monocular

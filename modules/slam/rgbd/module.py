@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sceneslam.motion.predictor import Prediction, Predictor
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.maps import MapLayers
@@ -18,10 +20,10 @@ from .alignment import Alignment
 from .answers import held, lost, placed, repeated, started
 from .limits import check_limits, check_sizes
 from .localizer import Fix
-from .motion import MotionModel
 from .parts import Parts
 from .renewal import NEWEST, Seen, renew, seen_by
 from .reunion import Reunion
+from .turn_rate import expected_rate
 from .view import View
 
 
@@ -77,7 +79,7 @@ class RgbdSlam:
         if rig.camera is None:
             raise InputError("rig: rgbd needs the camera's intrinsics, got none")
         self._camera: Camera = rig.camera
-        self._motion = MotionModel()
+        self._predictor = Predictor(rig)
         self._reunion.begin()
         self._build(None)
         self._T_local_base = se3.identity()
@@ -100,27 +102,29 @@ class RgbdSlam:
             observation = replace(observation, depth_m=None)
         self._observations += 1
         self._recall()
-        T_predicted = self._motion.predict(observation)
+        prediction = self._predictor.predict(observation)
         if observation.image_bgr is None:
-            return self._lose(observation, T_predicted)
+            return self._lose(observation, prediction)
         if self._eye.is_repeated(observation.image_bgr):
-            return self._repeat(observation, T_predicted)
-        rate_base = self._motion.turn_rate(observation)
+            return self._repeat(observation, prediction)
         view = self._eye.look(
-            observation, observation.image_bgr, T_predicted=T_predicted, rate_base=rate_base
+            observation,
+            observation.image_bgr,
+            T_predicted=prediction.T_local_base,
+            rate_base=expected_rate(observation, self._predictor),
         )
         fix = None
         if len(self._map.keyframes):
             fix = self._search.find(view, self._held_ids, is_lost=self._is_lost)
         if fix is not None:
-            view, fix = self._eye.settle(view, fix, self._motion)
-            answer = self._hold(view, fix)
+            view, fix = self._eye.settle(view, fix, self._predictor)
+            answer = self._hold(view, fix, prediction)
             if self._mapping.alignment is not None and not view.is_monocular:
                 self._build_anew(view, self._mapping.alignment)
             return answer
-        if not len(self._map.keyframes) or self._is_unknown(view):
-            return self._start(view)
-        return self._lose(observation, T_predicted)
+        if not len(self._map.keyframes) or self._is_unknown(view, prediction):
+            return self._start(view, prediction)
+        return self._lose(observation, prediction)
 
     def get_pose(self) -> Transform:
         """Return T_map_base = T_map_local @ T_local_base of the last observation (Eq. 2)."""
@@ -159,42 +163,47 @@ class RgbdSlam:
         self._mapping.shutdown()
         poses = renew(self._build(alignment), seen)
         self._memory.follow(before, poses)
-        self._motion.correct(poses[NEWEST] @ se3.inverse(self._T_local_base))
+        self._predictor.correct(poses[NEWEST] @ se3.inverse(self._T_local_base))
         self._T_local_base = poses[NEWEST]
         self._held_ids = self._map.keyframes.landmarks_of(self._map.keyframes.ids[-1:])
 
     def _recall(self) -> None:
         """Go on from where the map is: adjusted, after a loop, or beside an earlier session's."""
-        self._motion.correct(self._mapping.step())
+        self._predictor.correct(self._mapping.step())
         T_new_old = self._memory.step()
         if T_new_old is not None:
             self._T_local_base = T_new_old @ self._T_local_base
-            self._motion.correct(T_new_old)
+            self._predictor.correct(T_new_old)
 
-    def _is_unknown(self, view: View) -> bool:
+    def _is_unknown(self, view: View, prediction: Prediction) -> bool:
         is_far = self._keyframe_rule.is_far(view.T_predicted, self._map.keyframes)
-        return self._place_rule.wants(view, self._motion, is_far=is_far)
+        unmeasured_s = self._predictor.unmeasured_s(view.observation)
+        return self._place_rule.wants(view, prediction, unmeasured_s=unmeasured_s, is_far=is_far)
 
-    def _start(self, view: View) -> Tracking:
+    def _start(self, view: View, prediction: Prediction) -> Tracking:
         """Hang a keyframe on the prediction; wait, lost, for features with depth or odometry."""
         is_scaled = not view.is_monocular or view.observation.T_odom_base is not None
         if not (view.shows_enough and is_scaled):
-            return self._lose(view.observation, view.T_predicted)
-        is_placed = self._motion.is_reckoned or not len(self._map.keyframes)
-        guessed_s = None if is_placed else self._motion.unheld_s(view.observation)
-        self._hold_pose(view.observation, view.T_predicted)
+            return self._lose(view.observation, prediction)
+        is_placed = prediction.is_measured or not len(self._map.keyframes)
+        guessed_s = None if is_placed else self._predictor.unmeasured_s(view.observation)
+        self._hold_pose(view.observation, view.T_predicted, prediction.covariance)
         self._insert_keyframe(view, set(), guessed_s=guessed_s)
         self._memory.hold(view.observation.stamp_ns, self._T_local_base, np.zeros(0, np.int64))
         is_first, revision = self._observations == 1, self._memory.revision
         return started(view, self._T_local_base, is_first=is_first, revision=revision)
 
-    def _hold(self, view: View, fix: Fix) -> Tracking:
+    def _hold(self, view: View, fix: Fix, prediction: Prediction) -> Tracking:
         """Accept a pose, and extend the map where it is due."""
         status = self._health.judge(fix.estimate)
         # Over a few frames odometry errs less than few landmarks do.
-        is_reckoned = status is TrackingStatus.DEGRADED and self._motion.is_reckoned
-        T_local_base = view.T_predicted if is_reckoned else fix.estimate.T_local_base
-        self._hold_pose(view.observation, T_local_base)
+        is_reckoned = status is TrackingStatus.DEGRADED and prediction.is_measured
+        if is_reckoned:
+            T_local_base = view.T_predicted
+            self._hold_pose(view.observation, T_local_base, prediction.covariance)
+        else:
+            T_local_base = fix.estimate.T_local_base
+            self._hold_pose(view.observation, T_local_base, fix.estimate.covariance, is_seen=True)
         self._held_ids = fix.landmark_ids
         self._map.count_sightings(fix.expected_ids, fix.landmark_ids)
         segment = self._memory.segment(fix.landmark_ids)
@@ -216,23 +225,31 @@ class RgbdSlam:
         )
         return answer if segment is None else placed(answer, self._memory.segments, segment)
 
-    def _hold_pose(self, observation: Observation, T_local_base: Transform) -> None:
+    def _hold_pose(
+        self,
+        observation: Observation,
+        T_local_base: Transform,
+        covariance: NDArray[np.float64],
+        *,
+        is_seen: bool = False,
+    ) -> None:
         self._T_local_base, self._is_lost = T_local_base, False
         self._place_rule.restart()
-        self._motion.hold(observation, T_local_base)
+        information = np.asarray(np.linalg.inv(covariance)) if is_seen else None
+        self._predictor.measure(observation, T_local_base, covariance, information)
 
-    def _repeat(self, observation: Observation, T_predicted: Transform) -> Tracking:
+    def _repeat(self, observation: Observation, prediction: Prediction) -> Tracking:
         """Stay where odometry leads, else where the camera was: its image is the last one again."""
         if self._is_lost or not len(self._map.keyframes):
-            return self._lose(observation, T_predicted)
-        if observation.T_odom_base is not None:
-            self._T_local_base = T_predicted if self._motion.is_reckoned else self._T_local_base
-            self._motion.hold(observation, self._T_local_base)
+            return self._lose(observation, prediction)
+        self._predictor.coast(prediction)
+        if prediction.is_measured:
+            self._T_local_base = prediction.T_local_base
         self._memory.hold(observation.stamp_ns, self._T_local_base, np.zeros(0, np.int64))
         return repeated(observation.stamp_ns, self._T_local_base, revision=self._memory.revision)
 
-    def _lose(self, observation: Observation, T_predicted: Transform) -> Tracking:
-        self._motion.lose(observation, T_predicted)
+    def _lose(self, observation: Observation, prediction: Prediction) -> Tracking:
+        self._predictor.lose(prediction)
         self._is_lost = True
         return lost(observation.stamp_ns, self._T_local_base, revision=self._memory.revision)
 
