@@ -122,9 +122,6 @@ def measure(policy: Policy) -> tuple[float, float]:
 def _dead_reckoning() -> Odometry:
     return Odometry(
         use_gyro=False,
-        translation_noise_ratio=0.01,
-        rotation_noise_ratio=0.01,
-        rotation_noise_rad_per_m=0.01,
     )
 
 

@@ -52,9 +52,6 @@ def run_case(seed: int, limits: Limits) -> Case:
     sentence, late_s, harm = "", 0.0, []
     healthy = Odometry(
         use_gyro=False,
-        translation_noise_ratio=0.02,
-        rotation_noise_ratio=0.02,
-        rotation_noise_rad_per_m=0.01,
     )
     healthy.activate(RIG)
     # -S -I: without site packages it starts in a third of the time

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.motion.model import MotionModel
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
-from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.rig import Rig, Sensor, Wheels
 from sceneslam.types.trajectory import Trajectory
 
 _DEVIATION_MIN = 1e-4  # m and rad, of any pose
@@ -22,20 +22,12 @@ class Odometry:
     """Dead reckoning; `conf/slam/odometry.yaml` says what the settings are."""
 
     use_gyro: bool
-    translation_noise_ratio: float
-    rotation_noise_ratio: float
-    rotation_noise_rad_per_m: float
-    _T_odom_prev: se3.Transform | None = field(default=None, init=False)
-    _stamp_ns: int | None = field(default=None, init=False)
+    _motion: MotionModel = field(init=False)
+    _wheels: Wheels = field(init=False)
+    _T_held_curr: se3.Transform = field(default_factory=se3.identity, init=False)
     _T_map_local: se3.Transform = field(default_factory=se3.identity, init=False)
     _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
     _covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)), init=False)
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        for name in ("translation_noise_ratio", "rotation_noise_ratio", "rotation_noise_rad_per_m"):
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise ConfigError(name, getattr(self, name), "0 or more")
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
@@ -44,7 +36,8 @@ class Odometry:
 
     def activate(self, rig: Rig) -> None:
         """Start anew: `local` at the next observation that has odometry."""
-        self._T_odom_prev, self._stamp_ns = None, None
+        self._motion, self._wheels = MotionModel(rig), rig.wheels
+        self._T_held_curr = se3.identity()
         self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
         self._covariance = np.eye(6) * _DEVIATION_MIN**2
 
@@ -60,16 +53,15 @@ class Odometry:
 
         When odometry is back, its own motion over the gap counts.
         """
+        if not self.use_gyro:
+            observation = replace(observation, gyro_base=None)
+        motion = self._motion.predict(observation)
+        self._T_held_curr = self._T_held_curr @ motion.T_prev_curr  # a gap's guesses are undone
         T_odom_base = observation.T_odom_base
         if T_odom_base is None or not np.isfinite(T_odom_base).all():
-            self._stamp_ns = None  # the gyro's samples no longer cover the whole motion
             return self._answer(observation, TrackingStatus.LOST)
-        if self._T_odom_prev is not None:
-            T_prev_curr = se3.inverse(self._T_odom_prev) @ T_odom_base
-            if self.use_gyro:
-                T_prev_curr = self._turned_by_gyro(T_prev_curr, observation)
-            self._move(T_prev_curr)
-        self._T_odom_prev, self._stamp_ns = T_odom_base, observation.stamp_ns
+        self._move(self._T_held_curr)
+        self._T_held_curr = se3.identity()
         return self._answer(observation, TrackingStatus.TRACKING)
 
     def get_pose(self) -> se3.Transform:
@@ -90,8 +82,8 @@ class Odometry:
     def _move(self, T_prev_curr: se3.Transform) -> None:
         distance_m = float(np.linalg.norm(T_prev_curr[:3, 3]))
         angle_rad = float(se3.rotation_angle_rad(T_prev_curr))
-        along = self.translation_noise_ratio * distance_m
-        turn = self.rotation_noise_ratio * angle_rad + self.rotation_noise_rad_per_m * distance_m
+        along = self._wheels.drift_ratio * distance_m
+        turn = self._wheels.drift_ratio * angle_rad + self._wheels.drift_rad_per_m * distance_m
         # Errors of odometry go on in the same way: deviations add up, not variances.
         carried = se3.adjoint(se3.inverse(T_prev_curr))
         covariance = carried @ self._covariance @ carried.T
@@ -99,17 +91,6 @@ class Odometry:
         scale = deviation / np.sqrt(np.diag(covariance))
         self._covariance = covariance * np.outer(scale, scale)
         self._T_local_base = self._T_local_base @ T_prev_curr
-
-    def _turned_by_gyro(
-        self, T_prev_curr: se3.Transform, observation: Observation
-    ) -> se3.Transform:
-        """Return the motion with the gyro's rotation, where it covers all of the interval."""
-        if self._stamp_ns is None:
-            return T_prev_curr
-        turn = observation.turn_by_gyro((observation.stamp_ns - self._stamp_ns) * 1e-9)
-        if turn is None:
-            return T_prev_curr
-        return se3.from_parts(se3.so3_exp(turn), T_prev_curr[:3, 3])
 
     def _answer(self, observation: Observation, status: TrackingStatus) -> Tracking:
         is_lost = status is TrackingStatus.LOST
