@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,22 +15,33 @@ import cv2
 from sceneslam.config.build import Parts, build
 from sceneslam.config.provenance import save_config
 from sceneslam.evaluation.metrics import Metrics
+from sceneslam.evaluation.summary import summary_lines
 from sceneslam.interrupts import termination_as_interrupt, uninterrupted
 from sceneslam.loop import Loop
 from sceneslam.results import Results
 from sceneslam.storage.folder import RunFolder, give_back
 from sceneslam.types.errors import ConfigError, SceneSlamError, told
+from sceneslam.types.maps import HybridMap
 from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import GroundTruth
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Finished:
     """A run that ended, one way or another; its folder is written."""
 
+    folder: Path
     metrics: Metrics
-    trajectory: Trajectory
+    trajectory: Trajectory  # T_map_base: `stamps_ns` (N,), `T_world_base` (N, 4, 4)
+    modules: Sequence[str]  # per pose: the key of the module that gave it, "" where it was bridged
+    map: HybridMap
+    truth: GroundTruth | None
     faults: tuple[str, ...]  # what was wrong with the input or ended the run early
     is_interrupted: bool  # by Ctrl-C or SIGTERM
+
+    def __repr__(self) -> str:
+        """Return the run in a few lines, as the command line prints it."""
+        return "\n".join([*summary_lines(self.metrics), f"results  {self.folder}"])
 
 
 def run(
@@ -92,9 +103,14 @@ def _end(loop: Loop, results: Results, reference: Trajectory | None) -> Finished
     loop.close_sinks()
     metrics = results.save_rest(loop.result(), loop.truth, reference=reference)
     loop.close(is_saved=len(results.faults) == faults)
+    result = loop.result()
     return Finished(
+        folder=results.folder,
         metrics=metrics,
-        trajectory=loop.result().trajectory,
+        trajectory=result.trajectory,
+        modules=result.modules,
+        map=result.map,
+        truth=loop.truth,
         faults=tuple(results.faults),
         is_interrupted=loop.is_interrupted,
     )

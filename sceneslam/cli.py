@@ -23,6 +23,7 @@ from yaml import YAMLError
 
 import sceneslam
 from sceneslam.app import Finished, run
+from sceneslam.catalogue import listing
 from sceneslam.config import files
 from sceneslam.config.resolve import resolved
 from sceneslam.config.settings import DETECT_ONLY
@@ -53,6 +54,8 @@ def main() -> None:
     if "--version" in sys.argv[1:]:
         print(f"SceneSLAM {sceneslam.__version__}")
         sys.exit(OK)
+    if sys.argv[1:2] == ["list"]:
+        sys.exit(_list(sys.argv[2:]))
     codes: list[int] = []
     files.register()
 
@@ -63,7 +66,7 @@ def main() -> None:
 
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises then, and does not exit
     try:
-        sys.argv[1:] = _words(sys.argv[1:])
+        sys.argv[1:] = _words(sys.argv[1:]) or ["--help"]
         job()
     except Exception as error:
         if codes and not isinstance(error, HydraException):  # a run's own are handled in it
@@ -75,6 +78,15 @@ def main() -> None:
         print(f"error: standard output: {told(lost)}", file=sys.stderr)
         codes.append(INCOMPLETE)
     sys.exit(max(codes, default=OK))
+
+
+def _list(words: list[str]) -> int:
+    """Print what there is to choose; return the exit code."""
+    try:
+        print("\n".join(listing(words)))
+    except SceneSlamError as error:
+        return _say(error)
+    return OK
 
 
 def _words(words: list[str]) -> list[str]:

@@ -13,24 +13,11 @@ from types import ModuleType
 
 import yaml
 
+from sceneslam.catalogue import GROUPS
 from sceneslam.config.check import describe, hints_of
 
 ROOT = Path(__file__).resolve().parents[2]
 CONF = ROOT / "conf"
-GROUPS = {  # group -> what it chooses
-    "scenario": "A whole set-up: `+scenario=NAME`.",
-    "source": "Where observations come from: `source=NAME`.",
-    "effects": "What is done to them on the way: `effects=NAME`.",
-    "detector": "What tells the scene: `detector=NAME`.",
-    "slam": "The SLAM modules, each under a key of its own: `slam@slam.KEY=NAME`.",
-    "policy": "When the scene and the module change: `policy=NAME`.",
-    "atlas": "How maps are fused: `atlas=NAME`.",
-    "run": "How a run is carried out: `run=NAME`.",
-    "evaluation": "How a run is measured: `evaluation=NAME`.",
-    "sinks": "What writes along: `+sinks@sinks.KEY=NAME`; `~sinks@sinks.rerun` leaves one out.",
-    "viewer": "What shows the run while it runs: `viewer=NAME`.",
-    "experiment": "A question that takes many runs, or a second one: `+experiment=NAME`.",
-}
 _LINE = re.compile(
     r"^(?P<indent> *)(?P<key>[\w@./]+|\"\w+\"):(?: +(?P<value>[^#]*?))?(?: +#(?P<note>.*))?$"
 )

@@ -1,7 +1,7 @@
 """How all figures look: size, colours that the colour-blind can tell apart, bands of time.
 
-A figure is drawn once and written twice: as PNG for papers, and as SVG for the report, where its
-neutral colours become the page's own, so that it follows light and dark and prints sharply.
+A figure is drawn once and written twice, as PNG and as SVG; the SVG is put into the report as well,
+where its neutral colours become the page's own, so that it follows light and dark.
 """
 
 from __future__ import annotations
@@ -81,17 +81,20 @@ def save(figure: Any, path: Path) -> Path:
     return path
 
 
-def to_svg(figure: Any, name: str) -> str:
-    """Return a figure as an SVG element for an HTML page that has the colours' variables.
-
-    `name` keeps its inner references apart from those of other figures on the page.
-    """
+def save_svg(figure: Any, path: Path) -> str:
+    """Write an SVG for papers and slides, its text as text; return the file's content."""
     from matplotlib import rc_context
 
     text = StringIO()
-    with rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": path.stem}):
         figure.savefig(text, format="svg", metadata={"Date": None})
-    svg = text.getvalue()
+    with replacing(path, encoding="utf-8") as file:
+        file.write(text.getvalue())
+    return text.getvalue()
+
+
+def for_page(svg: str) -> str:
+    """Return an SVG file as an element for an HTML page that has the colours' variables."""
     svg = re.sub(r"<(metadata|style).*?</\1>\s*", "", svg[svg.index("<svg") :], flags=re.S)
     svg = re.sub(r'^<svg [^>]*?viewBox="([^"]*)"[^>]*>', r'<svg viewBox="\1">', svg)
     for color, variable in _PAGE_COLORS.items():

@@ -1,4 +1,4 @@
-"""All figures of a run: written as PNG files, and kept as SVG for the report."""
+"""All figures of a run, written as PNG and SVG files; the report holds them as well."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _ONLINE_DIFFERS_M = 1e-3  # below, what was told online is not drawn apart
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drawn:
-    """One figure, twice."""
+    """One figure; beside its PNG lies an SVG of the same name."""
 
     name: str
     png: Path
@@ -96,7 +96,8 @@ def _written(folder: Path, name: str, draw: Callable[[], Any], faults: list[str]
         if figure is None:
             return None
         png = look.save(figure, folder / f"{name}.png")
-        return Drawn(name=name, png=png, svg=look.to_svg(figure, name))
+        svg = look.for_page(look.save_svg(figure, png.with_suffix(".svg")))
+        return Drawn(name=name, png=png, svg=svg)
     except Exception as error:
         _log.info("the figure %s", name, exc_info=error)
         faults.append(f"the figure {name} could not be drawn: {told(error)}")

@@ -49,7 +49,7 @@ def write_report(
     reference: Trajectory | None = None,
     value_label: str = "detector value",
 ) -> Path:
-    """Write `figures/*.png` and `report.html` into the run's folder; return the report's path.
+    """Write `figures/` (PNG and SVG) and `report.html` into the run's folder; return its path.
 
     `threshold` is drawn with the detector's values, `faults` are sentences about the run: those
     of figures that could not be drawn are added.

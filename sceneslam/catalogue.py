@@ -1,0 +1,72 @@
+"""What there is to choose: every option of every group, with the first sentence of its file."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import sceneslam.conf
+from sceneslam.types.errors import ConfigError
+
+GROUPS = {  # group -> what it chooses
+    "scenario": "A whole set-up: `+scenario=NAME`.",
+    "source": "Where observations come from: `source=NAME`.",
+    "effects": "What is done to them on the way: `effects=NAME`.",
+    "detector": "What tells the scene: `detector=NAME`.",
+    "slam": "The SLAM modules, each under a key of its own: `slam@slam.KEY=NAME`.",
+    "policy": "When the scene and the module change: `policy=NAME`.",
+    "atlas": "How maps are fused: `atlas=NAME`.",
+    "run": "How a run is carried out: `run=NAME`.",
+    "evaluation": "How a run is measured: `evaluation=NAME`.",
+    "sinks": "What writes along: `+sinks@sinks.KEY=NAME`; `~sinks@sinks.rerun` leaves one out.",
+    "viewer": "What shows the run while it runs: `viewer=NAME`.",
+    "experiment": "A question that takes many runs, or a second one: `+experiment=NAME`.",
+}
+_ALIASES = {f"{group}s": group for group in GROUPS} | {"modules": "slam", "module": "slam"}
+
+
+def listing(words: Sequence[str]) -> list[str]:
+    """Return the lines of `python -m sceneslam list [GROUP ...] [--config-dir FOLDER]`.
+
+    Raises ConfigError for a group that does not exist and a folder that is not there.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m sceneslam list", description="List what there is to choose."
+    )
+    parser.add_argument("groups", nargs="*", metavar="GROUP", help=", ".join(GROUPS))
+    parser.add_argument("--config-dir", type=Path, help="a folder of your own configurations")
+    asked = parser.parse_args(words)
+    folders = [Path(folder) for folder in sceneslam.conf.__path__]
+    if asked.config_dir is not None:
+        if not asked.config_dir.is_dir():
+            raise ConfigError("--config-dir", str(asked.config_dir), "a folder that exists")
+        folders.append(asked.config_dir)
+    lines: list[str] = []
+    for name in asked.groups or GROUPS:
+        group = _ALIASES.get(name, name)
+        if group not in GROUPS:
+            raise ConfigError("list", name, ", ".join(GROUPS))
+        lines += ["", f"{group}: {GROUPS[group].replace('`', '')}", *_options(group, folders)]
+    return lines[1:]
+
+
+def _options(group: str, folders: Sequence[Path]) -> list[str]:
+    """Return a line for each option of a group; the last folder that holds it is taken."""
+    files = {path.stem: path for folder in folders for path in (folder / group).glob("*.yaml")}
+    width = max(map(len, files), default=0)
+    return [f"  {name:{width}}  {first_sentence(files[name])}".rstrip() for name in sorted(files)]
+
+
+def first_sentence(path: Path) -> str:
+    """Return the first sentence of the comment that a YAML file opens with; "" without one."""
+    said: list[str] = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        if line.startswith("# @package"):
+            continue
+        if not line.startswith("# ") or line.startswith("#  "):  # the text or its example follows
+            break
+        said.append(line[2:])
+    sentence = re.split(r"(?<!Fig)\. |(?<=\?) ", " ".join(said), maxsplit=1)[0]
+    return sentence.rstrip(".:")

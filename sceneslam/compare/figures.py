@@ -1,0 +1,45 @@
+"""Pictures of several runs: their paths from above, and their errors over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sceneslam.compare.runs import Run
+from sceneslam.evaluation import figure_style as look
+from sceneslam.evaluation.accuracy import absolute_errors
+from sceneslam.evaluation.figure_paths import draw_paths
+
+
+def paths(path: Path, runs: Sequence[Run]) -> bool:
+    """Draw all paths from above as a PNG; False where no run has a pose."""
+    if not any(len(run.trajectory) for run in runs):
+        return False
+    draw_paths(path, {run.name: run.trajectory for run in runs}, runs[0].truth)
+    return True
+
+
+def errors(path: Path, runs: Sequence[Run]) -> bool:
+    """Draw the position error of every run over time as a PNG; False where no truth is known."""
+    figure = look.new_figure(look.WIDTH_IN, 3.6)
+    axes = figure.add_subplot()
+    is_drawn = False
+    for number, run in enumerate(runs):
+        if run.truth is None:
+            continue
+        found = absolute_errors(run.trajectory, run.truth, run.metrics["association_gap_s"])
+        if not len(found.errors_m):
+            continue
+        times_s = (found.stamps_ns - run.metrics["start_ns"]) * 1e-9
+        color = look.PALETTE[number % len(look.PALETTE)]
+        drawn = look.thinned(times_s, np.asarray(found.errors_m))
+        axes.plot(*drawn, color=color, linewidth=1.3, label=run.name)
+        is_drawn = True
+    if is_drawn:
+        look.style(axes, y_label="position error [m]")
+        axes.set_ylim(bottom=0.0)
+        figure.legend(loc="outside lower center", ncols=2, fontsize=11, frameon=False)
+        look.save(figure, path)
+    return is_drawn

@@ -1,0 +1,72 @@
+"""Runs for scripts and notebooks: `from sceneslam import run`."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from datetime import datetime
+from pathlib import Path
+
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException, OverrideParseException
+
+from sceneslam import app
+from sceneslam.config.check import first_line
+from sceneslam.config.resolve import resolved
+from sceneslam.config.words import check_trust, how_to_quote
+from sceneslam.storage.folder import RunFolder, give_back
+from sceneslam.types.errors import ConfigError, SceneSlamError
+
+_STAMPED = "outputs/%Y-%m-%d/%H-%M-%S"
+
+
+def run(
+    *overrides: str, folder: str | Path | None = None, config_dir: str | Path | None = None
+) -> app.Finished:
+    """Run a configuration as the command line does; write its folder and return what came of it.
+
+    `overrides` are the command line's words: `"+scenario=bright_to_dark", "source.path=FOLDER"`.
+    `folder` is where the results go (`outputs/DATE/TIME`), `config_dir` a folder of
+    configurations of your own. Sweeps (`-m`) and experiments are for the command line.
+
+    Raises ConfigError or InputError where nothing could be run. What failed later is in the
+    result's `faults`.
+    """
+    config = _composed(overrides, config_dir)
+    if config.get("experiment"):
+        raise ConfigError("experiment", config["experiment"], "null: use python -m sceneslam")
+    is_stamped = folder is None
+    path = Path(datetime.now().strftime(_STAMPED)) if folder is None else Path(folder)
+    with closing(RunFolder.claim(path, is_stamped=is_stamped)) as claimed:
+        try:
+            return app.run(config, claimed.path, title=_title(overrides))
+        except SceneSlamError:
+            give_back(claimed.path)
+            raise
+
+
+def _composed(overrides: tuple[str, ...], config_dir: str | Path | None) -> dict[str, object]:
+    """Return the resolved configuration; raises ConfigError where it cannot be composed."""
+    words = [*overrides]
+    if config_dir is not None:
+        path = Path(config_dir).resolve()
+        if not path.is_dir():
+            raise ConfigError("config_dir", str(config_dir), "a folder that exists")
+        words.append(f"hydra.searchpath=['file://{path}']")
+    GlobalHydra.instance().clear()  # a notebook may have left one
+    try:
+        with initialize_config_module("sceneslam.conf", version_base="1.3"):
+            config = compose("config", overrides=words)
+    except OverrideParseException as error:
+        reason = how_to_quote(error.override, first_line(error))
+        raise ConfigError("overrides", error.override, f"an override ({reason})") from error
+    except HydraException as error:
+        allowed = f"overrides that compose ({first_line(error)})"
+        raise ConfigError("overrides", list(overrides), allowed) from error
+    check_trust(config, list(overrides))
+    return resolved(config)
+
+
+def _title(overrides: tuple[str, ...]) -> str:
+    named = [word for word in overrides if word.lstrip("+").startswith("scenario=")]
+    return named[-1].partition("=")[2] if named else "sceneslam"

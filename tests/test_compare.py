@@ -1,0 +1,96 @@
+"""Runs side by side: what is told of them, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sceneslam import run
+from sceneslam.compare.__main__ import main
+from sceneslam.compare.runs import differing, read_runs
+from sceneslam.types.errors import ConfigError
+
+WORDS = ("+scenario=single", "source=mcap", "run.progress=false", "slam@slam.only=odometry")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory, recording):
+    folder = tmp_path_factory.mktemp("runs")
+    source = f"source.path={recording}"
+    return [
+        run(*WORDS, source, folder=folder / "whole"),
+        run(*WORDS, source, "run.max_observations=20", folder=folder / "part"),
+    ]
+
+
+def test_a_script_gets_the_run_as_arrays(runs):
+    whole = runs[0]
+    assert whole.trajectory.T_world_base.shape == (30, 4, 4) and len(whole.modules) == 30
+    assert (whole.folder / "report.html").is_file() and not whole.faults
+    assert "30 observations" in repr(whole) and len(repr(whole)) < 2000
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("+scenario=nowhere",), "scenario/nowhere"),
+        (("policy.typo=1",), "policy.typo"),
+        (("source.path=a(b",), "quotes"),
+        (("+experiment=faults",), "experiment"),
+        ((*WORDS, "source.path=x.mcap", "detector._target_=os.system"), "os.system"),
+    ],
+)
+def test_a_script_is_told_what_is_wrong(tmp_path, words, named):
+    with pytest.raises(ConfigError, match=named):
+        run(*words, folder=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_scripts_own_configurations(tmp_path, recording):
+    (tmp_path / "conf" / "scenario").mkdir(parents=True)
+    text = "# @package _global_\ndefaults: [single, override /slam@slam.only: odometry]\n"
+    (tmp_path / "conf" / "scenario" / "mine.yaml").write_text(text)
+    words = ("+scenario=mine", "source=mcap", f"source.path={recording}", "run.progress=false")
+    done = run(*words, config_dir=tmp_path / "conf", folder=tmp_path / "out")
+    assert done.metrics["poses"] == 30
+    with pytest.raises(ConfigError, match="nowhere"):
+        run(*words, config_dir=tmp_path / "nowhere", folder=tmp_path / "other")
+
+
+def test_page_holds_what_was_measured_and_what_was_set_otherwise(runs, tmp_path, capsys):
+    folders = [str(one.folder) for one in runs]
+    assert main([*folders, "--out", str(tmp_path / "page")]) == 0
+    told = capsys.readouterr().out
+    assert "whole" in told and "part" in told and "largest distance from whole" in told
+    page = (tmp_path / "page" / "report.html").read_text()
+    assert page.count("<img ") == sum(1 for _ in (tmp_path / "page").glob("*.png")) > 0
+    assert [one.key for one in differing(read_runs([one.folder for one in runs]))] == [
+        "run.max_observations"
+    ]
+    assert "run.max_observations" in page and 'href="../' in page
+    assert main([*folders, "--out", str(tmp_path / "page")]) == 0  # its own page is replaced
+
+
+def test_nothing_foreign_and_no_run_is_overwritten(runs, tmp_path, capsys):
+    folders = [str(one.folder) for one in runs]
+    before = sorted(path.name for path in runs[0].folder.iterdir())
+    assert main([*folders, "--out", folders[0]]) == 2
+    assert sorted(path.name for path in runs[0].folder.iterdir()) == before
+    (tmp_path / "report.html").write_text("mine")
+    assert main([*folders, "--out", str(tmp_path)]) == 2
+    assert (tmp_path / "report.html").read_text() == "mine"
+    assert capsys.readouterr().err.count("error: --out") == 2
+
+
+@pytest.mark.parametrize("kind", ["one", "twice", "empty", "damaged"])
+def test_what_cannot_be_compared_is_named(runs, tmp_path, capsys, kind):
+    whole = runs[0].folder
+    (tmp_path / "metrics.json").write_text("{")
+    (tmp_path / "trajectory.tum").write_text("")
+    (tmp_path / "config.yaml").write_text("{}")
+    other = {"one": [], "twice": [whole], "empty": [whole.parent], "damaged": [tmp_path]}[kind]
+    assert main([str(path) for path in [whole, *other]]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and str(other[0] if other else whole) in error
+    assert not Path("outputs/compare").exists()
