@@ -45,6 +45,7 @@ def recordings(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         assert run_inside("python -m sceneslam +scenario=bright_to_dark hydra.run.dir=run") == 0
+    shutil.copytree(folder / "run", folder / "OTHER_RUN")
     for name in ("ESTIMATE", "TRUTH"):
         shutil.copy(folder / "run" / "trajectory.tum", folder / f"{name}.tum")
     return folder
