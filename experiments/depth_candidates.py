@@ -19,7 +19,13 @@ import cv2
 import numpy as np
 import open3d as o3d
 import open3d.core as o3c
-import small_gicp
+
+try:
+    import small_gicp
+except ImportError as missing:
+    raise SystemExit(
+        "error: small_gicp is needed: pip install 'sceneslam[candidates]'"
+    ) from missing
 from depth import open_source
 
 from sceneslam.evaluation.accuracy import absolute_errors

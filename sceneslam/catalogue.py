@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Sequence
+from importlib.resources import files
 from pathlib import Path
 
-import sceneslam.conf
 from sceneslam.types.errors import ConfigError
 
 GROUPS = {  # group -> what it chooses
@@ -38,7 +38,7 @@ def listing(words: Sequence[str]) -> list[str]:
     parser.add_argument("groups", nargs="*", metavar="GROUP", help=", ".join(GROUPS))
     parser.add_argument("--config-dir", type=Path, help="a folder of your own configurations")
     asked = parser.parse_args(words)
-    folders = [Path(folder) for folder in sceneslam.conf.__path__]
+    folders = [Path(str(files("sceneslam.conf")))]
     if asked.config_dir is not None:
         if not asked.config_dir.is_dir():
             raise ConfigError("--config-dir", str(asked.config_dir), "a folder that exists")
