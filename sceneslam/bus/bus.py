@@ -10,12 +10,12 @@ from typing import Protocol
 from statemachine import State, StateMachine
 
 from sceneslam.bus.changeover import Candidates, Changeover, Outcome, Plan
+from sceneslam.bus.dead_reckoning import DeadReckoning
 from sceneslam.bus.decision import Action, Health, Situation, Verdict, decide
 from sceneslam.bus.decision_log import DecisionLog
 from sceneslam.bus.estimator import Estimator
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.policy import Policy
-from sceneslam.bus.reckoning import Reckoning
 from sceneslam.bus.runner import Runner
 from sceneslam.bus.watch import Watch
 from sceneslam.interfaces import BackEnd, Detector, SlamModule
@@ -110,7 +110,7 @@ class Bus:
             log,
             scene_filter=policy.make_scene_filter(detector.scenes),
         )
-        self._reckoning = Reckoning(policy, rig)
+        self._reckoning = DeadReckoning(policy, rig)
         self._estimator = Estimator(
             policy=policy, rig=rig, back_end=back_end, log=log, has_choice=len(modules) > 1
         )

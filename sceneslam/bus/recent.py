@@ -29,7 +29,3 @@ class RecentMedian:
         """Take in a value (width,)."""
         self._ring[self._count % len(self._ring)] = value
         self._count += 1
-
-    def shift(self, value: float) -> None:
-        """Add to every value kept."""
-        self._ring[: len(self)] += value

@@ -1,0 +1,101 @@
+"""The independent motion that bridges and judges: wheels and gyro, by the one motion model.
+
+A judge is not taught by whom it judges: this model learns from wheels and gyro alone, and the
+wheels' scale beside a module is what the other modules measured.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from sceneslam.bus.events import EventLog
+from sceneslam.bus.hold import Hold
+from sceneslam.bus.policy import Policy
+from sceneslam.bus.wheel_scale import WheelScale
+from sceneslam.motion.model import MotionModel
+from sceneslam.types import se3
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.se3 import Transform
+
+
+class DeadReckoning:
+    """Corrects one observation's odometry and gyro after the other.
+
+    Modules teach it distances alone, and only where a gate watches them.
+    """
+
+    def __init__(self, policy: Policy, rig: Rig) -> None:
+        self._learns = policy.gate is not None and policy.handover != "cold"
+        self._motion = MotionModel(rig) if Sensor.GYRO in rig.sensors else None
+        self._scales: dict[str, WheelScale] = {}  # by the module that taught it
+        self._T_odom_base: Transform | None = None  # the last there was, as it came ...
+        self._T_corrected_base: Transform | None = None  # ... and as corrected
+        self._is_gap = False  # the last observation had none
+        self._turned_rad = 0.0  # by the newest observation
+
+    def correct(self, observation: Observation, module: str) -> Observation:
+        """Return the observation without the errors that are known so far, for a module."""
+        yaw_rad = self._yaw_rad(observation)
+        before, now = self._T_odom_base, observation.T_odom_base
+        is_gap, self._is_gap = self._is_gap, now is None
+        self._turned_rad = 0.0
+        observation = self._without_bias(observation)
+        if now is None:
+            return observation
+        self._T_odom_base = now
+        if before is None:
+            self._T_corrected_base = now
+            return observation
+        T_prev_curr = se3.inverse(before) @ now
+        if yaw_rad is not None and not is_gap:  # the gyro does not speak for a gap
+            apart_rad = yaw_rad - se3.yaw_rad(T_prev_curr)
+            T_prev_curr = T_prev_curr @ se3.from_xy_yaw(0.0, 0.0, apart_rad)
+        if self._learns:
+            self._turned_rad = float(se3.rotation_angle_rad(T_prev_curr))
+        learnt = self._taught(module)
+        if yaw_rad is None and learnt is None and self._T_corrected_base is before:
+            self._T_corrected_base = now  # nothing was ever corrected
+            return observation
+        T_prev_curr[:3, 3] *= 1.0 if learnt is None else learnt.scale
+        assert self._T_corrected_base is not None
+        self._T_corrected_base = se3.chained(self._T_corrected_base, T_prev_curr)
+        self._T_corrected_base.setflags(write=False)
+        return replace(observation, T_odom_base=self._T_corrected_base)
+
+    def learn(self, hold: Hold, module: str) -> None:
+        """Take in what the active module measured of the newest observation's distance."""
+        if self._learns and module:
+            scale = self._scales.setdefault(module, WheelScale())
+            scale.learn(hold, self._T_odom_base, self._turned_rad)
+
+    def close(self, stamp_ns: int, log: EventLog) -> None:
+        """Log what was learnt, if anything. May be called twice."""
+        known: dict[str, object] = {}
+        learnt = self._taught("")
+        if learnt is not None:
+            known |= {"wheel_scale": learnt.scale, "scale_deviation": learnt.variance**0.5}
+        if self._motion is not None and self._motion.gyro_bias.any():
+            known |= {"gyro_bias_radps": self._motion.gyro_bias.tolist()}
+        if known:
+            log.add("calibration", stamp_ns, **known)
+        self._scales, self._motion = {}, None
+
+    def _yaw_rad(self, observation: Observation) -> float | None:
+        """Return the yaw since the last observation, None where there is no gyro at all."""
+        if self._motion is None:
+            return None
+        return se3.yaw_rad(self._motion.predict(observation).T_prev_curr)
+
+    def _without_bias(self, observation: Observation) -> Observation:
+        if self._motion is None or observation.gyro_base is None:
+            return observation
+        gyro = observation.gyro_base.copy()
+        gyro[:, 1:] -= self._motion.gyro_bias
+        gyro.setflags(write=False)
+        return replace(observation, gyro_base=gyro)
+
+    def _taught(self, module: str) -> WheelScale | None:
+        """Return the scale that any module but one knows best, None where none taught it."""
+        others = (one for key, one in self._scales.items() if key != module and one.scale != 1.0)
+        return min(others, key=lambda one: one.variance, default=None)
