@@ -26,6 +26,7 @@ ALLOWED = {  # package -> what of ours it may import
     "sceneslam/detection": {"types", "interfaces", "bus", "config", "evaluation", "detection"},
     "sceneslam/collect": {"types", "evaluation", "collect"},
     "modules": {"types", "interfaces", "motion", "supervision", "vocabulary", "modules"},
+    "experiments/liars": {"types", "evaluation", "experiments"},
     "experiments/openloris": {"types", "evaluation", "experiments"},
     "experiments/handover": {"types", "atlas", "evaluation", "experiments"},
     "experiments/mutants": {"types", "interfaces", "ros", "config", "experiments"},

@@ -1,0 +1,1 @@
+"""What wheel odometry that lies does to every module."""
