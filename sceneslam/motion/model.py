@@ -61,11 +61,6 @@ class _Step:
     amounts: NDArray[np.float64]  # (2,): what its noise is a ratio of
     causes: NDArray[np.float64]  # (3,): metres, radians, seconds, of the turn's systematic error
 
-    @property
-    def moved(self) -> tuple[float, float]:
-        """Return the distance [m] and the turn [rad]."""
-        return float(np.linalg.norm(self.T[:3, 3])), float(se3.rotation_angle_rad(self.T))
-
     def then(self, step: _Step) -> _Step:
         """Return both in a row."""
         return _Step(
@@ -194,15 +189,13 @@ class MotionModel:
         for channel, axes in enumerate((slice(0, 2), slice(2, 3))):
             R = measured[axes, axes]
             if had_velocity:
-                unit = np.eye(len(R))
                 self._lies[channel].judge(
                     evidence_of_a_lie(
                         wheels=off[axes],
                         guess=off_guess[axes],
-                        wheels_covariance=wheels.variance[channel] * unit,
-                        guess_covariance=(guess.variance + before)[channel] * unit,
+                        wheels_variance=float(wheels.variance[channel]),
+                        guess_variance=float((guess.variance + before)[channel]),
                         covariance=R,
-                        amount=max(wheels.moved[channel], guess.moved[channel]),
                     )
                 )
             for missed, variance in zip(off[axes].tolist(), np.diag(R).tolist(), strict=True):

@@ -14,7 +14,6 @@ _STUDENT = 4.0  # degrees of freedom: an error of five deviations counts a sixth
 _HONEST_S, _LYING_S = 300.0, 5.0  # mean time for which wheels are right, and for which they lie
 _EVIDENCE_MAX = 3.0  # of one comparison, as log-likelihood ratio: comparisons in a row err together
 _LYING_MAX = 0.999
-_OUTLIERS = math.log(0.01)  # the share of measured motions that are wrong
 
 
 @dataclass(slots=True)
@@ -83,31 +82,19 @@ def evidence_of_a_lie(
     *,
     wheels: NDArray[np.float64],
     guess: NDArray[np.float64],
-    wheels_covariance: Matrix,
-    guess_covariance: Matrix,
+    wheels_variance: float,
+    guess_variance: float,
     covariance: Matrix,
-    amount: float,
 ) -> float:
     """Return how much likelier a measured motion is if the wheels lie (log-likelihood ratio).
 
     `wheels`, `guess` (N,): by what each differs from the measured motion, whose own `covariance`
-    is (N, N). Wheels that lie are off by about the `amount` of motion. A measured motion that is an
-    outlier says nothing; inertia, which is the guess, tells whether it is one.
+    is (N, N). Inertia is no better a witness than wheels are: a drive that it predicts well does
+    not make liars of wheels that are right within their noise.
     """
-    lie = amount**2 * np.eye(len(wheels))
-    outlier = _log_likelihood(guess, guess_covariance + covariance + lie)
-    inlier = _log_likelihood(guess, guess_covariance + covariance)
-    apart = wheels - guess
-    likelihoods = []
-    for wrong in (lie, np.zeros_like(lie)):
-        of_wheels = wheels_covariance + wrong
-        likelihoods.append(
-            np.logaddexp(
-                inlier + _log_likelihood(wheels, of_wheels + covariance),
-                _OUTLIERS + outlier + _log_likelihood(apart, of_wheels + guess_covariance),
-            )
-        )
-    return float(likelihoods[0] - likelihoods[1])
+    unit = np.eye(len(wheels))
+    by_inertia = _log_likelihood(guess, max(guess_variance, wheels_variance) * unit + covariance)
+    return by_inertia - _log_likelihood(wheels, wheels_variance * unit + covariance)
 
 
 def _log_likelihood(missed: NDArray[np.float64], covariance: Matrix) -> float:
