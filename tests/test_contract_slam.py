@@ -25,7 +25,11 @@ UNLIKE = {  # module and check -> why it is not held against it
     ("orb_slam3", "repeats_itself"): "its threads race: no two runs are the same to the bit",
     ("orb_slam3", "follows_a_known_motion"): "the room's equal squares mislead it by 0.2 m",
 }
-EXTRA = {"orb_slam3": "pyorbslam3"}  # what a module needs that is not installed with the package
+EXTRA = {
+    "orb_slam3": "pyorbslam3",
+    "genz_icp": "genz_icp",
+    "rko_lio": "rko_lio",
+}  # what a module needs that is not installed with the package
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,115 @@
+"""The `rko_lio` SLAM module: lidar-inertial odometry by RKO-LIO.
+
+Malladi et al., "A Robust Approach for LiDAR-Inertial Odometry Without Sensor-Specific Modeling",
+RA-L 2026. The library predicts and deskews by gyro and accelerometer, and levels its world by
+gravity; of its answers the motions from cloud to cloud are used.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig, Sensor
+
+from .cloud_odometry import CloudLimits, CloudMap, CloudOdometry
+from .clouds import Cloud
+from .quiet import quiet
+
+
+class RkoLio(CloudOdometry):
+    """Registers a lidar's clouds; `conf/slam/rko_lio.yaml` says what the settings are."""
+
+    requires = (frozenset({Sensor.POINTS, Sensor.GYRO, Sensor.ACCELEROMETER}),)
+
+    def __init__(
+        self,
+        *,
+        voxel_m: float | None,
+        correspondence_voxels: float,
+        is_at_rest_first: bool,
+        limits: CloudLimits,
+    ) -> None:
+        if find_spec("rko_lio") is None:
+            raise ConfigError("_target_", "RkoLio", "pip install 'sceneslam[rko_lio]'")
+        if not 0 < correspondence_voxels < np.inf:
+            raise ConfigError("correspondence_voxels", correspondence_voxels, "above 0")
+
+        def make_map(edge_m: float, range_max_m: float) -> CloudMap:
+            return _Map(
+                self._T_base_lidar,
+                deskew=True,
+                voxel_size=edge_m,
+                max_range=range_max_m,
+                min_range=0.0,
+                max_correspondence_distance=correspondence_voxels * edge_m,
+                max_num_threads=1,  # more would add up in another order
+                initialization_phase=is_at_rest_first,
+            )
+
+        super().__init__(make_map, limits, voxel_m=voxel_m)
+
+    def activate(self, rig: Rig) -> None:
+        """Start anew."""
+        self._T_base_lidar = se3.identity() if rig.lidar is None else rig.lidar.T_base_lidar
+        super().activate(rig)
+
+
+class _Map:
+    """The library, which takes every cloud into its own map at its own pose."""
+
+    def __init__(self, T_base_lidar: se3.Transform, **settings: Any) -> None:
+        from rko_lio.config import LIOConfig
+        from rko_lio.lio import LIO
+
+        self._T_base_lidar, self._lio = T_base_lidar, LIO(LIOConfig(**settings))
+        self._T_local_world: se3.Transform | None = None
+
+    def register(
+        self, cloud: Cloud, T_local_guess: se3.Transform, observation: Observation
+    ) -> se3.Transform | None:
+        """Return T_local_base of the observation's own points and inertial samples."""
+        from rko_lio.rko_lio_pybind import InputError
+
+        points = observation.points_lidar
+        assert points is not None
+        for after_s, rate, force in _inertial(observation):
+            time_ns = observation.stamp_ns + round(after_s * 1e9)
+            self._lio.add_imu_measurement(force, rate, time_ns, np.eye(4))
+        times_s = observation.point_times_s
+        after_ns = np.zeros(len(points)) if times_s is None else times_s * 1e9
+        stamps_ns = observation.stamp_ns + np.rint(after_ns).astype(np.int64)
+        with quiet():  # it logs there
+            try:
+                self._lio.register_scan(points, stamps_ns, self._T_base_lidar)
+            except InputError:
+                return None
+        self._T_world_base = np.array(self._lio.pose(), np.float64)
+        if self._T_local_world is None:
+            self._T_local_world = T_local_guess @ se3.inverse(self._T_world_base)
+        return self._T_local_world @ self._T_world_base
+
+    def accept(self, T_local_base: se3.Transform) -> None:
+        """Go on from this pose."""
+        self._T_local_world = T_local_base @ se3.inverse(self._T_world_base)
+
+    def points(self) -> NDArray[Any]:
+        """Return the map's points (N, 3) [m], local."""
+        points_world = np.asarray(self._lio.map_point_cloud()).reshape(-1, 3)
+        T_local_world = se3.identity() if self._T_local_world is None else self._T_local_world
+        return np.asarray(se3.apply(T_local_world, points_world))
+
+
+def _inertial(observation: Observation) -> list[tuple[float, NDArray[Any], NDArray[Any]]]:
+    """Return time after the stamp [s], rate and force, at the gyro's samples."""
+    gyro, force = observation.gyro_base, observation.accelerometer_base
+    if gyro is None or force is None:
+        return []
+    forces = [np.interp(gyro[:, 0], force[:, 0], force[:, axis]) for axis in (1, 2, 3)]
+    return list(zip(gyro[:, 0].tolist(), gyro[:, 1:], np.stack(forces, axis=1), strict=True))

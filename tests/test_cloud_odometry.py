@@ -1,0 +1,113 @@
+"""What is put around a library that registers clouds: bounds, bridges, weak directions."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneslam.modules.slam.cloud_odometry import CloudLimits, CloudOdometry
+from sceneslam.modules.slam.quiet import quiet
+from sceneslam.testing import RIG, room_observation
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.observation import TrackingStatus
+
+LIMITS = {
+    "noise_voxels": 0.1,
+    "noise_rad": 0.01,
+    "overlap_min_ratio": 0.0,
+    "weak_ratio": 0.0,
+    "speed_max_m_s": 5.0,
+    "turn_max_rad_s": 3.0,
+}
+
+
+class Answering:
+    """A library that answers with what it is told to, or with the guess."""
+
+    def __init__(self):
+        self.answers, self.accepted = {}, []
+
+    def register(self, cloud, T_local_guess, observation):
+        answer = self.answers.get(observation.stamp_ns, lambda T: T)
+        return answer(T_local_guess)
+
+    def accept(self, T_local_base):
+        self.accepted.append(T_local_base)
+
+    def points(self):
+        return np.zeros((0, 3))
+
+
+def driven(answers, *, odometry=True, **limits):
+    library = Answering()
+    library.answers = {room_observation(index).stamp_ns: answers[index] for index in answers}
+    module = CloudOdometry(
+        lambda voxel_m, range_m: library, CloudLimits(**(LIMITS | limits)), voxel_m=0.2
+    )
+    module.activate(RIG)
+    silent = {} if odometry else {"T_odom_base": None}
+    return [module.track(replace(room_observation(index), **silent)) for index in range(8)], library
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [lambda T: None, lambda T: T * np.nan, lambda T: T @ se3.from_xy_yaw(9.0, 0.0, 0.0)],
+    ids=["refused", "no number", "too far"],
+)
+def test_an_answer_that_cannot_be_is_bridged_by_odometry(answer):
+    found, library = driven({4: answer})
+    assert [one.status for one in found[3:6]] == [
+        TrackingStatus.TRACKING,
+        TrackingStatus.DEGRADED,
+        TrackingStatus.TRACKING,
+    ]
+    T_first = room_observation(0).T_odom_base
+    T_true = se3.inverse(T_first) @ room_observation(4).T_odom_base
+    assert np.linalg.norm((se3.inverse(T_true) @ found[4].T_local_base)[:3, 3]) < 0.02
+    assert len(library.accepted) == 7  # the cloud that was not placed stays out of the map
+
+
+def test_without_odometry_such_an_answer_is_lost():
+    found, _ = driven({4: lambda T: None}, odometry=False)
+    assert found[4].status is TrackingStatus.LOST and found[4].covariance is None
+    assert found[5].status is TrackingStatus.TRACKING
+
+
+def test_a_cloud_where_nothing_was_seen_before_is_refused():
+    away = {4: lambda T: T @ se3.exp(np.array([0.0, 0.0, 4.0, 0.0, 0.0, 0.0]))}
+    found, _ = driven(away, speed_max_m_s=1e3, overlap_min_ratio=0.5)
+    assert found[4].status is TrackingStatus.DEGRADED and found[4].inliers == 0
+
+
+def test_a_direction_that_the_cloud_leaves_open_follows_the_prediction():
+    slip = {index: lambda T: T @ se3.from_xy_yaw(0.05, 0.0, 0.0) for index in range(1, 8)}
+    weak, _ = driven(slip, weak_ratio=0.999)
+    held, _ = driven(slip)
+    assert weak[-1].status is TrackingStatus.DEGRADED
+    T_first = room_observation(0).T_odom_base
+    T_true = se3.inverse(T_first) @ room_observation(7).T_odom_base
+    off_m = [
+        np.linalg.norm((se3.inverse(T_true) @ found[-1].T_local_base)[:3, 3])
+        for found in (weak, held)
+    ]
+    assert off_m[0] < 0.5 * off_m[1]
+    assert np.trace(weak[-1].covariance) > np.trace(held[-1].covariance)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("noise_voxels", 0.0), ("overlap_min_ratio", 1.0), ("weak_ratio", -0.1)]
+)
+def test_a_limit_that_makes_no_sense_is_named(key, value):
+    with pytest.raises(ConfigError, match=key):
+        CloudLimits(**(LIMITS | {key: value}))
+
+
+def test_quiet_drops_standard_output_and_gives_it_back(capfd):
+    with quiet():
+        os.write(1, b"a page of status")
+    os.write(1, b"kept")
+    assert capfd.readouterr().out == "kept"
