@@ -125,7 +125,7 @@ class _Map:
                 kernel=sigma_m / 3.0,
             )
         self._dense, self._T_local_guess = dense, T_local_guess
-        return np.round(np.array(T_local_base, dtype=np.float64), _DECIMALS)
+        return np.asarray(np.round(np.asarray(T_local_base), _DECIMALS), np.float64)
 
     def accept(self, T_local_base: se3.Transform) -> None:
         """Add the last cloud to the map, and learn how good guesses are."""
