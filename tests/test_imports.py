@@ -39,8 +39,8 @@ ALLOWED = {  # package -> what of ours it may import
 
 
 SLAM = {  # what more than one SLAM module may use
-    "cloud_shape", "clouds", "degeneracy", "depth_scan", "grid", "icp_map", "lidar_scan", "process",
-    "surfaces", "cloud_odometry", "known_voxels", "quiet"}  # fmt: skip
+    "cloud_shape", "clouds", "degeneracy", "depth_scan", "grid", "lidar_scan", "process",
+    "surfaces", "cloud_odometry", "cloud_map", "quiet"}  # fmt: skip
 
 
 @pytest.mark.parametrize("package", ALLOWED)

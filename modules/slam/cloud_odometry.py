@@ -1,158 +1,123 @@
-"""A library that registers clouds, as a SLAM module: what it is not, is here.
+"""A library that registers clouds, as a SLAM module: prediction, judgement and states are here.
 
-Such libraries answer with a pose whatever they are given. Around them: the motion model's
-prediction, the bounds of a robot's motion, the overlap with what was seen before, the directions
-that a cloud's shape leaves open, the covariance, and the states that follow.
+Such libraries answer with a pose whatever they are given: empty clouds, NaN, a bare corridor.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sceneslam.motion.model import Motion, MotionModel
+from sceneslam.motion.predictor import Prediction, Predictor
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers, PointLayer
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
-from sceneslam.types.rig import Rig
+from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
-from .cloud_shape import cloud_localizability
-from .clouds import Cloud, CloudReader
+from .cloud_map import CloudMap
+from .clouds import CloudReader
 from .degeneracy import Localizability
-from .known_voxels import KnownVoxels
 
 _POINTS_MIN = 50  # fewer do not hold six degrees of freedom
-_SHAPE_POINTS = 10_000  # suffice for the shape of a cloud
-_DEPTH_VOXEL_M = 0.1
 _COAST_S = 0.5  # without a good cloud for longer, a guessed pose is no pose
-_CERTAIN = 1e-8 * np.eye(6)  # covariance of a pose that is so by definition
-_UNSEEN = 1e-6 * np.eye(6)  # information along a direction that is not measured
+_DEPTH_VOXEL_M = 0.1
+_DIFFUSE = 1e6  # variances of a cloud: a prediction that ICP alone decides against
 
 
-class CloudMap(Protocol):
-    """A library's map, in `local`."""
+@dataclass(kw_only=True, eq=False)
+class CloudOdometry(ABC):
+    """Fulfils `SlamModule` by a `CloudMap`; the YAML of each says what the settings are."""
 
-    def register(
-        self, cloud: Cloud, T_local_guess: se3.Transform, observation: Observation
-    ) -> se3.Transform | None:
-        """Return T_local_base of a cloud (N, 3) [m] in base, None where the library refuses it."""
-        ...
-
-    def accept(self, T_local_base: se3.Transform) -> None:
-        """Let the cloud registered last become part of the map, at this pose."""
-        ...
-
-    def points(self) -> NDArray[Any]:
-        """Return the map's points (N, 3) [m]."""
-        ...
-
-
-@dataclass(slots=True, kw_only=True)
-class CloudLimits:
-    """When a registration is believed, and how far; the YAML says what the values are."""
-
-    noise_voxels: float
+    voxel_m: float | None
+    depth_range_max_m: float
+    depth_stride_px: int
+    deskew: bool
+    noise_m: float | None
     noise_rad: float
     overlap_min_ratio: float
     weak_ratio: float
-    speed_max_m_s: float
+    speed_max_m_s: float | None
     turn_max_rad_s: float
+    _reader: CloudReader | None = field(default=None, init=False)
+    _icp: CloudMap | None = field(default=None, init=False)
+    _T_map_local: se3.Transform = field(default_factory=se3.identity, init=False)
+    _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
+    _predictor: Predictor = field(init=False)
 
     def __post_init__(self) -> None:
-        """Check the values."""
-        for field in fields(self):
-            is_ratio = field.name.endswith("_ratio")
-            value = getattr(self, field.name)
-            if is_ratio and not 0 <= value < 1:
-                raise ConfigError(field.name, value, "0 (never) to below 1")
-            if not is_ratio and not 0 < value < np.inf:
-                raise ConfigError(field.name, value, "above 0")
-
-
-class CloudOdometry:
-    """Fulfils all of `SlamModule` but `requires`."""
-
-    def __init__(
-        self,
-        make_map: Callable[[float, float], CloudMap],
-        limits: CloudLimits,
-        *,
-        voxel_m: float | None,
-        depth_range_max_m: float = 6.0,
-        depth_stride_px: int = 8,
-    ) -> None:
-        """Take what makes the library's map of a voxel's edge and the sensor's range [m]."""
-        for name, value in (
-            ("voxel_m", voxel_m),
-            ("depth_range_max_m", depth_range_max_m),
-            ("depth_stride_px", depth_stride_px),
-        ):
-            if value is not None and not 0 < value < np.inf:
+        """Check the settings."""
+        if not 0 <= self.overlap_min_ratio <= 1:
+            raise ConfigError("overlap_min_ratio", self.overlap_min_ratio, "0 to 1")
+        if not 0 <= self.weak_ratio < 1:
+            raise ConfigError("weak_ratio", self.weak_ratio, "0 (never weak) to below 1")
+        for name in (one.name for one in fields(self) if one.init):
+            value = getattr(self, name)
+            is_number = isinstance(value, float | int) and not isinstance(value, bool)
+            if is_number and not name.endswith("_ratio") and not 0 < value < np.inf:
                 raise ConfigError(name, value, "above 0")
-        self._make_map, self._limits, self._given_voxel_m = make_map, limits, voxel_m
-        self._depth = {"depth_range_max_m": depth_range_max_m, "depth_stride_px": depth_stride_px}
-        self._reader: CloudReader | None = None
-        self._map: CloudMap | None = None
-        self._T_map_local = se3.identity()
-        self._T_local_base = se3.identity()
+
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return the sensors, one of which suffices; odometry is used when present."""
+        return (frozenset({Sensor.POINTS}), frozenset({Sensor.DEPTH}))
+
+    @abstractmethod
+    def make_map(self, voxel_m: float, reader: CloudReader) -> CloudMap:
+        """Return the library's map, empty, for what a rig's sensor reads."""
 
     def activate(self, rig: Rig) -> None:
         """Start anew, with the lidar where there is one, else with the depth camera."""
-        self._reader = CloudReader(rig, **self._depth)  # type: ignore[arg-type]
+        self._reader = CloudReader(
+            rig, depth_range_max_m=self.depth_range_max_m, depth_stride_px=self.depth_stride_px
+        )
         range_max_m = self._reader.range_m[1]
         derived_m = _DEPTH_VOXEL_M if self._reader.is_depth else range_max_m / 100.0
-        self._voxel_m = self._given_voxel_m or derived_m
-        self._map = self._make_map(self._voxel_m, range_max_m)
-        noise = [self._limits.noise_voxels * self._voxel_m, self._limits.noise_rad]
-        self._precision = np.diag(1.0 / np.repeat(noise, 3) ** 2)  # of a registration
-        self._known = KnownVoxels(self._voxel_m)
-        self._motion = MotionModel(rig)
+        voxel_m = self.voxel_m or derived_m
+        self._icp = self.make_map(voxel_m, self._reader)
+        self._speed_max_m_s = self.speed_max_m_s or 0.5 * range_max_m
+        noise = np.array([self.noise_m or 0.2 * voxel_m, self.noise_rad]) ** 2
+        self._noise = np.repeat(noise, 3)  # variances of a registration
+        self._predictor = Predictor(rig)
         self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
-        self._T_local_held = se3.identity()  # by the latest good cloud
-        self._held_ns: int | None = None
-        self._marked_at = np.zeros(3)
-        self._covariance = _CERTAIN  # of the pose in base, beside the map around
+        self._has_map = False
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
         """Place `local` in the map."""
         self._T_map_local = np.array(T_map_local, dtype=np.float64)
 
-    def set_scene(self, scene: str) -> None:
+    def set_scene(self, scene: str) -> None:  # noqa: B027
         """Do nothing: geometry is the same by day and by night."""
 
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base at the observation."""
-        if self._reader is None or self._map is None:
+        if self._reader is None or self._icp is None:
             raise RuntimeError("track() before activate()")
-        velocity = self._motion.velocity
-        motion = self._motion.predict(observation)
-        T_local_guess = se3.orthonormal(self._T_local_base @ motion.T_prev_curr)
-        carry = se3.adjoint(se3.inverse(motion.T_prev_curr))
-        self._covariance = carry @ self._covariance @ carry.T + motion.covariance
-        cloud = self._reader.read_unswept(observation, velocity)
+        prediction = self._predictor.predict(observation)
+        twist_s = self._predictor.model.velocity if self.deskew else np.zeros(6)
+        cloud = self._reader.read_unswept(observation, twist_s)
         if cloud is None:
-            return self._bridge(observation, T_local_guess, motion, can_coast=True)
+            return self._bridge(observation, prediction, can_coast=True)
         if len(cloud) < _POINTS_MIN:
-            return self._bridge(observation, T_local_guess, motion, can_coast=False)
-        T_local_icp = self._map.register(cloud, T_local_guess, observation)
-        if T_local_icp is None or not self._is_plausible(observation.stamp_ns, T_local_icp):
-            return self._bridge(observation, T_local_guess, motion, can_coast=False)
-        inliers = self._known.count(se3.apply(T_local_icp, cloud))
-        overlap_ratio = inliers / len(cloud) if self._held_ns is not None else 1.0
-        if overlap_ratio < self._limits.overlap_min_ratio:
-            return self._bridge(observation, T_local_guess, motion, can_coast=False)
-        thinned = cloud[:: max(1, round(len(cloud) / _SHAPE_POINTS))]
-        shape = cloud_localizability(thinned, 2.0 * self._voxel_m)
-        T_local_base = self._fuse(T_local_guess, T_local_icp, shape, motion)
-        self._hold(observation.stamp_ns, T_local_base, cloud)
-        is_weak = shape.ratios[0] < self._limits.weak_ratio
-        status = TrackingStatus.DEGRADED if is_weak else TrackingStatus.TRACKING
+            return self._bridge(observation, prediction, can_coast=False)
+        T_local_icp = self._icp.register(cloud, prediction.T_local_base, observation)
+        if T_local_icp is None or not np.isfinite(T_local_icp).all():
+            return self._bridge(observation, prediction, can_coast=False)
+        overlap_ratio, inliers = self._icp.overlap(T_local_icp)
+        if self._has_map and not (
+            overlap_ratio >= self.overlap_min_ratio
+            and self._is_plausible(observation, prediction, T_local_icp)
+        ):
+            return self._bridge(observation, prediction, can_coast=False)
+        shape = self._icp.localizability()
+        self._T_local_base = self._fuse(observation, prediction, T_local_icp, shape)
+        self._icp.accept(prediction.T_local_base, self._T_local_base)
+        self._has_map = True
+        is_open = shape.ratios[0] < self.weak_ratio
+        status = TrackingStatus.DEGRADED if is_open else TrackingStatus.TRACKING
         return self._answer(observation, status, overlap_ratio, inliers)
 
     def get_pose(self) -> se3.Transform:
@@ -160,86 +125,73 @@ class CloudOdometry:
         return self._T_map_local @ self._T_local_base
 
     def get_trajectory(self) -> Trajectory:
-        """Return no poses: a map that moves along revises nothing."""
+        """Return no poses: registration with a map that moves along revises nothing."""
         return Trajectory.empty()
 
     def get_map(self) -> MapLayers:
-        """Return the map's points in `local`."""
-        if self._map is None or self._held_ns is None:
+        """Return the voxel map in `local`: what lies within the sensor's range by now."""
+        if self._icp is None:
             return MapLayers()
-        return MapLayers(points=PointLayer(points=self._map.points().astype(np.float32)))
+        return MapLayers(points=PointLayer(points=self._icp.points().astype(np.float32)))
 
     def shutdown(self) -> None:
         """Free the ray table; the map stays."""
         self._reader = None
 
-    def _is_plausible(self, stamp_ns: int, T_local_icp: se3.Transform) -> bool:
-        """Tell whether a robot can have moved so, in the time since the last good cloud."""
-        if not np.isfinite(T_local_icp).all():
-            return False
-        if self._held_ns is None:
-            return True
-        moved = se3.inverse(self._T_local_held) @ T_local_icp
-        duration_s = (stamp_ns - self._held_ns) * 1e-9
-        limits = self._limits
-        return bool(
-            np.linalg.norm(moved[:3, 3]) <= limits.speed_max_m_s * duration_s + self._voxel_m
-            and se3.rotation_angle_rad(moved) <= limits.turn_max_rad_s * duration_s
-        )
-
     def _fuse(
         self,
-        T_local_guess: se3.Transform,
+        observation: Observation,
+        prediction: Prediction,
         T_local_icp: se3.Transform,
         shape: Localizability,
-        motion: Motion,
     ) -> se3.Transform:
-        """Return the pose between the prediction's and the library's, and teach the prediction.
+        """Return the pose between odometry's and ICP's, by the covariance of each.
 
-        Where nothing measures the motion, the library's answer stands, but for the directions that
-        the cloud's shape leaves open: there the prediction does.
+        Point-to-point registration drags along smooth planes. Without odometry its answer stands,
+        but for the directions that the cloud's shape leaves open: there the prediction does.
         """
-        held = shape.held(self._limits.weak_ratio)
-        information = held.T @ self._precision @ held
-        predicted = self._covariance
-        fused = np.linalg.inv(np.linalg.inv(predicted) + information)
-        if self._held_ns is None:
-            self._motion.skip()
+        held = shape.held(self.weak_ratio)
+        information = held.T @ np.diag(1.0 / self._noise) @ held
+        covariance = np.asarray(np.linalg.inv(np.linalg.inv(prediction.covariance) + information))
+        if not self._has_map:
+            self._predictor.measure(observation, T_local_icp, covariance)
             return T_local_icp
-        self._covariance = np.asarray(0.5 * (fused + fused.T), np.float64)
-        T_before_now = se3.inverse(self._T_local_held) @ T_local_icp
-        self._motion.learn(T_before_now, np.asarray(np.linalg.inv(information + _UNSEEN)))
-        gain = fused @ information if motion.is_measured else held
-        off = se3.log(se3.inverse(T_local_guess) @ T_local_icp)
-        return se3.orthonormal(T_local_guess @ se3.exp(gain @ off))
+        is_known = prediction.is_measured
+        predicted = prediction.covariance if is_known else _DIFFUSE * np.diag(self._noise)
+        gain = np.linalg.solve(np.linalg.inv(predicted) + information, information)
+        off = se3.log(se3.inverse(prediction.T_local_base) @ T_local_icp)
+        T_local_base = np.asarray(prediction.T_local_base @ se3.exp(gain @ off))
+        self._predictor.measure(observation, T_local_base, covariance, information)
+        return T_local_base
 
-    def _hold(self, stamp_ns: int, T_local_base: se3.Transform, cloud: Cloud) -> None:
-        assert self._map is not None and self._reader is not None
-        self._map.accept(T_local_base)
-        self._T_local_base = self._T_local_held = T_local_base
-        self._held_ns = stamp_ns
-        if np.linalg.norm(T_local_base[:3, 3] - self._marked_at) > 0.5 * self._reader.range_m[1]:
-            self._known.reset(self._map.points())  # a map that moves along forgets
-            self._marked_at = T_local_base[:3, 3]
-        self._known.add(se3.apply(T_local_base, cloud))
+    def _is_plausible(
+        self, observation: Observation, prediction: Prediction, T_local_icp: se3.Transform
+    ) -> bool:
+        """Tell whether a robot can have moved so, in the time since the last good cloud."""
+        # Of a motion that odometry knows, the difference has to be small.
+        is_known = prediction.is_measured
+        T_before = prediction.T_local_base if is_known else self._predictor.T_local_measured
+        moved = se3.inverse(T_before) @ T_local_icp
+        share = 0.2 if is_known else 1.0
+        duration_s = max(self._predictor.unmeasured_s(observation), 0.02)
+        return bool(
+            np.linalg.norm(moved[:3, 3]) <= share * self._speed_max_m_s * duration_s + 0.05
+            and se3.rotation_angle_rad(moved) <= share * self.turn_max_rad_s * duration_s + 0.05
+        )
 
     def _bridge(
-        self,
-        observation: Observation,
-        T_local_guess: se3.Transform,
-        motion: Motion,
-        *,
-        can_coast: bool,
+        self, observation: Observation, prediction: Prediction, *, can_coast: bool
     ) -> Tracking:
         """Go on without a cloud: by odometry, for a moment as before, else not at all."""
-        since_ns = observation.stamp_ns - (self._held_ns or 0)
-        is_brief = can_coast and self._held_ns is not None and since_ns <= _COAST_S * 1e9
-        if motion.is_measured or is_brief:
-            self._T_local_base = T_local_guess
-            status = TrackingStatus.TRACKING if is_brief else TrackingStatus.DEGRADED
+        is_brief = self._has_map and self._predictor.unmeasured_s(observation) <= _COAST_S
+        if prediction.is_measured or (can_coast and is_brief):
+            self._predictor.coast(prediction)
+            self._T_local_base = prediction.T_local_base
+            is_known = prediction.is_measured
+            status = TrackingStatus.DEGRADED if is_known else TrackingStatus.TRACKING
             return self._answer(observation, status, 0.0, 0)
-        self._motion.stop()
-        self._T_local_base = self._T_local_held
+        self._predictor.lose(prediction)
+        self._T_local_base = self._predictor.T_local_measured
         return self._answer(observation, TrackingStatus.LOST, 0.0, 0)
 
     def _answer(
@@ -249,7 +201,7 @@ class CloudOdometry:
             stamp_ns=observation.stamp_ns,
             T_local_base=self._T_local_base.copy(),
             status=status,
-            covariance=None if status is TrackingStatus.LOST else self._covariance.copy(),
+            covariance=None if status is TrackingStatus.LOST else self._predictor.covariance.copy(),
             quality_ratio=quality_ratio,
             inliers=inliers,
         )

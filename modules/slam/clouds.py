@@ -18,27 +18,27 @@ class CloudReader:
     """Reads one rig's clouds: the lidar's where there is one, else the depth camera's."""
 
     def __init__(self, rig: Rig, *, depth_range_max_m: float, depth_stride_px: int) -> None:
-        """Choose the sensor; `range_m` is what it is believed within."""
+        """Choose the sensor; `range_m` is what it is believed within, `T_base_sensor` its place."""
         self.is_depth = Sensor.POINTS not in rig.sensors and rig.camera is not None
         self.range_m = (0.0, 100.0)
-        self._T_base_sensor = se3.identity()
+        self.T_base_sensor = se3.identity()
         self._stride_px = depth_stride_px
         self._camera = rig.camera
         if self.is_depth and rig.camera is not None:
             near_m, far_m = rig.camera.depth_range_m
             self.range_m = (near_m, min(far_m, depth_range_max_m))
-            self._T_base_sensor = rig.camera.T_base_cam
+            self.T_base_sensor = rig.camera.T_base_cam
             self._rays_cam = _rays_cam(rig.camera, depth_stride_px)
         elif rig.lidar is not None:
             self.range_m = rig.lidar.range_m
-            self._T_base_sensor = rig.lidar.T_base_lidar
+            self.T_base_sensor = rig.lidar.T_base_lidar
 
     def read(self, observation: Observation) -> Cloud | None:
         """Return the observation's valid points, unswept; None where it has no cloud."""
         found = self._sensed(observation)
         if found is None:
             return None
-        return np.asarray(se3.apply(self._T_base_sensor, found[self._valid(found)]))
+        return np.asarray(se3.apply(self.T_base_sensor, found[self._valid(found)]))
 
     def read_unswept(self, observation: Observation, twist_s: NDArray[np.float64]) -> Cloud | None:
         """Return the valid points as they were at the observation's stamp.
@@ -53,7 +53,7 @@ class CloudReader:
         if len(times_s) != len(found):
             raise InputError(f"point_times_s: expected {len(found)} values, got {len(times_s)}")
         valid = self._valid(found)
-        points = np.asarray(se3.apply(self._T_base_sensor, found[valid]))
+        points = np.asarray(se3.apply(self.T_base_sensor, found[valid]))
         times = np.nan_to_num(times_s[valid], nan=0.0, posinf=0.0, neginf=0.0)
         return _moved(points, times, twist_s)
 

@@ -7,6 +7,8 @@ its own pipeline takes no guess, and keeps the voxel size of one run for the nex
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -15,77 +17,62 @@ from numpy.typing import NDArray
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Sensor
 
-from .cloud_odometry import CloudLimits, CloudMap, CloudOdometry
-from .clouds import Cloud
+from .cloud_map import CloudMap
+from .cloud_odometry import CloudOdometry
+from .clouds import Cloud, CloudReader
 from .quiet import quiet
 
 _DECIMALS = 9  # kept: its threads add up in any order, which changes the sixteenth
 _VOXEL_RANGE_M = (0.02, 2.0)  # of the voxel that adapts; as in the library
 
 
+@dataclass(kw_only=True, eq=False)
 class GenzIcp(CloudOdometry):
     """Registers 3D clouds; `conf/slam/genz_icp.yaml` says what the settings are."""
 
-    requires = (frozenset({Sensor.POINTS}), frozenset({Sensor.DEPTH}))
+    points_desired: int
+    planarity_max: float
+    initial_threshold_m: float | None
+    motion_min_m: float | None
+    iterations_max: int
 
-    def __init__(
-        self,
-        *,
-        voxel_m: float | None,
-        points_desired: int,
-        planarity_max: float,
-        threshold_voxels: float,
-        motion_min_voxels: float,
-        iterations_max: int,
-        depth_range_max_m: float,
-        depth_stride_px: int,
-        limits: CloudLimits,
-    ) -> None:
-        from importlib.util import find_spec
-
+    def __post_init__(self) -> None:
+        """Check that the library is there, and the settings."""
         if find_spec("genz_icp") is None:
             raise ConfigError("_target_", "GenzIcp", "pip install 'sceneslam[genz_icp]'")
-        given = {
-            "points_desired": points_desired,
-            "planarity_max": planarity_max,
-            "threshold_voxels": threshold_voxels,
-            "motion_min_voxels": motion_min_voxels,
-            "iterations_max": iterations_max,
-        }
-        for name, value in given.items():
-            if not 0 < value < np.inf:
-                raise ConfigError(name, value, "above 0")
+        super().__post_init__()
 
-        def make_map(edge_m: float, range_max_m: float) -> CloudMap:
-            return _Map(edge_m, range_max_m, **given)  # type: ignore[arg-type]
-
-        super().__init__(
-            make_map,
-            limits,
+    def make_map(self, voxel_m: float, reader: CloudReader) -> CloudMap:
+        """Return the library's map."""
+        return _GenzMap(
             voxel_m=voxel_m,
-            depth_range_max_m=depth_range_max_m,
-            depth_stride_px=depth_stride_px,
+            range_max_m=reader.range_m[1],
+            points_desired=self.points_desired,
+            planarity_max=self.planarity_max,
+            initial_threshold_m=self.initial_threshold_m or 2.0 * voxel_m,
+            motion_min_m=self.motion_min_m or 0.1 * voxel_m,
+            iterations_max=self.iterations_max,
         )
 
 
-class _Map:
+class _GenzMap(CloudMap):
     """The library's parts, in the order of its pipeline."""
 
     def __init__(
         self,
+        *,
         voxel_m: float,
         range_max_m: float,
-        *,
         points_desired: int,
         planarity_max: float,
-        threshold_voxels: float,
-        motion_min_voxels: float,
+        initial_threshold_m: float,
+        motion_min_m: float,
         iterations_max: int,
     ) -> None:
         from genz_icp.pybind import genz_icp_pybind as parts
 
+        super().__init__(voxel_m=voxel_m, range_max_m=range_max_m)
         self._parts: Any = parts
         self._voxel_m, self._points_desired = voxel_m, points_desired
         self._map: Any = parts._VoxelHashMap(
@@ -96,13 +83,11 @@ class _Map:
             max_points_per_voxel=1,
         )
         self._registration: Any = parts._Registration(
-            max_num_iterations=iterations_max,
-            convergence_criterion=1e-4,
-            max_num_threads=1,
+            max_num_iterations=iterations_max, convergence_criterion=1e-4, max_num_threads=1
         )
         self._threshold: Any = parts._AdaptiveThreshold(
-            initial_threshold=threshold_voxels * voxel_m,
-            min_motion_th=motion_min_voxels * voxel_m,
+            initial_threshold=initial_threshold_m,
+            min_motion_th=motion_min_m,
             max_range=range_max_m,
         )
 
@@ -113,25 +98,24 @@ class _Map:
         thinned = self._thinned(cloud, self._voxel_m)
         adapted_m = self._voxel_m * len(thinned) / self._points_desired
         self._voxel_m = float(np.clip(adapted_m, *_VOXEL_RANGE_M))
-        dense = self._thinned(cloud, max(0.5 * self._voxel_m, _VOXEL_RANGE_M[0]))
-        source = self._thinned(dense, self._voxel_m)
+        self.dense = self._thinned(cloud, max(0.5 * self._voxel_m, _VOXEL_RANGE_M[0]))
+        self.source = self._thinned(self.dense, self._voxel_m)
         sigma_m = self._threshold._compute_threshold()
         with quiet():  # it draws a page of status at every scan
             T_local_base = self._registration._align_points_to_map(
-                points=self._parts._Vector3dVector(source),
+                points=self._parts._Vector3dVector(self.source),
                 voxel_map=self._map,
                 initial_guess=T_local_guess,
                 max_correspondance_distance=3.0 * sigma_m,
                 kernel=sigma_m / 3.0,
             )
-        self._dense, self._T_local_guess = dense, T_local_guess
         return np.asarray(np.round(np.asarray(T_local_base), _DECIMALS), np.float64)
 
-    def accept(self, T_local_base: se3.Transform) -> None:
+    def add(self, T_local_guess: se3.Transform, T_local_base: se3.Transform) -> None:
         """Add the last cloud to the map, and learn how good guesses are."""
-        deviation = se3.inverse(self._T_local_guess) @ T_local_base
+        deviation = se3.inverse(T_local_guess) @ T_local_base
         self._threshold._update_model_deviation(model_deviation=deviation)
-        self._map._update(self._parts._Vector3dVector(self._dense), T_local_base)
+        self._map._update(self._parts._Vector3dVector(self.dense), T_local_base)
 
     def points(self) -> NDArray[Any]:
         """Return the map's points (N, 3) [m], local."""

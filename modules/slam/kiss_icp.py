@@ -1,218 +1,102 @@
 """The `kiss_icp` SLAM module: an adapter over KISS-ICP, for lidars and depth cameras.
 
-Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023. The library registers and
-keeps the voxel map; deskewing, prediction and judgement are here: it takes empty clouds and NaN
-in silence, and stops the process where all stamps are equal or a rotation is off by 1e-10.
+Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023. Of the library its parts are
+used: its pipeline stops the process where all stamps are equal or a rotation is off by 1e-10.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sceneslam.motion.predictor import Prediction, Predictor
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError
-from sceneslam.types.maps import MapLayers, PointLayer
-from sceneslam.types.observation import Observation, Tracking, TrackingStatus
-from sceneslam.types.rig import Rig, Sensor
-from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.observation import Observation
 
-from .clouds import CloudReader
-from .degeneracy import Localizability
-from .icp_map import IcpMap
-
-_POINTS_MIN = 50  # fewer do not hold six degrees of freedom
-_COAST_S = 0.5  # without a good cloud for longer, a guessed pose is no pose
-_DEPTH_VOXEL_M = 0.1
-_POSITIVE = (
-    "voxel_m initial_threshold_m motion_min_m points_per_voxel iterations_max "
-    "depth_range_max_m depth_stride_px noise_m noise_rad speed_max_m_s turn_max_rad_s"
-)
-_DIFFUSE = 1e6  # variances of a cloud: a prediction that ICP alone decides against
+from .cloud_map import CloudMap
+from .cloud_odometry import CloudOdometry
+from .clouds import Cloud, CloudReader
 
 
 @dataclass(kw_only=True, eq=False)
-class KissIcp:
+class KissIcp(CloudOdometry):
     """Registers 3D clouds; `conf/slam/kiss_icp.yaml` says what the settings are."""
 
-    voxel_m: float | None
     initial_threshold_m: float | None
     motion_min_m: float | None
     points_per_voxel: int
     iterations_max: int
-    depth_range_max_m: float
-    depth_stride_px: int
-    deskew: bool
-    noise_m: float | None
-    noise_rad: float
-    overlap_min_ratio: float
-    weak_ratio: float
-    speed_max_m_s: float | None
-    turn_max_rad_s: float
-    _reader: CloudReader | None = field(default=None, init=False)
-    _icp: IcpMap | None = field(default=None, init=False)
-    _T_map_local: se3.Transform = field(default_factory=se3.identity, init=False)
-    _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
-    _predictor: Predictor = field(init=False)
 
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        for name in _POSITIVE.split():
-            value = getattr(self, name)
-            if value is not None and not 0 < value < np.inf:
-                raise ConfigError(name, value, "above 0")
-        if not 0 <= self.overlap_min_ratio <= 1:
-            raise ConfigError("overlap_min_ratio", self.overlap_min_ratio, "0 to 1")
-        if not 0 <= self.weak_ratio < 1:
-            raise ConfigError("weak_ratio", self.weak_ratio, "0 (never weak) to below 1")
-
-    @property
-    def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return the sensors, one of which suffices; odometry is used when present."""
-        return (frozenset({Sensor.POINTS}), frozenset({Sensor.DEPTH}))
-
-    def activate(self, rig: Rig) -> None:
-        """Start anew, with the lidar where there is one, else with the depth camera."""
-        self._reader = CloudReader(
-            rig, depth_range_max_m=self.depth_range_max_m, depth_stride_px=self.depth_stride_px
-        )
-        range_max_m = self._reader.range_m[1]
-        derived_m = _DEPTH_VOXEL_M if self._reader.is_depth else range_max_m / 100.0
-        voxel_m = self.voxel_m or derived_m
-        self._icp = IcpMap(
+    def make_map(self, voxel_m: float, reader: CloudReader) -> CloudMap:
+        """Return the library's map."""
+        return _KissMap(
             voxel_m=voxel_m,
             initial_threshold_m=self.initial_threshold_m or 2.0 * voxel_m,
-            motion_min_m=self.motion_min_m or (0.3 if self._reader.is_depth else 0.1) * voxel_m,
-            range_max_m=range_max_m,
+            motion_min_m=self.motion_min_m or (0.3 if reader.is_depth else 0.1) * voxel_m,
+            range_max_m=reader.range_m[1],
             points_per_voxel=self.points_per_voxel,
             iterations_max=self.iterations_max,
         )
-        self._speed_max_m_s = self.speed_max_m_s or 0.5 * range_max_m
-        noise = np.array([self.noise_m or 0.2 * voxel_m, self.noise_rad]) ** 2
-        self._noise = np.repeat(noise, 3)  # variances of a registration
-        self._predictor = Predictor(rig)
-        self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
-        self._has_map = False
 
-    def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Place `local` in the map."""
-        self._T_map_local = np.array(T_map_local, dtype=np.float64)
 
-    def set_scene(self, scene: str) -> None:
-        """Do nothing: geometry is the same by day and by night."""
+class _KissMap(CloudMap):
+    """KISS-ICP's parts, put together so that its answer can be judged before it joins the map."""
 
-    def track(self, observation: Observation) -> Tracking:
-        """Return T_local_base at the observation."""
-        if self._reader is None or self._icp is None:
-            raise RuntimeError("track() before activate()")
-        prediction = self._predictor.predict(observation)
-        twist_s = self._predictor.model.velocity if self.deskew else np.zeros(6)
-        cloud = self._reader.read_unswept(observation, twist_s)
-        if cloud is None:
-            return self._bridge(observation, prediction, can_coast=True)
-        if len(cloud) < _POINTS_MIN:
-            return self._bridge(observation, prediction, can_coast=False)
-        T_local_icp = self._icp.register(cloud, prediction.T_local_base)
-        overlap_ratio, inliers = self._icp.overlap(T_local_icp)
-        if self._has_map and not (
-            overlap_ratio >= self.overlap_min_ratio
-            and self._is_plausible(observation, prediction, T_local_icp)
-        ):
-            return self._bridge(observation, prediction, can_coast=False)
-        shape = self._icp.localizability()
-        self._T_local_base = self._fuse(observation, prediction, T_local_icp, shape)
-        self._icp.accept(prediction.T_local_base, self._T_local_base)
-        self._has_map = True
-        is_open = shape.ratios[0] < self.weak_ratio
-        status = TrackingStatus.DEGRADED if is_open else TrackingStatus.TRACKING
-        return self._answer(observation, status, overlap_ratio, inliers)
-
-    def get_pose(self) -> se3.Transform:
-        """Return T_map_base of the last observation."""
-        return self._T_map_local @ self._T_local_base
-
-    def get_trajectory(self) -> Trajectory:
-        """Return no poses: ICP against a map that moves along revises nothing."""
-        return Trajectory.empty()
-
-    def get_map(self) -> MapLayers:
-        """Return the voxel map in `local`: what lies within the sensor's range by now."""
-        if self._icp is None:
-            return MapLayers()
-        return MapLayers(points=PointLayer(points=self._icp.points().astype(np.float32)))
-
-    def shutdown(self) -> None:
-        """Free the ray table; the map stays."""
-        self._reader = None
-
-    def _fuse(
+    def __init__(
         self,
-        observation: Observation,
-        prediction: Prediction,
-        T_local_icp: se3.Transform,
-        shape: Localizability,
+        *,
+        voxel_m: float,
+        initial_threshold_m: float,
+        motion_min_m: float,
+        range_max_m: float,
+        points_per_voxel: int,
+        iterations_max: int,
+    ) -> None:
+        from kiss_icp.config import config as parts
+        from kiss_icp.config.parser import KISSConfig
+        from kiss_icp.kiss_icp import KissICP
+
+        # Constructed without validation, since the class would also read the environment.
+        config: Any = KISSConfig.model_construct(
+            data=parts.DataConfig(max_range=range_max_m, min_range=0.0, deskew=False),
+            mapping=parts.MappingConfig(voxel_size=voxel_m, max_points_per_voxel=points_per_voxel),
+            registration=parts.RegistrationConfig(
+                max_num_iterations=iterations_max,
+                convergence_criterion=1e-4,
+                max_num_threads=1,  # more would add up in another order
+            ),
+            adaptive_threshold=parts.AdaptiveThresholdConfig(
+                fixed_threshold=None,
+                initial_threshold=initial_threshold_m,
+                min_motion_th=motion_min_m,
+            ),
+        )
+        self._odometry: Any = KissICP(config)
+        super().__init__(voxel_m=voxel_m, range_max_m=range_max_m)
+
+    def register(
+        self, cloud: Cloud, T_local_guess: se3.Transform, observation: Observation
     ) -> se3.Transform:
-        """Return the pose between odometry's and ICP's, by the covariance of each.
-
-        Point-to-point registration drags along smooth planes. Without odometry its answer stands,
-        but for the directions that the cloud's shape leaves open: there the prediction does.
-        """
-        held = shape.held(self.weak_ratio)
-        information = held.T @ np.diag(1.0 / self._noise) @ held
-        covariance = np.asarray(np.linalg.inv(np.linalg.inv(prediction.covariance) + information))
-        if not self._has_map:
-            self._predictor.measure(observation, T_local_icp, covariance)
-            return T_local_icp
-        is_known = prediction.is_measured
-        predicted = prediction.covariance if is_known else _DIFFUSE * np.diag(self._noise)
-        gain = np.linalg.solve(np.linalg.inv(predicted) + information, information)
-        off = se3.log(se3.inverse(prediction.T_local_base) @ T_local_icp)
-        T_local_base = np.asarray(prediction.T_local_base @ se3.exp(gain @ off))
-        self._predictor.measure(observation, T_local_base, covariance, information)
-        return T_local_base
-
-    def _is_plausible(
-        self, observation: Observation, prediction: Prediction, T_local_icp: se3.Transform
-    ) -> bool:
-        """Tell whether a robot can have moved so, in the time since the last good cloud."""
-        if not np.isfinite(T_local_icp).all():
-            return False
-        # Of a motion that odometry knows, the difference has to be small.
-        is_known = prediction.is_measured
-        T_before = prediction.T_local_base if is_known else self._predictor.T_local_measured
-        moved = se3.inverse(T_before) @ T_local_icp
-        share = 0.2 if is_known else 1.0
-        duration_s = max(self._predictor.unmeasured_s(observation), 0.02)
-        return bool(
-            np.linalg.norm(moved[:3, 3]) <= share * self._speed_max_m_s * duration_s + 0.05
-            and se3.rotation_angle_rad(moved) <= share * self.turn_max_rad_s * duration_s + 0.05
+        """Return T_local_base of a cloud (N, 3) in base."""
+        self.source, self.dense = self._odometry.voxelize(cloud)
+        sigma_m = self._odometry.adaptive_threshold.get_threshold()
+        T_local_base = self._odometry.registration.align_points_to_map(
+            points=self.source,
+            voxel_map=self._odometry.local_map,
+            initial_guess=T_local_guess,
+            max_correspondance_distance=3.0 * sigma_m,
+            kernel=sigma_m,
         )
+        return np.array(T_local_base, dtype=np.float64)
 
-    def _bridge(
-        self, observation: Observation, prediction: Prediction, *, can_coast: bool
-    ) -> Tracking:
-        """Go on without a cloud: by odometry, for a moment as before, else not at all."""
-        is_brief = self._has_map and self._predictor.unmeasured_s(observation) <= _COAST_S
-        if prediction.is_measured or (can_coast and is_brief):
-            self._predictor.coast(prediction)
-            self._T_local_base = prediction.T_local_base
-            is_known = prediction.is_measured
-            status = TrackingStatus.DEGRADED if is_known else TrackingStatus.TRACKING
-            return self._answer(observation, status, 0.0, 0)
-        self._predictor.lose(prediction)
-        self._T_local_base = self._predictor.T_local_measured
-        return self._answer(observation, TrackingStatus.LOST, 0.0, 0)
+    def add(self, T_local_guess: se3.Transform, T_local_base: se3.Transform) -> None:
+        """Add the last cloud to the map, and learn how good guesses are."""
+        deviation = se3.inverse(T_local_guess) @ T_local_base
+        self._odometry.adaptive_threshold.update_model_deviation(deviation)
+        self._odometry.local_map.update(self.dense, T_local_base)
 
-    def _answer(
-        self, observation: Observation, status: TrackingStatus, quality_ratio: float, inliers: int
-    ) -> Tracking:
-        return Tracking(
-            stamp_ns=observation.stamp_ns,
-            T_local_base=self._T_local_base.copy(),
-            status=status,
-            covariance=None if status is TrackingStatus.LOST else self._predictor.covariance.copy(),
-            quality_ratio=quality_ratio,
-            inliers=inliers,
-        )
+    def points(self) -> NDArray[np.float64]:
+        """Return the map's points (N, 3) [m], local."""
+        return np.asarray(self._odometry.local_map.point_cloud()).reshape(-1, 3)

@@ -7,6 +7,7 @@ gravity; of its answers the motions from cloud to cloud are used.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import Any
 
@@ -16,59 +17,58 @@ from numpy.typing import NDArray
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.rig import Sensor
 
-from .cloud_odometry import CloudLimits, CloudMap, CloudOdometry
-from .clouds import Cloud
+from .cloud_map import CloudMap
+from .cloud_odometry import CloudOdometry
+from .clouds import Cloud, CloudReader
 from .quiet import quiet
 
 
+@dataclass(kw_only=True, eq=False)
 class RkoLio(CloudOdometry):
     """Registers a lidar's clouds; `conf/slam/rko_lio.yaml` says what the settings are."""
 
-    requires = (frozenset({Sensor.POINTS, Sensor.GYRO, Sensor.ACCELEROMETER}),)
+    correspondence_max_m: float | None
+    is_at_rest_first: bool
+    depth_range_max_m: float = field(default=1.0, init=False)  # depth is not used
+    depth_stride_px: int = field(default=1, init=False)
 
-    def __init__(
-        self,
-        *,
-        voxel_m: float | None,
-        correspondence_voxels: float,
-        is_at_rest_first: bool,
-        limits: CloudLimits,
-    ) -> None:
+    def __post_init__(self) -> None:
+        """Check that the library is there, and the settings."""
         if find_spec("rko_lio") is None:
             raise ConfigError("_target_", "RkoLio", "pip install 'sceneslam[rko_lio]'")
-        if not 0 < correspondence_voxels < np.inf:
-            raise ConfigError("correspondence_voxels", correspondence_voxels, "above 0")
+        super().__post_init__()
 
-        def make_map(edge_m: float, range_max_m: float) -> CloudMap:
-            return _Map(
-                self._T_base_lidar,
-                deskew=True,
-                voxel_size=edge_m,
-                max_range=range_max_m,
-                min_range=0.0,
-                max_correspondence_distance=correspondence_voxels * edge_m,
-                max_num_threads=1,  # more would add up in another order
-                initialization_phase=is_at_rest_first,
-            )
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return the sensors, all of which are needed."""
+        return (frozenset({Sensor.POINTS, Sensor.GYRO, Sensor.ACCELEROMETER}),)
 
-        super().__init__(make_map, limits, voxel_m=voxel_m)
-
-    def activate(self, rig: Rig) -> None:
-        """Start anew."""
-        self._T_base_lidar = se3.identity() if rig.lidar is None else rig.lidar.T_base_lidar
-        super().activate(rig)
+    def make_map(self, voxel_m: float, reader: CloudReader) -> CloudMap:
+        """Return the library's map."""
+        return _RkoMap(
+            reader,
+            voxel_m,
+            deskew=self.deskew,
+            max_correspondence_distance=self.correspondence_max_m or 0.5 * voxel_m,
+            initialization_phase=self.is_at_rest_first,
+        )
 
 
-class _Map:
+class _RkoMap(CloudMap):
     """The library, which takes every cloud into its own map at its own pose."""
 
-    def __init__(self, T_base_lidar: se3.Transform, **settings: Any) -> None:
+    def __init__(self, reader: CloudReader, voxel_m: float, **settings: Any) -> None:
         from rko_lio.config import LIOConfig
         from rko_lio.lio import LIO
 
-        self._T_base_lidar, self._lio = T_base_lidar, LIO(LIOConfig(**settings))
+        near_m, far_m = reader.range_m
+        super().__init__(voxel_m=voxel_m, range_max_m=far_m)
+        self._T_base_lidar = reader.T_base_sensor
+        common = {"voxel_size": voxel_m, "min_range": near_m, "max_range": far_m}
+        # More threads would add up in another order.
+        self._lio = LIO(LIOConfig(**common, **settings, max_num_threads=1))
         self._T_local_world: se3.Transform | None = None
 
     def register(
@@ -77,6 +77,7 @@ class _Map:
         """Return T_local_base of the observation's own points and inertial samples."""
         from rko_lio.rko_lio_pybind import InputError
 
+        self.source = self.dense = cloud
         points = observation.points_lidar
         assert points is not None
         for after_s, rate, force in _inertial(observation):
@@ -95,7 +96,7 @@ class _Map:
             self._T_local_world = T_local_guess @ se3.inverse(self._T_world_base)
         return self._T_local_world @ self._T_world_base
 
-    def accept(self, T_local_base: se3.Transform) -> None:
+    def add(self, T_local_guess: se3.Transform, T_local_base: se3.Transform) -> None:
         """Go on from this pose."""
         self._T_local_world = T_local_base @ se3.inverse(self._T_world_base)
 
