@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from sceneslam.evaluation import markup
+from sceneslam.evaluation.answer import Answer, answer
 from sceneslam.evaluation.chronicle import Entry, chronicle
 from sceneslam.evaluation.figures import write_figures
 from sceneslam.evaluation.metrics import Metrics
+from sceneslam.evaluation.names import module_names, renamed
 from sceneslam.evaluation.page import fill_page
 from sceneslam.evaluation.story import tell
 from sceneslam.evaluation.summary import degrees, number, percent, seconds
@@ -56,7 +58,7 @@ def write_report(
     """
     figures = write_figures(
         folder / "figures",
-        result,
+        renamed(result, module_names(config.get("slam") or {})),
         truth,
         threshold=threshold,
         value_label=value_label,
@@ -67,9 +69,10 @@ def write_report(
     entries = chronicle(result, metrics["switches"], value_label=value_label)
     told = {
         **_told(metrics),
+        "answer": _answer(answer(metrics, faults)),
         "title": escape(_titled(title, config)),
         "made_of": markup.bullets(_made_of(config)),
-        "faults": _faults(_amiss(faults, metrics)),
+        "faults": _faults(_amiss(metrics)),
         "figures": "".join(markup.figure(f.svg, _CAPTIONS[f.name]) for f in figures),
         "chronicle": _chronicle(entries),
         "modules": _modules(metrics, config.get("slam") or {}),
@@ -156,20 +159,33 @@ def _numbers(metrics: Metrics) -> str:
     return markup.tiles(entries)
 
 
-def _amiss(faults: Sequence[str], metrics: Metrics) -> list[str]:
-    """Return all that is not as it should be, what weighs most first."""
-    kinds = ("shortfalls", "warnings", "faults", "notes")
-    return [*faults, *(sentence for kind in kinds for sentence in metrics[kind])]
+def _answer(told: Answer) -> str:
+    """Return whether it worked, where not and why, and what to change."""
+    advice = f"<p><b>What to change</b></p>{markup.bullets(told.advice)}" if told.advice else ""
+    where = _listed(told.where) if told.where else ""
+    headline = f"<p><b>{escape(told.headline)}</b></p>"
+    return f'<div class="answer {told.kind}">{headline}{where}{advice}</div>'
+
+
+def _amiss(metrics: Metrics) -> list[str]:
+    """Return what else is not as it should be, what weighs most first."""
+    kinds = ("warnings", "faults", "notes")
+    return [sentence for kind in kinds for sentence in metrics[kind]]
 
 
 def _faults(faults: Sequence[str]) -> str:
     if not faults:
         return ""
-    sentences = list(dict.fromkeys(faults))  # each once, in order
-    shown = sentences[:_SHOWN_FAULTS]
-    if len(sentences) > len(shown):
-        shown.append(f"and {len(sentences) - len(shown)} more (see events.jsonl)")
-    return f'<h2>Faults</h2><div class="faults">{markup.bullets(shown)}</div>'
+    return f'<h2>Faults</h2><div class="faults">{_listed(faults)}</div>'
+
+
+def _listed(sentences: Sequence[str]) -> str:
+    """Return a list of sentences, each once, and how many more there are."""
+    known = list(dict.fromkeys(sentences))
+    shown = known[:_SHOWN_FAULTS]
+    if len(known) > len(shown):
+        shown.append(f"and {len(known) - len(shown)} more (see events.jsonl)")
+    return markup.bullets(shown)
 
 
 def _chronicle(entries: Sequence[Entry]) -> str:

@@ -1,0 +1,97 @@
+"""What the reader of a report asks first: did it work, if not where and why, what to change."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from sceneslam.evaluation.metrics import Metrics
+from sceneslam.evaluation.summary import number, percent
+
+_SHARE = 0.01  # of the observations: less is not worth a change
+_CORRECT = 0.99  # of the time
+_ADVICE = (  # what stands in a reason for a missing pose -> what to change
+    (
+        r"while (.+) was lost",
+        "“{0}” lost track. Give its scene another module to fall back on, as in "
+        "scenes.NAME=[{0},OTHER], or one that suits it better: "
+        "python -m sceneslam list slam.",
+    ),
+    (
+        r"while (.+) was not believed",
+        "“{0}” moved otherwise than the wheels. If the wheels are wrong: policy.gate=null.",
+    ),
+    (
+        r"before a module tracked",
+        "The first pose came late. Look at the first seconds of the recording: what the module "
+        "needs may not be there yet.",
+    ),
+    (
+        r"after a module failed",
+        "A module failed. run.isolation=process gives it a process of its own, which is restarted.",
+    ),
+    (
+        r"without (.+)",
+        "There was no {0} at these times. Look at the sensor, or at source.sync_tolerance_s where "
+        "its stamps lie apart from the images'.",
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer:
+    """The answer, in plain sentences."""
+
+    kind: str  # worked | partly | failed
+    headline: str
+    where: Sequence[str]  # what went wrong, where and why
+    advice: Sequence[str]  # what to change
+
+
+def answer(metrics: Metrics, faults: Sequence[str]) -> Answer:
+    """Return whether a run worked; `faults` are what was wrong with the input or ended it early."""
+    where = list(dict.fromkeys([*faults, *metrics["shortfalls"]]))
+    advice = [*dict.fromkeys(_advice(metrics))]
+    if not metrics["poses"]:
+        return Answer(kind="failed", headline="It did not work.", where=where, advice=advice)
+    rate, false = metrics["correct_rate"], metrics["false_switches"]
+    if rate is not None and rate < _CORRECT:
+        largest = number(metrics["ate_max_m"], 2, " m")
+        where.append(
+            f"The pose was correct for {percent(rate)} of the time, and off by {largest} at most."
+        )
+    if false:
+        where.append(f"{false} changes of module followed a scene that was not there.")
+    if where:
+        return Answer(kind="partly", headline="It worked in part.", where=where, advice=advice)
+    told = f"{percent(metrics['coverage'])} of the observations have a pose"
+    if metrics["ate_rmse_m"] is not None:
+        told += f", {number(metrics['ate_rmse_m'], 3, ' m')} off (root mean square)"
+    return Answer(kind="worked", headline=f"It worked: {told}.", where=[], advice=advice)
+
+
+def _advice(metrics: Metrics) -> Iterator[str]:
+    """Yield what would mend what cost the most poses, then what would mend wrong switches."""
+    least = _SHARE * metrics["observations"]
+    for reason, count in _reasons(metrics).items():
+        if count < least:
+            continue
+        for pattern, advice in _ADVICE:
+            if match := re.fullmatch(pattern, reason):
+                yield advice.format(*match.groups())
+                break
+    if metrics["false_switches"]:
+        yield (
+            "Look at the detector's figure: the threshold (detector.threshold) should lie between "
+            "the scenes, and policy.confirm_window_s outlast what flickers."
+        )
+
+
+def _reasons(metrics: Metrics) -> Mapping[str, int]:
+    """Return why poses were bridged or missing, with how many."""
+    reasons: dict[str, int] = dict(metrics["bridged_why"])
+    for sentence in metrics["shortfalls"]:
+        for count, reason in re.findall(r"(\d+) ([^,;]+)", sentence.partition("without: ")[2]):
+            reasons[reason] = reasons.get(reason, 0) + int(count)
+    return reasons

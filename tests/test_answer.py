@@ -1,0 +1,79 @@
+"""Did it work, where not, and what to change; and modules by their names."""
+
+from __future__ import annotations
+
+import pytest
+from evaluation_runs import SETTINGS, poseless_run, switched_run, true_loop
+
+from sceneslam.evaluation.answer import answer
+from sceneslam.evaluation.metrics import evaluate
+from sceneslam.evaluation.names import module_names, renamed
+
+
+def told(**changes):
+    metrics = evaluate(switched_run(), true_loop(), settings=SETTINGS)
+    return answer(metrics | changes, [])
+
+
+def test_a_good_run_is_told_in_one_sentence():
+    found = told()
+    assert found.kind == "worked" and not found.where and not found.advice
+    assert found.headline.startswith("It worked: 100.0 % of the observations")
+
+
+@pytest.mark.parametrize(
+    ("changes", "advice"),
+    [
+        ({"bridged_why": {"while dark was lost": 50}, "correct_rate": 0.7}, "[dark,OTHER]"),
+        ({"bridged_why": {"while dark was not believed": 50}}, "policy.gate=null"),
+        ({"bridged_why": {"after a module failed": 50}}, "run.isolation=process"),
+        ({"shortfalls": ["only 40 % of it; without: 120 without depth"]}, "no depth at these"),
+        ({"shortfalls": ["only 40 %; without: 120 before a module tracked"]}, "came late"),
+        ({"false_switches": 3}, "detector.threshold"),
+    ],
+)
+def test_what_to_change_follows_from_what_went_wrong(changes, advice):
+    found = told(**changes)
+    assert advice in " ".join(found.advice) and len(found.advice) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "where"),
+    [
+        ({"correct_rate": 0.7}, "correct for 70.0 % of the time"),
+        ({"false_switches": 3}, "3 changes of module"),
+        ({"shortfalls": ["`dark` failed once"]}, "`dark` failed once"),
+    ],
+)
+def test_a_run_that_worked_in_part_says_where(changes, where):
+    found = told(**changes)
+    assert found.kind == "partly" and where in " ".join(found.where)
+
+
+def test_few_bridged_poses_ask_for_no_change():
+    assert not told(bridged_why={"while dark was lost": 1}).advice
+
+
+def test_a_run_without_a_pose_did_not_work():
+    metrics = evaluate(poseless_run(observed=10), None, settings=SETTINGS)
+    found = answer(metrics, ["the source ended early"])
+    assert found.kind == "failed" and found.where == ["the source ended early"]
+
+
+def test_modules_get_their_names():
+    slam = {
+        "bright": {"_target_": "sceneslam.modules.slam.rgbd.module.Rgbd"},
+        "laser": {"_target_": "sceneslam.modules.slam.laser.module.Laser"},
+        "mine": {"_target_": "my_slam.Fast"},
+        "none": None,
+    }
+    names = module_names(slam)
+    assert names == {
+        "bright": "rgbd (bright)",
+        "laser": "laser",
+        "mine": "Fast (mine)",
+        "none": "none",
+    }
+    run = renamed(switched_run(), {"bright": "rgbd (bright)"})
+    assert "rgbd (bright)" in run.modules and "bright" not in run.modules
+    assert not any("bright" in (e.get("from"), e.get("to"), e.get("module")) for e in run.events)
