@@ -74,6 +74,6 @@ def test_modules_get_their_names():
         "mine": "Fast (mine)",
         "none": "none",
     }
-    run = renamed(switched_run(), {"bright": "rgbd (bright)"})
-    assert "rgbd (bright)" in run.modules and "bright" not in run.modules
-    assert not any("bright" in (e.get("from"), e.get("to"), e.get("module")) for e in run.events)
+    run = renamed(switched_run(), {"rgbd": "rgbd (bright)"})
+    assert "rgbd (bright)" in run.modules and "rgbd" not in run.modules
+    assert not any("rgbd" in (e.get("from"), e.get("to"), e.get("module")) for e in run.events)

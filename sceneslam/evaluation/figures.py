@@ -15,6 +15,7 @@ from sceneslam.evaluation import figure_style as look
 from sceneslam.evaluation.accuracy import AbsoluteErrors, absolute_errors
 from sceneslam.evaluation.comparison import compare
 from sceneslam.evaluation.figure_map import draw_map, draw_path
+from sceneslam.evaluation.figure_pose import draw_error_path, draw_pose
 from sceneslam.evaluation.figure_time import draw_posterior, draw_series, draw_timeline, draw_votes
 from sceneslam.types import se3
 from sceneslam.types.errors import told
@@ -52,7 +53,8 @@ def write_figures(
     A figure that fails (no memory is left, say) is left out, with a sentence in `faults`.
 
     `map`, `path` (where it is small in the map), `timeline`, `grey_mean`, `posterior` (of a
-    Bayes filter), `error` (with ground truth), `difference` (with a reference).
+    Bayes filter), `error` and `error_path` (with ground truth), `pose`, `difference` (with a
+    reference).
     """
     folder.mkdir(parents=True, exist_ok=True)
     true = truth.trajectory if truth else Trajectory.empty()
@@ -72,6 +74,8 @@ def write_figures(
             y_label="position error [m]",
             online_m=_online(errors, online),
         ),
+        "error_path": lambda: draw_error_path(result, errors),
+        "pose": lambda: draw_pose(result, truth, T_map_gt),
     }
     if reference is not None:
         difference = compare(result.trajectory, reference, association_gap_s)

@@ -26,12 +26,15 @@ _CAPTIONS = {
     "map": "The map from above: occupancy grid in grey, points and trajectory in the colour of "
     "the module that gave them, ground truth dashed.",
     "path": "The same, as near as the path allows.",
-    "timeline": "Which module gave the poses, and when it was in trouble.",
+    "timeline": "Which module gave the poses. Hatched: degraded, it tracks with less hold than it "
+    "needs and is less certain; crossed: lost, it has no pose.",
     "grey_mean": "What the detector measured. Shading: the true scene, where it is known; "
     "dash-dotted: the instant at which a change of scene was confirmed.",
     "posterior": "How probable each scene is by the votes so far. Shading and lines as above.",
     "error": "Distance from the true position after one rigid alignment of the whole trajectory. "
     "Shading: who gave the pose; dash-dotted: a change of module.",
+    "error_path": "The path from above, coloured by the distance from the true position.",
+    "pose": "Position and heading in the frame `map` over time.",
     "difference": "Distance from the reference run over the same path, without any alignment.",
 }
 
