@@ -161,7 +161,11 @@ class SlamModule(Protocol):
         ...
 
     def set_pose(self, T_map_local: Transform) -> None:
-        """Place `local` in the map (Eq. 1)."""
+        """Hear where `local` lies in the map (Eq. 1).
+
+        The bus makes T_map_base = T_map_local @ T_local_base of what `track` returns (Eq. 2): that
+        is the paper's GetPose.
+        """
         ...
 
     def set_scene(self, scene: str) -> None:
@@ -174,10 +178,6 @@ class SlamModule(Protocol):
         It holds at least one of the sensors in `requires`; another may have been silent. LOST
         where no pose can be told: the pose is then the last one that was held. Never returns NaN.
         """
-        ...
-
-    def get_pose(self) -> Transform:
-        """Return T_map_base = T_map_local @ T_local_base of the last observation (Eq. 2)."""
         ...
 
     def get_trajectory(self) -> Trajectory:

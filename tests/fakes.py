@@ -109,9 +109,6 @@ class ExactModule:
             status=TrackingStatus.TRACKING,
         )
 
-    def get_pose(self):
-        return self._T_map_local @ self._T_local_base
-
     def get_trajectory(self):
         return Trajectory.empty()
 

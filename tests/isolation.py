@@ -103,7 +103,7 @@ class Hoarder(ExactModule):
         self.images.append(observation.image_bgr)
         return super().track(observation)
 
-    def get_pose(self):
+    def get_trajectory(self):
         """Return what it kept: the grey of every image."""
         return np.array([image.mean() for image in self.images])
 

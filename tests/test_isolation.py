@@ -116,7 +116,7 @@ def test_images_that_a_module_keeps_stay_what_they_were(isolated):
     module = active(isolated(Hoarder))
     for index in range(20):
         module.track(seen(index, grey=10 * index))
-    np.testing.assert_array_equal(module.get_pose(), 10.0 * np.arange(20))
+    np.testing.assert_array_equal(module.get_trajectory(), 10.0 * np.arange(20))
 
 
 def test_images_that_a_module_drops_leave_their_memory_to_the_next(isolated):

@@ -170,21 +170,10 @@ def test_first_observation_is_the_origin_and_activation_starts_anew():
     assert (module.get_map().grid.log_odds > 0).any()
     module.activate(LASER_RIG)
     assert module.get_map().grid.log_odds.size == 0
-    np.testing.assert_array_equal(module.get_pose(), np.eye(4))
     again = [module.track(observation) for observation in observations]
     for one, two in zip(first, again, strict=True):
         np.testing.assert_array_equal(one.T_local_base, two.T_local_base)
         assert one.status is two.status
-
-
-def test_pose_in_the_map_is_the_product():
-    path = loop_path(160)[:30]
-    module = active()
-    T_map_local = se3.from_xy_yaw(3.0, -1.0, 2.0)
-    module.set_pose(T_map_local)
-    for observation in drive(room(), path):
-        tracking = module.track(observation)
-    np.testing.assert_array_equal(module.get_pose(), T_map_local @ tracking.T_local_base)
 
 
 def test_map_shows_the_walls_where_they_are():

@@ -44,7 +44,6 @@ class CloudOdometry(ABC):
     turn_max_rad_s: float
     _reader: CloudReader | None = field(default=None, init=False)
     _icp: CloudMap | None = field(default=None, init=False)
-    _T_map_local: se3.Transform = field(default_factory=se3.identity, init=False)
     _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
     _predictor: Predictor = field(init=False)
 
@@ -82,12 +81,11 @@ class CloudOdometry(ABC):
         noise = np.array([self.noise_m or 0.2 * voxel_m, self.noise_rad]) ** 2
         self._noise = np.repeat(noise, 3)  # variances of a registration
         self._predictor = Predictor(rig)
-        self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
+        self._T_local_base = se3.identity()
         self._has_map = False
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Place `local` in the map."""
-        self._T_map_local = np.array(T_map_local, dtype=np.float64)
+        """Do nothing: its poses are in `local` wherever that lies."""
 
     def set_scene(self, scene: str) -> None:  # noqa: B027
         """Do nothing: geometry is the same by day and by night."""
@@ -119,10 +117,6 @@ class CloudOdometry(ABC):
         is_open = shape.ratios[0] < self.weak_ratio
         status = TrackingStatus.DEGRADED if is_open else TrackingStatus.TRACKING
         return self._answer(observation, status, overlap_ratio, inliers)
-
-    def get_pose(self) -> se3.Transform:
-        """Return T_map_base of the last observation."""
-        return self._T_map_local @ self._T_local_base
 
     def get_trajectory(self) -> Trajectory:
         """Return no poses: registration with a map that moves along revises nothing."""

@@ -96,10 +96,6 @@ class Faulty:
         status = TrackingStatus.LOST if is_silent else tracking.status
         return replace(tracking, T_local_base=T_local_base, status=status)
 
-    def get_pose(self) -> se3.Transform:
-        """Return T_map_base of the last observation."""
-        return self._module.get_pose()
-
     def get_trajectory(self) -> Trajectory:
         """Return the module's trajectory, right again."""
         return self._module.get_trajectory()

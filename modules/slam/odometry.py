@@ -25,7 +25,6 @@ class Odometry:
     _motion: MotionModel = field(init=False)
     _wheels: Wheels = field(init=False)
     _T_held_curr: se3.Transform = field(default_factory=se3.identity, init=False)
-    _T_map_local: se3.Transform = field(default_factory=se3.identity, init=False)
     _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
     _covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)), init=False)
 
@@ -38,12 +37,11 @@ class Odometry:
         """Start anew: `local` at the next observation that has odometry."""
         self._motion, self._wheels = MotionModel(rig), rig.wheels
         self._T_held_curr = se3.identity()
-        self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
+        self._T_local_base = se3.identity()
         self._covariance = np.eye(6) * _DEVIATION_MIN**2
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Place `local` in the map."""
-        self._T_map_local = np.array(T_map_local, dtype=np.float64)
+        """Do nothing: its poses are in `local` wherever that lies."""
 
     def set_scene(self, scene: str) -> None:
         """Do nothing: wheels turn alike in every scene."""
@@ -63,10 +61,6 @@ class Odometry:
         self._move(self._T_held_curr)
         self._T_held_curr = se3.identity()
         return self._answer(observation, TrackingStatus.TRACKING)
-
-    def get_pose(self) -> se3.Transform:
-        """Return T_map_base of the last observation."""
-        return self._T_map_local @ self._T_local_base
 
     def get_trajectory(self) -> Trajectory:
         """Return no poses: dead reckoning revises nothing."""

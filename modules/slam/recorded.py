@@ -45,7 +45,7 @@ class Recorded:
         self._startup_ns = round(startup_s * 1e9)
         self._ready_ns: int | None = None  # from when on it gives poses
         self._T_local_world: se3.Transform | None = None
-        self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
+        self._T_local_base = se3.identity()
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
@@ -55,11 +55,10 @@ class Recorded:
     def activate(self, rig: Rig) -> None:
         """Start anew: `local` at the first observation that has a recorded pose."""
         self._ready_ns, self._T_local_world = None, None
-        self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
+        self._T_local_base = se3.identity()
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Place `local` in the map."""
-        self._T_map_local = np.array(T_map_local, dtype=np.float64)
+        """Do nothing: its poses are in `local` wherever that lies."""
 
     def set_scene(self, scene: str) -> None:
         """Do nothing: what was recorded stands."""
@@ -75,10 +74,6 @@ class Recorded:
             self._T_local_world = se3.inverse(T_world_base)
         self._T_local_base = self._T_local_world @ T_world_base
         return self._answer(observation.stamp_ns, TrackingStatus.TRACKING)
-
-    def get_pose(self) -> se3.Transform:
-        """Return T_map_base of the last observation that had a pose."""
-        return self._T_map_local @ self._T_local_base
 
     def get_trajectory(self) -> Trajectory:
         """Return no poses: a recording revises nothing."""

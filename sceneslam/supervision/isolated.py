@@ -105,10 +105,6 @@ class IsolatedModule:
         """Return the answer to `submit`."""
         return cast(Tracking, self._answer(self._limits.step_deadline_s))
 
-    def get_pose(self) -> Transform:
-        """Return T_map_base of the last observation."""
-        return cast(Transform, self._call(self._limits.step_deadline_s, "get_pose"))
-
     def get_trajectory(self) -> Trajectory:
         """Return T_local_base at every stamp."""
         return cast(Trajectory, self._call(self._limits.start_deadline_s, "get_trajectory"))

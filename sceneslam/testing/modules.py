@@ -82,16 +82,6 @@ def answers_with_rigid_poses_at_the_stamp(make: Make) -> None:
                 expect(is_square and least >= -1e-12, "covariance: (6, 6), none below 0", least)
 
 
-def places_its_pose_by_eq_2(make: Make) -> None:
-    """Check that T_map_base = T_map_local @ T_local_base."""
-    T_map_local = se3.from_xy_yaw(4.0, -2.0, 1.0)
-    with _active(make) as module:
-        module.set_pose(T_map_local)
-        tracking = _drive(module)[-1]
-        expected, found = T_map_local @ tracking.T_local_base, module.get_pose()
-        expect(np.allclose(found, expected, atol=1e-9), f"get_pose: {expected}", found)
-
-
 def repeats_itself(make: Make) -> None:
     """Check that two runs are identical to the bit, also of a module that is activated again."""
     with _active(make) as one, _active(make) as two:
@@ -174,7 +164,6 @@ MODULE_CHECKS: Sequence[Callable[[Make], None]] = (
     begins_at_the_identity,
     follows_a_known_motion,
     answers_with_rigid_poses_at_the_stamp,
-    places_its_pose_by_eq_2,
     repeats_itself,
     starts_anew_when_activated_again,
     survives_blind_sensors,

@@ -33,7 +33,6 @@ class DepthSlam:
     matched_min_ratio: float
     weak_ratio: float
     cloud_voxel_m: float
-    _T_map_local: se3.Transform = field(default_factory=se3.identity, init=False)
     _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
     _predictor: Predictor = field(init=False)
     _map: KeyframeMap = field(init=False)
@@ -69,12 +68,11 @@ class DepthSlam:
         )
         self._history = History(self._map)
         self._predictor = Predictor(rig)
-        self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
+        self._T_local_base = se3.identity()
         self._reference, self._revision = 0, 0
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Place `local` in the map (Eq. 1)."""
-        self._T_map_local = np.array(T_map_local, dtype=np.float64)
+        """Do nothing: its poses are in `local` wherever that lies."""
 
     def set_scene(self, scene: str) -> None:
         """Do nothing: depth is the same by day and by night."""
@@ -99,10 +97,6 @@ class DepthSlam:
         if found is None:
             return self._bridge(observation, prediction, can_coast=False)
         return self._hold(observation, surface, samples, prediction, found)
-
-    def get_pose(self) -> se3.Transform:
-        """Return T_map_base of the last observation."""
-        return self._T_map_local @ self._T_local_base
 
     def get_trajectory(self) -> Trajectory:
         """Return all poses after a last optimisation."""

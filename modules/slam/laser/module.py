@@ -68,7 +68,6 @@ class LaserSlam:
     _scanner: DepthScanner | LidarScanner | None = field(default=None, init=False)
     _front_end: FrontEnd | None = field(default=None, init=False)
     _T_base_laser: se3.Transform = field(default_factory=se3.identity, init=False)
-    _T_map_local: se3.Transform = field(default_factory=se3.identity, init=False)
     _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
 
     def __post_init__(self) -> None:
@@ -103,12 +102,10 @@ class LaserSlam:
         else:
             self._T_base_laser = se3.identity() if rig.laser is None else rig.laser.T_base_laser
         self._front_end = self._make_front_end(rig)
-        self._T_map_local = se3.identity()
         self._T_local_base = se3.identity()
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Place `local` in the map."""
-        self._T_map_local = np.array(T_map_local, dtype=np.float64)
+        """Do nothing: its poses are in `local` wherever that lies."""
 
     def set_scene(self, scene: str) -> None:
         """Do nothing: a laser sees the same by day and by night."""
@@ -128,10 +125,6 @@ class LaserSlam:
             inliers=estimate.inliers,
             revision=self._front_end.back_end.revision,
         )
-
-    def get_pose(self) -> se3.Transform:
-        """Return T_map_base of the last observation."""
-        return self._T_map_local @ self._T_local_base
 
     def get_trajectory(self) -> Trajectory:
         """Return all poses with every loop closed."""

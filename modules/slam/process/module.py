@@ -47,7 +47,6 @@ class ProcessSlam:
         self._revision = 0
         self._observation: Observation | None = None  # its answer was not collected yet
         self._layers: MapLayers | None = None  # as asked for last, None where outdated
-        self._T_map_local = se3.identity()
         self._start()
 
     @property
@@ -93,13 +92,12 @@ class ProcessSlam:
             self._start()
         self._greet()
         self._pipeline, self._revision = Pipeline(self._late_max_s), 0
-        self._layers, self._T_map_local = None, se3.identity()
+        self._layers = None
         self._is_active = True
         self._ask("activate", rig_fields(rig), self._limits.start_deadline_s, lambda _: None)
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Place `local` in the map; the program knows nothing of it."""
-        self._T_map_local = np.array(T_map_local, dtype=np.float64)
+        """Do nothing: its poses are in `local` wherever that lies."""
 
     def set_scene(self, scene: str) -> None:
         """Tell the program of the scene."""
@@ -124,10 +122,6 @@ class ProcessSlam:
         assert observation is not None
         self._receive("track", self._limits.step_deadline_s, self._take)
         return self._pipeline.report(observation, self._revision)
-
-    def get_pose(self) -> se3.Transform:
-        """Return T_map_base of the last observation."""
-        return self._T_map_local @ self._pipeline.T_local_base
 
     def get_trajectory(self) -> Trajectory:
         """Return the poses that the program revised, else those that it gave late, if any."""

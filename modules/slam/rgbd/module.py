@@ -63,7 +63,7 @@ class RgbdSlam:
         self._monocular_scenes = frozenset(monocular_scenes)
         self._ignores_depth = False
         self._reunion = Reunion(keyframe_limit=keyframe_limit)
-        self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
+        self._T_local_base = se3.identity()
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
@@ -88,7 +88,6 @@ class RgbdSlam:
 
     def set_pose(self, T_map_local: Transform) -> None:
         """Place `local` in the map (Eq. 1)."""
-        self._T_map_local = T_map_local.copy()
         self._reunion.place(T_map_local)
 
     def set_scene(self, scene: str) -> None:
@@ -125,10 +124,6 @@ class RgbdSlam:
         if not len(self._map.keyframes) or self._is_unknown(view, prediction):
             return self._start(view, prediction)
         return self._lose(observation, prediction)
-
-    def get_pose(self) -> Transform:
-        """Return T_map_base = T_map_local @ T_local_base of the last observation (Eq. 2)."""
-        return self._T_map_local @ self._T_local_base
 
     def get_trajectory(self) -> Trajectory:
         """Return T_local_base of every frame that was held, with all that loops corrected."""
