@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,7 @@ from sceneslam.experiments.openloris.dataset import Dataset, Sequence
 from sceneslam.modules.slam.recorded import Recorded
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, TrackingStatus
-from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.rig import Rig, Sensor, Wheels
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
@@ -89,7 +89,7 @@ def _config() -> _Config:
 
 
 def _scaled(settings: GateSettings, factor: float) -> GateSettings:
-    return GateSettings(**{**asdict(settings), "sigmas": factor * settings.sigmas})
+    return GateSettings(sigmas=factor * settings.sigmas)
 
 
 def _drifting(odometry: Trajectory, drift_deg_per_m: float) -> Trajectory:
@@ -120,7 +120,7 @@ def _drive(
     odometry: Trajectory, poses: list[Transform | None], rule: str, settings: GateSettings
 ) -> Driven:
     """Chain the module's motion where it is trusted, and bridge where it is not."""
-    gate, T_map_base, trusted = Gate(settings), [se3.identity()], 0
+    gate, T_map_base, trusted = Gate(settings, Wheels()), [se3.identity()], 0
     wheels = odometry.T_world_base
     for index in range(len(poses)):
         judgement = gate.update(

@@ -28,7 +28,6 @@ CONFIG = {
             "_target_": "sceneslam.bus.pace.PaceSettings",
             "period_s": 0.06,
             "step_m": 0.05,
-            "turn_rad": 0.05,
         },
         "scene_filter": None,
         "gate": None,

@@ -11,17 +11,7 @@ from sceneslam.bus.pace import PaceSettings
 from sceneslam.bus.policy import Policy
 from sceneslam.types import se3
 
-GATE = GateSettings(
-    sigmas=3.0,
-    horizons_s=[1.0, 5.0],
-    probation_s=1.0,
-    distance_m=0.03,
-    distance_per_m=0.02,
-    turn_rad=0.0175,
-    turn_per_rad=0.02,
-    turn_rad_per_m=0.01,
-    broken_ratio=0.5,
-)
+GATE = GateSettings(sigmas=3.0)
 TABLE = {"Bright": ["bright", "dark"], "Dark": ["dark", "bright"]}
 
 
@@ -34,7 +24,7 @@ def policy(**changes):
         "retry_s": 1e6,
         "buffer_s": 12.0,
         "buffer_mb": 256.0,
-        "catch_up": PaceSettings(period_s=0.0, step_m=0.0, turn_rad=0.0),
+        "catch_up": PaceSettings(period_s=0.0, step_m=0.0),
         "scene_filter": None,
         "gate": None,
         "startup_s": {},

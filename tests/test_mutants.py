@@ -109,7 +109,7 @@ def test_a_table_of_the_top_level_is_a_table(changes, key):
     ("change", "key"),
     [
         ("policy.gate.sigmas=-1", "policy.gate.sigmas"),
-        ("policy.gate.horizons_s=[1.0,inf]", "policy.gate.horizons_s[1]"),
+        ("evaluation.correct_limit_m=inf", "evaluation.correct_limit_m"),
         ("policy.gate=many", "policy.gate"),
         ("policy.gate._target_=sceneslam.bus.gate.Gate", "policy.gate.sigmas"),
         ("slam.bright.cloud_voxel_m=nan", "slam.bright.cloud_voxel_m"),

@@ -12,7 +12,7 @@ from sceneslam.bus.pace import Pace, PaceSettings
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.run import BRIDGED
 
-EVERY_THIRD = PaceSettings(period_s=0.3, step_m=10.0, turn_rad=3.0)
+EVERY_THIRD = PaceSettings(period_s=0.3, step_m=10.0)
 SWITCHED = {"scene_at": dark_from(40), "handover": "rewind"}  # confirmed at 60
 
 
@@ -77,7 +77,7 @@ def test_nothing_is_spared_to_a_module_that_is_lost():
     assert dark.indices[:4] == [40, 43, 44, 45]
 
 
-@pytest.mark.parametrize("change", [{"step_m": 0.01}, {"turn_rad": 0.01}, {"period_s": 0.1}])
+@pytest.mark.parametrize("change", [{"step_m": 0.01}, {"period_s": 0.1}])
 def test_observation_after_more_time_or_motion_is_not_spared(change):
     pace = Pace(replace(EVERY_THIRD, **change))
     pace.give(observation(0))
@@ -106,7 +106,7 @@ def test_gyro_samples_of_spared_observations_are_given_with_the_next():
     assert pace.give(third) is third
 
 
-@pytest.mark.parametrize("name", ["period_s", "step_m", "turn_rad"])
+@pytest.mark.parametrize("name", ["period_s", "step_m"])
 def test_impossible_paces_are_refused(name):
     with pytest.raises(ConfigError, match=name):
         replace(EVERY_THIRD, **{name: -1.0})

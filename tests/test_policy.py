@@ -1,8 +1,10 @@
 """The confirmation window, as a pure function of votes."""
 
 import itertools
+from pathlib import Path
 
 import pytest
+import yaml
 from driving import policy
 from hypothesis import given
 from hypothesis import strategies as st
@@ -79,3 +81,14 @@ def test_impossible_policy_is_refused_with_its_key(key, value):
     with pytest.raises(ConfigError) as caught:
         policy(**{key: value})
     assert caught.value.key == key
+
+
+def test_policy_has_few_keys():
+    path = Path(__file__).resolve().parents[1] / "conf" / "policy" / "default.yaml"
+
+    def leaves(node):
+        if not isinstance(node, dict) or not node:
+            return 1
+        return sum(leaves(value) for key, value in node.items() if key != "_target_")
+
+    assert leaves(yaml.safe_load(path.read_text())) <= 12

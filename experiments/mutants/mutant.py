@@ -23,7 +23,7 @@ class Mutant:
 
 
 def dotted(path: Path) -> str:
-    """Return a path as a message writes it: `policy.gate.horizons_s[0]`."""
+    """Return a path as a message writes it: `source.exposure.range_s[0]`."""
     text = ""
     for step in path:
         text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else step

@@ -33,7 +33,7 @@ class Drift:
 
 # A module's own covariance is that of its pose beside the map around it, which drifts as it grows.
 MAPPED = Drift(per_m=0.005, rad_per_m=0.0, rad_per_rad=0.0, rad_per_root=0.003)
-# As `policy.gate` has them.
+# As `Wheels` of a rig has them, unless its source says otherwise.
 WHEELS = Drift(per_m=0.02, rad_per_m=0.01, rad_per_rad=0.02, rad_per_root=0.0)
 # Guessed: it may have braked meanwhile.
 VELOCITY = Drift(per_m=0.5, rad_per_m=0.1, rad_per_rad=0.5, rad_per_root=0.0)

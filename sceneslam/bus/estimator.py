@@ -214,4 +214,5 @@ class Estimator:
 
     def _new_hold(self) -> Hold:
         gate = self._policy.gate if self._policy.handover != "cold" else None
-        return Hold(silence_ns=round(self._policy.lost_patience_s * 1e9), gate=gate)
+        silence_ns = round(self._policy.lost_patience_s * 1e9)
+        return Hold(silence_ns=silence_ns, gate=gate, wheels=self._rig.wheels)

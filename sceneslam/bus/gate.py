@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from sceneslam.bus.recent import RecentMedian
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError
+from sceneslam.types.ranges import check_above
+from sceneslam.types.rig import Wheels
 from sceneslam.types.se3 import Transform
 
 
@@ -40,26 +41,9 @@ class GateSettings:
     """
 
     sigmas: float
-    horizons_s: list[float]  # motions are compared over each; the shortest first
-    probation_s: float  # a module is trusted after agreeing for so long
-    distance_m: float  # standard deviation of any motion ...
-    distance_per_m: float  # ... and per metre driven
-    turn_rad: float  # the same of its turn ...
-    turn_per_rad: float  # ... per radian turned
-    turn_rad_per_m: float  # ... and per metre driven
-    broken_ratio: float  # off by more of the way than any wrong scale explains: not even the turn
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name != "horizons_s" and not 0 <= value < float("inf"):
-                raise ConfigError(field.name, value, "0 or more")
-        for name in ("sigmas", "distance_m", "turn_rad"):
-            if getattr(self, name) == 0:
-                raise ConfigError(name, 0, "a number above 0")
-        rising = sorted(set(self.horizons_s)) == list(self.horizons_s)
-        if not self.horizons_s or not rising or self.horizons_s[0] <= 0:
-            raise ConfigError("horizons_s", self.horizons_s, "seconds above 0, the shortest first")
+        check_above(0, sigmas=self.sigmas)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,6 +63,11 @@ class Judgement:
         return self.distance in _GOOD and self.turn in _GOOD
 
 
+_HORIZONS_S = (1.0, 5.0)  # over each: a jump shows in the shorter, a slow slide in the longer
+_PROBATION_NS = 1_000_000_000  # a module is trusted after agreeing over a whole horizon
+# Any motion differs by so much: clocks of sensors apart by 0.05 s at 0.6 m/s and 20 deg/s.
+_DISTANCE_M, _TURN_RAD = 0.03, 0.0175
+_BROKEN_RATIO = 0.5  # off by more of the way than any wrong scale explains: not even the turn
 # A robot changes its velocity by 1.5 m/s^2, a point a metre ahead of it by its turns' start, too.
 _STEP_S = 0.3  # over which velocities are taken, and changes of them
 _LATE_NS = 1_900_000_000  # a disagreement shows within the shortest horizon after it began
@@ -129,10 +118,9 @@ class Gate:
     another scale, though it seldom differs by as many as `sigmas`.
     """
 
-    def __init__(self, settings: GateSettings) -> None:
-        self._settings = settings
-        self._horizons_ns = [round(horizon_s * 1e9) for horizon_s in settings.horizons_s]
-        self._probation_ns = round(settings.probation_s * 1e9)
+    def __init__(self, settings: GateSettings, wheels: Wheels) -> None:
+        self._sigmas, self._wheels = settings.sigmas, wheels
+        self._horizons_ns = [round(horizon_s * 1e9) for horizon_s in _HORIZONS_S]
         self._samples: list[_Sample] = []  # by rising stamp, back to the longest horizon
         self._stamps_ns: list[int] = []  # theirs
         self._T_odom_base: Transform | None = None
@@ -202,13 +190,13 @@ class Gate:
 
     def _judge(self, now: _Sample, deviation_m: float | None) -> Judgement:
         found = self._anchors(now.stamp_ns)
-        excesses = [_excess(then, now, self._settings) for then in found]
+        excesses = [_excess(then, now, self._sigmas, self._wheels) for then in found]
         distance = max((excess.distance for excess in excesses), default=0.0)
         turn = max((excess.turn for excess in excesses), default=0.0)
-        distance = max(distance, self._usual(now, distance) / _USUAL_SIGMAS * self._settings.sigmas)
+        distance = max(distance, self._usual(now, distance) / _USUAL_SIGMAS * self._sigmas)
         if self._distance_since_ns is None or max(distance, turn) > 1.0:
             self._distance_since_ns = now.stamp_ns
-        elif now.stamp_ns - self._distance_since_ns >= self._probation_ns:
+        elif now.stamp_ns - self._distance_since_ns >= _PROBATION_NS:
             self._has_jumped = False  # that was another disagreement
         is_wrong = max(distance, turn) > 1.0
         if is_wrong and self._is_wheels_fault(found[-1], now, deviation_m):
@@ -233,8 +221,7 @@ class Gate:
         Who lies begins to move otherwise at once, as no robot does, and the other does not. Where
         neither did, a module that is more certain than wheels are is right: wheels err lastingly.
         """
-        settings = self._settings
-        wheels_m = settings.distance_m + settings.distance_per_m * (now.way_m - then.way_m)
+        wheels_m = _DISTANCE_M + self._wheels.drift_ratio * (now.way_m - then.way_m)
         if deviation_m is None or deviation_m > wheels_m:
             return False
         if not self._has_jumped:
@@ -273,7 +260,7 @@ class Gate:
     def _verdict(self, excess: float, since_ns: int, now: _Sample, is_known: bool) -> Verdict:
         if excess > 1.0:
             return Verdict.DISAGREE
-        is_long = now.stamp_ns - since_ns >= self._probation_ns
+        is_long = now.stamp_ns - since_ns >= _PROBATION_NS
         return Verdict.AGREE if is_known and is_long else Verdict.PROBATION
 
     def _anchors(self, stamp_ns: int) -> list[_Sample]:
@@ -304,22 +291,20 @@ def _turn_verdict(excess: float, is_known: bool) -> Verdict:
     return Verdict.AGREE if is_known else Verdict.PROBATION
 
 
-def _excess(then: _Sample, now: _Sample, settings: GateSettings) -> _Excess:
+def _excess(then: _Sample, now: _Sample, sigmas: float, wheels: Wheels) -> _Excess:
     """Return by how much the module's motion differs from the odometry's, over the bounds."""
     moved_local = now.position_local - then.position_local
     moved_odom = now.position_odom - then.position_odom
     apart_m = _norm(moved_local - then.R_local_odom @ moved_odom)
     apart_rad = _angle_rad(now.R_local_odom - then.R_local_odom)
     way_m, turned_rad = now.way_m - then.way_m, now.turn_rad - then.turn_rad
-    floor_m = settings.sigmas * settings.distance_m
-    bound_m = floor_m + settings.sigmas * settings.distance_per_m * way_m
-    deviation_rad = (
-        settings.turn_rad + settings.turn_per_rad * turned_rad + settings.turn_rad_per_m * way_m
-    )
-    broken = apart_m / (floor_m + settings.broken_ratio * way_m)
+    floor_m = sigmas * _DISTANCE_M
+    bound_m = floor_m + sigmas * wheels.drift_ratio * way_m
+    deviation_rad = _TURN_RAD + wheels.drift_ratio * turned_rad + wheels.drift_rad_per_m * way_m
+    broken = apart_m / (floor_m + _BROKEN_RATIO * way_m)
     return _Excess(
         distance=apart_m / bound_m,
-        turn=max(apart_rad / (settings.sigmas * deviation_rad), broken),
+        turn=max(apart_rad / (sigmas * deviation_rad), broken),
     )
 
 

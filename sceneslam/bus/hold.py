@@ -13,13 +13,16 @@ from sceneslam.bus.runner import Runner
 from sceneslam.bus.sureness import Sureness
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.rig import Wheels
 from sceneslam.types.se3 import Transform
 
 
 class Hold:
     """Follows one activation of a module: since when it is held, lost, silent or suspect."""
 
-    def __init__(self, *, silence_ns: int, gate: GateSettings | None) -> None:
+    def __init__(
+        self, *, silence_ns: int, gate: GateSettings | None, wheels: Wheels | None = None
+    ) -> None:
         self.status: TrackingStatus | None = None  # None until it was fed
         self.is_suspect = False  # from a disagreement on until it has agreed for long enough
         self.suspect_since_ns: int | None = None  # from when on it may have been wrong
@@ -36,7 +39,7 @@ class Hold:
         self.T_local_base: Transform | None = None  # at the last observation, where it told one
         self._T_odom_prev: Transform | None = None
         self._agreed: tuple[Transform, Transform] | None = None  # local, odom, when turns did last
-        self._gate = Gate(gate) if gate is not None else None
+        self._gate = Gate(gate, wheels or Wheels()) if gate is not None else None
         self._sureness = Sureness()
         self._revision = 0
         self._fed_ns: int | None = None  # when its sensors last spoke ...

@@ -16,8 +16,7 @@ class PaceSettings:
     """What a module that catches up is spared: observations after so little time and motion."""
 
     period_s: float  # 0: none is spared
-    step_m: float
-    turn_rad: float
+    step_m: float  # and as many radians: what is seen is a metre away or more
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -43,7 +42,7 @@ class Pace:
         return (
             observation.stamp_ns - last.stamp_ns < round(settings.period_s * 1e9)
             and float(np.linalg.norm(T_last_now[:3, 3])) < settings.step_m
-            and float(se3.rotation_angle_rad(T_last_now)) < settings.turn_rad
+            and float(se3.rotation_angle_rad(T_last_now)) < settings.step_m
         )
 
     def spare(self, observation: Observation) -> None:
