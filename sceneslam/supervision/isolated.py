@@ -9,8 +9,9 @@ from time import monotonic
 from typing import Any, cast
 
 from sceneslam.interfaces import SlamModule
-from sceneslam.supervision.limits import Limits, Restarts
+from sceneslam.supervision.limits import Limits
 from sceneslam.supervision.process import Process, ProcessDeathError
+from sceneslam.supervision.restarted import Restarted
 from sceneslam.types.errors import ConfigError, ModuleError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking
@@ -22,7 +23,7 @@ _log = logging.getLogger(__name__)
 _DYING_S = 0.5  # a death so soon after the first request came before it
 
 
-class IsolatedModule:
+class IsolatedModule(Restarted):
     """Fulfils `SlamModule`, `Restartable`, `Concurrent` by a process that `make` builds it in.
 
     Whatever ends the process ends the session: the call raises ModuleError with the reason, a new
@@ -35,11 +36,9 @@ class IsolatedModule:
         """Start the process; whether the module can be built there, `requires` says."""
         if not hasattr(os, "memfd_create"):
             raise ConfigError("isolation", "process", "inline (processes need Linux)")
-        self._name, self._make, self._limits = name, make, limits
-        self._restarts = Restarts(limits)
+        super().__init__(limits)
+        self._name, self._make = name, make
         self._requires: tuple[frozenset[Sensor], ...] | None = None
-        self._is_active = False
-        self._is_built = False
         self._process: Process | None = None
         self._start()
 
@@ -51,30 +50,10 @@ class IsolatedModule:
         assert self._requires is not None
         return self._requires
 
-    @property
-    def is_ready(self) -> bool:
-        """Tell whether `activate` would not have to wait, and start a process where it may be."""
-        self._bury()
-        if self._restarts.wait_s(monotonic()) > 0:
-            return False
-        if self._process is None:
-            self._start()
-        return self._is_built or (self._process is not None and self._process.has_reply())
-
-    @property
-    def is_spent(self) -> bool:
-        """Tell whether it failed too often to be started again, for now."""
-        return self._restarts.is_spent(monotonic())
-
-    def note_failure(self) -> None:
-        """Take that a session failed: the next may begin after a while, longer each time."""
-        if not self.is_spent:  # else it was refused for that, which is no failure
-            self._restarts.note_failure(monotonic())
-
     def activate(self, rig: Rig) -> None:
         """Start anew, in a new process where the last one died; waits until it may be started."""
         self._bury()
-        was_idle, asked_s = self._process is not None and self._is_built, monotonic()
+        was_idle, asked_s = self._process is not None and self._is_greeted, monotonic()
         try:
             self._begin(rig)
         except ProcessDeathError:
@@ -132,17 +111,21 @@ class IsolatedModule:
         self._is_active = True
         self._call(self._limits.start_deadline_s, "activate", rig)
 
+    @property
+    def _running(self) -> Process | None:
+        return self._process
+
     def _start(self) -> None:
         """Start a process and let it build the module, without waiting."""
-        self._is_built = self._is_active = False
+        self._is_greeted = self._is_active = False
         self._process = Process(self._limits)
         level = logging.getLogger().getEffectiveLevel()
         self._process.submit("build", self._make, level, self._limits.memory_limit_mb)
 
     def _await_built(self) -> None:
-        if not self._is_built:
+        if not self._is_greeted:
             self._requires = self._answer(self._limits.start_deadline_s)
-            self._is_built = True
+            self._is_greeted = True
 
     def _call(self, deadline_s: float, method: str, *arguments: object) -> Any:
         self._ask(method, *arguments)
@@ -176,6 +159,6 @@ class IsolatedModule:
 
     def _replace(self) -> None:
         """Start the next process at once where that is allowed: it can be built meanwhile."""
-        self._process, self._is_active, self._is_built = None, False, False
+        self._process, self._is_active, self._is_greeted = None, False, False
         if self._restarts.wait_s(monotonic()) == 0 and self._requires is not None:
             self._start()

@@ -75,7 +75,7 @@ class Process:
         except OSError as error:
             raise self._died() from error
 
-    def has_reply(self) -> bool:
+    def has_answer(self) -> bool:
         """Tell whether `collect` would return, or raise, at once."""
         return self._channel.has_message()
 

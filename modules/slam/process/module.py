@@ -9,7 +9,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sceneslam.supervision.limits import Limits, Restarts
+from sceneslam.supervision.limits import Limits
+from sceneslam.supervision.restarted import Restarted
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, ModuleError
 from sceneslam.types.maps import MapLayers
@@ -26,7 +27,7 @@ from .protocol import Fields, ProtocolError, text
 Value = TypeVar("Value")
 
 
-class ProcessSlam:
+class ProcessSlam(Restarted):
     """Fulfils `SlamModule`, `Restartable` and `Concurrent` by one run of a program per session.
 
     Whatever the program does wrong ends it, and the call raises ModuleError with one sentence.
@@ -38,11 +39,10 @@ class ProcessSlam:
             raise ConfigError("command", command, "a program that can be run, and its arguments")
         if not 0 <= late_max_s < np.inf:
             raise ConfigError("late_max_s", late_max_s, "seconds, 0 or more")
-        self._command, self._late_max_s, self._limits = command, late_max_s, limits
-        self._restarts = Restarts(limits)
+        super().__init__(limits)
+        self._command, self._late_max_s = command, late_max_s
         self._requires: tuple[frozenset[Sensor], ...] | None = None
         self._program: Program | None = None
-        self._is_greeted = self._is_active = False
         self._pipeline = Pipeline(late_max_s)
         self._revision = 0
         self._observation: Observation | None = None  # its answer was not collected yet
@@ -61,26 +61,10 @@ class ProcessSlam:
         assert self._requires is not None
         return self._requires
 
-    @property
-    def is_ready(self) -> bool:
-        """Tell whether `activate` would not have to wait, and start the program where it may be."""
-        self._bury()
-        if self._restarts.wait_s(monotonic()) > 0:
-            return False
-        if self._program is None:
-            self._start()
-        return self._is_greeted or (self._program is not None and self._program.has_answer())
-
-    @property
-    def is_spent(self) -> bool:
-        """Tell whether it failed too often to be started again, for now."""
-        return self._restarts.is_spent(monotonic())
-
     def note_failure(self) -> None:
-        """Take that a session failed: the next may begin after a while, longer each time."""
+        """Take that a session failed, and end the run of the program that it had."""
         self._kill()
-        if not self.is_spent:
-            self._restarts.note_failure(monotonic())
+        super().note_failure()
 
     def activate(self, rig: Rig) -> None:
         """Start anew, in a run of the program that no session has used."""
@@ -148,6 +132,10 @@ class ProcessSlam:
         if self._restarts.wait_s(monotonic()) == 0:
             self._start()
 
+    @property
+    def _running(self) -> Program | None:
+        return self._program
+
     def _start(self) -> None:
         """Start the program and greet it, without waiting."""
         self._is_greeted = self._is_active = False
@@ -158,7 +146,7 @@ class ProcessSlam:
         if not self._is_greeted:
             found = self._receive("hello", self._limits.start_deadline_s, required)
             if self._requires is not None and found != self._requires:
-                raise self._running().refuse(
+                raise self._own_program().refuse(
                     "requires other sensors than when it was started first"
                 )
             self._requires, self._is_greeted = found, True
@@ -178,7 +166,7 @@ class ProcessSlam:
             self._program.refuse("failed")
         self._close()
 
-    def _running(self) -> Program:
+    def _own_program(self) -> Program:
         if self._program is None:
             raise ModuleError("the program ended, and the session with it")
         return self._program
@@ -186,7 +174,7 @@ class ProcessSlam:
     def _session(self) -> Program:
         if not self._is_active:
             raise ModuleError("the program ended, and the session with it")
-        return self._running()
+        return self._own_program()
 
     def _ask(
         self, kind: str, fields: Fields, deadline_s: float, read: Callable[[Fields], Value]
@@ -196,11 +184,11 @@ class ProcessSlam:
 
     def _receive(self, kind: str, deadline_s: float, read: Callable[[Fields], Value]) -> Value:
         """Return what an answer says; what is no answer ends the program."""
-        reply = self._running().receive(kind, deadline_s)
+        reply = self._own_program().receive(kind, deadline_s)
         try:
             return read(reply)
         except (ProtocolError, ValueError, TypeError) as error:
-            raise self._running().refuse(str(error)) from error
+            raise self._own_program().refuse(str(error)) from error
 
     def _take(self, reply: Fields) -> None:
         self._pipeline.take(answers(reply))
