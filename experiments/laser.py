@@ -169,7 +169,7 @@ def main() -> None:
     """Run one of the commands above."""
     cv2.setNumThreads(1)
     log, relations_path, *words = sys.argv[1:]
-    source = Carmen(log, **{"range_max_m": settings("source/carmen.yaml")["range_max_m"]})
+    source = Carmen(**{**settings("source/carmen.yaml"), "path": log})
     relations = Relations.read(Path(relations_path))
     if words == ["harder"]:
         harder(source, relations)

@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ros_recordings import make_source
 
+from sceneslam.sources.carmen import Carmen
 from sceneslam.sources.rising import longest_rising, rising_stamps
-from sceneslam.types.errors import InputError
+from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.se3 import from_xy_yaw
 
 
@@ -147,3 +148,14 @@ def test_stamps_are_made_to_rise_with_the_fewest_changes(places: list[int]) -> N
 def test_one_late_stamp_is_set_between_its_neighbours() -> None:
     stamps_ns = np.array([1, 2, 9, 4, 5]) * 10**9
     np.testing.assert_array_equal(rising_stamps(stamps_ns), np.array([1, 2, 3, 4, 5]) * 10**9)
+
+
+def test_noise_of_the_wheels_is_the_configuration_s(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.clf", flaser([1.0, 2.0], "1.0"))
+    usual, given_noise = (
+        Carmen(str(path), 80.0, wheels) for wheels in (None, {"noise_ratio": 0.3})
+    )
+    assert given_noise.rig.wheels.noise_ratio == 0.3 > usual.rig.wheels.noise_ratio
+    for wrong, key in (({"noise": 0.3}, "wheels.noise"), ({"floor_m": 0.0}, "wheels.floor_m")):
+        with pytest.raises(ConfigError, match=key):
+            Carmen(str(path), 80.0, wrong)

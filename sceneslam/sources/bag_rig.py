@@ -13,7 +13,7 @@ from sceneslam.sources.intrinsics import Intrinsics
 from sceneslam.sources.recording import Recording
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
-from sceneslam.types.rig import Camera, Laser, Lidar, Rig, Sensor, optical_to_rep103
+from sceneslam.types.rig import Camera, Laser, Lidar, Rig, Sensor, Wheels, optical_to_rep103
 from sceneslam.types.se3 import Transform
 
 _NEEDS = {  # sensor -> whose topic it comes from
@@ -35,6 +35,7 @@ class Given:
     intrinsics: Intrinsics | None
     depth_range_m: tuple[float, float] | None
     lidar_range_m: tuple[float, float] | None
+    wheels: Wheels
 
 
 def sensor_topics(recording: Recording, topics: Topics) -> dict[Sensor, str]:
@@ -65,7 +66,7 @@ def make_rig(recording: Recording, topics: Topics, frames: FrameTree, given: Giv
         depth_range_m = given.depth_range_m or _said(said, "depth_range_m") or _DEPTH_RANGE_M
         camera = _camera(recording, topics, frames, given.intrinsics, depth_range_m)
     sensors = frozenset(sensor_topics(recording, topics))
-    return Rig(sensors=sensors, camera=camera, laser=laser, lidar=lidar)
+    return Rig(sensors=sensors, camera=camera, laser=laser, lidar=lidar, wheels=given.wheels)
 
 
 def place(recording: Recording, topic: str, frames: FrameTree) -> Transform:

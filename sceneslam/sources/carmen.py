@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +20,7 @@ from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.input_files import given_file
 from sceneslam.types.observation import LaserScan, Observation
-from sceneslam.types.rig import Laser, Rig, Sensor
+from sceneslam.types.rig import Laser, Rig, Sensor, Wheels
 from sceneslam.types.truth import GroundTruth
 
 _LOG = logging.getLogger(__name__)
@@ -38,7 +38,7 @@ class Carmen:
     to rise. Ranges of `range_max_m` and beyond are no return.
     """
 
-    def __init__(self, path: str, range_max_m: float) -> None:
+    def __init__(self, path: str, range_max_m: float, wheels: Mapping[str, float] | None) -> None:
         self._range_max_m = checked_above_zero("range_max_m", range_max_m)
         self._path = given_file(path, "a CARMEN log")
         self._lines = self._scan_lines()
@@ -56,6 +56,7 @@ class Carmen:
         self._rig = Rig(
             sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}),
             laser=Laser(T_base_laser=T_base_laser),
+            wheels=Wheels.given(wheels),
         )
         self._faults = FaultLog()
 

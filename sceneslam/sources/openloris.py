@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from sceneslam.ros.pixels import locked
@@ -13,7 +13,7 @@ from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.input_files import given_folder
 from sceneslam.types.observation import Observation
 from sceneslam.types.recorded import RecordedTrajectory, read_recorded
-from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.rig import Rig, Sensor, Wheels
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
@@ -28,10 +28,11 @@ class OpenLoris:
     told apart by their headers, not by their names. Shi et al., ICRA 2020.
     """
 
-    def __init__(self, path: str, sequence: str) -> None:
+    def __init__(self, path: str, sequence: str, wheels: Mapping[str, float] | None) -> None:
         named = re.fullmatch(r"([a-z]+)-(\d+)-(\d+)", sequence)
         if named is None:
             raise ConfigError("sequence", sequence, "scene-package-number, as in home-1-3")
+        self._wheels = Wheels.given(wheels)
         self._folder = given_folder(path)
         self._scene, self._number = named[1], int(named[3])
         self._odometry = self._find(_ODOMETRY)
@@ -41,7 +42,7 @@ class OpenLoris:
     @property
     def rig(self) -> Rig:
         """Return the wheel odometry alone."""
-        return Rig(sensors=frozenset({Sensor.ODOMETRY}))
+        return Rig(sensors=frozenset({Sensor.ODOMETRY}), wheels=self._wheels)
 
     @property
     def length(self) -> int | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -27,7 +27,7 @@ from sceneslam.sources.synchronise import Bundle, Sample, Synchroniser
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.input_files import given_path
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.rig import Rig, Sensor, Wheels
 from sceneslam.types.truth import GroundTruth
 
 _PRIMARY = (Sensor.IMAGE, Sensor.DEPTH, Sensor.POINTS, Sensor.SCAN, Sensor.ODOMETRY)
@@ -50,6 +50,7 @@ class RosBag:
         sync_tolerance_s: float,
         base_frame: str | None,
         ground_truth_frame: str | None,
+        wheels: Mapping[str, float] | None,
     ) -> None:
         checked_above_zero("depth_scale", depth_scale)
         checked_above_zero("sync_tolerance_s", sync_tolerance_s)
@@ -59,6 +60,7 @@ class RosBag:
             intrinsics=given_intrinsics(camera),
             depth_range_m=given_range_m("depth_range_m", depth_range_m),
             lidar_range_m=given_range_m("lidar_range_m", lidar_range_m),
+            wheels=Wheels.given(wheels),
         )
         self._path = given_path(path)
         self._depth_scale = depth_scale

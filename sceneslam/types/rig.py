@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.ranges import check_above
 from sceneslam.types.se3 import Transform, identity
 
 
@@ -93,6 +96,21 @@ class Wheels:
     drift_rad_per_m: float = 0.01
     floor_m: float = 0.0005  # of any step: encoders tick
     floor_rad: float = 0.0005
+
+    def __post_init__(self) -> None:
+        check_above(0, **{each.name: getattr(self, each.name) for each in fields(self)})
+
+    @classmethod
+    def given(cls, noise: Mapping[str, float] | None) -> Wheels:
+        """Return wheels of a configuration's `wheels`, None: the usual; ConfigError for others."""
+        names = [each.name for each in fields(cls)]
+        for name in noise or {}:
+            if name not in names:
+                raise ConfigError(f"wheels.{name}", (noise or {})[name], f"one of {names}")
+        try:
+            return cls(**(noise or {}))
+        except ConfigError as error:
+            raise error.under("wheels") from error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

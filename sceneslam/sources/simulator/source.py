@@ -142,6 +142,7 @@ class Simulator:
                 sync_tolerance_s=0.002,
                 base_frame=None,
                 ground_truth_frame=None,
+                wheels=None,
             )
         return self._reader
 
