@@ -84,7 +84,7 @@ class CloudOdometry(ABC):
         self._T_local_base = se3.identity()
         self._has_map = False
 
-    def set_pose(self, T_map_local: se3.Transform) -> None:
+    def set_pose(self, T_map_local: se3.Transform) -> None:  # noqa: B027
         """Do nothing: its poses are in `local` wherever that lies."""
 
     def set_scene(self, scene: str) -> None:  # noqa: B027
