@@ -1,0 +1,1 @@
+"""Direct RGB-D tracking: pixels and depths, without features."""

@@ -1,0 +1,76 @@
+"""The keyframes as a map: a thinned cloud, and a graph of the motions between them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.maps import PointLayer, PoseGraphLayer
+
+from .view import Tracker, View
+
+_CLOUD_STEP_M, _CLOUD_TURN_RAD = 0.2, 0.2  # between two keyframes that give points
+_CLOUD_STRIDE_PX = 2
+
+
+class Keyframes:
+    """Keeps poses of all keyframes, and points of those that show something new."""
+
+    def __init__(self, tracker: Tracker, voxel_m: float) -> None:
+        self._tracker, self._voxel_m = tracker, voxel_m
+        self._stamps_ns: list[int] = []
+        self._T_local_cam: list[se3.Transform] = []
+        self._edges: list[tuple[int, NDArray[np.float64]]] = []  # to a node, with information
+        self._points: list[NDArray[np.float32]] = []
+        self._T_local_shown: se3.Transform | None = None  # of the last that gave points
+
+    def add(
+        self,
+        stamp_ns: int,
+        view: View,
+        T_local_cam: se3.Transform,
+        information: NDArray[np.float64] | None,
+    ) -> None:
+        """Add a keyframe; `information` (6, 6), cam, is that of the motion from the one before."""
+        if information is not None:
+            self._edges.append((len(self._stamps_ns), information))
+        self._stamps_ns.append(stamp_ns)
+        self._T_local_cam.append(T_local_cam)
+        if self._T_local_shown is not None:
+            moved = se3.inverse(self._T_local_shown) @ T_local_cam
+            is_near = np.linalg.norm(moved[:3, 3]) < _CLOUD_STEP_M
+            if is_near and se3.rotation_angle_rad(moved) < _CLOUD_TURN_RAD:
+                return
+        self._T_local_shown = T_local_cam
+        points = self._tracker.points(view, _CLOUD_STRIDE_PX)
+        points = se3.apply(T_local_cam, points[points[:, 2] > 0])
+        self._points.append(points.astype(np.float32))
+
+    def cloud(self) -> PointLayer | None:
+        """Return the points in local, one per voxel; None where there is none."""
+        if not self._points:
+            return None
+        points = np.concatenate(self._points)
+        voxels = np.floor(points / self._voxel_m).astype(np.int64)
+        first = np.unique(voxels, axis=0, return_index=True)[1]
+        return PointLayer(points=points[np.sort(first)])
+
+    def graph(self, T_cam_base: se3.Transform) -> PoseGraphLayer | None:
+        """Return base at the keyframes and the motions between them; None where there is none."""
+        if not self._stamps_ns:
+            return None
+        T_local_base = np.stack(self._T_local_cam) @ T_cam_base
+        nodes = np.array([node for node, _ in self._edges], np.int64)
+        edges = np.stack([nodes - 1, nodes], axis=1)
+        back = se3.adjoint(T_cam_base)
+        informations = [back.T @ information @ back for _, information in self._edges]
+        T_from_to = [se3.inverse(T_local_base[a]) @ T_local_base[b] for a, b in edges.tolist()]
+        return PoseGraphLayer(
+            stamps_ns=np.array(self._stamps_ns, np.int64),
+            T_world_base=T_local_base,
+            edges=edges,
+            T_from_to=np.array(T_from_to).reshape(-1, 4, 4),
+            information=np.array(informations).reshape(-1, 6, 6),
+            is_loop=np.zeros(len(edges), np.bool_),
+        )

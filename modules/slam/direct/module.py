@@ -1,0 +1,225 @@
+"""The `direct` SLAM module: RGB-D tracking on pixels, frame to keyframe, without features.
+
+Photometric and depth residuals are minimised by OpenCV's RGB-D odometry (after Steinbruecker, Sturm
+and Cremers, "Real-Time Visual Odometry from Dense RGB-D Images", ICCVW 2011). It is for rooms with
+few corners but shading. What it lacks is here: whether an answer is one, and its covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.motion.predictor import Prediction, Predictor
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.maps import MapLayers, PointLayer, PoseGraphLayer
+from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
+
+from .keyframes import Keyframes
+from .view import Comparison, Tracker, View
+
+_POSITIVE = (
+    "width_px keyframe_step_m keyframe_turn_rad step_max_m turn_max_rad weak_m weak_rad "
+    "cloud_voxel_m"
+)
+_PIXELS_MIN = 300  # that both views show; with fewer there is nothing to compare
+_COAST_S = 0.5  # without an image for longer, a guessed pose is no pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Located:
+    """Where a view is, and how it lies on another there."""
+
+    T_local_cam: se3.Transform
+    comparison: Comparison
+
+
+@dataclass(kw_only=True, eq=False)
+class DirectSlam:
+    """Registers images with depth; `conf/slam/direct.yaml` says what the settings are."""
+
+    width_px: int
+    keyframe_step_m: float
+    keyframe_turn_rad: float
+    step_max_m: float
+    turn_max_rad: float
+    matched_min_ratio: float
+    weak_m: float
+    weak_rad: float
+    cloud_voxel_m: float
+    _T_map_local: se3.Transform = field(default_factory=se3.identity, init=False)
+    _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        for name in _POSITIVE.split():
+            if not 0 < getattr(self, name) < np.inf:
+                raise ConfigError(name, getattr(self, name), "above 0")
+        if not 0 < self.matched_min_ratio < 1:
+            raise ConfigError("matched_min_ratio", self.matched_min_ratio, "between 0 and 1")
+
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return image and depth; odometry and gyro are used when present."""
+        return (frozenset({Sensor.IMAGE, Sensor.DEPTH}),)
+
+    def activate(self, rig: Rig) -> None:
+        """Start anew with an empty map; raises InputError for a rig without a camera."""
+        if rig.camera is None:
+            raise InputError("rig: direct needs the camera's intrinsics, got none")
+        self._camera = rig.camera
+        self._tracker = Tracker(rig.camera, self.width_px, self.step_max_m, self.turn_max_rad)
+        self._predictor = Predictor(rig)
+        self._keyframes = Keyframes(self._tracker, self.cloud_voxel_m)
+        self._key: View | None = None
+        self._last: View | None = None
+        self._T_local_key = self._T_local_last = se3.identity()  # of cam
+        self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
+
+    def set_pose(self, T_map_local: se3.Transform) -> None:
+        """Place `local` in the map (Eq. 1)."""
+        self._T_map_local = np.array(T_map_local, dtype=np.float64)
+
+    def set_scene(self, scene: str) -> None:
+        """Do nothing: it says itself when it sees too little."""
+
+    def track(self, observation: Observation) -> Tracking:
+        """Return T_local_base at the observation."""
+        prediction = self._predictor.predict(observation)
+        image, depth_m = observation.image_bgr, observation.depth_m
+        if image is None or depth_m is None:
+            return self._bridge(observation, prediction, can_coast=True)
+        width, height = self._camera.size_wh
+        if image.shape[:2] != (height, width) or depth_m.shape != (height, width):
+            raise InputError(
+                f"image_bgr, depth_m: expected ({height}, {width}), got {image.shape[:2]} "
+                f"and {depth_m.shape}"
+            )
+        view = self._tracker.view(image, depth_m)
+        if self._key is None or self._last is None:
+            if np.count_nonzero(view.depth_m) < _PIXELS_MIN:
+                return self._bridge(observation, prediction, can_coast=False)
+            return self._begin(observation, prediction, view)
+        found = self._locate(view)
+        if found is not None:
+            return self._hold(observation, prediction, view, found)
+        if prediction.is_measured:
+            return self._begin(observation, prediction, view)
+        return self._bridge(observation, prediction, can_coast=False)
+
+    def get_pose(self) -> se3.Transform:
+        """Return T_map_base of the last observation."""
+        return self._T_map_local @ self._T_local_base
+
+    def get_trajectory(self) -> Trajectory:
+        """Return no poses: nothing is revised."""
+        return Trajectory.empty()
+
+    def get_map(self) -> MapLayers:
+        """Return the keyframes' cloud and their graph, in `local`."""
+        T_cam_base = se3.inverse(self._camera.T_base_cam)
+        graph: PoseGraphLayer | None = self._keyframes.graph(T_cam_base)
+        points: PointLayer | None = self._keyframes.cloud()
+        return MapLayers(points=points, pose_graph=graph)
+
+    def shutdown(self) -> None:
+        """Do nothing: only memory is held, and the map stays readable."""
+
+    def _locate(self, view: View) -> _Located | None:
+        """Return the view's place beside the keyframe, or else beside the view before."""
+        candidates = ((self._key, self._T_local_key), (self._last, self._T_local_last))
+        for other, T_local_other in candidates:
+            T_other_cam = None if other is None else self._tracker.register(view, other)
+            if other is None or T_other_cam is None:
+                continue
+            found = self._tracker.compare(view, other, T_other_cam)
+            is_enough = found.compared >= _PIXELS_MIN
+            if is_enough and found.matched_ratio >= self.matched_min_ratio:
+                return _Located(T_local_other @ T_other_cam, found)
+        return None
+
+    def _begin(self, observation: Observation, prediction: Prediction, view: View) -> Tracking:
+        """Make the first keyframe, or the first of a place that odometry alone leads to."""
+        is_first = self._key is None
+        self._predictor.coast(prediction)
+        self._T_local_base = prediction.T_local_base
+        self._add_keyframe(observation, view, None)
+        if is_first:
+            self._predictor.measure(observation, self._T_local_base, prediction.covariance)
+        status = TrackingStatus.TRACKING if is_first else TrackingStatus.DEGRADED
+        return self._answer(observation, status, 1.0 if is_first else 0.0, 0)
+
+    def _hold(
+        self,
+        observation: Observation,
+        prediction: Prediction,
+        view: View,
+        located: _Located,
+    ) -> Tracking:
+        """Go on from an answer, weighed against the prediction by the covariance of each."""
+        found = located.comparison
+        T_base_cam = self._camera.T_base_cam
+        back = se3.adjoint(se3.inverse(T_base_cam))
+        information = back.T @ found.information @ back
+        covariance = np.asarray(np.linalg.inv(np.linalg.inv(prediction.covariance) + information))
+        T_local_seen = located.T_local_cam @ se3.inverse(T_base_cam)
+        off = se3.log(se3.inverse(prediction.T_local_base) @ T_local_seen)
+        gain = covariance @ information
+        self._T_local_base = se3.orthonormal(prediction.T_local_base @ se3.exp(gain @ off))
+        self._predictor.measure(observation, self._T_local_base, covariance, information)
+        T_local_cam = self._T_local_base @ T_base_cam
+        T_key_cam = se3.inverse(self._T_local_key) @ T_local_cam
+        is_far = (
+            np.linalg.norm(T_key_cam[:3, 3]) > self.keyframe_step_m
+            or se3.rotation_angle_rad(T_key_cam) > self.keyframe_turn_rad
+        )
+        if is_far:
+            self._add_keyframe(observation, view, found.information)
+        self._last, self._T_local_last = view, T_local_cam
+        limits = np.repeat([self.weak_m, self.weak_rad], 3)
+        is_weak = (np.diag(np.linalg.pinv(information, hermitian=True)) > limits**2).any()
+        is_weak |= np.linalg.matrix_rank(information, hermitian=True) < 6
+        status = TrackingStatus.DEGRADED if is_weak else TrackingStatus.TRACKING
+        return self._answer(observation, status, found.matched_ratio, found.matched)
+
+    def _add_keyframe(
+        self, observation: Observation, view: View, information: NDArray[np.float64] | None
+    ) -> None:
+        """Make the view the keyframe; without information it is not connected with the last."""
+        self._key = self._last = view
+        self._T_local_key = self._T_local_last = self._T_local_base @ self._camera.T_base_cam
+        self._keyframes.add(observation.stamp_ns, view, self._T_local_key, information)
+
+    def _bridge(
+        self, observation: Observation, prediction: Prediction, *, can_coast: bool
+    ) -> Tracking:
+        """Go on without an image: by odometry, for a moment as before, else not at all."""
+        has_pose = self._key is not None
+        is_brief = has_pose and self._predictor.unmeasured_s(observation) <= _COAST_S
+        if prediction.is_measured or (can_coast and is_brief):
+            self._predictor.coast(prediction)
+            self._T_local_base = prediction.T_local_base
+            is_known = prediction.is_measured
+            status = TrackingStatus.DEGRADED if is_known else TrackingStatus.TRACKING
+            return self._answer(observation, status, 0.0, 0)
+        self._predictor.lose(prediction)
+        self._T_local_base = self._predictor.T_local_measured
+        return self._answer(observation, TrackingStatus.LOST, 0.0, 0)
+
+    def _answer(
+        self, observation: Observation, status: TrackingStatus, quality_ratio: float, inliers: int
+    ) -> Tracking:
+        is_lost = status is TrackingStatus.LOST
+        return Tracking(
+            stamp_ns=observation.stamp_ns,
+            T_local_base=self._T_local_base.copy(),
+            status=status,
+            covariance=None if is_lost else self._predictor.covariance.copy(),
+            quality_ratio=quality_ratio,
+            inliers=inliers,
+        )

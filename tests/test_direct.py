@@ -1,0 +1,98 @@
+"""Direct RGB-D tracking: without corners, and honest about what it does not see."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from sceneslam.modules.slam.direct.module import DirectSlam
+from sceneslam.modules.slam.direct.view import Tracker
+from sceneslam.testing import RIG, room_observation
+from sceneslam.testing.room import CAMERA, observation_at
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.observation import TrackingStatus
+
+SETTINGS = yaml.safe_load((Path(__file__).parents[1] / "conf/slam/direct.yaml").read_text())
+SETTINGS.pop("_target_")
+SILENT = {"T_odom_base": None, "gyro_base": None}
+
+
+def active(**settings):
+    module = DirectSlam(**{**SETTINGS, **settings})
+    module.activate(RIG)
+    return module
+
+
+def shaded(index):
+    """Return an observation without one corner: only soft shading is left of the texture."""
+    seen = room_observation(index)
+    return replace(seen, image_bgr=cv2.GaussianBlur(seen.image_bgr, (0, 0), 8), **SILENT)
+
+
+def test_it_follows_shading_without_corners():
+    grey = cv2.cvtColor(shaded(0).image_bgr, cv2.COLOR_BGR2GRAY)
+    assert len(cv2.FastFeatureDetector_create(7).detect(grey)) < 20
+    module = active()
+    found = [module.track(shaded(index)) for index in range(20)]
+    T_first, T_last = (room_observation(index).T_odom_base for index in (0, 19))
+    off = se3.inverse(se3.inverse(T_first) @ T_last) @ found[-1].T_local_base
+    assert np.linalg.norm(off[:3, 3]) < 0.02
+    assert all(one.status is TrackingStatus.TRACKING for one in found)
+    layers = module.get_map()
+    assert len(layers.points.points) > 1000
+    graph = layers.pose_graph
+    assert len(graph.edges) == len(graph.stamps_ns) - 1 > 2
+
+
+@pytest.mark.parametrize("odometry", [False, True])
+def test_an_image_of_another_place_is_no_pose(odometry):
+    elsewhere = observation_at(se3.from_xy_yaw(1.0, 1.0, 2.5), 4 / 30)
+    module = active()
+    for index in range(4):
+        seen = room_observation(index)
+        module.track(seen if odometry else replace(seen, **SILENT))
+    kept = {"T_odom_base": room_observation(4).T_odom_base} if odometry else SILENT
+    found = module.track(replace(elsewhere, **kept))
+    expected = TrackingStatus.DEGRADED if odometry else TrackingStatus.LOST
+    assert found.status is expected and (found.covariance is None) is not odometry
+
+
+def test_a_blank_wall_is_degraded_along_itself():
+    wall = replace(
+        room_observation(0),
+        image_bgr=np.full((CAMERA.size_wh[1], CAMERA.size_wh[0], 3), 128, np.uint8),
+        depth_m=np.full((CAMERA.size_wh[1], CAMERA.size_wh[0]), 2.0, np.float32),
+        **SILENT,
+    )
+    module = active()
+    found = [module.track(replace(wall, stamp_ns=wall.stamp_ns + i * 33_000_000)) for i in range(5)]
+    assert found[-1].status is not TrackingStatus.TRACKING
+    if found[-1].covariance is not None:
+        along, across = np.diag(found[-1].covariance)[[1, 0]]  # the camera looks along x
+        assert along > 4 * across
+
+
+def test_information_is_that_of_the_residuals():
+    tracker = Tracker(CAMERA, 320, 0.3, 0.4)
+    views = [
+        tracker.view(seen.image_bgr, seen.depth_m)
+        for seen in (room_observation(index) for index in (0, 3))
+    ]
+    T_other_view = tracker.register(views[1], views[0])
+    found = tracker.compare(views[1], views[0], T_other_view)
+    assert found.matched_ratio > 0.9
+    assert np.linalg.eigvalsh(found.information).min() > 0
+    off = T_other_view @ se3.exp(np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    assert tracker.compare(views[1], views[0], off).matched_ratio < found.matched_ratio
+
+
+@pytest.mark.parametrize(("key", "value"), [("width_px", 0), ("matched_min_ratio", 1.0)])
+def test_a_setting_that_makes_no_sense_is_named(key, value):
+    with pytest.raises(ConfigError, match=key):
+        active(**{key: value})
