@@ -16,6 +16,7 @@ from isolation import limits
 
 from sceneslam.modules.slam.orb_slam3.anchor import Anchor, inverse
 from sceneslam.modules.slam.orb_slam3.module import OrbSlam3
+from sceneslam.modules.slam.orb_slam3.scale import Scale
 from sceneslam.testing import RIG, room_observation
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
@@ -103,6 +104,28 @@ def test_a_new_map_goes_on_where_the_robot_is():
     T_world_next = T_world_cam @ se3.from_xy_yaw(0.5, 0.0, 0.0)
     moved = inverse(T_local_cam) @ anchor.place(T_world_next)
     np.testing.assert_allclose(moved, se3.from_xy_yaw(0.5, 0.0, 0.0), atol=1e-12)
+
+
+def test_a_monocular_map_is_as_large_as_odometry_says():
+    scale, anchor = Scale(), None
+    for index in range(30):
+        T_odom_cam = se3.from_xy_yaw(0.05 * index, 0.01 * index, 0.02 * index)
+        T_world_cam = se3.from_xy_yaw(1.0, 2.0, 0.3) @ T_odom_cam
+        T_world_cam[:3, 3] /= 2.5
+        scale.add(T_world_cam, T_odom_cam)
+        is_short = bool(np.linalg.norm(T_odom_cam[:3, 3]) < 0.5)
+        assert (scale.metres is None) is is_short
+        if anchor is None and scale.metres is not None:
+            anchor = Anchor(T_odom_cam, T_world_cam, scale.metres)
+        if anchor is not None:
+            np.testing.assert_allclose(anchor.place(T_world_cam), T_odom_cam, atol=1e-9)
+
+
+def test_a_map_of_another_motion_gets_no_scale():
+    scale = Scale()
+    for index in range(30):
+        scale.add(se3.from_xy_yaw(0.0, 0.3 * index, 0.0), se3.from_xy_yaw(0.05 * index, 0.0, 0.0))
+    assert scale.metres is None
 
 
 @needs_orb_slam3

@@ -19,16 +19,22 @@ def inverse(T_a_b: Transform) -> Transform:
 
 
 class Anchor:
-    """Places one map: T_local_cam = T_local_world @ T_world_cam."""
+    """Places one map, whose unit is so many `metres`: T_local_cam = T_local_world @ T_world_cam."""
 
-    def __init__(self, T_local_cam: Transform, T_world_cam: Transform) -> None:
-        self._T_local_world = T_local_cam @ inverse(T_world_cam)
+    def __init__(self, T_local_cam: Transform, T_world_cam: Transform, metres: float = 1.0) -> None:
+        self._metres = metres
+        self._T_local_world = T_local_cam @ inverse(self._scaled(T_world_cam))
 
     def place(self, T_world_cam: Transform) -> Transform:
         """Return T_local_cam."""
-        return np.asarray(self._T_local_world @ T_world_cam)
+        return np.asarray(self._T_local_world @ self._scaled(T_world_cam))
 
     def place_points(self, points_world: NDArray[Any]) -> NDArray[np.float32]:
         """Return points (N, 3) in local."""
         T = self._T_local_world
-        return np.asarray(points_world @ T[:3, :3].T + T[:3, 3], np.float32)
+        return np.asarray(self._metres * points_world @ T[:3, :3].T + T[:3, 3], np.float32)
+
+    def _scaled(self, T_world_cam: Transform) -> Transform:
+        scaled = np.array(T_world_cam, np.float64)
+        scaled[:3, 3] *= self._metres
+        return scaled

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from sceneslam.types.errors import InputError
 from sceneslam.vocabulary import describe, train
 
-from ..process.client import LOST, TRACKING, pose, poses, serve
-from ..process.protocol import Fields
+from ..process.client import DEGRADED, LOST, TRACKING, pose, poses, serve
+from ..process.protocol import Fields, as_text
 from .anchor import Anchor, Transform, inverse
+from .scale import Scale
 from .settings import write_settings
 
 _POINTS_EVERY = 10  # images
@@ -29,13 +30,14 @@ _POINT_M = 0.02  # of several points within a cube of this edge one is kept
 class OrbSlam3:
     """Tracks with ORB-SLAM3; `pyorbslam3` and a folder for its files are given."""
 
-    requires = "image depth"
+    requires = "image depth\nimage odometry"
 
     def __init__(self, orb: Any, folder: Path, settings: dict[str, Any]) -> None:
         self._orb, self._folder, self._settings = orb, folder, settings
         self._slam: Any = None
         self._anchors: list[Anchor] = []  # of the maps, the current one last
         self._is_new_map = True
+        self._scale: Scale | None = None  # of the current map, where there is no depth
         self._T_local_base: Transform = np.eye(4)
         self._T_odom_base: Transform | None = None  # at that pose
         self._revision, self._images = 0, 0
@@ -44,6 +46,7 @@ class OrbSlam3:
     def activate(self, rig: Fields) -> None:
         """Write the settings; with a vocabulary, start ORB-SLAM3."""
         self._T_base_cam = rig["camera.T_base_cam"]
+        self._has_depth = "depth" in as_text(rig["sensors"]).split()
         names = ("features", "fast")
         values = {name: self._settings[name] for name in names}
         write_settings(rig, self._folder / "settings.yaml", **values)
@@ -54,10 +57,10 @@ class OrbSlam3:
         """Do nothing."""
 
     def track(self, observation: Fields) -> dict[str, Any]:
-        """Return the pose; none without image or depth: odometry carries it on meanwhile."""
+        """Return the pose; none without the rig's image or depth: odometry carries it on then."""
         image = observation.get("image_bgr")
         depth = observation.get("depth_m")
-        if image is None or depth is None:
+        if image is None or (depth is None and self._has_depth):
             return poses([], [])
         stamp_ns = int(observation["stamp_ns"])
         if self._slam is None:
@@ -65,12 +68,15 @@ class OrbSlam3:
                 self._start(self._trained(image))
             except InputError:  # nothing to be seen yet
                 return pose(stamp_ns, self._T_local_base, LOST)
-        found = self._slam.track_rgbd(image, depth, stamp_ns * 1e-9)
+        if self._has_depth:
+            found = self._slam.track_rgbd(image, depth, stamp_ns * 1e-9)
+        else:
+            found = self._slam.track_monocular(image, stamp_ns * 1e-9)
         return self._answer(stamp_ns, found, observation.get("T_odom_base"))
 
     def trajectory(self) -> dict[str, Any]:
         """Return the frames' poses as corrected by loops, where there was one map only."""
-        if len(self._anchors) != 1:
+        if len(self._anchors) != 1 or not self._has_depth:  # it writes no monocular trajectory
             return poses([], [])
         path = self._folder / "trajectory.txt"
         self._slam.save_trajectory_tum(str(path))
@@ -92,7 +98,8 @@ class OrbSlam3:
 
     def _start(self, vocabulary: Path) -> None:
         settings = self._folder / "settings.yaml"
-        self._slam = self._orb.Slam(vocabulary, settings, self._orb.Sensor.RGBD)
+        sensor = self._orb.Sensor.RGBD if self._has_depth else self._orb.Sensor.MONOCULAR
+        self._slam = self._orb.Slam(vocabulary, settings, sensor)
 
     def _trained(self, image: NDArray[np.uint8]) -> Path:
         """Return a vocabulary of the first image alone: good enough to match features by."""
@@ -103,25 +110,43 @@ class OrbSlam3:
     def _answer(self, stamp_ns: int, found: Any, T_odom_base: Any) -> dict[str, Any]:
         state = self._orb.TrackingState
         self._images += 1
-        if found.state in (state.NO_IMAGES_YET, state.NOT_INITIALIZED, state.SYSTEM_NOT_READY):
-            self._is_new_map = True
+        is_beginning = found.state in (
+            state.NO_IMAGES_YET,
+            state.NOT_INITIALIZED,
+            state.SYSTEM_NOT_READY,
+        )
+        if is_beginning:
+            self._is_new_map, self._scale = True, None
         is_tracked = found.pose_valid and found.state in (state.OK, state.OK_KLT)
         T_expected_base = self._expected(T_odom_base)
-        if is_tracked:
-            self._place(found.pose_wc, T_expected_base @ self._T_base_cam)
+        metres = self._metres(found.pose_wc, T_odom_base) if is_tracked else None
+        status = LOST
+        if metres is not None:
+            self._place(found.pose_wc, T_expected_base @ self._T_base_cam, metres)
             T_local_cam = self._anchors[-1].place(found.pose_wc)
             self._T_local_base = T_local_cam @ inverse(self._T_base_cam)
-            self._T_odom_base = T_odom_base
+            self._T_odom_base, status = T_odom_base, TRACKING
             self._keep_points()
-        inliers = int(found.num_tracked_points) if is_tracked else 0
-        status = TRACKING if is_tracked else LOST
+        elif not self._has_depth and T_odom_base is not None and (is_tracked or is_beginning):
+            # The map has no scale yet, and nothing but odometry to take one from.
+            self._T_local_base, self._T_odom_base, status = T_expected_base, T_odom_base, DEGRADED
+        inliers = int(found.num_tracked_points) if status == TRACKING else 0
         reply = pose(stamp_ns, self._T_local_base, status, inliers=inliers)
         return {**reply, "revision": self._revision}
 
-    def _place(self, T_world_cam: Transform, T_expected_cam: Transform) -> None:
+    def _metres(self, T_world_cam: Transform, T_odom_base: Any) -> float | None:
+        """Return the metres per unit of the current map, None while they are not known."""
+        if self._has_depth:
+            return 1.0
+        if T_odom_base is not None and self._is_new_map:
+            self._scale = self._scale or Scale()
+            self._scale.add(T_world_cam, T_odom_base @ self._T_base_cam)
+        return None if self._scale is None else self._scale.metres
+
+    def _place(self, T_world_cam: Transform, T_expected_cam: Transform, metres: float) -> None:
         """Find where the current map lies: a new one where the camera is expected to be."""
         if self._is_new_map:
-            self._anchors.append(Anchor(T_expected_cam, T_world_cam))
+            self._anchors.append(Anchor(T_expected_cam, T_world_cam, metres))
             self._is_new_map = False
         elif self._slam.map_changed():
             self._revision += 1
