@@ -23,6 +23,7 @@ _CELLS = 8  # across the image, within which residuals are summed up
 _INDEPENDENT = 1.5  # common ratio up to which no wrong model shows: 1.0 to 1.7 in simulations,
 # 2.1 to 3.8 on freiburg1_rpy, 1.3 to 2.6 on RedKitchen
 _NOT_HELD = 1e-9  # of all information, added to every direction
+_SAME_SCALE_M = 3.0  # along which landmarks are the same: beyond, wheels measured the scale anew
 _KEPT = 0.95  # from image to image, of what residuals have in common
 
 
@@ -33,6 +34,8 @@ class Certainty:
         self._landmarks = landmarks
         self._common: float | None = None  # see `common_ratio`, followed over images
         self._scaled_local = np.zeros(3)  # [m], where the camera was when its scale was known
+        self._drift = np.zeros((3, 3))  # [m^2] in local, until it was there
+        self.by_wheels = np.zeros((6, 6))  # of the last covariance: the share that is the wheels'
 
     def covariance(
         self, view: View, fix: Fix, T_local_base: Transform, T_keyframe_base: Sequence[Transform]
@@ -53,6 +56,7 @@ class Certainty:
         model[:3, :3] += np.median((away_m**2).sum(axis=1)) * model[3:, 3:]
         scale = np.zeros((6, 6))
         scale[:3, :3] = self._scale_variance(view, fix, T_local_base)
+        self.by_wheels = scale if view.reckoned is not None else 0.0 * scale
         return np.asarray(measured + model + scale)
 
     def _follow(self, ratio: float) -> float:
@@ -65,8 +69,13 @@ class Certainty:
         sigmas = self._landmarks.scale_sigma[fix.landmark_ids]
         if not view.is_monocular or not sigmas.any():
             self._scaled_local = T_local_base[:3, 3].copy()
-        way_base = T_local_base[:3, :3].T @ (T_local_base[:3, 3] - self._scaled_local)
-        return np.asarray(np.mean(sigmas**2) * np.outer(way_base, way_base))
+            self._drift = np.zeros((3, 3))
+        way_local = T_local_base[:3, 3] - self._scaled_local
+        drift = np.mean(sigmas**2) * np.outer(way_local, way_local)
+        if view.reckoned is not None and float(np.linalg.norm(way_local)) > _SAME_SCALE_M:
+            self._drift, self._scaled_local = self._drift + drift, T_local_base[:3, 3].copy()
+            drift = np.zeros((3, 3))
+        return np.asarray(T_local_base[:3, :3].T @ (self._drift + drift) @ T_local_base[:3, :3])
 
 
 def common_ratio(view: View, fix: Fix) -> float:

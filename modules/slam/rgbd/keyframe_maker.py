@@ -52,6 +52,8 @@ class KeyframeMaker:
             landmark_ids=landmark_ids,
             view=self._layers.view(view.depth_m, view.image_bgr, stamp_ns=stamp_ns),
             turning=view.turning,
+            is_monocular=view.is_monocular,
+            reckoned=view.reckoned,
         )
         deep_rows = landmark_ids[:0] if fix is None else fix.deep_rows
         keyframe_id = self._map.insert(keyframe, deep_rows=deep_rows)

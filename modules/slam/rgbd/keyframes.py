@@ -35,6 +35,14 @@ def nothing_seen() -> DepthView:
     return DepthView(points_base=points_base, colors_bgr=colors_bgr, scan=None)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Reckoned:
+    """Where odometry alone led."""
+
+    T_reckoned_base: Transform  # never corrected
+    stretch: int  # along which odometry was there without a gap
+
+
 @dataclass(slots=True, kw_only=True, eq=False)
 class Keyframe:
     """One image that the map is built of. Pose and landmarks may be corrected later."""
@@ -45,6 +53,8 @@ class Keyframe:
     landmark_ids: NDArray[np.int64]  # (N,), per feature, or NO_LANDMARK
     view: DepthView
     turning: Turning
+    is_monocular: bool = False
+    reckoned: Reckoned | None = None
 
     def straighten(self, camera: Camera, readout_s: float) -> None:
         """Take it that reading the image took so much longer."""

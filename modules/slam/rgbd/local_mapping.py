@@ -80,6 +80,7 @@ class LocalMapping:
                         keyframe_ids=self._window.keyframe_ids,
                         free_ids=self._window.free_ids,
                         fresh=fresh,
+                        reckoned=self._window.reckoned,
                     )
                 )
         return T_new_old

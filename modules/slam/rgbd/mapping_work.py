@@ -22,6 +22,7 @@ class Task:
     keyframe_ids: list[int]  # (K,) of the bundle's keyframes, rising
     free_ids: list[int]
     fresh: Mapping[int, Shown]  # what new keyframes show, by their ids
+    reckoned: Mapping[tuple[int, int], Tie]  # by odometry, by keyframe ids
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,7 +51,7 @@ class MappingWork:
         rows = {keyframe_id: row for row, keyframe_id in enumerate(task.keyframe_ids)}
         ties = {
             (rows[one], rows[other]): tie
-            for (one, other), tie in self._ties.items()
+            for (one, other), tie in {**task.reckoned, **self._ties}.items()
             if one in rows and other in rows
         }
         bundle = replace(task.bundle, ties=Ties.of(ties))

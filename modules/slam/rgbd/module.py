@@ -21,6 +21,7 @@ from .answers import held, lost, placed, repeated, started
 from .limits import check_limits, check_sizes
 from .localizer import Fix
 from .parts import Parts
+from .reckoning import Reckoner
 from .renewal import NEWEST, Seen, renew, seen_by
 from .reunion import Reunion
 from .turn_rate import expected_rate
@@ -79,7 +80,7 @@ class RgbdSlam:
         if rig.camera is None:
             raise InputError("rig: rgbd needs the camera's intrinsics, got none")
         self._camera: Camera = rig.camera
-        self._predictor = Predictor(rig)
+        self._predictor, self._reckoner = Predictor(rig), Reckoner()
         self._reunion.begin()
         self._build(None)
         self._T_local_base = se3.identity()
@@ -102,6 +103,7 @@ class RgbdSlam:
         self._observations += 1
         self._recall()
         prediction = self._predictor.predict(observation)
+        reckoned = self._reckoner.add(prediction)
         if observation.image_bgr is None:
             return self._lose(observation, prediction)
         if self._eye.is_repeated(observation.image_bgr):
@@ -112,6 +114,7 @@ class RgbdSlam:
             T_predicted=prediction.T_local_base,
             rate_base=expected_rate(observation, self._predictor),
         )
+        view = replace(view, reckoned=reckoned)
         fix = None
         if len(self._map.keyframes):
             fix = self._search.find(view, self._held_ids, is_lost=self._is_lost)
@@ -198,21 +201,25 @@ class RgbdSlam:
             self._hold_pose(view.observation, T_local_base, prediction.covariance)
         else:
             T_local_base = fix.estimate.T_local_base
-            self._hold_pose(view.observation, T_local_base, fix.estimate.covariance, is_seen=True)
+            # Without depth the map's scale is the wheels', and teaches them nothing.
+            is_seen = not view.is_monocular
+            self._hold_pose(
+                view.observation, T_local_base, fix.estimate.covariance, is_seen=is_seen
+            )
         self._held_ids = fix.landmark_ids
         self._map.count_sightings(fix.expected_ids, fix.landmark_ids)
         segment = self._memory.segment(fix.landmark_ids)
         wanted = self._keyframe_rule.wants(T_local_base, fix, self._map.keyframes, segment)
         if status is TrackingStatus.TRACKING:
             self._reunion.see(view, T_local_base)
-        if wanted and status is TrackingStatus.TRACKING:
+        if wanted and (status is TrackingStatus.TRACKING or (is_reckoned and view.is_monocular)):
             self._insert_keyframe(view, segment, fix=fix)
         self._memory.hold(view.observation.stamp_ns, T_local_base, fix.landmark_ids)
         covariance = None
         if not is_reckoned:
             around = self._memory.around(T_local_base)
             covariance = self._certainty.covariance(view, fix, T_local_base, around)
-            if self._health.is_unsure(covariance):
+            if self._health.is_unsure(covariance - self._certainty.by_wheels):
                 status = TrackingStatus.DEGRADED
         revision = self._memory.revision
         answer = held(

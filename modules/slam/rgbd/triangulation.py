@@ -26,6 +26,7 @@ _NEAREST_M = 0.1
 _NEAREST_SHARE = 0.05  # of what a keyframe shows is known to be nearer than the rest ...
 _NEARER_RATIO = 0.5  # ... and what seems half as far as that is a wrong match
 _CORRELATED = 10.0  # errors of one pair of images that say the same
+_WHEELS_RATIO = 0.045  # of the way between two keyframes: 1 cm and 3 % of 0.3 to 1 m
 _MAX_DOUBT_RATIO = 0.3  # of its distance: a landmark less well known waits for another keyframe
 
 
@@ -62,7 +63,11 @@ def triangulate(visual_map: VisualMap, keyframe_id: int) -> None:
     store = visual_map.keyframes
     new = store[keyframe_id]
     known = new.landmark_ids[new.landmark_ids != NO_LANDMARK]
-    near = store.covisible(known, limit=_NEIGHBOURS + 1) if len(known) else store.ids[-2:]
+    near = (
+        store.covisible(known, limit=_NEIGHBOURS + 1)
+        if len(known)
+        else store.ids[-_NEIGHBOURS - 1 :]
+    )
     for other_id in near:
         if other_id != keyframe_id and _is_apart(visual_map, new, store[other_id], known):
             _triangulate_with(visual_map, keyframe_id, other_id)
@@ -104,13 +109,16 @@ def _scale_sigma(visual_map: VisualMap, keyframe: Keyframe, found: _Found) -> fl
     """Return by what share of their distance landmarks of a keyframe are wrong together.
 
     As wrong as the landmarks that placed it, and by what new ones add: many pixels of two images
-    say the same.
+    say the same. Wheels measure it anew with every keyframe.
     """
     known = keyframe.landmark_ids[keyframe.landmark_ids != NO_LANDMARK]
     before = float(np.mean(visual_map.landmarks.scale_sigma[known] ** 2)) if len(known) else 0.0
     doubts = found.doubt_ratio[found.is_sure]
     more = _CORRELATED * float(np.mean(doubts**2)) / len(doubts)
-    return float(np.sqrt(before + min(more, _MAX_DOUBT_RATIO**2)))
+    variance = before + min(more, _MAX_DOUBT_RATIO**2)
+    if keyframe.reckoned is not None:
+        variance = 1.0 / (1.0 / max(variance, 1e-12) + 1.0 / _WHEELS_RATIO**2)
+    return float(np.sqrt(variance))
 
 
 def _eye(visual_map: VisualMap, keyframe: Keyframe) -> _Eye:

@@ -11,6 +11,7 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
 from .features import Features
+from .keyframes import Reckoned
 from .shutter import Turning
 
 _FEWEST = 50  # features, with a depth where one is asked for, that a keyframe can be made of
@@ -26,6 +27,7 @@ class View:
     features: Features
     T_predicted: Transform  # T_local_base, before the image was asked
     turning: Turning
+    reckoned: Reckoned | None = None
 
     @property
     def shows_enough(self) -> bool:

@@ -12,13 +12,14 @@ from sceneslam.types.se3 import Transform
 
 from .bundle import Adjusted, Bundle
 from .keyframes import NO_LANDMARK
+from .reckoning import reckoned_ties
 from .residuals import Sightings
-from .ties import Ties
+from .ties import Tie, Ties
 from .visual_map import VisualMap
 
 _FREE = 5
 _HELD = 15
-_MAX_SIGMA_M = 1.0  # of a landmark that is worth keeping
+_MAX_SIGMA_M, _MAX_SIGMA_RATIO = 1.0, 0.3  # of a landmark worth keeping; the second of its distance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -31,6 +32,7 @@ class Window:
     landmark_ids: NDArray[np.int64]  # (L,), rising
     births: NDArray[np.int64]  # (L,), to tell a landmark from a later one of the same id
     feature_rows: NDArray[np.int64]  # (N,), of each sighting in its keyframe
+    reckoned: dict[tuple[int, int], Tie]  # by keyframe ids
     corrections: int  # of the map, when it was copied
 
 
@@ -81,6 +83,9 @@ def take_window(visual_map: VisualMap, keyframe_id: int) -> Window | None:
         landmark_ids=landmark_ids,
         births=visual_map.landmarks.births[landmark_ids],
         feature_rows=of_feature[chosen],
+        reckoned=reckoned_ties(
+            dict(zip(keyframe_ids, keyframes, strict=True)), visual_map.camera.T_base_cam
+        ),
         corrections=visual_map.corrections,
     )
 
@@ -101,7 +106,9 @@ def merge_window(visual_map: VisualMap, window: Window, adjusted: Adjusted) -> T
     newer = {k: T_new_old @ store[k].T_local_base for k in store.ids if k > newest}
     visual_map.correct({k: T for k, T in (poses | newer).items() if k in store.ids})
     same = table.alive[window.landmark_ids] & (table.births[window.landmark_ids] == window.births)
-    located = np.linalg.eigvalsh(adjusted.information)[:, 0] > _MAX_SIGMA_M**-2
+    away = adjusted.bundle.points_local - T_local_base[-1, :3, 3]
+    most_m = np.maximum(_MAX_SIGMA_M, _MAX_SIGMA_RATIO * np.linalg.norm(away, axis=1))
+    located = np.linalg.eigvalsh(adjusted.information)[:, 0] > most_m**-2
     known = same & located
     table.settle(
         window.landmark_ids[known],

@@ -1,0 +1,68 @@
+"""How far wheels and gyro say that the robot went between keyframes that have no depth.
+
+Two images tell a direction and no distance, and landmarks that are chosen for how well their
+distance is known are, in the mean, taken for nearer than they are: without this the scale shrinks
+from keyframe to keyframe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from itertools import pairwise
+
+import numpy as np
+
+from sceneslam.motion.predictor import Prediction
+from sceneslam.types import se3
+from sceneslam.types.se3 import Transform
+
+from .keyframes import Keyframe, Reckoned
+from .ties import Tie
+
+_SIGMA_M, _SIGMA_PER_M = 0.01, 0.03  # of the wheels' distance; a slip is an outlier
+_SIGMA_RAD, _SIGMA_RAD_PER_M = 0.005, 0.01  # of the gyro's turn, and of the floor's tilt
+_FARTHEST_M = 3.0  # apart: what wheels say of more adds nothing
+
+
+class Reckoner:
+    """Adds up what wheels and gyro measure; never corrected."""
+
+    def __init__(self) -> None:
+        self._now = Reckoned(T_reckoned_base=se3.identity(), stretch=0)
+
+    def add(self, prediction: Prediction) -> Reckoned | None:
+        """Return where odometry alone leads, None where there is none to be believed."""
+        T_now = se3.orthonormal(self._now.T_reckoned_base @ prediction.motion.T_prev_curr)
+        is_broken = not prediction.is_measured
+        self._now = Reckoned(T_reckoned_base=T_now, stretch=self._now.stretch + is_broken)
+        return None if is_broken else self._now
+
+
+def reckoned_ties(
+    keyframes: Mapping[int, Keyframe], T_base_cam: Transform
+) -> dict[tuple[int, int], Tie]:
+    """Return what odometry says of keyframes that follow each other, where one has no depth."""
+    ties: dict[tuple[int, int], Tie] = {}
+    for one, other in _neighbours(keyframes):
+        here, there = keyframes[one].reckoned, keyframes[other].reckoned
+        if here is None or there is None or here.stretch != there.stretch:
+            continue
+        T_one_other = se3.inverse(here.T_reckoned_base) @ there.T_reckoned_base
+        distance_m = float(np.linalg.norm(T_one_other[:3, 3]))
+        if distance_m > _FARTHEST_M:
+            continue
+        sigmas = np.repeat(
+            [_SIGMA_M + _SIGMA_PER_M * distance_m, _SIGMA_RAD + _SIGMA_RAD_PER_M * distance_m], 3
+        )
+        ties[one, other] = Tie(
+            T_one_other=se3.inverse(T_base_cam) @ T_one_other @ T_base_cam,
+            root=np.diag(1.0 / sigmas) @ se3.adjoint(T_base_cam),
+        )
+    return ties
+
+
+def _neighbours(keyframes: Mapping[int, Keyframe]) -> Iterable[tuple[int, int]]:
+    """Yield the keyframes that follow each other in time, where the later one has no depth."""
+    for one, other in pairwise(sorted(keyframes)):
+        if keyframes[other].is_monocular:
+            yield one, other
