@@ -23,7 +23,7 @@ _CELLS = 8  # across the image, within which residuals are summed up
 _INDEPENDENT = 1.5  # common ratio up to which no wrong model shows: 1.0 to 1.7 in simulations,
 # 2.1 to 3.8 on freiburg1_rpy, 1.3 to 2.6 on RedKitchen
 _NOT_HELD = 1e-9  # of all information, added to every direction
-_SAME_SCALE_M = 3.0  # along which landmarks are the same: beyond, wheels measured the scale anew
+_AROUND_M = 3.0  # how far the map around a pose reaches where wheels keep measuring its scale
 _KEPT = 0.95  # from image to image, of what residuals have in common
 
 
@@ -34,8 +34,7 @@ class Certainty:
         self._landmarks = landmarks
         self._common: float | None = None  # see `common_ratio`, followed over images
         self._scaled_local = np.zeros(3)  # [m], where the camera was when its scale was known
-        self._drift = np.zeros((3, 3))  # [m^2] in local, until it was there
-        self.by_wheels = np.zeros((6, 6))  # of the last covariance: the share that is the wheels'
+        self.by_wheels = np.zeros((6, 6))  # the share of the last one that is also the wheels'
 
     def covariance(
         self, view: View, fix: Fix, T_local_base: Transform, T_keyframe_base: Sequence[Transform]
@@ -69,13 +68,12 @@ class Certainty:
         sigmas = self._landmarks.scale_sigma[fix.landmark_ids]
         if not view.is_monocular or not sigmas.any():
             self._scaled_local = T_local_base[:3, 3].copy()
-            self._drift = np.zeros((3, 3))
         way_local = T_local_base[:3, 3] - self._scaled_local
-        drift = np.mean(sigmas**2) * np.outer(way_local, way_local)
-        if view.reckoned is not None and float(np.linalg.norm(way_local)) > _SAME_SCALE_M:
-            self._drift, self._scaled_local = self._drift + drift, T_local_base[:3, 3].copy()
-            drift = np.zeros((3, 3))
-        return np.asarray(T_local_base[:3, :3].T @ (self._drift + drift) @ T_local_base[:3, :3])
+        length_m = float(np.linalg.norm(way_local))
+        if view.reckoned is not None and length_m > _AROUND_M:
+            way_local = way_local * (_AROUND_M / length_m)
+        way_base = T_local_base[:3, :3].T @ way_local
+        return np.asarray(np.mean(sigmas**2) * np.outer(way_base, way_base))
 
 
 def common_ratio(view: View, fix: Fix) -> float:

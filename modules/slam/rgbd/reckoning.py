@@ -19,7 +19,7 @@ from sceneslam.types.se3 import Transform
 from .keyframes import Keyframe, Reckoned
 from .ties import Tie
 
-_SIGMA_M, _SIGMA_PER_M = 0.01, 0.03  # of the wheels' distance; a slip is an outlier
+_SIGMA_M, _SIGMA_PER_M = 0.003, 0.02  # of the wheels' distance; a slip is an outlier
 _SIGMA_RAD, _SIGMA_RAD_PER_M = 0.005, 0.01  # of the gyro's turn, and of the floor's tilt
 _FARTHEST_M = 3.0  # apart: what wheels say of more adds nothing
 

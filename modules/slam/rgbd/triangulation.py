@@ -26,7 +26,7 @@ _NEAREST_M = 0.1
 _NEAREST_SHARE = 0.05  # of what a keyframe shows is known to be nearer than the rest ...
 _NEARER_RATIO = 0.5  # ... and what seems half as far as that is a wrong match
 _CORRELATED = 10.0  # errors of one pair of images that say the same
-_WHEELS_RATIO = 0.045  # of the way between two keyframes: 1 cm and 3 % of 0.3 to 1 m
+_WHEELS_RATIO = 0.03  # of the way between two keyframes: 3 mm and 2 % of 0.3 m and more
 _MAX_DOUBT_RATIO = 0.3  # of its distance: a landmark less well known waits for another keyframe
 
 
