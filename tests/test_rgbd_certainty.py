@@ -17,7 +17,7 @@ from sceneslam.types.observation import TrackingStatus
 COUNT = 600
 
 
-def sighting(bend, *, is_monocular=False):
+def sighting(bend, *, is_monocular=False, reckoned=None):
     """A view of pixels all over the image, and a fix whose residuals are noise and a bent lens."""
     rng = np.random.default_rng(0)
     uv_px = rng.uniform([0, 0], [640, 480], (COUNT, 2))
@@ -36,7 +36,10 @@ def sighting(bend, *, is_monocular=False):
     estimate = SimpleNamespace(linearised=linearised, covariance=1e-6 * np.eye(6))
     rows = np.arange(COUNT)
     fix = SimpleNamespace(estimate=estimate, feature_rows=rows, landmark_ids=rows)
-    return SimpleNamespace(gray=gray, features=features, is_monocular=is_monocular), fix
+    view = SimpleNamespace(
+        gray=gray, features=features, is_monocular=is_monocular, reckoned=reckoned
+    )
+    return view, fix
 
 
 def landmarks_with(scale_sigma):
@@ -89,6 +92,17 @@ def test_a_scale_that_nothing_holds_counts_from_where_depth_was_seen_last():
     assert across < 0.01
     assert sigmas_m(3.0, is_monocular=False).max() < 0.01
     assert sigmas_m(3.0, is_monocular=True).max() < 0.01
+
+
+def test_a_scale_that_wheels_measure_on_and_on_counts_over_the_map_around():
+    certainty = Certainty(landmarks_with(0.02))
+    seen = [sighting(0.0, is_monocular=k > 0, reckoned=object()) for k in range(3)]
+    for x_m, (view, fix) in zip((0.0, 2.0, 20.0), seen, strict=True):
+        T_local_base = se3.from_xy_yaw(x_m, 0.0, 0.0)
+        covariance = certainty.covariance(view, fix, T_local_base, [se3.identity()])
+        expected_m = 0.02 * min(x_m, 3.0)
+        assert np.sqrt(covariance[0, 0]) == pytest.approx(expected_m, abs=0.002)
+        assert np.sqrt(certainty.by_wheels[0, 0]) == pytest.approx(expected_m, abs=0.002)
 
 
 def test_the_longer_there_is_no_depth_the_less_sure_is_the_scale():
