@@ -10,8 +10,11 @@ from test_rgbd_bundle import CAMERA, exact_bundle, keyframe_at, true_poses
 
 from sceneslam.modules.slam.rgbd.bundle import adjust
 from sceneslam.modules.slam.rgbd.keyframes import Reckoned
-from sceneslam.modules.slam.rgbd.reckoning import reckoned_ties
+from sceneslam.modules.slam.rgbd.localizer import Fix
+from sceneslam.modules.slam.rgbd.pose_solver import PoseEstimate
+from sceneslam.modules.slam.rgbd.reckoning import led, reckoned_ties
 from sceneslam.modules.slam.rgbd.ties import Ties
+from sceneslam.motion.predictor import Prediction
 from sceneslam.types import se3
 
 
@@ -66,3 +69,40 @@ def test_ties_bring_back_a_scale_that_images_alone_cannot_tell():
     assert length_m(adjust(CAMERA, wrong)) == pytest.approx(0.8 * true_m, rel=0.05)
     ties = Ties.of(reckoned_ties(keys, CAMERA.T_base_cam))
     assert length_m(adjust(CAMERA, replace(wrong, ties=ties))) == pytest.approx(true_m, rel=0.05)
+
+
+def found_at(x_m):
+    """Return a pose that an image found, its deviation 2 cm."""
+    nothing = np.zeros(0, int)
+    estimate = PoseEstimate(
+        T_local_base=se3.from_xy_yaw(x_m, 0.0, 0.0),
+        covariance=0.02**2 * np.eye(6),
+        inliers=nothing > 0,
+        depth_inliers=nothing > 0,
+        depth_agreement_ratio=1.0,
+        linearised=None,
+    )
+    return Fix(
+        estimate=estimate,
+        landmark_ids=nothing,
+        feature_rows=nothing,
+        deep_rows=nothing,
+        expected_ids=nothing,
+    )
+
+
+@pytest.mark.parametrize(
+    ("found_m", "scale_m", "expected_m"),
+    [(1.1, 0.0, 1.05), (1.1, 1.0, 1.0), (1.5, 0.0, 1.5)],
+    ids=["as sure as each other", "scale unknown", "wheels slip"],
+)
+def test_a_pose_without_depth_is_led_by_odometry_unless_they_contradict(
+    found_m, scale_m, expected_m
+):
+    T_predicted, known = se3.from_xy_yaw(1.0, 0.0, 0.0), 0.04**2 * np.eye(6)
+    prediction = Prediction(T_local_base=T_predicted, covariance=known, motion=None)
+    fix = led(found_at(found_m), prediction, np.diag([scale_m**2, 0.0, 0.0]))
+    assert fix.estimate.T_local_base[0, 3] == pytest.approx(expected_m, abs=0.001)
+    is_image_alone = expected_m == found_m
+    expected_m2 = 0.02**2 if is_image_alone else 0.04**2 / 2
+    assert fix.estimate.covariance[1, 1] == pytest.approx(expected_m2)

@@ -23,7 +23,7 @@ _CELLS = 8  # across the image, within which residuals are summed up
 _INDEPENDENT = 1.5  # common ratio up to which no wrong model shows: 1.0 to 1.7 in simulations,
 # 2.1 to 3.8 on freiburg1_rpy, 1.3 to 2.6 on RedKitchen
 _NOT_HELD = 1e-9  # of all information, added to every direction
-_AROUND_M = 3.0  # how far the map around a pose reaches where wheels keep measuring its scale
+_AROUND_M = 1.5  # five keyframes, as are adjusted at a time: beyond, wheels measured the scale anew
 _KEPT = 0.95  # from image to image, of what residuals have in common
 
 
@@ -54,7 +54,7 @@ class Certainty:
         away_m = self._landmarks.points_local[fix.landmark_ids] - T_local_base[:3, 3]
         model[:3, :3] += np.median((away_m**2).sum(axis=1)) * model[3:, 3:]
         scale = np.zeros((6, 6))
-        scale[:3, :3] = self._scale_variance(view, fix, T_local_base)
+        scale[:3, :3] = self.scale_variance(view, fix, T_local_base)
         self.by_wheels = scale if view.reckoned is not None else 0.0 * scale
         return np.asarray(measured + model + scale)
 
@@ -63,7 +63,7 @@ class Certainty:
         self._common = _KEPT * before + (1.0 - _KEPT) * ratio
         return max(1.0, self._common)
 
-    def _scale_variance(self, view: View, fix: Fix, T_local_base: Transform) -> NDArray[np.float64]:
+    def scale_variance(self, view: View, fix: Fix, T_local_base: Transform) -> NDArray[np.float64]:
         """Return (3, 3) [m^2]: the way since the scale was known, times how unsure it is."""
         sigmas = self._landmarks.scale_sigma[fix.landmark_ids]
         if not view.is_monocular or not sigmas.any():

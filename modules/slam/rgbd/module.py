@@ -21,7 +21,7 @@ from .answers import held, lost, placed, repeated, started
 from .limits import check_limits, check_sizes
 from .localizer import Fix
 from .parts import Parts
-from .reckoning import Reckoner
+from .reckoning import Reckoner, led
 from .renewal import NEWEST, Seen, renew, seen_by
 from .reunion import Reunion
 from .turn_rate import expected_rate
@@ -193,6 +193,9 @@ class RgbdSlam:
 
     def _hold(self, view: View, fix: Fix, prediction: Prediction) -> Tracking:
         """Accept a pose, and extend the map where it is due."""
+        if view.is_monocular and prediction.is_measured:
+            scale = self._certainty.scale_variance(view, fix, fix.estimate.T_local_base)
+            fix = led(fix, prediction, scale)
         status = self._health.judge(fix.estimate)
         # Over a few frames odometry errs less than few landmarks do.
         is_reckoned = status is TrackingStatus.DEGRADED and prediction.is_measured
