@@ -102,7 +102,7 @@ class Detector(Protocol):
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return the sets of sensors that suffice, one of which the source must have."""
+        """Return the alternatives of sensors; the source must have every sensor of one of them."""
         ...
 
     def activate(self, rig: Rig) -> None:
@@ -150,7 +150,7 @@ class SlamModule(Protocol):
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return the sets of sensors that suffice, one of which the source must have."""
+        """Return the alternatives of sensors; the source must have every sensor of one of them."""
         ...
 
     def activate(self, rig: Rig) -> None:
@@ -181,7 +181,7 @@ class SlamModule(Protocol):
         ...
 
     def get_trajectory(self) -> Trajectory:
-        """Return T_local_base at every stamp that held a pose, as best known by now.
+        """Return T_local_base at every stamp that has a pose, as best known by now.
 
         Empty where a module never revises what `track` told. Asked once, before `get_map`, when
         the module is about to be shut down; a last optimisation belongs here. May be slow.
@@ -301,7 +301,7 @@ class Sink(Protocol):
         ...
 
     def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
-        """Take one observation with its pose (None when there is none) and active module."""
+        """Take one observation with its pose (None without a pose) and active module."""
         ...
 
     def write_event(self, event: Event) -> None:
@@ -327,7 +327,7 @@ class ResultSink(Protocol):
 
 
 class TrajectoryLog(Protocol):
-    """What the atlas is told, in order; told again to another atlas, it gives the same.
+    """The calls of an atlas, in order; repeated on another atlas, they give the same result.
 
     Poses and transforms are (4, 4), covariances (6, 6) or None, as the atlas takes them.
     """

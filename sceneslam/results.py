@@ -34,7 +34,7 @@ class Results:
     evaluation: EvaluationSettings
     has_report: bool
     value_label: str  # of the detector's votes, for the figures
-    faults: list[str]  # of the run; each is told in the report
+    faults: list[str]  # of the run; each is in the report
 
     def save_trajectories(self, result: RunResult) -> None:
         """Write the trajectories: nothing is worth as much, and nothing else is waited for."""
@@ -93,7 +93,7 @@ class Results:
             metrics,
             title=self.title,
             config=self.config,
-            threshold=(self.config.get("evaluation") or {}).get("drawn_threshold"),
+            threshold=(self.config.get("detector") or {}).get("threshold"),
             config_yaml=(self.folder / "config.yaml").read_text(),
             versions=self.versions,
             faults=self.faults,

@@ -64,7 +64,7 @@ def test_a_path_that_is_small_in_the_map_is_drawn_apart(tmp_path):
 
 def test_the_page_is_named_after_its_recording_and_says_when_no_truth_is_known(tmp_path):
     page = report(tmp_path, switched_run(), None, config={"source": {"path": "night/<1>.bag"}})
-    assert "<h1>a run · &lt;1&gt;.bag</h1>" in page and "is not known" in page
+    assert "<h1>a run · &lt;1&gt;.bag</h1>" in page and "No ground truth is known" in page
 
 
 def test_map_has_equal_axes(tmp_path):

@@ -33,7 +33,7 @@ class _Open:
 
     @property
     def told(self) -> Told:
-        """Return its poses, as told and as revised."""
+        """Return its poses, as reported and as revised."""
         online = _trajectory(self.stamps_ns, self.poses)
         return Told(
             module=self.module, T_map_local=self.T_map_local, online=online, revised=self.revised
@@ -48,7 +48,9 @@ class _Path:
     poses: list[Transform] = field(default_factory=list)  # T_map_base
     modules: list[str] = field(default_factory=list)
     sessions: list[int] = field(default_factory=list)  # that was open, -1 before the first
-    covariances: list[Covariance | None] = field(default_factory=list)  # of T_local_base, as told
+    covariances: list[Covariance | None] = field(
+        default_factory=list
+    )  # of T_local_base, as reported
 
     def add(
         self,
@@ -88,12 +90,12 @@ class Atlas:
             raise ConfigError("voxel_m", voxel_m, "metres above 0")
         self._voxel_m = voxel_m
         self._sessions: list[_Open] = []
-        self._online = _Path()  # as told at the time
+        self._online = _Path()  # as reported at the time
         self._path = _Path()  # as known now
         self._journal: TrajectoryLog | None = None
 
     def keep_journal(self, journal: TrajectoryLog) -> None:
-        """Note there, from now on, what it is told: the same, told again, gives the same."""
+        """Write every call to a log from now on; the same calls, repeated, give the same atlas."""
         self._journal = journal
 
     def begin_session(self, module: str, T_map_local: Transform) -> int:
@@ -153,7 +155,7 @@ class Atlas:
 
     @property
     def online(self) -> Trajectory:
-        """Return T_map_base over time as it was told at the time."""
+        """Return T_map_base over time as it was reported at the time."""
         return _trajectory(self._online.stamps_ns, self._online.poses)
 
     @property
@@ -177,7 +179,7 @@ class Atlas:
         return list(starts.values())
 
     def covariances(self, has_odometry: bool) -> NDArray[np.float64]:
-        """Return how sure the poses of the trajectory are (N, 6, 6), before modules revised them.
+        """Return the covariances of the trajectory (N, 6, 6), before modules revised the poses.
 
         In `base`, translation first. Bridges are the wheels' motion where there is odometry.
         """

@@ -17,12 +17,12 @@ _ROUNDING = 1e-9  # of products of transforms
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Told:
-    """A session as its module told it, and as it says at its end that it was."""
+    """A session as its module reported it, and as the module revised it at its end."""
 
     module: str
     T_map_local: Transform
     online: Trajectory  # T_local_base
-    revised: Trajectory  # T_local_base; empty: as told
+    revised: Trajectory  # T_local_base; empty: as reported
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -93,7 +93,7 @@ def _spread(
 def _corrections(
     session: Told, carried: Transform, stamps_ns: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return T_map_told (N, 4, 4): what takes the poses as told to the poses as revised."""
+    """Return T_map_told (N, 4, 4): the transforms from reported to revised poses."""
     online, revised = session.online, session.revised
     if not len(revised):
         return np.broadcast_to(carried, (len(stamps_ns), 4, 4))

@@ -1,4 +1,4 @@
-"""How sure every pose in `map` is: carried through hand-overs, growing on the way."""
+"""The covariance of every pose in `map`: carried through hand-overs, growing with the distance."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Step:
 
 @dataclass(slots=True)
 class _Known:
-    """A pose with its covariance; `told` is the module's share of it."""
+    """A pose with its covariance; `told` is the part that its module reported."""
 
     T_map_base: Transform
     carried: Covariance

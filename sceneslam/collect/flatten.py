@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 Number = float | None
 
-# What is told of all switches of a run: name, of which entry, by what.
+# One number for all switches of a run: its name, the entry it is made of, and how.
 _OF_SWITCHES: Sequence[tuple[str, str, Callable[[Sequence[float]], float]]] = (
     ("confirm_delay_s", "confirm_delay_s", lambda values: sum(values) / len(values)),
     ("confirm_delay_max_s", "confirm_delay_s", max),

@@ -48,13 +48,13 @@ def read_rows(folder: Path) -> list[Row]:
 
 
 def swept_keys(rows: Sequence[Row]) -> list[str]:
-    """Return the keys of which not all rows have the same value, in the order given."""
+    """Return the keys whose values differ between rows, in the order given."""
     keys = dict.fromkeys(key for row in rows for key in row.keys)
     return [key for key in keys if len({row.keys.get(key) for row in rows}) > 1]
 
 
 def _runs(folder: Path) -> Iterator[Path]:
-    """Yield the folders of runs; what a run keeps inside its own (a reference) is none."""
+    """Yield the folders of runs; a run inside the folder of another (a reference) is left out."""
     is_run = (folder / "job.json").is_file() or (folder / ".hydra" / "overrides.yaml").is_file()
     if is_run:
         yield folder

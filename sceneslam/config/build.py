@@ -37,6 +37,7 @@ class Parts:
     sinks: Mapping[str, Sink]
     evaluation: EvaluationSettings
     run: RunSettings
+    threshold: float | None  # of the detector, for the figures
 
     def close(self) -> None:
         """End the processes of the modules that have one."""
@@ -79,6 +80,7 @@ def build(config: Mapping[str, Any]) -> Parts:
         sinks=sinks,
         evaluation=evaluation,
         run=run,
+        threshold=config["detector"].get("threshold"),
     )
 
 
@@ -150,7 +152,7 @@ def _tell_of_rows(table: Mapping[str, Any], scenes: Mapping[str, Sequence[str]])
 
 
 def _group(config: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """Return a table of the top level, empty where there is none."""
+    """Return a table of the top level, empty where it is missing."""
     value = config.get(key)
     if value is not None and not isinstance(value, Mapping):
         raise ConfigError(key, value, "a table of keys")

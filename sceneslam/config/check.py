@@ -137,7 +137,7 @@ def _check_number(value: float, key: str) -> None:
 
 
 def hints_of(target: Callable[..., object]) -> dict[str, Any]:
-    """Return the types of a target's arguments, nothing where they cannot be told at run time."""
+    """Return the types of a target's arguments, empty where they cannot be found at run time."""
     try:
         return typing.get_type_hints(target.__init__ if inspect.isclass(target) else target)
     except (NameError, TypeError):

@@ -43,7 +43,7 @@ def check_yaml(path: Path) -> None:
         try:
             _count_values(file.read(), path)
         except yaml.YAMLError:
-            return  # whoever reads it says where
+            return  # the reader of the file says where
         except UnicodeDecodeError:
             return
 

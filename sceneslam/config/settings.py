@@ -12,7 +12,7 @@ from sceneslam.types.errors import ConfigError
 DETECT_ONLY = "detect_only"
 MODES = ("recording", "live", DETECT_ONLY)
 ISOLATIONS = ("inline", "process")
-_MOST_THREADS = 256  # of OpenCV; it starts as many as it is told, and no machine of ours has more
+_MOST_THREADS = 256  # of OpenCV, which starts as many as it is asked for
 
 
 @dataclass(slots=True, kw_only=True)

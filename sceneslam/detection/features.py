@@ -21,8 +21,8 @@ class Features:
     """A recording as a detector sees it."""
 
     stamps_ns: NDArray[np.int64]  # (N,) of all observations
-    values: NDArray[np.float64]  # (N, F); rows of what held nothing are not used
-    is_there: NDArray[np.bool_]  # (N,) whether the observation held anything to vote on
+    values: NDArray[np.float64]  # (N, F); rows without a measurement are not used
+    is_there: NDArray[np.bool_]  # (N,) whether the observation had an input for the detector
     scenes: tuple[SceneChange, ...] | None  # the true ones, None where nothing is known
 
     @property

@@ -53,7 +53,7 @@ def watch(config: Mapping[str, Any]) -> Watched:
 
 
 def detect(config: Mapping[str, Any], folder: Path) -> list[str]:
-    """Write a folder with events, metrics and configuration; return what to tell in short lines."""
+    """Write a folder with events, metrics and configuration; return a summary in short lines."""
     watched = watch(config)
     builder = Builder(config)
     detector = builder.make("detector", FeatureDetector)

@@ -78,9 +78,9 @@ def draw_series(
     limit_m: float | None = None,
     online_m: NDArray[np.float64] | None = None,
 ) -> Any:
-    """Return a distance over time with a band per module, None when there is none.
+    """Return a distance over time with a band per module, None without values.
 
-    `online_m` is the same of what was told at the time, at the same stamps.
+    `online_m` is the distance of the poses as reported at the time, at the same stamps.
     """
     if not len(values_m):
         return None
@@ -93,7 +93,7 @@ def draw_series(
     marker = "o" if len(values_m) == 1 else None
     if online_m is not None:
         told = look.thinned(times_s, online_m)
-        axes.plot(*told, color=look.MUTED, linewidth=1.1, dashes=(3, 1), label="as told online")
+        axes.plot(*told, color=look.MUTED, linewidth=1.1, dashes=(3, 1), label="as reported online")
     curve = look.thinned(times_s, values_m)
     axes.plot(*curve, color=look.INK, linewidth=1.3, marker=marker, label=label)
     if limit_m is not None:
@@ -150,7 +150,7 @@ def _at_s(result: RunResult, event: Event) -> float:
 
 def _is_fault(event: Event) -> bool:
     if event["event"] == "dropped":
-        return int(event["count"]) > 0  # live mode tells it always
+        return int(event["count"]) > 0  # live mode always reports it
     return bool(event["event"] == "fault")
 
 

@@ -25,7 +25,7 @@ from sceneslam.types.truth import GroundTruth
 
 _log = logging.getLogger(__name__)
 _PAPER_DIFFERENCE_M = 0.10  # "less than 10 cm" between the switched and the unswitched run
-_ONLINE_DIFFERS_M = 1e-3  # below, what was told online is not drawn apart
+_ONLINE_DIFFERS_M = 1e-3  # smaller differences between online and revised errors are not drawn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""One HTML file that tells how a run went and opens alone."""
+"""One HTML file with everything about a run, which opens without a network."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def _numbers(metrics: Metrics) -> str:
     online_m = metrics["ate_online_m"]
     entries = {
         "position error, root mean square (ATE)": number(metrics["ate_rmse_m"], 4, " m"),
-        "the same, as told online": number(online_m, 4, " m"),
+        "the same, as reported online": number(online_m, 4, " m"),
         "largest error": number(metrics["ate_max_m"], 3, " m"),
         "rotation error, root mean square": degrees(metrics["ate_rot_rad"]),
         f"error over {metrics['segment_m']:g} m of path": number(

@@ -76,7 +76,7 @@ def _change(metrics: Metrics, switch: dict[str, Any]) -> str:
 
 def _accuracy(metrics: Metrics) -> str:
     if metrics["ate_rmse_m"] is None:
-        return "Where the robot truly was is not known, or not at these times: no error is told."
+        return "No ground truth is known at these times, so no error can be given."
     text = (
         f"Against the ground truth the position is off by {number(metrics['ate_rmse_m'], 3, ' m')} "
         f"(root mean square) and at most {number(metrics['ate_max_m'], 3, ' m')}. "

@@ -126,7 +126,7 @@ def _describe(decision: Event, result: RunResult, truth: GroundTruth | None) -> 
 
 
 def _same_stamp(events: Sequence[Event], kind: str, decision: Event) -> Event:
-    """Return the event of a kind that belongs to a decision, an empty one when there is none."""
+    """Return the event of a kind that belongs to a decision, or an empty one."""
     for event in events:
         same = event["event"] == kind and event["stamp_ns"] == decision["stamp_ns"]
         if same and event["module"] == decision["to"]:

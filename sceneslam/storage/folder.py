@@ -203,7 +203,7 @@ def _is_own(mark: dict[str, Any]) -> bool:
 
 
 def _read_mark(path: Path) -> dict[str, Any]:
-    """Return what the mark of a folder says of its newest run, nothing where there is none."""
+    """Return what the mark of a folder says of its newest run; empty without a mark."""
     try:
         about = json.loads((path / MARK).read_text().partition("\n")[0])
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""The journal of a run: what the atlas is told, on disk at once, so that a run can be recovered.
+"""The journal of a run: every call of the atlas, on disk at once, so that a run can be recovered.
 
 `journal.bin` begins with `MAGIC`; records follow, little endian: kind (1 byte), length of the body
 (4), CRC-32 of kind and body (4), body. A pose is the upper three rows of its matrix, 12 float64.
@@ -130,7 +130,7 @@ class Journal:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kept:
-    """What a journal says beside what the atlas was told."""
+    """What a journal holds beside the calls of the atlas."""
 
     head: Head
     observed_ns: NDArray[np.int64]
@@ -138,7 +138,10 @@ class Kept:
 
 
 def read_journal(path: Path, log: TrajectoryLog) -> Kept:
-    """Tell `log` what a journal holds as far as it is whole; raises InputError where it is none."""
+    """Repeat on `log` the calls that a journal holds, as far as it is whole.
+
+    Raises InputError for a file that is not a journal.
+    """
     data = path.read_bytes()
     if not data.startswith(MAGIC):
         raise InputError(f"not a journal of this version: {path}")

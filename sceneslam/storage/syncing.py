@@ -1,4 +1,4 @@
-"""Lets files reach the disk while they grow, beside whoever writes them."""
+"""Syncs files to disk while they grow, in a thread beside their writer."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ class Restarted(ABC):
     @property
     @abstractmethod
     def _running(self) -> Running | None:
-        """Return the process, None where there is none."""
+        """Return the process, None before the first start."""
 
     @abstractmethod
     def _start(self) -> None:

@@ -45,7 +45,7 @@ class Channel:
     """
 
     def __init__(self, line: socket.socket, pidfd: int | None = None) -> None:
-        """Talk over `line`; `pidfd` tells of the other end's death, whoever else has its line."""
+        """Talk over `line`; `pidfd` is readable once the other process has ended."""
         self._line, self._pidfd = line, pidfd
         self._arrivals = select.poll()
         self._arrivals.register(line, select.POLLIN)
@@ -154,7 +154,7 @@ class Channel:
         return marshal.dumps((returned, head, place))
 
     def _borrow(self, size: int) -> int:
-        """Return the smallest free block that holds `size` bytes, a new one where there is none."""
+        """Return the smallest free block of at least `size` bytes, or a new one."""
         fitting = [index for index in self._free if len(self._blocks[index].memory) >= size]
         if fitting:
             index = min(fitting, key=lambda index: len(self._blocks[index].memory))

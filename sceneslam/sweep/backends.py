@@ -45,7 +45,7 @@ class Joblib:
         self._n_jobs, self._cpus_per_job = n_jobs, cpus_per_job
 
     def run(self, orders: Sequence[Order]) -> None:
-        """Run them from threads, each of which waits for its job's process."""
+        """Run them from threads; each thread waits for the process of its job."""
         try:
             from joblib import Parallel, delayed
         except ImportError as error:

@@ -1,4 +1,4 @@
-"""One line that tells how all jobs of a sweep stand."""
+"""One line with the state of all jobs of a sweep."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _TOLD = (State.RUNNING, State.INCOMPLETE, State.FAILED, State.KILLED, State.STOP
 
 
 class Progress:
-    """Shows the states that the jobs' folders tell, while it is entered."""
+    """Shows the states of the jobs, read from their folders, while it is entered."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         self._waiting = set(folders)

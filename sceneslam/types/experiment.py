@@ -29,7 +29,7 @@ class Outcome:
     folder: Path
     metrics: Mapping[str, Any]
     trajectory: Trajectory  # T_map_base, as revised
-    online: Trajectory  # as told at the time
+    online: Trajectory  # as reported at the time
     faults: Sequence[str]
 
 

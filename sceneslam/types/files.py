@@ -78,7 +78,7 @@ class AppendedFile:
     """A file that grows by whole pieces: after a failure it ends with the last whole one."""
 
     def __init__(self, path: Path, make_room: Callable[[], bool] = lambda: False) -> None:
-        """Begin the file; `make_room` gives room on a full disk, and tells whether it did."""
+        """Begin the file; `make_room` gives room on a full disk, and returns whether it did."""
         self._fd = os.open(own(path), os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
         self._size, self._make_room = 0, make_room
 

@@ -1,4 +1,4 @@
-"""Files that a user names: found as typed, regular, and read as text whoever wrote them."""
+"""Files that a user names: found as typed, regular files, and read as text in any encoding."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def given_file(path: str, expected: str) -> Path:
 
 
 def given_folder(path: str, expected: str = "a folder") -> Path:
-    """Return the path of a folder; raises InputError where there is none."""
+    """Return the path of a folder; raises InputError where it does not exist."""
     folder = given_path(path)
     if not folder.is_dir():
         got = ", got a file" if folder.exists() else ""

@@ -99,8 +99,8 @@ class TrackingStatus(Enum):
     """How far a module's pose can be trusted."""
 
     TRACKING = "tracking"
-    DEGRADED = "degraded"  # a pose, but some direction is not held by the measurements
-    LOST = "lost"  # no pose for this observation; T_local_base is the last one that was held
+    DEGRADED = "degraded"  # a pose, but the measurements do not constrain every direction
+    LOST = "lost"  # no pose for this observation; T_local_base is the last one that was tracked
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -59,7 +59,7 @@ class RunResult:
 
     observed_ns: NDArray[np.int64]  # stamps of all observations fed
     trajectory: Trajectory  # T_map_base, with what modules corrected afterwards
-    online: Trajectory  # the same stamps, as told at the time
+    online: Trajectory  # the same stamps, as reported at the time
     covariances: NDArray[np.float64]  # (N, 6, 6) of `trajectory`, in base, translation first
     modules: Sequence[str]  # per pose: key of the module that gave it, "" where it was bridged
     sessions: Sequence[Session]
