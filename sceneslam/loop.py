@@ -17,6 +17,7 @@ from tqdm import tqdm
 from sceneslam.bus.bus import Bus
 from sceneslam.bus.handover_log import log_uncertainty
 from sceneslam.config.build import Parts
+from sceneslam.config.settings import LIVE
 from sceneslam.engine.live import LiveTally, run_live
 from sceneslam.interfaces import Live, LiveFeed, ResultSink, Sink
 from sceneslam.keeping import Keeping
@@ -188,7 +189,7 @@ class Loop:
             return
         self._began_s = perf_counter()
         with self._progress() as self._bar:
-            if self._parts.run.mode == "live":
+            if self._parts.run.mode == LIVE:
                 self._run_live(chain([first], observations), None)
                 return
             for observation in chain([first], observations):

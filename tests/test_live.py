@@ -8,6 +8,7 @@ import pytest
 
 from sceneslam.engine.live import LiveSettings, run_live
 from sceneslam.engine.mailbox import Mailbox, Waited
+from sceneslam.sources.rising_live import RisingLive
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import LaserScan, Observation
 
@@ -217,3 +218,37 @@ def test_image_is_not_replaced_by_an_observation_without_one():
 def test_impossible_times_are_refused(words, key):
     with pytest.raises(ConfigError, match=key):
         LiveSettings(**words)
+
+
+def test_jump_of_a_live_robots_odometry_is_told_with_what_it_is_moved_by():
+    """Who publishes map -> odom needs what the wheels said, not what was made of it."""
+    feed = Feed()
+
+    class Wheels:
+        faults = ()
+
+        def __iter__(self):
+            for index in range(10):
+                T_odom_base = np.eye(4)
+                T_odom_base[0, 3] = 0.1 * index + (50.0 if index >= 5 else 0.0)
+                yield Observation(stamp_ns=index * 100_000_000, T_odom_base=T_odom_base)
+
+    source = RisingLive(Wheels(), feed)
+    ways_m = [observation.T_odom_base[0, 3] for observation in source]
+    np.testing.assert_allclose(ways_m, 0.1 * np.arange(10), atol=1e-6)
+    (event,) = source.notices()
+    assert event["event"] == "odometry_jump" and event["stamp_ns"] == 500_000_000
+    np.testing.assert_allclose(np.reshape(event["T_smooth_odom"], (4, 4))[0, 3], -50.0, atol=1e-6)
+
+
+def test_live_observation_behind_the_one_before_is_left_out_at_once():
+    class Backwards:
+        faults = ()
+
+        def __iter__(self):
+            for stamp_ns in (5, 9, 7, 11):
+                yield Observation(stamp_ns=stamp_ns, image_bgr=IMAGE)
+
+    source = RisingLive(Backwards(), Feed())
+    assert [observation.stamp_ns for observation in source] == [5, 9, 11]
+    assert "its stamp does not rise: 1 time" in source.faults[0]

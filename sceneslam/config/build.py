@@ -12,10 +12,11 @@ from sceneslam.atlas.atlas import Atlas
 from sceneslam.bus.policy import Policy
 from sceneslam.config.check import NOTHING, check_keys
 from sceneslam.config.component import Builder
-from sceneslam.config.settings import DETECT_ONLY, RunSettings
+from sceneslam.config.settings import DETECT_ONLY, LIVE, RunSettings
 from sceneslam.evaluation.settings import EvaluationSettings
-from sceneslam.interfaces import Detector, Sink, SlamModule, Source
+from sceneslam.interfaces import Detector, Live, Sink, SlamModule, Source
 from sceneslam.sources.ordered import Ordered
+from sceneslam.sources.rising_live import RisingLive
 from sceneslam.supervision.isolated import IsolatedModule
 from sceneslam.types.errors import ConfigError, ModuleError, told
 from sceneslam.types.rig import Rig, Sensor
@@ -65,6 +66,7 @@ def build(config: Mapping[str, Any]) -> Parts:
     evaluation = builder.make("evaluation", EvaluationSettings)
     sinks = {key: builder.make(f"sinks.{key}", Sink) for key in _group(config, "sinks")}
     source = make_source(config, builder)
+    _check_mode(run, source)
     rig = source.rig
     check_detector(config, detector, rig)
     for key in modules:
@@ -89,12 +91,19 @@ def make_source(config: Mapping[str, Any], builder: Builder) -> Source:
     source = builder.make("source", Source)
     if config.get("effects"):
         source = builder.make("effects", Source, source)
-    return Ordered(source)
+    feed = source.live if isinstance(source, Live) else None
+    return Ordered(source) if feed is None else RisingLive(source, feed)
 
 
 def check_detector(config: Mapping[str, Any], detector: Detector, rig: Rig) -> None:
     """Raise ConfigError when the source lacks the sensors that the detector needs."""
     _check_sensors("detector", config["detector"], detector.requires, rig)
+
+
+def _check_mode(run: RunSettings, source: Source) -> None:
+    """Raise ConfigError where a robot would be run as if it were a recording."""
+    if run.mode != LIVE and isinstance(source, Live) and source.live is not None:
+        raise ConfigError("run.mode", run.mode, f"{LIVE}, since this source measures now: run=live")
 
 
 def _module(builder: Builder, run: RunSettings, key: str) -> SlamModule:

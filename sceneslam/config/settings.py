@@ -10,7 +10,8 @@ from sceneslam.supervision.limits import Limits
 from sceneslam.types.errors import ConfigError
 
 DETECT_ONLY = "detect_only"
-MODES = ("recording", "live", DETECT_ONLY)
+LIVE = "live"
+MODES = ("recording", LIVE, DETECT_ONLY)
 ISOLATIONS = ("inline", "process")
 _MOST_THREADS = 256  # of OpenCV, which starts as many as it is asked for
 

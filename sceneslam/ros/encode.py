@@ -64,6 +64,21 @@ class Encoder:
             data=data.ravel(),
         )
 
+    def image(self, stamp_ns: int, pixels: NDArray[Any], encoding: str) -> bytes:
+        """Return an Image of pixels (H, W, C), as they are."""
+        height, width = pixels.shape[:2]
+        data = np.ascontiguousarray(pixels).reshape(height, -1).view(np.uint8)
+        return self._cdr(
+            "sensor_msgs/msg/Image",
+            header=self._header(stamp_ns, names.CAMERA),
+            height=height,
+            width=width,
+            encoding=encoding,
+            is_bigendian=0,
+            step=data.shape[1],
+            data=data.ravel(),
+        )
+
     def scan(self, scan: LaserScan) -> bytes:
         """Return a LaserScan; its angles and ranges are float32 by the type."""
         last = max(len(scan.ranges_m) - 1, 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,10 @@ from sceneslam.sources.synchronise import Bundle, Sample
 from sceneslam.types.errors import InputError
 from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Sensor
+from sceneslam.types.se3 import Transform
+
+# One observation per message of the first of these that there is.
+PRIMARY = (Sensor.IMAGE, Sensor.DEPTH, Sensor.POINTS, Sensor.SCAN, Sensor.ODOMETRY)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -152,3 +157,16 @@ def _samples(bundle: Bundle, sensor: Sensor) -> NDArray[np.float64] | None:
         for sample in bundle.samples[sensor]
     ]
     return locked(np.array(rows, dtype=np.float64))
+
+
+def measured(message: Any, sensor: Sensor, T_base_imu: Transform) -> Any:
+    """Return what a decoded message holds of a sensor, None where it makes no sense.
+
+    The pose (4, 4) of an Odometry, the vector (3,) of an Imu in base, else the message itself.
+    """
+    if sensor is Sensor.ODOMETRY:
+        return decode.transform(message.pose.pose.position, message.pose.pose.orientation)
+    if sensor.is_sampled:
+        held = decode.inertial(message).get(sensor)
+        return None if held is None else T_base_imu[:3, :3] @ held
+    return message

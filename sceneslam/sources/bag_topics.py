@@ -20,7 +20,7 @@ _POSES = (
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/TransformStamped",
 )
-_TYPES = {
+TYPES = {
     "image": _IMAGES,
     "depth": _IMAGES,
     "camera_info": ("sensor_msgs/msg/CameraInfo",),
@@ -70,15 +70,15 @@ def choose_topics(recording: Recording, given: Mapping[str, str | None]) -> Topi
     found = {
         "image": _without_grey(_one_transport(colors), firsts),
         "depth": _prefer(_one_transport(depths), lambda name: "align" in name or "regist" in name),
-        **{need: _of_type(recording, _TYPES[need]) for need in ("scan", "points", "imu")},
-        "odometry": [n for n in _of_type(recording, _TYPES["odometry"]) if not _is_truth(n)],
+        **{need: _of_type(recording, TYPES[need]) for need in ("scan", "points", "imu")},
+        "odometry": [n for n in _of_type(recording, TYPES["odometry"]) if not _is_truth(n)],
         "ground_truth": [n for n in _of_type(recording, _POSES) if _is_truth(n)],
-        "scene": [n for n in _of_type(recording, _TYPES["scene"]) if _is_truth(n)],
+        "scene": [n for n in _of_type(recording, TYPES["scene"]) if _is_truth(n)],
     }
     for need, candidates in found.items():
         chosen.setdefault(need, _only(need, candidates))
     picture = chosen["image"] if chosen["image"] != NONE else chosen["depth"]
-    infos = _of_type(recording, _TYPES["camera_info"])
+    infos = _of_type(recording, TYPES["camera_info"])
     chosen.setdefault("camera_info", _only("camera_info", _beside(picture, infos)))
     return Topics(**{need: None if name == NONE else name for need, name in chosen.items()})
 
@@ -99,15 +99,15 @@ def describe(recording: Recording) -> str:
 
 def _check_given(recording: Recording, need: str, name: str | None) -> None:
     key = f"topics.{need}"
-    if need not in _TYPES:
-        raise ConfigError(key, name, f"a topic for one of {', '.join(_TYPES)}")
+    if need not in TYPES:
+        raise ConfigError(key, name, f"a topic for one of {', '.join(TYPES)}")
     if name in (None, NONE):
         return
     if not isinstance(name, str) or name not in recording.topics:
         raise ConfigError(key, name, f"{NONE}, null (find it) or one of {describe(recording)}")
     msgtype = recording.topics[name].msgtype
-    if msgtype not in _TYPES[need]:
-        raise ConfigError(key, f"{name} ({msgtype})", f"a topic of {' or '.join(_TYPES[need])}")
+    if msgtype not in TYPES[need]:
+        raise ConfigError(key, f"{name} ({msgtype})", f"a topic of {' or '.join(TYPES[need])}")
 
 
 def _of_type(recording: Recording, types: Collection[str]) -> list[str]:

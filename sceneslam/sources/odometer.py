@@ -35,6 +35,11 @@ class Odometer:
         self._rates = np.zeros(2)  # of the last step [m/s, rad/s] ...
         self._twist = np.zeros(6)  # ... and its motion per second
 
+    @property
+    def T_smooth_odom(self) -> Transform:
+        """Return what odometry is moved by since the last jump, the identity before the first."""
+        return se3.identity() if self._T_smooth_odom is None else self._T_smooth_odom
+
     def smooth(self, observation: Observation, log: FaultLog) -> Observation:
         """Return the observation with odometry that goes on from that of the one before."""
         before, T_odom_base = self._before, observation.T_odom_base

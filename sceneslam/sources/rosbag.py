@@ -11,7 +11,7 @@ import numpy as np
 from sceneslam.ros import decode
 from sceneslam.ros.pixels import DepthUnits
 from sceneslam.sources.bag_frames import FrameTree
-from sceneslam.sources.bag_observation import BundleDecoder, Decoded
+from sceneslam.sources.bag_observation import PRIMARY, BundleDecoder, Decoded, measured
 from sceneslam.sources.bag_rig import Given, make_rig, picture_size_wh, place, sensor_topics
 from sceneslam.sources.bag_topics import choose_topics, describe
 from sceneslam.sources.bag_truth import BASE, CAMERA, read_truth
@@ -29,8 +29,6 @@ from sceneslam.types.input_files import given_path
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor, Wheels
 from sceneslam.types.truth import GroundTruth
-
-_PRIMARY = (Sensor.IMAGE, Sensor.DEPTH, Sensor.POINTS, Sensor.SCAN, Sensor.ODOMETRY)
 
 
 class RosBag:
@@ -162,24 +160,19 @@ class RosBag:
             return
         stamp_ns = decode.stamp_ns(value) or message.log_ns
         for sensor in (one for one, topic in self._by_sensor.items() if topic == message.topic):
-            held = value
-            if sensor is Sensor.ODOMETRY:
-                held = decode.transform(value.pose.pose.position, value.pose.pose.orientation)
-                if held is None:
-                    fault = f"a pose of {message.topic} is no rigid motion"
-                    self._faults.add(fault, at_stamp(stamp_ns))
-            elif sensor.is_sampled:
-                measured = decode.inertial(value).get(sensor)
-                held = None if measured is None else T_base_imu[:3, :3] @ measured
+            held = measured(value, sensor, T_base_imu)
             if held is not None:
                 yield sensor, Sample(stamp_ns=stamp_ns, value=held)
+            elif sensor is Sensor.ODOMETRY:
+                fault = f"a pose of {message.topic} is no rigid motion"
+                self._faults.add(fault, at_stamp(stamp_ns))
 
     def _stamp_ns(self, message: Message) -> int:
         decoded = self._recording.decode(message)
         return message.log_ns if decoded is None else decode.stamp_ns(decoded) or message.log_ns
 
     def _choose_primary(self) -> Sensor:
-        for sensor in _PRIMARY:
+        for sensor in PRIMARY:
             if sensor in self._by_sensor:
                 return sensor
         there = describe(self._recording) or "no readable messages at all"

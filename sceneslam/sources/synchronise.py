@@ -13,7 +13,8 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Sensor
 from sceneslam.types.se3 import Transform
 
-_PATIENCE_NS = 1_000_000_000  # how long a message waits for a stream that is behind
+_PATIENCE_S = 1.0  # how long a message waits for a stream that is behind
+_REACH_NS = 1_000_000_000  # what is this much older than the first message belongs to none
 _ODOMETRY_GAP_NS = 1_000_000_000  # beyond, odometry is not interpolated
 _ODOMETRY_HOLD_NS = 100_000_000  # how far the first and last odometry reach beyond themselves
 _MOST_HELD = 4096  # samples of one stream
@@ -40,12 +41,25 @@ class Bundle:
 
 
 class Synchroniser:
-    """Takes samples in the order of recording, gives bundles in the order of the primary's."""
+    """Takes samples in the order of recording, gives bundles in the order of the primary's.
+
+    A bundle waits for the streams in `waits_for` (None: all) until something is `patience_s` newer.
+    """
 
     def __init__(
-        self, primary: Sensor, streams: frozenset[Sensor], sync_tolerance_s: float
+        self,
+        primary: Sensor,
+        streams: frozenset[Sensor],
+        sync_tolerance_s: float,
+        *,
+        waits_for: frozenset[Sensor] | None = None,
+        patience_s: float = _PATIENCE_S,
+        extrapolates: bool = False,  # odometry that is not there in time
     ) -> None:
         self._primary = primary
+        self._extrapolates = extrapolates
+        self._waits_for = streams if waits_for is None else waits_for
+        self._patience_ns = round(patience_s * 1e9)
         self._tolerance_ns = round(sync_tolerance_s * 1e9)
         self._waiting: deque[Sample] = deque()
         self._held: dict[Sensor, deque[Sample]] = {
@@ -53,7 +67,8 @@ class Synchroniser:
         }
         self._seen_ns: dict[Sensor, int] = {}  # the latest stamp of each stream
         self._newest_ns = 0
-        self._previous_ns: int | None = None
+        self._taken_ns: dict[Sensor, int] = {}  # the newest that a bundle was given
+        self._passed: Sample | None = None  # the odometry before the oldest that is held
 
     def add(self, sensor: Sensor, sample: Sample) -> Iterator[Bundle]:
         """Take one sample; yield the bundles that are complete by it."""
@@ -63,6 +78,15 @@ class Synchroniser:
         while self._waiting and self._is_complete(self._waiting[0].stamp_ns):
             yield self._bundle(self._waiting.popleft())
 
+    def follow(self, primary: Sensor, waits_for: frozenset[Sensor]) -> None:
+        """Give a bundle per message of another sensor from now on; what it held is its own."""
+        self._waits_for = waits_for
+        if primary is not self._primary:
+            self._held[self._primary] = deque(maxlen=_MOST_HELD)
+            self._held.pop(primary, None)
+            self._primary = primary
+            self._waiting.clear()
+
     def flush(self) -> Iterator[Bundle]:
         """Yield what still waits, at the end of the recording."""
         while self._waiting:
@@ -70,9 +94,11 @@ class Synchroniser:
 
     def _is_complete(self, stamp_ns: int) -> bool:
         """Tell whether no stream can still bring something that belongs to the stamp."""
-        if self._newest_ns - stamp_ns > _PATIENCE_NS:
+        if self._newest_ns - stamp_ns > self._patience_ns:
             return True
         for sensor, held in self._held.items():
+            if sensor not in self._waits_for:
+                continue
             needed_ns = stamp_ns
             if sensor is Sensor.DEPTH and not any(one.stamp_ns == stamp_ns for one in held):
                 needed_ns += self._tolerance_ns
@@ -82,7 +108,7 @@ class Synchroniser:
 
     def _bundle(self, primary: Sample) -> Bundle:
         stamp_ns = primary.stamp_ns
-        bundle = Bundle(
+        return Bundle(
             primary=primary,
             depth=self._nearest(Sensor.DEPTH, stamp_ns),
             scan=self._last_since(Sensor.SCAN, stamp_ns),
@@ -94,8 +120,6 @@ class Synchroniser:
                 if sensor.is_sampled
             },
         )
-        self._previous_ns = stamp_ns
-        return bundle
 
     def _nearest(self, sensor: Sensor, stamp_ns: int) -> Sample | None:
         """Return the sample nearest to the stamp within the tolerance; each is used once."""
@@ -115,7 +139,7 @@ class Synchroniser:
         return found[-1] if found else None
 
     def _take_until(self, sensor: Sensor, stamp_ns: int) -> Sequence[Sample]:
-        """Return the samples since the bundle before up to the stamp, by stamp."""
+        """Return the samples since the last that was taken up to the stamp, by stamp."""
         held = self._held.get(sensor)
         if not held:
             return ()
@@ -123,22 +147,35 @@ class Synchroniser:
         later = [sample for sample in held if sample.stamp_ns > stamp_ns]
         held.clear()
         held.extend(later)
-        since_ns = stamp_ns - _PATIENCE_NS if self._previous_ns is None else self._previous_ns
+        since_ns = self._taken_ns.get(sensor, stamp_ns - _REACH_NS)
         found = [sample for sample in found if sample.stamp_ns > since_ns]
-        return sorted(found, key=lambda sample: sample.stamp_ns)
+        found.sort(key=lambda sample: sample.stamp_ns)
+        if found:
+            self._taken_ns[sensor] = found[-1].stamp_ns
+        return found
 
     def _odometry_at(self, stamp_ns: int) -> Transform | None:
         held = self._held.get(Sensor.ODOMETRY)
         if not held:
             return None
         while len(held) > 1 and held[1].stamp_ns <= stamp_ns:
-            held.popleft()
+            self._passed = held.popleft()
         before, after = held[0], held[min(1, len(held) - 1)]
         if before.stamp_ns == stamp_ns or before is after or before.stamp_ns > stamp_ns:
             is_near = abs(before.stamp_ns - stamp_ns) <= _ODOMETRY_HOLD_NS
+            if is_near and self._extrapolates and before.stamp_ns < stamp_ns:
+                return self._extrapolated(before, stamp_ns)
             return np.array(before.value) if is_near else None
         gap_ns = after.stamp_ns - before.stamp_ns
         if gap_ns > _ODOMETRY_GAP_NS:
             return None
         ratio = (stamp_ns - before.stamp_ns) / gap_ns
         return se3.interpolate(before.value, after.value, ratio)
+
+    def _extrapolated(self, last: Sample, stamp_ns: int) -> Transform:
+        """Return odometry a little after its last message, at the velocity before it."""
+        passed = self._passed
+        gap_ns = 0 if passed is None else last.stamp_ns - passed.stamp_ns
+        if passed is None or not 0 < gap_ns <= _ODOMETRY_GAP_NS:
+            return np.array(last.value)
+        return se3.interpolate(passed.value, last.value, (stamp_ns - passed.stamp_ns) / gap_ns)

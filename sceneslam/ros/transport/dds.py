@@ -14,6 +14,7 @@ import socket
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic_ns
 from typing import Any
@@ -78,7 +79,7 @@ class DdsTransport:
             allowed = f"a domain that can be joined ({told(error)})"
             raise ConfigError("domain_id", domain, allowed) from error
         self._lock = threading.RLock()
-        self._readers: dict[str, tuple[Any, Heard]] = {}
+        self._readers: dict[str, _Reader] = {}
         self._writers: dict[str, _Writer] = {}
         self._topics: dict[str, Any] = {}
         self._published: dict[Any, tuple[str, str]] = {}  # by endpoint
@@ -102,11 +103,21 @@ class DdsTransport:
         with self._lock:
             reader = DataReader(self._participant, self._topic(topic, msgtype), _qos(qos))
             mask = SampleState.NotRead | ViewState.Any | InstanceState.Any
-            self._readers[topic] = (reader, heard)
-            self._waitset.attach(ReadCondition(reader, mask))
+            condition = ReadCondition(reader, mask)
+            self.unsubscribe(topic)
+            self._readers[topic] = _Reader(reader=reader, condition=condition, heard=heard)
+            self._waitset.attach(condition)
             if self._thread is None:
                 self._thread = threading.Thread(target=self._listen, name="dds", daemon=True)
                 self._thread.start()
+
+    def unsubscribe(self, topic: str) -> None:
+        """Delete the topic's reader."""
+        with self._lock:
+            one = self._readers.pop(topic, None)
+            if one is not None:
+                self._waitset.detach(one.condition)
+                one.reader._delete(one.reader._ref)
 
     def publisher(self, topic: str, msgtype: str, qos: Qos = Qos.RELIABLE) -> Publisher:
         """Return the topic's writer."""
@@ -134,12 +145,15 @@ class DdsTransport:
         while not self._is_closed:
             self._waitset.wait(timeout=duration(seconds=_WAKE_S))
             with self._lock:
-                readers = list(self._readers.items())
-            for topic, (reader, heard) in readers:
-                for sample in reader.take(_BATCH):
-                    cdr = getattr(sample, "cdr", b"")
-                    if cdr and not self._is_closed:
-                        _deliver(heard, Arrival(topic=topic, cdr=cdr, arrived_ns=monotonic_ns()))
+                taken = [
+                    (one.heard, Arrival(topic=topic, cdr=sample.cdr, arrived_ns=monotonic_ns()))
+                    for topic, one in self._readers.items()
+                    for sample in one.reader.take(_BATCH)
+                    if isinstance(sample, _Bytes)
+                ]
+            for heard, arrival in taken:
+                if not self._is_closed:
+                    _deliver(heard, arrival)
 
     def _topic(self, topic: str, msgtype: str) -> Any:
         if topic not in self._topics:
@@ -167,6 +181,15 @@ class _Bytes(IdlStruct):
     @classmethod
     def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Any:
         return cls(b"")  # a writer that left
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Reader:
+    """One subscription."""
+
+    reader: Any
+    condition: Any
+    heard: Heard
 
 
 class _Writer:

@@ -43,6 +43,7 @@ class RclpyTransport:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._publishers: dict[str, _Publisher] = {}
+        self._subscriptions: dict[str, Any] = {}
         self._is_closed = False
         self._thread = threading.Thread(target=self._spin, name="rclpy", daemon=True)
         self._thread.start()
@@ -67,8 +68,17 @@ class RclpyTransport:
             except Exception as error:
                 _log.warning("a message of %s could not be taken: %s", topic, told(error))
 
-        self._node.create_subscription(_type(msgtype), topic, deliver, _profile(qos), raw=True)
+        self.unsubscribe(topic)
+        self._subscriptions[topic] = self._node.create_subscription(
+            _type(msgtype), topic, deliver, _profile(qos), raw=True
+        )
         self._executor.wake()
+
+    def unsubscribe(self, topic: str) -> None:
+        """Destroy the topic's subscription."""
+        one = self._subscriptions.pop(topic, None)
+        if one is not None:
+            self._node.destroy_subscription(one)
 
     def publisher(self, topic: str, msgtype: str, qos: Qos = Qos.RELIABLE) -> Publisher:
         """Return the topic's publisher."""

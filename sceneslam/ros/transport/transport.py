@@ -62,6 +62,10 @@ class Transport(Protocol):
         """Call `heard` for every message from now on, in a thread of the transport's own."""
         ...
 
+    def unsubscribe(self, topic: str) -> None:
+        """Call nobody any more for a topic; also where nobody was called."""
+        ...
+
     def publisher(self, topic: str, msgtype: str, qos: Qos = Qos.RELIABLE) -> Publisher:
         """Return what sends on a topic; the same one for the same topic."""
         ...

@@ -1,0 +1,79 @@
+"""A live source with its promises kept: stamps rise, arrays hold numbers, odometry is smooth."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from sceneslam.interfaces import LiveFeed, Source
+from sceneslam.sources.clean import cleaned
+from sceneslam.sources.faults import FaultLog, at_stamp
+from sceneslam.sources.odometer import Odometer
+from sceneslam.sources.wrapped import Wrapped
+from sceneslam.types.observation import Observation
+from sceneslam.types.run import Event
+from sceneslam.types.truth import GroundTruth
+
+
+class RisingLive(Wrapped):
+    """Leaves out at once what comes behind, and holds nothing back to see what follows."""
+
+    def __init__(self, source: Source, feed: LiveFeed) -> None:
+        super().__init__(source)
+        self._feed = feed
+        self._log = FaultLog()
+        self._notices: list[Event] = []
+        self._lock = threading.Lock()
+
+    @property
+    def live(self) -> LiveFeed | None:
+        """Return itself: it tells what it does to odometry, too."""
+        return self
+
+    @property
+    def faults(self) -> Sequence[str]:
+        """Return the source's faults and what was left out here."""
+        return [*self._source.faults, *self._log.sentences()]
+
+    def __iter__(self) -> Iterator[Observation]:
+        """Yield the source's observations by rising stamp."""
+        odometer, last_ns = Odometer(), None
+        for observation in self._source:
+            stamp_ns = observation.stamp_ns
+            if last_ns is not None and stamp_ns <= last_ns:
+                self._log.add("observation left out, its stamp does not rise", at_stamp(stamp_ns))
+                continue
+            last_ns, before = stamp_ns, odometer.T_smooth_odom
+            mended = odometer.smooth(cleaned(observation, self._log), self._log)
+            if not np.array_equal(before, odometer.T_smooth_odom):
+                T_smooth_odom = odometer.T_smooth_odom.ravel().tolist()
+                self._tell("odometry_jump", stamp_ns, T_smooth_odom=T_smooth_odom)
+            yield mended
+
+    def ground_truth(self) -> GroundTruth | None:
+        """Return the source's ground truth."""
+        return self._source.ground_truth()
+
+    def measured_ns(self, observation: Observation) -> int:
+        """Return when the source measured an observation."""
+        return self._feed.measured_ns(observation)
+
+    def notices(self) -> Sequence[Event]:
+        """Return what the source tells, and where odometry jumped.
+
+        `odometry_jump` has what the observations' odometry is from there on, of what was measured:
+        `T_smooth_odom`, 16 numbers row by row.
+        """
+        with self._lock:
+            told, self._notices = self._notices, []
+        return [*self._feed.notices(), *told]
+
+    def close(self) -> None:
+        """Close the source."""
+        self._feed.close()
+
+    def _tell(self, event: str, stamp_ns: int, **fields: object) -> None:
+        with self._lock:
+            self._notices.append({"event": event, "stamp_ns": stamp_ns, **fields})

@@ -1,0 +1,119 @@
+"""What was heard of a robot in a few seconds, as a recording: chosen from and surveyed as one."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from time import monotonic
+from typing import Any
+
+from sceneslam.ros import names
+from sceneslam.ros.messages import MessageDecoder, TopicType
+from sceneslam.ros.transport.transport import Arrival, Qos, Transport
+from sceneslam.sources.bag_topics import TYPES
+from sceneslam.sources.recording import Message
+
+_LOOK_S = 0.1  # between two looks at what is announced
+_MOST_HELD = 400  # messages of a topic ...
+_MOST_PICTURES = 40  # ... and of those that hold a megabyte each
+_PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")
+_TF = {names.TF: Qos.RELIABLE, names.TF_STATIC: Qos.HISTORY}
+_TF_TYPE = "tf2_msgs/msg/TFMessage"
+
+
+class Heard:
+    """A recording in memory that grows while a transport is listened to.
+
+    `topics` holds what was heard, `announced` also what others only say that they publish.
+    """
+
+    is_slow = False
+
+    def __init__(self) -> None:
+        self.topics: dict[str, TopicType] = {}
+        self.announced: dict[str, str] = {}  # topic -> type
+        self.metadata: Mapping[str, Mapping[str, str]] = {}
+        self.faults: Sequence[str] = ()
+        self._held: dict[str, deque[Message]] = {}
+        self._changed = threading.Lock()
+        self._decoder = MessageDecoder(self.topics)
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """Return when the first and the last message came (monotonic clock)."""
+        times = [one.log_ns for held in self._copies() for one in (held[0], held[-1])]
+        return min(times, default=0), max(times, default=0)
+
+    def listen(
+        self, transport: Transport, *, wanted: Collection[str], listen_s: float, wait_s: float
+    ) -> None:
+        """Listen until `listen_s` after the first measurement, and to all that is `wanted`.
+
+        Gives up after `wait_s`.
+        """
+        until_s, first_s = monotonic() + wait_s, None
+        tick = threading.Event()
+        while monotonic() < until_s:
+            for topic, msgtype in transport.topics().items():
+                if topic not in self.announced and _may_serve(topic, msgtype):
+                    self.announced[topic] = msgtype
+                    transport.subscribe(topic, msgtype, self.take, _TF.get(topic, Qos.SENSOR))
+            measured = self.topics.keys() - _TF.keys()
+            if measured and first_s is None:
+                first_s = monotonic()
+            is_long = first_s is not None and monotonic() - first_s >= listen_s
+            if is_long and self.topics.keys() >= set(wanted):
+                break
+            tick.wait(_LOOK_S)
+        for topic in self.announced:
+            transport.unsubscribe(topic)
+
+    def take(self, arrival: Arrival) -> None:
+        """Take a message; of many, the newest are kept."""
+        topic = arrival.topic
+        with self._changed:
+            msgtype = self.announced[topic]
+            known = self.topics.get(topic)
+            count = 1 if known is None else known.count + 1
+            most = _MOST_PICTURES if msgtype in _PICTURES else _MOST_HELD
+            held = self._held.setdefault(topic, deque(maxlen=most))
+            held.append(Message(topic=topic, log_ns=arrival.arrived_ns, data=arrival.cdr))
+            self.topics[topic] = cdr_type(msgtype, count)
+
+    def messages(self, topics: Collection[str], from_ns: int | None = None) -> Iterator[Message]:
+        """Yield by arrival."""
+        found = [one for held in self._copies() for one in held if one.topic in topics]
+        for message in sorted(found, key=lambda one: one.log_ns):
+            if from_ns is None or message.log_ns >= from_ns:
+                yield message
+
+    def last(self, topic: str) -> Message | None:
+        """Return the topic's last message."""
+        held = self._held.get(topic)
+        return held[-1] if held else None
+
+    def decode(self, message: Message) -> Any:
+        """Return the decoded message, None when its bytes make no sense."""
+        return self._decoder.decode(message.topic, message.data)
+
+    def _copies(self) -> list[list[Message]]:
+        with self._changed:
+            return [list(held) for held in self._held.values()]
+
+
+def cdr_type(msgtype: str, count: int = 0) -> TopicType:
+    """Return a topic of a standard type, as it comes over the network."""
+    return TopicType(
+        msgtype=msgtype, encoding="cdr", definition="", definition_format="ros2msg", count=count
+    )
+
+
+def _may_serve(topic: str, msgtype: str) -> bool:
+    if topic in _TF:
+        return msgtype == _TF_TYPE
+    is_own = topic.startswith(names.OWN_PREFIX)
+    return not is_own and any(msgtype in TYPES[need] for need in _NEEDS)
+
+
+_NEEDS = ("image", "camera_info", "scan", "points", "odometry", "imu")

@@ -1,0 +1,279 @@
+"""A robot that runs ROS 2, live: over DDS without ROS, or through rclpy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from time import monotonic_ns
+from typing import Any
+
+from sceneslam.interfaces import LiveFeed
+from sceneslam.ros import decode
+from sceneslam.ros.messages import MessageDecoder
+from sceneslam.ros.pixels import DepthUnits
+from sceneslam.ros.transport.transport import Arrival, Network, Transport, open_transport
+from sceneslam.sources.bag_frames import FrameTree
+from sceneslam.sources.bag_observation import PRIMARY, BundleDecoder, measured
+from sceneslam.sources.bag_rig import Given, make_rig, picture_size_wh, place, sensor_topics
+from sceneslam.sources.bag_topics import NONE, TYPES, choose_topics
+from sceneslam.sources.faults import FaultLog, at_stamp
+from sceneslam.sources.intrinsics import checked_above_zero, given_intrinsics, given_range_m
+from sceneslam.sources.ros2.clock import Order, StampClock
+from sceneslam.sources.ros2.heard import Heard, cdr_type
+from sceneslam.sources.ros2.inbox import Inbox
+from sceneslam.sources.ros2.streams import Streams
+from sceneslam.sources.survey.bag_sample import survey_recording
+from sceneslam.sources.survey.survey import Survey
+from sceneslam.sources.synchronise import Bundle, Sample, Synchroniser
+from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.truth import GroundTruth
+
+_TICK_S = 0.1  # how late a silence may be noticed
+_PATIENCE_S = 0.05  # an image waits so long for odometry of its instant: 20 Hz, as robots send it
+_USUAL = {  # a RealSense camera's and a robot's names; other topics are found by their type
+    "image": ("/camera/color/image_raw", "/camera/camera/color/image_raw"),
+    "depth": (
+        "/camera/aligned_depth_to_color/image_raw",
+        "/camera/camera/aligned_depth_to_color/image_raw",
+    ),
+    "camera_info": ("/camera/color/camera_info", "/camera/camera/color/camera_info"),
+    "scan": ("/scan",),
+    "odometry": ("/odom",),
+    "imu": ("/imu", "/camera/imu", "/camera/camera/imu"),
+}
+
+
+class Ros2:
+    """Gives one observation per message of the first of image, depth, points, scan, odometry.
+
+    Where that falls silent, the next one takes its place until it is back. `topics` as for a bag.
+    The robot is listened to for `listen_s` before it is chosen what is used, and until every topic
+    that is named was heard; after `wait_s` that is an InputError.
+    """
+
+    def __init__(
+        self,
+        topics: dict[str, Any],
+        camera: dict[str, Any],
+        depth_scale: float,
+        depth_range_m: list[float] | None,
+        lidar_range_m: list[float] | None,
+        sync_tolerance_s: float,
+        base_frame: str | None,
+        transport: str,
+        domain_id: int | None,
+        discovery: str | None,
+        listen_s: float,
+        wait_s: float,
+        silent_after_s: float,
+    ) -> None:
+        for key, value in (
+            ("depth_scale", depth_scale),
+            ("sync_tolerance_s", sync_tolerance_s),
+            ("listen_s", listen_s),
+            ("silent_after_s", silent_after_s),
+        ):
+            checked_above_zero(key, value)
+        if not wait_s > listen_s:
+            raise ConfigError("wait_s", wait_s, f"more than listen_s ({listen_s:g}) [s]")
+        for need in topics.keys() - TYPES.keys():
+            raise ConfigError(
+                f"topics.{need}", topics[need], f"a topic for one of {', '.join(TYPES)}"
+            )
+        self._given = Given(
+            intrinsics=given_intrinsics(camera),
+            depth_range_m=given_range_m("depth_range_m", depth_range_m),
+            lidar_range_m=given_range_m("lidar_range_m", lidar_range_m),
+        )
+        self._named, self._base_frame = topics, base_frame
+        self._depth_scale, self._sync_tolerance_s = depth_scale, sync_tolerance_s
+        self._listen_s, self._wait_s, self._silent_after_s = listen_s, wait_s, silent_after_s
+        self._network = Network(transport=transport, domain_id=domain_id, discovery=discovery)
+        self._faults = FaultLog()
+        self._transport: Transport | None = None
+        self._inbox, self._clock = Inbox(), StampClock()
+        self._streams: Streams | None = None
+        self.heard = Heard()
+
+    @property
+    def rig(self) -> Rig:
+        """Return the sensors that are heard; waits for them the first time.
+
+        Raises InputError where nothing is heard, or not what is named.
+        """
+        if self._transport is None:
+            self._listen()
+        return self._rig
+
+    @property
+    def length(self) -> int | None:
+        """Return None: nobody knows how long it will last."""
+        return None
+
+    @property
+    def faults(self) -> Sequence[str]:
+        """Return what was wrong with single messages."""
+        return self._faults.sentences()
+
+    @property
+    def live(self) -> LiveFeed | None:
+        """Return itself."""
+        return self
+
+    def survey(self) -> Survey:
+        """Return what was heard at the beginning."""
+        _ = self.rig
+        return survey_recording(
+            self.heard,
+            {sensor: self._by_sensor[sensor] for sensor in Sensor if sensor in self._by_sensor},
+            depth_scale=self._depth_scale,
+            sync_tolerance_s=self._sync_tolerance_s,
+        )
+
+    def ground_truth(self) -> GroundTruth | None:
+        """Return None: nobody knows."""
+        return None
+
+    def measured_ns(self, observation: Observation) -> int:
+        """Return when an observation was measured, by the monotonic clock."""
+        return self._clock.measured_ns(observation.stamp_ns)
+
+    def notices(self) -> Sequence[Any]:
+        """Return what happened to the topics since the last call."""
+        return self._streams.notices() if self._streams is not None else ()
+
+    def close(self) -> None:
+        """Leave the domain and end the iteration."""
+        self._inbox.close()
+        if self._transport is not None:
+            self._transport.close()
+
+    def __iter__(self) -> Iterator[Observation]:
+        """Yield observations as they come, until `close`."""
+        for bundle, primary in self._bundles():
+            decoded = self._decoders[primary].observe(bundle)
+            for problem in decoded.problems:
+                self._faults.add(problem, at_stamp(decoded.stamp_ns))
+            if decoded.observation is not None:
+                yield decoded.observation
+
+    def _listen(self) -> None:
+        """Hear what there is, choose what is used, and follow that alone."""
+        wanted = [name for name in self._named.values() if name not in (None, NONE)]
+        self._transport = open_transport(self._network)
+        try:
+            self.heard.listen(
+                self._transport, wanted=wanted, listen_s=self._listen_s, wait_s=self._wait_s
+            )
+            self._choose(wanted)
+        except BaseException:
+            self.close()
+            raise
+        self._follow(self._transport)
+
+    def _choose(self, wanted: Sequence[str]) -> None:
+        heard, missing = self.heard, sorted(set(wanted) - self.heard.topics.keys())
+        if missing or not heard.topics:
+            what = f"nothing on {', '.join(missing)}" if missing else "no topic with a sensor"
+            raise InputError(
+                f"{what} within {self._wait_s:g} s in {self._where()}: {self._there()}"
+            )
+        names = {need: self._name(need, name) for need, name in self._named.items()}
+        try:
+            self.topics = choose_topics(heard, names)
+            self._by_sensor = sensor_topics(heard, self.topics)
+            if not any(sensor in self._by_sensor for sensor in PRIMARY):
+                raise InputError("no image, depth, points, scan or odometry")
+            self.frames = FrameTree(heard, self._base_frame)
+            self._rig = make_rig(heard, self.topics, self.frames, self._given)
+        except InputError as error:
+            raise InputError(f"{error}: {self._where()}, {self._there()}") from error
+
+    def _name(self, need: str, name: str | None) -> str | None:
+        """Return the name that is given, or the usual one where it was heard."""
+        usual = (one for one in _USUAL.get(need, ()) if one in self.heard.topics)
+        return name if name is not None else next(usual, None)
+
+    def _follow(self, transport: Transport) -> None:
+        used = {self._by_sensor[sensor] for sensor in self._by_sensor}
+        types = {topic: self.heard.topics[topic].msgtype for topic in used}
+        self._decoder = MessageDecoder({topic: cdr_type(types[topic]) for topic in used})
+        self._T_base_imu = place(self.heard, self.topics.imu or "", self.frames)
+        camera, is_seeing = self._rig.camera, bool(self.topics.image or self.topics.depth)
+        units = DepthUnits(self._depth_scale, camera.depth_range_m if camera else (0.0, 100.0))
+        size_wh = picture_size_wh(self.heard, self.topics) if is_seeing else None
+        sensors = self._rig.sensors
+        self._decoders = {
+            sensor: BundleDecoder(sensor, sensors, size_wh, units) for sensor in PRIMARY
+        }
+        self._streams = Streams(self._by_sensor, self._silent_after_s, monotonic_ns())
+        for topic in sorted(used):
+            transport.subscribe(topic, types[topic], self._inbox.put)
+
+    def _bundles(self) -> Iterator[tuple[Bundle, Sensor]]:
+        """Yield bundles with the sensor that each is made for."""
+        assert self._streams is not None, "rig is asked first"
+        streams, primary = self._streams, self._streams.pace
+        synchroniser = Synchroniser(
+            primary,
+            frozenset(self._by_sensor),
+            self._sync_tolerance_s,
+            waits_for=streams.waits_for,
+            patience_s=_PATIENCE_S,
+            extrapolates=True,
+        )
+        stamp_ns, looked_ns = 0, monotonic_ns()
+        while not self._inbox.is_closed:
+            arrival = self._inbox.take(_TICK_S)
+            if arrival is not None:
+                for sensor, sample in self._samples(arrival):
+                    stamp_ns = sample.stamp_ns
+                    if sensor is not streams.pace or primary is streams.pace:
+                        yield from ((one, primary) for one in synchroniser.add(sensor, sample))
+            if monotonic_ns() - looked_ns > _TICK_S * 1e9:
+                looked_ns = monotonic_ns()
+                streams.look(looked_ns, stamp_ns)
+                streams.drop(self._inbox.take_dropped(), looked_ns, stamp_ns)
+            primary = streams.pace
+            synchroniser.follow(primary, streams.waits_for)
+
+    def _samples(self, arrival: Arrival) -> Iterator[tuple[Sensor, Sample]]:
+        """Yield what a message holds, on one time line."""
+        assert self._streams is not None
+        topic = arrival.topic
+        message = self._decoder.decode(topic, arrival.cdr)
+        if message is None:
+            self._faults.add(f"a message of {topic} makes no sense", "its arrival")
+            return
+        lined = self._clock.line_up(topic, decode.stamp_ns(message), arrival.arrived_ns)
+        self._streams.hear(topic, lined, arrival.arrived_ns)
+        if lined.order is Order.UNORDERED:
+            return
+        if lined.shift_ns:
+            message = _restamped(message, lined.stamp_ns)
+        for sensor in (one for one, name in self._by_sensor.items() if name == topic):
+            held = measured(message, sensor, self._T_base_imu)
+            if held is not None:
+                yield sensor, Sample(stamp_ns=lined.stamp_ns, value=held)
+
+    def _where(self) -> str:
+        reach = self._network.reach()
+        return f"domain {self._network.domain()} ({reach}; ROS_DOMAIN_ID, source.discovery)"
+
+    def _there(self) -> str:
+        """Return what is announced, and what of it was heard, to show."""
+        announced: Mapping[str, str] = self.heard.announced
+        parts = [
+            f"{topic} ({msgtype}{'' if topic in self.heard.topics else ', silent'})"
+            for topic, msgtype in sorted(announced.items())
+        ]
+        return f"there is {', '.join(parts)}" if parts else "nobody publishes a sensor there"
+
+
+def _restamped(message: Any, stamp_ns: int) -> Any:
+    """Return a decoded message with another stamp in its header."""
+    sec, nanosec = divmod(stamp_ns, 10**9)
+    stamp = replace(message.header.stamp, sec=sec, nanosec=nanosec)
+    return replace(message, header=replace(message.header, stamp=stamp))

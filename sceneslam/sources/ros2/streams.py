@@ -1,0 +1,105 @@
+"""Which of a robot's streams are alive, and what is worth a word about each."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+from sceneslam.sources.bag_observation import PRIMARY
+from sceneslam.sources.ros2.clock import Lined, Order
+from sceneslam.types.rig import Sensor
+from sceneslam.types.run import Event
+
+_WAITED_FOR = frozenset({Sensor.DEPTH, Sensor.ODOMETRY, Sensor.GYRO, Sensor.ACCELEROMETER})
+_STREAK_NS = 5_000_000_000  # what goes on for so long is told once
+
+
+class Streams:
+    """Watches topics fall silent, come back, come late; `notices` is safe from any thread."""
+
+    def __init__(self, topics: Mapping[Sensor, str], silent_after_s: float, now_ns: int) -> None:
+        self._topics = topics
+        self._silent_ns = round(silent_after_s * 1e9)
+        self._heard_ns = dict.fromkeys(topics.values(), now_ns)
+        self._silent: set[str] = set()
+        self._told_ns: dict[tuple[str, str], int] = {}
+        self._shifts_ns: dict[str, int] = {}
+        self._dropped: Counter[str] = Counter()
+        self._dropped_ns = now_ns
+        self._notices: list[Event] = []
+        self._lock = threading.Lock()
+
+    @property
+    def pace(self) -> Sensor:
+        """Return the sensor whose messages observations are made of: the first that is alive."""
+        ranked = [sensor for sensor in PRIMARY if sensor in self._topics]
+        alive = [sensor for sensor in ranked if self._topics[sensor] not in self._silent]
+        return (alive or ranked)[0]
+
+    @property
+    def waits_for(self) -> frozenset[Sensor]:
+        """Return the streams that are alive and whose measurement at that instant is needed."""
+        return frozenset(
+            sensor
+            for sensor, topic in self._topics.items()
+            if sensor in _WAITED_FOR and topic not in self._silent
+        )
+
+    def hear(self, topic: str, lined: Lined, arrived_ns: int) -> None:
+        """Take that a message came."""
+        self._heard_ns[topic] = arrived_ns
+        if topic in self._silent:
+            self._silent.discard(topic)
+            self._tell("stream_returned", lined.stamp_ns, topic=topic)
+        if lined.order is Order.JUMPED:
+            before_ns = self._shifts_ns.get(topic, 0)
+            jumped_s = (before_ns - lined.shift_ns) / 1e9
+            self._tell(
+                "clock_jump",
+                lined.stamp_ns,
+                topic=topic,
+                jumped_s=jumped_s,
+                shift_ns=lined.shift_ns,
+                paces=topic == self._topics[self.pace],
+            )
+        elif lined.order is not Order.RISING:
+            self._tell_once(lined.order.name.lower(), lined.stamp_ns, topic, arrived_ns)
+        self._shifts_ns[topic] = lined.shift_ns
+
+    def look(self, now_ns: int, stamp_ns: int) -> bool:
+        """Notice who fell silent; return whether anybody did."""
+        fallen = [
+            topic
+            for topic, heard_ns in self._heard_ns.items()
+            if topic not in self._silent and now_ns - heard_ns > self._silent_ns
+        ]
+        for topic in fallen:
+            self._silent.add(topic)
+            self._tell("stream_silent", stamp_ns, topic=topic, for_s=self._silent_ns / 1e9)
+        return bool(fallen)
+
+    def drop(self, counts: Mapping[str, int], now_ns: int, stamp_ns: int) -> None:
+        """Take how many messages had to go before anybody decoded them; told in sums."""
+        self._dropped.update(counts)
+        if self._dropped and now_ns - self._dropped_ns > _STREAK_NS:
+            self._dropped_ns = now_ns
+            for topic, count in sorted(self._dropped.items()):
+                self._tell("messages_dropped", stamp_ns, topic=topic, count=count)
+            self._dropped.clear()
+
+    def notices(self) -> Sequence[Event]:
+        """Return what there was to tell since the last call."""
+        with self._lock:
+            told, self._notices = self._notices, []
+            return told
+
+    def _tell_once(self, event: str, stamp_ns: int, topic: str, now_ns: int) -> None:
+        last_ns = self._told_ns.get((event, topic))
+        self._told_ns[event, topic] = now_ns
+        if last_ns is None or now_ns - last_ns > _STREAK_NS:
+            self._tell(event, stamp_ns, topic=topic)
+
+    def _tell(self, event: str, stamp_ns: int, **fields: object) -> None:
+        with self._lock:
+            self._notices.append({"event": event, "stamp_ns": stamp_ns, **fields})

@@ -1,0 +1,292 @@
+"""A robot as a source: what is heard, what is missing, who is silent, whose clock jumps."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import contextmanager
+from time import monotonic_ns
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from sceneslam.ros import names
+from sceneslam.ros.encode import Encoder
+from sceneslam.ros.transport.transport import Arrival
+from sceneslam.sources.ros2 import source as under_test
+from sceneslam.sources.ros2.clock import Order, StampClock
+from sceneslam.sources.ros2.inbox import Inbox
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.observation import LaserScan
+from sceneslam.types.rig import Camera, Sensor
+
+MS, S = 1_000_000, 1_000_000_000
+IMAGE, DEPTH = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"
+INFO = "/camera/color/camera_info"
+PICTURE = "sensor_msgs/msg/Image"
+TYPES = {
+    IMAGE: PICTURE,
+    DEPTH: PICTURE,
+    INFO: "sensor_msgs/msg/CameraInfo",
+    "/scan": "sensor_msgs/msg/LaserScan",
+    "/odom": "nav_msgs/msg/Odometry",
+    "/imu": "sensor_msgs/msg/Imu",
+    names.TF_STATIC: "tf2_msgs/msg/TFMessage",
+    "/chatter": "std_msgs/msg/String",
+}
+CAMERA = Camera(size_wh=(8, 6), fx=5.0, fy=5.0, cx=4.0, cy=3.0)
+T_BASE_LASER = se3.from_parts(np.eye(3), np.array([0.2, 0.0, 0.3]))
+
+
+class Robot:
+    """A transport whose other side is driven by the test; stamps are what it says."""
+
+    def __init__(self, *topics):
+        self.encoder, self._heard, self.is_closed = Encoder(), {}, False
+        self._topics = {topic: TYPES[topic] for topic in topics}
+        for topic in topics:  # what serialises a type is made at its first message
+            self._message(self.encoder, topic, 0)
+
+    def topics(self):
+        return self._topics
+
+    def subscribe(self, topic, msgtype, heard, qos=None):
+        assert TYPES[topic] == msgtype
+        self._heard[topic] = heard
+
+    def unsubscribe(self, topic):
+        self._heard.pop(topic, None)
+
+    def publisher(self, topic, msgtype, qos=None):
+        raise AssertionError("a source says nothing")
+
+    def close(self):
+        self.is_closed = True
+
+    def send(self, topic, cdr):
+        if topic in self._heard:
+            self._heard[topic](Arrival(topic=topic, cdr=cdr, arrived_ns=monotonic_ns()))
+
+    def measure(self, stamp_ns, *, without=()):
+        """Send what every topic would at one instant."""
+        for topic in [one for one in self._topics if one not in without]:
+            self.send(topic, self._message(self.encoder, topic, stamp_ns))
+
+    def _message(self, encoder, topic, stamp_ns):
+        if topic == "/odom":
+            x_m = stamp_ns / S
+            T_odom_base = se3.from_parts(np.eye(3), np.array([x_m, 0.0, 0.0]))
+            return encoder.odometry(stamp_ns, T_odom_base, names.ODOM)
+        if topic == "/imu":
+            return encoder.imu(stamp_ns, {Sensor.GYRO: np.array([0.0, 0.0, 0.5])})
+        if topic == "/scan":
+            return encoder.scan(scan(stamp_ns))
+        if topic == INFO:
+            return encoder.camera_info(stamp_ns, CAMERA)
+        if topic == names.TF_STATIC:
+            return encoder.transforms(stamp_ns, names.BASE, {names.LASER: T_BASE_LASER})
+        if topic == IMAGE:
+            return encoder.image(stamp_ns, np.full((6, 8, 3), 7, np.uint8), "bgr8")
+        return encoder.image(stamp_ns, np.full((6, 8, 1), 2000, np.uint16), "16UC1")
+
+
+def scan(stamp_ns):
+    return LaserScan(
+        stamp_ns=stamp_ns,
+        ranges_m=np.ones(5, np.float32),
+        angle_min_rad=0.0,
+        angle_step_rad=0.1,
+        range_min_m=0.1,
+        range_max_m=10.0,
+    )
+
+
+@pytest.fixture
+def make(monkeypatch):
+    with initialize_config_module("sceneslam.conf", version_base="1.3"):
+        config = OmegaConf.to_container(compose("source/ros2").source)
+    config.pop("_target_")
+    quick = {"listen_s": 0.05, "wait_s": 0.5, "silent_after_s": 0.3}
+
+    def made(robot, **words):
+        monkeypatch.setattr(under_test, "open_transport", lambda network: robot)
+        topics = config["topics"] | words.pop("topics", {})
+        return under_test.Ros2(**(config | quick | words | {"topics": topics}))
+
+    return made
+
+
+@contextmanager
+def talking(robot):
+    """Measure every 10 ms while a source listens."""
+    is_over = threading.Event()
+
+    def talk():
+        index = 0
+        while not is_over.wait(0.01):
+            index += 1
+            robot.measure(index * 10 * MS)
+
+    thread = threading.Thread(target=talk)
+    thread.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        thread.join()
+
+
+def heard(source, robot):
+    with talking(robot):
+        return source.rig
+
+
+ALL = (IMAGE, DEPTH, INFO, "/scan", "/odom", "/imu", names.TF_STATIC)
+
+
+def test_rig_is_what_is_heard(make):
+    robot = Robot(*ALL, "/chatter")
+    rig = heard(make(robot), robot)
+    assert rig.sensors == {
+        Sensor.IMAGE, Sensor.DEPTH, Sensor.SCAN, Sensor.ODOMETRY, Sensor.GYRO,
+    }  # fmt: skip
+    assert rig.camera.size_wh == (8, 6)
+    np.testing.assert_allclose(rig.laser.T_base_laser, T_BASE_LASER)
+
+
+def test_observation_holds_what_was_measured_at_its_stamp(make):
+    robot = Robot(*ALL)
+    source = make(robot)
+    heard(source, robot)
+    for index in range(100, 104):
+        robot.measure(index * 33 * MS)
+    observations = iter(source)
+    taken = [next(observations) for _ in range(3)]
+    assert [one.stamp_ns for one in taken] == [index * 33 * MS for index in range(100, 103)]
+    for one in taken:
+        assert one.image_bgr[0, 0, 0] == 7 and one.depth_m[0, 0] == 2.0
+        np.testing.assert_allclose(one.T_odom_base[0, 3], one.stamp_ns / S)
+        assert one.gyro_base[-1, 3] == 0.5
+    source.close()
+    assert list(observations) == [] and robot.is_closed
+
+
+def test_scan_takes_the_place_of_images_that_fall_silent(make):
+    robot = Robot(*ALL)
+    source = make(robot)
+    heard(source, robot)
+    over = threading.Event()
+
+    def drive():
+        for index in range(1000):
+            robot.measure(100 * S + index * 20 * MS, without=(IMAGE, DEPTH) if index > 5 else ())
+            if over.wait(0.02):
+                return
+
+    thread = threading.Thread(target=drive)
+    thread.start()
+    for observation in source:
+        if observation.image_bgr is None:
+            break
+    over.set()
+    thread.join()
+    source.close()
+    assert observation.scan is not None and observation.T_odom_base is not None
+    silent = {one["topic"] for one in source.notices() if one["event"] == "stream_silent"}
+    assert silent >= {IMAGE, DEPTH}
+
+
+def test_topic_that_is_named_and_not_heard_is_named_with_what_is_there(make):
+    robot = Robot(IMAGE)
+    source = make(robot, topics={"image": "/front/image"})
+    with talking(robot), pytest.raises(InputError, match=r"nothing on /front/image within 0.5 s"):
+        _ = source.rig
+    assert robot.is_closed
+
+
+def test_topic_that_is_announced_and_silent_is_said_to_be_so(make):
+    with pytest.raises(InputError, match=r"there is /scan \(sensor_msgs/msg/LaserScan, silent\)"):
+        _ = make(Robot("/scan")).rig
+
+
+def test_where_nobody_is_it_says_where_it_listened(make):
+    with pytest.raises(InputError, match=r"domain 5 \(localhost.*nobody publishes a sensor"):
+        _ = make(Robot(), domain_id=5).rig
+
+
+def test_depth_without_intrinsics_says_what_to_give(make):
+    robot = Robot(DEPTH)
+    with pytest.raises(InputError, match="depth without intrinsics"):
+        heard(make(robot), robot)
+
+
+@pytest.mark.parametrize(
+    ("words", "key"),
+    [
+        ({"wait_s": 0.01}, "wait_s"),
+        ({"listen_s": 0.0}, "listen_s"),
+        ({"topics": {"sonar": "/x"}}, "topics.sonar"),
+        ({"transport": "mqtt"}, "transport"),
+    ],
+)
+def test_impossible_settings_are_refused(make, words, key):
+    with pytest.raises(ConfigError, match=key):
+        make(Robot(), **words)
+
+
+class TestClock:
+    def lines(self, *messages, clock=None):
+        clock = clock or StampClock()
+        return [clock.line_up(topic, stamp, arrived) for topic, stamp, arrived in messages]
+
+    def test_steady_clock_is_left_alone(self):
+        lined = self.lines(*[("/a", index * 33 * MS, S + index * 33 * MS) for index in range(9)])
+        assert [one.stamp_ns for one in lined] == [index * 33 * MS for index in range(9)]
+        assert {one.order for one in lined} == {Order.RISING}
+
+    @pytest.mark.parametrize("jump_ns", [-100 * S, 3600 * S])
+    def test_jump_is_taken_out_of_all_topics_alike(self, jump_ns):
+        lined = self.lines(
+            ("/a", 10 * S, 0),
+            ("/b", 10 * S, 1 * MS),
+            ("/a", 10 * S + 33 * MS + jump_ns, 40 * MS),  # 7 ms late, as they come
+            ("/b", 10 * S + 33 * MS + jump_ns, 34 * MS),
+        )
+        assert [one.order for one in lined[2:]] == [Order.JUMPED, Order.JUMPED]
+        assert lined[2].stamp_ns == lined[3].stamp_ns  # what belongs together stays so
+        assert lined[2].stamp_ns == pytest.approx(10 * S + 40 * MS)
+
+    def test_burst_after_a_stall_is_late_and_no_jump(self):
+        lined = self.lines(
+            ("/a", 0, 0), ("/a", 33 * MS, 5 * S), ("/a", 66 * MS, 5 * S), ("/a", 5 * S, 5 * S + 1)
+        )
+        assert [one.order for one in lined] == [Order.RISING, Order.LATE, Order.LATE, Order.RISING]
+        assert all(one.shift_ns == 0 for one in lined)
+
+    def test_message_behind_the_one_before_is_unordered(self):
+        lined = self.lines(("/a", 66 * MS, 0), ("/a", 33 * MS, 1), ("/a", 99 * MS, 33 * MS))
+        assert [one.order for one in lined] == [Order.RISING, Order.UNORDERED, Order.RISING]
+
+    def test_driver_that_restarts_with_another_clock_goes_on_from_where_it_was(self):
+        lined = self.lines(("/a", 500 * S, 0), ("/a", 2 * S, 20 * S))
+        assert lined[1].order is Order.JUMPED and lined[1].stamp_ns == 520 * S
+
+    def test_clocks_that_drift_apart_are_not_late(self):
+        clock = StampClock()
+        for second in range(20_000):  # the robot's is slow by 100 ppm: 2 s in the end
+            lined = clock.line_up("/a", round(second * S * 0.9999), second * S)
+        assert lined.order is Order.RISING
+
+
+def test_inbox_keeps_the_newest_of_each_topic():
+    inbox = Inbox()
+    for index in range(10):
+        inbox.put(Arrival(topic="/image", cdr=bytes(1_000_000), arrived_ns=index))
+    inbox.put(Arrival(topic="/imu", cdr=bytes(8), arrived_ns=10))
+    assert [inbox.take(0.0).arrived_ns for _ in range(5)] == [6, 7, 8, 9, 10]
+    assert inbox.take_dropped() == {"/image": 6} and not inbox.take_dropped()
+    assert inbox.take(0.0) is None
+    inbox.close()
+    assert inbox.take(60.0) is None
