@@ -15,8 +15,9 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types.command import Command
 from sceneslam.types.experiment import RunTrials, Verdict
-from sceneslam.types.maps import MapLayers
+from sceneslam.types.maps import HybridMap, MapLayers
 from sceneslam.types.observation import Observation, SceneVote, Tracking
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import Event, RunResult
@@ -323,6 +324,40 @@ class ResultSink(Protocol):
 
     def write_result(self, result: RunResult) -> None:
         """Take the revised trajectory and the map, once, after the truth, before `close`."""
+        ...
+
+
+@runtime_checkable
+class CovarianceSink(Protocol):
+    """A sink that also wants to know how certain each pose is."""
+
+    def write_covariance(self, stamp_ns: int, covariance: NDArray[np.float64]) -> None:
+        """Take the covariance (6, 6) [m, rad] of the next pose, in base, as its module told it."""
+        ...
+
+
+@runtime_checkable
+class Steering(Protocol):
+    """A sink through which an operator steers the run."""
+
+    def commands(self) -> Sequence[Command]:
+        """Return what was asked since the last call, oldest first; asked before every step."""
+        ...
+
+
+class LiveMapper(Protocol):
+    """Draws the map while the robot drives, of what the sensors measured at the reported poses."""
+
+    def open(self, rig: Rig) -> None:
+        """Begin an empty map."""
+        ...
+
+    def add(self, observation: Observation, T_map_base: Transform) -> None:
+        """Draw one observation."""
+        ...
+
+    def map(self) -> HybridMap:
+        """Return the map so far, in `map`."""
         ...
 
 

@@ -14,12 +14,14 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from sceneslam.atlas.save import save_map
 from sceneslam.bus.bus import Bus
 from sceneslam.bus.handover_log import log_uncertainty
 from sceneslam.config.build import Parts
 from sceneslam.config.settings import LIVE
 from sceneslam.engine.live import LiveTally, run_live
-from sceneslam.interfaces import Live, LiveFeed, ResultSink, Sink
+from sceneslam.engine.steering import Operator, SteeredDetector
+from sceneslam.interfaces import CovarianceSink, Live, LiveFeed, ResultSink, Sink, Steering
 from sceneslam.keeping import Keeping
 from sceneslam.results import Results
 from sceneslam.sources.survey.preflight import preflight
@@ -57,8 +59,10 @@ class Loop:
         self._live = LiveTally()
         self._covariances = np.zeros((0, 6, 6))
         self._began_s, self._wall_s = perf_counter(), 0.0
+        detector = SteeredDetector(parts.detector)
+        self._operator = Operator(detector, parts.scenes, save_map, results.folder, self._log.add)
         self._bus = Bus(
-            detector=parts.detector,
+            detector=detector,
             modules=parts.modules,
             scenes=parts.scenes,
             policy=parts.policy,
@@ -211,6 +215,7 @@ class Loop:
         """Take what happened to the input of a live run."""
         fields = {key: value for key, value in event.items() if key not in ("event", "stamp_ns")}
         self._log.add(event["event"], event["stamp_ns"], **fields)
+        self._write_events()  # before the observation that it is about
         if event["event"] == "given_up":
             self.faults.append(f"the source was silent for {event['for_s']:g} s")
 
@@ -226,6 +231,9 @@ class Loop:
 
     def _step(self, observation: Observation) -> bool:
         """Feed one observation; return whether the run goes on."""
+        self._steer(observation.stamp_ns)
+        if self._operator.is_paused:
+            return True
         self._bus.step(observation)
         self._observed_ns.append(observation.stamp_ns)
         module = self._parts.modules.get(self._bus.active)
@@ -236,17 +244,34 @@ class Loop:
         self._bar.update()
         return self._bus.state != "terminate"
 
+    def _steer(self, stamp_ns: int) -> None:
+        """Do what operators asked since the last observation."""
+        for sink in list(self._sinks.values()):
+            for command in sink.commands() if isinstance(sink, Steering) else ():
+                self._operator.obey(command, stamp_ns)
+
     def _write(self, observation: Observation) -> None:
-        """Give the sinks the observation with its pose, and the events since the last one."""
+        """Give the sinks the observation with its pose, and then the events."""
         if not self._keeping.has_room(len(self._observed_ns)):
             for key in list(self._sinks):
                 self._drop_sink(key, OSError(errno.ENOSPC, "what is left is for the results"))
         T_map_base = self._parts.atlas.pose_at(observation.stamp_ns)
+        covariance = self._parts.atlas.last_covariance
+        for key, sink in list(self._sinks.items()):
+            try:
+                if isinstance(sink, CovarianceSink) and covariance is not None:
+                    sink.write_covariance(observation.stamp_ns, covariance)
+                sink.write(observation, T_map_base, self._bus.active)
+            except Exception as error:
+                self._drop_sink(key, error)
+        self._write_events()
+
+    def _write_events(self) -> None:
+        """Give the sinks the events since the last one."""
         events = self._log.since(self._events_written)
         self._events_written += len(events)
         for key, sink in list(self._sinks.items()):
             try:
-                sink.write(observation, T_map_base, self._bus.active)
                 for event in events:
                     sink.write_event(event)
             except Exception as error:

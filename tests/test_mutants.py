@@ -61,6 +61,7 @@ def test_every_shipped_component_and_scenario_is_mutated(recordings):
     named |= {"detect_only", "video"}  # builds no modules; none lives on images alone
     named |= {"onnx", "indoor_outdoor"}  # need a network's file
     named |= {"process", "orb_slam3"}  # need a program that the user's word allows
+    named |= {"ros2"}  # needs a robot
     for group in ("source", "detector", "effects", "policy", "atlas", "run", "slam", "sinks"):
         assert options(group) <= named, group
 

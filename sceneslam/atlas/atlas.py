@@ -149,6 +149,11 @@ class Atlas:
         return self._path.poses[-1] if self.last_stamp_ns == stamp_ns else None
 
     @property
+    def last_covariance(self) -> Covariance | None:
+        """Return the (6, 6) of the newest pose as its module told it, None where it did not."""
+        return self._path.covariances[-1] if self._path.covariances else None
+
+    @property
     def last_stamp_ns(self) -> int | None:
         """Return the stamp of the newest pose, None before the first."""
         return self._path.stamps_ns[-1] if self._path.stamps_ns else None

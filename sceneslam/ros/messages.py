@@ -17,6 +17,12 @@ class TopicType:
     definition_format: str  # `ros2msg`, `ros1msg` or `ros2idl`
     count: int  # messages
 
+    @classmethod
+    def of_network(cls, msgtype: str, count: int = 0) -> TopicType:
+        """Return a topic of a standard type, as it comes over the network."""
+        kind = {"msgtype": msgtype, "encoding": "cdr", "definition": ""}
+        return cls(**kind, definition_format="ros2msg", count=count)
+
     def with_count(self, count: int) -> TopicType:
         """Return the same with another count."""
         return replace(self, count=count)

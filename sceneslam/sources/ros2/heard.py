@@ -79,7 +79,7 @@ class Heard:
             most = _MOST_PICTURES if msgtype in _PICTURES else _MOST_HELD
             held = self._held.setdefault(topic, deque(maxlen=most))
             held.append(Message(topic=topic, log_ns=arrival.arrived_ns, data=arrival.cdr))
-            self.topics[topic] = cdr_type(msgtype, count)
+            self.topics[topic] = TopicType.of_network(msgtype, count)
 
     def messages(self, topics: Collection[str], from_ns: int | None = None) -> Iterator[Message]:
         """Yield by arrival."""
@@ -100,13 +100,6 @@ class Heard:
     def _copies(self) -> list[list[Message]]:
         with self._changed:
             return [list(held) for held in self._held.values()]
-
-
-def cdr_type(msgtype: str, count: int = 0) -> TopicType:
-    """Return a topic of a standard type, as it comes over the network."""
-    return TopicType(
-        msgtype=msgtype, encoding="cdr", definition="", definition_format="ros2msg", count=count
-    )
 
 
 def _may_serve(topic: str, msgtype: str) -> bool:

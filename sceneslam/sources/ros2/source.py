@@ -9,7 +9,7 @@ from typing import Any
 
 from sceneslam.interfaces import LiveFeed
 from sceneslam.ros import decode
-from sceneslam.ros.messages import MessageDecoder
+from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.ros.pixels import DepthUnits
 from sceneslam.ros.transport.transport import Arrival, Network, Transport, open_transport
 from sceneslam.sources.bag_frames import FrameTree
@@ -19,7 +19,7 @@ from sceneslam.sources.bag_topics import NONE, TYPES, choose_topics
 from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.sources.intrinsics import checked_above_zero, given_intrinsics, given_range_m
 from sceneslam.sources.ros2.clock import Order, StampClock
-from sceneslam.sources.ros2.heard import Heard, cdr_type
+from sceneslam.sources.ros2.heard import Heard
 from sceneslam.sources.ros2.inbox import Inbox
 from sceneslam.sources.ros2.streams import Streams
 from sceneslam.sources.survey.bag_sample import survey_recording
@@ -199,7 +199,9 @@ class Ros2:
     def _follow(self, transport: Transport) -> None:
         used = {self._by_sensor[sensor] for sensor in self._by_sensor}
         types = {topic: self.heard.topics[topic].msgtype for topic in used}
-        self._decoder = MessageDecoder({topic: cdr_type(types[topic]) for topic in used})
+        self._decoder = MessageDecoder(
+            {topic: TopicType.of_network(types[topic]) for topic in used}
+        )
         self._T_base_imu = place(self.heard, self.topics.imu or "", self.frames)
         camera, is_seeing = self._rig.camera, bool(self.topics.image or self.topics.depth)
         units = DepthUnits(self._depth_scale, camera.depth_range_m if camera else (0.0, 100.0))
@@ -232,8 +234,10 @@ class Ros2:
                     stamp_ns = sample.stamp_ns
                     if sensor is not streams.pace or primary is streams.pace:
                         yield from ((one, primary) for one in synchroniser.add(sensor, sample))
-            if monotonic_ns() - looked_ns > _TICK_S * 1e9:
-                looked_ns = monotonic_ns()
+            # While messages wait here, the time is that of their arrival: who is heard late is heard.
+            now_ns = monotonic_ns() if arrival is None else arrival.arrived_ns
+            if now_ns - looked_ns > _TICK_S * 1e9:
+                looked_ns = now_ns
                 streams.look(looked_ns, stamp_ns)
                 streams.drop(self._inbox.take_dropped(), looked_ns, stamp_ns)
             primary = streams.pace

@@ -1,0 +1,92 @@
+"""A map drawn at the reported poses: a grid of scans, or of depth as scans, and coloured points."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.modules.slam.depth_scan import DepthScanner, scan_frame
+from sceneslam.modules.slam.grid import OccupancyGrid
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.maps import HybridMap, PointLayer
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Camera, Rig
+from sceneslam.types.se3 import Transform, apply
+
+_KEY_BITS = 21  # of a voxel's index along each axis
+_UNSEEN_BGR = (160, 160, 160)  # of points that no camera saw
+
+
+class GridAndPoints:
+    """Draws every observation once, and does not move what was drawn when poses are revised."""
+
+    def __init__(self, resolution_m: float, voxel_m: float, depth_stride_px: int) -> None:
+        if not voxel_m > 0:
+            raise ConfigError("voxel_m", voxel_m, "above 0 [m]")
+        if depth_stride_px < 1:
+            raise ConfigError("depth_stride_px", depth_stride_px, "1 or more")
+        self._resolution_m, self._voxel_m = resolution_m, voxel_m
+        self._stride = depth_stride_px
+
+    def open(self, rig: Rig) -> None:
+        """Begin an empty map."""
+        self._rig, self._grid = rig, OccupancyGrid(self._resolution_m)
+        self._keys = np.zeros(0, np.int64)  # of the voxels that hold a point, sorted
+        self._points, self._colors = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+        self._scanner = None if rig.camera is None else _scanner(rig.camera)
+
+    def add(self, observation: Observation, T_map_base: Transform) -> None:
+        """Draw one observation."""
+        camera, laser = self._rig.camera, self._rig.laser
+        if observation.scan is not None and laser is not None:
+            self._grid.insert(T_map_base @ laser.T_base_laser, observation.scan)
+        elif observation.depth_m is not None and camera is not None and self._scanner is not None:
+            scan = self._scanner.scan(observation.depth_m, stamp_ns=observation.stamp_ns)
+            self._grid.insert(T_map_base @ scan_frame(camera), scan)
+        if observation.depth_m is not None and camera is not None:
+            self._add_depth(observation, T_map_base)
+
+    def map(self) -> HybridMap:
+        """Return a copy of the map."""
+        return HybridMap(
+            points=PointLayer(points=self._points, colors_bgr=self._colors),
+            point_modules=np.zeros(len(self._points), np.uint8),
+            modules=("map",),
+            grid=self._grid.layer(),
+        )
+
+    def _add_depth(self, observation: Observation, T_map_base: Transform) -> None:
+        camera, depth_m = self._rig.camera, observation.depth_m
+        assert camera is not None and depth_m is not None
+        rows, columns = np.mgrid[
+            0 : depth_m.shape[0] : self._stride, 0 : depth_m.shape[1] : self._stride
+        ]
+        depths = depth_m[rows, columns]
+        is_measured = camera.measures(depths)
+        rows, columns, depths = rows[is_measured], columns[is_measured], depths[is_measured]
+        if not len(depths):
+            return
+        pixels = np.column_stack([columns, rows]).astype(np.float64)[:, None]
+        rays = cv2.undistortPoints(pixels, camera.K, np.array(camera.distortion))[:, 0]
+        points_cam = np.column_stack([rays * depths[:, None], depths])
+        points = apply(T_map_base @ camera.T_base_cam, points_cam).astype(np.float32)
+        colors = np.full((len(points), 3), _UNSEEN_BGR, np.uint8)
+        if observation.image_bgr is not None:
+            colors = observation.image_bgr[rows, columns]
+        self._add_points(points, colors)
+
+    def _add_points(self, points: NDArray[np.float32], colors: NDArray[np.uint8]) -> None:
+        """Add the points of voxels that hold none yet."""
+        cells = np.floor(points / self._voxel_m).astype(np.int64) + (1 << (_KEY_BITS - 1))
+        keys = (cells[:, 0] << 2 * _KEY_BITS) | (cells[:, 1] << _KEY_BITS) | cells[:, 2]
+        keys, first = np.unique(keys, return_index=True)
+        is_new = ~np.isin(keys, self._keys, assume_unique=True)
+        self._keys = np.union1d(self._keys, keys[is_new])
+        self._points = np.concatenate([self._points, points[first[is_new]]])
+        self._colors = np.concatenate([self._colors, colors[first[is_new]]])
+
+
+def _scanner(camera: Camera) -> DepthScanner:
+    """Return what makes scans of depth: of all heights that the paper's laser module takes."""
+    return DepthScanner(camera, height_min_m=None, height_max_m=None, beams=180, stride_px=2)

@@ -1,0 +1,117 @@
+"""What an operator asks of a run while it goes, carried out between two observations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from sceneslam.interfaces import Detector
+from sceneslam.types.command import Command, Pause, SaveMap, SelectModule, SelectScene
+from sceneslam.types.errors import told
+from sceneslam.types.maps import HybridMap
+from sceneslam.types.observation import Observation, SceneVote
+from sceneslam.types.rig import Rig, Sensor
+
+_UNLIKELY = 0.01  # of a scene that was not chosen, for a filter of probabilities
+
+
+class SteeredDetector:
+    """A detector whose votes an operator may replace; they are confirmed like any other."""
+
+    def __init__(self, detector: Detector) -> None:
+        self._detector = detector
+        self.selected = ""  # the scene that is voted for; "": the detector's own
+
+    @property
+    def quantity(self) -> str:
+        """Return the detector's."""
+        return self._detector.quantity
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """Return the detector's."""
+        return self._detector.scenes
+
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return the detector's."""
+        return self._detector.requires
+
+    def activate(self, rig: Rig) -> None:
+        """Activate the detector."""
+        self._detector.activate(rig)
+
+    def get_scene(self, observation: Observation) -> SceneVote:
+        """Return a vote for the selected scene, with what the detector measured."""
+        vote = self._detector.get_scene(observation)
+        if not self.selected:
+            return vote
+        likelihoods = dict.fromkeys(self.scenes, _UNLIKELY) | {self.selected: 1.0}
+        return SceneVote(
+            stamp_ns=vote.stamp_ns, scene=self.selected, value=vote.value, likelihoods=likelihoods
+        )
+
+    def shutdown(self) -> None:
+        """Shut the detector down."""
+        self._detector.shutdown()
+
+
+class Operator:
+    """Carries commands out; `note` takes what came of each as an event."""
+
+    def __init__(
+        self,
+        detector: SteeredDetector,
+        table: Mapping[str, Sequence[str]],
+        save: Callable[[HybridMap, Path], None],
+        folder: Path,
+        note: Callable[..., None],
+    ) -> None:
+        self._detector, self._table = detector, table
+        self._save, self._folder, self._note = save, folder, note
+        self.is_paused = False
+
+    def obey(self, command: Command, stamp_ns: int) -> None:
+        """Carry a command out, or say in an event why not."""
+        refusal = self._carry_out(command)
+        asked, what = type(command).__name__, _what(command)
+        if refusal:
+            self._note("command_refused", stamp_ns, command=asked, what=what, why=refusal)
+        else:
+            self._note("command", stamp_ns, command=asked, what=what)
+
+    def _carry_out(self, command: Command) -> str:
+        """Carry out; return why that is not possible, "" where it was."""
+        match command:
+            case Pause(is_paused=is_paused):
+                self.is_paused = is_paused
+            case SelectScene(scene=scene):
+                return self._select(scene)
+            case SelectModule(module=""):
+                return self._select("")
+            case SelectModule(module=module):
+                scenes = [scene for scene, keys in self._table.items() if keys[0] == module]
+                firsts = ", ".join(sorted({keys[0] for keys in self._table.values()}))
+                return self._select(scenes[0]) if scenes else f"first of a scene are: {firsts}"
+            case SaveMap(name=name, hybrid=hybrid):
+                if not name or Path(name).name != name or name.startswith("."):
+                    return "a name without slashes is wanted"
+                try:
+                    self._save(hybrid, self._folder / "maps" / name)
+                except OSError as error:
+                    return told(error)
+        return ""
+
+    def _select(self, scene: str) -> str:
+        if scene and scene not in self._detector.scenes:
+            return f"the detector's scenes are: {', '.join(self._detector.scenes)}"
+        self._detector.selected = scene
+        return ""
+
+
+def _what(command: Command) -> str:
+    match command:
+        case Pause(is_paused=is_paused):
+            return "on" if is_paused else "off"
+        case SelectScene(scene=what) | SelectModule(module=what) | SaveMap(name=what):
+            return what

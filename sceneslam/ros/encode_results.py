@@ -1,0 +1,153 @@
+"""What a run finds out as ROS 2 messages: path, grid, cloud, diagnostics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.ros.encode import FLOAT32, Encoder
+from sceneslam.types import se3
+from sceneslam.types.maps import GridLayer, PointLayer
+from sceneslam.types.se3 import Transform
+
+UINT32 = 6  # sensor_msgs/PointField
+OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"  # diagnostic_msgs/DiagnosticStatus
+
+
+class ResultEncoder(Encoder):
+    """Builds and serialises results."""
+
+    def pose_odometry(
+        self,
+        stamp_ns: int,
+        T_frame_base: Transform,
+        covariance: NDArray[np.float64] | None,
+        *,
+        frame: str,
+        base: str,
+    ) -> bytes:
+        """Return an Odometry whose pose has a covariance (6, 6) [m, rad] in base, or none.
+
+        The message wants it along the axes of `frame`: it is turned. Velocity is not estimated, as
+        the first entry of its covariance says (-1).
+        """
+        zero = self._new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        unknown = np.zeros(36)
+        unknown[0] = -1.0
+        known = np.zeros((6, 6)) if covariance is None else _turned(covariance, T_frame_base)
+        return self._cdr(
+            "nav_msgs/msg/Odometry",
+            header=self._header(stamp_ns, frame),
+            child_frame_id=base,
+            pose=self._new(
+                "geometry_msgs/msg/PoseWithCovariance",
+                pose=self._pose(T_frame_base),
+                covariance=known.ravel(),
+            ),
+            twist=self._new(
+                "geometry_msgs/msg/TwistWithCovariance",
+                twist=self._new("geometry_msgs/msg/Twist", linear=zero, angular=zero),
+                covariance=unknown,
+            ),
+        )
+
+    def path(
+        self, stamps_ns: Sequence[int], T_frame_base: Sequence[Transform], frame: str
+    ) -> bytes:
+        """Return a Path; stamped as its last pose."""
+        poses = [
+            self._new(
+                "geometry_msgs/msg/PoseStamped",
+                header=self._header(stamp_ns, frame),
+                pose=self._pose(T),
+            )
+            for stamp_ns, T in zip(stamps_ns, T_frame_base, strict=True)
+        ]
+        last_ns = stamps_ns[-1] if len(stamps_ns) else 0
+        return self._cdr("nav_msgs/msg/Path", header=self._header(last_ns, frame), poses=poses)
+
+    def grid(self, stamp_ns: int, grid: GridLayer, T_frame_map: Transform, frame: str) -> bytes:
+        """Return an OccupancyGrid: 0 to 100 per cent occupied, -1 unknown."""
+        occupied = 1.0 / (1.0 + np.exp(-grid.log_odds.astype(np.float32)))
+        percent = np.where(grid.log_odds == 0, -1, np.rint(100 * occupied)).astype(np.int8)
+        rows, columns = percent.shape
+        T_map_corner = se3.from_xy_yaw(*grid.origin_xy_m, 0.0)
+        stamp = self._header(stamp_ns, frame).stamp
+        return self._cdr(
+            "nav_msgs/msg/OccupancyGrid",
+            header=self._header(stamp_ns, frame),
+            info=self._new(
+                "nav_msgs/msg/MapMetaData",
+                map_load_time=stamp,
+                resolution=grid.resolution_m,
+                width=columns,
+                height=rows,
+                origin=self._pose(T_frame_map @ T_map_corner),
+            ),
+            data=percent.ravel(),
+        )
+
+    def cloud(self, stamp_ns: int, layer: PointLayer, T_frame_map: Transform, frame: str) -> bytes:
+        """Return a PointCloud2 with x y z [m] and rgb, packed as RViz and Foxglove read it."""
+        kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")]
+        rows = np.zeros(len(layer.points), dtype=kinds)
+        points = layer.points @ T_frame_map[:3, :3].T.astype(np.float32)
+        points = points + T_frame_map[:3, 3].astype(np.float32)
+        for column, axis in enumerate("xyz"):
+            rows[axis] = points[:, column]
+        if layer.colors_bgr is not None:
+            blue, green, red = layer.colors_bgr.astype(np.uint32).T
+            rows["rgb"] = (red << 16) | (green << 8) | blue
+        fields = [
+            self._new(
+                "sensor_msgs/msg/PointField",
+                name=name,
+                offset=4 * index,
+                datatype=UINT32 if name == "rgb" else FLOAT32,
+                count=1,
+            )
+            for index, (name, _) in enumerate(kinds)
+        ]
+        return self._cdr(
+            "sensor_msgs/msg/PointCloud2",
+            header=self._header(stamp_ns, frame),
+            height=1,
+            width=len(rows),
+            fields=fields,
+            is_bigendian=False,
+            point_step=rows.dtype.itemsize,
+            row_step=rows.dtype.itemsize * len(rows),
+            data=rows.view(np.uint8).ravel(),
+            is_dense=True,
+        )
+
+    def diagnostics(
+        self, stamp_ns: int, level: bytes, message: str, values: Mapping[str, str]
+    ) -> bytes:
+        """Return a DiagnosticArray with one status, `sceneslam`."""
+        entries = [
+            self._new("diagnostic_msgs/msg/KeyValue", key=key, value=value)
+            for key, value in values.items()
+        ]
+        status = self._new(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=level[0],
+            name="sceneslam",
+            message=message,
+            hardware_id="",
+            values=entries,
+        )
+        return self._cdr(
+            "diagnostic_msgs/msg/DiagnosticArray",
+            header=self._header(stamp_ns, ""),
+            status=[status],
+        )
+
+
+def _turned(covariance: NDArray[np.float64], T_frame_base: Transform) -> NDArray[np.float64]:
+    """Return a covariance in base, translation first, along the axes of the frame."""
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = T_frame_base[:3, :3]
+    return np.asarray(turn @ covariance @ turn.T)

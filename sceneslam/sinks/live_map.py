@@ -1,0 +1,96 @@
+"""The map while the robot drives, drawn beside the run: the pose never waits for it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from time import monotonic
+
+import numpy as np
+
+from sceneslam.interfaces import LiveMapper
+from sceneslam.types import se3
+from sceneslam.types.errors import told
+from sceneslam.types.maps import HybridMap, PointLayer
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig
+from sceneslam.types.se3 import Transform
+
+_log = logging.getLogger(__name__)
+_STEP_M, _STEP_RAD = 0.1, 0.1  # what is seen from nearer places than that is seen already
+NOTHING = HybridMap(
+    points=PointLayer(points=np.zeros((0, 3), np.float32)),
+    point_modules=np.zeros(0, np.uint8),
+    modules=(),
+)
+
+
+class LiveMap:
+    """Draws what is seen from new places in a thread of its own; the newest waits, no more."""
+
+    def __init__(
+        self, mapper: LiveMapper, *, every_s: float, publish: Callable[[HybridMap], None]
+    ) -> None:
+        self._mapper, self._every_s, self._publish = mapper, every_s, publish
+        self._waiting: tuple[Observation, Transform] | None = None
+        self._T_map_drawn: Transform | None = None
+        self._newest = NOTHING
+        self._is_closed = False
+        self._changed = threading.Condition()
+        self._thread: threading.Thread | None = None
+
+    def open(self, rig: Rig) -> None:
+        """Begin an empty map."""
+        self._mapper.open(rig)
+        self._is_closed, self._newest, self._T_map_drawn = False, NOTHING, None
+        self._thread = threading.Thread(target=self._draw, name="map", daemon=True)
+        self._thread.start()
+
+    def add(self, observation: Observation, T_map_base: Transform) -> None:
+        """Leave an observation where it was made from a new place."""
+        if not self._is_new(T_map_base):
+            return
+        with self._changed:
+            self._waiting = (observation, T_map_base)
+            self._changed.notify()
+
+    def newest(self) -> HybridMap:
+        """Return the map as it was published last."""
+        return self._newest
+
+    def close(self) -> None:
+        """End the thread. May be called twice."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def _is_new(self, T_map_base: Transform) -> bool:
+        if self._T_map_drawn is None:
+            return True
+        T_drawn_base = se3.inverse(self._T_map_drawn) @ T_map_base
+        way_m = float(np.linalg.norm(T_drawn_base[:3, 3]))
+        return way_m > _STEP_M or float(se3.rotation_angle_rad(T_drawn_base)) > _STEP_RAD
+
+    def _draw(self) -> None:
+        published_s, is_changed = monotonic() - self._every_s, False
+        try:
+            while True:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._waiting or self._is_closed, self._every_s)
+                    waiting, self._waiting = self._waiting, None
+                if self._is_closed:
+                    return
+                if waiting is not None:
+                    self._mapper.add(*waiting)
+                    self._T_map_drawn, is_changed = waiting[1], True
+                if is_changed and monotonic() - published_s >= self._every_s:
+                    published_s, is_changed = monotonic(), False
+                    self._newest = self._mapper.map()
+                    self._publish(self._newest)
+        except Exception as error:
+            _log.warning("the live map is drawn no further: %s", told(error))
+            _log.debug("the whole error", exc_info=error)

@@ -1,0 +1,342 @@
+"""What a robot hears of a run: REP-105's tree, paths, maps; and what its operator may ask."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+from configured import config
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+from test_source_ros2 import CAMERA, scan
+
+from sceneslam.app import run
+from sceneslam.engine.steering import Operator, SteeredDetector
+from sceneslam.modules.maps.live_map import GridAndPoints
+from sceneslam.ros.encode_results import ResultEncoder
+from sceneslam.ros.messages import MessageDecoder, TopicType
+from sceneslam.ros.transport.transport import Arrival
+from sceneslam.sinks.ros2 import requests
+from sceneslam.sinks.ros2 import sink as under_test
+from sceneslam.types import se3
+from sceneslam.types.command import Pause, SaveMap, SelectModule, SelectScene
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.observation import Observation, SceneVote
+from sceneslam.types.rig import Laser, Rig, Sensor
+
+S = 1_000_000_000
+RIG = Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser())
+TYPES = {topic: kind for topic, (kind, _) in under_test._TYPES.items()}
+
+
+class Air:
+    """A transport whose other side is the test's."""
+
+    def __init__(self):
+        self.sent, self.heard, self.is_closed = {}, {}, False
+        self.map_came = threading.Event()
+        self._decoder = MessageDecoder(
+            {topic: TopicType.of_network(kind) for topic, kind in TYPES.items()}
+        )
+
+    def topics(self):
+        return {}
+
+    def subscribe(self, topic, msgtype, heard, qos=None):
+        self.heard[topic] = heard
+
+    def unsubscribe(self, topic):
+        self.heard.pop(topic, None)
+
+    def publisher(self, topic, msgtype, qos=None):
+        air = self
+
+        class Publisher:
+            def publish(self, cdr):
+                air.sent.setdefault(topic, []).append(air._decoder.decode(topic, cdr))
+                if topic == under_test.MAP:
+                    air.map_came.set()
+
+        return Publisher()
+
+    def close(self):
+        self.is_closed = True
+
+    def ask(self, topic, cdr):
+        self.heard[topic](Arrival(topic=topic, cdr=cdr, arrived_ns=0))
+
+    def last(self, topic):
+        return self.sent[topic][-1]
+
+
+@pytest.fixture
+def air(monkeypatch):
+    made = Air()
+    monkeypatch.setattr(under_test, "open_transport", lambda network: made)
+    return made
+
+
+@pytest.fixture
+def sink(air, tmp_path):
+    made = make()
+    made.open(RIG, tmp_path)
+    yield made
+    made.close()
+
+
+def make(**words):
+    with initialize_config_module("sceneslam.conf", version_base="1.3"):
+        settings = OmegaConf.to_container(compose("sinks/ros2").sinks)
+    settings.pop("_target_")
+    mapper = settings.pop("mapper")
+    mapper.pop("_target_")
+    return under_test.Ros2Sink(
+        **(settings | {"map_every_s": 0.0} | words), mapper=GridAndPoints(**mapper)
+    )
+
+
+def at(x_m, y_m=0.0, yaw_rad=0.0):
+    return se3.from_xy_yaw(x_m, y_m, yaw_rad)
+
+
+def seen(stamp_ns, T_odom_base=None):
+    return Observation(stamp_ns=stamp_ns, T_odom_base=T_odom_base, scan=scan(stamp_ns))
+
+
+def transform(message):
+    (entry,) = message.transforms
+    at_, turn = entry.transform.translation, entry.transform.rotation
+    T = se3.from_quat_xyzw(
+        np.array([at_.x, at_.y, at_.z]), np.array([turn.x, turn.y, turn.z, turn.w])
+    )
+    return entry.header.frame_id, entry.child_frame_id, T, stamp_ns(entry)
+
+
+def stamp_ns(message):
+    return message.header.stamp.sec * S + message.header.stamp.nanosec
+
+
+def test_map_to_odom_leads_to_the_pose_over_the_robots_own_odometry(air, sink):
+    T_odom_base, T_map_base = at(2.0, 1.0, 0.7), at(5.0, -1.0, 0.2)
+    sink.write(seen(3 * S, T_odom_base), T_map_base, "laser")
+    frame, child, T_map_odom, at_ns = transform(air.last("/tf"))
+    assert (frame, child, at_ns) == ("map", "odom", 3 * S + 100_000_000)
+    np.testing.assert_allclose(T_map_odom @ T_odom_base, T_map_base, atol=1e-9)
+    assert len(air.sent["/tf"]) == 1  # odom -> base_link is the robot's
+
+
+def test_robot_without_odometry_gets_map_to_base(air, sink):
+    sink.write(seen(S), at(1.0), "laser")
+    frame, child, T_map_base, _ = transform(air.last("/tf"))
+    assert (frame, child) == ("map", "base_link")
+    np.testing.assert_allclose(T_map_base, at(1.0), atol=1e-9)
+
+
+def test_reset_odometry_and_a_clock_that_jumped_are_the_robots_in_what_is_sent(air, sink):
+    sink.write_event(
+        {"event": "clock_jump", "stamp_ns": 0, "topic": "/odom", "shift_ns": 100 * S, "paces": True}
+    )
+    T_smooth_odom = at(3.0, 0.0, 0.5)
+    sink.write_event(
+        {"event": "odometry_jump", "stamp_ns": 0, "T_smooth_odom": T_smooth_odom.ravel().tolist()}
+    )
+    T_odom_base, T_map_base = at(0.1), at(3.2)
+    sink.write(seen(107 * S, T_smooth_odom @ T_odom_base), T_map_base, "laser")
+    _, _, T_map_odom, at_ns = transform(air.last("/tf"))
+    assert at_ns == 7 * S + 100_000_000 and stamp_ns(air.last("/sceneslam/odometry")) == 7 * S
+    np.testing.assert_allclose(T_map_odom @ T_odom_base, T_map_base, atol=1e-9)
+
+
+def test_covariance_is_along_the_axes_of_the_map(air, sink):
+    sink.write_covariance(S, np.diag([0.04, 0.01, 0, 0, 0, 0.02]))
+    sink.write(seen(S, at(0.0)), at(0.0, 0.0, np.pi / 2), "laser")
+    message = air.last("/sceneslam/odometry")
+    assert (message.header.frame_id, message.child_frame_id) == ("map", "base_link")
+    told = np.reshape(message.pose.covariance, (6, 6))
+    np.testing.assert_allclose(np.diag(told), [0.01, 0.04, 0, 0, 0, 0.02], atol=1e-12)
+    sink.write(seen(2 * S, at(0.0)), at(0.0), "laser")  # of which nobody told how certain it is
+    assert not np.any(air.last("/sceneslam/odometry").pose.covariance)
+
+
+def test_scene_and_module_are_said_when_they_change(air, sink):
+    for index, module in enumerate(["a", "a", "b"]):
+        sink.write(seen(index * S, at(0.0)), at(0.0), module)
+    sink.write_event({"event": "scene", "stamp_ns": 0, "scene": "Dark", "previous": None})
+    assert [message.data for message in air.sent["/sceneslam/module"]] == ["a", "b"]
+    assert air.last("/sceneslam/scene").data == "Dark"
+
+
+def test_diagnostics_say_who_tracks_and_how_well(air, sink):
+    sink.write(seen(S, at(0.0)), at(0.0), "laser")
+    assert air.last("/diagnostics").status[0].level == 2  # nobody said that it tracks
+    sink.write_event({"event": "tracking", "stamp_ns": S, "module": "laser", "status": "tracking"})
+    sink.write(seen(3 * S, at(0.0)), at(0.0), "laser")
+    status = air.last("/diagnostics").status[0]
+    assert (status.level, status.message) == (0, "laser: tracking")
+
+
+def test_path_stays_short_however_long_the_run(air, sink, monkeypatch):
+    monkeypatch.setattr(under_test, "_PATH_POSES", 10)
+    for index in range(100):
+        sink.write(seen(index * S // 10, at(0.0)), at(0.1 * index), "laser")
+    poses = air.last("/sceneslam/path").poses
+    assert 5 <= len(poses) <= 10 and poses[0].pose.position.x == 0.0
+    steps = np.diff([pose.pose.position.x for pose in poses])
+    np.testing.assert_allclose(steps, steps[0], atol=1e-6)
+
+
+def test_grid_shows_the_wall_where_the_scan_met_it(air, sink):
+    for index in range(8):
+        sink.write(seen(index * S, at(0.0)), at(2.0 + 0.2 * index), "laser")
+    assert air.map_came.wait(10.0)
+    sink.close()
+    message = air.last("/map")
+    grid = np.reshape(message.data, (message.info.height, message.info.width))
+    origin = message.info.origin.position
+    column = int((3.0 - origin.x) / message.info.resolution)  # a metre ahead of the first place
+    row = int((0.0 - origin.y) / message.info.resolution)
+    assert grid[row, column - 10] < 50 and grid.max() > 50 and grid.min() == -1
+
+
+def test_initial_pose_moves_the_map_under_the_robot(air, sink):
+    encoder = ResultEncoder()
+    T_map_base, T_said = at(2.0, 0.0, 0.1), at(10.0, 5.0, 1.0)
+    message = encoder._new(
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        header=encoder._header(0, "map"),
+        pose=encoder._new(
+            "geometry_msgs/msg/PoseWithCovariance",
+            pose=encoder._pose(T_said),
+            covariance=np.zeros(36),
+        ),
+    )
+    cdr = bytes(encoder._store.serialize_cdr(message, message.__msgtype__))
+    air.ask(requests.INITIAL_POSE, cdr)
+    for x_m in (2.0, 3.0):
+        sink.write(seen(S, at(0.0)), at(x_m, 0.0, 0.1), "laser")
+        _, _, T_frame_odom, _ = transform(air.last("/tf"))
+        expected = T_said @ se3.inverse(T_map_base) @ at(x_m, 0.0, 0.1)
+        np.testing.assert_allclose(T_frame_odom, expected, atol=1e-9)
+
+
+def test_operators_wishes_become_commands(air, sink):
+    encoder = ResultEncoder()
+    air.ask(requests.SELECT_SCENE, encoder.text("Dark"))
+    air.ask(requests.SELECT_MODULE, encoder.text("laser"))
+    air.ask(requests.SAVE_MAP, encoder.text("floor1"))
+    air.ask(requests.PAUSE, bytes([0, 1, 0, 0, 1]))
+    air.ask(requests.PAUSE, b"\x00\x01")  # cut off
+    *others, save = sink.commands()
+    assert others == [
+        SelectScene(scene="Dark"), SelectModule(module="laser"), Pause(is_paused=True),
+    ]  # fmt: skip
+    assert isinstance(save, SaveMap) and save.name == "floor1" and not sink.commands()
+
+
+@pytest.mark.parametrize(
+    ("words", "key"),
+    [
+        ({"map_frame": "odom"}, "map_frame"),
+        ({"base_frame": ""}, "map_frame"),
+        ({"tf_ahead_s": -1.0}, "tf_ahead_s"),
+        ({"transport": "x"}, "transport"),
+    ],
+)
+def test_impossible_settings_are_refused(words, key):
+    with pytest.raises(ConfigError, match=key):
+        make(**words)
+
+
+class Bright:
+    quantity, scenes, requires = "", ("Bright", "Dark"), (frozenset(),)
+
+    def activate(self, rig):
+        pass
+
+    def get_scene(self, observation):
+        return SceneVote(stamp_ns=observation.stamp_ns, scene="Bright", value=3.0)
+
+    def shutdown(self):
+        pass
+
+
+class Desk:
+    """An operator with nothing behind it."""
+
+    def __init__(self, folder):
+        self.detector, self.events, self.saved = SteeredDetector(Bright()), [], []
+        table = {"Bright": ("rgbd", "laser"), "Dark": ("laser",)}
+        self.operator = Operator(
+            self.detector,
+            table,
+            lambda hybrid, path: self.saved.append(path),
+            folder,
+            lambda event, stamp_ns, **fields: self.events.append({"event": event, **fields}),
+        )
+
+    def vote(self):
+        return self.detector.get_scene(Observation(stamp_ns=0)).scene
+
+
+def test_selected_scene_is_voted_for_until_it_is_given_back(tmp_path):
+    desk = Desk(tmp_path)
+    assert desk.vote() == "Bright"
+    for command, scene in [
+        (SelectScene(scene="Dark"), "Dark"),
+        (SelectScene(scene=""), "Bright"),
+        (SelectModule(module="laser"), "Dark"),
+        (SelectModule(module=""), "Bright"),
+    ]:
+        desk.operator.obey(command, 0)
+        assert desk.vote() == scene
+    assert {event["event"] for event in desk.events} == {"command"}
+
+
+@pytest.mark.parametrize(
+    ("command", "why"),
+    [
+        (SelectScene(scene="Fog"), "the detector's scenes are: Bright, Dark"),
+        (SelectModule(module="orb"), "first of a scene are: laser, rgbd"),
+        (SaveMap(name="../x", hybrid=None), "a name without slashes is wanted"),
+        (SaveMap(name="", hybrid=None), "a name without slashes is wanted"),
+    ],
+)
+def test_wish_that_cannot_be_met_is_refused_with_what_can(tmp_path, command, why):
+    desk = Desk(tmp_path)
+    desk.operator.obey(command, 0)
+    assert desk.events[0]["event"] == "command_refused" and desk.events[0]["why"] == why
+    assert desk.vote() == "Bright" and not desk.saved
+
+
+def test_map_is_saved_under_its_name(tmp_path):
+    desk = Desk(tmp_path)
+    desk.operator.obey(SaveMap(name="floor1", hybrid=None), 0)
+    assert desk.saved == [tmp_path / "maps" / "floor1"]
+
+
+def test_points_have_the_colour_of_their_pixel_and_lie_where_it_looked():
+    rig = Rig(sensors=frozenset({Sensor.IMAGE, Sensor.DEPTH}), camera=CAMERA)
+    mapper = GridAndPoints(resolution_m=0.1, voxel_m=0.01, depth_stride_px=1)
+    mapper.open(rig)
+    image = np.full((6, 8, 3), (1, 2, 3), np.uint8)
+    depth_m = np.zeros((6, 8), np.float32)
+    depth_m[3, 4] = 2.0  # the principal point: straight ahead
+    mapper.add(Observation(stamp_ns=0, image_bgr=image, depth_m=depth_m), at(1.0))
+    layer = mapper.map().points
+    np.testing.assert_allclose(layer.points, [[3.0, 0.0, 0.0]], atol=1e-6)
+    assert layer.colors_bgr.tolist() == [[1, 2, 3]]
+    mapper.add(Observation(stamp_ns=1, image_bgr=image, depth_m=depth_m), at(1.0))
+    assert len(mapper.map().points.points) == 1
+
+
+def test_run_says_over_the_air_what_it_says_in_its_folder(air, tmp_path):
+    """A whole run, with the sink as it is configured."""
+    with initialize_config_module("sceneslam.conf", version_base="1.3"):
+        settings = OmegaConf.to_container(compose("sinks/ros2").sinks)
+    finished = run(config(sinks={"ros2": settings}), tmp_path / "out")
+    assert not finished.faults
+    assert len(air.sent["/sceneslam/odometry"]) == len(finished.trajectory)
+    last = air.last("/sceneslam/path").poses[-1].pose.position
+    np.testing.assert_allclose([last.x, last.y], finished.trajectory.positions_m[-1, :2], atol=1e-6)
+    assert air.is_closed
