@@ -7,6 +7,7 @@ down what it hears of a run: poses, path, map, words.
 """
 
 import json
+import pathlib
 import struct
 import sys
 import time
@@ -38,14 +39,14 @@ def messages(path):
     """Return [(topic, type, nanoseconds, bytes)], by time."""
     from mcap.reader import make_reader
 
-    with open(path, "rb") as file:
+    with pathlib.Path(path).open("rb") as file:
         read = make_reader(file).iter_messages()
         found = [(c.topic, s.name, m.log_time, m.data) for s, c, m in read if s.name in SENSORS]
     return [one for one in found if not one[0].startswith(("/sceneslam", "/ground_truth"))]
 
 
 def restamped(data, origin_ns, now_ns):
-    """Return a message whose header's stamp is now for the origin; that is where a header begins."""
+    """Return a message that begins with a header, stamped now where it was stamped the origin."""
     sec, nanosec = struct.unpack_from("<iI", data, 4)
     stamp_ns = sec * 10**9 + nanosec - origin_ns + now_ns
     made = bytearray(data)
@@ -108,8 +109,7 @@ def main(recording, heard_path):
     until_s = time.monotonic() + LINGERS_S
     while time.monotonic() < until_s:
         rclpy.spin_once(node, timeout_sec=0.05)
-    with open(heard_path, "w") as file:
-        json.dump(heard, file)
+    pathlib.Path(heard_path).write_text(json.dumps(heard))
 
 
 main(*sys.argv[1:])

@@ -234,7 +234,7 @@ class Ros2:
                     stamp_ns = sample.stamp_ns
                     if sensor is not streams.pace or primary is streams.pace:
                         yield from ((one, primary) for one in synchroniser.add(sensor, sample))
-            # While messages wait here, the time is that of their arrival: who is heard late is heard.
+            # While messages wait here, the time is theirs: who is read late was heard in time.
             now_ns = monotonic_ns() if arrival is None else arrival.arrived_ns
             if now_ns - looked_ns > _TICK_S * 1e9:
                 looked_ns = now_ns
