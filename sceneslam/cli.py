@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -29,6 +29,7 @@ from sceneslam.config.resolve import resolved
 from sceneslam.config.settings import DETECT_ONLY
 from sceneslam.config.words import check_trust, how_to_quote, is_override, readable, shortened
 from sceneslam.detection.run import detect
+from sceneslam.doctor import examine
 from sceneslam.evaluation.summary import summary_lines
 from sceneslam.evaluation.verdict import verdict_lines
 from sceneslam.experiment import run_experiment
@@ -55,7 +56,9 @@ def main() -> None:
         print(f"SceneSLAM {sceneslam.__version__}")
         sys.exit(OK)
     if sys.argv[1:2] == ["list"]:
-        sys.exit(_list(sys.argv[2:]))
+        sys.exit(_tell(lambda: listing(sys.argv[2:])))
+    if sys.argv[1:2] == ["doctor"]:
+        sys.exit(_tell(lambda: examine(_words(sys.argv[2:]))))
     codes: list[int] = []
     files.register()
 
@@ -80,12 +83,14 @@ def main() -> None:
     sys.exit(max(codes, default=OK))
 
 
-def _list(words: list[str]) -> int:
-    """Print what there is to choose; return the exit code."""
+def _tell(find: Callable[[], list[str]]) -> int:
+    """Print what is found; return the exit code."""
     try:
-        print("\n".join(listing(words)))
+        print("\n".join(find()))
     except SceneSlamError as error:
         return _say(error)
+    except KeyboardInterrupt:
+        return INCOMPLETE
     return OK
 
 

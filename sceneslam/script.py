@@ -32,7 +32,7 @@ def run(
     Raises ConfigError or InputError where nothing could be run. What failed later is in the
     result's `faults`.
     """
-    config = _composed(overrides, config_dir)
+    config = composed(overrides, config_dir)
     if config.get("experiment"):
         raise ConfigError("experiment", config["experiment"], "null: use python -m sceneslam")
     is_stamped = folder is None
@@ -45,7 +45,7 @@ def run(
             raise
 
 
-def _composed(overrides: tuple[str, ...], config_dir: str | Path | None) -> dict[str, object]:
+def composed(overrides: tuple[str, ...], config_dir: str | Path | None) -> dict[str, object]:
     """Return the resolved configuration; raises ConfigError where it cannot be composed."""
     words = [*overrides]
     if config_dir is not None:

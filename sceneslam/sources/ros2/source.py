@@ -15,7 +15,7 @@ from sceneslam.ros.transport.transport import Arrival, Network, Transport, open_
 from sceneslam.sources.bag_frames import FrameTree
 from sceneslam.sources.bag_observation import PRIMARY, BundleDecoder, measured
 from sceneslam.sources.bag_rig import Given, make_rig, picture_size_wh, place, sensor_topics
-from sceneslam.sources.bag_topics import NONE, TYPES, choose_topics
+from sceneslam.sources.bag_topics import NONE, TYPES, choose_topics, first
 from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.sources.intrinsics import checked_above_zero, given_intrinsics, given_range_m
 from sceneslam.sources.ros2.clock import Order, StampClock
@@ -130,6 +130,8 @@ class Ros2:
             {sensor: self._by_sensor[sensor] for sensor in Sensor if sensor in self._by_sensor},
             depth_scale=self._depth_scale,
             sync_tolerance_s=self._sync_tolerance_s,
+            unplaced=self._unplaced(),
+            silent=sorted(self.heard.announced.keys() - self.heard.topics.keys()),
         )
 
     def ground_truth(self) -> GroundTruth | None:
@@ -261,6 +263,13 @@ class Ros2:
             held = measured(message, sensor, self._T_base_imu)
             if held is not None:
                 yield sensor, Sample(stamp_ns=lined.stamp_ns, value=held)
+
+    def _unplaced(self) -> list[str]:
+        """Return the frames of sensors that no transform connects with the base."""
+        topics = (self.topics.image or self.topics.depth, self.topics.scan, self.topics.points)
+        messages = [first(self.heard, topic) for topic in topics if topic]
+        frames = dict.fromkeys(decode.frame_id(one) for one in messages if one is not None)
+        return [frame for frame in frames if self.frames.T_base(frame) is None]
 
     def _where(self) -> str:
         reach = self._network.reach()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,8 @@ def survey_recording(
     *,
     depth_scale: float,
     sync_tolerance_s: float,
+    unplaced: Sequence[str] = (),
+    silent: Sequence[str] = (),
 ) -> Survey:
     """Return the streams of a recording, sampled in stretches of a second."""
     taken: dict[Sensor, list[int]] = {sensor: [] for sensor in topics}
@@ -59,6 +61,8 @@ def survey_recording(
         odometry_ns=np.array(samples.odometry_ns, np.int64),
         T_odom_base=samples.T_odom_base,
         gyro_radps=samples.gyro_radps,
+        unplaced=unplaced,
+        silent=silent,
     )
 
 

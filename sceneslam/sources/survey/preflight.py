@@ -41,7 +41,7 @@ def preflight(survey: Survey, rig: Rig) -> Preflight:
     warnings = [*_of_time(survey), *_of_pairs(survey)]
     if camera is not None:
         warnings += [*_of_lens(camera), *_of_depth(survey, camera)]
-    warnings += [*_of_ranges(survey, rig), *_of_motion(survey)]
+    warnings += [*_of_ranges(survey, rig), *_of_motion(survey), *_of_places(survey)]
     lines = [_line(stream, survey, camera) for stream in survey.streams]
     return Preflight(lines=tuple(lines), warnings=tuple(warnings))
 
@@ -211,6 +211,17 @@ def _of_motion(survey: Survey) -> Iterator[str]:
         if turn > _TURN_MAX_RADPS:
             place = getattr(survey.stream(Sensor.GYRO), "place", "")
             yield f"{place}: {turn:.3g} rad/s are implausible; is its unit degrees?"
+
+
+def _of_places(survey: Survey) -> Iterator[str]:
+    """Yield sensors that nobody says where they sit, and topics that nobody fills."""
+    for frame in survey.unplaced:
+        yield (
+            f"no transform connects frame {frame!r} with the robot's base (source.base_frame): its "
+            "sensor is taken to sit in base, a camera to look along x"
+        )
+    for topic in survey.silent:
+        yield f"{topic} is announced, but nothing came"
 
 
 def _measured(depths_m: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:

@@ -46,6 +46,8 @@ class Survey:
     odometry_ns: Stamps | None = None  # (N,) of ...
     T_odom_base: Sequence[Transform] = ()  # ... these N poses
     gyro_radps: Sequence[NDArray[np.float64]] = ()  # (3,) each
+    unplaced: Sequence[str] = ()  # frames of sensors that no transform connects with the base
+    silent: Sequence[str] = ()  # topics that are announced, though nothing came
 
     def stream(self, sensor: Sensor) -> Stream | None:
         """Return a sensor's stream, None where the recording has none."""

@@ -1,0 +1,119 @@
+"""What a source holds, what it lacks for which module, and the command to run it with."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from importlib.resources import files
+from typing import Any
+
+from sceneslam.config.build import make_source
+from sceneslam.config.component import Builder
+from sceneslam.interfaces import Live, SlamModule
+from sceneslam.script import composed
+from sceneslam.sources.survey.preflight import Preflight, preflight
+from sceneslam.sources.survey.survey import Surveyed
+from sceneslam.types.errors import ConfigError, InputError, told
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.se3 import Transform
+
+_log = logging.getLogger(__name__)
+_KEY = "slam.only"
+_BOTH = (  # scenarios and what they need; the first that fits is proposed
+    ("+scenario=bright_to_dark", {Sensor.IMAGE, Sensor.DEPTH}),
+    ("+scenario=single slam@slam.only=laser", {Sensor.SCAN}),
+    ("+scenario=single slam@slam.only=depth", {Sensor.DEPTH}),
+    ("+scenario=single slam@slam.only=kiss_icp", {Sensor.POINTS}),
+    ("+scenario=single slam@slam.only=odometry", {Sensor.ODOMETRY}),
+)
+
+
+def examine(words: Sequence[str]) -> list[str]:
+    """Return the lines of `python -m sceneslam doctor source=NAME [source.KEY=VALUE ...]`.
+
+    Raises ConfigError or InputError where the source cannot be read at all.
+    """
+    if not any(word.startswith("source=") for word in words):
+        raise ConfigError("doctor", " ".join(words) or "nothing", "source=NAME, as source=ros2")
+    words = [word for word in words if word.startswith(("source", "effects"))]
+    config: dict[str, Any] = composed(tuple(words), None)
+    source = make_source(config, Builder(config))
+    feed = source.live if isinstance(source, Live) else None
+    try:
+        rig = source.rig
+        survey = source.survey() if isinstance(source, Surveyed) else None
+        found = Preflight(lines=(), warnings=()) if survey is None else preflight(survey, rig)
+    finally:
+        if feed is not None:
+            feed.close()
+    return [
+        *(found.lines or [f"sensors: {', '.join(_named(rig.sensors))}"]),
+        *(f"warning: {one}" for one in found.warnings),
+        "",
+        *_places(rig),
+        "",
+        *_modules(words, rig),
+        "",
+        *_proposal(words, rig, is_live=feed is not None),
+    ]
+
+
+def _places(rig: Rig) -> Iterator[str]:
+    """Yield where the sensors sit on the robot."""
+    mounts: dict[str, Transform | None] = {
+        "camera": rig.camera.T_base_cam if rig.camera else None,
+        "laser": rig.laser.T_base_laser if rig.laser else None,
+        "lidar": rig.lidar.T_base_lidar if rig.lidar else None,
+    }
+    for name, T_base_sensor in mounts.items():
+        if T_base_sensor is not None:
+            x, y, z = T_base_sensor[:3, 3]
+            forward = T_base_sensor[:3, 2 if name == "camera" else 0]
+            looks = ", ".join(f"{value:.2f}" for value in forward)
+            yield f"{name:8} at ({x:.2f}, {y:.2f}, {z:.2f}) m in base, looks along ({looks})"
+    if rig.camera is not None:
+        camera = rig.camera
+        width, height = camera.size_wh
+        yield (
+            f"camera   {width}x{height}, fx {camera.fx:.1f}, fy {camera.fy:.1f}, "
+            f"cx {camera.cx:.1f}, cy {camera.cy:.1f} px"
+        )
+
+
+def _modules(words: Sequence[str], rig: Rig) -> Iterator[str]:
+    """Yield for every SLAM module whether it can run, and what it lacks."""
+    names = sorted(path.name for path in files("sceneslam.conf").joinpath("slam").iterdir())
+    for name in (one.removesuffix(".yaml") for one in names if one.endswith(".yaml")):
+        try:
+            config: dict[str, Any] = composed(
+                ("+scenario=single", *words, f"slam@{_KEY}={name}"), None
+            )
+            requires = Builder(config).make(_KEY, SlamModule).requires
+        except (ConfigError, InputError) as error:
+            _log.debug("slam=%s: %s", name, told(error))
+            yield f"{name:12} not tried: {_first_line(error)}"
+            continue
+        lacking = [sensors - rig.sensors for sensors in requires]
+        if not all(lacking):
+            yield f"{name:12} can run"
+        else:
+            needs = ", or ".join(" and ".join(_named(one)) for one in lacking)
+            yield f"{name:12} lacks {needs}"
+
+
+def _proposal(words: Sequence[str], rig: Rig, *, is_live: bool) -> Iterator[str]:
+    scenario = next((text for text, needs in _BOTH if needs <= rig.sensors), None)
+    if scenario is None:
+        yield "no SLAM module can run on this"
+        return
+    more = ["run=live", "+sinks@sinks.ros2=ros2"] if is_live else []
+    yield "run it with:"
+    yield "  " + " ".join(["python -m sceneslam", scenario, *words, *more])
+
+
+def _named(sensors: frozenset[Sensor]) -> list[str]:
+    return [sensor.value for sensor in Sensor if sensor in sensors]
+
+
+def _first_line(error: Exception) -> str:
+    return told(error).splitlines()[0].removeprefix("ConfigError: ")
