@@ -17,7 +17,7 @@ from sceneslam.modules.maps.live_map import GridAndPoints
 from sceneslam.ros.encode_results import ResultEncoder
 from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.ros.transport.transport import Arrival
-from sceneslam.sinks.ros2 import requests
+from sceneslam.sinks.ros2 import requests, topics
 from sceneslam.sinks.ros2 import sink as under_test
 from sceneslam.types import se3
 from sceneslam.types.command import Pause, SaveMap, SelectModule, SelectScene
@@ -27,7 +27,7 @@ from sceneslam.types.rig import Laser, Rig, Sensor
 
 S = 1_000_000_000
 RIG = Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser())
-TYPES = {topic: kind for topic, (kind, _) in under_test._TYPES.items()}
+TYPES = {topic: kind for topic, (kind, _) in topics.TYPES.items()}
 
 
 class Air:
@@ -39,9 +39,6 @@ class Air:
         self._decoder = MessageDecoder(
             {topic: TopicType.of_network(kind) for topic, kind in TYPES.items()}
         )
-
-    def topics(self):
-        return {}
 
     def subscribe(self, topic, msgtype, heard, qos=None):
         self.heard[topic] = heard
@@ -55,7 +52,7 @@ class Air:
         class Publisher:
             def publish(self, cdr):
                 air.sent.setdefault(topic, []).append(air._decoder.decode(topic, cdr))
-                if topic == under_test.MAP:
+                if topic == topics.MAP:
                     air.map_came.set()
 
         return Publisher()
@@ -177,7 +174,7 @@ def test_diagnostics_say_who_tracks_and_how_well(air, sink):
 
 
 def test_path_stays_short_however_long_the_run(air, sink, monkeypatch):
-    monkeypatch.setattr(under_test, "_PATH_POSES", 10)
+    monkeypatch.setattr(topics, "_PATH_POSES", 10)
     for index in range(100):
         sink.write(seen(index * S // 10, at(0.0)), at(0.1 * index), "laser")
     poses = air.last("/sceneslam/path").poses

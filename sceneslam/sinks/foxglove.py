@@ -1,0 +1,140 @@
+"""The run in Foxglove while it runs: what the robot sees, where it is, who works, and why."""
+
+from __future__ import annotations
+
+import json
+import logging
+from importlib.resources import files
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sceneslam.interfaces import LiveMapper
+from sceneslam.ros import names
+from sceneslam.ros.transport.transport import Qos, Transport
+from sceneslam.sinks.ros2 import requests
+from sceneslam.sinks.ros2.topics import TopicSink
+from sceneslam.types.errors import ConfigError, told
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig
+from sceneslam.types.run import Event
+from sceneslam.types.se3 import Transform
+
+EVENTS = "/sceneslam/events"
+PARAMETERS = {  # of Foxglove's panel of that name -> the topic that a value is a message on
+    "scene": requests.SELECT_SCENE,
+    "module": requests.SELECT_MODULE,
+    "paused": requests.PAUSE,
+    "save_map": requests.SAVE_MAP,
+}
+LAYOUT = "foxglove_layout.json"
+_SENSORS = {
+    names.IMAGE: (names.TYPES[names.IMAGE], Qos.SENSOR),
+    names.SCAN: (names.TYPES[names.SCAN], Qos.SENSOR),
+    names.TF_STATIC: (names.TYPES[names.TF_STATIC], Qos.LATCHED),
+    EVENTS: ("std_msgs/msg/String", Qos.RELIABLE),
+}
+_TOLD = ("scene", "decision", "refused", "fault", "warning", "command", "command_refused")
+_log = logging.getLogger(__name__)
+
+
+class FoxgloveSink(TopicSink):
+    """Serves the run on this machine; Foxglove connects, and steers by its panels.
+
+    Beside what a robot hears: every `image_every`-th image, scans, the whole tree of frames, and
+    the events that people look for. The layout lies in the run's folder.
+    """
+
+    def __init__(
+        self,
+        port: int,
+        image_every: int,
+        jpeg_quality: int,
+        map_every_s: float,
+        mapper: LiveMapper,
+    ) -> None:
+        if not 0 <= port <= 65535 or 0 < port < 1024:
+            raise ConfigError("port", port, "1024 to 65535, or 0: any that is free")
+        if image_every < 1:
+            raise ConfigError("image_every", image_every, "1 or more")
+        if not 1 <= jpeg_quality <= 100:
+            raise ConfigError("jpeg_quality", jpeg_quality, "1 to 100")
+        self._port, self._image_every, self._jpeg_quality = port, image_every, jpeg_quality
+        super().__init__(
+            self._serve,
+            map_frame=names.MAP,
+            odom_frame=names.ODOM,
+            base_frame=names.BASE,
+            tf_ahead_s=0.0,
+            map_every_s=map_every_s,
+            mapper=mapper,
+        )
+
+    def open(self, rig: Rig, folder: Path) -> None:
+        """Begin to serve."""
+        self._rig, self._images = rig, 0
+        super().open(rig, folder)
+        layout = files("sceneslam.sinks").joinpath(LAYOUT).read_text()
+        (folder / LAYOUT).write_text(layout)
+
+    def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
+        """Show what was seen, and where."""
+        stamp_ns = observation.stamp_ns
+        if T_map_base is not None and observation.T_odom_base is not None:
+            children = {names.BASE: observation.T_odom_base}
+            self.send(names.TF, self.encoder.transforms(stamp_ns, names.ODOM, children))
+        if observation.scan is not None:
+            self._show(names.SCAN, self.encoder.scan(observation.scan))
+        if observation.image_bgr is not None:
+            self._show_image(stamp_ns, observation.image_bgr)
+        super().write(observation, T_map_base, module)
+
+    def write_event(self, event: Event) -> None:
+        """Show what was decided."""
+        super().write_event(event)
+        if event["event"] in _TOLD:
+            text = json.dumps(dict(event), default=str)
+            self._show(EVENTS, self.encoder.text(text))
+
+    def _serve(self) -> Transport:
+        try:
+            from sceneslam.ros.transport.foxglove_server import FoxgloveTransport
+        except ImportError as error:
+            allowed = f"none, or pip install 'sceneslam[foxglove]' ({told(error)})"
+            raise ConfigError("viewer", "foxglove", allowed) from error
+        served = FoxgloveTransport(self._port, PARAMETERS)
+        for topic, (msgtype, qos) in _SENSORS.items():
+            served.publisher(topic, msgtype, qos)
+        frames = self._frames()
+        if frames:
+            cdr = self.encoder.transforms(0, names.BASE, frames)
+            served.publisher(names.TF_STATIC, *_SENSORS[names.TF_STATIC]).publish(cdr)
+        _log.warning(
+            "Foxglove: open connection %s; layout %s in the run's folder", served.url, LAYOUT
+        )
+        return served
+
+    def _frames(self) -> dict[str, Transform]:
+        rig = self._rig
+        frames = {}
+        if rig.camera:
+            frames[names.CAMERA] = rig.camera.T_base_cam
+        if rig.laser:
+            frames[names.LASER] = rig.laser.T_base_laser
+        return frames
+
+    def _show_image(self, stamp_ns: int, image_bgr: np.ndarray) -> None:
+        self._images += 1
+        if self._images % self._image_every != 0:
+            return
+        quality = [cv2.IMWRITE_JPEG_QUALITY, self._jpeg_quality]
+        done, data = cv2.imencode(".jpeg", image_bgr, quality)
+        if done:
+            jpeg = np.asarray(data, np.uint8)
+            self._show(names.IMAGE, self.encoder.compressed_image(stamp_ns, "jpeg", jpeg))
+
+    def _show(self, topic: str, cdr: bytes) -> None:
+        transport = self._transport
+        if transport is not None:
+            transport.publisher(topic, *_SENSORS[topic]).publish(cdr)
