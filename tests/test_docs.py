@@ -24,17 +24,22 @@ NOT_RUN = {  # first words -> why it is not run here
     ".": "makes the environment that the tests run in",
     "pip install": "needs a network; what it installs is held against pyproject.toml",
     "rerun": "opens a window; the recording is read by tests of the sink",
+    "ros2": "needs a robot's ROS",
+    "export": "is for the reader's shell",
+    "python -m sceneslam doctor source=ros2": "needs a robot; tests of the doctor have one",
     "mkdocs serve": "serves until it is stopped; the site is built by a test",
     "python -m sceneslam.sweep": "goes on with a sweep; tests of sweeps stop one and do",
     "python experiments/": "takes minutes; its numbers stand beside it, a test finds the program",
 }
-SHOWS = "viewer=rerun"  # starts a viewer that stays; tests of the sink start one and end it
+# A viewer stays, a robot is not there: composed only. Tests of these sinks and sources have both.
+SHOWS = re.compile(r"viewer=rerun|source=ros2")
 ASKS = re.compile(r" \+experiment=(?!unswitched)")  # takes minutes; is composed only
 ALL = [(page, command) for page in PAGES for command in commands(page)]
 RUN = [
     (page, command)
     for page, command in ALL
-    if not command.startswith(tuple(NOT_RUN)) and not (SHOWS in command or ASKS.search(command))
+    if not command.startswith(tuple(NOT_RUN))
+    and not (SHOWS.search(command) or ASKS.search(command))
 ]
 
 
@@ -73,8 +78,10 @@ def test_command_runs(workshop, monkeypatch, capfd, page, command):
         assert f"{OBSERVATIONS} poses (coverage 100.0 %)" in said
 
 
-@pytest.mark.parametrize("command", [c for _, c in ALL if ASKS.search(c)])
-def test_experiment_composes(workshop, monkeypatch, capfd, command):
+@pytest.mark.parametrize(
+    "command", [c for _, c in ALL if ASKS.search(c) or ("source=ros2" in c and "doctor" not in c)]
+)
+def test_what_is_not_run_composes(workshop, monkeypatch, capfd, command):
     monkeypatch.chdir(workshop)
     asked = command.replace("sceneslam -m ", "sceneslam ")
     assert run_inside(f"{asked} --cfg job") == 0
