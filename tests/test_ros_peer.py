@@ -36,7 +36,7 @@ def test_run_over_the_air_is_as_good_as_the_run_over_the_recording(tmp_path):
     recording = next((tmp_path / "a").rglob("*.mcap"))
     domain = str(100 + os.getpid() % 100)
     heard_path = tmp_path / "heard.json"
-    words = ["source=ros2", "run=live", "run.end_after_s=3", "run.report=false"]
+    words = ["source=ros2", "run=live", "run.end_after_s=15", "run.report=false"]
     live = subprocess.Popen(
         [sys.executable, "-m", "sceneslam", SCENARIO, *words, "+sinks@sinks.ros2=ros2",
          "run.isolation=process", f"hydra.run.dir={tmp_path / 'b'}"],

@@ -1,16 +1,20 @@
 """What is recorded is read back: observations, rig and truth."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from ros_recordings import STAMP_NS, make_source
 
 from sceneslam.interfaces import Sink
+from sceneslam.ros import names
 from sceneslam.ros.writer import ObservationWriter
 from sceneslam.sinks.mcap import McapSink
+from sceneslam.sources.open_recording import open_recording
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
+from sceneslam.types.maps import GridLayer, PointLayer
 from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Camera, Laser, Lidar, Rig, Sensor, optical_to_rep103
 from sceneslam.types.trajectory import Trajectory
@@ -180,12 +184,12 @@ def test_an_unknown_image_format_is_refused(tmp_path: Path) -> None:
 
 def test_the_sink_refuses_an_unknown_image_format_before_the_run() -> None:
     with pytest.raises(ConfigError) as caught:
-        McapSink("run.mcap", "bmp")
+        McapSink("run.mcap", "bmp", 90, 1, 1)
     assert caught.value.key == "image_format"
 
 
 def test_the_sinks_poses_are_results_and_no_input(tmp_path: Path) -> None:
-    sink = McapSink("run.mcap", "jpeg")
+    sink = McapSink("run.mcap", "jpeg", 90, 1, 1)
     assert isinstance(sink, Sink)
     sink.open(RIG, tmp_path)
     made = observations(3)
@@ -210,3 +214,36 @@ def test_recordings_open_with_the_reference_reader(tmp_path: Path) -> None:
         topics = {channel.topic for _, channel, _ in reader.iter_messages()}
         assert {"/scan", "/points", "/odom", "/imu", "/tf_static"} <= topics
         assert [one.name for one in reader.iter_attachments()] == ["config.yaml"]
+
+
+def test_looked_at_a_recording_of_a_run_shows_map_path_truth_and_velocity(tmp_path: Path) -> None:
+    """As Foxglove draws the paper's Fig. 7: everything in frames that tf connects."""
+    sink = McapSink("run.mcap", "jpeg", 75, 1, 2)
+    sink.open(RIG, tmp_path)
+    made = observations(5)
+    for index, observation in enumerate(made):
+        at = se3.from_xy_yaw(0.2 * index, 0.0, 0.0)
+        sink.write(observation, at, "visual")
+    sink.write_truth(truth(made))
+    grid = GridLayer(
+        log_odds=np.ones((4, 5), np.float32), resolution_m=0.1, origin_xy_m=(-1.0, -2.0)
+    )
+    points = PointLayer(points=np.ones((3, 3), np.float32))
+    trajectory = Trajectory(
+        stamps_ns=np.array([one.stamp_ns for one in made]), T_world_base=np.stack([np.eye(4)] * 5)
+    )
+    result = SimpleNamespace(trajectory=trajectory, map=SimpleNamespace(grid=grid, points=points))
+    sink.write_result(result)
+    sink.close()
+    recording = open_recording(tmp_path / "run.mcap")
+    heard = {topic: [] for topic in recording.topics}
+    for message in recording.messages(heard.keys()):
+        heard[message.topic].append(recording.decode(message))
+    assert len(heard[names.IMAGE]) == 5 and len(heard[names.DEPTH]) == 3
+    assert heard["/map"][0].info.width == 5 and heard["/sceneslam/points"][0].width == 3
+    assert len(heard["/sceneslam/path"][0].poses) == 5
+    period_s = (made[1].stamp_ns - made[0].stamp_ns) / 1e9
+    speed = heard["/sceneslam/odometry"][1].twist.twist.linear.x
+    np.testing.assert_allclose(speed, 0.2 / period_s)
+    static = [entry for one in heard["/tf_static"] for entry in one.transforms]
+    assert ("map", "gt") in [(one.header.frame_id, one.child_frame_id) for one in static]

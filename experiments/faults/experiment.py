@@ -83,7 +83,8 @@ class FaultsExperiment:
         plain["run"] |= {"isolation": "inline", "max_observations": self._cut_off_observations}
         plain["run"] |= {"progress": True}
         mcap = {"_target_": "sceneslam.sinks.mcap.McapSink", "path": "run.mcap"}
-        plain["sinks"] = {"mcap": mcap | {"image_format": "png"}}
+        every = {"jpeg_quality": 95, "image_every": 1, "depth_every": 1}
+        plain["sinks"] = {"mcap": mcap | {"image_format": "png"} | every}
         place = folder / "cut_offs"
         counts = {**self._cut_offs}
         if counts.get("disk") and not can_mount(place / "disk"):

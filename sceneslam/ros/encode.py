@@ -131,9 +131,22 @@ class Encoder:
             is_dense=True,
         )
 
-    def odometry(self, stamp_ns: int, T_frame_base: Transform, frame: str) -> bytes:
-        """Return an Odometry of base_link in `frame`, without velocity and covariance."""
-        zero = self._new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+    def odometry(
+        self,
+        stamp_ns: int,
+        T_frame_base: Transform,
+        frame: str,
+        twist_base: NDArray[np.float64] | None = None,
+    ) -> bytes:
+        """Return an Odometry of base_link in `frame`, without covariance.
+
+        `twist_base` (6,) is the velocity [m/s, rad/s] in base; None: zero.
+        """
+        moves = np.zeros(6) if twist_base is None else twist_base
+        linear, angular = (
+            self._new("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=float(z))
+            for x, y, z in (moves[:3], moves[3:])
+        )
         return self._cdr(
             names.TYPES[names.ODOMETRY],
             header=self._header(stamp_ns, frame),
@@ -145,7 +158,7 @@ class Encoder:
             ),
             twist=self._new(
                 "geometry_msgs/msg/TwistWithCovariance",
-                twist=self._new("geometry_msgs/msg/Twist", linear=zero, angular=zero),
+                twist=self._new("geometry_msgs/msg/Twist", linear=linear, angular=angular),
                 covariance=np.zeros(36),
             ),
         )

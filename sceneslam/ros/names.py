@@ -17,7 +17,10 @@ TF_STATIC = "/tf_static"
 TRUTH_ODOMETRY = "/ground_truth/odom"
 TRUTH_SCENE = "/ground_truth/scene"
 OWN_PREFIX = "/sceneslam/"  # results, never an input
-RESULT_ODOMETRY = OWN_PREFIX + "odom"
+RESULT_ODOMETRY = OWN_PREFIX + "odometry"
+RESULT_PATH = OWN_PREFIX + "path"
+RESULT_POINTS = OWN_PREFIX + "points"
+RESULT_MAP = "/map"
 RESULT_MODULE = OWN_PREFIX + "module"
 RESULT_EVENTS = OWN_PREFIX + "events"  # JSON
 
@@ -36,6 +39,9 @@ TYPES = {
     TRUTH_ODOMETRY: "nav_msgs/msg/Odometry",
     TRUTH_SCENE: "std_msgs/msg/String",
     RESULT_ODOMETRY: "nav_msgs/msg/Odometry",
+    RESULT_PATH: "nav_msgs/msg/Path",
+    RESULT_POINTS: "sensor_msgs/msg/PointCloud2",
+    RESULT_MAP: "nav_msgs/msg/OccupancyGrid",
     RESULT_MODULE: "std_msgs/msg/String",
     RESULT_EVENTS: "std_msgs/msg/String",
 }

@@ -11,11 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.ros import names
-from sceneslam.ros.encode import Encoder
+from sceneslam.ros.encode_results import ResultEncoder
+from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.run import RunResult
 from sceneslam.types.se3 import Transform
+from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
 _CHUNK_BYTES = 256 * 1024  # what a file that was cut off loses at most
@@ -39,7 +42,9 @@ class ObservationWriter:
         self._rig = rig
         self._image_format = image_format
         self._jpeg_quality = jpeg_quality
-        self._encoder = Encoder()
+        self._encoder = ResultEncoder()
+        self._posed: tuple[int, Transform] | None = None
+        self._first_pose: tuple[int, Transform] | None = None
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._last_ns = 0
@@ -82,12 +87,29 @@ class ObservationWriter:
             self._write_image(stamp_ns, observation.image_bgr)
 
     def write_pose(self, stamp_ns: int, T_map_base: Transform) -> None:
-        """Add a result: the pose in `map`, as Odometry and as transform."""
+        """Add a result: the pose in `map`, as Odometry with its velocity and as transform."""
         self._write_frames(stamp_ns)
-        data = self._encoder.odometry(stamp_ns, T_map_base, names.MAP)
+        before, self._posed = self._posed, (stamp_ns, T_map_base)
+        self._first_pose = self._first_pose or self._posed
+        twist_base = None if before is None else _twist(*before, stamp_ns, T_map_base)
+        data = self._encoder.odometry(stamp_ns, T_map_base, names.MAP, twist_base)
         self._add(names.RESULT_ODOMETRY, stamp_ns, data)
         data = self._encoder.transforms(stamp_ns, names.MAP, {names.BASE: T_map_base})
         self._add(names.TF, stamp_ns, data)
+
+    def write_result(self, result: RunResult) -> None:
+        """Add what is known at the end: the revised path, the grid and the coloured points."""
+        trajectory, at_ns = result.trajectory, self._last_ns
+        poses = list(trajectory.T_world_base)
+        path = self._encoder.path(trajectory.stamps_ns.tolist(), poses, names.MAP)
+        self._add(names.RESULT_PATH, at_ns, path)
+        here = np.eye(4)
+        if result.map.grid is not None:
+            grid = self._encoder.grid(at_ns, result.map.grid, here, names.MAP)
+            self._add(names.RESULT_MAP, at_ns, grid)
+        if len(result.map.points.points):
+            cloud = self._encoder.cloud(at_ns, result.map.points, here, names.MAP)
+            self._add(names.RESULT_POINTS, at_ns, cloud)
 
     def write_module(self, stamp_ns: int, module: str) -> None:
         """Add a result: the module that is active from `stamp_ns` on."""
@@ -98,7 +120,11 @@ class ObservationWriter:
         self._add(names.RESULT_EVENTS, stamp_ns, self._encoder.text(text))
 
     def write_truth(self, truth: GroundTruth) -> None:
-        """Add all true poses (float64) and scene changes; any time before `close`."""
+        """Add all true poses (float64) and scene changes; any time before `close`.
+
+        Where there are results, frame `gt` is laid on `map` at the first of their poses.
+        """
+        self._write_truth_frame(truth.trajectory)
         for stamp_ns, T_gt_base in zip(
             truth.trajectory.stamps_ns.tolist(), truth.trajectory.T_world_base, strict=True
         ):
@@ -153,6 +179,15 @@ class ObservationWriter:
             data = self._encoder.transforms(stamp_ns, names.BASE, frames)
             self._add(names.TF_STATIC, stamp_ns, data)
 
+    def _write_truth_frame(self, trajectory: Trajectory) -> None:
+        if self._first_pose is None or not len(trajectory):
+            return
+        stamp_ns, T_map_base = self._first_pose
+        nearest = int(np.abs(trajectory.stamps_ns - stamp_ns).argmin())
+        T_map_gt = T_map_base @ se3.inverse(trajectory.T_world_base[nearest])
+        data = self._encoder.transforms(stamp_ns, names.MAP, {names.GT: T_map_gt})
+        self._add(names.TF_STATIC, stamp_ns, data)
+
     def _add(self, topic: str, stamp_ns: int, data: bytes) -> None:
         if topic not in self._channels:
             msgtype = names.TYPES[topic]
@@ -167,6 +202,16 @@ class ObservationWriter:
         self._mcap.add_message(
             channel_id=self._channels[topic], log_time=stamp_ns, publish_time=stamp_ns, data=data
         )
+
+
+def _twist(
+    before_ns: int, T_map_before: Transform, stamp_ns: int, T_map_base: Transform
+) -> NDArray[np.float64] | None:
+    """Return the velocity (6,) [m/s, rad/s] in base between two poses, None at one instant."""
+    if stamp_ns <= before_ns:
+        return None
+    motion = se3.log(se3.inverse(T_map_before) @ T_map_base)
+    return np.asarray(motion * (1e9 / (stamp_ns - before_ns)))
 
 
 def depth_png(depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:

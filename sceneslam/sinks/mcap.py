@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
+from dataclasses import replace
 from pathlib import Path
 
 from sceneslam.ros.writer import ObservationWriter
@@ -10,19 +12,34 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.files import finish, part_of
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
-from sceneslam.types.run import Event
+from sceneslam.types.run import Event, RunResult
 from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import GroundTruth
 
+_log = logging.getLogger(__name__)
+
 
 class McapSink:
-    """Writes observations, poses in `map` and active modules; read back by `source=mcap`."""
+    """Writes observations, poses in `map`, active modules and, at the end, the map.
 
-    def __init__(self, path: str, image_format: str) -> None:
+    With `image_format` png and every image and depth image, `source=mcap` reads back what the run
+    was given; else it is for looking at.
+    """
+
+    def __init__(
+        self, path: str, image_format: str, jpeg_quality: int, image_every: int, depth_every: int
+    ) -> None:
         if image_format not in ("jpeg", "png"):
             raise ConfigError("image_format", image_format, "jpeg or png")
+        if not 1 <= jpeg_quality <= 100:
+            raise ConfigError("jpeg_quality", jpeg_quality, "1 to 100")
+        for key, every in (("image_every", image_every), ("depth_every", depth_every)):
+            if every < 1:
+                raise ConfigError(key, every, "a whole number of observations from 1")
         self._path = self._file = Path(path)
-        self._image_format = image_format
+        self._image_format, self._jpeg_quality = image_format, jpeg_quality
+        self._image_every, self._depth_every = image_every, depth_every
+        self._images = self._depths = 0
         self._writer: ObservationWriter | None = None
         self._module = ""
 
@@ -31,14 +48,17 @@ class McapSink:
         self._file = folder / self._path
         self._file.parent.mkdir(parents=True, exist_ok=True)
         part = part_of(self._file)
-        self._writer = ObservationWriter(part, rig=rig, image_format=self._image_format)
+        self._writer = ObservationWriter(
+            part, rig=rig, image_format=self._image_format, jpeg_quality=self._jpeg_quality
+        )
+        self._images = self._depths = 0
         self._module = ""
 
     def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
         """Add one observation, its pose where there is one, and the module when it changes."""
         if self._writer is None:
             return
-        self._writer.write(observation)
+        self._writer.write(self._thinned(observation))
         if T_map_base is not None:
             self._writer.write_pose(observation.stamp_ns, T_map_base)
         if module != self._module:
@@ -56,9 +76,27 @@ class McapSink:
         if self._writer is not None:
             self._writer.write_truth(truth)
 
+    def write_result(self, result: RunResult) -> None:
+        """Add the path as revised, the grid and the points."""
+        if self._writer is not None:
+            self._writer.write_result(result)
+
     def close(self) -> None:
-        """Finish the file."""
+        """Finish the file, and say how large it is."""
         if self._writer is not None:
             writer, self._writer = self._writer, None
             writer.close()
             finish(self._file)
+            _log.info("%s: %.1f MB", self._file.name, self._file.stat().st_size / 1e6)
+
+    def _thinned(self, observation: Observation) -> Observation:
+        """Return the observation with the pictures that are due."""
+        if observation.image_bgr is not None:
+            self._images += 1
+            if self._images % self._image_every != 1 % self._image_every:
+                observation = replace(observation, image_bgr=None)
+        if observation.depth_m is not None:
+            self._depths += 1
+            if self._depths % self._depth_every != 1 % self._depth_every:
+                observation = replace(observation, depth_m=None)
+        return observation
