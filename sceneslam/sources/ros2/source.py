@@ -27,7 +27,7 @@ from sceneslam.sources.survey.survey import Survey
 from sceneslam.sources.synchronise import Bundle, Sample, Synchroniser
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.rig import Rig, Sensor, Wheels
 from sceneslam.types.truth import GroundTruth
 
 _TICK_S = 0.1  # how late a silence may be noticed
@@ -68,6 +68,7 @@ class Ros2:
         listen_s: float,
         wait_s: float,
         silent_after_s: float,
+        wheels: Mapping[str, float] | None,
     ) -> None:
         for key, value in (
             ("depth_scale", depth_scale),
@@ -86,6 +87,7 @@ class Ros2:
             intrinsics=given_intrinsics(camera),
             depth_range_m=given_range_m("depth_range_m", depth_range_m),
             lidar_range_m=given_range_m("lidar_range_m", lidar_range_m),
+            wheels=Wheels.given(wheels),
         )
         self._named, self._base_frame = topics, base_frame
         self._depth_scale, self._sync_tolerance_s = depth_scale, sync_tolerance_s
