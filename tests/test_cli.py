@@ -143,7 +143,8 @@ def test_sweep_runs_every_job(folder):
 
 
 def test_recorded_run_can_be_run_again_to_the_same_trajectory(folder):
-    done = call(folder, *SINGLE, "+sinks@sinks.mcap=mcap")
+    exact = ("sinks.mcap.image_format=png", "sinks.mcap.depth_every=1")
+    done = call(folder, *SINGLE, "+sinks@sinks.mcap=mcap", *exact)
     assert done.returncode == 0, done.stderr
     first = (folder / "out" / "trajectory.tum").read_bytes()
     (folder / "out" / "run.mcap").rename(folder / "again.mcap")

@@ -124,10 +124,8 @@ def talking(robot):
     is_over = threading.Event()
 
     def talk():
-        index = 0
         while not is_over.wait(0.01):
-            index += 1
-            robot.measure(index * 10 * MS)
+            robot.measure(monotonic_ns())
 
     thread = threading.Thread(target=talk)
     thread.start()
@@ -160,11 +158,12 @@ def test_observation_holds_what_was_measured_at_its_stamp(make):
     robot = Robot(*ALL)
     source = make(robot)
     heard(source, robot)
-    for index in range(100, 104):
-        robot.measure(index * 33 * MS)
-    observations = iter(source)
+    now_ns = monotonic_ns()
+    for index in range(4):
+        robot.measure(now_ns + index * 33 * MS)
+    observations = (one for one in source if one.stamp_ns >= now_ns)
     taken = [next(observations) for _ in range(3)]
-    assert [one.stamp_ns for one in taken] == [index * 33 * MS for index in range(100, 103)]
+    assert [one.stamp_ns - now_ns for one in taken] == [0, 33 * MS, 66 * MS]
     for one in taken:
         assert one.image_bgr[0, 0, 0] == 7 and one.depth_m[0, 0] == 2.0
         np.testing.assert_allclose(one.T_odom_base[0, 3], one.stamp_ns / S)
@@ -181,7 +180,7 @@ def test_scan_takes_the_place_of_images_that_fall_silent(make):
 
     def drive():
         for index in range(1000):
-            robot.measure(100 * S + index * 20 * MS, without=(IMAGE, DEPTH) if index > 5 else ())
+            robot.measure(monotonic_ns(), without=(IMAGE, DEPTH) if index > 5 else ())
             if over.wait(0.02):
                 return
 
