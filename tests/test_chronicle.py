@@ -129,3 +129,16 @@ def test_chronicle_tells_trials_refusals_and_faults():
 
 def test_nothing_happened_in_a_run_without_events():
     assert tell(poseless_run(3)) == []
+
+
+def test_chronicle_tells_what_happened_to_the_input_of_a_live_run():
+    at_ns = int(stamps(200)[50])
+    entries = tell(
+        run_with(
+            happened("clock_jump", at_ns, topic="/scan", jumped_s=-100.0, shift_ns=1, paces=False),
+            happened("stream_silent", at_ns, topic="/imu", for_s=1.0),
+            happened("late", at_ns, topic="/imu"),  # too common for a story
+        )
+    )
+    told = [entry.what for entry in entries if entry.kind == "trouble"]
+    assert told == ["the clock of /scan jumped by -100 s", "/imu said nothing for 1 s"]

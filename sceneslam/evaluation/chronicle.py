@@ -14,6 +14,17 @@ _SHORT_S = 0.5  # trouble that passes sooner is counted, not told
 _TOLD_TROUBLES = 5  # of one kind and module; more are summed up
 
 
+_OF_INPUT = {  # events of a live run's input -> in words
+    "silent": "the source gave nothing for {for_s:g} s",
+    "returned": "the source is back",
+    "given_up": "the source gave nothing for {for_s:g} s, and the run ended",
+    "stream_silent": "{topic} said nothing for {for_s:g} s",
+    "stream_returned": "{topic} is back",
+    "clock_jump": "the clock of {topic} jumped by {jumped_s:g} s",
+    "odometry_jump": "odometry jumped: it was reset, or moved as no vehicle does",
+}
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Trouble:
     """A stretch in which a module did not track as it should."""
@@ -71,6 +82,7 @@ class _Writer:
             "suspect": self._tell_suspicion,
             "fault": self._tell_fault,
             "dropped": self._tell_dropped,
+            **dict.fromkeys(_OF_INPUT, self._tell_input),
         }
         for event in self._events:
             if event["event"] in tellers:
@@ -195,6 +207,10 @@ class _Writer:
         if event["count"]:
             what = f"{event['count']} observations were dropped in all, for newer ones had come"
             self._add(event["stamp_ns"], "fault", what)
+
+    def _tell_input(self, event: Event) -> None:
+        what = _OF_INPUT[event["event"]]
+        self._add(event["stamp_ns"], "trouble", what.format(**event))
 
 
 def _range(values: Sequence[float]) -> str:

@@ -47,10 +47,12 @@ def degrees(value_rad: float | None, digits: int = 2) -> str:
 
 def _what_was_seen(metrics: Metrics) -> str:
     dropped = f" ({metrics['dropped']} dropped)" if metrics["dropped"] else ""
+    p50_ms, p99_ms = metrics["latency_ms"]["p50"], metrics["latency_ms"]["p99"]
+    latency = "" if p50_ms is None else f", stamp to pose {p50_ms:.0f} ms (p99 {p99_ms:.0f})"
     return (
         f"{metrics['observations']} observations in {metrics['duration_s']:.1f} s{dropped}, "
         f"{metrics['poses']} poses (coverage {percent(metrics['coverage'])}), "
-        f"path {metrics['path_length_m']:.2f} m"
+        f"path {metrics['path_length_m']:.2f} m{latency}"
     )
 
 
