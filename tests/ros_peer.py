@@ -1,9 +1,10 @@
 """A robot for the tests, of another vendor's DDS: run by a Python that has rclpy.
 
-    python ros_peer.py RECORDING.mcap HEARD.json
+    python ros_peer.py RECORDING.mcap HEARD.json [RATE]
 
-Publishes a recording's sensor topics at the pace of their stamps, as if measured now, and writes
-down what it hears of a run: poses, path, map, words.
+Publishes a recording's sensor topics at the pace of their stamps (RATE times: by 0.25 the robot
+drives at a quarter of its speed), as if measured now, and writes down what it hears of a run: poses,
+path, map, words.
 """
 
 import json
@@ -45,16 +46,17 @@ def messages(path):
     return [one for one in found if not one[0].startswith(("/sceneslam", "/ground_truth"))]
 
 
-def restamped(data, origin_ns, now_ns):
+def restamped(data, origin_ns, now_ns, rate=1.0):
     """Return a message that begins with a header, stamped now where it was stamped the origin."""
     sec, nanosec = struct.unpack_from("<iI", data, 4)
-    stamp_ns = sec * 10**9 + nanosec - origin_ns + now_ns
+    stamp_ns = round((sec * 10**9 + nanosec - origin_ns) / rate) + now_ns
     made = bytearray(data)
     struct.pack_into("<iI", made, 4, *divmod(stamp_ns, 10**9))
     return bytes(made)
 
 
-def main(recording, heard_path):
+def main(recording, heard_path, rate=1.0):
+    rate = float(rate)
     rclpy.init()
     node = rclpy.create_node("robot")
     heard = {"poses": [], "path": [], "map": None, "scenes": [], "modules": []}
@@ -96,16 +98,16 @@ def main(recording, heard_path):
     while not heard["poses"] and time.monotonic() < until_s:
         now_ns, round_s = time.time_ns(), time.monotonic() + 0.1
         for topic, _, _, data in opening:
-            publishers[topic].publish(restamped(data, first_ns, now_ns))
+            publishers[topic].publish(restamped(data, first_ns, now_ns, rate))
         while time.monotonic() < round_s:
             rclpy.spin_once(node, timeout_sec=0.01)
     heard["began_ns"], began_s = time.time_ns(), time.monotonic()
-    heard["first_ns"] = first_ns
+    heard["first_ns"], heard["rate"] = first_ns, rate
     for topic, _, at_ns, data in drive:
-        due_s = began_s + (at_ns - first_ns) / 1e9
+        due_s = began_s + (at_ns - first_ns) / 1e9 / rate
         while time.monotonic() < due_s:
             rclpy.spin_once(node, timeout_sec=max(due_s - time.monotonic(), 0.0))
-        publishers[topic].publish(restamped(data, first_ns, heard["began_ns"]))
+        publishers[topic].publish(restamped(data, first_ns, heard["began_ns"], rate))
     until_s = time.monotonic() + LINGERS_S
     while time.monotonic() < until_s:
         rclpy.spin_once(node, timeout_sec=0.05)
