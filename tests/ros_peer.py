@@ -2,9 +2,8 @@
 
     python ros_peer.py RECORDING.mcap HEARD.json [RATE]
 
-Publishes a recording's sensor topics at the pace of their stamps (RATE times: by 0.25 the robot
-drives at a quarter of its speed), as if measured now, and writes down what it hears of a run: poses,
-path, map, words.
+Publishes a recording's sensor topics at the pace of their stamps, as if measured now, and writes
+down what it hears of a run: poses, path, map, words. RATE 0.25: at a quarter of the robot's speed.
 """
 
 import json

@@ -34,7 +34,8 @@ SCENARIO = "+scenario=bright_to_dark"
 def test_run_over_the_air_is_as_good_as_the_run_over_the_recording(tmp_path):
     pytest.importorskip("cyclonedds")
     assert PYTHON is not None
-    recorded = run(SCENARIO, "+sinks@sinks.mcap=mcap", "run.report=false", folder=tmp_path / "a")
+    exact = ("+sinks@sinks.mcap=mcap", "sinks.mcap.depth_every=1", "run.report=false")
+    recorded = run(SCENARIO, *exact, folder=tmp_path / "a")
     recording = next((tmp_path / "a").rglob("*.mcap"))
     domain = str(100 + os.getpid() % 100)
     heard_path = tmp_path / "heard.json"
