@@ -93,7 +93,7 @@ class Results:
             metrics,
             title=self.title,
             config=self.config,
-            threshold=(self.config.get("detector") or {}).get("threshold"),
+            threshold=(self.config.get("evaluation") or {}).get("drawn_threshold"),
             config_yaml=(self.folder / "config.yaml").read_text(),
             versions=self.versions,
             faults=self.faults,

@@ -42,6 +42,7 @@ CONFIG = {
         "correct_limit_m": 0.25,
         "correct_limit_ratio": 0.0,
         "correct_limit_rad": 0.17,
+        "drawn_threshold": None,
         "coverage_min_ratio": 0.9,
     },
     "run": {

@@ -48,9 +48,7 @@ class _Path:
     poses: list[Transform] = field(default_factory=list)  # T_map_base
     modules: list[str] = field(default_factory=list)
     sessions: list[int] = field(default_factory=list)  # that was open, -1 before the first
-    covariances: list[Covariance | None] = field(
-        default_factory=list
-    )  # of T_local_base, as reported
+    covariances: list[Covariance | None] = field(default_factory=list)  # as reported
 
     def add(
         self,

@@ -38,7 +38,6 @@ class Parts:
     sinks: Mapping[str, Sink]
     evaluation: EvaluationSettings
     run: RunSettings
-    threshold: float | None  # of the detector, for the figures
 
     def close(self) -> None:
         """End the processes of the modules that have one."""
@@ -82,7 +81,6 @@ def build(config: Mapping[str, Any]) -> Parts:
         sinks=sinks,
         evaluation=evaluation,
         run=run,
-        threshold=config["detector"].get("threshold"),
     )
 
 

@@ -19,10 +19,13 @@ class EvaluationSettings:
     correct_limit_ratio: float  # ... plus this share of the distance driven so far ...
     correct_limit_rad: float  # ... and within this angle
     coverage_min_ratio: float  # of the observations get a pose; with less a run is incomplete
+    drawn_threshold: float | None  # of the detector's values, a line in their figure
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
+            if field.name == "drawn_threshold":
+                continue
             is_ratio = field.name.endswith("_ratio")
             if not (value > 0 or (is_ratio and value == 0)) or value == float("inf"):
                 allowed = "0 or a finite number above" if is_ratio else "a finite number above 0"
