@@ -17,7 +17,7 @@ from rgbd_loop import MAX_GAP_S, build, camera_only, follow
 
 from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.evaluation.association import interpolated
-from sceneslam.sources.depth_gap import DepthGap
+from sceneslam.sources.failing_sensor import FailingSensor
 from sceneslam.types import se3
 from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.trajectory import Trajectory
@@ -63,7 +63,9 @@ def bridge(overrides: list[str], length_s: float) -> str:
     source, module, truth = build(overrides)
     stamps_ns = [observation.stamp_ns for observation in source]
     gap_s = gap_of(length_s, (stamps_ns[-1] - stamps_ns[0]) * 1e-9)
-    blind = DepthGap(source, [gap_s])
+    blind = FailingSensor(
+        source, "depth_blinded", [gap_s], names_scene=False, otherwise="Bright", seed=0
+    )
     answers, cost = follow(module, (camera_only(observation) for observation in blind))
     revised = module.get_trajectory()
     module.shutdown()

@@ -132,7 +132,8 @@ class FeatureDetector(Detector, Protocol):
     def get_features(self, observation: Observation) -> NDArray[np.float64] | None:
         """Return (F,) numbers, F the same for all; None when it holds nothing to vote on.
 
-        They depend on nothing but the observation and the `feature_settings`.
+        They depend on nothing but the observations since `activate`, which come by rising stamp,
+        and the `feature_settings`.
         """
         ...
 

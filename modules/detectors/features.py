@@ -1,4 +1,7 @@
-"""What can be measured of an observation in a millisecond or two, each as one number."""
+"""What can be measured of an observation in a millisecond or two, each as one number.
+
+FEATURES depend on one observation alone, FEATURES_OVER_TIME also on those before it.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types.observation import LaserScan, Observation
-from sceneslam.types.rig import Sensor
+from sceneslam.types.rig import Rig, Sensor
 
+from . import image_health
 from .grey_mean import grey_mean
+from .lens import Dirt
+from .silence import Frozen, Silent
+from .wheel_check import WheelCheck
 
 _USABLE = (16, 239)  # grey values that are neither lost in read noise nor saturated
 _CORNER_STEP = 20  # grey values; OpenCV's ORB begins with it
@@ -20,12 +27,26 @@ _SCAN_SPAN = 4  # beams to either side that tell a surface's direction
 _SCAN_STEP_M = 0.3  # neighbouring returns farther apart lie on different surfaces
 
 
+_NEAR_M = 0.1  # beyond a scanner's shortest range: what is so near lies on its window
+_DEPTH_STEP_RATIO = 0.1  # of the depth: pixels that differ by more are of different surfaces
+
+Measure = Callable[[Observation], float]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Feature:
     """A number of an observation, NaN where its sensor was silent."""
 
     sensor: Sensor
-    measure: Callable[[Observation], float]
+    measure: Measure
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FeatureOverTime:
+    """A number of the observations so far; `make` begins anew. It is never NaN."""
+
+    sensor: Sensor  # without which it says nothing
+    make: Callable[[Rig], Measure]
 
 
 def usable_ratio(image_bgr: NDArray[np.uint8]) -> float:
@@ -46,6 +67,29 @@ def depth_ratio(depth_m: NDArray[np.float32]) -> float:
     return float(np.count_nonzero(depth_m > 0) / depth_m.size)
 
 
+def depth_noise_ratio(depth_m: NDArray[np.float32]) -> float:
+    """Return the share of measured pixels, in the image's middle, unlike all four beside them."""
+    height, width = depth_m.shape
+    middle_m = depth_m[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    inner_m = middle_m[1:-1, 1:-1]
+    beside_m = (middle_m[:-2, 1:-1], middle_m[2:, 1:-1], middle_m[1:-1, :-2], middle_m[1:-1, 2:])
+    nearest_m = np.minimum.reduce([np.abs(inner_m - other_m) for other_m in beside_m])
+    is_measured = inner_m > 0
+    count = np.count_nonzero(is_measured)
+    is_wild = is_measured & (nearest_m > _DEPTH_STEP_RATIO * inner_m)
+    return float(np.count_nonzero(is_wild) / count) if count else 0.0
+
+
+def scan_near_ratio(scan: LaserScan) -> float:
+    """Return the share of beams that end on the scanner's own window."""
+    return float(np.mean(scan.ranges_m < scan.range_min_m + _NEAR_M))
+
+
+def scan_return_ratio(scan: LaserScan) -> float:
+    """Return the share of beams that return."""
+    return float(np.mean(np.isfinite(scan.ranges_m)))
+
+
 def scan_hold(scan: LaserScan) -> float:
     """Return how well a scan's surfaces hold its weakest direction: 0 (a bare corridor) to 1.
 
@@ -64,24 +108,70 @@ def scan_hold(scan: LaserScan) -> float:
 
 
 def _of_image(measure: Callable[[NDArray[np.uint8]], float]) -> Feature:
-    def told(one: Observation) -> float:
-        return np.nan if one.image_bgr is None else measure(one.image_bgr)
-
-    return Feature(sensor=Sensor.IMAGE, measure=told)
-
-
-def _depth(one: Observation) -> float:
-    return np.nan if one.depth_m is None else depth_ratio(one.depth_m)
+    return Feature(
+        sensor=Sensor.IMAGE,
+        measure=lambda one: np.nan if one.image_bgr is None else measure(one.image_bgr),
+    )
 
 
-def _scan(one: Observation) -> float:
-    return np.nan if one.scan is None else scan_hold(one.scan)
+def _of_depth(measure: Callable[[NDArray[np.float32]], float]) -> Feature:
+    return Feature(
+        sensor=Sensor.DEPTH,
+        measure=lambda one: np.nan if one.depth_m is None else measure(one.depth_m),
+    )
+
+
+def _of_scan(measure: Callable[[LaserScan], float]) -> Feature:
+    return Feature(
+        sensor=Sensor.SCAN, measure=lambda one: np.nan if one.scan is None else measure(one.scan)
+    )
 
 
 FEATURES: Mapping[str, Feature] = {
     "grey_mean": _of_image(grey_mean),
     "usable_ratio": _of_image(usable_ratio),
     "corner_count": _of_image(corner_count),
-    "depth_ratio": Feature(sensor=Sensor.DEPTH, measure=_depth),
-    "scan_hold": Feature(sensor=Sensor.SCAN, measure=_scan),
+    "grey_peak": _of_image(image_health.grey_peak),
+    "overexposed_ratio": _of_image(image_health.overexposed_ratio),
+    "sharpness": _of_image(image_health.sharpness),
+    "depth_ratio": _of_depth(depth_ratio),
+    "depth_noise_ratio": _of_depth(depth_noise_ratio),
+    "scan_hold": _of_scan(scan_hold),
+    "scan_near_ratio": _of_scan(scan_near_ratio),
+    "scan_return_ratio": _of_scan(scan_return_ratio),
+}
+
+
+def _image(one: Observation) -> NDArray[np.uint8] | None:
+    return one.image_bgr
+
+
+def _depth(one: Observation) -> NDArray[np.float32] | None:
+    return one.depth_m
+
+
+def _ranges(one: Observation) -> NDArray[np.float32] | None:
+    return None if one.scan is None else one.scan.ranges_m
+
+
+def _odometry(one: Observation) -> NDArray[np.float64] | None:
+    return one.T_odom_base
+
+
+def _over_time(sensor: Sensor, make: Callable[[], Measure]) -> FeatureOverTime:
+    return FeatureOverTime(sensor=sensor, make=lambda rig: make())
+
+
+FEATURES_OVER_TIME: Mapping[str, FeatureOverTime] = {
+    "image_silent_s": _over_time(Sensor.IMAGE, lambda: Silent(_image)),
+    "depth_silent_s": _over_time(Sensor.DEPTH, lambda: Silent(_depth)),
+    "scan_silent_s": _over_time(Sensor.SCAN, lambda: Silent(_ranges)),
+    "odometry_silent_s": _over_time(Sensor.ODOMETRY, lambda: Silent(_odometry)),
+    "image_frozen_s": _over_time(Sensor.IMAGE, lambda: Frozen(_image)),
+    "depth_frozen_s": _over_time(Sensor.DEPTH, lambda: Frozen(_depth)),
+    "scan_frozen_s": _over_time(Sensor.SCAN, lambda: Frozen(_ranges, needs_motion=True)),
+    "flicker_hz": _over_time(Sensor.IMAGE, image_health.Flicker),
+    "tear_count": _over_time(Sensor.IMAGE, image_health.Tears),
+    "dirt_ratio": FeatureOverTime(sensor=Sensor.IMAGE, make=Dirt),
+    "wheel_ratio": FeatureOverTime(sensor=Sensor.ODOMETRY, make=WheelCheck),
 }

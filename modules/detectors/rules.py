@@ -13,7 +13,7 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import UNSURE, Observation, SceneVote
 from sceneslam.types.rig import Rig, Sensor
 
-from .features import FEATURES
+from .features import FEATURES, FEATURES_OVER_TIME, Measure
 
 Limits = Mapping[str, Sequence[float | None]]
 
@@ -23,6 +23,7 @@ class _Rule:
     """A scene, and within which limits (low, high) each of its features lies."""
 
     scene: str
+    sensors: frozenset[Sensor]
     indices: NDArray[np.int64]
     low: NDArray[np.float64]
     high: NDArray[np.float64]
@@ -44,13 +45,15 @@ class Rules:
     """Votes for the first scene, in the rules' order, whose conditions all hold.
 
     Each rule has a name of its own, by which an overlay can change it, and is `{scene: NAME, when:
-    {FEATURE: [low, high], ...}}` with null for no limit; a rule that is null is none. Where no rule
-    holds it votes for `otherwise` (null: UNSURE). The scene voted last keeps until its limits,
-    wider by `hysteresis_ratio` of themselves, are left, or a rule before it holds.
+    {FEATURE: [low, high], ...}}` with null for no limit. A rule that is null is left out, and with
+    `skip_absent_sensors` so is one on a sensor that the source does not have. Where no rule holds
+    the vote is `otherwise` (null: UNSURE). The scene voted last stays until its limits, wider by
+    `hysteresis_ratio` of themselves, are left, or an earlier rule holds. A measurement counts for
+    `hold_s`, so that sensors need not measure at the same stamps.
     """
 
     quantity = ""
-    feature_settings = ("features",)
+    feature_settings = ("features", "hold_s")
 
     def __init__(
         self,
@@ -58,20 +61,24 @@ class Rules:
         rules: dict[str, dict[str, Any] | None],
         otherwise: str | None,
         hysteresis_ratio: float,
+        hold_s: float = 0.0,
+        skip_absent_sensors: bool = False,
     ) -> None:
-        if not features or not set(features) <= set(FEATURES) or len(set(features)) < len(features):
-            raise ConfigError(
-                "features", list(features), f"different ones of {', '.join(FEATURES)}"
-            )
+        _check_features(features)
         if not 0 <= hysteresis_ratio < 1:
             raise ConfigError("hysteresis_ratio", hysteresis_ratio, "0 to below 1")
+        if not 0 <= hold_s < np.inf:
+            raise ConfigError("hold_s", hold_s, "seconds, 0 or more")
         used = {name: rule for name, rule in rules.items() if rule is not None}
         if not used:
             raise ConfigError("rules", rules, "one rule or more that is not null")
         if otherwise in ("", UNSURE):
             raise ConfigError("otherwise", otherwise, f"a scene, not {UNSURE}, or null")
         self._features = tuple(features)
+        self._hold_ns = round(hold_s * 1e9)
+        self._skips = skip_absent_sensors
         self._rules = [self._read(f"rules.{name}", rule) for name, rule in used.items()]
+        self._present = self._rules  # those whose sensors the rig has
         self._otherwise = otherwise or UNSURE
         self._hysteresis_ratio = hysteresis_ratio
         self._voted: str | None = None
@@ -80,21 +87,37 @@ class Rules:
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return the sensors of all features."""
-        return (frozenset(FEATURES[name].sensor for name in self._features),)
+        """Return the sensors of all features; none where rules on absent ones are left out."""
+        if self._skips:
+            return (frozenset(),)
+        return (frozenset(_sensor(name) for name in self._features),)
 
     def activate(self, rig: Rig) -> None:
-        """Forget the last vote."""
+        """Forget the last vote and all measurements."""
         self._voted = None
+        self._measures: list[Measure] = [
+            FEATURES[name].measure if name in FEATURES else FEATURES_OVER_TIME[name].make(rig)
+            for name in self._features
+        ]
+        self._latest = np.full(len(self._features), np.nan)
+        self._measured_ns = np.zeros(len(self._features), np.int64)
+        self._present = [
+            rule for rule in self._rules if not self._skips or rule.sensors <= rig.sensors
+        ]
 
     def get_scene(self, observation: Observation) -> SceneVote:
         """Return the first scene whose conditions hold."""
         return self.decide(observation.stamp_ns, self.get_features(observation))
 
     def get_features(self, observation: Observation) -> NDArray[np.float64] | None:
-        """Return (F,) the configured features, NaN where a sensor was silent."""
-        told = np.array([FEATURES[name].measure(observation) for name in self._features])
-        return None if np.isnan(told).all() else told
+        """Return (F,) the configured features, NaN where a sensor was silent for `hold_s`."""
+        values = np.array([measure(observation) for measure in self._measures])
+        is_new = ~np.isnan(values)
+        self._latest[is_new] = values[is_new]
+        self._measured_ns[is_new] = observation.stamp_ns
+        is_old = observation.stamp_ns - self._measured_ns >= self._hold_ns
+        values = np.where(is_old & ~is_new, np.nan, self._latest)
+        return None if np.isnan(values).all() else values
 
     def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
         """Return the vote; UNSURE where a rule that comes first cannot be judged."""
@@ -108,7 +131,7 @@ class Rules:
         """Do nothing: there is nothing to free."""
 
     def _first(self, features: NDArray[np.float64]) -> str:
-        for rule in self._rules:
+        for rule in self._present:
             margin_ratio = self._hysteresis_ratio if rule.scene == self._voted else 0.0
             holds = rule.holds(features, margin_ratio)
             if holds is None:
@@ -129,14 +152,26 @@ class Rules:
         highs = [np.inf if limits[1] is None else limits[1] for limits in when.values()]
         return _Rule(
             scene=scene,
+            sensors=frozenset(map(_sensor, when)),
             indices=np.array([self._features.index(name) for name in when], np.int64),
             low=np.array(lows, np.float64),
             high=np.array(highs, np.float64),
         )
 
 
+def _sensor(feature: str) -> Sensor:
+    found = FEATURES.get(feature) or FEATURES_OVER_TIME[feature]
+    return found.sensor
+
+
+def _check_features(names: Sequence[str]) -> None:
+    known = (*FEATURES, *FEATURES_OVER_TIME)
+    if not names or not set(names) <= set(known) or len(set(names)) < len(names):
+        raise ConfigError("features", list(names), f"different ones of {', '.join(known)}")
+
+
 def _check(key: str, limits: Sequence[float | None]) -> None:
-    """Raise ConfigError where limits are no [low, high]."""
+    """Raise ConfigError unless limits are [low, high]."""
     is_pair = isinstance(limits, Sequence) and not isinstance(limits, str) and len(limits) == 2
     numbers = [one for one in limits if one is not None] if is_pair else []
     is_number = all(isinstance(one, int | float) and np.isfinite(one) for one in numbers)

@@ -79,7 +79,7 @@ class LightsOut(Wrapped):
     def ground_truth(self) -> GroundTruth | None:
         """Return the source's truth with the scenes that the schedule makes of it."""
         truth = self._source.ground_truth()
-        start_ns = self._start_ns()
+        start_ns = self.start_ns()
         if start_ns is None:
             return truth
         before = truth.scenes if truth is not None else ()
@@ -108,12 +108,6 @@ class LightsOut(Wrapped):
                 "schedule_unit", "ratio", "seconds, as this source does not know its duration"
             )
         return (span.end_ns - span.start_ns) * 1e-9
-
-    def _start_ns(self) -> int | None:
-        if self.span is not None:
-            return self.span.start_ns
-        first = next(iter(self._source), None)
-        return None if first is None else first.stamp_ns
 
 
 def _merge(

@@ -44,3 +44,10 @@ class Wrapped:
     def survey(self) -> Survey | None:
         """Return what the source holds where it can be looked at; effects are not in it."""
         return self._source.survey() if isinstance(self._source, Surveyed) else None
+
+    def start_ns(self) -> int | None:
+        """Return the stamp of the first observation, None where there is none."""
+        if self.span is not None:
+            return self.span.start_ns
+        first = next(iter(self._source), None)
+        return None if first is None else first.stamp_ns

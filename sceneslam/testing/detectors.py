@@ -55,15 +55,16 @@ def survives_an_empty_observation(make: Make) -> None:
 
 def votes_by_features_that_can_be_kept(make: Make) -> None:
     """Check that features, where it has any, decide the vote whenever they were taken."""
+    observations = [room_observation(index) for index in range(3)]
+    observations.insert(2, Observation(stamp_ns=observations[1].stamp_ns + 1))
     with _active(make) as detector:
         if not isinstance(detector, FeatureDetector):
             return
-        observations = [room_observation(index) for index in range(3)]
-        observations.insert(2, Observation(stamp_ns=observations[1].stamp_ns + 1))
         kept = [(one.stamp_ns, detector.get_features(one)) for one in observations]
+    with _active(make) as detector:
         votes = [repr(detector.get_scene(one)) for one in observations]
-        detector.shutdown()
-        detector.activate(RIG)
+    with _active(make) as detector:
+        assert isinstance(detector, FeatureDetector)
         again = [repr(detector.decide(stamp_ns, features)) for stamp_ns, features in kept]
         expect(again == votes, f"decide: {votes}", again)
 
