@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
+from statistics import median
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from sceneslam.types.rig import Rig
 _WIDTH_PX = 96  # of the small images that are compared
 _TURN_RAD = 0.15  # between two images; a view of 57 degrees moves by 15 % of its width
 _SPAN_NS = 2_000_000_000  # within which the robot turns so far, and for which a finding holds
+_FINDINGS = 7  # of which the median counts: an edge may stay by chance for an image or two
 _REACH_PX = 9  # what else may have moved a point, by parallax: translation, tilt
 _STAYED, _MOVED = 8, 16  # grey values: at most so different where it was, so much from all around
 
@@ -39,16 +41,16 @@ class Dirt:
     _views: deque[_View] = field(default_factory=deque)
     _yaw_rad: float = 0.0
     _last: Observation | None = None
-    _found: float = 0.0
-    _found_ns: int = 0
+    _found: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=_FINDINGS))
 
     def __call__(self, observation: Observation) -> float:
-        """Return the share of the image that is dirty, as found in the last two seconds."""
+        """Return the share of the image that is dirty, the median of the last findings."""
         self._turn(observation)
         if observation.image_bgr is not None and self.rig.camera is not None:
             self._compare(observation.stamp_ns, observation.image_bgr, self.rig.camera.fx)
-        is_old = observation.stamp_ns - self._found_ns > _SPAN_NS
-        return 0.0 if is_old else self._found
+        while self._found and observation.stamp_ns - self._found[0][0] > _SPAN_NS:
+            self._found.popleft()
+        return median(ratio for _, ratio in self._found) if self._found else 0.0
 
     def _turn(self, observation: Observation) -> None:
         """Follow the robot's yaw by the gyro, or else by the wheels."""
@@ -85,8 +87,7 @@ class Dirt:
         # A turn to the left moves the view to the right.
         shift_px = round(fx_px / width * _WIDTH_PX * np.tan(now.yaw_rad - before.yaw_rad))
         if 0 < abs(shift_px) <= _WIDTH_PX // 2:
-            self._found = _dirty_ratio(before.grey, now.grey, shift_px)
-            self._found_ns = stamp_ns
+            self._found.append((stamp_ns, _dirty_ratio(before.grey, now.grey, shift_px)))
 
 
 def _dirty_ratio(before: NDArray[np.uint8], now: NDArray[np.uint8], shift_px: int) -> float:
