@@ -117,7 +117,7 @@ def score(filter_: SceneFilter, one: Drive) -> Score:
     found = [scene for scene in map(filter_.update, one.votes) if scene is not None]
     events = [{"stamp_ns": scene.stamp_ns, "scene": scene.scene} for scene in found]
     end_ns = one.votes[-1].stamp_ns
-    scores = score_detection(events, one.truth, end_ns)
+    scores = score_detection(events, one.truth, end_ns, {})
     first_ns = found[0].stamp_ns if found else end_ns  # until then no scene is known
     return Score(
         false=scores["false"],

@@ -27,6 +27,7 @@ SETTINGS = EvaluationSettings(
     correct_limit_rad=0.1745,
     coverage_min_ratio=0.9,
     drawn_threshold=None,
+    scenes={},
 )
 
 

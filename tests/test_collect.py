@@ -13,7 +13,7 @@ import pytest
 
 from sceneslam.collect.__main__ import main
 from sceneslam.collect.chart import Line, Point, draw_lines, front
-from sceneslam.collect.curves import charts
+from sceneslam.collect.curves import _alike, charts
 from sceneslam.collect.flatten import flat
 from sceneslam.collect.rows import Row, read_rows
 from sceneslam.collect.status import State, Status
@@ -215,3 +215,8 @@ def test_front_weighs_settings_over_all_recordings_where_they_ran_to_the_end():
     rows.append(Row(name="3", status="failed", keys={"story": "hard", "window": 3}, metrics={}))
     page = " ".join(charts(groups_of(rows)))
     assert "no other is better than: window=1: 1 s, 2 false; window=2: 3 s, 0.5 false." in page
+
+
+def test_settings_that_do_alike_are_told_once_by_the_one_in_the_middle():
+    twins = [Point(x=1.0, y=0.0, label=f"threshold={value}") for value in (60, 80, 100)]
+    assert _alike(twins) == "threshold=80 (as 2 others): 1 s, 0 false"

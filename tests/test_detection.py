@@ -190,3 +190,16 @@ def test_lists_and_flags_are_swept_like_numbers(cache, tmp_path):
     assert [row["run.progress"] for row in rows] == ["True"] * 2 + ["False"] * 2
     assert rows[0]["detector.features"] == "[grey_mean, corner_count, depth_ratio]"
     assert [row["status"] for row in rows] == ["done", "failed"] * 2
+
+
+def test_cells_without_a_swept_key_are_left_out_and_named(cache, tmp_path):
+    words = ("detector=grey_mean,learned", "detector.threshold=80,100", "run.max_observations=20")
+    done, rows = swept(cache, tmp_path, *words)
+    told_of = [(row["detector"], row["detector.threshold"]) for row in rows]
+    assert told_of == [("grey_mean", "80"), ("grey_mean", "100"), ("learned", "")]
+    assert done.returncode == 0 and "left out: detector.threshold" in done.stdout, done.stderr
+
+
+def test_swept_key_that_no_cell_has_is_named(cache, tmp_path):
+    with pytest.raises(FileNotFoundError):  # there is no table
+        swept(cache, tmp_path, "detector=grey_mean,learned", "detector.treshold=80,100")

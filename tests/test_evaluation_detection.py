@@ -14,9 +14,9 @@ TRUTH = GroundTruth(
 )
 
 
-def score(*seen, truth=TRUTH):
+def score(*seen, truth=TRUTH, scenes=None):
     events = [{"stamp_ns": round(at * S), "scene": scene} for at, scene in seen]
-    return score_detection(events, truth, 30 * S)
+    return score_detection(events, truth, 30 * S, scenes or {})
 
 
 def test_every_change_found_late_by_the_window():
@@ -62,3 +62,12 @@ def test_nothing_confirmed_finds_nothing():
 def test_truth_that_speaks_of_other_scenes_says_nothing():
     scores = score((0, "Light"), (12, "Night"))
     assert scores["confirmed"] == 2 and scores["false"] is None
+
+
+def test_own_names_of_scenes_count_as_those_of_the_truth():
+    seen = ((0, "Hall"), (12, "Tunnel"), (14, "Corridor"), (21, "Hall"))
+    names = {"Hall": "Bright", "Tunnel": "Dark", "Corridor": "Dark"}
+    scores = score(*seen, scenes=names)
+    assert scores["confirmed"] == 4
+    assert (scores["false"], scores["missed"], scores["delay_max_s"]) == (0, 0, 2.0)
+    assert score(*seen)["false"] is None

@@ -112,7 +112,7 @@ def test_failure_is_named_within_a_second_and_nothing_before(failure):
 def test_dirt_shows_once_the_robot_has_turned():
     dirt = Dirt(RIG)
     ratios = [dirt(seen) for seen in failing(Listed(list(drive())), "camera_dirty", seed=4)]
-    assert max(ratios[:20]) < 0.001 and min(ratios[26:40]) > 0.02
+    assert max(ratios[:20]) < 0.001 and min(ratios[30:40]) > 0.02
 
 
 def test_truth_names_the_failure_while_it_lasts():

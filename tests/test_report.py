@@ -20,6 +20,7 @@ from evaluation_runs import (
     true_loop,
 )
 
+from sceneslam.evaluation.figure_features import feature_limits
 from sceneslam.evaluation.figure_time import draw_timeline
 from sceneslam.evaluation.figures import write_figures
 from sceneslam.evaluation.metrics import evaluate
@@ -31,7 +32,7 @@ LIMIT_BYTES = 150_000
 
 
 def draw(folder, run, truth, **more):
-    drawn = write_figures(folder, run, truth, threshold=100.0, **more)
+    drawn = write_figures(folder, run, truth, threshold=100.0, limits={"light": [55.0]}, **more)
     assert all(figure.png.stat().st_size < LIMIT_BYTES for figure in drawn)
     assert all(len(figure.svg) < 3 * LIMIT_BYTES for figure in drawn)
     return [figure.name for figure in drawn]
@@ -100,6 +101,24 @@ def test_figures_are_the_same_bytes_each_time(tmp_path):
     draw(tmp_path / "b", switched_run(), true_loop())
     for first in (tmp_path / "a").iterdir():
         assert first.read_bytes() == (tmp_path / "b" / first.name).read_bytes()
+
+
+def test_what_rules_measure_is_drawn_with_their_limits(tmp_path):
+    run = switched_run()
+    events = [
+        event | {"features": {"light": 50.0 + k, "other": 1.0}}
+        if event["event"] == "vote"
+        else event
+        for k, event in enumerate(run.events)
+    ]
+    names = draw(tmp_path, replace(run, events=events), None)
+    assert names == ["map", "timeline", "grey_mean", "features"]
+
+
+def test_limits_of_rules_are_read_with_their_named_values():
+    rules = {"dark": {"when": {"grey_mean": [None, "dim"]}}, "plain": None}
+    rules["half"] = {"when": {"grey_mean": ["dim", 90.0]}}
+    assert feature_limits({"values": {"dim": 55.0}, "rules": rules}) == {"grey_mean": [55.0, 90.0]}
 
 
 def test_figures_without_truth_leave_out_the_error(tmp_path):

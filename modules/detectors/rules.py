@@ -15,7 +15,8 @@ from sceneslam.types.rig import Rig, Sensor
 
 from .features import FEATURES, FEATURES_OVER_TIME, Measure
 
-Limits = Mapping[str, Sequence[float | None]]
+Limit = float | str | None  # str: the name of a value
+Limits = Mapping[str, Sequence[Limit]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,7 +50,8 @@ class Rules:
     `skip_absent_sensors` so is one on a sensor that the source does not have. Where no rule holds
     the vote is `otherwise` (null: UNSURE). The scene voted last stays until its limits, wider by
     `hysteresis_ratio` of themselves, are left, or an earlier rule holds. A measurement counts for
-    `hold_s`, so that sensors need not measure at the same stamps.
+    `hold_s`, so that sensors need not measure at the same stamps. A limit may be the name of one
+    of the `values`, which several rules then share.
     """
 
     quantity = ""
@@ -62,6 +64,7 @@ class Rules:
         otherwise: str | None,
         hysteresis_ratio: float,
         hold_s: float = 0.0,
+        values: dict[str, float] | None = None,
         skip_absent_sensors: bool = False,
     ) -> None:
         _check_features(features)
@@ -77,6 +80,7 @@ class Rules:
         self._features = tuple(features)
         self._hold_ns = round(hold_s * 1e9)
         self._skips = skip_absent_sensors
+        self._values = dict(values or {})
         self._rules = [self._read(f"rules.{name}", rule) for name, rule in used.items()]
         self._present = self._rules  # those whose sensors the rig has
         self._otherwise = otherwise or UNSURE
@@ -122,10 +126,12 @@ class Rules:
     def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
         """Return the vote; UNSURE where a rule that comes first cannot be judged."""
         scene = UNSURE if features is None else self._first(features)
-        if scene == UNSURE:
+        if scene != UNSURE:
+            self._voted = scene
+        if features is None:
             return SceneVote(stamp_ns=stamp_ns, scene=UNSURE)
-        self._voted = scene
-        return SceneVote(stamp_ns=stamp_ns, scene=scene)
+        measured = dict(zip(self._features, features.tolist(), strict=True))
+        return SceneVote(stamp_ns=stamp_ns, scene=scene, features=measured)
 
     def shutdown(self) -> None:
         """Do nothing: there is nothing to free."""
@@ -146,17 +152,27 @@ class Rules:
             raise ConfigError(key, dict(rule), f"a scene, not {UNSURE}, and when")
         if not isinstance(when, Mapping) or not when or not set(when) <= set(self._features):
             raise ConfigError(f"{key}.when", when, f"limits of {', '.join(self._features)}")
-        for name, limits in when.items():
-            _check(f"{key}.when.{name}", limits)
-        lows = [-np.inf if limits[0] is None else limits[0] for limits in when.values()]
-        highs = [np.inf if limits[1] is None else limits[1] for limits in when.values()]
+        pairs = [self._pair(f"{key}.when.{name}", limits) for name, limits in when.items()]
         return _Rule(
             scene=scene,
             sensors=frozenset(map(_sensor, when)),
             indices=np.array([self._features.index(name) for name in when], np.int64),
-            low=np.array(lows, np.float64),
-            high=np.array(highs, np.float64),
+            low=np.array([low for low, _ in pairs], np.float64),
+            high=np.array([high for _, high in pairs], np.float64),
         )
+
+    def _pair(self, key: str, limits: Sequence[Limit]) -> tuple[float, float]:
+        """Return [low, high] as numbers; raises ConfigError."""
+        is_pair = isinstance(limits, Sequence) and not isinstance(limits, str) and len(limits) == 2
+        known = [self._values.get(x, x) if isinstance(x, str) else x for x in limits or ()]
+        numbers = [one for one in known if one is not None] if is_pair else []
+        is_number = all(isinstance(one, int | float) and np.isfinite(one) for one in numbers)
+        if not is_pair or not is_number or sorted(set(numbers)) != numbers or not numbers:
+            names = f", or one of values: {', '.join(self._values)}" if self._values else ""
+            allowed = f"[low, high], low below high, null for no limit{names}"
+            raise ConfigError(key, limits, allowed)
+        low, high = known
+        return -np.inf if low is None else float(low), np.inf if high is None else float(high)
 
 
 def _sensor(feature: str) -> Sensor:
@@ -168,12 +184,3 @@ def _check_features(names: Sequence[str]) -> None:
     known = (*FEATURES, *FEATURES_OVER_TIME)
     if not names or not set(names) <= set(known) or len(set(names)) < len(names):
         raise ConfigError("features", list(names), f"different ones of {', '.join(known)}")
-
-
-def _check(key: str, limits: Sequence[float | None]) -> None:
-    """Raise ConfigError unless limits are [low, high]."""
-    is_pair = isinstance(limits, Sequence) and not isinstance(limits, str) and len(limits) == 2
-    numbers = [one for one in limits if one is not None] if is_pair else []
-    is_number = all(isinstance(one, int | float) and np.isfinite(one) for one in numbers)
-    if not is_pair or not is_number or sorted(set(numbers)) != numbers or not numbers:
-        raise ConfigError(key, limits, "[low, high], low below high, null for no limit")

@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from time import perf_counter_ns
+from typing import Any
 
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.scene_filter import ConfirmedScene, SceneFilter
@@ -24,7 +25,10 @@ def log_vote(
     posterior: Mapping[str, float] | None,
 ) -> None:
     """Log a vote with the scenes' probabilities after it, and the scene that it confirmed."""
-    told = {} if posterior is None else {"posterior": posterior}
+    told: dict[str, Any] = {} if posterior is None else {"posterior": posterior}
+    if vote.features is not None:
+        values = vote.features.items()
+        told["features"] = {name: value if math.isfinite(value) else None for name, value in values}
     log.add("vote", vote.stamp_ns, scene=vote.scene, value=vote.value, **told)
     if confirmed is not None:
         log.add(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import groupby
 
 from sceneslam.collect.chart import Line, Point, draw_front, draw_lines, front
 from sceneslam.collect.rows import Row, Value
@@ -52,7 +53,7 @@ def _front(groups: Sequence[Group]) -> str:
     drawn = draw_front(
         points, x_label=_SHOWN["detection.delay_s"], y_label=_SHOWN["detection.false"]
     )
-    best = [f"{one.label}: {one.x:.3g} s, {one.y:.3g} false" for one in front(points)]
+    best = list(map(_alike, _twins(front(points))))
     return figure(
         drawn,
         "Every setting that ran wherever others did and found all true changes: how late it found "
@@ -60,6 +61,19 @@ def _front(groups: Sequence[Group]) -> str:
         "those that no other is better than: "
         f"{'; '.join(best[:_BEST_MAX])}{'; ...' if len(best) > _BEST_MAX else '.'}",
     )
+
+
+def _twins(best: Sequence[Point]) -> Iterator[Sequence[Point]]:
+    """Yield the points of a front that lie on each other together."""
+    for _, twins in groupby(best, key=lambda point: (point.x, point.y)):
+        yield list(twins)
+
+
+def _alike(twins: Sequence[Point]) -> str:
+    """Return settings that do alike in words, by the one in the middle: farthest from failing."""
+    one = twins[len(twins) // 2]
+    others = f" (as {len(twins) - 1} others)" if len(twins) > 1 else ""
+    return f"{one.label}{others}: {one.x:.3g} s, {one.y:.3g} false"
 
 
 def _settings(groups: Sequence[Group]) -> list[Group]:

@@ -14,6 +14,7 @@ from sceneslam.config.component import Builder
 from sceneslam.detection.decide import confirm, vote
 from sceneslam.detection.run import Watched, score, watch
 from sceneslam.evaluation.metrics import Metrics
+from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.interfaces import FeatureDetector
 from sceneslam.types.errors import SceneSlamError
 from sceneslam.types.observation import SceneVote
@@ -55,6 +56,7 @@ def try_all(config: Mapping[str, Any], axes: Sequence[Axis]) -> Iterator[Tried]:
     """
     detectors = list(_settings(axes, "detector."))
     policies = [_built(config, setting) for setting in _settings(axes, "policy.")]
+    evaluation = Builder(config).make("evaluation", EvaluationSettings)
     watched: dict[str, Watched] = {}
     for setting in detectors:
         try:
@@ -70,7 +72,9 @@ def try_all(config: Mapping[str, Any], axes: Sequence[Axis]) -> Iterator[Tried]:
                 yield Tried(setting=both, error=str(policy))
             else:
                 confirmed = confirm(ballot.votes, policy, ballot.scenes)
-                yield Tried(setting=both, metrics=score(ballot.watched.features, confirmed))
+                yield Tried(
+                    setting=both, metrics=score(ballot.watched.features, confirmed, evaluation)
+                )
 
 
 def _votes(config: Mapping[str, Any], watched: dict[str, Watched]) -> _Ballot:

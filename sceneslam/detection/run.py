@@ -22,6 +22,7 @@ from sceneslam.detection.features import Features
 from sceneslam.detection.recall import recall
 from sceneslam.evaluation.detection import score_detection
 from sceneslam.evaluation.metrics import Metrics, write_metrics
+from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.evaluation.summary import number
 from sceneslam.evaluation.switches import true_scene
 from sceneslam.interfaces import FeatureDetector
@@ -64,7 +65,7 @@ def detect(config: Mapping[str, Any], folder: Path) -> list[str]:
     folder.mkdir(parents=True, exist_ok=True)
     _write_events(folder / "events.jsonl", told)
     save_config(config, folder / "config.yaml")
-    metrics = score(watched.features, confirmed)
+    metrics = score(watched.features, confirmed, builder.make("evaluation", EvaluationSettings))
     write_metrics(folder / "metrics.json", metrics)
     scores = metrics["detection"]
     return [
@@ -77,13 +78,15 @@ def detect(config: Mapping[str, Any], folder: Path) -> list[str]:
     ]
 
 
-def score(features: Features, confirmed: Sequence[ConfirmedScene]) -> Metrics:
+def score(
+    features: Features, confirmed: Sequence[ConfirmedScene], settings: EvaluationSettings
+) -> Metrics:
     """Return the metrics of confirmed scenes, named as those of a run with SLAM."""
     stamps_ns = features.stamps_ns
     end_ns = int(stamps_ns[-1]) if len(stamps_ns) else 0
     events = [asdict(scene) for scene in confirmed]
     return {
-        "detection": score_detection(events, features.truth, end_ns),
+        "detection": score_detection(events, features.truth, end_ns, settings.scenes),
         "observations": len(stamps_ns),
     }
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import pairwise
+from collections.abc import Mapping, Sequence
+from itertools import groupby, pairwise
 from typing import Any
 
 from sceneslam.evaluation.switches import true_changes, true_scene
@@ -14,18 +14,25 @@ Seen = Sequence[tuple[int, str]]  # when which scene was confirmed
 
 
 def score_detection(
-    confirmed: Sequence[Event], truth: GroundTruth | None, end_ns: int
+    confirmed: Sequence[Event],
+    truth: GroundTruth | None,
+    end_ns: int,
+    scenes: Mapping[str, str],
 ) -> dict[str, Any]:
     """Return what `scene` events of a run are worth; what takes the true scenes is None without.
 
     A true change is found when its scene is the confirmed one before the next true change comes;
     `delay_s` is the mean over those found, 0 where it was confirmed too early. A confirmation of
     a scene that is not the true one is false. `wrong_s` is how long the confirmed scene was not
-    the true one, until `end_ns`.
+    the true one, until `end_ns`. `scenes` gives own scenes the name that the truth has for them.
     """
     scores: dict[str, Any] = {"confirmed": len(confirmed)}
     names = ("false", "missed", "delay_s", "delay_max_s", "wrong_s")
-    seen = [(int(event["stamp_ns"]), str(event["scene"])) for event in confirmed]
+    renamed = [
+        (int(event["stamp_ns"]), scenes.get(str(event["scene"]), str(event["scene"])))
+        for event in confirmed
+    ]
+    seen = [next(group) for _, group in groupby(renamed, key=lambda pair: pair[1])]
     if truth is None or not truth.scenes or not _are_of(truth, seen):
         return scores | dict.fromkeys(names)
     delays_s = _delays_s(seen, truth, end_ns)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sceneslam.evaluation import figure_style as look
 from sceneslam.evaluation.accuracy import AbsoluteErrors, absolute_errors
 from sceneslam.evaluation.comparison import compare
+from sceneslam.evaluation.figure_features import Limits, draw_features
 from sceneslam.evaluation.figure_map import draw_map, draw_path
 from sceneslam.evaluation.figure_pose import draw_error_path, draw_pose
 from sceneslam.evaluation.figure_time import draw_posterior, draw_series, draw_timeline, draw_votes
@@ -43,6 +44,7 @@ def write_figures(
     truth: GroundTruth | None,
     *,
     threshold: float | None,
+    limits: Limits,
     value_label: str = "detector value",
     reference: Trajectory | None = None,
     association_gap_s: float = 0.01,
@@ -53,8 +55,8 @@ def write_figures(
     A figure that fails (no memory is left, say) is left out, with a sentence in `faults`.
 
     `map`, `path` (where it is small in the map), `timeline`, `grey_mean`, `posterior` (of a
-    Bayes filter), `error` and `error_path` (with ground truth), `pose`, `difference` (with a
-    reference).
+    Bayes filter), `features` (of rules, with their `limits`), `error` and `error_path` (with
+    ground truth), `pose`, `difference` (with a reference).
     """
     folder.mkdir(parents=True, exist_ok=True)
     true = truth.trajectory if truth else Trajectory.empty()
@@ -67,6 +69,7 @@ def write_figures(
         "timeline": lambda: draw_timeline(result, truth),
         "grey_mean": lambda: draw_votes(result, truth, threshold, value_label),
         "posterior": lambda: draw_posterior(result, truth),
+        "features": lambda: draw_features(result, truth, limits),
         "error": lambda: draw_series(
             result,
             errors.stamps_ns,

@@ -54,8 +54,8 @@ def evaluate(
         **_accuracy(result, truth, settings),
         "coverage": coverage(result),
         "switches": switches,
-        "false_switches": count_false(switches, truth, told),
-        "detection": _detection(result, truth),
+        "false_switches": count_false(switches, truth, told, settings.scenes),
+        "detection": _detection(result, truth, settings),
         **_extent(result),
         **_costs(result),
         "modules": _per_module(result),
@@ -123,10 +123,12 @@ def _accuracy(
     }
 
 
-def _detection(result: RunResult, truth: GroundTruth | None) -> Metrics:
+def _detection(
+    result: RunResult, truth: GroundTruth | None, settings: EvaluationSettings
+) -> Metrics:
     confirmed = [event for event in result.events if event["event"] == "scene"]
     end_ns = int(result.observed_ns[-1]) if len(result.observed_ns) else 0
-    return score_detection(confirmed, truth, end_ns)
+    return score_detection(confirmed, truth, end_ns, settings.scenes)
 
 
 def _extent(result: RunResult) -> Metrics:

@@ -11,6 +11,7 @@ from typing import Any
 from sceneslam.evaluation import markup
 from sceneslam.evaluation.answer import Answer, answer
 from sceneslam.evaluation.chronicle import Entry, chronicle
+from sceneslam.evaluation.figure_features import feature_limits
 from sceneslam.evaluation.figures import write_figures
 from sceneslam.evaluation.metrics import Metrics
 from sceneslam.evaluation.names import module_names, renamed
@@ -30,6 +31,8 @@ _CAPTIONS = {
     "needs and is less certain; crossed: lost, it has no pose.",
     "grey_mean": "What the detector measured. Shading: the true scene, where it is known; "
     "dash-dotted: the instant at which a change of scene was confirmed.",
+    "features": "What the rules measure, and their limits (dashed): a limit suits where the curve "
+    "is on one side of it in one scene, and on the other in the others. Shading as above.",
     "posterior": "How probable each scene is by the votes so far. Shading and lines as above.",
     "error": "Distance from the true position after one rigid alignment of the whole trajectory. "
     "Shading: who gave the pose; dash-dotted: a change of module.",
@@ -64,6 +67,7 @@ def write_report(
         renamed(result, module_names(config.get("slam") or {})),
         truth,
         threshold=threshold,
+        limits=feature_limits(config.get("detector") or {}),
         value_label=value_label,
         reference=reference,
         association_gap_s=metrics["association_gap_s"],

@@ -10,7 +10,7 @@ from sceneslam.types.errors import ConfigError
 
 @dataclass(slots=True, kw_only=True)
 class EvaluationSettings:
-    """CorrectLimits of the metrics; every one is a finite number, and all but `_ratio` above 0."""
+    """Limits of the metrics, finite numbers, all but `_ratio` above 0; and names of scenes."""
 
     association_gap_s: float  # a pose and its true pose are at most this far apart
     rpe_interval_s: float  # the relative pose error is taken over this time
@@ -20,12 +20,16 @@ class EvaluationSettings:
     correct_limit_rad: float  # ... and within this angle
     coverage_min_ratio: float  # of the observations get a pose; with less a run is incomplete
     drawn_threshold: float | None  # of the detector's values, a line in their figure
+    scenes: dict[str, str]  # a detector's name of a scene -> the name that the truth has for it
 
     def __post_init__(self) -> None:
+        for scene, name in self.scenes.items():
+            if not isinstance(name, str) or not name:
+                raise ConfigError(f"scenes.{scene}", name, "the name of a true scene")
         for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name == "drawn_threshold":
+            if field.name in ("scenes", "drawn_threshold"):
                 continue
+            value = getattr(self, field.name)
             is_ratio = field.name.endswith("_ratio")
             if not (value > 0 or (is_ratio and value == 0)) or value == float("inf"):
                 allowed = "0 or a finite number above" if is_ratio else "a finite number above 0"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
@@ -39,17 +39,26 @@ def list_switches(result: RunResult, truth: GroundTruth | None) -> list[dict[str
 
 
 def count_false(
-    switches: Sequence[dict[str, Any]], truth: GroundTruth | None, told: Collection[str]
+    switches: Sequence[dict[str, Any]],
+    truth: GroundTruth | None,
+    told: Collection[str],
+    scenes: Mapping[str, str],
 ) -> int | None:
     """Return how many switches followed a scene that was not the true one; None without truth.
 
     `told` are the scenes that the detector found. Where the truth knows none of their names it
-    speaks of other scenes, and says nothing about these.
+    speaks of other scenes, and says nothing about these. `scenes` gives own scenes the name that
+    the truth has for them.
     """
-    if truth is None or not {change.scene for change in truth.scenes} & {*told}:
+    named = {scenes.get(scene, scene) for scene in told}
+    if truth is None or not {change.scene for change in truth.scenes} & named:
         return None
     by_scene = [switch for switch in switches if switch["reason"] == "scene"]
-    false = [s for s in by_scene if true_scene(truth, s["stamp_ns"]) != s["scene"]]
+    false = [
+        s
+        for s in by_scene
+        if true_scene(truth, s["stamp_ns"]) != scenes.get(s["scene"], s["scene"])
+    ]
     return len(false)
 
 

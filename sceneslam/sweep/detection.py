@@ -5,15 +5,16 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, QuotedString, Transformer
+from hydra.errors import ConfigCompositionException
 from hydra.types import HydraContext
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from sceneslam.collect.flatten import flat
@@ -38,23 +39,60 @@ def sweep_detection(
     axes = [Axis(key=key, values=list(_values(one))) for key, one in inner.items()]
     first = [_words(one)[0] for one in inner.values()]  # a misspelt key is found by composing
     outer = [_words(one) for key, one in overrides.items() if key not in inner]
-    composed = [
-        (chosen, context.config_loader.load_sweep_config(config, [*chosen, *first]))
-        for chosen in map(list, product(*outer))
-    ]
+    cells = [_Cell.of(context, config, chosen, axes, first) for chosen in product(*outer)]
+    for axis, word in zip(axes, first, strict=True):
+        if not any(axis in cell.axes for cell in cells):  # no detector or policy has this key
+            context.config_loader.load_sweep_config(config, [*cells[0].chosen, word])
     rows: list[Row] = []
     with tqdm(desc="sweep", unit="setting", mininterval=0.5) as bar:
-        for chosen, one in composed:
-            for tried in try_all(resolved(without_hydra(one)), axes):
-                rows.append(_row(len(rows), chosen, tried))
+        for cell in cells:
+            for tried in try_all(resolved(without_hydra(cell.config)), cell.axes):
+                rows.append(_row(len(rows), cell.chosen, tried))
                 bar.update()
     (folder / ROWS).write_text("".join(json.dumps(asdict(row)) + "\n" for row in rows))
     page = write_rows(folder, rows)
     print(overview(rows), end="")
+    for cell in cells:
+        absent = [axis.key for axis in axes if axis not in cell.axes]
+        if absent:
+            print(f"left out: {', '.join(absent)}, which {' '.join(cell.chosen)} does not have")
     for error in list(dict.fromkeys(row.error for row in rows if row.error))[:_TOLD_ERRORS]:
         print(f"error: {error}", file=sys.stderr)
     print(f"{len(rows)} settings\ntable    {folder}/table.csv\npage     {page}")
     return all(row.status == State.DONE.value for row in rows)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Cell:
+    """A choice of what has to be composed anew, and the axes whose keys it has."""
+
+    chosen: Sequence[str]
+    config: DictConfig
+    axes: Sequence[Axis]
+
+    @classmethod
+    def of(
+        cls,
+        context: HydraContext,
+        config: DictConfig,
+        chosen: Sequence[str],
+        axes: Sequence[Axis],
+        first: Sequence[str],
+    ) -> _Cell:
+        """Compose a choice with the first value of every axis that it has a key for."""
+        compose = context.config_loader.load_sweep_config
+        own = list(zip(axes, first, strict=True))
+        try:
+            composed = compose(config, [*chosen, *first])
+        except ConfigCompositionException:
+            plain = compose(config, list(chosen))
+            own = [
+                (axis, word)
+                for axis, word in own
+                if word.startswith("+") or OmegaConf.select(plain, axis.key, default=own) is not own
+            ]
+            composed = compose(config, [*chosen, *(word for _, word in own)])
+        return cls(chosen=chosen, config=composed, axes=[axis for axis, _ in own])
 
 
 def _row(number: int, chosen: Sequence[str], tried: Tried) -> Row:

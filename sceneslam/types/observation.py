@@ -93,6 +93,7 @@ class SceneVote:
     scene: str  # one of the detector's scenes, or UNSURE
     value: float = float("nan")  # what the detector measured (grey mean, probability, ...)
     likelihoods: Mapping[str, float] | None = None  # scene -> P(measured | scene), up to a factor
+    features: Mapping[str, float] | None = None  # all that was measured, for figures; NaN: nothing
 
 
 class TrackingStatus(Enum):
