@@ -105,12 +105,8 @@ def test_figures_are_the_same_bytes_each_time(tmp_path):
 
 def test_what_rules_measure_is_drawn_with_their_limits(tmp_path):
     run = switched_run()
-    events = [
-        event | {"features": {"light": 50.0 + k, "other": 1.0}}
-        if event["event"] == "vote"
-        else event
-        for k, event in enumerate(run.events)
-    ]
+    measured = {"features": {"light": 50.0, "other": 1.0}}
+    events = [event | (measured if event["event"] == "vote" else {}) for event in run.events]
     names = draw(tmp_path, replace(run, events=events), None)
     assert names == ["map", "timeline", "grey_mean", "features"]
 
