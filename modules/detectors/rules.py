@@ -82,7 +82,8 @@ class Rules:
         self._skips = skip_absent_sensors
         self._values = dict(values or {})
         self._rules = [self._read(f"rules.{name}", rule) for name, rule in used.items()]
-        self._present = self._rules  # those whose sensors the rig has
+        self._present = self._rules  # those whose sensors the rig has ...
+        self._told = list(range(len(self._features)))  # ... and the features that votes tell
         self._otherwise = otherwise or UNSURE
         self._hysteresis_ratio = hysteresis_ratio
         self._voted: str | None = None
@@ -108,6 +109,11 @@ class Rules:
         self._present = [
             rule for rule in self._rules if not self._skips or rule.sensors <= rig.sensors
         ]
+        self._told = [
+            index
+            for index, name in enumerate(self._features)
+            if not self._skips or _sensor(name) in rig.sensors
+        ]
 
     def get_scene(self, observation: Observation) -> SceneVote:
         """Return the first scene whose conditions hold."""
@@ -130,7 +136,7 @@ class Rules:
             self._voted = scene
         if features is None:
             return SceneVote(stamp_ns=stamp_ns, scene=UNSURE)
-        measured = dict(zip(self._features, features.tolist(), strict=True))
+        measured = {self._features[index]: float(features[index]) for index in self._told}
         return SceneVote(stamp_ns=stamp_ns, scene=scene, features=measured)
 
     def shutdown(self) -> None:
