@@ -18,7 +18,8 @@ from sceneslam.testing import MODULE_CHECKS, ContractError, check_module, room_o
 from sceneslam.types.trajectory import Trajectory
 
 CONF = Path(__file__).parents[1] / "conf"
-COMPONENTS = sorted((CONF / "slam").glob("*.yaml"))
+# A ROS 2 node answers when it likes: tests/test_ros2_node.py
+COMPONENTS = sorted(set((CONF / "slam").glob("*.yaml")) - {CONF / "slam" / "ros2_node.yaml"})
 ISOLATED = Path("laser in its own process")
 STEPS = 40
 UNLIKE = {  # module and check -> why it is not held against it

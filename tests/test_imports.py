@@ -25,7 +25,7 @@ ALLOWED = {  # package -> what of ours it may import
     "sceneslam/scenes": {"types", "interfaces", "config", "scenes"},
     "sceneslam/detection": {"types", "interfaces", "bus", "config", "evaluation", "detection"},
     "sceneslam/collect": {"types", "evaluation", "collect"},
-    "modules": {"types", "interfaces", "motion", "supervision", "vocabulary", "modules"},
+    "modules": {"types", "interfaces", "motion", "supervision", "vocabulary", "ros", "modules"},
     "experiments/liars": {"types", "evaluation", "experiments"},
     "experiments/openloris": {"types", "evaluation", "experiments"},
     "experiments/handover": {"types", "atlas", "evaluation", "experiments"},

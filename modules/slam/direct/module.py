@@ -52,7 +52,6 @@ class DirectSlam:
     weak_m: float
     weak_rad: float
     cloud_voxel_m: float
-    _T_map_local: se3.Transform = field(default_factory=se3.identity, init=False)
     _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
 
     def __post_init__(self) -> None:
@@ -79,11 +78,10 @@ class DirectSlam:
         self._key: View | None = None
         self._last: View | None = None
         self._T_local_key = self._T_local_last = se3.identity()  # of cam
-        self._T_map_local, self._T_local_base = se3.identity(), se3.identity()
+        self._T_local_base = se3.identity()
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Place `local` in the map (Eq. 1)."""
-        self._T_map_local = np.array(T_map_local, dtype=np.float64)
+        """Do nothing: its poses are in `local` wherever that lies."""
 
     def set_scene(self, scene: str) -> None:
         """Do nothing: it says itself when it sees too little."""
@@ -111,10 +109,6 @@ class DirectSlam:
         if prediction.is_measured:
             return self._begin(observation, prediction, view)
         return self._bridge(observation, prediction, can_coast=False)
-
-    def get_pose(self) -> se3.Transform:
-        """Return T_map_base of the last observation."""
-        return self._T_map_local @ self._T_local_base
 
     def get_trajectory(self) -> Trajectory:
         """Return no poses: nothing is revised."""

@@ -1,0 +1,192 @@
+"""The program between `slam=process` and ROS 2: sensors out as topics, poses and maps back."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.ros import names
+from sceneslam.ros.encode import Encoder
+from sceneslam.ros.transport.transport import Network, Qos, open_transport
+from sceneslam.types import se3
+from sceneslam.types.observation import LaserScan
+from sceneslam.types.rig import Camera, Sensor
+from sceneslam.types.se3 import Transform
+
+from ..process.client import LOST, TRACKING, poses, serve
+from ..process.protocol import Fields, ProtocolError
+from .heard import Heard, moved
+
+_TYPES = {
+    "image": "sensor_msgs/msg/Image",
+    "camera_info": "sensor_msgs/msg/CameraInfo",
+    "depth": "sensor_msgs/msg/Image",
+    "scan": "sensor_msgs/msg/LaserScan",
+    "points": "sensor_msgs/msg/PointCloud2",
+    "odometry": "nav_msgs/msg/Odometry",
+    "imu": "sensor_msgs/msg/Imu",
+}
+_KEPT = 1000  # observations whose poses may still come
+
+
+class Bridge:
+    """Sends what is observed, and answers with what the node says."""
+
+    def __init__(self, settings: dict[str, Any]) -> None:
+        self._settings, self._topics = settings, settings["topics"]
+        self.requires = " ".join(settings["needs"])
+        self._encoder = Encoder()
+        self._node: subprocess.Popen[bytes] | None = None
+        self._sent: dict[int, Transform | None] = {}  # stamp -> T_odom_base
+        self._first: tuple[int, Transform | None] | None = None
+        self._T_local_world: Transform | None = None
+        self._given_ns = 0  # stamp of the newest pose that was handed on
+
+    def activate(self, rig: Fields) -> None:
+        """Join the domain and start the node; what it says on standard output is its log."""
+        self._transport = open_transport(Network(**self._settings["network"]))
+        self._heard = Heard(self._transport, self._settings)
+        self._camera = _camera(rig)
+        places = {
+            frame: rig[name]
+            for frame, name in (
+                (names.CAMERA, "camera.T_base_cam"),
+                (names.LASER, "laser.T_base_laser"),
+                (names.LIDAR, "lidar.T_base_lidar"),
+            )
+            if name in rig
+        }
+        static = self._encoder.transforms(0, names.BASE, places)
+        self._transport.publisher(names.TF_STATIC, "tf2_msgs/msg/TFMessage", Qos.HISTORY).publish(
+            static
+        )
+        is_camera = self._settings["pose_frame"] == "camera"
+        self._T_frame_base = se3.inverse(places[names.CAMERA]) if is_camera else np.eye(4)
+        if self._settings["command"] is not None:
+            self._node = subprocess.Popen(
+                self._settings["command"], stdin=subprocess.DEVNULL, stdout=sys.stderr
+            )
+
+    def set_scene(self, scene: str) -> None:
+        """Do nothing."""
+
+    def track(self, observation: Fields) -> dict[str, Any]:
+        """Send what was measured; return the poses that have come by now."""
+        if self._node is not None and self._node.poll() is not None:
+            command = " ".join(self._settings["command"])
+            raise ProtocolError(f"the node ended with {self._node.returncode}: {command}")
+        stamp_ns = int(observation["stamp_ns"])
+        T_odom_base = observation.get("T_odom_base")
+        if self._first is None:
+            self._first = (stamp_ns, T_odom_base)
+        self._sent[stamp_ns] = T_odom_base
+        while len(self._sent) > _KEPT:
+            del self._sent[next(iter(self._sent))]
+        self._send(stamp_ns, observation)
+        if self._settings["pose_kind"] == "tf":
+            T_map_odom = self._heard.T_map_odom
+            if T_map_odom is None or T_odom_base is None:
+                return poses([], [])
+            said = {stamp_ns: (T_map_odom @ T_odom_base, 0.0)}
+        else:
+            said = self._heard.wait(stamp_ns, self._settings["answer_s"])
+        return self._answer(said)
+
+    def trajectory(self) -> dict[str, Any]:
+        """Return no poses: what a node revises it does not say by stamp."""
+        return poses([], [])
+
+    def map(self) -> dict[str, Any]:
+        """Return the newest map."""
+        if self._T_local_world is None:
+            return {}
+        return moved(self._heard.map(), self._T_local_world)
+
+    def _answer(self, said: dict[int, tuple[Transform, float]]) -> dict[str, Any]:
+        """Return the poses of observations that were sent, those that came too late left out."""
+        stamps_ns = sorted(ns for ns in said if ns in self._sent and ns > self._given_ns)
+        statuses, found = [], []
+        for stamp_ns in stamps_ns:
+            T_world_frame, deviation_m = said[stamp_ns]
+            T_world_base = T_world_frame @ self._T_frame_base
+            if self._T_local_world is None:
+                self._T_local_world = self._since_first(stamp_ns) @ se3.inverse(T_world_base)
+            found.append(se3.orthonormal(self._T_local_world @ T_world_base))
+            is_lost = deviation_m > self._settings["deviation_max_m"]
+            statuses.append(LOST if is_lost else TRACKING)
+            self._given_ns = stamp_ns
+        return {**poses(stamps_ns, found), "status": np.array(statuses, np.int64)}
+
+    def _since_first(self, stamp_ns: int) -> Transform:
+        """Return the motion by odometry since the first observation, none where it is silent."""
+        assert self._first is not None
+        T_first, T_now = self._first[1], self._sent[stamp_ns]
+        return np.eye(4) if T_first is None or T_now is None else se3.inverse(T_first) @ T_now
+
+    def _send(self, stamp_ns: int, observation: Fields) -> None:
+        encoder, T_odom_base = self._encoder, observation.get("T_odom_base")
+        if T_odom_base is not None:
+            tf = encoder.transforms(stamp_ns, names.ODOM, {names.BASE: T_odom_base})
+            self._transport.publisher(names.TF, "tf2_msgs/msg/TFMessage", Qos.RELIABLE).publish(tf)
+            self._publish("odometry", encoder.odometry, stamp_ns, T_odom_base, names.ODOM)
+        for at_ns, measured in _inertial(stamp_ns, observation).items():
+            self._publish("imu", encoder.imu, at_ns, measured)
+        if "scan.ranges_m" in observation:
+            self._publish("scan", encoder.scan, _scan(observation))
+        points, times_s = observation.get("points_lidar"), observation.get("point_times_s")
+        if points is not None:
+            self._publish("points", encoder.points, stamp_ns, points, times_s)
+        image_bgr, depth_m = observation.get("image_bgr"), observation.get("depth_m")
+        if self._camera is not None and (image_bgr is not None or depth_m is not None):
+            self._publish("camera_info", encoder.camera_info, stamp_ns, self._camera)
+        for name, encoding, pixels in (("depth", "32FC1", depth_m), ("image", "bgr8", image_bgr)):
+            if pixels is not None:
+                self._publish(name, encoder.image, stamp_ns, pixels, encoding)
+
+    def _publish(self, name: str, encode: Callable[..., bytes], *values: Any) -> None:
+        """Send a message on a sensor's topic, where it has one."""
+        if self._topics[name] is not None:
+            publisher = self._transport.publisher(self._topics[name], _TYPES[name], Qos.RELIABLE)
+            publisher.publish(encode(*values))
+
+
+def _camera(rig: Fields) -> Camera | None:
+    if "camera.fx" not in rig:
+        return None
+    width, height = rig["camera.size_wh"].tolist()
+    return Camera(
+        size_wh=(width, height),
+        fx=float(rig["camera.fx"]),
+        fy=float(rig["camera.fy"]),
+        cx=float(rig["camera.cx"]),
+        cy=float(rig["camera.cy"]),
+        distortion=tuple(rig["camera.distortion"].tolist()),
+    )
+
+
+def _scan(observation: Fields) -> LaserScan:
+    values = {name: float(observation[f"scan.{name}"]) for name in (
+        "angle_min_rad", "angle_step_rad", "range_min_m", "range_max_m")}  # fmt: skip
+    ranges_m = observation["scan.ranges_m"]
+    return LaserScan(stamp_ns=int(observation["scan.stamp_ns"]), ranges_m=ranges_m, **values)
+
+
+def _inertial(stamp_ns: int, observation: Fields) -> dict[int, dict[Sensor, NDArray[Any]]]:
+    found: dict[int, dict[Sensor, NDArray[Any]]] = {}
+    for sensor in (sensor for sensor in Sensor if sensor.is_sampled):
+        for row in observation.get(sensor.field, np.zeros((0, 4))):
+            found.setdefault(stamp_ns + round(float(row[0]) * 1e9), {})[sensor] = row[1:]
+    return dict(sorted(found.items()))
+
+
+def main(settings: dict[str, Any]) -> None:
+    """Serve until the input is closed; the node ends with this program's group."""
+    serve(Bridge(settings))
+    sys.stderr.flush()
+    os._exit(0)  # the transport's threads would go on

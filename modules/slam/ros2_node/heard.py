@@ -1,0 +1,113 @@
+"""What a SLAM node says: poses by stamp, and the newest map."""
+
+from __future__ import annotations
+
+import threading
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.ros import decode, names
+from sceneslam.ros.clouds import cloud
+from sceneslam.ros.transport.transport import Arrival, Qos, Transport
+from sceneslam.types import se3
+from sceneslam.types.se3 import Transform
+
+_MAP_TYPES = {"grid": "nav_msgs/msg/OccupancyGrid", "points": "sensor_msgs/msg/PointCloud2"}
+_POSE_TYPES = {"odometry": "nav_msgs/msg/Odometry", "pose": "geometry_msgs/msg/PoseStamped"}
+_LOG_ODDS = 4.0  # of a cell that is said to be occupied for sure
+
+
+class Heard:
+    """Listens; what is said comes in a thread of the transport's."""
+
+    def __init__(self, transport: Transport, settings: dict[str, Any]) -> None:
+        from rosbags.typesys import Stores, get_typestore
+
+        self._store: Any = get_typestore(Stores.ROS2_HUMBLE)
+        self._came = threading.Condition()
+        self._poses: dict[int, tuple[Transform, float]] = {}  # stamp -> pose, deviation [m]
+        self.T_map_odom: Transform | None = None
+        self._map: dict[str, NDArray[Any]] = {}
+        topics, self._map_kind = settings["topics"], settings["map_kind"]
+        if settings["pose_kind"] == "tf":
+            transport.subscribe(names.TF, "tf2_msgs/msg/TFMessage", self._hear_tf, Qos.RELIABLE)
+        else:
+            self._pose_type = _POSE_TYPES[settings["pose_kind"]]
+            transport.subscribe(topics["pose"], self._pose_type, self._hear_pose, Qos.SENSOR)
+        if topics["map"] is not None:
+            kind = _MAP_TYPES[self._map_kind]
+            qos = Qos.LATCHED if self._map_kind == "grid" else Qos.SENSOR
+            transport.subscribe(topics["map"], kind, self._hear_map, qos)
+
+    def wait(self, stamp_ns: int, wait_s: float) -> dict[int, tuple[Transform, float]]:
+        """Return the poses that came, once there is one for a stamp or the time is over."""
+        until_s = monotonic() + wait_s
+        with self._came:
+            while stamp_ns not in self._poses and monotonic() < until_s:
+                self._came.wait(until_s - monotonic())
+            found, self._poses = self._poses, {}
+        return found
+
+    def map(self) -> dict[str, NDArray[Any]]:
+        """Return the newest map's layers, in the node's own frame."""
+        with self._came:
+            return dict(self._map)
+
+    def _hear_pose(self, arrival: Arrival) -> None:
+        message = self._store.deserialize_cdr(arrival.cdr, self._pose_type)
+        has_covariance = hasattr(message.pose, "covariance")
+        pose = message.pose.pose if has_covariance else message.pose
+        T_world_frame = decode.transform(pose.position, pose.orientation)
+        deviation_m = 0.0
+        if has_covariance:
+            variances = np.asarray(message.pose.covariance).reshape(6, 6)[[0, 1, 2], [0, 1, 2]]
+            deviation_m = float(np.sqrt(max(variances.max(), 0.0)))
+        if T_world_frame is not None and np.isfinite(T_world_frame).all():
+            with self._came:
+                self._poses[decode.stamp_ns(message)] = (T_world_frame, deviation_m)
+                self._came.notify()
+
+    def _hear_tf(self, arrival: Arrival) -> None:
+        message = self._store.deserialize_cdr(arrival.cdr, "tf2_msgs/msg/TFMessage")
+        for one in message.transforms:
+            frames = (decode.frame_id(one), str(one.child_frame_id).lstrip("/"))
+            if frames == (names.MAP, names.ODOM):
+                found = decode.transform(one.transform.translation, one.transform.rotation)
+                if found is not None and np.isfinite(found).all():
+                    self.T_map_odom = found
+
+    def _hear_map(self, arrival: Arrival) -> None:
+        message = self._store.deserialize_cdr(arrival.cdr, _MAP_TYPES[self._map_kind])
+        with self._came:
+            self._map = _grid(message) if self._map_kind == "grid" else _points(message)
+
+
+def _grid(message: Any) -> dict[str, NDArray[Any]]:
+    """Return an OccupancyGrid as log odds; its axes have to be those of the map frame."""
+    info = message.info
+    percent = np.asarray(message.data, np.float32).reshape(info.height, info.width)
+    log_odds = np.where(percent < 0, 0.0, (percent - 50.0) / 50.0 * _LOG_ODDS)
+    return {
+        "grid.log_odds": log_odds.astype(np.float32),
+        "grid.resolution_m": np.array(info.resolution, np.float64),
+        "grid.origin_xy_m": np.array([info.origin.position.x, info.origin.position.y]),
+    }
+
+
+def _points(message: Any) -> dict[str, NDArray[Any]]:
+    found = cloud(message, decode.stamp_ns(message))
+    return {} if found is None else {"points.points": found.points_lidar}
+
+
+def moved(layers: dict[str, NDArray[Any]], T_local_world: Transform) -> dict[str, NDArray[Any]]:
+    """Return the layers in local; a grid is left out where local is turned against it."""
+    if "points.points" in layers:
+        points = se3.apply(T_local_world, layers["points.points"])
+        return {"points.points": points.astype(np.float32)}
+    if "grid.log_odds" in layers and se3.rotation_angle_rad(T_local_world) < 1e-3:
+        origin = layers["grid.origin_xy_m"] + T_local_world[:2, 3]
+        return {**layers, "grid.origin_xy_m": origin}
+    return {}

@@ -1,0 +1,110 @@
+"""The `ros2_node` SLAM module: any SLAM node of ROS 2, as the paper ran its systems.
+
+The node is started by a program of ours that speaks the protocol of `slam=process` on one side and
+ROS 2 over DDS on the other. Deadlines, restarts and poses that come late are those of `process`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from sceneslam.ros.transport.transport import DDS, Network
+from sceneslam.supervision.limits import Limits
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.rig import Sensor
+from sceneslam.types.run import Command
+
+from ..process.module import ProcessSlam
+
+POSES = ("odometry", "pose", "tf")
+MAPS = ("grid", "points")
+# The path is set when the interpreter is up: what lies in a user's folder must not shadow its own.
+_MAIN = """
+import json, sys
+settings, *sys.path = sys.argv[1:]
+from sceneslam.modules.slam.ros2_node.bridge import main
+main(json.loads(settings))
+"""
+
+
+@dataclass(slots=True, kw_only=True)
+class Topics:
+    """Names of topics; null: not sent, or not listened to."""
+
+    image: str | None
+    camera_info: str | None
+    depth: str | None
+    scan: str | None
+    points: str | None
+    odometry: str | None
+    imu: str | None
+    pose: str | None
+    map: str | None
+
+    def __post_init__(self) -> None:
+        for name, topic in asdict(self).items():
+            if topic is not None and not topic.startswith("/"):
+                raise ConfigError(name, topic, "null or the whole name of a topic: /scan")
+
+
+class Ros2Node(ProcessSlam):
+    """Runs a command, or attaches to what runs already; answers with the poses that it publishes.
+
+    `pose_kind`: what comes on `topics.pose`: `odometry` (Odometry) or `pose` (PoseStamped) of
+    base_link, or `tf`: map -> odom on /tf, chained with the odometry that the node is sent.
+    """
+
+    def __init__(
+        self,
+        *,
+        command: Command | None,
+        needs: Sequence[str],
+        topics: Topics,
+        pose_kind: str,
+        map_kind: str,
+        pose_frame: str,
+        answer_s: float,
+        deviation_max_m: float,
+        network: Network,
+        late_max_s: float,
+        limits: Limits,
+    ) -> None:
+        if network.transport == DDS and importlib.util.find_spec("cyclonedds") is None:
+            raise ConfigError("network.transport", DDS, "pip install 'sceneslam[ros2]'")
+        if command is not None and (not command or shutil.which(command[0]) is None):
+            raise ConfigError("command", command, "null, or a program that can be run")
+        for name, given, known in (("pose_kind", pose_kind, POSES), ("map_kind", map_kind, MAPS)):
+            if given not in known:
+                raise ConfigError(name, given, " | ".join(known))
+        if pose_frame not in ("base", "camera"):
+            raise ConfigError("pose_frame", pose_frame, "base | camera")
+        if pose_kind != "tf" and topics.pose is None:
+            raise ConfigError("topics.pose", None, f"a topic, as pose_kind is {pose_kind}")
+        for name, value in (("answer_s", answer_s), ("deviation_max_m", deviation_max_m)):
+            if not 0 < value < np.inf:
+                raise ConfigError(name, value, "above 0")
+        sensors = {sensor.value for sensor in Sensor}
+        if not needs or not sensors >= set(needs):
+            raise ConfigError("needs", list(needs), f"some of {', '.join(sorted(sensors))}")
+        settings = {
+            "command": None if command is None else list(command),
+            "needs": list(needs),
+            "topics": asdict(topics),
+            "pose_kind": pose_kind,
+            "map_kind": map_kind,
+            "pose_frame": pose_frame,
+            "answer_s": answer_s,
+            "deviation_max_m": deviation_max_m,
+            "network": asdict(network),
+        }
+        bridge = Command(
+            [sys.executable, "-P", "-c", _MAIN, json.dumps(settings), *sys.path],
+        )
+        super().__init__(command=bridge, late_max_s=late_max_s, limits=limits)

@@ -1,0 +1,142 @@
+"""A SLAM node of ROS 2 as a module: it answers over DDS, from a process of its own."""
+
+from __future__ import annotations
+
+import os
+import sys
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from time import monotonic, sleep
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_module
+from hydra.utils import instantiate
+from isolation import limits
+
+from sceneslam.modules.slam.ros2_node.heard import moved
+from sceneslam.modules.slam.ros2_node.module import Ros2Node, Topics
+from sceneslam.ros.transport.transport import Network
+from sceneslam.testing import RIG, room_observation
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError, ModuleError
+from sceneslam.types.observation import TrackingStatus
+
+pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: pip install sceneslam[ros2]")
+NODE = Path(__file__).with_name("ros2_odometry_node.py")
+NONE = dict.fromkeys(("image", "camera_info", "depth", "scan", "points", "imu", "map"))
+
+
+def build(behaviour, **changes):
+    domain_id = 100 + (os.getpid() + 50) % 100
+    command = [sys.executable, str(NODE), str(domain_id), behaviour]
+    values = {
+        "command": command,
+        "needs": ["odometry"],
+        "topics": Topics(**NONE, odometry="/odom", pose="/slam/pose"),
+        "pose_kind": "odometry",
+        "map_kind": "grid",
+        "pose_frame": "base",
+        "answer_s": 0.5,
+        "deviation_max_m": 1.0,
+        "network": Network(domain_id=domain_id),
+        "late_max_s": 0.5,
+        "limits": limits(),
+    }
+    return Ros2Node(**(values | changes))
+
+
+@contextmanager
+def active(behaviour):
+    module = build(behaviour)
+    module.activate(RIG)
+    try:
+        yield module
+    finally:
+        module.note_failure()
+
+
+def drive(module, until, *, count=200):
+    """Return what it answers, until one is as it should be."""
+    found = []
+    for index in range(count):
+        found.append(module.track(room_observation(index)))
+        if until(found[-1]):
+            break
+    return found
+
+
+def test_a_node_that_answers_is_tracked_from_where_odometry_began():
+    with active("good") as module:
+        found = drive(module, lambda one: one.status is TrackingStatus.TRACKING)
+        assert found[-1].status is TrackingStatus.TRACKING
+        assert {one.status for one in found[:-1]} <= {TrackingStatus.DEGRADED, TrackingStatus.LOST}
+        T_first = room_observation(0).T_odom_base
+        T_true = se3.inverse(T_first) @ room_observation(len(found) - 1).T_odom_base
+        np.testing.assert_allclose(found[-1].T_local_base, T_true, atol=1e-6)
+        silent = module.track(replace(room_observation(len(found)), T_odom_base=None))
+        assert silent.status is not TrackingStatus.TRACKING  # the node had nothing to answer
+
+
+def test_a_node_that_is_silent_is_lost_after_late_max_s():
+    module = build("silent", answer_s=0.01)
+    module.activate(RIG)
+    found = drive(module, lambda one: one.status is TrackingStatus.LOST, count=40)
+    module.note_failure()
+    assert found[-1].status is TrackingStatus.LOST and 14 <= len(found) <= 18  # 0.5 s at 30 Hz
+
+
+def test_a_node_that_is_unsure_is_lost():
+    with active("unsure") as module:
+        began_s = monotonic()
+        statuses = []
+        for index in range(15):  # before late_max_s is over
+            statuses.append(module.track(room_observation(index)).status)
+            if statuses[-1] is TrackingStatus.LOST or monotonic() - began_s > 20:
+                break
+        assert statuses[-1] is TrackingStatus.LOST
+
+
+def test_a_node_that_ends_ends_the_session_with_a_sentence():
+    with active("ends") as module, pytest.raises(ModuleError, match="the node ended"):
+        for index in range(300):
+            module.track(room_observation(index))
+            sleep(0.01)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("command", ["no-such-program"]),
+        ("pose_kind", "twist"),
+        ("pose_frame", "laser"),
+        ("needs", ["sonar"]),
+        ("answer_s", 0.0),
+    ],
+)
+def test_a_setting_that_makes_no_sense_is_named(key, value):
+    with pytest.raises(ConfigError, match=key):
+        build("good", **{key: value})
+
+
+@pytest.mark.parametrize("preset", ["slam_toolbox", "cartographer", "rtabmap", "orb_slam3"])
+def test_a_preset_is_a_whole_configuration(preset):
+    with initialize_config_module("sceneslam.conf", version_base="1.3"):
+        overrides = ["+scenario=single", f"slam@slam.only=ros2/{preset}"]
+        if preset == "orb_slam3":
+            overrides.append("slam.only.command=[true]")
+        node = compose("config", overrides=overrides).slam.only
+    node.command = ["true"]  # the real one is not installed here
+    assert isinstance(instantiate(node, _convert_="all"), Ros2Node)
+
+
+def test_a_grid_is_moved_unless_it_would_have_to_be_turned():
+    grid = {
+        "grid.log_odds": np.zeros((2, 3), np.float32),
+        "grid.resolution_m": np.array(0.05),
+        "grid.origin_xy_m": np.array([1.0, 2.0]),
+    }
+    found = moved(grid, se3.from_xy_yaw(0.5, -0.5, 0.0))
+    np.testing.assert_allclose(found["grid.origin_xy_m"], [1.5, 1.5])
+    assert moved(grid, se3.from_xy_yaw(0.0, 0.0, 0.3)) == {}
