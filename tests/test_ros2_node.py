@@ -14,7 +14,9 @@ import pytest
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from isolation import limits
+from omegaconf import OmegaConf
 
+from sceneslam.config.check import check_node
 from sceneslam.modules.slam.ros2_node.heard import moved
 from sceneslam.modules.slam.ros2_node.module import Ros2Node, Topics
 from sceneslam.ros.transport.transport import Network
@@ -125,8 +127,12 @@ def test_a_preset_is_a_whole_configuration(preset):
     with initialize_config_module("sceneslam.conf", version_base="1.3"):
         overrides = ["+scenario=single", f"slam@slam.only=ros2/{preset}"]
         if preset == "orb_slam3":
-            overrides.append("slam.only.command=[true]")
+            overrides.append("slam.only.command=[my_orb_slam]")
         node = compose("config", overrides=overrides).slam.only
+    plain = OmegaConf.to_container(node, resolve=True)
+    program = plain["command"][0]
+    with pytest.raises(ConfigError, match=rf"allow_targets=\[{program}\]"):
+        check_node(plain, "slam.only", allow=[])
     node.command = ["true"]  # the real one is not installed here
     assert isinstance(instantiate(node, _convert_="all"), Ros2Node)
 

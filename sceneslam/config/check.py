@@ -105,7 +105,8 @@ def check_node(node: object, key: str, *, allow: Sequence[str], positional: int 
             continue
         if name in hints and not fits(value, hints[name]):
             raise ConfigError(f"{key}.{name}", value, describe(hints[name]))
-        if hints.get(name) is Command and value != NOT_GIVEN and not set(value[:1]) <= set(allow):
+        is_command = Command in (hints.get(name), *typing.get_args(hints.get(name)))
+        if is_command and isinstance(value, list) and not set(value[:1]) <= set(allow):
             allowed = f"a program that the command line allows: allow_targets=[{value[0]}]"
             raise ConfigError(f"{key}.{name}", value, allowed)
 
