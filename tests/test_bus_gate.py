@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from driving import GATE, drive, events
+from driving import GATE, drive, events, policy
 from fakes import PERIOD_NS, RIG, TWIST, ExactModule, observation, true_pose
 
+from sceneslam.bus.decision import Action, Health, Situation, Trial, decide
 from sceneslam.types import se3
 from sceneslam.types.rig import Sensor
 from sceneslam.types.run import BRIDGED
@@ -116,3 +117,27 @@ def test_a_wheel_that_slips_is_not_believed_against_gyro_and_module(has_gyro):
     )
     assert bool(events(log, "suspect")) == (not has_gyro)  # without, wheels are the only witness
     assert (BRIDGED in atlas.pose_modules) == (not has_gyro)
+
+
+def test_two_that_the_wheels_contradict_do_not_take_turns():
+    def suspect(**more):
+        return Situation(
+            stamp_ns=20 * 10**9,
+            scene="Bright",
+            served_scene="Bright",
+            active="dark",
+            health=Health.SUSPECT,
+            unheld_since_ns=10 * 10**9,
+            held_ns=9 * 10**9,
+            is_blind=False,
+            choices=("bright", "dark"),
+            served_choices=("bright", "dark"),
+            tried=frozenset({"bright"}),
+            rounds=0,
+            trial=Trial.NONE,
+            may_return=True,
+            **more,
+        )
+
+    assert decide(policy(), suspect(retry_ns=21 * 10**9)).action is Action.GO_ON
+    assert decide(policy(), suspect(retry_ns=19 * 10**9)).to == ("bright",)

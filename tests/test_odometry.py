@@ -1,5 +1,6 @@
 """Dead reckoning of motions that are known."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -112,3 +113,11 @@ def test_activation_starts_anew_and_shutdown_may_come_twice():
     again = [module.track(observation).T_local_base for observation in arc(20, gyro=True)]
     np.testing.assert_array_equal(first[0], np.eye(4))
     np.testing.assert_array_equal(first, again)
+
+
+def test_gyro_that_is_biased_about_the_level_axes_lifts_no_robot_off_the_floor():
+    module = active()
+    for observation in arc(200, yaw_step_rad=0.0, gyro=True):
+        tilted = observation.gyro_base + np.array([0.0, 0.02, 0.02, 0.0])
+        tracking = module.track(replace(observation, gyro_base=tilted))
+    assert abs(tracking.T_local_base[2, 3]) < 1e-9

@@ -24,7 +24,8 @@ class Odometry:
     use_gyro: bool
     _motion: MotionModel = field(init=False)
     _wheels: Wheels = field(init=False)
-    _T_held_curr: se3.Transform = field(default_factory=se3.identity, init=False)
+    _T_odom_base: se3.Transform | None = field(default=None, init=False)  # the last there was
+    _is_gap: bool = field(default=False, init=False)  # since then there was none
     _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
     _covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)), init=False)
 
@@ -36,7 +37,7 @@ class Odometry:
     def activate(self, rig: Rig) -> None:
         """Start anew: `local` at the next observation that has odometry."""
         self._motion, self._wheels = MotionModel(rig), rig.wheels
-        self._T_held_curr = se3.identity()
+        self._T_odom_base, self._is_gap = None, False
         self._T_local_base = se3.identity()
         self._covariance = np.eye(6) * _DEVIATION_MIN**2
 
@@ -53,13 +54,17 @@ class Odometry:
         """
         if not self.use_gyro:
             observation = replace(observation, gyro_base=None)
-        motion = self._motion.predict(observation)
-        self._T_held_curr = self._T_held_curr @ motion.T_prev_curr  # a gap's guesses are undone
-        T_odom_base = observation.T_odom_base
+        yaw_rad = se3.yaw_rad(self._motion.predict(observation).T_prev_curr)
+        before, T_odom_base = self._T_odom_base, observation.T_odom_base
         if T_odom_base is None or not np.isfinite(T_odom_base).all():
+            self._is_gap = True
             return self._answer(observation, TrackingStatus.LOST)
-        self._move(self._T_held_curr)
-        self._T_held_curr = se3.identity()
+        if before is not None:
+            T_prev_curr = se3.inverse(before) @ T_odom_base
+            if not self._is_gap:  # the gyro does not speak for a gap
+                T_prev_curr = se3.with_yaw(T_prev_curr, yaw_rad)
+            self._move(T_prev_curr)
+        self._T_odom_base, self._is_gap = T_odom_base, False
         return self._answer(observation, TrackingStatus.TRACKING)
 
     def get_trajectory(self) -> Trajectory:

@@ -49,8 +49,7 @@ class DeadReckoning:
             return observation
         T_prev_curr = se3.inverse(before) @ now
         if yaw_rad is not None and not is_gap:  # the gyro does not speak for a gap
-            apart_rad = yaw_rad - se3.yaw_rad(T_prev_curr)
-            T_prev_curr = T_prev_curr @ se3.from_xy_yaw(0.0, 0.0, apart_rad)
+            T_prev_curr = se3.with_yaw(T_prev_curr, yaw_rad)
         if self._learns:
             self._turned_rad = float(se3.rotation_angle_rad(T_prev_curr))
         learnt = self._taught(module)

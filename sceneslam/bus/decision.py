@@ -106,7 +106,10 @@ def _decide_on_loss(policy: Policy, now: Situation) -> Verdict:
     """
     lost_ns = now.stamp_ns - now.unheld_since_ns
     window_ns = round(policy.confirm_window_s * 1e9)
-    others = tuple(key for key in now.served_choices if key != now.active)
+    # Two that both disagree with the wheels do not take turns: the wheels bridge meanwhile.
+    may_return = now.stamp_ns >= now.retry_ns or now.health is not Health.SUSPECT
+    barred = (now.active,) if may_return else (now.active, *now.served_choices[:1])
+    others = tuple(key for key in now.served_choices if key not in barred)
     left, rounds = tuple(key for key in others if key not in now.tried), now.rounds
     if now.held_ns >= window_ns or (now.health is Health.FAILED and not left):
         left, rounds = others, 0

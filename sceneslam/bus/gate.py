@@ -86,9 +86,7 @@ def with_heading(T_prev_curr_odom: Transform, rotation: NDArray[np.float64]) -> 
     `rotation` (3, 3) is the module's over the same time. Wheels stay on the floor: the way is
     theirs, and so are roll and pitch, which a module's tilt would turn into a climb.
     """
-    module_rad = np.arctan2(rotation[1, 0], rotation[0, 0])
-    apart_rad = float(module_rad) - se3.yaw_rad(T_prev_curr_odom)
-    return T_prev_curr_odom @ se3.from_xy_yaw(0.0, 0.0, apart_rad)
+    return se3.with_yaw(T_prev_curr_odom, float(np.arctan2(rotation[1, 0], rotation[0, 0])))
 
 
 @dataclass(slots=True, kw_only=True, eq=False)

@@ -40,6 +40,11 @@ def yaw_rad(T_a_b: Transform) -> float:
     return float(np.arctan2(T_a_b[1, 0], T_a_b[0, 0]))
 
 
+def with_yaw(T_a_b: Transform, rad: float) -> Transform:
+    """Return a motion over the same distance, with the same roll and pitch, by another yaw."""
+    return T_a_b @ from_xy_yaw(0.0, 0.0, rad - yaw_rad(T_a_b))
+
+
 def inverse(T_a_b: Transform) -> Transform:
     """Return T_b_a; works on a stack (..., 4, 4) too."""
     rotation_t = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
