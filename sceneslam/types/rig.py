@@ -119,7 +119,6 @@ class Gyro:
 
     bias_radps: float = 0.02  # before it is learnt
     noise_rad: float = 3e-4  # of the turn between two observations, at least
-    scale_ratio: float = 0.01  # per radian turned
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

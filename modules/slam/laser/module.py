@@ -68,7 +68,6 @@ class LaserSlam:
     _scanner: DepthScanner | LidarScanner | None = field(default=None, init=False)
     _front_end: FrontEnd | None = field(default=None, init=False)
     _T_base_laser: se3.Transform = field(default_factory=se3.identity, init=False)
-    _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -102,7 +101,6 @@ class LaserSlam:
         else:
             self._T_base_laser = se3.identity() if rig.laser is None else rig.laser.T_base_laser
         self._front_end = self._make_front_end(rig)
-        self._T_local_base = se3.identity()
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
         """Do nothing: its poses are in `local` wherever that lies."""
@@ -115,10 +113,9 @@ class LaserSlam:
         if self._front_end is None:
             raise RuntimeError("track() before activate()")
         estimate = self._front_end.track(observation, self._scan(observation))
-        self._T_local_base = to_transform(estimate.T_local_base)
         return Tracking(
             stamp_ns=observation.stamp_ns,
-            T_local_base=self._T_local_base.copy(),
+            T_local_base=to_transform(estimate.T_local_base),
             status=estimate.status,
             covariance=_covariance_base(estimate),
             quality_ratio=estimate.quality_ratio,
