@@ -93,13 +93,21 @@ class Results:
             metrics,
             title=self.title,
             config=self.config,
-            threshold=(self.config.get("evaluation") or {}).get("drawn_threshold"),
+            threshold=self._drawn_threshold(),
             config_yaml=(self.folder / "config.yaml").read_text(),
             versions=self.versions,
             faults=self.faults,
             reference=reference,
             value_label=self.value_label,
         )
+
+    def _drawn_threshold(self) -> float | None:
+        """Return `evaluation.drawn_threshold`, else the detector's own, if it has one."""
+        for group, key in (("evaluation", "drawn_threshold"), ("detector", "threshold")):
+            value = (self.config.get(group) or {}).get(key)
+            if value is not None:
+                return float(value)
+        return None
 
     @contextmanager
     def _noting(self, what: str) -> Iterator[None]:

@@ -212,7 +212,7 @@ def default_settings():
     path = Path(__file__).parents[1] / "conf" / "evaluation" / "default.yaml"
     arguments = yaml.safe_load(path.read_text())
     assert arguments.pop("_target_") == "sceneslam.evaluation.settings.EvaluationSettings"
-    return arguments | {"drawn_threshold": None}  # an interpolation
+    return arguments
 
 
 @pytest.mark.parametrize("key", ["correct_limit_m", "correct_limit_ratio"])
