@@ -34,7 +34,7 @@ class Results:
     evaluation: EvaluationSettings
     has_report: bool
     value_label: str  # of the detector's votes, for the figures
-    faults: list[str]  # of the run; each is told in the report
+    faults: list[str]  # of the run; each is in the report
 
     def save_trajectories(self, result: RunResult) -> None:
         """Write the trajectories: nothing is worth as much, and nothing else is waited for."""

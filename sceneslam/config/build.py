@@ -159,7 +159,7 @@ def _tell_of_rows(table: Mapping[str, Any], scenes: Mapping[str, Sequence[str]])
 
 
 def _group(config: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """Return a table of the top level, empty where there is none."""
+    """Return a table of the top level, empty where it is missing."""
     value = config.get(key)
     if value is not None and not isinstance(value, Mapping):
         raise ConfigError(key, value, "a table of keys")

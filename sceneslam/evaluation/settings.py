@@ -1,4 +1,4 @@
-"""What counts as matched and as correct when a run is held against its ground truth."""
+"""What counts as matched and as correct when a run is compared with its ground truth."""
 
 from __future__ import annotations
 
