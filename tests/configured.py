@@ -44,6 +44,7 @@ CONFIG = {
         "correct_limit_rad": 0.17,
         "drawn_threshold": None,
         "coverage_min_ratio": 0.9,
+        "scenes": {},
     },
     "run": {
         "_target_": "sceneslam.config.settings.RunSettings",
