@@ -49,12 +49,12 @@ def measured():
     return found
 
 
-def test_the_numbers_of_the_readme_were_measured():
+def test_the_numbers_of_the_overview_were_measured():
     """A decimal in its prose is that of a file, in its own unit or another, rounded."""
-    text = re.sub(r"```.*?```", "", (ROOT / "README.md").read_text(), flags=re.S)
-    prose = TOOL["_BLOCK"].sub("", text.partition("## What it can do so far")[2])
+    text = (ROOT / "experiments" / "README.md").read_text()
+    prose = TOOL["_BLOCK"].sub("", re.sub(r"```.*?```", "", text, flags=re.S))
     values = measured()
-    for number in DECIMAL.findall(prose.partition("## Development")[0]):
+    for number in DECIMAL.findall(prose):
         half = 0.51 * 10.0 ** -len(number.partition(".")[2])
         near = (abs(value * scale - float(number)) <= half for value in values for scale in SCALES)
         assert any(near), f"{number} is in no file of experiments/"

@@ -15,6 +15,7 @@ SCENARIOS = (
     "white_wall",
     "dark_corridor",
     "depth_dropout",
+    "failing_sensors",
 )
 EXPERIMENTS = (
     "faults",
@@ -56,7 +57,7 @@ def bases(folder: Path) -> list[Base]:
         _single("single", ""),
         *(
             _single(name, "slam.only", f"slam@slam.only={name}")
-            for name in ("rgbd", "laser", "depth", "kiss_icp", "odometry")
+            for name in ("rgbd", "laser", "depth", "direct", "kiss_icp", "odometry")
         ),
         _single(
             "recorded", "slam.only", "slam@slam.only=recorded", f"slam.only.path={folder}/path.tum"
