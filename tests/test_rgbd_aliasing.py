@@ -69,14 +69,20 @@ def test_corridor_that_repeats_would_be_closed_if_any_drift_were_believed(
 def test_lost_camera_does_not_choose_between_two_places_that_look_the_same(endless_corridor):
     module = make()
     drive_on(module)
-    gone = se3.from_xy_yaw(0.0, 90.0, 0.0)  # where no landmark is near, says the odometry
-    module.track(replace(corridor(STEPS - 1), T_odom_base=se3.identity()))
+    module.track(replace(corridor(STEPS), T_odom_base=se3.identity()))
     black = np.zeros((240, 320, 3), np.uint8)
-    module.track(replace(corridor(STEPS), image_bgr=black, T_odom_base=gone))
-    ambiguous, clear = (replace(corridor(i), T_odom_base=gone) for i in (2, STEPS // 2))
-    answer = module.track(replace(ambiguous, stamp_ns=corridor(STEPS + 1).stamp_ns))
+    for metre in range(1, 31):  # to where no landmark is near, say the wheels
+        gone = se3.from_xy_yaw(float(metre), 0.0, 0.0)
+        stamp_ns = corridor(STEPS).stamp_ns + metre * 400_000_000
+        dark = replace(corridor(STEPS), stamp_ns=stamp_ns, image_bgr=black, T_odom_base=gone)
+        module.track(dark)
+    ambiguous, clear = (
+        replace(corridor(index), stamp_ns=stamp_ns + later_ns, T_odom_base=gone)
+        for index, later_ns in ((2, 33_000_000), (STEPS // 2, 66_000_000))
+    )
+    answer = module.track(ambiguous)
     assert answer.status is TrackingStatus.LOST
-    answer = module.track(replace(clear, stamp_ns=corridor(STEPS + 2).stamp_ns))
+    answer = module.track(clear)
     assert answer.status is not TrackingStatus.LOST
     travelled_m = np.linalg.norm(answer.T_local_base[:2, 3])
     assert travelled_m == pytest.approx(STEP_M * (STEPS // 2), abs=0.1)

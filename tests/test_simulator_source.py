@@ -146,7 +146,7 @@ def test_a_damaged_cache_file_is_rendered_anew(
     assert all(same(one, other) for one, other in zip(first, again, strict=True))
 
 
-def test_an_interrupted_rendering_leaves_no_file(
+def test_an_interrupted_rendering_leaves_no_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(*_: object) -> None:
@@ -155,7 +155,7 @@ def test_an_interrupted_rendering_leaves_no_file(
     monkeypatch.setattr("sceneslam.sources.simulator.source.changes_of", interrupt)
     with pytest.raises(KeyboardInterrupt):
         list(make(tmp_path, duration_s=0.1))
-    assert list(tmp_path.iterdir()) == []
+    assert {path.suffix for path in tmp_path.iterdir()} <= {".lock"}
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def test_all_gyro_samples_since_the_image_before_are_taken() -> None:
     gyro = [(Sensor.GYRO, stamp, stamp) for stamp in range(5, 300, 10)]
     images = [(Sensor.IMAGE, stamp, "") for stamp in (100, 200)]
     found = bundles(Sensor.IMAGE, sorted(gyro + images, key=lambda one: one[1]))
-    assert [sample.value for sample in found[1].gyro] == list(range(105, 200, 10))
+    assert [sample.value for sample in found[1].samples[Sensor.GYRO]] == list(range(105, 200, 10))
 
 
 def test_odometry_is_interpolated_and_not_across_a_gap() -> None:
