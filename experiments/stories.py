@@ -12,8 +12,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 OUT = Path(__file__).parent / "results" / "README" / "stories.csv"
 COLUMNS = (
     *("scenario", "path [m]", "ATE RMSE (max) [m]", "coverage", "Correct Rate"),
@@ -24,7 +22,7 @@ COLUMNS = (
 def row(folder: Path) -> list[str]:
     """Return one run's line."""
     metrics = json.loads((folder / "metrics.json").read_text())
-    words = yaml.safe_load((folder / ".hydra" / "overrides.yaml").read_text())
+    words = json.loads((folder / "job.json").read_text())["overrides"]
     scenario = next(w.partition("=")[2] for w in words if w.lstrip("+").startswith("scenario="))
     return [
         scenario,
