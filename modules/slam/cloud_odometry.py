@@ -23,7 +23,6 @@ from .clouds import CloudReader
 from .degeneracy import Localizability
 
 _POINTS_MIN = 50  # fewer do not hold six degrees of freedom
-_COAST_S = 0.5  # without a good cloud for longer, a guessed pose is no pose
 _DEPTH_VOXEL_M = 0.1
 _DIFFUSE = 1e6  # variances of a cloud: a prediction that ICP alone decides against
 
@@ -177,16 +176,12 @@ class CloudOdometry(ABC):
         self, observation: Observation, prediction: Prediction, *, can_coast: bool
     ) -> Tracking:
         """Go on without a cloud: by odometry, for a moment as before, else not at all."""
-        is_brief = self._has_map and self._predictor.unmeasured_s(observation) <= _COAST_S
-        if prediction.is_measured or (can_coast and is_brief):
-            self._predictor.coast(prediction)
-            self._T_local_base = prediction.T_local_base
-            is_known = prediction.is_measured
-            status = TrackingStatus.DEGRADED if is_known else TrackingStatus.TRACKING
-            return self._answer(observation, status, 0.0, 0)
-        self._predictor.lose(prediction)
-        self._T_local_base = self._predictor.T_local_measured
-        return self._answer(observation, TrackingStatus.LOST, 0.0, 0)
+        can_coast = can_coast and self._has_map
+        status = self._predictor.bridge(observation, prediction, can_coast=can_coast)
+        is_lost = status is TrackingStatus.LOST
+        kept = self._predictor.T_local_measured if is_lost else prediction.T_local_base
+        self._T_local_base = kept
+        return self._answer(observation, status, 0.0, 0)
 
     def _answer(
         self, observation: Observation, status: TrackingStatus, quality_ratio: float, inliers: int

@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from sceneslam.motion.model import Motion, MotionModel
 from sceneslam.types import se3
-from sceneslam.types.observation import Observation
+from sceneslam.types.observation import Observation, TrackingStatus
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
 
 Matrix = NDArray[np.float64]
 
 _FIRST_DEVIATION = 1e-4  # m and rad: of the pose that `local` is defined by
+_COAST_S = 0.5  # without a measurement for longer, a guessed pose is no pose
 _UNMEASURED = 1e-6  # 1/m^2, 1/rad^2: the information along what a sensor does not measure
 
 
@@ -105,6 +106,22 @@ class Predictor:
             self.T_local_base = se3.from_parts(rotation, position)
         self.model.slow_down()
         self._is_lost = True
+
+    def bridge(
+        self, observation: Observation, prediction: Prediction, *, can_coast: bool
+    ) -> TrackingStatus:
+        """Go on without a measurement; return what the pose is worth then.
+
+        Odometry leads on (DEGRADED), else the last velocity for a moment where `can_coast`
+        (TRACKING), else the pose is lost.
+        """
+        is_brief = self.unmeasured_s(observation) <= _COAST_S
+        if prediction.is_measured or (can_coast and is_brief):
+            self.coast(prediction)
+            is_known = prediction.is_measured
+            return TrackingStatus.DEGRADED if is_known else TrackingStatus.TRACKING
+        self.lose(prediction)
+        return TrackingStatus.LOST
 
     def correct(self, T_new_old: Transform) -> None:
         """Take that the map, and the poses with it, was corrected."""

@@ -22,7 +22,6 @@ from .localizer import Localizer
 from .pose_graph import PoseGraph
 
 _SAMPLES_MIN = 100
-_COAST_S = 0.5  # without depth for longer, a guessed pose is no pose
 
 
 @dataclass(kw_only=True, eq=False)
@@ -195,18 +194,11 @@ class DepthSlam:
         self, observation: Observation, prediction: Prediction, *, can_coast: bool
     ) -> Tracking:
         """Go on without depth: by odometry, for a moment as before, else not at all."""
-        is_brief = len(self._map) > 0 and self._predictor.unmeasured_s(observation) <= _COAST_S
-        if prediction.is_measured or (can_coast and is_brief):
-            self._coast(prediction)
-            is_known = prediction.is_measured
-            status = TrackingStatus.DEGRADED if is_known else TrackingStatus.TRACKING
-            return self._answer(observation, status, 0.0, 0)
-        self._predictor.lose(prediction)
-        return self._answer(observation, TrackingStatus.LOST, 0.0, 0)
-
-    def _coast(self, prediction: Prediction) -> None:
-        self._predictor.coast(prediction)
-        self._T_local_base = prediction.T_local_base
+        can_coast = can_coast and len(self._map) > 0
+        status = self._predictor.bridge(observation, prediction, can_coast=can_coast)
+        if status is not TrackingStatus.LOST:
+            self._T_local_base = prediction.T_local_base
+        return self._answer(observation, status, 0.0, 0)
 
     def _answer(
         self, observation: Observation, status: TrackingStatus, quality_ratio: float, inliers: int

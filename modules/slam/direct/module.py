@@ -28,7 +28,6 @@ _POSITIVE = (
     "cloud_voxel_m"
 )
 _PIXELS_MIN = 300  # that both views show; with fewer there is nothing to compare
-_COAST_S = 0.5  # without an image for longer, a guessed pose is no pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,17 +192,12 @@ class DirectSlam:
         self, observation: Observation, prediction: Prediction, *, can_coast: bool
     ) -> Tracking:
         """Go on without an image: by odometry, for a moment as before, else not at all."""
-        has_pose = self._key is not None
-        is_brief = has_pose and self._predictor.unmeasured_s(observation) <= _COAST_S
-        if prediction.is_measured or (can_coast and is_brief):
-            self._predictor.coast(prediction)
-            self._T_local_base = prediction.T_local_base
-            is_known = prediction.is_measured
-            status = TrackingStatus.DEGRADED if is_known else TrackingStatus.TRACKING
-            return self._answer(observation, status, 0.0, 0)
-        self._predictor.lose(prediction)
-        self._T_local_base = self._predictor.T_local_measured
-        return self._answer(observation, TrackingStatus.LOST, 0.0, 0)
+        can_coast = can_coast and self._key is not None
+        status = self._predictor.bridge(observation, prediction, can_coast=can_coast)
+        is_lost = status is TrackingStatus.LOST
+        kept = self._predictor.T_local_measured if is_lost else prediction.T_local_base
+        self._T_local_base = kept
+        return self._answer(observation, status, 0.0, 0)
 
     def _answer(
         self, observation: Observation, status: TrackingStatus, quality_ratio: float, inliers: int
