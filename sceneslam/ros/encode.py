@@ -14,7 +14,7 @@ from sceneslam.types.observation import LaserScan
 from sceneslam.types.rig import Camera, Sensor
 from sceneslam.types.se3 import Transform
 
-FLOAT32, FLOAT64 = 7, 8  # sensor_msgs/PointField
+_DATATYPES = {"<u4": 6, "<f4": 7, "<f8": 8}  # of sensor_msgs/PointField
 
 
 class Encoder:
@@ -103,33 +103,15 @@ class Encoder:
         point_times_s: NDArray[np.float64] | None,
     ) -> bytes:
         """Return a PointCloud2 with x y z, and `time` [s after the stamp] where it is known."""
-        layout: list[tuple[str, str, int]] = [(axis, "<f4", FLOAT32) for axis in "xyz"]
+        layout = [(axis, "<f4") for axis in "xyz"]
         if point_times_s is not None:
-            layout.append(("time", "<f8", FLOAT64))
-        rows = np.zeros(len(points_lidar), dtype=[(name, dtype) for name, dtype, _ in layout])
+            layout.append(("time", "<f8"))
+        rows = np.zeros(len(points_lidar), dtype=layout)
         for column, axis in enumerate("xyz"):
             rows[axis] = points_lidar[:, column]
         if point_times_s is not None:
             rows["time"] = point_times_s
-        offsets = [rows.dtype.fields[name][1] for name, _, _ in layout] if rows.dtype.fields else []
-        fields = [
-            self._new(
-                "sensor_msgs/msg/PointField", name=name, offset=offset, datatype=code, count=1
-            )
-            for (name, _, code), offset in zip(layout, offsets, strict=True)
-        ]
-        return self._cdr(
-            names.TYPES[names.POINTS],
-            header=self._header(stamp_ns, names.LIDAR),
-            height=1,
-            width=len(rows),
-            fields=fields,
-            is_bigendian=False,
-            point_step=rows.dtype.itemsize,
-            row_step=rows.dtype.itemsize * len(rows),
-            data=rows.view(np.uint8).ravel(),
-            is_dense=True,
-        )
+        return self._cloud(stamp_ns, rows, names.LIDAR)
 
     def odometry(
         self,
@@ -214,6 +196,31 @@ class Encoder:
             "geometry_msgs/msg/Pose",
             position=self._new("geometry_msgs/msg/Point", x=x, y=y, z=z),
             orientation=self._new("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+        )
+
+    def _cloud(self, stamp_ns: int, rows: NDArray[np.void], frame: str) -> bytes:
+        """Return a PointCloud2 of rows whose dtype names the fields."""
+        fields = [
+            self._new(
+                "sensor_msgs/msg/PointField",
+                name=name,
+                offset=offset,
+                datatype=_DATATYPES[kind.str],
+                count=1,
+            )
+            for name, (kind, offset, *_) in (rows.dtype.fields or {}).items()
+        ]
+        return self._cdr(
+            names.TYPES[names.POINTS],
+            header=self._header(stamp_ns, frame),
+            height=1,
+            width=len(rows),
+            fields=fields,
+            is_bigendian=False,
+            point_step=rows.dtype.itemsize,
+            row_step=rows.dtype.itemsize * len(rows),
+            data=rows.view(np.uint8).ravel(),
+            is_dense=True,
         )
 
     def _header(self, stamp_ns: int, frame: str) -> Any:

@@ -7,12 +7,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.ros.encode import FLOAT32, Encoder
+from sceneslam.ros.encode import Encoder
 from sceneslam.types import se3
 from sceneslam.types.maps import GridLayer, PointLayer
 from sceneslam.types.se3 import Transform
 
-UINT32 = 6  # sensor_msgs/PointField
 OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"  # diagnostic_msgs/DiagnosticStatus
 
 
@@ -100,28 +99,7 @@ class ResultEncoder(Encoder):
         if layer.colors_bgr is not None:
             blue, green, red = layer.colors_bgr.astype(np.uint32).T
             rows["rgb"] = (red << 16) | (green << 8) | blue
-        fields = [
-            self._new(
-                "sensor_msgs/msg/PointField",
-                name=name,
-                offset=4 * index,
-                datatype=UINT32 if name == "rgb" else FLOAT32,
-                count=1,
-            )
-            for index, (name, _) in enumerate(kinds)
-        ]
-        return self._cdr(
-            "sensor_msgs/msg/PointCloud2",
-            header=self._header(stamp_ns, frame),
-            height=1,
-            width=len(rows),
-            fields=fields,
-            is_bigendian=False,
-            point_step=rows.dtype.itemsize,
-            row_step=rows.dtype.itemsize * len(rows),
-            data=rows.view(np.uint8).ravel(),
-            is_dense=True,
-        )
+        return self._cloud(stamp_ns, rows, frame)
 
     def diagnostics(
         self, stamp_ns: int, level: bytes, message: str, values: Mapping[str, str]
