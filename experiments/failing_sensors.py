@@ -22,22 +22,13 @@ from sceneslam.detection.decide import confirm
 from sceneslam.interfaces import FeatureDetector, Source
 from sceneslam.sources.failing_sensor import FailingSensor
 from sceneslam.sources.failures import FAILURES, scene_of
+from sceneslam.sources.simulator.stories import STORIES
 from sceneslam.types.observation import Observation, SceneVote
 from sceneslam.types.truth import GroundTruth
 
 SEEDS = (100, 101, 102, 103, 104)
 SPANS_S = ((4.0, 8.0), (8.0, 12.0))  # of a failure, one drive each: straight on, and in a bend
 CAMERA = ("source.camera.size_wh=[320,240]", "source.camera.rate_hz=15", "source.laser=true")
-STORIES = (
-    "bright_to_dark",
-    "dark_to_bright",
-    "there_and_back",
-    "lights_out",
-    "flicker",
-    "white_wall",
-    "dark_corridor",
-    "depth_dropout",
-)
 STORY_SEEDS = (100, 101)
 SUNNY = "depth_dropout"  # where the sun does blind the depth camera
 DATA = Path("../shared/data")

@@ -227,23 +227,11 @@ class FullDisk(IdleSink):
         raise OSError("no space left on device")
 
 
-class ClosedSink:
+class ClosedSink(IdleSink):
     """Cannot be opened."""
 
     def open(self, rig, folder):
         raise OSError("no such device")
-
-    def write(self, observation, T_map_base, module):
-        pass
-
-    def write_event(self, event):
-        pass
-
-    def write_truth(self, truth):
-        pass
-
-    def close(self):
-        pass
 
 
 class Intruder(ClosedSink):

@@ -24,10 +24,7 @@ def draw_votes(
     if not np.isfinite(values).any():
         return None
     times_s = look.elapsed_s(result, np.array([e["stamp_ns"] for e in votes], np.int64))
-    figure = look.new_figure()
-    axes = figure.add_subplot()
-    bands = look.true_scene_spans(result, truth)
-    look.draw_bands(axes, bands, look.scene_tints(b.label for b in bands), 0.9)
+    figure, axes = _over_true_scenes(result, truth)
     curve = look.thinned(times_s, values)
     axes.plot(*curve, color=look.PALETTE[0], linewidth=1.4, label=value_label)
     if threshold is not None:
@@ -52,10 +49,7 @@ def draw_posterior(result: RunResult, truth: GroundTruth | None) -> Any:
     if not votes:
         return None
     times_s = look.elapsed_s(result, np.array([e["stamp_ns"] for e in votes], np.int64))
-    figure = look.new_figure()
-    axes = figure.add_subplot()
-    bands = look.true_scene_spans(result, truth)
-    look.draw_bands(axes, bands, look.scene_tints(b.label for b in bands), 0.9)
+    figure, axes = _over_true_scenes(result, truth)
     for number, scene in enumerate(votes[0]["posterior"]):
         values = np.array([event["posterior"][scene] for event in votes])
         color = look.PALETTE[number % len(look.PALETTE)]
@@ -142,6 +136,15 @@ def draw_timeline(result: RunResult, truth: GroundTruth | None) -> Any:
     axes.set_xlim(0.0, max(look.duration_s(result), 1e-3))
     _key_to_trouble(figure, result)
     return figure
+
+
+def _over_true_scenes(result: RunResult, truth: GroundTruth | None) -> tuple[Any, Any]:
+    """Return a figure and its axes, shaded by the true scenes."""
+    figure = look.new_figure()
+    axes = figure.add_subplot()
+    bands = look.true_scene_spans(result, truth)
+    look.draw_bands(axes, bands, look.scene_tints(b.label for b in bands), 0.9)
+    return figure, axes
 
 
 def _at_s(result: RunResult, event: Event) -> float:
