@@ -25,7 +25,7 @@ from sceneslam.sources.simulator.shot import floor_plan
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
 
-_SHORTEST_S = 2.0  # of a drive through a zone; a corner of the next one is none
+_SHORTEST_S = 2.0  # of a drive through a zone; shorter: a corner of the next one
 
 
 def main() -> None:

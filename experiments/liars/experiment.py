@@ -30,7 +30,7 @@ class Drive:
     relations: Path | None = None  # true relative poses of a log
 
     def error_m(self, outcome: Outcome) -> float:
-        """Return the mean error of the relations, else the ATE; NaN where there is none."""
+        """Return the mean error of the relations, else the ATE; NaN where neither is known."""
         if self.relations is not None:
             errors = relation_errors(outcome.trajectory, Relations.read(self.relations))
             return errors["trans_mean_m"]

@@ -79,7 +79,7 @@ class Learned:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Return a model as it is written; raises InputError where it is none."""
+    """Return a model as it is written; raises InputError for anything else."""
     if not path.is_file():
         raise InputError(f"model not found (python -m sceneslam.scenes train makes one): {path}")
     try:

@@ -248,7 +248,7 @@ class MotionModel:
         self._is_measured = True
 
     def _take_odometry(self, observation: Observation, duration_s: float) -> _Step | None:
-        """Return the motion since the last odometry, None where there is none now or was none."""
+        """Return the motion since the last odometry, None where it is missing now or was before."""
         self._silent_s += duration_s
         T_before, T_odom_base = self._T_odom_base, _finite(observation.T_odom_base)
         if T_odom_base is None:

@@ -61,7 +61,7 @@ class Model:
 
     @classmethod
     def read(cls, path: Path) -> Model:
-        """Return the model in a file; raises InputError where there is none."""
+        """Return the model in a file; raises InputError where it is missing."""
         if not path.is_file():
             raise InputError(f"model not found: {path}")
         try:

@@ -48,7 +48,7 @@ class Keyframes:
         self._points.append(points.astype(np.float32))
 
     def cloud(self) -> PointLayer | None:
-        """Return the points in local, one per voxel; None where there is none."""
+        """Return the points in local, one per voxel; None without a point."""
         if not self._points:
             return None
         points = np.concatenate(self._points)
@@ -57,7 +57,7 @@ class Keyframes:
         return PointLayer(points=points[np.sort(first)])
 
     def graph(self, T_cam_base: se3.Transform) -> PoseGraphLayer | None:
-        """Return base at the keyframes and the motions between them; None where there is none."""
+        """Return base at the keyframes and the motions between them; None without a keyframe."""
         if not self._stamps_ns:
             return None
         T_local_base = np.stack(self._T_local_cam) @ T_cam_base

@@ -33,7 +33,7 @@ class Slam(Protocol):
         ...
 
     def track(self, observation: Fields) -> Reply:
-        """Return `pose(...)`, `{}`-like `poses([])` where there is none yet, or several."""
+        """Return `pose(...)`, or `poses([...])` for several; an empty list: none is known yet."""
         ...
 
     def trajectory(self) -> Reply:

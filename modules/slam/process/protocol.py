@@ -55,7 +55,7 @@ def pack(kind: str, number: int, fields: Fields) -> list[memoryview]:
 
 
 def read_head(data: bytes) -> Head:
-    """Return the head in the first 40 bytes; raises ProtocolError where they are none."""
+    """Return the head in the first 40 bytes; raises ProtocolError where they are not one."""
     magic, kind, number, count, length = _HEAD.unpack(data)
     if magic[:-1] != MAGIC[:-1]:
         raise ProtocolError(f"wrote what is no message: {data[:24]!r}")

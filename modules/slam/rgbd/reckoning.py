@@ -35,7 +35,7 @@ class Reckoner:
         self._now = Reckoned(T_reckoned_base=se3.identity(), stretch=0)
 
     def add(self, prediction: Prediction) -> Reckoned | None:
-        """Return where odometry alone leads, None where there is none to be believed."""
+        """Return the pose by odometry alone; None without odometry that can be believed."""
         T_now = se3.orthonormal(self._now.T_reckoned_base @ prediction.motion.T_prev_curr)
         is_broken = not prediction.is_measured
         self._now = Reckoned(T_reckoned_base=T_now, stretch=self._now.stretch + is_broken)
