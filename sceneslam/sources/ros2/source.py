@@ -236,7 +236,9 @@ class Ros2:
             if arrival is not None:
                 for sensor, sample in self._samples(arrival):
                     stamp_ns = sample.stamp_ns
-                    if sensor is not streams.pace or primary is streams.pace:
+                    if sensor is not streams.pace or (
+                        streams.has_begun and primary is streams.pace
+                    ):
                         yield from ((one, primary) for one in synchroniser.add(sensor, sample))
             # While messages wait here, the time is theirs: who is read late was heard in time.
             now_ns = monotonic_ns() if arrival is None else arrival.arrived_ns

@@ -23,6 +23,7 @@ class Streams:
         self._silent_ns = round(silent_after_s * 1e9)
         self._heard_ns = dict.fromkeys(topics.values(), now_ns)
         self._silent: set[str] = set()
+        self._unheard = set(topics.values())
         self._told_ns: dict[tuple[str, str], int] = {}
         self._shifts_ns: dict[str, int] = {}
         self._dropped: Counter[str] = Counter()
@@ -46,9 +47,15 @@ class Streams:
             if sensor in _WAITED_FOR and topic not in self._silent
         )
 
+    @property
+    def has_begun(self) -> bool:
+        """Tell whether a message of every stream that is alive has come."""
+        return self._unheard <= self._silent
+
     def hear(self, topic: str, lined: Lined, arrived_ns: int) -> None:
         """Take that a message came."""
         self._heard_ns[topic] = arrived_ns
+        self._unheard.discard(topic)
         if topic in self._silent:
             self._silent.discard(topic)
             self._tell("stream_returned", lined.stamp_ns, topic=topic)
