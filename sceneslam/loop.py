@@ -15,6 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from sceneslam.atlas.save import save_map
+from sceneslam.bus.beside import executor
 from sceneslam.bus.bus import Bus
 from sceneslam.bus.handover_log import log_uncertainty
 from sceneslam.config.build import Parts
@@ -60,7 +61,11 @@ class Loop:
         self._covariances = np.zeros((0, 6, 6))
         self._began_s, self._wall_s = perf_counter(), 0.0
         detector = SteeredDetector(parts.detector)
-        self._operator = Operator(detector, parts.scenes, save_map, results.folder, self._log.add)
+        is_live = parts.run.mode == LIVE
+        saver = executor("save", is_live=is_live)
+        self._operator = Operator(
+            detector, parts.scenes, save_map, results.folder, self._log.add, saver
+        )
         self._bus = Bus(
             detector=detector,
             modules=parts.modules,
@@ -70,6 +75,7 @@ class Loop:
             back_end=parts.atlas,
             log=self._log,
             catch_up_steps=parts.run.catch_up_steps,
+            is_live=is_live,
         )
         self._sinks: dict[str, Sink] = {}
         try:
@@ -98,6 +104,7 @@ class Loop:
         """Shut everything down but the sinks, in reverse order, and gather what was wrong."""
         if self._bus.state == "terminate":
             self.faults.append(self._why_over())
+        self._operator.close(self._last_ns())
         self._bus.close(self._last_ns())
         has_odometry = Sensor.ODOMETRY in self._parts.rig.sensors
         self._covariances = self._parts.atlas.covariances(has_odometry)
@@ -249,6 +256,7 @@ class Loop:
         for sink in list(self._sinks.values()):
             for command in sink.commands() if isinstance(sink, Steering) else ():
                 self._operator.obey(command, stamp_ns)
+        self._operator.report(stamp_ns)
 
     def _write(self, observation: Observation) -> None:
         """Give the sinks the observation with its pose, and then the events."""

@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from test_source_ros2 import CAMERA, scan
 
 from sceneslam.app import run
+from sceneslam.bus.beside import InStep
 from sceneslam.engine.steering import Operator, SteeredDetector
 from sceneslam.modules.maps.live_map import GridAndPoints
 from sceneslam.ros.encode_results import ResultEncoder
@@ -270,6 +271,7 @@ class Desk:
             lambda hybrid, path: self.saved.append(path),
             folder,
             lambda event, stamp_ns, **fields: self.events.append({"event": event, **fields}),
+            InStep(),
         )
 
     def vote(self):

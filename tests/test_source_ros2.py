@@ -154,6 +154,17 @@ def test_rig_is_what_is_heard(make):
     np.testing.assert_allclose(rig.laser.T_base_laser, T_BASE_LASER)
 
 
+def test_first_observation_is_one_that_every_stream_was_there_for(make):
+    robot = Robot(*ALL)
+    source = make(robot)
+    heard(source, robot)
+    now_ns = monotonic_ns()
+    for index in range(6):
+        robot.measure(now_ns + index * 33 * MS, without=(DEPTH, "/imu") if index < 2 else ())
+    first = next(one for one in source if one.stamp_ns >= now_ns)
+    assert first.stamp_ns == now_ns + 66 * MS and first.has(Sensor.DEPTH)
+
+
 def test_observation_holds_what_was_measured_at_its_stamp(make):
     robot = Robot(*ALL)
     source = make(robot)

@@ -9,6 +9,7 @@ from typing import Protocol
 
 from statemachine import State, StateMachine
 
+from sceneslam.bus.beside import executor
 from sceneslam.bus.changeover import Candidates, Changeover, Outcome, Plan
 from sceneslam.bus.dead_reckoning import DeadReckoning
 from sceneslam.bus.decision import Action, Health, Situation, Verdict, decide
@@ -87,6 +88,7 @@ class Bus:
 
     `scenes` maps every scene to keys of `modules`: the one to run, then its fallbacks.
     `catch_up_steps`: remembered observations led through a new module per observation, None: all.
+    `is_live`: modules are started and shut down beside the poses.
     """
 
     def __init__(
@@ -100,8 +102,12 @@ class Bus:
         back_end: BackEnd,
         log: EventLog,
         catch_up_steps: int | None = None,
+        is_live: bool = False,
     ) -> None:
-        self.runners = {key: Runner(key, module) for key, module in modules.items()}
+        self.runners = {
+            key: Runner(key, module, executor(key, is_live=is_live))
+            for key, module in modules.items()
+        }
         self.bus_us: list[float] = []
         self._policy, self._log = policy, log
         self._watch = Watch(
@@ -173,6 +179,8 @@ class Bus:
         self._reckoning.close(stamp_ns, self._log)
         self._changeover.close()
         self._estimator.close()
+        for runner in self.runners.values():
+            runner.close()
         self._watch.close()
 
     # What the machine asks before it takes a failure's way out.

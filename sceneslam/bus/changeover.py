@@ -98,8 +98,9 @@ class _Attempt:
     """A candidate that is being started."""
 
     key: str
-    ready_ns: int  # when its start is over
-    handover: Handover | None = None  # None until then
+    ready_ns: int  # when it may be started
+    is_begun: bool = False  # it is being started, or was
+    handover: Handover | None = None  # None until that is over
 
 
 class Changeover:
@@ -185,16 +186,15 @@ class Changeover:
         if trial is None or stamp_ns < trial.ready_ns:
             return
         try:
-            if trial.handover is None:
-                trial.handover = self._estimator.begin(
-                    self._runners[trial.key], self._scene, None, is_trial=True
-                )
-            trial.handover.advance(None)
+            handover = self._begun(trial, None, is_trial=True)
+            if handover is None:
+                return
+            handover.advance(None)
         except ModuleError as error:
             self._fault(stamp_ns, str(error))
             self._end_trial()
             return
-        if trial.handover.is_lost:
+        if handover.is_lost:
             self._end_trial()
 
     def close(self) -> None:
@@ -232,20 +232,32 @@ class Changeover:
             return None
         runner, since_ns = self._runners[attempt.key], self._plan.since_ns
         try:
-            if attempt.handover is None:
-                attempt.handover = self._estimator.begin(runner, self._scene, since_ns)
-            if not attempt.handover.advance(self._limit):
+            handover = self._begun(attempt, since_ns)
+            if handover is None or not handover.advance(self._limit):
                 return None
         except ModuleError as error:
             self._fault(stamp_ns, str(error))
             return self._refuse(runner, stamp_ns, "failed")
-        if attempt.handover.is_lost and self._can_refuse():
+        if handover.is_lost and self._can_refuse():
             return self._refuse(runner, stamp_ns, "lost")
-        self._estimator.accept(attempt.handover)
+        self._estimator.accept(handover)
         is_in_vain = self._plan.held_ns < round(self._policy.confirm_window_s * 1e9)
         self._candidates.postpone(stamp_ns, is_in_vain=is_in_vain)
         self._log_choice("decision", stamp_ns, attempt.key)
         return True
+
+    def _begun(
+        self, attempt: _Attempt, since_ns: int | None, *, is_trial: bool = False
+    ) -> Handover | None:
+        """Start a candidate; return its hand-over once it has started, None until then."""
+        if attempt.handover is None:
+            runner = self._runners[attempt.key]
+            if not attempt.is_begun:
+                attempt.is_begun = True
+                self._estimator.start(runner, self._scene)
+            if runner.has_started():
+                attempt.handover = self._estimator.begin(runner, since_ns, is_trial=is_trial)
+        return attempt.handover
 
     def _can_refuse(self) -> bool:
         """Tell whether something better than a lost module is left; the paper does not ask."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
+from dataclasses import dataclass
+
 import numpy as np
 
 from sceneslam.bus.bridge import Bridge
@@ -12,7 +15,7 @@ from sceneslam.bus.hold import Hold
 from sceneslam.bus.memory import Memory, Moment
 from sceneslam.bus.pace import Pace
 from sceneslam.bus.policy import Policy
-from sceneslam.bus.runner import Runner
+from sceneslam.bus.runner import Legacy, Runner
 from sceneslam.bus.session import Session
 from sceneslam.interfaces import BackEnd
 from sceneslam.types import se3
@@ -23,6 +26,14 @@ from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
 
 _VELOCITY_S = 0.5  # for which a robot that is not seen is taken to drive on as it did
+
+
+@dataclass(frozen=True, slots=True)
+class _Ending:
+    """A module that is being shut down."""
+
+    legacy: Future[Legacy]
+    placed: list[int]  # the back end's sessions of it
 
 
 class Estimator:
@@ -43,6 +54,7 @@ class Estimator:
             keeps_sensors=has_choice,
         )
         self._placed: list[int] = []  # the back end's sessions of the active one
+        self._ending: list[_Ending] = []  # modules that are being shut down
         self._told: TrackingStatus | None = None  # what the log says of the active module ...
         self._told_lie = False  # ... and of the wheels
 
@@ -68,6 +80,7 @@ class Estimator:
 
     def track(self, observation: Observation, *, by_velocity: bool) -> None:
         """Give the observation its pose; raises ModuleError when the module broke its promise."""
+        self._keep_maps(waits=False)
         session, was_placed = self._session, self._session.is_placed
         moment = session.advance(observation, by_velocity=by_velocity)
         self._tell(observation.stamp_ns)
@@ -82,10 +95,12 @@ class Estimator:
         if session.fault is not None:
             raise session.fault
 
-    def begin(
-        self, runner: Runner, scene: str, since_ns: int | None, *, is_trial: bool = False
-    ) -> Handover:
-        """Begin to hand over to a module; raises ModuleError when it cannot be activated.
+    def start(self, runner: Runner, scene: str) -> None:
+        """Begin to activate a module that is to be handed over to."""
+        runner.start(self._rig, scene)
+
+    def begin(self, runner: Runner, since_ns: int | None, *, is_trial: bool = False) -> Handover:
+        """Begin to hand over to a module that has started.
 
         `since_ns`: when the scene that calls for it began, None where it is not the scene. A
         trial begins now, whatever the kind of hand-over.
@@ -95,7 +110,7 @@ class Estimator:
             anchor = self._memory.anchor(since_ns)
         session = Session(runner, self._new_hold(), anchor.bridge.copy())
         pace = Pace(self._policy.catch_up)
-        return Handover(session, self._memory, anchor=anchor, pace=pace, scene=scene, rig=self._rig)
+        return Handover(session, self._memory, anchor=anchor, pace=pace)
 
     def settle(self, handover: Handover) -> None:
         """Place a module that was on trial at the pose of now: what it gave before is not used."""
@@ -122,6 +137,7 @@ class Estimator:
     def close(self) -> None:
         """Shut the active module down for good, and forget what was observed."""
         self.retire()
+        self._keep_maps(waits=True)
         self._memory.clear()
 
     def _distrust(self, since_ns: int, moment: Moment) -> Moment:
@@ -203,14 +219,20 @@ class Estimator:
 
     def _retire(self, runner: Runner | None, placed: list[int]) -> None:
         """Shut a module down; its map lies where it was placed last."""
-        if runner is None:
-            return
-        legacy = runner.retire()
-        for what in legacy.lost if placed else ():
-            self._log.add("fault", self._memory.newest.stamp_ns, what=what)
-        for session in placed:
-            layers = legacy.layers if session == placed[-1] else MapLayers()
-            self._back_end.close_session(session, layers, legacy.trajectory)
+        if runner is not None:
+            self._ending.append(_Ending(runner.retire(), placed))
+            self._keep_maps(waits=False)
+
+    def _keep_maps(self, *, waits: bool) -> None:
+        """Give the back end what modules that have ended leave; `waits` for those that have not."""
+        while self._ending and (waits or self._ending[0].legacy.done()):
+            ending = self._ending.pop(0)
+            legacy, placed = ending.legacy.result(), ending.placed
+            for what in legacy.lost if placed else ():
+                self._log.add("fault", self._memory.newest.stamp_ns, what=what)
+            for session in placed:
+                layers = legacy.layers if session == placed[-1] else MapLayers()
+                self._back_end.close_session(session, layers, legacy.trajectory)
 
     def _new_hold(self) -> Hold:
         gate = self._policy.gate if self._policy.handover != "cold" else None

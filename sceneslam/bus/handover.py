@@ -1,4 +1,4 @@
-"""A session on its way to become the active one: started, placed (Eq. 1), and caught up."""
+"""A session on its way to become the active one: placed (Eq. 1), and caught up."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from sceneslam.bus.pace import Pace
 from sceneslam.bus.session import Session
 from sceneslam.types import se3
 from sceneslam.types.observation import Tracking, TrackingStatus
-from sceneslam.types.rig import Rig
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
 
@@ -31,8 +30,6 @@ class Handover:
         *,
         anchor: Moment,
         pace: Pace,
-        scene: str,
-        rig: Rig,
     ) -> None:
         assert session.runner is not None
         self.session, self.runner, self.anchor = session, session.runner, anchor
@@ -43,10 +40,9 @@ class Handover:
         self._given_ns = anchor.stamp_ns  # ... and held its pose
         self._began_ns, self._done_ns = anchor.stamp_ns, anchor.stamp_ns - 1
         self._reported: Transform | None = None  # the pose of the moment before, as known then
-        self._cost_ns = 0  # that it took so far; what is waited for between is not counted ...
-        self._first_cost_ns = 0  # ... and until the first pose
-        with self._timed():
-            self.runner.activate(rig, scene)
+        # What it took so far, the start among it; what is waited for between is not counted.
+        self._cost_ns = self.runner.start_ns
+        self._first_cost_ns = 0  # the same until the first pose
 
     @property
     def is_placed(self) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from time import perf_counter_ns
@@ -30,14 +31,21 @@ class Legacy:
 
 
 class Runner:
-    """Turns whatever a module raises into a ModuleError, and refuses answers that are none."""
+    """Turns whatever a module raises into a ModuleError, and refuses answers that are none.
 
-    def __init__(self, key: str, module: SlamModule) -> None:
+    Its start and its end may take long: `executor` makes these calls, one after the other.
+    """
+
+    def __init__(self, key: str, module: SlamModule, executor: Executor) -> None:
         self.key = key
         self.is_failed = False
         self.T_map_local: Transform | None = None  # None until it is placed
         self.track_ms: list[float] = []
-        self.spent_ns = 0  # in all calls together
+        self.spent_ns = 0  # that callers waited, in all calls together
+        self.start_ns = 0  # that the last start took
+        self._executor = executor
+        self._starting: Future[None] | None = None
+        self._ending: Future[Legacy] | None = None
         self._is_active = False
         self._submitted: Observation | None = None  # its answer was not collected yet
         self._module = module
@@ -49,6 +57,8 @@ class Runner:
     def can_run(self) -> bool:
         """Tell whether the module can be activated at once."""
         module = self._module
+        if self._ending is not None and not self._ending.done():
+            return not self.is_failed  # it is activated once it has ended; it cannot be asked now
         return not self.is_failed or (isinstance(module, Restartable) and module.is_ready)
 
     @property
@@ -57,23 +67,29 @@ class Runner:
         module = self._module
         return not self.is_failed or (isinstance(module, Restartable) and not module.is_spent)
 
-    def activate(self, rig: Rig, scene: str) -> None:
-        """Start the module anew; raises ModuleError when it cannot."""
+    def start(self, rig: Rig, scene: str) -> None:
+        """Begin to activate the module anew; `has_started` tells what came of it."""
         self.T_map_local, self.is_failed = None, False
-        with self._asking("could not be activated"):
-            self._module.activate(rig)
-            self._module.set_scene(scene)
-            self._is_active = True
+        with self._timed():
+            self._starting = self._executor.submit(self._activate, rig, scene)
+
+    def has_started(self) -> bool:
+        """Return whether the start is over; raises ModuleError where the module cannot start."""
+        assert self._starting is not None, "started first"
+        if not self._starting.done():
+            return False
+        self._starting.result()
+        return True
 
     def place(self, T_map_local: Transform) -> None:
         """Place the module's frame in the map."""
         self.T_map_local = T_map_local
-        with self._asking("could not be placed"):
+        with self._timed(), self._asking("could not be placed"):
             self._module.set_pose(T_map_local)
 
     def set_scene(self, scene: str) -> None:
         """Tell the module of a confirmed scene that it goes on with."""
-        with self._asking("could not take the scene"):
+        with self._timed(), self._asking("could not take the scene"):
             self._module.set_scene(scene)
 
     def can_use(self, observation: Observation) -> bool:
@@ -86,7 +102,7 @@ class Runner:
         Does nothing for any other. Raises ModuleError as `track`.
         """
         if isinstance(self._module, Concurrent) and self.can_use(observation):
-            with self._asking("failed while tracking"):
+            with self._timed(), self._asking("failed while tracking"):
                 self._module.submit(observation)
                 self._submitted = observation
 
@@ -94,13 +110,30 @@ class Runner:
         """Return the module's answer; raises ModuleError on an exception or no proper pose."""
         began_ns = perf_counter_ns()
         try:
-            with self._asking("failed while tracking"):
+            with self._timed(), self._asking("failed while tracking"):
                 return checked_tracking(self._answer(observation), observation.stamp_ns)
         finally:
             self.track_ms.append((perf_counter_ns() - began_ns) / 1e6)
 
-    def retire(self) -> Legacy:
-        """Shut the module down and return what it leaves, empty where it cannot give it."""
+    def retire(self) -> Future[Legacy]:
+        """Shut the module down; return what it leaves, empty where it cannot give it."""
+        with self._timed():
+            self._ending = self._executor.submit(self._retire)
+        return self._ending
+
+    def close(self) -> None:
+        """Wait for the module's end."""
+        self._executor.shutdown()
+
+    def _activate(self, rig: Rig, scene: str) -> None:
+        began_ns = perf_counter_ns()
+        with self._asking("could not be activated"):
+            self._module.activate(rig)
+            self._module.set_scene(scene)
+            self._is_active = True
+        self.start_ns = perf_counter_ns() - began_ns
+
+    def _retire(self) -> Legacy:
         layers, trajectory, lost = MapLayers(), Trajectory.empty(), list[str]()
         self._drain()
         if self._is_active:
@@ -152,8 +185,7 @@ class Runner:
 
     @contextmanager
     def _calling(self, what: str) -> Iterator[None]:
-        """Count what a call costs; turn whatever it raises, but Ctrl-C, into a ModuleError."""
-        began_ns = perf_counter_ns()
+        """Turn whatever a call raises, but Ctrl-C, into a ModuleError."""
         try:
             yield
         except KeyboardInterrupt:
@@ -162,5 +194,12 @@ class Runner:
             sentence = f"slam.{self.key} {what}: {told(error)}"
             _log.info(sentence, exc_info=error)
             raise ModuleError(sentence) from error
+
+    @contextmanager
+    def _timed(self) -> Iterator[None]:
+        """Count what the caller waits."""
+        began_ns = perf_counter_ns()
+        try:
+            yield
         finally:
             self.spent_ns += perf_counter_ns() - began_ns

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass
 from pathlib import Path
 
 from sceneslam.interfaces import Detector
@@ -56,8 +58,19 @@ class SteeredDetector:
         self._detector.shutdown()
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Saving:
+    """A map that is being written."""
+
+    command: SaveMap
+    saved: Future[None]
+
+
 class Operator:
-    """Carries commands out; `note` takes what came of each as an event."""
+    """Carries commands out; `note` takes what came of each as an event.
+
+    Maps are written by `executor`, which may take its time.
+    """
 
     def __init__(
         self,
@@ -66,14 +79,37 @@ class Operator:
         save: Callable[[HybridMap, Path], None],
         folder: Path,
         note: Callable[..., None],
+        executor: Executor,
     ) -> None:
         self._detector, self._table = detector, table
         self._save, self._folder, self._note = save, folder, note
+        self._executor = executor
+        self._saving: list[_Saving] = []
         self.is_paused = False
 
     def obey(self, command: Command, stamp_ns: int) -> None:
         """Carry a command out, or say in an event why not."""
-        refusal = self._carry_out(command)
+        if isinstance(command, SaveMap) and _is_name(command.name):
+            folder = self._folder / "maps" / command.name
+            saved = self._executor.submit(self._save, command.hybrid, folder)
+            self._saving.append(_Saving(command=command, saved=saved))
+            self.report(stamp_ns)
+        else:
+            self._tell(command, stamp_ns, self._carry_out(command))
+
+    def report(self, stamp_ns: int) -> None:
+        """Say of the maps that are written by now what came of it."""
+        while self._saving and self._saving[0].saved.done():
+            saving = self._saving.pop(0)
+            error = saving.saved.exception()
+            self._tell(saving.command, stamp_ns, "" if error is None else told(error))
+
+    def close(self, stamp_ns: int) -> None:
+        """Wait for the maps that are being written."""
+        self._executor.shutdown()
+        self.report(stamp_ns)
+
+    def _tell(self, command: Command, stamp_ns: int, refusal: str) -> None:
         asked, what = type(command).__name__, _what(command)
         if refusal:
             self._note("command_refused", stamp_ns, command=asked, what=what, why=refusal)
@@ -93,13 +129,8 @@ class Operator:
                 scenes = [scene for scene, keys in self._table.items() if keys[0] == module]
                 firsts = ", ".join(sorted({keys[0] for keys in self._table.values()}))
                 return self._select(scenes[0]) if scenes else f"first of a scene are: {firsts}"
-            case SaveMap(name=name, hybrid=hybrid):
-                if not name or Path(name).name != name or name.startswith("."):
-                    return "a name without slashes is wanted"
-                try:
-                    self._save(hybrid, self._folder / "maps" / name)
-                except OSError as error:
-                    return told(error)
+            case SaveMap():
+                return "a name without slashes is wanted"
         return ""
 
     def _select(self, scene: str) -> str:
@@ -107,6 +138,10 @@ class Operator:
             return f"the detector's scenes are: {', '.join(self._detector.scenes)}"
         self._detector.selected = scene
         return ""
+
+
+def _is_name(name: str) -> bool:
+    return bool(name) and Path(name).name == name and not name.startswith(".")
 
 
 def _what(command: Command) -> str:

@@ -157,6 +157,8 @@ class Ros2:
     def __iter__(self) -> Iterator[Observation]:
         """Yield observations as they come, until `close`."""
         for bundle, primary in self._bundles():
+            if self._streams is None or not self._streams.has_begun(bundle.primary.stamp_ns):
+                continue
             decoded = self._decoders[primary].observe(bundle)
             for problem in decoded.problems:
                 self._faults.add(problem, at_stamp(decoded.stamp_ns))
@@ -236,9 +238,7 @@ class Ros2:
             if arrival is not None:
                 for sensor, sample in self._samples(arrival):
                     stamp_ns = sample.stamp_ns
-                    if sensor is not streams.pace or (
-                        streams.has_begun and primary is streams.pace
-                    ):
+                    if sensor is not streams.pace or primary is streams.pace:
                         yield from ((one, primary) for one in synchroniser.add(sensor, sample))
             # While messages wait here, the time is theirs: who is read late was heard in time.
             now_ns = monotonic_ns() if arrival is None else arrival.arrived_ns

@@ -23,7 +23,7 @@ class Streams:
         self._silent_ns = round(silent_after_s * 1e9)
         self._heard_ns = dict.fromkeys(topics.values(), now_ns)
         self._silent: set[str] = set()
-        self._unheard = set(topics.values())
+        self._first_ns: dict[str, int] = {}
         self._told_ns: dict[tuple[str, str], int] = {}
         self._shifts_ns: dict[str, int] = {}
         self._dropped: Counter[str] = Counter()
@@ -47,15 +47,24 @@ class Streams:
             if sensor in _WAITED_FOR and topic not in self._silent
         )
 
-    @property
-    def has_begun(self) -> bool:
-        """Tell whether a message of every stream that is alive has come."""
-        return self._unheard <= self._silent
+    def has_begun(self, stamp_ns: int) -> bool:
+        """Tell whether all streams that are alive had spoken by then: what came before is partial.
+
+        Streams of their own pace, such as a laser's, need only have been heard.
+        """
+        for sensor, topic in self._topics.items():
+            first_ns = self._first_ns.get(topic)
+            if first_ns is None:
+                if topic not in self._silent:
+                    return False
+            elif sensor in _WAITED_FOR and first_ns > stamp_ns:
+                return False
+        return True
 
     def hear(self, topic: str, lined: Lined, arrived_ns: int) -> None:
         """Take that a message came."""
         self._heard_ns[topic] = arrived_ns
-        self._unheard.discard(topic)
+        self._first_ns.setdefault(topic, lined.stamp_ns)
         if topic in self._silent:
             self._silent.discard(topic)
             self._tell("stream_returned", lined.stamp_ns, topic=topic)

@@ -1,0 +1,144 @@
+"""A live run: starting, ending and saving take as long as they like; no observation waits."""
+
+from threading import Event
+
+import numpy as np
+from driving import TABLE, assert_exact, dark_from, drive, events
+from fakes import PERIOD_NS, ExactModule, observation
+
+from sceneslam.bus.beside import executor
+from sceneslam.engine.steering import Operator
+from sceneslam.types.command import SaveMap
+from sceneslam.types.maps import HybridMap, PointLayer
+
+
+class Slow(ExactModule):
+    """Starts or ends only once it is let."""
+
+    def __init__(self, *, may_start=None, may_end=None):
+        super().__init__()
+        self._may_start, self._may_end = may_start, may_end
+        self.has_started = Event()
+
+    def activate(self, rig):
+        assert self._may_start is None or self._may_start.wait(10.0)
+        super().activate(rig)
+        self.has_started.set()
+
+    def get_trajectory(self):
+        assert self._may_end is None or self._may_end.wait(10.0)
+        return super().get_trajectory()
+
+
+def letting(event, at, then=None):
+    """Return a feed that sets an event at an observation and awaits another soon after."""
+
+    def feed(index):
+        if index == at:
+            event.set()
+        if index == at + 10 and then is not None:
+            assert then.wait(10.0)
+        return observation(index)
+
+    return feed
+
+
+def settled(log, kind, module):
+    return [one for one in events(log, kind) if one.get("to", one.get("module")) == module]
+
+
+def test_module_that_starts_slowly_takes_over_when_it_is_ready():
+    may_start = Event()
+    modules = {"bright": ExactModule(), "dark": Slow(may_start=may_start)}
+    _, atlas, log, _ = drive(
+        modules,
+        scene_at=dark_from(20),
+        steps=400,
+        confirm_window_s=0.5,
+        is_live=True,
+        feed=letting(may_start, 100, modules["dark"].has_started),
+        handover="rewind",
+        buffer_s=100.0,
+    )
+    assert len(atlas.trajectory) == 400
+    assert_exact(atlas)
+    (decision,) = settled(log, "decision", "dark")
+    assert decision["stamp_ns"] >= 100 * PERIOD_NS
+    assert atlas.pose_modules[60] in ("bright", "dark") and atlas.pose_modules[-1] == "dark"
+
+
+def test_module_that_ends_slowly_keeps_nobody_and_its_map_is_kept():
+    may_end = Event()
+    modules = {"bright": Slow(may_end=may_end), "dark": ExactModule()}
+    _, atlas, log, _ = drive(
+        modules,
+        scene_at=dark_from(20),
+        confirm_window_s=0.5,
+        is_live=True,
+        feed=letting(may_end, 90),
+    )
+    assert len(atlas.trajectory) == 100
+    assert settled(log, "decision", "dark")[0]["stamp_ns"] < 40 * PERIOD_NS
+    assert len(atlas.sessions) == 2 and not events(log, "fault")
+
+
+def test_module_that_is_called_back_while_it_ends_starts_after_that():
+    may_end = Event()
+    modules = {"bright": Slow(may_end=may_end), "dark": ExactModule()}
+    _, atlas, log, _ = drive(
+        modules,
+        scene_at=lambda i: "Dark" if 20 <= i < 40 else "Bright",
+        steps=2000,
+        confirm_window_s=0.5,
+        is_live=True,
+        feed=letting(may_end, 100),
+    )
+    assert len(atlas.trajectory) == 2000
+    assert_exact(atlas)
+    assert [one["to"] for one in events(log, "decision")] == ["bright", "dark", "bright"]
+    assert events(log, "decision")[-1]["stamp_ns"] >= 100 * PERIOD_NS
+
+
+def test_run_may_end_while_a_module_starts():
+    may_start = Event()
+    modules = {"bright": ExactModule(), "dark": Slow(may_start=may_start)}
+    drive(
+        modules,
+        scene_at=dark_from(20),
+        confirm_window_s=0.5,
+        is_live=True,
+        feed=letting(may_start, 99),
+    )
+    assert modules["dark"].shutdowns == 1
+
+
+def test_module_that_cannot_start_is_refused_when_that_is_known():
+    modules = {"bright": ExactModule(), "dark": ExactModule(raises_on_activate=True)}
+    _, atlas, log, _ = drive(modules, scene_at=dark_from(20), steps=300, is_live=True)
+    assert len(atlas.trajectory) == 300 and set(atlas.pose_modules) == {"bright"}
+    assert "no licence" in events(log, "fault")[0]["what"]
+
+
+def test_map_is_saved_beside_the_pose_and_its_failure_is_told(tmp_path):
+    may_save, told = Event(), []
+
+    def save(hybrid, folder):
+        may_save.wait(10.0)
+        if folder.name == "full":
+            raise OSError(28, "no room")
+
+    def note(event, stamp_ns, **fields):
+        told.append((event, stamp_ns, fields["what"], fields.get("why")))
+
+    nothing = PointLayer(points=np.zeros((0, 3), np.float32))
+    hybrid = HybridMap(points=nothing, point_modules=np.zeros(0, np.uint8), modules=())
+    operator = Operator(None, TABLE, save, tmp_path, note, executor("save", is_live=True))
+    for name in ("floor", "full", "a/b"):
+        operator.obey(SaveMap(name=name, hybrid=hybrid), 1)
+    assert [one[2] for one in told] == ["a/b"]
+    may_save.set()
+    operator.close(7)
+    assert told[1:] == [
+        ("command", 7, "floor", None),
+        ("command_refused", 7, "full", "OSError: [Errno 28] no room"),
+    ]
