@@ -208,15 +208,18 @@ class Loop:
                     return
 
     def _run_live(self, observations: Iterator[Observation], feed: LiveFeed | None) -> None:
-        self._live = run_live(
-            observations,
-            self._step,
-            self._note,
-            settings=self._parts.run.live,
-            feed=feed,
-        )
-        images = self._live.dropped_images
-        self._log.add("dropped", self._last_ns(), count=self._live.dropped, images=images)
+        try:
+            run_live(
+                observations,
+                self._step,
+                self._note,
+                settings=self._parts.run.live,
+                feed=feed,
+                tally=self._live,
+            )
+        finally:
+            images = self._live.dropped_images
+            self._log.add("dropped", self._last_ns(), count=self._live.dropped, images=images)
 
     def _note(self, event: Event) -> None:
         """Take what happened to the input of a live run."""

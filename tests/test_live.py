@@ -6,7 +6,7 @@ from time import monotonic
 import numpy as np
 import pytest
 
-from sceneslam.engine.live import LiveSettings, run_live
+from sceneslam.engine.live import LiveSettings, LiveTally, run_live
 from sceneslam.engine.mailbox import Mailbox, Waited
 from sceneslam.sources.rising_live import RisingLive
 from sceneslam.types.errors import ConfigError
@@ -108,6 +108,19 @@ def test_error_of_the_source_is_raised_after_what_came_before_it():
     with pytest.raises(ValueError, match="source"):
         Run(broken(), step=lambda o: taken.append(o) or True)
     assert len(taken) == 1
+
+
+def test_interrupted_run_still_knows_what_it_cost():
+    tally = LiveTally()
+
+    def step(observation):
+        if observation.stamp_ns >= 5 * 10**6:
+            raise KeyboardInterrupt
+        return True
+
+    with pytest.raises(KeyboardInterrupt):
+        run_live(observations(9, 10**6), step, print, settings=AT_ONCE, tally=tally)
+    assert 0 < len(tally.latencies_ms) + tally.dropped < 9
 
 
 def test_step_can_end_the_run_while_the_source_is_silent():

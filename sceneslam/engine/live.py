@@ -51,14 +51,18 @@ def run_live(
     *,
     settings: LiveSettings,
     feed: LiveFeed | None = None,
+    tally: LiveTally | None = None,
 ) -> LiveTally:
     """Run `step` on the observations as they come until it returns False; return what it cost.
+
+    A `tally` that is given holds that also where the run is interrupted.
 
     Without a `feed` they are a recording's and paced by their stamps. `note` takes what happens to
     the input: `silent`, `returned`, and what the feed tells. Both run in the thread `bus`, the
     source in another. What they raise is raised here; Ctrl-C ends both.
     """
     run = _LiveRun(observations, step, note, settings=settings, feed=feed)
+    run.tally = tally if tally is not None else run.tally
     return run.carry_out()
 
 
@@ -75,7 +79,7 @@ class _LiveRun:
         self._observations, self._step, self._note = observations, step, note
         self._settings, self._feed = settings, feed
         self._mailbox, self._is_over = Mailbox(), threading.Event()
-        self._tally, self._errors = LiveTally(), list[BaseException]()
+        self.tally, self._errors = LiveTally(), list[BaseException]()
         self._lag_ns: int | None = None  # clock - stamp / rate, of the first observation
         self._last_ns = 0
 
@@ -95,11 +99,11 @@ class _LiveRun:
             if self._feed is not None:
                 self._feed.close()
             source.join(_LEAVE_S)
+            self.tally.dropped = self._mailbox.dropped
+            self.tally.dropped_images = self._mailbox.dropped_images
         if self._errors:
             raise self._errors[0]
-        self._tally.dropped = self._mailbox.dropped
-        self._tally.dropped_images = self._mailbox.dropped_images
-        return self._tally
+        return self.tally
 
     def _guard(self, work: Callable[[], None]) -> None:
         try:
@@ -141,7 +145,7 @@ class _LiveRun:
             if not self._step(taken):
                 break
             measured_ns = self._feed.measured_ns(taken) if self._feed else self._due_ns(taken)
-            self._tally.latencies_ms.append((monotonic_ns() - measured_ns) / 1e6)
+            self.tally.latencies_ms.append((monotonic_ns() - measured_ns) / 1e6)
         self._is_over.set()
 
     def _due_ns(self, observation: Observation) -> int:

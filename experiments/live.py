@@ -1,0 +1,140 @@
+"""Run a recorded story live and print what it costs: latency, memory, threads, open files.
+
+    python experiments/live.py                              two laps at the robot's speed
+    python experiments/live.py --minutes 30 --rate 2        soak: half an hour at twice the speed
+    python experiments/live.py --scenario flicker slam@slam.dark=depth
+
+Every 10 s a line: memory of the run and of the processes that it started (resident), threads and
+open files of the run. At the end the latency from an image's stamp to its pose (p50, p99), dropped
+images, switches, and by how much memory grew per hour over the second half. Other words are
+overrides of the run. Latency says something on an idle machine alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+EVERY_S = 10.0
+LAP_S = 20.0  # no story is shorter
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sample:
+    """What a run takes at one time."""
+
+    at_s: float
+    memory_mb: float
+    children_mb: float
+    threads: int
+    files: int
+
+    def __str__(self) -> str:
+        """Return a line."""
+        memory = f"{self.memory_mb:5.0f} MB + {self.children_mb:4.0f} MB in its processes"
+        return f"{self.at_s:6.0f} s  {memory}  {self.threads} threads  {self.files} files"
+
+
+def main() -> None:
+    """Run, and print while it runs."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--minutes", type=float, default=None)
+    parser.add_argument("--rate", type=float, default=1.0)
+    parser.add_argument("--scenario", default="there_and_back")
+    given, overrides = parser.parse_known_args()
+    laps = 2 if given.minutes is None else int(given.minutes * 60 * given.rate / LAP_S) + 1
+    words = [
+        f"+scenario={given.scenario}", "run=live", f"run.rate={given.rate}", "effects=laps",
+        f"effects.laps={laps}", "run.report=false", "run.progress=false", "~sinks@sinks.rerun",
+    ]  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        run = subprocess.Popen(
+            [sys.executable, "-m", "sceneslam", *words, *overrides, f"hydra.run.dir={folder}/run"]
+        )
+        samples = watch(run, Path(folder) / "run", given.minutes)
+        metrics = json.loads((Path(folder) / "run" / "metrics.json").read_text())
+    show(samples, metrics)
+
+
+def watch(run: subprocess.Popen[bytes], folder: Path, minutes: float | None) -> list[Sample]:
+    """Print and return samples from the first event on until the run ends, or is over time."""
+    samples, began_s = list[Sample](), None
+    while run.poll() is None:
+        time.sleep(EVERY_S if began_s is not None else 0.5)
+        events = folder / "events.jsonl"
+        if began_s is None and events.is_file() and events.stat().st_size:
+            began_s = time.monotonic()
+        if began_s is None or run.poll() is not None:
+            continue
+        samples.append(sample(run.pid, time.monotonic() - began_s))
+        print(samples[-1], flush=True)
+        if minutes is not None and time.monotonic() - began_s > minutes * 60:
+            run.terminate()
+            break
+    run.wait()
+    return samples
+
+
+def sample(pid: int, at_s: float) -> Sample:
+    """Return what a process takes now."""
+    process = Path(f"/proc/{pid}")
+    return Sample(
+        at_s=at_s,
+        memory_mb=resident_mb(pid),
+        children_mb=sum(resident_mb(child) for child in children(pid)),
+        threads=len(list((process / "task").iterdir())),
+        files=len(list((process / "fd").iterdir())),
+    )
+
+
+def resident_mb(pid: int) -> float:
+    """Return the resident memory of a process, 0 where it has ended."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096e-6
+    except OSError:
+        return 0.0
+
+
+def children(pid: int) -> Iterator[int]:
+    """Yield the processes that a process has started, and theirs."""
+    for task in Path(f"/proc/{pid}/task").glob("*/children"):
+        try:
+            found = task.read_text().split()
+        except OSError:
+            continue
+        for child in found:
+            yield int(child)
+            yield from children(int(child))
+
+
+def show(samples: list[Sample], metrics: dict[str, object]) -> None:
+    """Print what the whole run cost."""
+    latency = metrics["latency_ms"]
+    assert isinstance(latency, dict)
+    print(f"stamp to pose: p50 {latency['p50']:.0f} ms, p99 {latency['p99']:.0f} ms")
+    taken, dropped = metrics["observations"], metrics["dropped_images"]
+    switches = metrics["switches"]
+    assert isinstance(switches, list)
+    print(f"{taken} observations, {dropped} images dropped, {len(switches)} switches")
+    late = samples[len(samples) // 2 :]
+    if len(late) > 2:
+        hours = np.array([one.at_s for one in late]) / 3600
+        total_mb = np.array([one.memory_mb + one.children_mb for one in late])
+        print(f"memory over the second half: {np.polyfit(hours, total_mb, 1)[0]:+.0f} MB per hour")
+        threads, files = {one.threads for one in late}, {one.files for one in late}
+        print(f"threads {min(threads)} to {max(threads)}, files {min(files)} to {max(files)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""A round trip that is driven again and again: for runs of hours from a recording of seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sceneslam.interfaces import Source
+from sceneslam.sources.spanned import Span
+from sceneslam.sources.wrapped import Wrapped
+from sceneslam.types import se3
+from sceneslam.types.observation import Observation
+from sceneslam.types.ranges import check_least
+from sceneslam.types.se3 import Transform
+from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import GroundTruth, SceneChange
+
+_PAUSE_NS = 33_000_000  # between the last observation of a lap and the first of the next
+
+
+class Laps(Wrapped):
+    """Passes a recording on `laps` times, one after the other: stamps and odometry go on.
+
+    The recording should end where it began: else the robot is moved at the end of every lap, which
+    its wheels do not notice.
+    """
+
+    def __init__(self, source: Source, laps: int) -> None:
+        check_least(1, laps=laps)
+        super().__init__(source)
+        self._laps = laps
+
+    @property
+    def length(self) -> int | None:
+        """Return how many observations there are at most."""
+        one = self._source.length
+        return None if one is None else one * self._laps
+
+    @property
+    def span(self) -> Span | None:
+        """Return None: the span is that of a lap."""
+        return None
+
+    def __iter__(self) -> Iterator[Observation]:
+        """Yield every lap's observations."""
+        shift_ns, T_odom_start = 0, se3.identity()
+        for _ in range(self._laps):
+            first: Observation | None = None
+            last: Observation | None = None
+            for observation in self._source:
+                if first is None:
+                    first = observation
+                last = _moved(observation, shift_ns, first.T_odom_base, T_odom_start)
+                yield last
+            if first is None or last is None:
+                return
+            shift_ns = last.stamp_ns + _PAUSE_NS - first.stamp_ns
+            if last.T_odom_base is not None:
+                T_odom_start = last.T_odom_base
+
+    def ground_truth(self) -> GroundTruth | None:
+        """Return the truth of all laps."""
+        truth = self._source.ground_truth()
+        stamps_ns = [observation.stamp_ns for observation in self._source]
+        if truth is None or not stamps_ns:
+            return truth
+        lap_ns = stamps_ns[-1] + _PAUSE_NS - stamps_ns[0]
+        shifts_ns = [lap * lap_ns for lap in range(self._laps)]
+        known = truth.trajectory
+        is_within = known.stamps_ns < stamps_ns[0] + lap_ns
+        return GroundTruth(
+            trajectory=Trajectory(
+                stamps_ns=np.concatenate([known.stamps_ns[is_within] + by for by in shifts_ns]),
+                T_world_base=np.concatenate([known.T_world_base[is_within]] * self._laps),
+            ),
+            scenes=_repeated(truth.scenes, shifts_ns),
+        )
+
+
+def _moved(
+    observation: Observation,
+    shift_ns: int,
+    T_odom_first: Transform | None,
+    T_odom_start: Transform,
+) -> Observation:
+    """Return an observation of a later lap, which began at `T_odom_start`."""
+    T_odom_base = observation.T_odom_base
+    if T_odom_base is not None and T_odom_first is not None and shift_ns:
+        T_odom_base = T_odom_start @ se3.inverse(T_odom_first) @ T_odom_base
+    scan = observation.scan
+    if scan is not None:
+        scan = replace(scan, stamp_ns=scan.stamp_ns + shift_ns)
+    stamp_ns = observation.stamp_ns + shift_ns
+    return replace(observation, stamp_ns=stamp_ns, scan=scan, T_odom_base=T_odom_base)
+
+
+def _repeated(scenes: Sequence[SceneChange], shifts_ns: Sequence[int]) -> tuple[SceneChange, ...]:
+    """Return the scenes of all laps; one that goes on into the next lap is no change."""
+    every = [replace(one, stamp_ns=one.stamp_ns + by) for by in shifts_ns for one in scenes]
+    return tuple(
+        one
+        for before, one in zip([None, *every], every, strict=False)
+        if before is None or one.scene != before.scene
+    )

@@ -1,0 +1,1 @@
+"""A RealSense camera on this machine's USB as a source."""

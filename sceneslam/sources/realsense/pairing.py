@@ -1,0 +1,68 @@
+"""Which depth belongs to an image, and which motion samples."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.sources.realsense.frames import Frame
+from sceneslam.types.rig import Sensor
+
+_PATIENCE_NS = 50_000_000  # an image waits so long for its depth
+_MOST = 3  # images and depths that wait
+_MOST_SAMPLES = 1000  # that wait for an image
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Paired:
+    """What belongs to one image."""
+
+    stamp_ns: int
+    image: Frame
+    depth: Frame | None
+    samples: tuple[tuple[int, Frame], ...]  # stamp and frame, since the image before
+
+
+class Pairing:
+    """Takes frames with their stamps on the run's time line."""
+
+    def __init__(self, tolerance_ns: int) -> None:
+        self._tolerance_ns = tolerance_ns
+        self._images: deque[tuple[int, Frame]] = deque(maxlen=_MOST)
+        self._depths: deque[tuple[int, Frame]] = deque(maxlen=_MOST)
+        self._samples: deque[tuple[int, Frame]] = deque(maxlen=_MOST_SAMPLES)
+
+    def add(self, frame: Frame, stamp_ns: int) -> None:
+        """Take a frame."""
+        held = {Sensor.IMAGE: self._images, Sensor.DEPTH: self._depths}
+        held.get(frame.sensor, self._samples).append((stamp_ns, frame))
+
+    def next(self, now_ns: int) -> Paired | None:
+        """Return the oldest image once its depth is there, or will not come; None until then."""
+        if not self._images:
+            return None
+        stamp_ns, image = self._images[0]
+        near = [one for one in self._depths if abs(one[0] - stamp_ns) <= self._tolerance_ns]
+        is_past = any(one[0] > stamp_ns + self._tolerance_ns for one in self._depths)
+        is_over = is_past or len(self._images) == _MOST
+        if not near and not is_over and now_ns - image.arrived_ns < _PATIENCE_NS:
+            return None
+        self._images.popleft()
+        depth = min(near, key=lambda one: abs(one[0] - stamp_ns))[1] if near else None
+        samples = tuple(one for one in self._samples if one[0] <= stamp_ns)
+        later = [one for one in self._samples if one[0] > stamp_ns]
+        self._samples = deque(later, maxlen=_MOST_SAMPLES)
+        return Paired(stamp_ns=stamp_ns, image=image, depth=depth, samples=samples)
+
+
+def samples_of(paired: Paired, sensor: Sensor) -> NDArray[np.float64]:
+    """Return a sensor's samples (M, 4): seconds after the image, values along its own axes."""
+    rows = []
+    for stamp_ns, frame in paired.samples:
+        if frame.sensor is sensor:
+            v = frame.frame.as_motion_frame().get_motion_data()
+            rows.append([(stamp_ns - paired.stamp_ns) * 1e-9, v.x, v.y, v.z])
+    return np.array(rows, dtype=np.float64).reshape(-1, 4)
