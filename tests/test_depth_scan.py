@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneslam.modules.slam.depth_scan import DepthScanner, scan_frame, scan_from_depth
+from sceneslam.scans.depth_scan import DepthScanner, scan_frame, scan_from_depth
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.rig import Camera, optical_to_rep103

@@ -15,7 +15,9 @@ ALLOWED = {  # package -> what of ours it may import
     "sceneslam/ros": {"types", "ros"},
     "sceneslam/sources": {"types", "interfaces", "ros", "sources"},
     "sceneslam/sinks": {"types", "interfaces", "ros", "sinks"},
-    "sceneslam/atlas": {"types", "interfaces", "atlas"},
+    "sceneslam/atlas": {"types", "interfaces", "scans", "atlas"},
+    "sceneslam/scans": {"types", "scans"},
+    "sceneslam/maps": {"types", "scans", "atlas", "streams", "maps"},
     "sceneslam/testing": {"types", "interfaces", "testing"},
     "sceneslam/supervision": {"types", "interfaces", "supervision"},
     "sceneslam/storage": {"types", "interfaces", "storage"},
@@ -25,7 +27,16 @@ ALLOWED = {  # package -> what of ours it may import
     "sceneslam/scenes": {"types", "interfaces", "config", "scenes"},
     "sceneslam/detection": {"types", "interfaces", "bus", "config", "evaluation", "detection"},
     "sceneslam/collect": {"types", "evaluation", "collect"},
-    "modules": {"types", "interfaces", "motion", "supervision", "vocabulary", "ros", "modules"},
+    "modules": {
+        "types",
+        "interfaces",
+        "motion",
+        "scans",
+        "supervision",
+        "vocabulary",
+        "ros",
+        "modules",
+    },
     "experiments/liars": {"types", "evaluation", "experiments"},
     "experiments/openloris": {"types", "evaluation", "experiments"},
     "experiments/handover": {"types", "atlas", "evaluation", "experiments"},
@@ -39,7 +50,7 @@ ALLOWED = {  # package -> what of ours it may import
 
 
 SLAM = {  # what more than one SLAM module may use
-    "cloud_shape", "clouds", "degeneracy", "depth_scan", "grid", "lidar_scan", "process",
+    "cloud_shape", "clouds", "degeneracy", "grid", "process",
     "surfaces", "cloud_odometry", "cloud_map", "quiet"}  # fmt: skip
 
 

@@ -11,10 +11,10 @@ from test_laser_world import box, drive, loop_path, room, scan_at
 from sceneslam.modules.slam.laser.field import LikelihoodField
 from sceneslam.modules.slam.laser.loop_search import LoopSearch
 from sceneslam.modules.slam.laser.module import LaserSlam
-from sceneslam.modules.slam.laser.planar import between, betweens, compose, composed
 from sceneslam.modules.slam.laser.pose_graph import Edge, PoseGraph, optimise
 from sceneslam.modules.slam.laser.surface import SurfaceReader
 from sceneslam.types import se3
+from sceneslam.types.planar import between, betweens, compose, composed
 from sceneslam.types.rig import Laser, Rig, Sensor
 
 PERIOD_NS = 100_000_000

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sceneslam.modules.slam.lidar_scan import LidarScanner
+from sceneslam.scans.lidar_scan import LidarScanner
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.rig import Lidar

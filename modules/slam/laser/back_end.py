@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sceneslam.types.planar import between
+
 from .keyframes import Keyframes
 from .loop_closure import LoopCloser
-from .planar import between
 from .pose_graph import Edge, PoseGraph, optimise
 
 _FELT = np.array([5e-3, 5e-3, 2e-3])  # m, m, rad: less is within the noise of the pose itself

@@ -8,14 +8,7 @@ import numpy as np
 
 from sceneslam.motion.model import Motion, MotionModel
 from sceneslam.types.observation import LaserScan, Observation, TrackingStatus
-
-from .back_end import BackEnd
-from .field import LikelihoodField
-from .history import History
-from .keyframes import Keyframe, Keyframes
-from .loop_search import LoopSearch
-from .matcher import Match, Matcher, Prior, novelty
-from .planar import (
+from sceneslam.types.planar import (
     Matrix,
     Planar,
     between,
@@ -27,6 +20,13 @@ from .planar import (
     to_transform,
     turn,
 )
+
+from .back_end import BackEnd
+from .field import LikelihoodField
+from .history import History
+from .keyframes import Keyframe, Keyframes
+from .loop_search import LoopSearch
+from .matcher import Match, Matcher, Prior, novelty
 from .surface import SurfacePoints
 
 _OVERLAP_MIN_RATIO = 0.5  # with less, the map does not reach here yet

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sceneslam.types import se3
+from sceneslam.types.planar import Planar, between, betweens, composed
 from sceneslam.types.trajectory import Trajectory
 
 from .keyframes import Keyframes
-from .planar import Planar, between, betweens, composed
 
 _NONE = -1  # before the first keyframe: the pose is as it was told
 

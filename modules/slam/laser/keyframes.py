@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types.observation import LaserScan
+from sceneslam.types.planar import Matrix, Planar, wrap
 
-from .planar import Matrix, Planar, wrap
 from .surface import SurfacePoints, SurfaceReader, joined
 
 

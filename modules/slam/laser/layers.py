@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from sceneslam.types import se3
 from sceneslam.types.maps import MapLayers, PointLayer, PoseGraphLayer
 from sceneslam.types.observation import LaserScan
+from sceneslam.types.planar import Matrix, apply, to_transform
 
 from ..grid import OccupancyGrid
 from .keyframes import Keyframes
-from .planar import Matrix, apply, to_transform
 from .pose_graph import Edge
 
 _PLANAR = [0, 1, 5]  # x, y, yaw in se3.log's order

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types.planar import Planar, apply, between, compose, from_transform, turn
+
 from .keyframes import Keyframes
 from .matcher import Match, Matcher
 from .places import Place, Places
-from .planar import Planar, apply, between, compose, from_transform, turn
 from .pose_graph import Edge
 from .surface import SurfacePoints
 

@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types.planar import Planar, wrap
+
 from .field import LikelihoodField
-from .planar import Planar, wrap
 
 _CELL_M = 0.1  # or a little more: the finest shift; the refinement goes on from there
 _LEVELS = 4  # shifts of 0.1, 0.2, 0.4, 0.8 m

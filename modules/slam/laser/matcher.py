@@ -23,8 +23,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types.planar import Matrix, Planar, rotation, wrap
+
 from .field import LikelihoodField
-from .planar import Matrix, Planar, rotation, wrap
 from .surface import SurfacePoints
 
 _SEARCH_POINTS = 120  # more do not change the coarse answer

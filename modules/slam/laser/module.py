@@ -8,15 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.motion.model import MotionModel
+from sceneslam.scans.depth_scan import DepthScanner
+from sceneslam.scans.lidar_scan import LidarScanner
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import LaserScan, Observation, Tracking, TrackingStatus
+from sceneslam.types.planar import to_transform, turn
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
-from ..depth_scan import DepthScanner
-from ..lidar_scan import LidarScanner
 from .back_end import BackEnd
 from .frontend import Estimate, FrontEnd, ScanSettings
 from .history import History
@@ -25,7 +26,6 @@ from .layers import covariance_6, map_layers
 from .loop_closure import LoopCloser
 from .matcher import Matcher
 from .places import Places
-from .planar import to_transform, turn
 from .surface import SurfaceReader
 
 _ABOVE_0 = (

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections import OrderedDict
 from dataclasses import dataclass, field
 
+from sceneslam.types.planar import between
+
 from .field import LikelihoodField
 from .keyframes import Keyframes
 from .loop_search import LoopSearch
-from .planar import between
 from .surface import joined
 
 _KEPT = 24  # places in memory, about 2 MB each

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .planar import Matrix, Planar
+from sceneslam.types.planar import Matrix, Planar
 
 _HUBER = 1.345  # sigmas; 95 % as good as least squares where nothing is wrong
 _RELINEARIZE = 0.005  # m and rad: poses that moved less keep their linearization

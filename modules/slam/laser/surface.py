@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.observation import LaserScan
-
-from .planar import Planar, rotation
+from sceneslam.types.planar import Planar, rotation
 
 _SPAN_M = 0.2  # neighbours within this distance along the scan make a point's surface
 _NEIGHBOURS_MIN = 4  # fewer points do not tell a surface

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.scans.depth_scan import DepthScanner
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import GridLayer, MapLayers, PointLayer
 from sceneslam.types.rig import Camera
 
-from ..depth_scan import DepthScanner
 from ..grid import OccupancyGrid
 from .keyframes import DepthView, Keyframe, nothing_seen
 

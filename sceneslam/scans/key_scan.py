@@ -1,0 +1,111 @@
+"""A level scan of whatever sensor there is: laser, lidar or depth camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.scans.depth_scan import DepthScanner
+from sceneslam.scans.lidar_scan import LidarScanner
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.observation import LaserScan, Observation
+from sceneslam.types.rig import Rig
+from sceneslam.types.se3 import Transform
+
+_LEVEL_COS = np.cos(np.radians(5.0))  # a laser that is tilted by more measures floor and ceiling
+_BEAMS = 360  # of a lidar's turn
+_DEPTH_BEAMS, _STRIDE_PX = 160, 4  # a beam of a third of a degree is a cell wide at the far end
+_REACH = 3  # points to either side that a line is laid through
+_SHORTEST_M, _LONGEST_M = 0.03, 0.6  # from the first to the last of them
+_FLAT_RATIO, _FLAT_M = 0.1, 0.02  # how far one in between may lie off the line: the noise of range
+_FAR_M = 15.0  # beyond, neighbouring beams of a degree are five cells apart
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class KeyScan:
+    """Where the beams of one scan ended, in base's x and y."""
+
+    stamp_ns: int
+    points: NDArray[np.float64]  # (N, 2) [m], base, by rising angle
+    normals: NDArray[np.float64]  # (N, 2) unit, towards the sensor; 0 where there is no line
+    origin: NDArray[np.float64]  # (2,) [m], base: where the beams begin
+
+
+class KeyScanner:
+    """Makes scans of a rig's observations, by the sensor that sees most to the sides."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._laser = rig.laser
+        if self._laser is not None and abs(self._laser.T_base_laser[2, 2]) < _LEVEL_COS:
+            self._laser = None
+        self._lidar: LidarScanner | None = None
+        if rig.lidar is not None:
+            self._lidar = LidarScanner(
+                rig.lidar, height_min_m=None, height_max_m=None, beams=_BEAMS
+            )
+        self._depth: DepthScanner | None = None
+        if rig.camera is not None:
+            try:
+                self._depth = DepthScanner(
+                    rig.camera,
+                    height_min_m=None,
+                    height_max_m=None,
+                    beams=_DEPTH_BEAMS,
+                    stride_px=_STRIDE_PX,
+                )
+            except ConfigError:  # it looks at the floor or the ceiling alone
+                self._depth = None
+
+    def make(self, observation: Observation) -> KeyScan | None:
+        """Return the scan of an observation, None where no sensor of it can make one."""
+        if observation.scan is not None and self._laser is not None:
+            return _key_scan(observation.stamp_ns, observation.scan, self._laser.T_base_laser)
+        if observation.points_lidar is not None and self._lidar is not None:
+            scan = self._lidar.scan(observation.points_lidar, stamp_ns=observation.stamp_ns)
+            return _key_scan(observation.stamp_ns, scan, self._lidar.T_base_laser)
+        if observation.depth_m is not None and self._depth is not None:
+            scan = self._depth.scan(observation.depth_m, stamp_ns=observation.stamp_ns)
+            return _key_scan(observation.stamp_ns, scan, self._depth.T_base_laser)
+        return None
+
+
+def _key_scan(stamp_ns: int, scan: LaserScan, T_base_laser: Transform) -> KeyScan:
+    ranges_m, angles = scan.ranges_m.astype(np.float64), scan.angles_rad.astype(np.float64)
+    farthest_m = min(scan.range_max_m, _FAR_M)
+    valid = (ranges_m > scan.range_min_m) & (ranges_m < farthest_m)  # false for NaN
+    ranges_m, angles = ranges_m[valid], angles[valid]
+    points = np.column_stack(
+        [ranges_m * np.cos(angles), ranges_m * np.sin(angles), np.zeros(len(angles))]
+    )
+    points_base = np.asarray(se3.apply(T_base_laser, points)[:, :2], np.float64)
+    origin = T_base_laser[:2, 3].copy()
+    normals = line_normals(points_base, origin)
+    return KeyScan(stamp_ns=stamp_ns, points=points_base, normals=normals, origin=origin)
+
+
+def line_normals(points: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the unit normals (N, 2), towards `origin`, of the lines through neighbouring points.
+
+    0 where the neighbours lie further apart, or not on a line: a thin wall has two sides.
+    """
+    normals = np.zeros_like(points)
+    count = len(points)
+    if count < 2 * _REACH + 1:
+        return normals
+    inner = slice(_REACH, count - _REACH)
+    before, after = points[: count - 2 * _REACH], points[2 * _REACH :]
+    along = after - before
+    length_m = np.linalg.norm(along, axis=1)
+    normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(length_m, 1e-9)[:, None]
+    spread_m = np.zeros(len(along))
+    for shift in range(1, 2 * _REACH):
+        between = points[shift : shift + len(along)]
+        spread_m = np.maximum(spread_m, np.abs(((between - before) * normal).sum(axis=1)))
+    towards = np.sign(((origin - points[inner]) * normal).sum(axis=1))
+    is_line = (length_m > _SHORTEST_M) & (length_m < _LONGEST_M)
+    is_line &= spread_m < np.maximum(_FLAT_RATIO * length_m, _FLAT_M)
+    normals[inner] = normal * (towards * is_line)[:, None]
+    return normals
