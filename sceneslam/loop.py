@@ -77,6 +77,7 @@ class Loop:
             catch_up_steps=parts.run.catch_up_steps,
             is_live=is_live,
         )
+        parts.atlas.open(parts.rig, self._log.add, is_live=parts.run.mode == LIVE)
         self._sinks: dict[str, Sink] = {}
         try:
             for key, sink in parts.sinks.items():
@@ -106,6 +107,7 @@ class Loop:
             self.faults.append(self._why_over())
         self._operator.close(self._last_ns())
         self._bus.close(self._last_ns())
+        self.faults += self._parts.atlas.finish()
         has_odometry = Sensor.ODOMETRY in self._parts.rig.sensors
         self._covariances = self._parts.atlas.covariances(has_odometry)
         log_uncertainty(self._log, self._parts.atlas.session_starts(), self._covariances)
@@ -245,6 +247,7 @@ class Loop:
         if self._operator.is_paused:
             return True
         self._bus.step(observation)
+        self._parts.atlas.observe(observation)
         self._observed_ns.append(observation.stamp_ns)
         module = self._parts.modules.get(self._bus.active)
         self._tally.add(observation, () if module is None else module.requires)

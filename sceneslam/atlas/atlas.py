@@ -3,104 +3,96 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.fusion import fuse
-from sceneslam.atlas.revision import Revised, Told, revise
+from sceneslam.atlas.lasting.lasting_map import EXTEND, LastingMap
+from sceneslam.atlas.mapper import Mapper, Note
+from sceneslam.atlas.pose_path import OpenSession, PosePath, trajectory_of
+from sceneslam.atlas.revision import Revised, revise
+from sceneslam.atlas.submaps.collector import Known
+from sceneslam.atlas.submaps.correction import Correction
+from sceneslam.atlas.submaps.own_loops import own_loops
 from sceneslam.atlas.uncertainty import VELOCITY, WHEELS, Covariance, Step, propagate
 from sceneslam.interfaces import TrajectoryLog
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import HybridMap, MapLayers
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig
 from sceneslam.types.run import BRIDGED, Session, SessionStart
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
 
-@dataclass(slots=True)
-class _Open:
-    """A session while it grows."""
-
-    module: str
-    T_map_local: Transform
-    stamps_ns: list[int] = field(default_factory=list)
-    poses: list[Transform] = field(default_factory=list)  # T_local_base
-    layers: MapLayers = field(default_factory=MapLayers)
-    revised: Trajectory = field(default_factory=Trajectory.empty)  # T_local_base
-
-    @property
-    def told(self) -> Told:
-        """Return its poses, as reported and as revised."""
-        online = _trajectory(self.stamps_ns, self.poses)
-        return Told(
-            module=self.module, T_map_local=self.T_map_local, online=online, revised=self.revised
-        )
-
-
-@dataclass(slots=True)
-class _Path:
-    """Poses by rising stamp."""
-
-    stamps_ns: list[int] = field(default_factory=list)
-    poses: list[Transform] = field(default_factory=list)  # T_map_base
-    modules: list[str] = field(default_factory=list)
-    sessions: list[int] = field(default_factory=list)  # that was open, -1 before the first
-    covariances: list[Covariance | None] = field(default_factory=list)  # as reported
-
-    def add(
-        self,
-        stamp_ns: int,
-        T_map_base: Transform,
-        module: str,
-        session: int,
-        covariance: Covariance | None,
-    ) -> None:
-        """Add a pose unless its stamp has one."""
-        if self.stamps_ns and stamp_ns <= self.stamps_ns[-1]:
-            return
-        self.covariances.append(covariance)
-        self.stamps_ns.append(stamp_ns)
-        self.poses.append(T_map_base)
-        self.modules.append(module)
-        self.sessions.append(session)
-
-    def cut(self, stamp_ns: int) -> None:
-        """Forget the poses from an instant on."""
-        keep = bisect_left(self.stamps_ns, stamp_ns)
-        for values in (
-            self.stamps_ns,
-            self.poses,
-            self.modules,
-            self.sessions,
-            self.covariances,
-        ):
-            del values[keep:]
-
-
 class Atlas:
     """Keeps one trajectory and one map in `map` through every change of module."""
 
-    def __init__(self, *, voxel_m: float) -> None:
+    def __init__(
+        self,
+        *,
+        voxel_m: float,
+        load: str | None = None,
+        save: str | None = None,
+        mode: str = EXTEND,
+        save_every_s: float = 60.0,
+    ) -> None:
         if not 0 < voxel_m < float("inf"):
             raise ConfigError("voxel_m", voxel_m, "metres above 0")
+        self._lasting = LastingMap(load=load, save=save, mode=mode, save_every_s=save_every_s)
+        self._mapper: Mapper | None = None  # None where there are no observations, but poses alone
+        self._note: Note | None = None
+        self._correction: Correction | None = None
         self._voxel_m = voxel_m
-        self._sessions: list[_Open] = []
-        self._online = _Path()  # as reported at the time
-        self._path = _Path()  # as known now
+        self._sessions: list[OpenSession] = []
+        self._online = PosePath()  # as reported at the time
+        self._path = PosePath()  # as known now
         self._journal: TrajectoryLog | None = None
 
     def keep_journal(self, journal: TrajectoryLog) -> None:
         """Write every call to a log from now on; the same calls, repeated, give the same atlas."""
         self._journal = journal
 
+    def open(self, rig: Rig, note: Note, *, is_live: bool = False) -> None:
+        """Get ready for observations; `note` takes events: a place that was recognized, a loop."""
+        self._note = note
+        loaded = self._lasting.loaded
+        self._mapper = Mapper(rig, known=self._known, note=note, loaded=loaded, is_live=is_live)
+
+    def observe(self, observation: Observation) -> None:
+        """Take an observation, after its pose."""
+        if self._mapper is not None and self._note is not None:
+            self._mapper.observe(observation)
+            self._lasting.keep(observation.stamp_ns, self._mapper, self._note)
+
+    def finish(self) -> list[str]:
+        """Close the loops between sessions and save the map; return what went wrong.
+
+        After the last session was closed.
+        """
+        if self._mapper is None or self._note is None or not self._path.stamps_ns:
+            return []
+        revised = self._revise().T_map_base
+        at = partial(self._revised_at, revised)
+        self._correction = self._mapper.finish(
+            at,
+            own_loops(self._sessions, at),
+            frozenset(
+                number
+                for number, session in enumerate(self._sessions)
+                if session.layers.pose_graph is not None
+            ),
+        )
+        self._lasting.finish(self._mapper, self._path.stamps_ns[-1], self._note)
+        return self._lasting.faults
+
     def begin_session(self, module: str, T_map_local: Transform) -> int:
         """Open a session of a module that was placed in the map (Eq. 1); return its number."""
         if self._journal is not None:
             self._journal.add_session(module, T_map_local)
-        self._sessions.append(_Open(module, T_map_local))
+        self._sessions.append(OpenSession(module, T_map_local))
         return len(self._sessions) - 1
 
     def add_local(self, stamp_ns: int, T_local_base: Transform) -> None:
@@ -124,7 +116,7 @@ class Atlas:
         if self._journal is not None:
             self._journal.add_pose(stamp_ns, T_map_base, module, covariance)
         session = len(self._sessions) - 1
-        self._online.add(stamp_ns, T_map_base, module, session, covariance)
+        self._online.add(stamp_ns, self._in_map(T_map_base), module, session, covariance)
         self._path.add(stamp_ns, T_map_base, module, session, covariance)
 
     def rewind(self, stamp_ns: int) -> None:
@@ -143,8 +135,13 @@ class Atlas:
         self._sessions[session].layers, self._sessions[session].revised = layers, revised
 
     def pose_at(self, stamp_ns: int) -> Transform | None:
-        """Return T_map_base at the newest stamp, None when it got no pose."""
-        return self._path.poses[-1] if self.last_stamp_ns == stamp_ns else None
+        """Return T_map_base at the newest stamp, None when it got no pose.
+
+        In the loaded map, from when the run was found in it.
+        """
+        if self.last_stamp_ns != stamp_ns:
+            return None
+        return self._in_map(self._path.poses[-1])
 
     @property
     def last_covariance(self) -> Covariance | None:
@@ -159,7 +156,7 @@ class Atlas:
     @property
     def online(self) -> Trajectory:
         """Return T_map_base over time as it was reported at the time."""
-        return _trajectory(self._online.stamps_ns, self._online.poses)
+        return trajectory_of(self._online.stamps_ns, self._online.poses)
 
     @property
     def trajectory(self) -> Trajectory:
@@ -167,7 +164,10 @@ class Atlas:
         if not self._path.stamps_ns:
             return Trajectory.empty()
         stamps_ns = np.array(self._path.stamps_ns, np.int64)
-        return Trajectory(stamps_ns=stamps_ns, T_world_base=self._revise().T_map_base)
+        poses = self._revise().T_map_base
+        if self._correction is not None:
+            poses = self._correction.apply(stamps_ns, poses)
+        return Trajectory(stamps_ns=stamps_ns, T_world_base=poses)
 
     def session_starts(self) -> list[SessionStart]:
         """Return, per session, the first pose of the trajectory that its module gave."""
@@ -203,7 +203,7 @@ class Atlas:
     @property
     def sessions(self) -> tuple[Session, ...]:
         """Return every session so far, as revised."""
-        placed = self._revise().T_map_local
+        placed = self._placed()
         return tuple(
             Session(
                 index=index,
@@ -216,11 +216,49 @@ class Atlas:
 
     def fuse_maps(self) -> HybridMap:
         """Return the one map of all sessions (the paper's hybrid map)."""
-        placed = zip(self._sessions, self._revise().T_map_local, strict=True)
+        placed = zip(self._sessions, self._placed(), strict=True)
         return fuse(
             [(session.module, T_map_local, session.layers) for session, T_map_local in placed],
             voxel_m=self._voxel_m,
         )
+
+    def _in_map(self, T_run_base: Transform) -> Transform:
+        """Return a pose in the loaded map, from when the run was found in it."""
+        if self._mapper is None or not self._mapper.is_placed:
+            return T_run_base
+        return np.asarray(self._mapper.T_map_run @ T_run_base)
+
+    def _placed(self) -> list[Transform]:
+        """Return T_map_local of every session, moved as the middle of its poses was."""
+        placed = self._revise().T_map_local
+        if self._correction is None:
+            return placed
+        path = np.array(self._path.sessions, np.int64)
+        for session, T_map_local in enumerate(placed):
+            rows = np.flatnonzero(path == session)
+            if len(rows):
+                stamp_ns = np.array([self._path.stamps_ns[rows[len(rows) // 2]]], np.int64)
+                placed[session] = self._correction.apply(stamp_ns, T_map_local[None])[0]
+        return placed
+
+    def _known(self, stamp_ns: int) -> Known | None:
+        """Return what the path holds at a stamp."""
+        path = self._path
+        row = bisect_left(path.stamps_ns, stamp_ns)
+        if row == len(path.stamps_ns) or path.stamps_ns[row] != stamp_ns:
+            return None
+        return Known(
+            T_map_base=path.poses[row],
+            session=path.sessions[row],
+            module=path.modules[row],
+            covariance=path.covariances[row],
+        )
+
+    def _revised_at(self, revised: NDArray[np.float64], stamp_ns: int) -> Transform | None:
+        row = bisect_left(self._path.stamps_ns, stamp_ns)
+        if row == len(self._path.stamps_ns) or self._path.stamps_ns[row] != stamp_ns:
+            return None
+        return np.asarray(revised[row])
 
     def _revise(self) -> Revised:
         return revise(
@@ -229,9 +267,3 @@ class Atlas:
             np.array(self._path.poses).reshape(-1, 4, 4),
             np.array(self._path.sessions, np.int64),
         )
-
-
-def _trajectory(stamps_ns: Sequence[int], poses: Sequence[Transform]) -> Trajectory:
-    if not stamps_ns:
-        return Trajectory.empty()
-    return Trajectory(stamps_ns=np.array(stamps_ns, np.int64), T_world_base=np.stack(poses))

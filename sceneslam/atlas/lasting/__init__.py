@@ -1,0 +1,1 @@
+"""Maps that are saved and loaded."""

@@ -1,0 +1,81 @@
+"""Where a run's map comes from and where it goes: load, save now and then, save at the end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sceneslam.atlas.lasting.map_files import HEAD, load_map_files, save_map_files
+from sceneslam.atlas.lasting.saved_map import SavedMap, forget_contradicted
+from sceneslam.atlas.mapper import Mapper, Note
+from sceneslam.types.errors import ConfigError, InputError, told
+
+LOCALIZE, EXTEND, UPDATE = "localize", "extend", "update"
+
+
+class LastingMap:
+    """The settings `load`, `save`, `mode` and `save_every_s` of the atlas."""
+
+    def __init__(
+        self, *, load: str | None, save: str | None, mode: str, save_every_s: float
+    ) -> None:
+        """Load the map, if there is one; raises ConfigError where that fails."""
+        if mode not in (LOCALIZE, EXTEND, UPDATE):
+            raise ConfigError("mode", mode, f"{LOCALIZE} | {EXTEND} | {UPDATE}")
+        if mode == LOCALIZE and save is not None:
+            raise ConfigError(
+                "save", save, f"null where mode is {LOCALIZE}: the map stays as it is"
+            )
+        if mode != EXTEND and load is None:
+            raise ConfigError("mode", mode, f"{EXTEND} where no map is loaded (load=FOLDER)")
+        if not save_every_s > 0:
+            raise ConfigError("save_every_s", save_every_s, "seconds above 0")
+        self._mode, self._every_ns = mode, round(save_every_s * 1e9)
+        self._save = None if save is None else Path(save).resolve()
+        self._load = None if load is None else Path(load).resolve()
+        self.loaded: SavedMap | None = None
+        self.faults: list[str] = []
+        self._saved_ns: int | None = None
+        try:
+            if self._load is not None:
+                self.loaded = load_map_files(self._load)
+        except InputError as error:
+            raise ConfigError("load", str(load), f"the folder of a saved map ({error})") from error
+        if self._save is not None and self._save.is_dir():
+            foreign = any(self._save.iterdir()) and not (self._save / HEAD).is_file()
+            if foreign:
+                raise ConfigError("save", str(save), "a folder that is empty or holds a map")
+
+    def keep(self, stamp_ns: int, mapper: Mapper, note: Note) -> None:
+        """Save where it is time."""
+        if self._saved_ns is None:
+            self._saved_ns = stamp_ns
+        if self._save is not None and stamp_ns - self._saved_ns >= self._every_ns:
+            self._saved_ns = stamp_ns
+            self._write(mapper, stamp_ns, note)
+
+    def finish(self, mapper: Mapper, stamp_ns: int, note: Note) -> None:
+        """Save at the end, and say where the run was not found in the loaded map."""
+        if self._load is not None and not mapper.is_found:
+            self.faults.append(
+                f"the run was not found in the map {self._load}, its poses are in its own frame"
+            )
+        if self._save is not None:
+            self._write(mapper, stamp_ns, note)
+
+    def _write(self, mapper: Mapper, stamp_ns: int, note: Note) -> None:
+        assert self._save is not None
+        saved = mapper.saved()
+        if self._mode == UPDATE and self.loaded is not None and mapper.is_found:
+            saved = forget_contradicted(saved, self.loaded.runs)
+        try:
+            save_map_files(saved, self._save)
+        except (OSError, InputError) as error:
+            fault = f"the map could not be saved: {told(error)}"
+            if fault not in self.faults:
+                self.faults.append(fault)
+            return
+        note("map_saved", stamp_ns, submaps=len(saved.submaps), loops=_loops(saved))
+
+
+def _loops(saved: SavedMap) -> int:
+    return sum(edge.kind.name == "LOOP" for edge in saved.edges)

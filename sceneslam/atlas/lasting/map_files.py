@@ -1,0 +1,259 @@
+"""Writes and reads a saved map: a YAML that names and seals one file of arrays.
+
+`docs/map.md` documents the format. The arrays are written first, under a name of their own; the
+YAML that names them takes its place in one step. Whoever is killed on the way leaves the old map.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from sceneslam.atlas.lasting.saved_map import SavedMap
+from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan
+from sceneslam.atlas.submaps.graph import Edge, Kind
+from sceneslam.atlas.submaps.submap import Submap
+from sceneslam.types.errors import InputError, told
+from sceneslam.types.files import PART, replacing
+
+HEAD, FORMAT, VERSION = "map.yaml", "sceneslam-map", 1
+_ARRAYS = "arrays-"  # and the beginning of their checksum: two maps never share a file
+_SHAPES: Mapping[str, tuple[str, str, tuple[int, ...]]] = {  # name -> dtype, row of, inner shape
+    "node_run": ("<i8", "submaps", ()),
+    "node_session": ("<i8", "submaps", ()),
+    "node_module": ("<i8", "submaps", ()),
+    "node_piece": ("<i8", "submaps", ()),
+    "node_pose": ("<f8", "submaps", (3,)),
+    "node_scans": ("<i8", "submaps", ()),
+    "node_points": ("<i8", "submaps", ()),
+    "node_grid_shape": ("<i8", "submaps", (2,)),
+    "node_grid_origin": ("<f8", "submaps", (2,)),
+    "scan_stamp_ns": ("<i8", "scans", ()),
+    "scan_pose": ("<f8", "scans", (3,)),
+    "point": ("<f4", "points", (2,)),
+    "normal": ("<f4", "points", (2,)),
+    "free_bits": ("|u1", "bytes", ()),
+    "edge_nodes": ("<i8", "edges", (2,)),
+    "edge_motion": ("<f8", "edges", (3,)),
+    "edge_covariance": ("<f8", "edges", (3, 3)),
+    "edge_kind": ("<i8", "edges", ()),
+}
+
+
+def save_map_files(saved: SavedMap, folder: Path) -> None:
+    """Write the map into a folder of its own; the same map gives the same bytes.
+
+    Raises InputError where the folder holds something else, OSError where it cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    others = [path for path in folder.iterdir() if not _is_ours(path)]
+    if others:
+        raise InputError(f"a map is saved in a folder of its own, {others[0].name} is in: {folder}")
+    modules = sorted({submap.module for submap in saved.submaps})
+    data = _packed(_arrays(saved, modules))
+    seal = hashlib.sha256(data).hexdigest()
+    name = f"{_ARRAYS}{seal[:16]}.npz"
+    with replacing(folder / name, "wb") as file:
+        file.write(data)
+    head = {
+        "format": FORMAT,
+        "version": VERSION,
+        "arrays": name,
+        "sha256": seal,
+        "cell_m": CELL_M,
+        "submaps": len(saved.submaps),
+        "edges": len(saved.edges),
+        "runs": saved.runs,
+        "pieces": len(np.unique(saved.pieces)),
+        "modules": modules,
+    }
+    with replacing(folder / HEAD) as file:
+        yaml.safe_dump(head, file, sort_keys=False)
+    for path in folder.iterdir():
+        if _is_ours(path) and path.name not in (HEAD, name):
+            path.unlink()
+
+
+def load_map_files(folder: Path) -> SavedMap:
+    """Return the map of a folder; raises InputError that says what is wrong with it."""
+    head = _read_head(folder)
+    path = folder / str(head["arrays"])
+    if path.parent != folder or not path.is_file():
+        raise InputError(f"the map is not complete, {head['arrays']} is missing: {folder}")
+    data = path.read_bytes()
+    if hashlib.sha256(data).hexdigest() != head["sha256"]:
+        raise InputError(f"the map is damaged, its checksum is another: {path}")
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except (ValueError, OSError, zipfile.BadZipFile, KeyError) as error:
+        raise InputError(f"the map's arrays cannot be read ({told(error)}): {path}") from error
+    _check(arrays, path)
+    modules = head.get("modules")
+    if not isinstance(modules, list) or arrays["node_module"].max(initial=-1) >= len(modules):
+        raise InputError(f"modules: expected the names that the submaps refer to: {folder / HEAD}")
+    return _unpacked(arrays, [str(module) for module in modules])
+
+
+def _is_ours(path: Path) -> bool:
+    name = path.name.removesuffix(PART)
+    return name == HEAD or (name.startswith(_ARRAYS) and name.endswith(".npz"))
+
+
+def _read_head(folder: Path) -> dict[str, Any]:
+    path = folder / HEAD
+    if not folder.is_dir():
+        raise InputError(f"there is no map, the folder is missing: {folder}")
+    if not path.is_file():
+        raise InputError(f"not a map, it has no {HEAD}: {folder}")
+    try:
+        head = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, ValueError, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"the map's {HEAD} cannot be read ({reason}): {path}") from error
+    if not isinstance(head, dict) or head.get("format") != FORMAT:
+        raise InputError(f"not a map of SceneSLAM (format: {FORMAT} is missing): {path}")
+    version = head.get("version")
+    if version != VERSION:
+        newer = isinstance(version, int) and version > VERSION
+        which = "a newer SceneSLAM wrote it" if newer else f"only version {VERSION} is known"
+        raise InputError(f"a map of version {version!r}, {which}: {path}")
+    for key in ("arrays", "sha256"):
+        if not isinstance(head.get(key), str):
+            raise InputError(f"{key}: missing, the map's {HEAD} is not complete: {path}")
+    if head.get("cell_m") != CELL_M:
+        raise InputError(f"cell_m: got {head.get('cell_m')!r}, allowed: {CELL_M}: {path}")
+    return head
+
+
+def _check(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
+    """Raise InputError where arrays do not fit together."""
+    counts: dict[str, int] = {}
+    for name, (dtype, rows, inner) in _SHAPES.items():
+        found = arrays.get(name)
+        if found is None:
+            raise InputError(f"{name}: missing among the map's arrays: {path}")
+        if found.dtype.str != dtype or found.ndim == 0 or found.shape[1:] != inner:
+            expected = f"{dtype} of shape (N, {', '.join(map(str, inner))})"
+            raise InputError(
+                f"{name}: expected {expected}, got {found.dtype.str} {found.shape}: {path}"
+            )
+        if not np.isfinite(found).all():
+            raise InputError(f"{name}: expected finite numbers: {path}")
+        if counts.setdefault(rows, len(found)) != len(found):
+            raise InputError(f"{name}: expected {counts[rows]} rows, got {len(found)}: {path}")
+    sizes = -(-arrays["node_grid_shape"].prod(axis=1) // 8)
+    totals = {"scans": arrays["node_scans"], "points": arrays["node_points"], "bytes": sizes}
+    for rows, parts in totals.items():
+        if (parts < 0).any() or int(parts.sum()) != counts[rows]:
+            raise InputError(f"the submaps' {rows} do not add up to {counts[rows]}: {path}")
+    nodes, kinds = arrays["edge_nodes"], arrays["edge_kind"]
+    if len(nodes) and not (nodes.min() >= 0 and nodes.max() < counts["submaps"]):
+        raise InputError(f"edge_nodes: expected 0 to {counts['submaps'] - 1}: {path}")
+    if not np.isin(kinds, [kind.value for kind in Kind]).all():
+        raise InputError(f"edge_kind: expected 0 to {max(Kind)}: {path}")
+
+
+def _arrays(saved: SavedMap, modules: list[str]) -> dict[str, NDArray[Any]]:
+    submaps, edges = saved.submaps, saved.edges
+    plans = [submap.plan for submap in submaps]
+    stamps = [stamp for submap in submaps for stamp in submap.stamps_ns.tolist()]
+    columns: dict[str, Any] = {
+        "node_run": [submap.run for submap in submaps],
+        "node_session": [submap.session for submap in submaps],
+        "node_module": [modules.index(submap.module) for submap in submaps],
+        "node_piece": saved.pieces,
+        "node_pose": saved.T_map_node,
+        "node_scans": [len(submap.stamps_ns) for submap in submaps],
+        "node_points": [len(plan) for plan in plans],
+        "node_grid_shape": [plan.free.shape for plan in plans],
+        "node_grid_origin": [plan.origin_xy_m for plan in plans],
+        "scan_stamp_ns": stamps,
+        "scan_pose": np.concatenate([np.zeros((0, 3)), *(s.T_submap_base for s in submaps)]),
+        "point": np.concatenate([np.zeros((0, 2)), *(plan.points for plan in plans)]),
+        "normal": np.concatenate([np.zeros((0, 2)), *(plan.normals for plan in plans)]),
+        "free_bits": np.concatenate([[], *(np.packbits(plan.free) for plan in plans)]),
+        "edge_nodes": [(edge.first, edge.second) for edge in edges],
+        "edge_motion": [edge.T_first_second for edge in edges],
+        "edge_covariance": [edge.covariance for edge in edges],
+        "edge_kind": [int(edge.kind) for edge in edges],
+    }
+    return {
+        name: np.asarray(columns[name], np.dtype(dtype)).reshape(-1, *inner)
+        for name, (dtype, _, inner) in _SHAPES.items()
+    }
+
+
+def _packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """Return an npz whose bytes depend on the arrays alone, not on the time."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, array in arrays.items():
+            part = io.BytesIO()
+            np.lib.format.write_array(part, np.ascontiguousarray(array), allow_pickle=False)
+            entry = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
+            file.writestr(entry, part.getvalue(), zipfile.ZIP_DEFLATED, 6)
+    return buffer.getvalue()
+
+
+def _unpacked(arrays: Mapping[str, NDArray[Any]], modules: list[str]) -> SavedMap:
+    def parts(name: str, sizes: NDArray[Any]) -> list[NDArray[Any]]:
+        return np.split(arrays[name], np.cumsum(sizes)[:-1]) if len(sizes) else []
+
+    shapes, scans, points = (
+        arrays[name] for name in ("node_grid_shape", "node_scans", "node_points")
+    )
+    bits = parts("free_bits", -(-shapes.prod(axis=1) // 8))
+    rows = zip(
+        parts("scan_stamp_ns", scans),
+        parts("scan_pose", scans),
+        parts("point", points),
+        parts("normal", points),
+        bits,
+        strict=True,
+    )
+    submaps = []
+    for index, (stamps_ns, poses, walls, normals, free) in enumerate(rows):
+        shape = tuple(shapes[index].tolist())
+        x_m, y_m = arrays["node_grid_origin"][index].tolist()
+        cells = np.unpackbits(free, count=int(np.prod(shape))).reshape(shape).astype(bool)
+        submaps.append(
+            Submap(
+                run=int(arrays["node_run"][index]),
+                session=int(arrays["node_session"][index]),
+                module=modules[int(arrays["node_module"][index])],
+                stamps_ns=stamps_ns,
+                T_submap_base=poses,
+                plan=FloorPlan(points=walls, normals=normals, free=cells, origin_xy_m=(x_m, y_m)),
+            )
+        )
+    edges = [
+        Edge(
+            first=int(nodes[0]),
+            second=int(nodes[1]),
+            T_first_second=motion,
+            covariance=covariance,
+            kind=Kind(int(kind)),
+        )
+        for nodes, motion, covariance, kind in zip(
+            arrays["edge_nodes"],
+            arrays["edge_motion"],
+            arrays["edge_covariance"],
+            arrays["edge_kind"],
+            strict=True,
+        )
+    ]
+    return SavedMap(
+        submaps=tuple(submaps),
+        T_map_node=arrays["node_pose"],
+        pieces=arrays["node_piece"],
+        edges=tuple(edges),
+    )

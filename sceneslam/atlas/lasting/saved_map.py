@@ -1,0 +1,99 @@
+"""A map that lasts: submaps, where they lie, and what was measured between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan, join
+from sceneslam.atlas.submaps.graph import Edge
+from sceneslam.atlas.submaps.submap import Submap
+from sceneslam.types import planar
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SavedMap:
+    """The graph of all runs; nodes of one piece lie in one frame, pieces are not connected."""
+
+    submaps: tuple[Submap, ...]
+    T_map_node: NDArray[np.float64]  # (N, 3)
+    pieces: NDArray[np.int64]  # (N,), 0 the first
+    edges: tuple[Edge, ...]
+
+    @property
+    def runs(self) -> int:
+        """Return how many runs it was made in."""
+        return 1 + max((submap.run for submap in self.submaps), default=-1)
+
+    def plan(self, piece: int = 0, *, newest_wins: bool = True) -> FloorPlan:
+        """Return the floor plan of a piece, in its frame."""
+        placed = [
+            (T, submap.plan)
+            for T, submap, own in zip(self.T_map_node, self.submaps, self.pieces, strict=True)
+            if own == piece
+        ]
+        return join(placed, newest_wins=newest_wins)
+
+    def of(self, keep: Sequence[int]) -> SavedMap:
+        """Return the map of some of the nodes, and of the edges between them."""
+        number = {node: index for index, node in enumerate(keep)}
+        return SavedMap(
+            submaps=tuple(self.submaps[node] for node in keep),
+            T_map_node=self.T_map_node[list(keep)].reshape(-1, 3),
+            pieces=self.pieces[list(keep)],
+            edges=tuple(
+                replace(edge, first=number[edge.first], second=number[edge.second])
+                for edge in self.edges
+                if edge.first in number and edge.second in number
+            ),
+        )
+
+
+def empty_map() -> SavedMap:
+    """Return a map of nothing."""
+    return SavedMap(submaps=(), T_map_node=np.zeros((0, 3)), pieces=np.zeros(0, np.int64), edges=())
+
+
+def forget_contradicted(saved: SavedMap, run: int) -> SavedMap:
+    """Return the map without walls of earlier runs that stand where `run` saw free space.
+
+    Nor is free in an earlier run what is a wall in this one. Within a cell of either, where the
+    registration is no better, nothing is forgotten.
+    """
+    newest = [index for index, submap in enumerate(saved.submaps) if submap.run == run]
+    if not newest:
+        return saved
+    piece = int(saved.pieces[newest[0]])
+    today = join([(saved.T_map_node[i], saved.submaps[i].plan) for i in newest])
+    submaps = list(saved.submaps)
+    for index, submap in enumerate(saved.submaps):
+        if submap.run != run and saved.pieces[index] == piece and len(submap.plan):
+            T_today_plan = saved.T_map_node[index]
+            submaps[index] = replace(submap, plan=_without(submap.plan, T_today_plan, today))
+    return replace(saved, submaps=tuple(submaps))
+
+
+def _without(plan: FloorPlan, T_today_plan: planar.Planar, today: FloorPlan) -> FloorPlan:
+    """Return a plan without what another, in which it lies at T_today_plan, contradicts."""
+    points = planar.apply(T_today_plan, plan.points.astype(np.float64))
+    kept = ~_clear(today, points)
+    free = plan.free.copy()
+    walls = planar.apply(planar.between(T_today_plan, np.zeros(3)), today.points.astype(np.float64))
+    cells = np.floor((walls - np.array(plan.origin_xy_m)) / CELL_M).astype(np.int64)
+    rows, columns = free.shape
+    inside = ((cells >= 0) & (cells < [columns, rows])).all(axis=1)
+    free[cells[inside, 1], cells[inside, 0]] = False
+    return replace(plan, points=plan.points[kept], normals=plan.normals[kept], free=free)
+
+
+def _clear(plan: FloorPlan, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which points (N, 2) lie in free cells of a plan, with free cells all around."""
+    free = np.pad(plan.free, 2)
+    inner = free.copy()
+    for axis in (0, 1):
+        inner &= np.roll(free, 1, axis) & np.roll(free, -1, axis)
+    cells = np.clip(plan.cells(points) + 2, 0, [free.shape[1] - 1, free.shape[0] - 1])
+    return np.asarray(inner[cells[:, 1], cells[:, 0]])

@@ -1,0 +1,1 @@
+"""Floor plans, and finding one in another."""

@@ -1,0 +1,181 @@
+"""A floor plan: where walls stand and where it is free, drawn from scans at known poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.scans.key_scan import KeyScan
+from sceneslam.types import planar
+from sceneslam.types.planar import Planar
+
+CELL_M = 0.05  # a depth camera's error at 4 m; every finer structure comes and goes with the view
+_PAD = 10  # cells around everything
+_SHORT_CELLS = 1.5  # a ray ends so far before its return: the cell of a wall is not free
+_HITS_PER_MISS = 0.25  # a wall that rays graze is passed by many
+_AGREE_RATIO = 0.8  # of the length of the normals' sum over their number: they are one wall's
+_CELLS_MAX = 5 * 10**7  # 350 m x 350 m
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FloorPlan:
+    """Walls as points, at most one per cell, and free cells; what is neither is unknown."""
+
+    points: NDArray[np.float32]  # (P, 2) [m]
+    normals: NDArray[np.float32]  # (P, 2) unit, to where the wall was seen from; 0: no line
+    free: NDArray[np.bool_]  # (rows, columns); row 0 is the lowest y
+    origin_xy_m: tuple[float, float]  # outer corner of cell (0, 0), a multiple of the cell
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def cells(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
+        """Return the (N, 2) column and row of points (N, 2), which may lie outside."""
+        cells = np.floor((points - np.array(self.origin_xy_m)) / CELL_M)
+        return np.asarray(cells, np.int64)
+
+
+def empty() -> FloorPlan:
+    """Return a plan of nothing."""
+    nothing = np.zeros((0, 2), np.float32)
+    return FloorPlan(
+        points=nothing, normals=nothing, free=np.zeros((1, 1), bool), origin_xy_m=(0.0, 0.0)
+    )
+
+
+def draw(scans: Sequence[tuple[Planar, KeyScan]]) -> FloorPlan:
+    """Return the plan of scans at poses T_plan_base."""
+    ends = [planar.apply(T, scan.points) for T, scan in scans]
+    starts = [planar.apply(T, scan.origin[None])[0] for T, scan in scans]
+    everything = np.concatenate([*ends, *(start[None] for start in starts)])
+    if not sum(len(each) for each in ends):
+        return empty()
+    low, (rows, columns) = _box(everything)
+    misses = np.zeros((rows, columns), np.uint16)
+    for start, end in zip(starts, ends, strict=True):
+        ray = np.zeros((rows, columns), np.uint8)
+        _draw_rays(ray, start / CELL_M - low, end / CELL_M - low)
+        misses += ray
+    points = np.concatenate(ends)
+    turned = [scan.normals @ planar.rotation(float(T[2])).T for T, scan in scans]
+    index, hits, centres, normals = _binned(points, np.concatenate(turned), low, (rows, columns))
+    least = 1 if len(scans) < 3 else 2
+    passed = misses.reshape(-1)[index]
+    is_wall = (hits >= least) & (hits >= _HITS_PER_MISS * passed)
+    free = misses >= least
+    free.reshape(-1)[index] = False
+    return _plan(centres[is_wall], normals[is_wall], free, low)
+
+
+def join(placed: Sequence[tuple[Planar, FloorPlan]], *, newest_wins: bool = False) -> FloorPlan:
+    """Return one plan of many at poses T_joined_plan, oldest first.
+
+    `newest_wins`: a wall goes where a later plan saw free space around its cell.
+    """
+    placed = [(T, plan) for T, plan in placed if len(plan) or plan.free.any()]
+    if not placed:
+        return empty()
+    points = [planar.apply(T, plan.points.astype(np.float64)) for T, plan in placed]
+    normals = [plan.normals @ planar.rotation(float(T[2])).T for T, plan in placed]
+    low, (rows, columns) = _box(np.concatenate([*points, *(_corners(T, p) for T, p in placed)]))
+    free = np.zeros((rows, columns), bool)
+    kept: list[NDArray[np.float64]] = []  # (P, 4): points and normals
+    for (T, plan), *walls in zip(placed, points, normals, strict=True):
+        seen = _laid(T, plan, low, (rows, columns))
+        if newest_wins:
+            inner = cv2.erode(seen.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+            kept = [each[~_at(inner, each[:, :2], low)] for each in kept]
+        free |= seen
+        kept.append(np.concatenate(walls, axis=1))
+    left = np.concatenate(kept)
+    index, _, centres, mean = _binned(left[:, :2], left[:, 2:], low, (rows, columns))
+    free.reshape(-1)[index] = False
+    return _plan(centres, mean, free, low)
+
+
+def _plan(
+    centres: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    free: NDArray[np.bool_],
+    low: NDArray[np.int64],
+) -> FloorPlan:
+    x_m, y_m = (low * CELL_M).tolist()
+    return FloorPlan(
+        points=centres.astype(np.float32),
+        normals=normals.astype(np.float32),
+        free=free,
+        origin_xy_m=(x_m, y_m),
+    )
+
+
+def _box(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, int]]:
+    """Return the lowest cell and the (rows, columns) of a grid around points."""
+    low = np.floor(points.min(axis=0) / CELL_M).astype(np.int64) - _PAD
+    high = np.floor(points.max(axis=0) / CELL_M).astype(np.int64) + _PAD + 1
+    columns, rows = (high - low).tolist()
+    if rows * columns > _CELLS_MAX:
+        raise ValueError(f"a floor plan of {columns * CELL_M:.0f} m x {rows * CELL_M:.0f} m")
+    return low, (rows, columns)
+
+
+def _draw_rays(
+    image: NDArray[np.uint8], start: NDArray[np.float64], ends: NDArray[np.float64]
+) -> None:
+    """Draw rays, in cells, up to just before their ends."""
+    away = ends - start
+    length = np.linalg.norm(away, axis=1, keepdims=True)
+    ends = start + away * np.maximum(1.0 - _SHORT_CELLS / np.maximum(length, 1e-9), 0.0)
+    rays = np.stack([np.broadcast_to(start, ends.shape), ends], axis=1)
+    cv2.polylines(image, list(np.floor(rays).astype(np.int32)), False, 1)
+
+
+def _binned(
+    points: NDArray[np.float64],
+    normals: NDArray[np.floating],
+    low: NDArray[np.int64],
+    shape: tuple[int, int],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the cells that hold points (flat indices), how many, their mean and normal (P, 2).
+
+    The normal is 0 where those of a cell disagree.
+    """
+    cells = np.floor(points / CELL_M).astype(np.int64) - low
+    flat = cells[:, 1] * shape[1] + cells[:, 0]
+    index, inverse, count = np.unique(flat, return_inverse=True, return_counts=True)
+    size = len(index)
+    sums = [np.bincount(inverse, points[:, axis], size) for axis in (0, 1)]
+    faced = np.column_stack([np.bincount(inverse, normals[:, axis], size) for axis in (0, 1)])
+    lines = np.bincount(inverse, np.abs(normals).sum(axis=1) > 0, size)
+    length = np.linalg.norm(faced, axis=1)
+    agrees = (length > _AGREE_RATIO * lines) & (lines > 0)
+    unit = np.where(agrees[:, None], faced / np.maximum(length, 1e-9)[:, None], 0.0)
+    return index, count, np.column_stack(sums) / count[:, None], unit
+
+
+def _corners(T_joined_plan: Planar, plan: FloorPlan) -> NDArray[np.float64]:
+    rows, columns = plan.free.shape
+    unit = np.array([[0, 0], [0, rows], [columns, 0], [columns, rows]], np.float64)
+    return planar.apply(T_joined_plan, np.array(plan.origin_xy_m) + CELL_M * unit)
+
+
+def _laid(
+    T_joined_plan: Planar, plan: FloorPlan, low: NDArray[np.int64], shape: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Return the free cells of a plan in the cells of another grid (nearest)."""
+    turn = planar.rotation(float(T_joined_plan[2])).T
+    shift = turn @ ((low + 0.5) * CELL_M - T_joined_plan[:2]) - np.array(plan.origin_xy_m)
+    affine = np.column_stack([turn, shift / CELL_M - 0.5])
+    flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+    size_wh = (shape[1], shape[0])
+    return np.asarray(cv2.warpAffine(plan.free.astype(np.uint8), affine, size_wh, flags=flags) > 0)
+
+
+def _at(
+    image: NDArray[np.bool_], points: NDArray[np.float64], low: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    cells = np.floor(points / CELL_M).astype(np.int64) - low
+    return np.asarray(image[cells[:, 1], cells[:, 0]])

@@ -1,0 +1,165 @@
+"""Finds a run in a map that was loaded, and goes on to check that it is there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from sceneslam.atlas.places.floor_plan import FloorPlan, draw
+from sceneslam.atlas.places.plan_field import PlanField
+from sceneslam.atlas.places.plan_search import Window
+from sceneslam.atlas.places.recognition import Recognizer
+from sceneslam.atlas.places.registration import Registration, register
+from sceneslam.atlas.uncertainty import WHEELS
+from sceneslam.scans.key_scan import KeyScan
+from sceneslam.types import planar
+from sceneslam.types.planar import Planar
+
+_SPAN_M, _SPAN_SCANS = 6.0, 60  # of the latest path: what is compared with the map
+_PERIOD_S, _PERIOD_MAX_S = 0.5, 8.0  # between two searches; doubled with every four in vain
+_FIX_M, _FIX_S = 0.5, 1.0  # once found, so far and so long from one comparison to the next
+_AGREE_M, _AGREE_RAD = 0.1, 0.05  # two searches in a row that agree are believed
+_REACH_M, _REACH_RAD, _SIGMAS = 0.15, 0.05, 3.0  # of a fix around the prediction
+_DOUBTS = 3  # comparisons in a row that contradict the map: it was another place
+_KNOWN_MIN = 0.6
+
+
+class Outcome(Enum):
+    """What a comparison with the map led to."""
+
+    NOTHING = "nothing"
+    FOUND = "relocalized"
+    FIXED = "fixed"  # found before, and confirmed
+    WITHDRAWN = "relocalization_withdrawn"  # found before, and contradicted since
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Placed:
+    """A scan at its pose in the frame of the run."""
+
+    scan: KeyScan
+    T_run_base: Planar
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fix:
+    """Where the robot is in the map, as its newest scans have it."""
+
+    stamp_ns: int
+    match: Registration  # of `base` at the stamp, in the map
+
+    @property
+    def T_map_base(self) -> Planar:
+        """Return the robot's pose in the map."""
+        return self.match.T_target_query
+
+
+class Localizer:
+    """Compares the last metres of a run with a map."""
+
+    def __init__(self, plan: FloorPlan) -> None:
+        self.T_map_run: Planar | None = None  # None until the run was found
+        self.fixes: list[Fix] = []
+        self._map = Recognizer(PlanField(plan))
+        self._next_ns = 0
+        self._fixed_at: Placed | None = None
+        self._guess: Planar | None = None  # T_map_run of the last search
+        self._vain = self._doubts = 0
+
+    def is_due(self, placed: Placed) -> bool:
+        """Tell whether it is time to compare at the newest scan."""
+        if placed.scan.stamp_ns < self._next_ns:
+            return False
+        if self.T_map_run is None or self._fixed_at is None:
+            return True
+        away = planar.between(self._fixed_at.T_run_base, placed.T_run_base)
+        return bool(np.hypot(away[0], away[1]) >= _FIX_M or abs(away[2]) >= 1.0)
+
+    def compare(self, latest: Sequence[Placed]) -> Outcome:
+        """Compare the latest scans, oldest first, with the map."""
+        newest, query = latest[-1], _query(latest)
+        if not len(query):
+            return Outcome.NOTHING
+        field = PlanField(query)
+        if self.T_map_run is not None:
+            return self._check(newest, field)
+        match = self._map.recognize(field, None)
+        self._wait(newest, _PERIOD_S * 2.0 ** min(self._vain // 4, 4))
+        if match is None or match.weak_directions:
+            self._guess, self._vain = None, self._vain + 1
+            return Outcome.NOTHING
+        T_map_run = _run_in_map(match, newest)
+        before, self._guess = self._guess, T_map_run
+        if before is None or not _agree(before, T_map_run, newest.T_run_base):
+            return Outcome.NOTHING
+        self._take(newest, match)
+        return Outcome.FOUND
+
+    def _check(self, newest: Placed, query: PlanField) -> Outcome:
+        """Compare near where the robot should be; what contradicts often enough ends it."""
+        assert self.T_map_run is not None and self._fixed_at is not None
+        self._wait(newest, _FIX_S)
+        expected = planar.compose(self.T_map_run, newest.T_run_base)
+        away = planar.between(self._fixed_at.T_run_base, newest.T_run_base)
+        moved_m, turned_rad = float(np.hypot(away[0], away[1])), abs(float(away[2]))
+        turn = WHEELS.rad_per_m * moved_m + WHEELS.rad_per_rad * turned_rad
+        window = Window(
+            around=expected,
+            half_m=_REACH_M + _SIGMAS * WHEELS.per_m * moved_m,
+            half_rad=_REACH_RAD + _SIGMAS * turn,
+        )
+        match = self._map.recognize(query, window)
+        if match is not None and _is_within(match, window):
+            self._take(newest, match)
+            return Outcome.FIXED
+        there = register(query, self._map.field, expected)
+        is_contradicted = there.known_ratio >= _KNOWN_MIN and not there.is_verified
+        self._doubts = self._doubts + 1 if is_contradicted else 0
+        if self._doubts < _DOUBTS:
+            return Outcome.NOTHING
+        self.T_map_run, self._guess, self._fixed_at = None, None, None
+        self._doubts, self._vain, self.fixes = 0, 0, []
+        return Outcome.WITHDRAWN
+
+    def _take(self, newest: Placed, match: Registration) -> None:
+        self.T_map_run, self._fixed_at = _run_in_map(match, newest), newest
+        self.fixes.append(Fix(stamp_ns=newest.scan.stamp_ns, match=match))
+        self._doubts = self._vain = 0
+        self._wait(newest, _FIX_S)
+
+    def _wait(self, newest: Placed, period_s: float) -> None:
+        self._next_ns = newest.scan.stamp_ns + round(min(period_s, _PERIOD_MAX_S) * 1e9)
+
+
+def _query(latest: Sequence[Placed]) -> FloorPlan:
+    """Return the plan of the last metres in the frame of base at the newest scan."""
+    newest, length_m = latest[-1], 0.0
+    scans: list[tuple[Planar, KeyScan]] = []
+    after = newest
+    for placed in reversed(latest[-_SPAN_SCANS:]):
+        step = planar.between(placed.T_run_base, after.T_run_base)
+        length_m += float(np.hypot(step[0], step[1]))
+        if length_m > _SPAN_M:
+            break
+        scans.append((planar.between(newest.T_run_base, placed.T_run_base), placed.scan))
+        after = placed
+    return draw(scans)
+
+
+def _run_in_map(match: Registration, newest: Placed) -> Planar:
+    T_base_run = planar.between(newest.T_run_base, np.zeros(3))
+    return planar.compose(match.T_target_query, T_base_run)
+
+
+def _agree(first: Planar, second: Planar, T_run_base: Planar) -> bool:
+    """Tell whether two placements of the run have the robot in the same place."""
+    off = planar.between(planar.compose(first, T_run_base), planar.compose(second, T_run_base))
+    return bool(np.hypot(off[0], off[1]) <= _AGREE_M and abs(off[2]) <= _AGREE_RAD)
+
+
+def _is_within(match: Registration, window: Window) -> bool:
+    off = planar.between(window.around, match.T_target_query)
+    return bool(np.hypot(off[0], off[1]) <= window.half_m and abs(off[2]) <= window.half_rad)

@@ -1,0 +1,83 @@
+"""Looks walls and free space up in a floor plan: the nearest wall of any point in one step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan
+
+_MARGIN = 20  # cells around the plan: a point that is further out has no wall near
+_CLEAR_M = 0.2  # free cells so far from all walls are evidence that no wall stands there
+_LIKELIHOOD_M = 0.1  # standard deviation of a wall in the coarse search
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Nearest:
+    """What a plan holds around points."""
+
+    error: NDArray[np.float64]  # (N, 2) [m]: from the nearest wall point to the point
+    normals: NDArray[np.float64]  # (N, 2)
+    distance_m: NDArray[np.float64]  # (N,)
+    is_clear: NDArray[np.bool_]  # (N,): free, and no wall near
+    is_known: NDArray[np.bool_]  # (N,): free, or a wall near
+
+
+class PlanField:
+    """The look-up tables of one plan, which must hold a wall."""
+
+    def __init__(self, plan: FloorPlan) -> None:
+        self.plan = plan
+        self._free = np.pad(plan.free, _MARGIN)
+        self._origin = np.array(plan.origin_xy_m) - _MARGIN * CELL_M
+        image = np.ones(self._free.shape, np.uint8)
+        cells = self._cells(plan.points)
+        image[cells[:, 1], cells[:, 0]] = 0
+        far, labels = cv2.distanceTransformWithLabels(
+            image, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        owner = np.zeros(int(labels.max()) + 1, np.int64)
+        owner[labels[cells[:, 1], cells[:, 0]]] = np.arange(len(plan.points))
+        self._nearest, self._far_m = owner[labels], far * CELL_M
+        self._points = plan.points.astype(np.float64)
+        self._normals = plan.normals.astype(np.float64)
+
+    def nearest(self, points: NDArray[np.float64]) -> Nearest:
+        """Return what lies around points (N, 2) [m] of the plan's frame."""
+        rows, columns = self._free.shape
+        cells = self._cells(points)
+        inside = ((cells >= 0) & (cells < [columns, rows])).all(axis=1)
+        column, row = np.clip(cells[:, 0], 0, columns - 1), np.clip(cells[:, 1], 0, rows - 1)
+        index = self._nearest[row, column]
+        error = points - self._points[index]
+        distance_m = np.linalg.norm(error, axis=1)
+        is_free = self._free[row, column] & inside
+        return Nearest(
+            error=error,
+            normals=self._normals[index],
+            distance_m=distance_m,
+            is_clear=is_free & (distance_m > _CLEAR_M),
+            is_known=is_free | (distance_m <= _CLEAR_M),
+        )
+
+    @cached_property
+    def likelihood(self) -> NDArray[np.float32]:
+        """Return (rows, columns): 1 on a wall, falling with the distance; below 0 where it is free.
+
+        The margin is part of it: `origin_xy_m` is its corner.
+        """
+        near = np.exp(-0.5 * (self._far_m / _LIKELIHOOD_M) ** 2)
+        clear = self._free & (self._far_m > _CLEAR_M)
+        return np.where(clear, -1.0, near).astype(np.float32)
+
+    @property
+    def origin_xy_m(self) -> NDArray[np.float64]:
+        """Return the outer corner (2,) of the likelihood's cell (0, 0)."""
+        return self._origin
+
+    def _cells(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
+        return np.asarray(np.floor((points - self._origin) / CELL_M).astype(np.int64))

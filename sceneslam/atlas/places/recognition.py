@@ -1,0 +1,62 @@
+"""Recognizes a place: the one pose of a plan in another that nothing speaks against."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sceneslam.atlas.places.plan_field import PlanField
+from sceneslam.atlas.places.plan_search import PlanSearch, Window, is_apart
+from sceneslam.atlas.places.registration import Registration, register
+
+_SCORE_MIN = 0.3  # of the coarse search, whose cells are three of the plan's
+_CANDIDATES = 24  # that are refined
+_RIVAL_RATIO = 0.85  # a second place that fits as well as this share of the best is as likely
+_POINTS_MIN = 40  # two metres of wall: less may stand anywhere
+_KNOWN_MIN = 0.6  # of the walls: where most is unknown, nothing is recognized
+_NEAR_M, _NEAR_RAD = 0.3, 0.1  # a window so small needs no search: the refinement reaches as far
+
+
+class Recognizer:
+    """Finds plans in one target."""
+
+    def __init__(self, target: PlanField) -> None:
+        self.field, self._search = target, PlanSearch(target)
+
+    def recognize(
+        self, query: PlanField, window: Window | None, *, known_min: float = _KNOWN_MIN
+    ) -> Registration | None:
+        """Return the pose of the query, None where there is none, or more than one.
+
+        A pose is refuted where walls of the one stand in free space of the other, or away from its
+        walls. `window` None: anywhere in the target.
+        """
+        if len(query.plan) < _POINTS_MIN:
+            return None
+        found = self._candidates(query, window)
+        verified = [
+            one
+            for one in found
+            if one.is_verified and one.known_ratio >= known_min and one.weak_directions < 2
+        ]
+        if not verified:
+            return None
+        best = max(verified, key=_worth)
+        rivals = [
+            one
+            for one in found
+            if is_apart(one.T_target_query, best.T_target_query)
+            and one.inlier_ratio * one.known_ratio >= _RIVAL_RATIO * _worth(best)
+            and not one.is_refuted
+        ]
+        return None if rivals else best
+
+    def _candidates(self, query: PlanField, window: Window | None) -> list[Registration]:
+        if window is not None and window.half_m <= _NEAR_M and window.half_rad <= _NEAR_RAD:
+            return [register(query, self.field, window.around)]
+        points = query.plan.points.astype(np.float64)
+        peaks = self._search.find(points, window, score_min=_SCORE_MIN, most=_CANDIDATES)
+        return [register(query, self.field, peak.T_target_query) for peak in peaks]
+
+
+def _worth(one: Registration) -> float:
+    return one.inlier_ratio * one.known_ratio

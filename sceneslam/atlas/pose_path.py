@@ -1,0 +1,82 @@
+"""The poses of a run as they come: the path of the robot, and each session's own."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sceneslam.atlas.revision import Told
+from sceneslam.atlas.uncertainty import Covariance
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.se3 import Transform
+from sceneslam.types.trajectory import Trajectory
+
+
+@dataclass(slots=True)
+class OpenSession:
+    """A session while it grows."""
+
+    module: str
+    T_map_local: Transform
+    stamps_ns: list[int] = field(default_factory=list)
+    poses: list[Transform] = field(default_factory=list)  # T_local_base
+    layers: MapLayers = field(default_factory=MapLayers)
+    revised: Trajectory = field(default_factory=Trajectory.empty)  # T_local_base
+
+    @property
+    def told(self) -> Told:
+        """Return its poses, as reported and as revised."""
+        online = trajectory_of(self.stamps_ns, self.poses)
+        return Told(
+            module=self.module, T_map_local=self.T_map_local, online=online, revised=self.revised
+        )
+
+
+@dataclass(slots=True)
+class PosePath:
+    """Poses by rising stamp."""
+
+    stamps_ns: list[int] = field(default_factory=list)
+    poses: list[Transform] = field(default_factory=list)  # T_map_base
+    modules: list[str] = field(default_factory=list)
+    sessions: list[int] = field(default_factory=list)  # that was open, -1 before the first
+    covariances: list[Covariance | None] = field(default_factory=list)  # as reported
+
+    def add(
+        self,
+        stamp_ns: int,
+        T_map_base: Transform,
+        module: str,
+        session: int,
+        covariance: Covariance | None,
+    ) -> None:
+        """Add a pose unless its stamp has one."""
+        if self.stamps_ns and stamp_ns <= self.stamps_ns[-1]:
+            return
+        self.covariances.append(covariance)
+        self.stamps_ns.append(stamp_ns)
+        self.poses.append(T_map_base)
+        self.modules.append(module)
+        self.sessions.append(session)
+
+    def cut(self, stamp_ns: int) -> None:
+        """Forget the poses from an instant on."""
+        keep = bisect_left(self.stamps_ns, stamp_ns)
+        for values in (
+            self.stamps_ns,
+            self.poses,
+            self.modules,
+            self.sessions,
+            self.covariances,
+        ):
+            del values[keep:]
+
+
+def trajectory_of(stamps_ns: Sequence[int], poses: Sequence[Transform]) -> Trajectory:
+    """Return poses as a trajectory."""
+    if not stamps_ns:
+        return Trajectory.empty()
+    return Trajectory(stamps_ns=np.array(stamps_ns, np.int64), T_world_base=np.stack(poses))

@@ -1,0 +1,1 @@
+"""Submaps, and the graph between them."""

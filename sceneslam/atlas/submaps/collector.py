@@ -1,0 +1,155 @@
+"""Collects scans at the poses of a run, and cuts them into submaps once the poses are settled."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.atlas.submaps.graph import Edge, Kind
+from sceneslam.atlas.submaps.submap import (
+    STEP_M,
+    STEP_RAD,
+    KeyPose,
+    Submap,
+    make_submap,
+    motion_covariance,
+    split,
+)
+from sceneslam.atlas.uncertainty import MAPPED, VELOCITY, WHEELS
+from sceneslam.scans.key_scan import KeyScan
+from sceneslam.types import planar, se3
+from sceneslam.types.planar import Planar
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.run import BRIDGED
+from sceneslam.types.se3 import Transform
+
+_SETTLED_NS = 20_000_000_000  # what is older is not taken back by a hand-over (policy.buffer_s)
+_LEVEL_COS = np.cos(np.radians(3.0))  # a wall 4 m away is then seen 0.2 m higher or lower
+_SLOPE = 0.2  # m per m: steeper than any ramp, so that it is no floor that the base moves on
+_LEVEL_RATIO = 0.5  # of all steps, at least: else it is a sensor that is carried by hand
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Known:
+    """What the path holds at a stamp."""
+
+    T_map_base: Transform  # frame of the run
+    session: int
+    module: str  # BRIDGED where none gave the pose
+    covariance: NDArray[np.float64] | None  # (6, 6), as the module has it
+
+
+class Collector:
+    """The submaps of one run so far, and the motions between them."""
+
+    def __init__(self, rig: Rig, known: Callable[[int], Known | None], run: int) -> None:
+        """Begin; `known` tells the path at a stamp, as it is known when asked."""
+        self.submaps: list[Submap] = []
+        self.T_run_node: list[Planar] = []
+        self.motions: list[Edge] = []
+        self.drift = [np.zeros(3)]  # per submap: deviations [m, m, rad], summed up along the path
+        self._known, self._run = known, run
+        self._bridge = WHEELS if Sensor.ODOMETRY in rig.sensors else VELOCITY
+        self._scans: list[KeyScan] = []  # not yet in a submap
+        self._part: list[KeyPose] = []  # the newest submap's
+        self._last: Transform | None = None  # where the last scan was taken
+        self._level = self._steps = 0
+
+    @property
+    def is_level(self) -> bool:
+        """Tell whether the base moves on a floor."""
+        return self._level >= _LEVEL_RATIO * self._steps
+
+    def has_moved(self, T_run_base: Transform) -> bool:
+        """Tell whether it is time for a scan."""
+        if self._last is None:
+            return True
+        step = se3.inverse(self._last) @ T_run_base
+        return bool(np.hypot(*step[:2, 3]) >= STEP_M or abs(se3.yaw_rad(step)) >= STEP_RAD)
+
+    def step_to(self, T_run_base: Transform) -> bool:
+        """Note a step; return whether it led to a pose as a robot on a floor takes it."""
+        is_level = bool(T_run_base[2, 2] >= _LEVEL_COS)
+        if self._last is not None:
+            step_m = T_run_base[:3, 3] - self._last[:3, 3]
+            is_level &= bool(abs(step_m[2]) <= _SLOPE * max(np.hypot(*step_m[:2]), STEP_M))
+        self._last = T_run_base
+        self._steps, self._level = self._steps + 1, self._level + is_level
+        return is_level
+
+    def add(self, scan: KeyScan) -> None:
+        """Take a scan after its step, and cut what is settled."""
+        self._scans.append(scan)
+        settled = bisect_right(
+            self._scans, scan.stamp_ns - _SETTLED_NS, key=lambda each: each.stamp_ns
+        )
+        if 2 * settled > len(self._scans):
+            self._cut(settled, is_end=False)
+
+    def finish(self) -> None:
+        """Cut what is left."""
+        self._cut(len(self._scans), is_end=True)
+
+    def remeasure(self, poses: NDArray[np.float64]) -> None:
+        """Take where the submaps lie (N, 3), and so the motions, as the modules revised them."""
+        self.T_run_node = list(poses)
+        self.motions = [
+            replace(edge, T_first_second=planar.between(poses[edge.first], poses[edge.second]))
+            for edge in self.motions
+        ]
+
+    def node_at(self, stamp_ns: int) -> int:
+        """Return the submap that a stamp lies in, or the last before it."""
+        starts = [int(submap.stamps_ns[0]) for submap in self.submaps]
+        return max(bisect_right(starts, stamp_ns) - 1, 0)
+
+    def _cut(self, count: int, *, is_end: bool) -> None:
+        """Make submaps of the oldest scans; the last may go on, unless this is the end."""
+        poses = [pose for scan in self._scans[:count] if (pose := self._posed(scan)) is not None]
+        parts = split(poses)
+        for part in parts if is_end else parts[:-1]:
+            self._append(part)
+        done_ns = -1 if not self._part else self._part[-1].stamp_ns
+        self._scans = [scan for scan in self._scans if scan.stamp_ns > done_ns]
+
+    def _posed(self, scan: KeyScan) -> KeyPose | None:
+        known = self._known(scan.stamp_ns)
+        if known is None:
+            return None
+        told = known.covariance
+        return KeyPose(
+            scan=scan,
+            T_map_base=planar.from_transform(known.T_map_base),
+            session=known.session,
+            module=known.module,
+            drift=self._bridge if known.module == BRIDGED else MAPPED,
+            told=None if told is None else planar.planar_covariance(told),
+        )
+
+    def _append(self, part: list[KeyPose]) -> None:
+        if self._part:
+            covariance = motion_covariance([*self._part, part[0]])
+            self.motions.append(
+                Edge(
+                    first=len(self.submaps) - 1,
+                    second=len(self.submaps),
+                    T_first_second=planar.between(self._part[0].T_map_base, part[0].T_map_base),
+                    covariance=covariance,
+                    kind=self._kind(part[0]),
+                )
+            )
+            self.drift.append(self.drift[-1] + np.sqrt(np.diag(covariance)))
+        self.submaps.append(make_submap(part, self._run))
+        self.T_run_node.append(part[0].T_map_base)
+        self._part = part
+
+    def _kind(self, pose: KeyPose) -> Kind:
+        """Return by what the motion from the newest submap to a pose was measured."""
+        if self._part[0].session != pose.session:
+            return Kind.HANDOVER
+        bridged = sum(each.module == BRIDGED for each in [*self._part, pose])
+        return Kind.BRIDGE if 2 * bridged > len(self._part) else Kind.MOTION

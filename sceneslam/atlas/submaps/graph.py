@@ -1,0 +1,152 @@
+"""The one graph: submaps of all modules and runs, and every motion that was measured between them.
+
+Wrong loops are kept out twice: only the largest set of loops that agree with one another is taken
+(Mangelson et al., "Pairwise consistent measurement set maximization", ICRA 2018), and what is
+taken is weighed by graduated non-convexity (Yang et al., RA-L 2020), which can give each up again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import planar
+from sceneslam.types.planar import Matrix, Planar
+
+_CHI2_3 = 11.34  # of three degrees of freedom, exceeded by one in a hundred
+_FIXED = np.array([1e-4, 1e-4, 1e-5])  # m, m, rad
+_LOOSE = np.array([10.0, 10.0, 3.0])  # m, m, rad: any loop moves it
+
+
+class Kind(IntEnum):
+    """What an edge was measured by."""
+
+    MOTION = 0  # a module's own
+    BRIDGE = 1  # wheels, gyro or velocity
+    HANDOVER = 2  # from a module to the next, over observations that both saw
+    LOOP = 3  # a place that was seen again
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Edge:
+    """A measured motion between two nodes."""
+
+    first: int
+    second: int
+    T_first_second: Planar
+    covariance: Matrix  # (3, 3), axes of second
+    kind: Kind
+
+    def shifted(self, by: int) -> Edge:
+        """Return the edge between nodes whose numbers are higher."""
+        return replace(self, first=self.first + by, second=self.second + by)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Solved:
+    """The graph after optimisation."""
+
+    T_map_node: NDArray[np.float64]  # (N, 3)
+    loops: tuple[Edge, ...]  # that were believed
+
+
+def solve(
+    T_map_node: NDArray[np.float64],
+    motions: Sequence[Edge],
+    loops: Sequence[Edge],
+    *,
+    fixed: Sequence[int],
+    loose: int,
+) -> Solved:
+    """Return the poses (N, 3) that fit the motions and the believed loops best.
+
+    `fixed` nodes stay; so does `loose` unless a loop to one of them moves it. Every node must be
+    connected to one of these. Same input, same bits.
+    """
+    import gtsam
+
+    if not loops:
+        return Solved(T_map_node=T_map_node, loops=())
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for number, pose in enumerate(T_map_node):
+        values.insert(number, gtsam.Pose2(*pose))
+    noise = gtsam.noiseModel.Diagonal.Sigmas(_FIXED)
+    for number in fixed:
+        graph.add(gtsam.PriorFactorPose2(number, gtsam.Pose2(*T_map_node[number]), noise))
+    slack = gtsam.noiseModel.Diagonal.Sigmas(_LOOSE if len(fixed) else _FIXED)
+    graph.add(gtsam.PriorFactorPose2(loose, gtsam.Pose2(*T_map_node[loose]), slack))
+    for edge in [*motions, *loops]:
+        graph.add(_factor(gtsam, edge))
+    trusted = list(range(len(fixed) + 1 + len(motions)))
+    parameters = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
+    parameters.setKnownInliers(trusted)
+    optimizer = gtsam.GncLMOptimizer(graph, values, parameters)
+    optimizer.setInlierCostThresholds(0.5 * _CHI2_3)
+    result = optimizer.optimize()
+    weights = np.asarray(optimizer.getWeights())[len(trusted) :]
+    poses = [result.atPose2(number) for number in range(len(T_map_node))]
+    return Solved(
+        T_map_node=np.array([[pose.x(), pose.y(), pose.theta()] for pose in poses]),
+        loops=tuple(loop for loop, weight in zip(loops, weights, strict=True) if weight > 0.5),
+    )
+
+
+def _factor(gtsam: Any, edge: Edge) -> Any:
+    noise = gtsam.noiseModel.Gaussian.Covariance(edge.covariance)
+    return gtsam.BetweenFactorPose2(
+        edge.first, edge.second, gtsam.Pose2(*edge.T_first_second), noise
+    )
+
+
+def consistent(
+    loops: Sequence[Edge], T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
+) -> list[Edge]:
+    """Return the largest set of loops of which any two agree within the drift between them.
+
+    `drift` (N, 3): standard deviations [m, m, rad], summed up along the path to each node.
+    """
+    count = len(loops)
+    agree = np.zeros((count, count), bool)
+    for row in range(count):
+        for column in range(row):
+            agree[row, column] = _agree(loops[row], loops[column], T_map_node, drift)
+    agree |= agree.T
+    return [loops[index] for index in _largest_clique(agree)]
+
+
+def _agree(a: Edge, b: Edge, T_map_node: NDArray[np.float64], drift: NDArray[np.float64]) -> bool:
+    """Tell whether the circle a, the path between their ends, b and the path back closes."""
+    T_ends = planar.between(T_map_node[a.second], T_map_node[b.second])
+    T_starts = planar.between(T_map_node[a.first], T_map_node[b.first])
+    around = planar.compose(a.T_first_second, T_ends)
+    straight = planar.compose(T_starts, b.T_first_second)
+    off = planar.between(straight, around)
+    lever_m = float(np.hypot(*T_ends[:2]) + np.hypot(*T_starts[:2]))
+    path = np.abs(drift[a.second] - drift[b.second]) + np.abs(drift[a.first] - drift[b.first])
+    path[:2] += 0.5 * lever_m * path[2]
+    measured = np.sqrt(np.diag(a.covariance) + np.diag(b.covariance))
+    measured[:2] += lever_m * np.sqrt(a.covariance[2, 2])
+    return bool(((off / np.hypot(path, measured)) ** 2).sum() < _CHI2_3)
+
+
+def _largest_clique(agree: NDArray[np.bool_]) -> list[int]:
+    """Return the members of the largest clique, grown greedily from every node in turn."""
+    best: list[int] = []
+    order = np.argsort(-agree.sum(axis=1), kind="stable").tolist()
+    for start in order:
+        if agree[start].sum() + 1 <= len(best):
+            break
+        members, others = [start], agree[start].copy()
+        while others.any():
+            shared = (agree & others).sum(axis=1) * others
+            chosen = int(np.argmax(np.where(others, shared + 1, 0)))
+            members.append(chosen)
+            others &= agree[chosen]
+        if len(members) > len(best):
+            best = members
+    return sorted(best)

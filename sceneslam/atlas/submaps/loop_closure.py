@@ -1,0 +1,124 @@
+"""Loops between submaps of whatever module, by their floor plans alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.atlas.places.floor_plan import FloorPlan, join
+from sceneslam.atlas.places.plan_field import PlanField
+from sceneslam.atlas.places.plan_search import Window
+from sceneslam.atlas.places.recognition import Recognizer
+from sceneslam.atlas.submaps.graph import Edge, Kind
+from sceneslam.atlas.submaps.submap import Submap
+from sceneslam.types import planar
+from sceneslam.types.planar import Planar
+
+_SIGMAS = 3.0  # of the drift: so far a candidate may lie from where the graph has it
+_GAIN_M = 0.02  # drift below this cannot be measured better by two plans
+_HALF_MAX_M = 15.0  # more drift than that: only a search of the whole map helps
+_NEIGHBOURS = 2  # submaps to either side that a target is made of
+_TARGETS = 3  # per submap: three loops to different places already outvote a wrong one
+_KNOWN_MIN = 0.35  # of a submap's walls, as two submaps need not cover the same ground
+_CACHED = 8  # targets
+
+
+class LoopFinder:
+    """Measures the motion between submaps of different sessions."""
+
+    def __init__(self, submaps: Sequence[Submap], closed: frozenset[int]) -> None:
+        """Take all submaps; modules of the sessions in `closed` find the loops within them."""
+        self._submaps, self._closed = submaps, closed
+        self._targets: dict[int, Recognizer] = {}
+
+    def loops_to(
+        self, second: int, T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
+    ) -> list[Edge]:
+        """Return the loops from earlier submaps to one, which the graph makes likely.
+
+        `T_map_node` (N, 3) are the nodes as known, `drift` (N, 3) the standard deviations summed
+        up to each of them [m, m, rad].
+        """
+        query: PlanField | None = None
+        found = []
+        for first in self._candidates(second, T_map_node, drift):
+            query = query or PlanField(self._submaps[second].plan)
+            window = _window(first, second, T_map_node, drift)
+            target = self._target(first, T_map_node)
+            match = target.recognize(query, window, known_min=_KNOWN_MIN)
+            if match is None:
+                continue
+            off = planar.between(window.around, match.T_target_query)
+            if np.hypot(off[0], off[1]) > window.half_m or abs(off[2]) > window.half_rad:
+                continue
+            found.append(
+                Edge(
+                    first=first,
+                    second=second,
+                    T_first_second=match.T_target_query,
+                    covariance=match.covariance,
+                    kind=Kind.LOOP,
+                )
+            )
+        return found
+
+    def _candidates(
+        self, second: int, T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
+    ) -> list[int]:
+        """Return the nearest submaps that may overlap, of which none is another's neighbour."""
+        near: list[tuple[float, int]] = []
+        for first in range(second - 1):
+            if not self._may_close(first, second):
+                continue
+            window = _window(first, second, T_map_node, drift)
+            if window.half_m < _SIGMAS * _GAIN_M or window.half_m > _HALF_MAX_M:
+                continue
+            gap_m = _gap_m(self._submaps[first].plan, self._submaps[second].plan, window.around)
+            if gap_m <= window.half_m:
+                near.append((float(np.hypot(*window.around[:2])), first))
+        chosen: list[int] = []
+        for _, first in sorted(near):
+            if len(chosen) < _TARGETS and all(abs(first - c) > _NEIGHBOURS for c in chosen):
+                chosen.append(first)
+        return chosen
+
+    def _may_close(self, first: int, second: int) -> bool:
+        a, b = self._submaps[first], self._submaps[second]
+        if (a.run, a.session) != (b.run, b.session):
+            return bool(len(a.plan) and len(b.plan))
+        return a.session not in self._closed and second - first > 2 * _NEIGHBOURS
+
+    def _target(self, first: int, T_map_node: NDArray[np.float64]) -> Recognizer:
+        if first not in self._targets:
+            while len(self._targets) >= _CACHED:
+                del self._targets[next(iter(self._targets))]
+            own = self._submaps[first]
+            around = range(max(first - _NEIGHBOURS, 0), first + _NEIGHBOURS + 1)
+            placed = [
+                (planar.between(T_map_node[first], T_map_node[index]), self._submaps[index].plan)
+                for index in around
+                if index < len(T_map_node)
+                and (self._submaps[index].run, self._submaps[index].session)
+                == (own.run, own.session)
+            ]
+            self._targets[first] = Recognizer(PlanField(join(placed)))
+        return self._targets[first]
+
+
+def _window(
+    first: int, second: int, T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
+) -> Window:
+    around = planar.between(T_map_node[first], T_map_node[second])
+    sigma = np.abs(drift[second] - drift[first])
+    half_m = _SIGMAS * float(max(sigma[0], sigma[1]) + 0.5 * sigma[2] * np.hypot(*around[:2]))
+    return Window(around=around, half_m=half_m, half_rad=_SIGMAS * float(sigma[2]))
+
+
+def _gap_m(first: FloorPlan, second: FloorPlan, T_first_second: Planar) -> float:
+    """Return how far the boxes around two plans lie apart, 0 or less where they overlap."""
+    a = first.points.astype(np.float64)
+    b = planar.apply(T_first_second, second.points.astype(np.float64))
+    gaps = np.maximum(a.min(axis=0) - b.max(axis=0), b.min(axis=0) - a.max(axis=0))
+    return float(gaps.max())

@@ -1,0 +1,117 @@
+"""Submaps: a few metres of a session with the floor plan that was drawn on them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.atlas.places.floor_plan import FloorPlan, draw
+from sceneslam.atlas.uncertainty import Drift
+from sceneslam.scans.key_scan import KeyScan
+from sceneslam.types import planar
+from sceneslam.types.planar import Matrix, Planar
+
+LENGTH_M = 2.5  # of the path in a submap: by MAPPED it bends by a centimetre
+TURN_RAD = 2 * np.pi  # or so much turning: everything around was seen
+STEP_M, STEP_RAD = 0.1, 0.1  # between two scans of a submap
+_FLOOR = np.array([0.003, 0.003, 0.002])  # m, m, rad: of any motion between two submaps
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class KeyPose:
+    """A scan with its pose, and what is known of the motion to it."""
+
+    scan: KeyScan
+    T_map_base: Planar  # as known when it was added
+    session: int
+    module: str
+    drift: Drift  # of the motion from the one before
+    told: Matrix | None  # (3, 3) of T_local_base, as the module has it
+
+    @property
+    def stamp_ns(self) -> int:
+        """Return when it was."""
+        return self.scan.stamp_ns
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Submap:
+    """A node of the graph; its frame is base, level, at its first scan."""
+
+    run: int  # which recording of a saved map it is from, by age
+    session: int
+    module: str
+    stamps_ns: NDArray[np.int64]  # (K,) of its scans
+    T_submap_base: NDArray[np.float64]  # (K, 3)
+    plan: FloorPlan  # in its frame
+
+
+def make_submap(poses: Sequence[KeyPose], run: int) -> Submap:
+    """Return the submap of scans that follow one another in one session."""
+    first = poses[0]
+    T_submap_base = [planar.between(first.T_map_base, pose.T_map_base) for pose in poses]
+    return Submap(
+        run=run,
+        session=first.session,
+        module=first.module,
+        stamps_ns=np.array([pose.stamp_ns for pose in poses], np.int64),
+        T_submap_base=np.array(T_submap_base),
+        plan=draw(list(zip(T_submap_base, (pose.scan for pose in poses), strict=True))),
+    )
+
+
+def split(poses: Sequence[KeyPose]) -> list[list[KeyPose]]:
+    """Return the poses in submaps: a session, a length and a turn at most."""
+    parts: list[list[KeyPose]] = []
+    length_m = turn_rad = 0.0
+    for pose in poses:
+        if parts and parts[-1][-1].session == pose.session:
+            step = planar.between(parts[-1][-1].T_map_base, pose.T_map_base)
+            length_m += float(np.hypot(step[0], step[1]))
+            turn_rad += abs(float(step[2]))
+            if length_m <= LENGTH_M and turn_rad <= TURN_RAD:
+                parts[-1].append(pose)
+                continue
+        parts.append([pose])
+        length_m = turn_rad = 0.0
+    return parts
+
+
+def motion_covariance(poses: Sequence[KeyPose]) -> Matrix:
+    """Return the covariance (3, 3), axes of the last, of the motion from the first to the last.
+
+    Errors of one kind go on alike: their deviations add up, those of a map's rotation at random.
+    """
+    motions = np.array(
+        [planar.between(a.T_map_base, b.T_map_base) for a, b in pairwise(poses)]
+    ).reshape(-1, 3)
+    along_m, turned = np.hypot(motions[:, 0], motions[:, 1]), np.abs(motions[:, 2])
+    kinds = [pose.drift for pose in poses[1:]]
+    per_m = np.array([kind.per_m for kind in kinds])
+    rad_per_m = np.array([kind.rad_per_m for kind in kinds])
+    rad_per_rad = np.array([kind.rad_per_rad for kind in kinds])
+    rad_per_root = np.array([kind.rad_per_root for kind in kinds])
+    turn = float(rad_per_m @ along_m + rad_per_rad @ turned)
+    turn = float(np.hypot(turn, np.sqrt(rad_per_root**2 @ (along_m + turned))))
+    away = planar.between(poses[0].T_map_base, poses[-1].T_map_base)
+    lever_m = 0.5 * float(np.hypot(away[0], away[1]))
+    shift_m = float(np.hypot(per_m @ along_m, turn * lever_m))
+    covariance = np.diag(np.array([shift_m, shift_m, turn]) ** 2 + _FLOOR**2)
+    return covariance + _grown(poses[0], poses[-1])
+
+
+def _grown(first: KeyPose, last: KeyPose) -> Matrix:
+    """Return by how much a module's own covariance grew between two poses of its session."""
+    if first.session != last.session or first.told is None or last.told is None:
+        return np.zeros((3, 3))
+    x, y, _ = planar.between(last.T_map_base, first.T_map_base)
+    carry = np.eye(3)
+    carry[:2, 2] = y, -x
+    turn = planar.turn(float(first.T_map_base[2] - last.T_map_base[2]))
+    carried = carry @ turn @ first.told @ turn.T @ carry.T
+    values, vectors = np.linalg.eigh(last.told - carried)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

@@ -1,0 +1,291 @@
+"""One map of all modules and runs: places recognized, loops closed, maps that last."""
+
+import numpy as np
+import pytest
+from plan_worlds import FLAT_TOUR, Drive, World, box, corridor, flat, start_of, through, twins
+
+from sceneslam.atlas.atlas import Atlas
+from sceneslam.atlas.lasting.map_files import HEAD, load_map_files, save_map_files
+from sceneslam.atlas.lasting.saved_map import forget_contradicted
+from sceneslam.atlas.places.floor_plan import draw
+from sceneslam.atlas.places.plan_field import PlanField
+from sceneslam.atlas.places.recognition import Recognizer
+from sceneslam.atlas.places.registration import register
+from sceneslam.atlas.submaps.graph import Edge, Kind, consistent, solve
+from sceneslam.types import planar
+from sceneslam.types.errors import ConfigError, InputError
+
+
+def world(walls, seed=0):
+    return World(walls, np.random.default_rng(seed))
+
+
+def plan_of(seen, true):
+    first = true[0]
+    return draw([(planar.between(first, pose), seen.key_scan(pose)) for pose in true])
+
+
+def atlas(**settings):
+    return Atlas(voxel_m=0.05, **settings)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """A map of the flat, and the poses of the drive that made it."""
+    folder, true = tmp_path_factory.mktemp("flat") / "map", through(FLAT_TOUR)
+    drive = Drive(atlas(save=str(folder))).go(world(flat()), true)
+    assert drive.faults == []
+    return folder, true
+
+
+def test_a_robot_finds_itself_anywhere_in_a_room_and_nowhere_else():
+    true = through(FLAT_TOUR)
+    target = Recognizer(PlanField(plan_of(world(flat()), true)))
+    rng, found = np.random.default_rng(1), 0
+    for _ in range(12):
+        pose = np.array([rng.uniform(2.2, 5.6), rng.uniform(0.5, 2.8), rng.uniform(-3, 3)])
+        query = PlanField(draw(world(flat(), 2).around(pose)))
+        match = target.recognize(query, None)
+        if match is not None:
+            off = planar.between(planar.between(true[0], pose), match.T_target_query)
+            assert np.hypot(off[0], off[1]) < 0.05 and abs(off[2]) < np.radians(1.0)
+            found += 1
+    assert found >= 9
+
+
+def test_of_two_rooms_that_look_alike_neither_is_recognized():
+    drive = [(1.0, 1.0), (4.2, 1.2), (4.2, 3.4), (2.5, 2.0), (2.5, -1.0), (10.5, -1.0),
+             (10.5, 2.0), (9.0, 1.0), (12.2, 1.2), (12.2, 3.4)]  # fmt: skip
+    target = Recognizer(PlanField(plan_of(world(twins()), through(drive))))
+    query = PlanField(draw(world(twins(), 1).around(np.array([2.5, 2.2, 0.3]), turn_rad=6.0)))
+    assert target.recognize(query, None) is None
+
+
+def test_a_room_that_is_not_in_the_map_is_not_recognized():
+    target = Recognizer(PlanField(plan_of(world(flat()), through(FLAT_TOUR))))
+    other = box(0, 0, 7.5, 3.2) + box(2, 1, 2.5, 1.4) + box(5, 2.2, 6.3, 3.0)
+    query = PlanField(draw(world(other).around(np.array([3.5, 1.8, 0.0]), turn_rad=6.0)))
+    assert target.recognize(query, None) is None
+
+
+def test_a_bare_corridor_does_not_hold_a_pose_along_it():
+    seen = world(corridor())
+    target = PlanField(plan_of(seen, through([(0.0, 0.0), (4.0, 0.0)])))
+    query = PlanField(plan_of(seen, through([(1.0, 0.0), (3.0, 0.0)])))
+    match = register(query, target, np.array([1.3, 0.1, 0.02]))
+    assert match.weak_directions == 1
+    assert abs(match.T_target_query[1]) < 0.02 and abs(match.T_target_query[2]) < 0.01
+    assert match.covariance[0, 0] > 1.0 and match.covariance[1, 1] < 0.02**2
+
+
+def ring(count=12, step_m=1.0):
+    """Nodes on a circle, as measured and as they are."""
+    turn = 2 * np.pi / count
+    motion, true = np.array([step_m, 0.0, turn]), [np.zeros(3)]
+    for _ in range(count):
+        true.append(planar.compose(true[-1], motion))
+    drifted = [np.zeros(3)]
+    for _ in range(count):
+        drifted.append(planar.compose(drifted[-1], motion + np.array([0.02, 0.0, 0.01])))
+    true, drifted = np.array(true), np.array(drifted)
+    motions = [
+        edge_of(row, row + 1, planar.between(drifted[row], drifted[row + 1]), 0.03, Kind.MOTION)
+        for row in range(count)
+    ]
+    return true, drifted, motions
+
+
+def edge_of(first, second, T_first_second, sigma, kind=Kind.LOOP):
+    covariance = np.diag([sigma, sigma, 0.5 * sigma]) ** 2
+    return Edge(
+        first=first, second=second, T_first_second=T_first_second, covariance=covariance, kind=kind
+    )
+
+
+def test_loops_that_agree_are_believed_and_a_wrong_one_is_not():
+    true, drifted, motions = ring()
+    right = [
+        edge_of(a, b, planar.between(true[a], true[b]), 0.01)
+        for a, b in ((0, 12), (1, 11), (0, 11))
+    ]
+    wrong = edge_of(2, 9, np.array([3.0, 1.0, 1.5]), 0.01)
+    drift = np.cumsum(np.full((13, 3), 0.03), axis=0)
+    loops = consistent([right[0], wrong, *right[1:]], drifted, drift)
+    assert loops == right
+    solved = solve(drifted, motions, loops, fixed=(), loose=0)
+    assert len(solved.loops) == 3
+    assert np.abs(solved.T_map_node[:, :2] - true[:, :2]).max() < 0.1
+    assert np.abs(drifted[:, :2] - true[:, :2]).max() > 0.2
+
+
+def test_a_wrong_loop_that_was_taken_is_given_up_and_the_same_input_gives_the_same_bits():
+    true, drifted, motions = ring()
+    loops = [
+        edge_of(0, 12, planar.between(true[0], true[12]), 0.01),
+        edge_of(1, 11, planar.between(true[1], true[11]), 0.01),
+        edge_of(2, 9, np.array([3.0, 1.0, 1.5]), 0.01),
+    ]
+    first, again = (solve(drifted, motions, loops, fixed=(), loose=0) for _ in range(2))
+    assert first.loops == tuple(loops[:2])
+    np.testing.assert_array_equal(first.T_map_node, again.T_map_node)
+
+
+def test_loops_between_modules_take_out_what_odometry_drifts():
+    true = np.concatenate([through(FLAT_TOUR), through(FLAT_TOUR)])
+    drive = Drive(atlas()).go(world(flat()), true, drift_ratio=0.01, turn_drift=0.003, sessions=4)
+    assert drive.kinds().count("loop") >= 3
+    before = np.linalg.norm(drive.atlas.online.positions_m[:, :2] - _planar(true), axis=1)
+    after = drive.errors_m(true, start_of(true))
+    assert np.sqrt((after**2).mean()) < np.sqrt((before**2).mean()) / 3
+
+
+def _planar(true):
+    return np.array([planar.compose(start_of(true), pose)[:2] for pose in true])
+
+
+def test_a_run_without_loops_stays_as_it_was_to_the_bit():
+    drive = Drive(atlas()).go(world(flat()), through(FLAT_TOUR[:4]))
+    np.testing.assert_array_equal(
+        drive.atlas.trajectory.T_world_base, drive.atlas.online.T_world_base
+    )
+
+
+def test_a_map_that_is_saved_loaded_and_saved_has_the_same_bytes(saved, tmp_path):
+    folder, _ = saved
+    save_map_files(load_map_files(folder), tmp_path / "again")
+    for path in folder.iterdir():
+        assert path.read_bytes() == (tmp_path / "again" / path.name).read_bytes()
+
+
+def test_a_run_finds_itself_in_a_loaded_map_and_its_poses_lie_in_it(saved, tmp_path):
+    folder, first = saved
+    true = through([(7.3, 0.9), (9.2, 1.0), (9.3, 2.0), (5.2, 2.0), (3.2, 0.9), (5.3, 0.9)])
+    drive = Drive(atlas(load=str(folder), save=str(tmp_path / "map"))).go(world(flat(), 5), true)
+    found = [event for event in drive.events if event["event"] == "relocalized"]
+    assert len(found) == 1 and found[0]["after_s"] <= 3.0 and drive.faults == []
+    assert drive.errors_m(true, start_of(first)).max() < 0.05
+    both = load_map_files(tmp_path / "map")
+    assert both.runs == 2 and set(both.pieces.tolist()) == {0}
+
+
+def test_a_run_that_is_nowhere_in_the_map_says_so_and_keeps_its_own_piece(saved, tmp_path):
+    folder, _ = saved
+    other = world(box(0, 0, 7.5, 3.2) + box(2, 1, 2.5, 1.4) + box(5, 2.2, 6.3, 3.0))
+    true = through([(1.0, 0.5), (6.5, 0.6), (6.8, 1.5), (3.2, 2.5), (1.0, 2.5)])
+    drive = Drive(atlas(load=str(folder), save=str(tmp_path / "map"))).go(other, true)
+    assert "not_relocalized" in drive.kinds() and "relocalized" not in drive.kinds()
+    assert "was not found in the map" in drive.faults[0]
+    assert drive.errors_m(true, start_of(true)).max() < 1e-6
+    assert set(load_map_files(tmp_path / "map").pieces.tolist()) == {0, 1}
+
+
+def test_furniture_that_was_moved_is_forgotten_by_an_update(saved, tmp_path):
+    folder, first = saved
+    moved = [wall for wall in flat() if wall not in box(1, 1, 1.8, 2)] + box(4.6, 0.1, 5.4, 0.5)
+    true = through([(0.6, 2.6), (3.0, 2.4), (2.6, 0.7), (0.5, 0.5), (0.4, 2.4), (3.0, 2.2)])
+    settings = {"load": str(folder), "save": str(tmp_path / "map"), "mode": "update"}
+    drive = Drive(atlas(**settings)).go(world(moved, 3), true)
+    assert drive.faults == []
+    plan = load_map_files(tmp_path / "map").plan()
+    corners = [planar.compose(start_of(first), np.array([x, y, 0.0]))[:2] for x, y in
+               ((1.0, 1.5), (1.4, 1.0), (1.8, 1.5), (1.4, 2.0))]  # fmt: skip
+    for corner in corners:
+        away_m = np.linalg.norm(plan.points - corner, axis=1).min()
+        column, row = plan.cells(corner[None])[0]
+        assert away_m > 0.15 and plan.free[row, column]
+
+
+def test_a_run_that_localizes_leaves_the_map_as_it_is(saved):
+    folder, first = saved
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    true = through([(3.0, 2.4), (3.2, 0.8), (5.4, 0.9), (5.4, 2.0)])
+    drive = Drive(atlas(load=str(folder), mode="localize")).go(world(flat(), 7), true)
+    assert drive.errors_m(true, start_of(first)).max() < 0.05
+    assert before == {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"mode": "guess"}, "mode: got 'guess', allowed: localize | extend | update"),
+        ({"mode": "localize"}, "mode: got 'localize', allowed: extend where no map is loaded"),
+        ({"load": "missing"}, "load: got 'missing', allowed: the folder of a saved map"),
+        ({"save_every_s": 0.0}, "save_every_s: got 0.0, allowed: seconds above 0"),
+    ],
+)
+def test_a_setting_that_does_not_fit_is_named(settings, said):
+    with pytest.raises(ConfigError, match=said.replace("|", r"\|")):
+        atlas(**settings)
+
+
+def test_a_folder_that_holds_other_files_is_refused(tmp_path):
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(ConfigError, match="empty or holds a map"):
+        atlas(save=str(tmp_path))
+
+
+def damaged(folder, tmp_path, harm):
+    copy = tmp_path / "map"
+    copy.mkdir()
+    for path in folder.iterdir():
+        (copy / path.name).write_bytes(path.read_bytes())
+    harm(copy, next(copy.glob("arrays-*.npz")))
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("harm", "said"),
+    [
+        (lambda f, a: a.write_bytes(a.read_bytes()[:-100]), "damaged, its checksum is another"),
+        (lambda f, a: a.unlink(), "not complete, arrays-.* is missing"),
+        (lambda f, a: (f / HEAD).unlink(), "not a map, it has no map.yaml"),
+        (lambda f, a: (f / HEAD).write_text("image: grid.pgm\n"), "not a map of SceneSLAM"),
+        (lambda f, a: (f / HEAD).write_text("a: [\n"), "map.yaml cannot be read"),
+        (
+            lambda f, a: (f / HEAD).write_text(
+                (f / HEAD).read_text().replace("version: 1", "version: 2")
+            ),
+            "version 2, a newer SceneSLAM wrote it",
+        ),
+        (
+            lambda f, a: (f / HEAD).write_text("format: sceneslam-map\nversion: 1\n"),
+            "arrays: missing, the map's map.yaml is not complete",
+        ),
+    ],
+)
+def test_every_damage_has_its_sentence(saved, tmp_path, harm, said):
+    with pytest.raises(InputError, match=said):
+        load_map_files(damaged(saved[0], tmp_path, harm))
+
+
+@pytest.mark.parametrize("writes", [0, 1, 2, 3])
+def test_whoever_is_killed_while_saving_leaves_a_whole_map(saved, tmp_path, monkeypatch, writes):
+    folder = damaged(saved[0], tmp_path, lambda f, a: None)
+    old = load_map_files(folder)
+    done = []
+
+    def dies(function):
+        def maybe(*args, **more):
+            if len(done) == writes:
+                raise KeyboardInterrupt
+            done.append(function)
+            return function(*args, **more)
+
+        return maybe
+
+    from pathlib import Path
+
+    monkeypatch.setattr(Path, "replace", dies(Path.replace))
+    monkeypatch.setattr(Path, "unlink", dies(Path.unlink))
+    smaller = old.of(range(len(old.submaps) - 1))
+    with pytest.raises(KeyboardInterrupt):
+        save_map_files(smaller, folder)
+        raise KeyboardInterrupt  # it was not killed
+    monkeypatch.undo()
+    assert len(load_map_files(folder).submaps) in (len(old.submaps), len(smaller.submaps))
+
+
+def test_nothing_is_forgotten_that_another_run_did_not_contradict(saved):
+    old = load_map_files(saved[0])
+    kept = forget_contradicted(old, run=5)
+    assert kept is old
