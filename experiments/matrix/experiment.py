@@ -93,7 +93,7 @@ class MatrixExperiment:
             csv.writer(file, lineterminator="\n").writerows(rows_of(cells))
         return Verdict(
             figures=list(self._promises.figures(cells, self._alone)),
-            table=_table(mean(cells), deviation(cells)),
+            table=_table(cells),
             pictures=self._draw(folder, cells, groups[0], oracles[0], outcomes),
         )
 
@@ -144,12 +144,16 @@ def _truth(group: Mapping[str, Outcome]) -> Trajectory:
     return Trajectory.read_tum(first.folder / "groundtruth.tum")
 
 
-def _table(means: Sequence[Cell], deviations: Sequence[Cell]) -> Table:
-    """Return mean and deviation over the seeds, a row per story and strategy."""
+def _table(cells: Sequence[Cell]) -> Table:
+    """Return the means over the seeds, a row per story and strategy, and of several the spread."""
+    means, deviations = mean(cells), deviation(cells)
+    has_spread = len({cell.seed for cell in cells}) > 1
 
     def shown(at: int, name: str, scale: float, digits: int) -> str:
         middle, spread = (scale * getattr(one[at], name) for one in (means, deviations))
-        return "-" if math.isnan(middle) else f"{middle:.{digits}f} ± {spread:.{digits}f}"
+        if math.isnan(middle):
+            return "-"
+        return f"{middle:.{digits}f}" + (f" ± {spread:.{digits}f}" if has_spread else "")
 
     rows = [
         (one.story, one.strategy, *(shown(at, *how) for how in _COLUMNS.values()))
