@@ -54,6 +54,9 @@ class BundleDecoder:
         problems: list[str] = []
         stamp_ns = bundle.primary.stamp_ns
         scan, points = self._scan(bundle, problems), self._points(bundle, problems)
+        samples: dict[str, Any] = {
+            sensor.field: _samples(bundle, sensor) for sensor in bundle.samples
+        }
         observation = Observation(
             stamp_ns=stamp_ns,
             image_bgr=self._image(bundle, problems),
@@ -62,7 +65,7 @@ class BundleDecoder:
             points_lidar=None if points is None else points.points_lidar,
             point_times_s=None if points is None else points.point_times_s,
             T_odom_base=self._odometry(bundle),
-            **{sensor.field: _samples(bundle, sensor) for sensor in bundle.samples},
+            **samples,
         )
         is_empty = not any(observation.has(sensor) for sensor in self._sensors)
         return Decoded(

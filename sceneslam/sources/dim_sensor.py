@@ -50,13 +50,17 @@ class DimSensor:
         index |= noise >> 4
         return np.take(self._table, index).reshape(image_bgr.shape)
 
+    def gain(self, light: float) -> float:
+        """Return by how much automatic exposure makes up for `light` (0 to 1)."""
+        return min(self._gain_max, 1.0 / light) if light > 0 else self._gain_max
+
     def _make_table(self, light: float) -> NDArray[np.uint8]:
         """Return (256 * 4096,): the new values of each recorded value, by rising quantile."""
-        gain = min(self._gain_max, 1.0 / light) if light > 0 else self._gain_max
+        gain = self.gain(light)
         values = np.arange(_LEVELS)
-        electrons = _linear(values / 255.0) * self._full_well * light
+        electrons = srgb_to_linear(values / 255.0) * self._full_well * light
         # What reaches the next value up: the new value is at most k below limits[k].
-        limits = _linear((values[:-1] + 0.5) / 255.0) * self._full_well / gain
+        limits = srgb_to_linear((values[:-1] + 0.5) / 255.0) * self._full_well / gain
         added = electrons * (1.0 - light)  # shot noise that the recording does not hold
         sigma = max(self._read_noise * np.sqrt(1.0 - light**2), _SMALLEST_SIGMA)
         below = np.empty((_LEVELS, _LEVELS))
@@ -73,7 +77,7 @@ class DimSensor:
         return np.repeat(np.tile(values.astype(np.uint8), _LEVELS), counts.ravel())
 
 
-def _linear(srgb: NDArray[np.floating]) -> NDArray[np.float64]:
+def srgb_to_linear(srgb: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return linear light of sRGB values, both 0 to 1 (IEC 61966-2-1)."""
     return np.asarray(np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4))
 

@@ -28,7 +28,8 @@ class LightsOut(Wrapped):
     `schedule` is a list of [time, level], the time in seconds from the first observation or, with
     `schedule_unit: ratio`, as share of the recording. Level 1 is the image as recorded, bit for
     bit; at level 0 the share `ambient_ratio` of the light is left. The true scene is Dark while
-    the level is below a half. `lights` on or off holds the level at 1 or 0 throughout.
+    the level is below a half. `lights` on or off holds the level at 1 or 0 throughout. Dimmed images
+    carry their exposure, with the recording's as the reference.
     """
 
     def __init__(
@@ -97,9 +98,10 @@ class LightsOut(Wrapped):
         light = self._ambient_ratio + (1.0 - self._ambient_ratio) * level
         if observation.image_bgr is None or light >= 1.0:
             return observation
+        exposure_ratio = (observation.exposure_ratio or 1.0) * self._sensor.gain(light)
         rng = np.random.Generator(np.random.SFC64([self._seed, observation.stamp_ns % 2**64]))
         image_bgr = self._sensor.dim(observation.image_bgr, light, rng)
-        return replace(observation, image_bgr=locked(image_bgr))
+        return replace(observation, image_bgr=locked(image_bgr), exposure_ratio=exposure_ratio)
 
     def _duration_s(self) -> float:
         span = self.span

@@ -51,6 +51,7 @@ class Observation:
     gyro_base: NDArray[np.float64] | None = None  # (M, 4): t - stamp [s], rate [rad/s]
     accelerometer_base: NDArray[np.float64] | None = None  # (M, 4): t - stamp [s], specific force
     # [m/s^2]: (0, 0, 9.8) at rest on level ground
+    exposure_ratio: float | None = None  # of the image: time x gain, over the source's reference
 
     def has(self, sensor: Sensor) -> bool:
         """Tell whether this observation holds a measurement of `sensor`."""

@@ -1,0 +1,45 @@
+"""The mean of grey that an image would have at the source's reference exposure."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.observation import Observation
+
+from .grey_mean import GreyMean
+
+_ROWS = 96  # of the grid of pixels that is looked at
+
+
+class LightMean(GreyMean):
+    """Compares with the threshold how bright the scene is, not how bright its image is.
+
+    The source has to report the exposure of its images; without it an image is taken as exposed by
+    the reference.
+    """
+
+    quantity = "mean of grey at the reference exposure"
+
+    def get_features(self, observation: Observation) -> NDArray[np.float64] | None:
+        """Return (1,): the mean of grey at the reference exposure."""
+        if observation.image_bgr is None:
+            return None
+        return np.array([light_mean(observation.image_bgr, observation.exposure_ratio or 1.0)])
+
+
+def light_mean(image_bgr: NDArray[np.uint8], exposure_ratio: float) -> float:
+    """Return the mean of grey, in [0, 255], of an (H, W, 3) BGR image had it been exposed by 1.
+
+    Grey values stand for light by the sRGB curve (IEC 61966-2-1), and light is proportional to the
+    exposure. A saturated pixel counts as just saturated.
+    """
+    step = max(1, min(image_bgr.shape[:2]) // _ROWS)
+    grey = cv2.cvtColor(np.ascontiguousarray(image_bgr[::step, ::step]), cv2.COLOR_BGR2GRAY)
+    counts = np.bincount(grey.ravel(), minlength=256)
+    values = np.arange(256) / 255.0
+    light = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    light = np.minimum(light / exposure_ratio, 1.0)
+    greys = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return float(255.0 * (counts @ greys) / grey.size)

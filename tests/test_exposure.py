@@ -1,0 +1,59 @@
+"""Exposure: what sources report of it, and the detector that uses it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_effects import film, lights_out
+
+from sceneslam.modules.detectors.light_mean import LightMean, light_mean
+from sceneslam.sources.exposure_times import ExposureTimes
+from sceneslam.types.errors import ConfigError, InputError
+
+GREY = np.random.default_rng(0).integers(100, 161, (120, 160, 3), dtype=np.uint8)
+
+
+def detector() -> LightMean:
+    made = LightMean(threshold=100.0, hysteresis=0.0, scenes=("Bright", "Dark"))
+    made.activate(film().rig)
+    return made
+
+
+def test_light_is_the_image_where_nothing_is_known_of_its_exposure():
+    assert light_mean(GREY, 1.0) == pytest.approx(130.0, abs=0.5)
+
+
+@pytest.mark.parametrize("exposure_ratio", [0.25, 0.5, 2.0, 8.0])
+def test_exposure_scales_light_and_not_grey_values(exposure_ratio):
+    share = (130.0 / 255 + 0.055) / 1.055
+    expected = 255 * (1.055 * (share**2.4 / exposure_ratio) ** (1 / 2.4) - 0.055)
+    image = np.full((120, 160, 3), 130, np.uint8)
+    assert light_mean(image, exposure_ratio) == pytest.approx(min(expected, 255.0), abs=0.5)
+
+
+def test_automatic_exposure_hides_darkness_from_the_image_alone():
+    """Three quarters of the light are gone; the exposure makes up for all of it."""
+    source = lights_out(film(GREY), lights="off", ambient_ratio=0.25, exposure_gain_max=4.0)
+    votes = [detector().get_scene(one) for one in source]
+    assert {vote.scene for vote in votes} == {"Dark"}
+    unaware = [detector().get_scene(replace(one, exposure_ratio=None)) for one in source]
+    assert {vote.scene for vote in unaware} == {"Bright"}
+
+
+def test_exposures_of_a_file_reach_the_images(tmp_path):
+    (tmp_path / "times.txt").write_text("# stamp_s exposure_s gain\n5.0 0.01 1\n15.0 0.02 4\n")
+    effect = ExposureTimes(film(), path=str(tmp_path / "times.txt"), reference_s=0.01)
+    ratios = [one.exposure_ratio for one in effect]
+    assert ratios[0] == 1.0 and ratios[49] == 1.0 and ratios[-1] == pytest.approx(8.0)
+    assert effect.ground_truth() is not None
+
+
+@pytest.mark.parametrize("text", ["", "5.0\n", "5.0 0.01 1 2\n", "5.0 0\n", "6 1\n5 1\n", "a b\n"])
+def test_wrong_file_of_exposures_is_refused_in_one_sentence(tmp_path, text):
+    (tmp_path / "times.txt").write_text(text)
+    with pytest.raises(InputError, match=r"expected lines `stamp_s exposure_s`.*times\.txt"):
+        ExposureTimes(film(), path=str(tmp_path / "times.txt"), reference_s=None)
+    with pytest.raises(InputError, match="not found"):
+        ExposureTimes(film(), path=str(tmp_path / "nothing.txt"), reference_s=None)
+    with pytest.raises(ConfigError, match="reference_s"):
+        ExposureTimes(film(), path=str(tmp_path / "times.txt"), reference_s=0.0)
