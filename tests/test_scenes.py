@@ -19,8 +19,8 @@ from sceneslam.config.resolve import resolved
 from sceneslam.detection.run import detect
 from sceneslam.interfaces import FeatureDetector
 from sceneslam.scenes.__main__ import main
-from sceneslam.scenes.examples import Example
 from sceneslam.scenes.model import Model
+from sceneslam.scenes.words import read_word
 from sceneslam.types.errors import InputError
 from sceneslam.types.observation import UNSURE, Observation
 
@@ -191,12 +191,16 @@ def test_weights_that_do_not_fit_the_features_are_refused(model, tmp_path):
         learned(tmp_path / "model.yaml")
 
 
-def test_words_are_read_as_documented():
-    example = Example.of("Dark:robot='my clip.mp4@1.5:20' effects=lights_out lights=off")
-    assert (example.scene, example.group, example.path) == ("Dark", "robot", "my clip.mp4")
-    assert (example.start_s, example.end_s) == (1.5, 20.0)
-    assert example.overrides == ("effects=lights_out", "lights=off")
-    assert Example.of("Dark=a/b/").group == Example.of("Dark=a/b@0:5").group == "a/b"
+def test_words_are_read_as_documented(folders):
+    folder = f"{folders}/Bright_0"
+    example = read_word(f"Dark:robot='{folder}@1.5:20' effects=lights_out lights=off")
+    assert (example.scene, example.group) == ("Dark", "robot")
+    (part,) = example.parts
+    assert (part.start_s, part.end_s, part.weight_per_s) == (1.5, 20.0, 1.0)
+    assert example.config["source"]["path"] == folder
+    assert example.config["lights"] == "off" and example.config["effects"] is not None
+    groups = {read_word(f"Dark={folder}{end}").group for end in ("/", "@0:5")}
+    assert groups == {folder}
 
 
 def test_model_that_ships_knows_rooms_and_streets(shared_data):

@@ -1,6 +1,7 @@
 """Train a detector on recordings of known scenes, and test it on others.
 
-`python -m sceneslam.scenes train OUT.yaml Bright=FOLDER Dark=FOLDER ...`
+`train MODEL Bright=FOLDER Dark=FOLDER ...` fits a model, `test MODEL ...` scores it. `label LABELS
+RUNS` writes which module was best when, as examples to train on.
 """
 
 from __future__ import annotations
@@ -9,20 +10,26 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 
 from sceneslam.config.component import Builder
-from sceneslam.scenes.examples import Example, FeatureSource, Seen, look
+from sceneslam.scenes.examples import FeatureSource, Seen, look
+from sceneslam.scenes.label import Table, label
 from sceneslam.scenes.model import Model
+from sceneslam.scenes.runs import read_runs
 from sceneslam.scenes.score import table, write_sheet
 from sceneslam.scenes.train import Judged, judge, train
+from sceneslam.scenes.words import read_words
 from sceneslam.types.errors import InputError, SceneSlamError
 
 # The upper half of grey follows the light; the lower one, the shadows, whatever lies in them.
 _FEATURES = "q50,q75,q90,q98"
 _FEATURES_TARGET = "sceneslam.modules.detectors.image_features.Features"
+_CHANGE_M = 0.02  # what wheels lose over the half metre between two modules' poses
+_COMMAND = ("python", "-m", "sceneslam.scenes")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -30,7 +37,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if arguments is None else list(arguments)
     options = _parser().parse_args(words)
     try:
-        _train(options, words) if options.command == "train" else _test(options)
+        if options.command == "train":
+            _train(options, words)
+        elif options.command == "test":
+            _test(options)
+        else:
+            _label(options, words)
     except SceneSlamError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -46,7 +58,7 @@ def _train(options: argparse.Namespace, words: Sequence[str]) -> None:
     held_out = [one.is_right for one in trained.held_out]
     share = f"{100 * np.concatenate(held_out).mean():.1f} %" if held_out else "unknown"
     comment = [
-        f"Made by: {shlex.join(['python', '-m', 'sceneslam.scenes', *words])}",
+        f"Made by: {shlex.join([*_COMMAND, *words])}",
         f"Right on recordings that it was not trained on: {share}. Its scores were divided by",
         f"{trained.temperature:.3g}, so that its probabilities are right there.",
     ]
@@ -69,10 +81,26 @@ def _test(options: argparse.Namespace) -> None:
 
 
 def _look(options: argparse.Namespace, names: Sequence[str]) -> list[Seen]:
-    examples = [Example.of(word) for word in options.examples]
+    examples = read_words(options.examples)
     node = {"_target_": _FEATURES_TARGET, "names": list(names)}
     features = Builder({"features": node}).make("features", FeatureSource)
-    return [look(example, features, options.images) for example in examples]
+    return look(examples, features, options.images)
+
+
+def _label(options: argparse.Namespace, words: Sequence[str]) -> None:
+    labels = label(read_runs(options.runs), options.change_m)
+    labels.write(options.labels, shlex.join([*_COMMAND, *words]))
+    for one in labels.recordings:
+        stays = [next(found) for _, found in groupby(one.spans, key=lambda span: span.scene)]
+        print(f"{one.name}: {', '.join(f'{s.scene} from {s.start_s:g} s' for s in stays)}")
+    print(f"table    {_table(labels.table)}")
+    print(f"labels   {options.labels} (train MODEL.yaml {options.labels})")
+
+
+def _table(table: Table) -> str:
+    """Return the table as an override of the configuration."""
+    rows = ",".join(f"{scene}:[{','.join(modules)}]" for scene, modules in table.items())
+    return f'"scenes={{{rows}}}"'
 
 
 def _told(judged: Sequence[Judged], otherwise: str) -> list[str]:
@@ -89,7 +117,8 @@ def _parser() -> argparse.ArgumentParser:
             "examples",
             nargs="+",
             help="SCENE=PATH of a film, folder or bag; SCENE:GROUP=PATH holds out together what "
-            "was recorded together; 'SCENE=PATH@FROM:TO effects=lights_out' takes seconds and keys",
+            "was recorded together; 'SCENE=PATH@FROM:TO effects=lights_out' takes seconds and "
+            "keys; or a file that `label` wrote",
         )
         command.add_argument("--images", type=int, default=200, help="of each example (200)")
     commands.choices["train"].add_argument(
@@ -97,6 +126,20 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands.choices["test"].add_argument(
         "--sheet", type=Path, default=Path("wrong.png"), help="the wrong images (wrong.png)"
+    )
+    command = commands.add_parser("label", help="which module was best when?")
+    command.add_argument("labels", type=Path, help="YAML file of the labels")
+    command.add_argument(
+        "runs",
+        type=Path,
+        nargs="+",
+        help="folders of runs, each of one module alone; of every recording one per module",
+    )
+    command.add_argument(
+        "--change-m",
+        type=float,
+        default=_CHANGE_M,
+        help=f"error of a change of module ({_CHANGE_M})",
     )
     return parser
 

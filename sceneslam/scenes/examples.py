@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-import re
-import shlex
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import islice
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any, Protocol
 
 import cv2
 import numpy as np
-from hydra import compose, initialize_config_module
-from hydra.errors import HydraException
 from numpy.typing import NDArray
-from omegaconf.errors import OmegaConfBaseException
 
 from sceneslam.config.build import make_source
-from sceneslam.config.check import check_keys
 from sceneslam.config.component import Builder
-from sceneslam.config.resolve import resolved
-from sceneslam.interfaces import Source
 from sceneslam.types.errors import InputError
-from sceneslam.types.observation import UNSURE, Observation
+from sceneslam.types.observation import Observation
 
-_WORD = re.compile(r"(?P<scene>[^=:]+)(:(?P<group>[^=]+))?=(?P<rest>.+)")
-_SPAN = re.compile(r"(?P<path>.+)@(?P<start>[0-9.]+):(?P<end>[0-9.]+)")
-_USAGE = "SCENE=PATH, SCENE:GROUP=PATH or 'SCENE=PATH@FROM:TO effects=...', seconds"
 _THUMBNAIL_PX = 160  # wide
 
 
@@ -40,43 +28,30 @@ class FeatureSource(Protocol):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Example:
-    """A recording, or a part of it, that shows one scene."""
+class Stretch:
+    """A part of a recording, [from, to) in seconds after the first observation."""
 
-    scene: str
-    group: str  # what was recorded together: one path, unless it was given
-    path: str
     start_s: float
     end_s: float
-    overrides: tuple[str, ...]  # of the configuration: a source, effects
+    weight_per_s: float = 1.0
 
-    @classmethod
-    def of(cls, word: str) -> Example:
-        """Return what a word of the command line says; raises InputError."""
-        found = _WORD.fullmatch(word)
-        if not found or found["scene"] == UNSURE:
-            raise InputError(f"example: got {word!r}, allowed: {_USAGE}")
-        path, *overrides = shlex.split(found["rest"])
-        span = _SPAN.fullmatch(path)
-        try:
-            start_s, end_s = (float(span[k]) for k in ("start", "end")) if span else (0.0, np.inf)
-        except ValueError:
-            raise InputError(f"example: got {word!r}, allowed: {_USAGE}") from None
-        path = span["path"] if span else path
-        return cls(
-            scene=found["scene"],
-            group=found["group"] or path.rstrip("/"),
-            path=path,
-            start_s=start_s,
-            end_s=end_s,
-            overrides=tuple(overrides),
-        )
 
-    @property
-    def name(self) -> str:
-        """Return the path, with what was made of it."""
-        span = "" if np.isinf(self.end_s) else f"@{self.start_s:g}:{self.end_s:g}"
-        return " ".join([f"{self.path}{span}", *self.overrides])
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Example:
+    """Those parts of a recording that show one scene."""
+
+    scene: str
+    group: str  # examples of one group are held out together
+    name: str
+    parts: Sequence[Stretch]
+    config: Mapping[str, Any]  # of the source and its effects
+    is_weighted: bool = False  # by its parts; else it counts as much as every other of its scene
+
+    def weight(self, time_s: float) -> float | None:
+        """Return the weight of a time after the first observation, None outside the parts."""
+        inside = (part for part in self.parts if part.start_s <= time_s < part.end_s)
+        found = next(inside, None)
+        return None if found is None else found.weight_per_s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,68 +60,72 @@ class Seen:
 
     example: Example
     features: NDArray[np.float64]  # (N, F)
+    weights: NDArray[np.float64]  # (N,)
     thumbnails: Sequence[NDArray[np.uint8]]  # N, empty where the source has no images
 
 
-def look(example: Example, features: FeatureSource, images: int) -> Seen:
-    """Return the features of up to so many observations, evenly over the example.
+def look(examples: Sequence[Example], features: FeatureSource, images: int) -> list[Seen]:
+    """Return the features of up to so many observations of each recording, evenly over it.
 
-    Raises ConfigError or InputError where the recording cannot be read or holds none.
+    Examples of one recording, one after the other, are taken from it together. Raises ConfigError
+    or InputError where a recording cannot be read, or an example has no observation.
     """
-    source = _source(example)
-    step = max(1, (source.length or images) // images)
-    rows, thumbnails = [], []
-    for observation in islice(_within(source, example), 0, None, step):
+    seen: list[Seen] = []
+    for _, found in groupby(examples, key=lambda example: id(example.config)):
+        seen += _look(list(found), features, images)
+    return seen
+
+
+@dataclass(slots=True)
+class _Collected:
+    """What is kept of an example while its recording is read."""
+
+    example: Example
+    count: int = 0
+    rows: list[NDArray[np.float64]] = field(default_factory=list)
+    weights: list[float] = field(default_factory=list)
+    thumbnails: list[NDArray[np.uint8]] = field(default_factory=list)
+
+    def take(self, observation: Observation, weight: float, features: FeatureSource) -> None:
         row = features.get_features(observation)
         if row is None or np.isnan(row).any():
-            continue
-        rows.append(row)
+            return
+        self.rows.append(row)
+        self.weights.append(weight)
         if observation.image_bgr is not None:
-            thumbnails.append(_thumbnail(observation.image_bgr))
-    if not rows:
-        raise InputError(
-            f"example: no observation of {example.scene} has all features: {example.name}"
+            self.thumbnails.append(_thumbnail(observation.image_bgr))
+
+    def seen(self) -> Seen:
+        if not self.rows:
+            scene, name = self.example.scene, self.example.name
+            raise InputError(f"example: no observation of {scene} has all features: {name}")
+        return Seen(
+            example=self.example,
+            features=np.array(self.rows),
+            weights=np.array(self.weights),
+            thumbnails=self.thumbnails,
         )
-    return Seen(example=example, features=np.array(rows), thumbnails=thumbnails)
 
 
-def _within(source: Source, example: Example) -> Iterator[Observation]:
+def _look(examples: Sequence[Example], features: FeatureSource, images: int) -> list[Seen]:
+    """Return what is seen of examples of one recording."""
+    source = make_source(examples[0].config, Builder(examples[0].config))
+    step = max(1, (source.length or images) // images)
+    end_s = max(part.end_s for example in examples for part in example.parts)
+    collected = [_Collected(example) for example in examples]
     first_ns: int | None = None
     for observation in source:
         first_ns = observation.stamp_ns if first_ns is None else first_ns
         time_s = (observation.stamp_ns - first_ns) * 1e-9
-        if time_s >= example.end_s:
-            return
-        if time_s >= example.start_s:
-            yield observation
-
-
-def _source(example: Example) -> Source:
-    overrides = [f"source={_kind(Path(example.path))}", f"source.path={_quoted(example.path)}"]
-    if any(word.startswith("source=") for word in example.overrides):
-        overrides = overrides[1:]
-    try:
-        with initialize_config_module("sceneslam.conf", version_base="1.3"):
-            config: Mapping[str, Any] = resolved(
-                compose("config", overrides=[*overrides, *example.overrides])
-            )
-    except (HydraException, OmegaConfBaseException) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"example: {reason}: {example.name}") from error
-    check_keys(config)
-    return make_source(config, Builder(config))
-
-
-def _kind(path: Path) -> str:
-    """Return the source that reads a path."""
-    if (path / "rgb.txt").is_file():
-        return "tum_rgbd"
-    is_bag = (path / "metadata.yaml").is_file() or path.suffix in (".bag", ".mcap")
-    return "rosbag" if is_bag else "video"
-
-
-def _quoted(path: str) -> str:
-    return "'" + path.replace("\\", "\\\\").replace("'", "\\'") + "'"
+        if time_s >= end_s:
+            break
+        for one in collected:
+            weight = one.example.weight(time_s)
+            if weight is not None:
+                if one.count % step == 0:
+                    one.take(observation, weight, features)
+                one.count += 1
+    return [one.seen() for one in collected]
 
 
 def _thumbnail(image_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:

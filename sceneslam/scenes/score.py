@@ -83,7 +83,7 @@ def _cell(probability: float, one: Judged, place: int) -> NDArray[np.uint8]:
     cell[: image.shape[0], : image.shape[1]] = image
     texts = (
         f"{one.seen.example.scene}: {one.votes[place]} {100 * probability:.0f} %",
-        Path(one.seen.example.path).name[:24],
+        Path(one.seen.example.group).name[:24],
     )
     for line, text in enumerate(texts):
         at = (2, height - 18 + 13 * line)

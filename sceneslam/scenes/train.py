@@ -83,16 +83,27 @@ def _scenes(all_seen: Sequence[Seen]) -> set[str]:
 
 
 def _fit(all_seen: Sequence[Seen], names: Sequence[str]) -> Model:
-    """Fit a model in which every scene weighs the same, and in it every example."""
-    labels: list[str] = []
-    weights: list[float] = []
-    for seen in all_seen:
-        scene, count = seen.example.scene, len(seen.features)
-        examples = sum(other.example.scene == scene for other in all_seen)
-        labels += [scene] * count
-        weights += [_IMAGES_PER_SCENE / examples / count] * count
+    labels = [seen.example.scene for seen in all_seen for _ in seen.features]
     features = np.concatenate([seen.features for seen in all_seen])
-    return fit(features, labels, np.array(weights), names)
+    return fit(features, labels, _weights(all_seen), names)
+
+
+def _weights(all_seen: Sequence[Seen]) -> NDArray[np.float64]:
+    """Return (N,) the weights of all images, which sum to that of the scenes.
+
+    Every scene weighs the same, and in it every example, unless the examples have weights of
+    their own.
+    """
+    total = _IMAGES_PER_SCENE * len(_scenes(all_seen))
+    if all(seen.example.is_weighted for seen in all_seen):
+        weights = np.concatenate([seen.weights for seen in all_seen])
+        return np.asarray(total * weights / max(float(weights.sum()), 1e-12))
+    parts = []
+    for seen in all_seen:
+        examples = sum(other.example.scene == seen.example.scene for other in all_seen)
+        count = len(seen.features)
+        parts.append(np.full(count, _IMAGES_PER_SCENE / examples / count))
+    return np.concatenate(parts)
 
 
 def _temperature(held_out: Sequence[Judged]) -> float:

@@ -1,0 +1,202 @@
+"""Which module was best when: labels for training, and the table that follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from sceneslam.scenes.runs import STEP_S, ModuleRun
+from sceneslam.types.errors import InputError
+
+Table = Mapping[str, Sequence[str]]  # scene -> modules, the best first
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Span:
+    """A second of a recording or less, in which one module was best."""
+
+    start_s: float  # after the first observation
+    end_s: float
+    scene: str  # named after the module
+    gain_m: float  # by which the other modules' error would have grown more, on average
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Labelled:
+    """A recording with its labels."""
+
+    name: str
+    group: str  # what is held out together: one path, or one story of the simulator
+    config: Mapping[str, Any]  # of its source and effects
+    spans: Sequence[Span]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Labels:
+    """Labelled recordings, and which modules to try in each scene."""
+
+    recordings: Sequence[Labelled]
+    table: Table
+
+    def write(self, path: Path, comment: str) -> None:
+        """Write a YAML file."""
+        node = {
+            "table": {scene: list(modules) for scene, modules in self.table.items()},
+            "recordings": [
+                {
+                    "name": one.name,
+                    "group": one.group,
+                    "config": dict(one.config),
+                    "spans": [[s.start_s, s.end_s, s.scene, s.gain_m] for s in one.spans],
+                }
+                for one in self.recordings
+            ],
+        }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        text = yaml.safe_dump(node, sort_keys=False, default_flow_style=None, width=100)
+        path.write_text(f"# Made by: {comment}\n{text}")
+
+    @classmethod
+    def read(cls, path: Path) -> Labels:
+        """Return the labels in a file; raises InputError where it is missing or another file."""
+        if not path.is_file():
+            raise InputError(f"labels not found: {path}")
+        try:
+            node = yaml.safe_load(path.read_text())
+            recordings = [
+                Labelled(
+                    name=str(one["name"]),
+                    group=str(one["group"]),
+                    config=dict(one["config"]),
+                    spans=[
+                        Span(
+                            start_s=float(start_s),
+                            end_s=float(end_s),
+                            scene=str(scene),
+                            gain_m=float(gain_m),
+                        )
+                        for start_s, end_s, scene, gain_m in one["spans"]
+                    ],
+                )
+                for one in node["recordings"]
+            ]
+            return cls(recordings=recordings, table=dict(node["table"]))
+        except (KeyError, TypeError, ValueError, yaml.YAMLError) as error:
+            raise InputError(f"not a file of labels ({type(error).__name__}): {path}") from error
+
+
+def label(runs: Sequence[ModuleRun], change_m: float) -> Labels:
+    """Return the labels of all recordings that the runs are of.
+
+    Of all ways to use the modules one after the other, the one is taken whose error is least; each
+    change of module adds `change_m` [m]. Raises InputError where a recording has one module only.
+    """
+    keys = sorted({run.module for run in runs})
+    recordings, drifts = [], []
+    for _, found in groupby(sorted(runs, key=_order), key=lambda run: run.recording):
+        group = list(found)
+        stamps_ns = _instants_ns(group)
+        drift_mps = _drifts_mps(group, keys, stamps_ns)
+        best = cheapest(drift_mps * STEP_S, change_m)
+        recordings.append(_labelled(group[0], keys, best, drift_mps))
+        drifts.append(np.column_stack([best, drift_mps]))
+    return Labels(recordings=recordings, table=_table(keys, np.concatenate(drifts)))
+
+
+def cheapest(costs: NDArray[np.float64], change: float) -> NDArray[np.int64]:
+    """Return (N,) the choice per instant with the least sum of costs (N, K) and changes.
+
+    Dynamic programming (Viterbi): the least sum up to an instant that ends in each choice.
+    """
+    count, choices = costs.shape
+    came_from = np.zeros((count, choices), np.int64)
+    total = costs[0].copy()
+    for at in range(1, count):
+        best = int(np.argmin(total))
+        changes = total[best] + change < total
+        came_from[at] = np.where(changes, best, np.arange(choices))
+        total = np.where(changes, total[best] + change, total) + costs[at]
+    path = np.zeros(count, np.int64)
+    path[-1] = int(np.argmin(total))
+    for at in range(count - 1, 0, -1):
+        path[at - 1] = came_from[at, path[at]]
+    return path
+
+
+def _order(run: ModuleRun) -> tuple[str, str]:
+    return run.recording, run.module
+
+
+def _instants_ns(group: Sequence[ModuleRun]) -> NDArray[np.int64]:
+    modules = [run.module for run in group]
+    if len(set(modules)) < 2 or len(set(modules)) < len(modules):
+        raise InputError(
+            f"runs: of each recording one run of every module, two modules or more; "
+            f"got {', '.join(modules)}: {group[0].folder.parent}"
+        )
+    first_ns = min(int(run.estimate.stamps_ns[0]) for run in group)
+    last_ns = max(int(run.estimate.stamps_ns[-1]) for run in group)
+    return np.arange(first_ns, last_ns, round(STEP_S * 1e9), dtype=np.int64)
+
+
+def _drifts_mps(
+    group: Sequence[ModuleRun], keys: Sequence[str], stamps_ns: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return (N, K) the modules' drift; infinite for a module that was not run."""
+    drift_mps = np.full((len(stamps_ns), len(keys)), np.inf)
+    for run in group:
+        drift_mps[:, keys.index(run.module)] = run.drift_mps(stamps_ns)
+    return drift_mps
+
+
+def _labelled(
+    run: ModuleRun, keys: Sequence[str], best: NDArray[np.int64], drift_mps: NDArray[np.float64]
+) -> Labelled:
+    source = run.config["source"]
+    group = str(source.get("path") or source.get("story") or source["_target_"])
+    gains_m = _gains_mps(best, drift_mps) * STEP_S
+    per_second = round(1.0 / STEP_S)
+    spans = []
+    for (place, _), found in groupby(enumerate(best), key=lambda at: (at[1], at[0] // per_second)):
+        inside = [at for at, _ in found]
+        spans.append(
+            Span(
+                start_s=round(inside[0] * STEP_S, 3),
+                end_s=round((inside[-1] + 1) * STEP_S, 3),
+                scene=keys[place],
+                gain_m=round(float(gains_m[inside].sum()), 6),
+            )
+        )
+    return Labelled(
+        name=f"{group}, {run.folder.parent.name}/{run.folder.name}",
+        group=group,
+        config={key: run.config.get(key) for key in ("source", "effects")},
+        spans=spans,
+    )
+
+
+def _gains_mps(best: NDArray[np.int64], drift_mps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (N,) by how much the other modules' drift exceeds the best one's, 0 or more."""
+    excess_mps = drift_mps - np.take_along_axis(drift_mps, best[:, None], axis=1)
+    was_run = np.isfinite(excess_mps)
+    total_mps = np.where(was_run, excess_mps, 0.0).sum(axis=1)
+    return np.asarray(np.maximum(total_mps / np.maximum(was_run.sum(axis=1) - 1, 1), 0.0))
+
+
+def _table(keys: Sequence[str], drifts: NDArray[np.float64]) -> Table:
+    """Return for each module that was best somewhere all modules, by their mean drift there."""
+    best, drift_mps = drifts[:, 0].astype(int), drifts[:, 1:]
+    table = {}
+    for place in np.unique(best):
+        means_mps = np.where(
+            np.arange(len(keys)) == place, -1.0, drift_mps[best == place].mean(axis=0)
+        )
+        table[keys[place]] = [keys[other] for other in np.argsort(means_mps, kind="stable")]
+    return table

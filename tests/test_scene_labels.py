@@ -1,0 +1,175 @@
+"""Labels from runs: which module was best when."""
+
+from __future__ import annotations
+
+import json
+import re
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from networks import footage
+
+from sceneslam.scenes.__main__ import main
+from sceneslam.scenes.label import Labels, cheapest
+from sceneslam.scenes.words import read_word
+from sceneslam.types.trajectory import Trajectory
+
+FIRST_NS = 10**12
+
+
+def drive(drift_mps: np.ndarray) -> Trajectory:
+    """Return a drive along x at 0.5 m/s, 10 Hz, sideways off by a drift."""
+    stamps_ns = FIRST_NS + np.arange(len(drift_mps), dtype=np.int64) * 10**8
+    T_world_base = np.tile(np.eye(4), (len(drift_mps), 1, 1))
+    T_world_base[:, 0, 3] = 0.05 * np.arange(len(drift_mps))
+    T_world_base[:, 1, 3] = np.cumsum(drift_mps) * 0.1
+    return Trajectory(stamps_ns=stamps_ns, T_world_base=T_world_base)
+
+
+def write_run(
+    folder: Path,
+    module: str,
+    drift_mps: np.ndarray,
+    *,
+    recording: Path,
+    has_truth: bool = True,
+    lost_s: tuple[float, float] | None = None,
+) -> None:
+    folder.mkdir(parents=True)
+    drive(drift_mps).write_tum(folder / "trajectory.tum")
+    if has_truth:
+        drive(np.zeros_like(drift_mps)).write_tum(folder / "groundtruth.tum")
+    source = read_word(f"Any={recording} source.rate_hz=10").config["source"]
+    config = {"source": source, "effects": None, "scenes": {"Any": [module]}}
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    turns = zip(lost_s or (), ("lost", "tracking"), strict=False)
+    events = [
+        {"event": "tracking", "stamp_ns": FIRST_NS + round(at_s * 1e9), "status": status}
+        for at_s, status in turns
+    ]
+    (folder / "events.jsonl").write_text("".join(f"{json.dumps(one)}\n" for one in events))
+    rows = np.zeros((len(drift_mps), 22))
+    rows[:, 0] = FIRST_NS * 1e-9 + np.arange(len(drift_mps)) * 0.1
+    rows[:, 1] = (np.cumsum(np.abs(drift_mps)) * 0.1) ** 2  # its own variance of x
+    np.savetxt(folder / "trajectory_covariance.txt", rows)
+
+
+def film(folder: Path) -> Path:
+    """Write ten seconds at 10 Hz, lit and then dark."""
+    import cv2
+
+    folder.mkdir(parents=True)
+    for index in range(100):
+        kind = "Indoor" if index < 50 else "Dark"
+        cv2.imwrite(str(folder / f"{index:03d}.png"), footage(kind, index))
+    return folder
+
+
+@pytest.fixture(params=[True, False], ids=["truth", "own covariance"])
+def runs(tmp_path, request) -> Path:
+    """Two modules: one drifts in the second half, the other one in the first."""
+    recording = film(tmp_path / "film")
+    halves = np.repeat([0.001, 0.05], 50)
+    for module, drift_mps in (("eyes", halves), ("laser", halves[::-1])):
+        write_run(
+            tmp_path / "runs" / module,
+            module,
+            drift_mps,
+            recording=recording,
+            has_truth=request.param,
+        )
+    return tmp_path / "runs"
+
+
+def spans_of(path: Path) -> list[tuple[str, float]]:
+    (one,) = Labels.read(path).recordings
+    changes = [one.spans[0], *(b for a, b in zip(one.spans, one.spans[1:], strict=False))]
+    found: list[tuple[str, float]] = []
+    for span in changes:
+        if not found or found[-1][0] != span.scene:
+            found.append((span.scene, span.start_s))
+    return found
+
+
+def test_every_instant_gets_the_module_whose_error_grew_least(runs, tmp_path, capsys):
+    assert main(["label", str(tmp_path / "labels.yaml"), str(runs)]) == 0
+    (first, second) = spans_of(tmp_path / "labels.yaml")
+    assert first == ("eyes", 0.0) and second[0] == "laser" and second[1] == pytest.approx(5, abs=1)
+    assert '"scenes={eyes:[eyes,laser],laser:[laser,eyes]}"' in capsys.readouterr().out
+
+
+def test_a_change_that_costs_more_than_it_gains_is_not_made(runs, tmp_path):
+    assert main(["label", str(tmp_path / "l.yaml"), str(runs), "--change-m", "1.0"]) == 0
+    assert len(spans_of(tmp_path / "l.yaml")) == 1
+
+
+def test_a_lost_module_is_never_the_best(tmp_path):
+    recording, still = film(tmp_path / "film"), np.full(100, 1e-4)
+    one, other = tmp_path / "runs" / "eyes", tmp_path / "runs" / "wheels"
+    write_run(one, "eyes", still, recording=recording, lost_s=(3.0, 6.0))
+    write_run(other, "wheels", np.full(100, 0.02), recording=recording)
+    assert main(["label", str(tmp_path / "labels.yaml"), str(tmp_path / "runs")]) == 0
+    scenes = spans_of(tmp_path / "labels.yaml")
+    assert scenes == [("eyes", 0.0), ("wheels", 3.0), ("eyes", 6.0)]
+
+
+def test_a_detector_is_trained_on_labels(runs, tmp_path, capsys):
+    pytest.importorskip("sklearn", reason="the extra `learn` is not installed")
+    assert main(["label", str(tmp_path / "labels.yaml"), str(runs)]) == 0
+    words = [str(tmp_path / "model.yaml"), str(tmp_path / "labels.yaml")]
+    assert main(["train", *words]) == 0
+    assert main(["test", *words, "--sheet", str(tmp_path / "wrong.png")]) == 0
+    said = capsys.readouterr().out
+    assert float(re.findall(r"images: ([0-9.]+) % right", said)[-1]) >= 90.0
+
+
+@given(
+    st.lists(st.lists(st.floats(0, 1), min_size=3, max_size=3), min_size=1, max_size=6),
+    st.floats(0, 1),
+)
+def test_no_other_choice_is_cheaper(costs, change):
+    table = np.array(costs)
+
+    def total(path):
+        steps = sum(table[at, choice] for at, choice in enumerate(path))
+        return steps + change * np.count_nonzero(np.diff(path))
+
+    least = min(map(total, product(range(3), repeat=len(table))))
+    assert total(cheapest(table, change)) == pytest.approx(least, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda runs: (runs / "eyes" / "config.yaml").unlink(), "config.yaml cannot be read"),
+        (lambda runs: (runs / "eyes" / "trajectory.tum").write_text(""), "fewer than two poses"),
+        (
+            lambda runs: (runs / "eyes" / "config.yaml").write_text(
+                "source: {}\nscenes: {A: [eyes, laser]}"
+            ),
+            "got eyes, laser, allowed: one module",
+        ),
+        (lambda runs: (runs / "eyes" / "trajectory.tum").unlink(), "two modules or more"),
+    ],
+)
+def test_runs_that_cannot_be_compared_are_one_sentence(runs, tmp_path, capsys, change, told):
+    change(runs)
+    assert main(["label", str(tmp_path / "labels.yaml"), str(runs)]) == 2
+    said = capsys.readouterr().err
+    assert told in said and said.count("\n") == 1, said
+
+
+@pytest.mark.parametrize("text", ["[]", "recordings: [{name: a}]", "a: [", "table: {}"])
+def test_file_without_labels_is_refused(tmp_path, capsys, text):
+    (tmp_path / "labels.yaml").write_text(text)
+    assert main(["train", str(tmp_path / "m.yaml"), str(tmp_path / "labels.yaml")]) == 2
+    assert "not a file of labels" in capsys.readouterr().err
+    assert main(["train", str(tmp_path / "m.yaml"), str(tmp_path / "nothing.yaml")]) == 2
+    assert "labels not found" in capsys.readouterr().err
+    assert main(["label", str(tmp_path / "l.yaml"), str(tmp_path)]) == 2
+    assert "no finished run" in capsys.readouterr().err
