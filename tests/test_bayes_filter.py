@@ -46,7 +46,7 @@ def test_change_is_confirmed_within_two_seconds_at_any_rate_of_images(rate_hz):
     assert first.scene == "Bright" and first.previous is None
     assert change.scene == "Dark" and change.previous == "Bright"
     delay_s = (change.stamp_ns - cast[count].stamp_ns) * 1e-9
-    assert 1.2 < delay_s < 2.0
+    assert 0.79 < delay_s < 2.0  # no drop-out of the story `flicker` is as long
     assert change.since_ns == cast[count].stamp_ns
 
 
@@ -103,7 +103,7 @@ def test_what_is_confirmed_is_probable_and_another_scene_each_time(cast, rate_hz
         found = filter_.update(vote)
         assert sum(filter_.posterior.values()) == pytest.approx(1.0)
         if found is not None:
-            assert filter_.posterior[found.scene] >= 0.99
+            assert filter_.posterior[found.scene] >= settings().confirm_probability
             assert found.previous == before != found.scene and found.since_ns <= found.stamp_ns
             before = found.scene
 
