@@ -32,6 +32,7 @@ NOT_RUN = {  # first words -> why it is not run here
     "python experiments/": "takes minutes; its numbers stand beside it, a test finds the program",
 }
 # A viewer stays, a robot is not there: composed only. Tests of these sinks and sources have both.
+RECORDED = "python -m sceneslam +scenario=bright_to_dark"
 SHOWS = re.compile(r"viewer=rerun|source=ros2")
 ASKS = re.compile(r" \+experiment=(?!unswitched)")  # takes minutes; is composed only
 ALL = [(page, command) for page in PAGES for command in commands(page)]
@@ -49,7 +50,7 @@ def recordings(tmp_path_factory):
     write_recordings(folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        assert run_inside("python -m sceneslam +scenario=bright_to_dark hydra.run.dir=run") == 0
+        assert run_inside(f"{RECORDED} hydra.run.dir=run atlas.save=MAP") == 0
     shutil.copytree(folder / "run", folder / "OTHER_RUN")
     for name in ("ESTIMATE", "TRUTH"):
         shutil.copy(folder / "run" / "trajectory.tum", folder / f"{name}.tum")

@@ -39,6 +39,7 @@ ALLOWED = {  # package -> what of ours it may import
     },
     "experiments/liars": {"types", "evaluation", "experiments"},
     "experiments/openloris": {"types", "evaluation", "experiments"},
+    "experiments/one_map": {"types", "scans", "atlas", "testing", "experiments"},
     "experiments/handover": {"types", "atlas", "evaluation", "experiments"},
     "experiments/mutants": {"types", "interfaces", "ros", "config", "experiments"},
     "experiments/matrix": {"types", "evaluation", "bus", "modules", "experiments"},

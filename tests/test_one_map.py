@@ -1,28 +1,45 @@
 """One map of all modules and runs: places recognized, loops closed, maps that last."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from plan_worlds import FLAT_TOUR, Drive, World, box, corridor, flat, start_of, through, twins
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.lasting.map_files import HEAD, load_map_files, save_map_files
 from sceneslam.atlas.lasting.saved_map import forget_contradicted
-from sceneslam.atlas.places.floor_plan import draw
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.places.registration import register
 from sceneslam.atlas.submaps.graph import Edge, Kind, consistent, solve
+from sceneslam.experiments.one_map.drive import Drive, Odometry, map_of, plan_of
+from sceneslam.maps.__main__ import main
+from sceneslam.testing.floor_plans import (
+    CUPBOARD,
+    FLAT_TOUR,
+    TWINS_FIRST,
+    TWINS_SECOND,
+    Scanner,
+    World,
+    box,
+    corridor,
+    flat,
+    through,
+    twins,
+)
 from sceneslam.types import planar
 from sceneslam.types.errors import ConfigError, InputError
 
 
 def world(walls, seed=0):
-    return World(walls, np.random.default_rng(seed))
+    return World(walls, np.random.default_rng(seed), Scanner())
 
 
-def plan_of(seen, true):
-    first = true[0]
-    return draw([(planar.between(first, pose), seen.key_scan(pose)) for pose in true])
+def around(pose, turn_rad=1.5, scans=10):
+    """The poses of a turn on the spot."""
+    return np.array(
+        [planar.compose(pose, np.array([0, 0, yaw])) for yaw in np.linspace(0, turn_rad, scans)]
+    )
 
 
 def atlas(**settings):
@@ -44,7 +61,7 @@ def test_a_robot_finds_itself_anywhere_in_a_room_and_nowhere_else():
     rng, found = np.random.default_rng(1), 0
     for _ in range(12):
         pose = np.array([rng.uniform(2.2, 5.6), rng.uniform(0.5, 2.8), rng.uniform(-3, 3)])
-        query = PlanField(draw(world(flat(), 2).around(pose)))
+        query = PlanField(plan_of(world(flat(), 2), around(pose)))
         match = target.recognize(query, None)
         if match is not None:
             off = planar.between(planar.between(true[0], pose), match.T_target_query)
@@ -54,17 +71,17 @@ def test_a_robot_finds_itself_anywhere_in_a_room_and_nowhere_else():
 
 
 def test_of_two_rooms_that_look_alike_neither_is_recognized():
-    drive = [(1.0, 1.0), (4.2, 1.2), (4.2, 3.4), (2.5, 2.0), (2.5, -1.0), (10.5, -1.0),
-             (10.5, 2.0), (9.0, 1.0), (12.2, 1.2), (12.2, 3.4)]  # fmt: skip
-    target = Recognizer(PlanField(plan_of(world(twins()), through(drive))))
-    query = PlanField(draw(world(twins(), 1).around(np.array([2.5, 2.2, 0.3]), turn_rad=6.0)))
+    drive = through((*TWINS_FIRST, *TWINS_SECOND))
+    target = Recognizer(PlanField(plan_of(world(twins()), drive)))
+    turn = around(np.array([2.5, 2.2, 0.3]), turn_rad=6.0)
+    query = PlanField(plan_of(world(twins(), 1), turn))
     assert target.recognize(query, None) is None
 
 
 def test_a_room_that_is_not_in_the_map_is_not_recognized():
     target = Recognizer(PlanField(plan_of(world(flat()), through(FLAT_TOUR))))
     other = box(0, 0, 7.5, 3.2) + box(2, 1, 2.5, 1.4) + box(5, 2.2, 6.3, 3.0)
-    query = PlanField(draw(world(other).around(np.array([3.5, 1.8, 0.0]), turn_rad=6.0)))
+    query = PlanField(plan_of(world(other), around(np.array([3.5, 1.8, 0.0]), turn_rad=6.0)))
     assert target.recognize(query, None) is None
 
 
@@ -132,15 +149,12 @@ def test_a_wrong_loop_that_was_taken_is_given_up_and_the_same_input_gives_the_sa
 
 def test_loops_between_modules_take_out_what_odometry_drifts():
     true = np.concatenate([through(FLAT_TOUR), through(FLAT_TOUR)])
-    drive = Drive(atlas()).go(world(flat()), true, drift_ratio=0.01, turn_drift=0.003, sessions=4)
-    assert drive.kinds().count("loop") >= 3
-    before = np.linalg.norm(drive.atlas.online.positions_m[:, :2] - _planar(true), axis=1)
-    after = drive.errors_m(true, start_of(true))
+    odometry = Odometry(scale=0.01, turn_rad_per_m=0.003)
+    drive = Drive(atlas()).go(world(flat()), true, odometry=odometry, sessions=4)
+    assert len(drive.of_kind("loop")) >= 3
+    before = drive.errors_m(true, map_of(true), is_online=True)
+    after = drive.errors_m(true, map_of(true))
     assert np.sqrt((after**2).mean()) < np.sqrt((before**2).mean()) / 3
-
-
-def _planar(true):
-    return np.array([planar.compose(start_of(true), pose)[:2] for pose in true])
 
 
 def test_a_run_without_loops_stays_as_it_was_to_the_bit():
@@ -161,9 +175,9 @@ def test_a_run_finds_itself_in_a_loaded_map_and_its_poses_lie_in_it(saved, tmp_p
     folder, first = saved
     true = through([(7.3, 0.9), (9.2, 1.0), (9.3, 2.0), (5.2, 2.0), (3.2, 0.9), (5.3, 0.9)])
     drive = Drive(atlas(load=str(folder), save=str(tmp_path / "map"))).go(world(flat(), 5), true)
-    found = [event for event in drive.events if event["event"] == "relocalized"]
+    found = drive.of_kind("relocalized")
     assert len(found) == 1 and found[0]["after_s"] <= 3.0 and drive.faults == []
-    assert drive.errors_m(true, start_of(first)).max() < 0.05
+    assert drive.errors_m(true, map_of(first)).max() < 0.05
     both = load_map_files(tmp_path / "map")
     assert both.runs == 2 and set(both.pieces.tolist()) == {0}
 
@@ -173,21 +187,21 @@ def test_a_run_that_is_nowhere_in_the_map_says_so_and_keeps_its_own_piece(saved,
     other = world(box(0, 0, 7.5, 3.2) + box(2, 1, 2.5, 1.4) + box(5, 2.2, 6.3, 3.0))
     true = through([(1.0, 0.5), (6.5, 0.6), (6.8, 1.5), (3.2, 2.5), (1.0, 2.5)])
     drive = Drive(atlas(load=str(folder), save=str(tmp_path / "map"))).go(other, true)
-    assert "not_relocalized" in drive.kinds() and "relocalized" not in drive.kinds()
+    assert drive.of_kind("not_relocalized") and not drive.of_kind("relocalized")
     assert "was not found in the map" in drive.faults[0]
-    assert drive.errors_m(true, start_of(true)).max() < 1e-6
+    assert drive.errors_m(true, map_of(true)).max() < 1e-6
     assert set(load_map_files(tmp_path / "map").pieces.tolist()) == {0, 1}
 
 
 def test_furniture_that_was_moved_is_forgotten_by_an_update(saved, tmp_path):
     folder, first = saved
-    moved = [wall for wall in flat() if wall not in box(1, 1, 1.8, 2)] + box(4.6, 0.1, 5.4, 0.5)
+    moved = [wall for wall in flat() if wall not in CUPBOARD] + box(4.6, 0.1, 5.4, 0.5)
     true = through([(0.6, 2.6), (3.0, 2.4), (2.6, 0.7), (0.5, 0.5), (0.4, 2.4), (3.0, 2.2)])
     settings = {"load": str(folder), "save": str(tmp_path / "map"), "mode": "update"}
     drive = Drive(atlas(**settings)).go(world(moved, 3), true)
     assert drive.faults == []
     plan = load_map_files(tmp_path / "map").plan()
-    corners = [planar.compose(start_of(first), np.array([x, y, 0.0]))[:2] for x, y in
+    corners = [planar.compose(map_of(first), np.array([x, y, 0.0]))[:2] for x, y in
                ((1.0, 1.5), (1.4, 1.0), (1.8, 1.5), (1.4, 2.0))]  # fmt: skip
     for corner in corners:
         away_m = np.linalg.norm(plan.points - corner, axis=1).min()
@@ -200,7 +214,7 @@ def test_a_run_that_localizes_leaves_the_map_as_it_is(saved):
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     true = through([(3.0, 2.4), (3.2, 0.8), (5.4, 0.9), (5.4, 2.0)])
     drive = Drive(atlas(load=str(folder), mode="localize")).go(world(flat(), 7), true)
-    assert drive.errors_m(true, start_of(first)).max() < 0.05
+    assert drive.errors_m(true, map_of(first)).max() < 0.05
     assert before == {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
@@ -273,8 +287,6 @@ def test_whoever_is_killed_while_saving_leaves_a_whole_map(saved, tmp_path, monk
 
         return maybe
 
-    from pathlib import Path
-
     monkeypatch.setattr(Path, "replace", dies(Path.replace))
     monkeypatch.setattr(Path, "unlink", dies(Path.unlink))
     smaller = old.of(range(len(old.submaps) - 1))
@@ -289,3 +301,48 @@ def test_nothing_is_forgotten_that_another_run_did_not_contradict(saved):
     old = load_map_files(saved[0])
     kept = forget_contradicted(old, run=5)
     assert kept is old
+
+
+def test_two_maps_of_one_place_are_merged(saved, tmp_path, capsys):
+    folder, first = saved
+    true = through([(7.3, 0.9), (9.2, 1.0), (9.3, 2.0), (5.2, 2.0), (3.2, 0.9), (5.3, 0.9)])
+    Drive(atlas(save=str(tmp_path / "second"))).go(world(flat(), 5), true)
+    both = tmp_path / "both"
+    assert main(["merge", str(folder), str(tmp_path / "second"), "--out", str(both)]) == 0
+    assert "2 runs" in capsys.readouterr().out
+    merged, count = load_map_files(both), len(load_map_files(folder).submaps)
+    off = planar.between(planar.compose(map_of(first), true[0]), merged.T_map_node[count])
+    assert np.hypot(off[0], off[1]) < 0.03 and abs(off[2]) < 0.01
+    assert main(["check", str(both)]) == 0
+
+
+def test_maps_of_two_places_stay_apart(saved, tmp_path, capsys):
+    other = world(box(0, 0, 7.5, 3.2) + box(2, 1, 2.5, 1.4) + box(5, 2.2, 6.3, 3.0))
+    true = through([(1.0, 0.5), (6.5, 0.6), (6.8, 1.5), (3.2, 2.5), (1.0, 2.5)])
+    Drive(atlas(save=str(tmp_path / "other"))).go(other, true)
+    both = str(tmp_path / "both")
+    assert main(["merge", str(saved[0]), str(tmp_path / "other"), "--out", both]) == 1
+    assert "1 pieces were not recognized" in capsys.readouterr().err
+    assert main(["check", both]) == 0
+
+
+def test_a_map_is_thinned_where_it_was_seen_again(saved, tmp_path, capsys):
+    true = np.concatenate([through(FLAT_TOUR), through(FLAT_TOUR)])
+    Drive(atlas(save=str(tmp_path / "twice"))).go(world(flat()), true)
+    thin = tmp_path / "thin"
+    assert main(["prune", str(tmp_path / "twice"), "--out", str(thin)]) == 0
+    before, after = load_map_files(tmp_path / "twice"), load_map_files(thin)
+    assert len(after.submaps) <= 0.7 * len(before.submaps)
+    walls = before.plan().points.astype(np.float64)
+    assert (PlanField(after.plan()).nearest(walls).distance_m < 0.1).mean() > 0.97
+    assert main(["check", str(thin)]) == 0
+
+
+def test_a_map_is_exported_and_told_about(saved, tmp_path, capsys):
+    assert main(["info", str(saved[0])]) == 0
+    assert "piece 0:" in capsys.readouterr().out
+    assert main(["export", str(saved[0]), "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "grid.pgm").read_bytes().startswith(b"P5")
+    assert "EDGE_SE3:QUAT 0 1" in (tmp_path / "pose_graph.g2o").read_text()
+    assert main(["info", str(tmp_path)]) == 2
+    assert "not a map, it has no map.yaml" in capsys.readouterr().err

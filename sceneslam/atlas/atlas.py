@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from bisect import bisect_left
 from functools import partial
 
@@ -18,13 +19,15 @@ from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.submaps.own_loops import own_loops
 from sceneslam.atlas.uncertainty import VELOCITY, WHEELS, Covariance, Step, propagate
 from sceneslam.interfaces import TrajectoryLog
-from sceneslam.types.errors import ConfigError
+from sceneslam.types.errors import ConfigError, told
 from sceneslam.types.maps import HybridMap, MapLayers
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.run import BRIDGED, Session, SessionStart
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
+
+_log = logging.getLogger(__name__)
 
 
 class Atlas:
@@ -63,17 +66,30 @@ class Atlas:
 
     def observe(self, observation: Observation) -> None:
         """Take an observation, after its pose."""
-        if self._mapper is not None and self._note is not None:
+        if self._mapper is None or self._note is None:
+            return
+        try:
             self._mapper.observe(observation)
             self._lasting.keep(observation.stamp_ns, self._mapper, self._note)
+        except Exception as error:  # the poses go on without a map
+            self._give_up(error)
 
     def finish(self) -> list[str]:
         """Close the loops between sessions and save the map; return what went wrong.
 
         After the last session was closed.
         """
-        if self._mapper is None or self._note is None or not self._path.stamps_ns:
-            return []
+        if self._mapper is None or not self._path.stamps_ns:
+            return self._lasting.faults
+        try:
+            self._solve()
+        except Exception as error:
+            self._give_up(error)
+        return self._lasting.faults
+
+    def _solve(self) -> None:
+        """Solve the graph and save the map."""
+        assert self._mapper is not None and self._note is not None
         revised = self._revise().T_map_base
         at = partial(self._revised_at, revised)
         self._correction = self._mapper.finish(
@@ -86,7 +102,12 @@ class Atlas:
             ),
         )
         self._lasting.finish(self._mapper, self._path.stamps_ns[-1], self._note)
-        return self._lasting.faults
+
+    def _give_up(self, error: Exception) -> None:
+        """Go on without submaps: the trajectory stays as the modules have it."""
+        _log.info("submaps", exc_info=error)
+        self._mapper, self._correction = None, None
+        self._lasting.faults.append(f"the run goes on without submaps and loops: {told(error)}")
 
     def begin_session(self, module: str, T_map_local: Transform) -> int:
         """Open a session of a module that was placed in the map (Eq. 1); return its number."""

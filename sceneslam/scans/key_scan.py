@@ -29,8 +29,7 @@ class KeyScan:
     """Where the beams of one scan ended, in base's x and y."""
 
     stamp_ns: int
-    points: NDArray[np.float64]  # (N, 2) [m], base, by rising angle
-    normals: NDArray[np.float64]  # (N, 2) unit, towards the sensor; 0 where there is no line
+    points: NDArray[np.float32]  # (N, 2) [m], base, by rising angle
     origin: NDArray[np.float64]  # (2,) [m], base: where the beams begin
 
 
@@ -80,17 +79,16 @@ def _key_scan(stamp_ns: int, scan: LaserScan, T_base_laser: Transform) -> KeySca
     points = np.column_stack(
         [ranges_m * np.cos(angles), ranges_m * np.sin(angles), np.zeros(len(angles))]
     )
-    points_base = np.asarray(se3.apply(T_base_laser, points)[:, :2], np.float64)
-    origin = T_base_laser[:2, 3].copy()
-    normals = line_normals(points_base, origin)
-    return KeyScan(stamp_ns=stamp_ns, points=points_base, normals=normals, origin=origin)
+    points_base = np.asarray(se3.apply(T_base_laser, points)[:, :2], np.float32)
+    return KeyScan(stamp_ns=stamp_ns, points=points_base, origin=T_base_laser[:2, 3].copy())
 
 
-def line_normals(points: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit normals (N, 2), towards `origin`, of the lines through neighbouring points.
+def line_normals(scan: KeyScan) -> NDArray[np.float64]:
+    """Return the unit normals (N, 2), towards the sensor, of lines through neighbouring points.
 
-    0 where the neighbours lie further apart, or not on a line: a thin wall has two sides.
+    0 where the neighbours lie further apart, or not on a line.
     """
+    points, origin = scan.points.astype(np.float64), scan.origin
     normals = np.zeros_like(points)
     count = len(points)
     if count < 2 * _REACH + 1:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan
 from sceneslam.atlas.submaps.graph import Edge, Kind
-from sceneslam.atlas.submaps.submap import Submap
+from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.types.errors import InputError, told
 from sceneslam.types.files import PART, replacing
 
@@ -232,7 +232,9 @@ def _unpacked(arrays: Mapping[str, NDArray[Any]], modules: list[str]) -> SavedMa
                 module=modules[int(arrays["node_module"][index])],
                 stamps_ns=stamps_ns,
                 T_submap_base=poses,
-                plan=FloorPlan(points=walls, normals=normals, free=cells, origin_xy_m=(x_m, y_m)),
+                drawing=Drawing(
+                    FloorPlan(points=walls, normals=normals, free=cells, origin_xy_m=(x_m, y_m))
+                ),
             )
         )
     edges = [

@@ -72,7 +72,7 @@ def forget_contradicted(saved: SavedMap, run: int) -> SavedMap:
     for index, submap in enumerate(saved.submaps):
         if submap.run != run and saved.pieces[index] == piece and len(submap.plan):
             T_today_plan = saved.T_map_node[index]
-            submaps[index] = replace(submap, plan=_without(submap.plan, T_today_plan, today))
+            submaps[index] = submap.with_plan(_without(submap.plan, T_today_plan, today))
     return replace(saved, submaps=tuple(submaps))
 
 

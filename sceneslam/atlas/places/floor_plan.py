@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.scans.key_scan import KeyScan
+from sceneslam.scans.key_scan import KeyScan, line_normals
 from sceneslam.types import planar
 from sceneslam.types.planar import Planar
 
@@ -49,7 +49,7 @@ def empty() -> FloorPlan:
 
 def draw(scans: Sequence[tuple[Planar, KeyScan]]) -> FloorPlan:
     """Return the plan of scans at poses T_plan_base."""
-    ends = [planar.apply(T, scan.points) for T, scan in scans]
+    ends = [planar.apply(T, scan.points.astype(np.float64)) for T, scan in scans]
     starts = [planar.apply(T, scan.origin[None])[0] for T, scan in scans]
     everything = np.concatenate([*ends, *(start[None] for start in starts)])
     if not sum(len(each) for each in ends):
@@ -61,7 +61,7 @@ def draw(scans: Sequence[tuple[Planar, KeyScan]]) -> FloorPlan:
         _draw_rays(ray, start / CELL_M - low, end / CELL_M - low)
         misses += ray
     points = np.concatenate(ends)
-    turned = [scan.normals @ planar.rotation(float(T[2])).T for T, scan in scans]
+    turned = [line_normals(scan) @ planar.rotation(float(T[2])).T for T, scan in scans]
     index, hits, centres, normals = _binned(points, np.concatenate(turned), low, (rows, columns))
     least = 1 if len(scans) < 3 else 2
     passed = misses.reshape(-1)[index]

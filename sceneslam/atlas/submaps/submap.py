@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -38,6 +38,22 @@ class KeyPose:
         return self.scan.stamp_ns
 
 
+class Drawing:
+    """A floor plan, drawn when it is asked for first: most runs have no use for it."""
+
+    def __init__(
+        self, plan: FloorPlan | None = None, scans: Sequence[tuple[Planar, KeyScan]] = ()
+    ) -> None:
+        self._plan, self._scans = plan, tuple(scans)
+
+    @property
+    def plan(self) -> FloorPlan:
+        """Return the plan; the scans are forgotten with it."""
+        if self._plan is None:
+            self._plan, self._scans = draw(self._scans), ()
+        return self._plan
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Submap:
     """A node of the graph; its frame is base, level, at its first scan."""
@@ -47,7 +63,16 @@ class Submap:
     module: str
     stamps_ns: NDArray[np.int64]  # (K,) of its scans
     T_submap_base: NDArray[np.float64]  # (K, 3)
-    plan: FloorPlan  # in its frame
+    drawing: Drawing  # of its plan
+
+    @property
+    def plan(self) -> FloorPlan:
+        """Return its floor plan, in its frame."""
+        return self.drawing.plan
+
+    def with_plan(self, plan: FloorPlan) -> Submap:
+        """Return the submap with another plan."""
+        return replace(self, drawing=Drawing(plan))
 
 
 def make_submap(poses: Sequence[KeyPose], run: int) -> Submap:
@@ -60,7 +85,7 @@ def make_submap(poses: Sequence[KeyPose], run: int) -> Submap:
         module=first.module,
         stamps_ns=np.array([pose.stamp_ns for pose in poses], np.int64),
         T_submap_base=np.array(T_submap_base),
-        plan=draw(list(zip(T_submap_base, (pose.scan for pose in poses), strict=True))),
+        drawing=Drawing(scans=list(zip(T_submap_base, (pose.scan for pose in poses), strict=True))),
     )
 
 

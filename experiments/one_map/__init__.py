@@ -1,0 +1,1 @@
+"""One map of all modules and runs: what it promises, and what holds."""

@@ -1,0 +1,116 @@
+"""Joins the pieces of two maps, or of one, where they show the same place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.atlas.lasting.saved_map import SavedMap
+from sceneslam.atlas.places.floor_plan import join
+from sceneslam.atlas.places.plan_field import PlanField
+from sceneslam.atlas.places.recognition import Recognizer
+from sceneslam.atlas.submaps.graph import Edge, Kind, consistent, solve
+from sceneslam.types import planar
+
+_AROUND = 1  # submaps to either side that are looked for together with one
+_LOOPS_MIN = 2  # that agree: one place may look like another
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Joined:
+    """A map, and what became of the pieces that were to be joined to its first."""
+
+    map: SavedMap
+    joined: int
+    apart: int  # pieces of which no two submaps were recognized in the first
+
+
+def side_by_side(first: SavedMap, second: SavedMap) -> SavedMap:
+    """Return both maps in one, the second's pieces and runs after the first's."""
+    count, pieces = len(first.submaps), int(first.pieces.max(initial=-1)) + 1
+    later = [replace(submap, run=submap.run + first.runs) for submap in second.submaps]
+    return SavedMap(
+        submaps=(*first.submaps, *later),
+        T_map_node=np.concatenate([first.T_map_node, second.T_map_node]),
+        pieces=np.concatenate([first.pieces, second.pieces + pieces]),
+        edges=(*first.edges, *(edge.shifted(count) for edge in second.edges)),
+    )
+
+
+def join_pieces(saved: SavedMap) -> Joined:
+    """Return the map with every piece in the first that is recognized in it."""
+    joined = apart = 0
+    for piece in np.unique(saved.pieces[saved.pieces > 0]).tolist():
+        found = _joined(saved, piece)
+        joined, apart = joined + (found is not None), apart + (found is None)
+        saved = saved if found is None else found
+    return Joined(map=_renumbered(saved), joined=joined, apart=apart)
+
+
+def _joined(saved: SavedMap, piece: int) -> SavedMap | None:
+    """Return the map with a piece in the first, None where it is not recognized."""
+    own = np.flatnonzero(saved.pieces == piece).tolist()
+    loops = _loops(saved, own)
+    drift = np.zeros_like(saved.T_map_node)
+    agreeing = consistent(loops, saved.T_map_node, drift)
+    if len(agreeing) < _LOOPS_MIN:
+        return None
+    nodes = np.array(saved.T_map_node)
+    seed = agreeing[0]
+    T_first_piece = planar.compose(
+        planar.compose(nodes[seed.first], seed.T_first_second),
+        planar.between(nodes[seed.second], np.zeros(3)),
+    )
+    for node in own:
+        nodes[node] = planar.compose(T_first_piece, nodes[node])
+    solved = _solve(saved, nodes, own, agreeing)
+    pieces = np.where(saved.pieces == piece, 0, saved.pieces)
+    return replace(saved, T_map_node=solved, pieces=pieces, edges=(*saved.edges, *agreeing))
+
+
+def _loops(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
+    """Return where the submaps of a piece lie in the first piece."""
+    main = np.flatnonzero(saved.pieces == 0)
+    target, found = Recognizer(PlanField(saved.plan())), []
+    for row, node in enumerate(own):
+        around = own[max(row - _AROUND, 0) : row + _AROUND + 1]
+        near = [index for index in around if saved.submaps[index].run == saved.submaps[node].run]
+        query = join(
+            [
+                (planar.between(saved.T_map_node[node], saved.T_map_node[i]), saved.submaps[i].plan)
+                for i in near
+            ]
+        )
+        match = target.recognize(PlanField(query), None) if len(query) else None
+        if match is None or match.weak_directions:
+            continue
+        away_m = np.linalg.norm(saved.T_map_node[main, :2] - match.T_target_query[:2], axis=1)
+        first = int(main[np.argmin(away_m)])
+        found.append(
+            Edge(
+                first=first,
+                second=node,
+                T_first_second=planar.between(saved.T_map_node[first], match.T_target_query),
+                covariance=match.covariance,
+                kind=Kind.LOOP,
+            )
+        )
+    return found
+
+
+def _solve(
+    saved: SavedMap, nodes: NDArray[np.float64], own: Sequence[int], loops: Sequence[Edge]
+) -> NDArray[np.float64]:
+    """Return the nodes; those of the other pieces stay."""
+    inside = set(own)
+    motions = [edge for edge in saved.edges if edge.first in inside and edge.second in inside]
+    fixed = [node for node in range(len(nodes)) if node not in inside]
+    return solve(nodes, motions, loops, fixed=fixed, loose=own[0]).T_map_node
+
+
+def _renumbered(saved: SavedMap) -> SavedMap:
+    _, pieces = np.unique(saved.pieces, return_inverse=True)
+    return replace(saved, pieces=np.asarray(pieces, np.int64))

@@ -1,0 +1,83 @@
+"""Thins a map out: submaps go whose ground later ones show as well."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sceneslam.atlas.lasting.saved_map import SavedMap
+from sceneslam.atlas.places.floor_plan import join
+from sceneslam.atlas.places.plan_field import PlanField
+from sceneslam.atlas.submaps.graph import Edge, Kind
+from sceneslam.types import planar
+
+_COVERED_RATIO = 0.95  # of a submap's walls: what is left is within a wall's noise
+
+
+def prune(saved: SavedMap) -> SavedMap:
+    """Return the map without submaps whose walls all later ones of their piece have.
+
+    The newest stay. Motions through what goes are joined, in a row; its loops go with it.
+    """
+    kept = list(range(len(saved.submaps)))
+    for node in range(len(saved.submaps)):
+        others = [
+            other for other in kept if other > node and saved.pieces[other] == saved.pieces[node]
+        ]
+        if others and _is_covered(saved, node, others):
+            kept.remove(node)
+    bridges = _bridges(saved, set(kept))
+    thinned = SavedMap(
+        submaps=saved.submaps,
+        T_map_node=saved.T_map_node,
+        pieces=saved.pieces,
+        edges=(*saved.edges, *bridges),
+    )
+    return thinned.of(kept)
+
+
+def _is_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
+    plan = saved.submaps[node].plan
+    if not len(plan):
+        return True
+    low, high = plan.points.min(axis=0), plan.points.max(axis=0)
+    reach_m = float(np.linalg.norm(high - low))
+    away_m = np.linalg.norm(saved.T_map_node[others, :2] - saved.T_map_node[node, :2], axis=1)
+    near = [other for other, far_m in zip(others, away_m, strict=True) if far_m <= 2 * reach_m]
+    placed = [
+        (planar.between(saved.T_map_node[node], saved.T_map_node[other]), saved.submaps[other].plan)
+        for other in near
+    ]
+    shown = join(placed)
+    if not len(shown):
+        return False
+    far_m = PlanField(shown).nearest(plan.points.astype(np.float64)).distance_m
+    return bool((far_m <= 0.1).mean() >= _COVERED_RATIO)  # two cells
+
+
+def _bridges(saved: SavedMap, kept: set[int]) -> list[Edge]:
+    """Return the motions over runs of submaps that go."""
+    onward = {edge.first: edge for edge in saved.edges if edge.kind is not Kind.LOOP}
+    found = []
+    for start in sorted(kept):
+        edge, passed = onward.get(start), False
+        while edge is not None and edge.second not in kept:
+            after = onward.get(edge.second)
+            edge, passed = None if after is None else _in_a_row(start, edge, after), True
+        if edge is not None and passed:
+            found.append(edge)
+    return found
+
+
+def _in_a_row(start: int, edge: Edge, after: Edge) -> Edge:
+    T = after.T_first_second
+    back = planar.turn(-float(T[2]))
+    carry = np.eye(3)
+    carry[:2, 2] = -T[1], T[0]
+    carried = back @ carry @ edge.covariance @ carry.T @ back.T
+    return Edge(
+        first=start,
+        second=after.second,
+        T_first_second=planar.compose(edge.T_first_second, T),
+        covariance=carried + after.covariance,
+        kind=max(edge.kind, after.kind),
+    )

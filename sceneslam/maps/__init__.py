@@ -1,0 +1,1 @@
+"""Looks after saved maps: `python -m sceneslam.maps`."""

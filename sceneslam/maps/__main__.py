@@ -1,0 +1,100 @@
+"""Look after saved maps: `python -m sceneslam.maps info|check|merge|prune|export MAP`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from sceneslam.atlas.lasting.map_files import load_map_files, save_map_files
+from sceneslam.atlas.lasting.merge import join_pieces, side_by_side
+from sceneslam.atlas.lasting.prune import prune
+from sceneslam.maps.export import export
+from sceneslam.maps.inspect import described, flaws
+from sceneslam.streams import secure_streams
+from sceneslam.types.errors import SceneSlamError, told
+
+OK, INCOMPLETE, UNUSABLE = 0, 1, 2
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Do what is asked; return 0, 1 where something is wrong with the map, 2 where it is no map."""
+    options = _parser().parse_args(arguments)
+    try:
+        return int(options.act(options))
+    except (SceneSlamError, OSError) as error:
+        said = str(error) if isinstance(error, SceneSlamError) else told(error)
+        print(f"error: {said}", file=sys.stderr)
+        return UNUSABLE
+
+
+def _info(options: argparse.Namespace) -> int:
+    print("\n".join(described(load_map_files(options.map))))
+    return OK
+
+
+def _check(options: argparse.Namespace) -> int:
+    found = flaws(load_map_files(options.map))
+    for flaw in found:
+        print(f"error: {flaw}", file=sys.stderr)
+    if not found:
+        print("the map is whole")
+    return INCOMPLETE if found else OK
+
+
+def _merge(options: argparse.Namespace) -> int:
+    saved = load_map_files(options.map)
+    for other in options.others:
+        saved = side_by_side(saved, load_map_files(other))
+    result = join_pieces(saved)
+    save_map_files(result.map, options.out)
+    print("\n".join([*described(result.map), f"map  {options.out}"]))
+    if result.apart:
+        print(
+            f"error: {result.apart} pieces were not recognized in the first and stay apart",
+            file=sys.stderr,
+        )
+    return INCOMPLETE if result.apart else OK
+
+
+def _prune(options: argparse.Namespace) -> int:
+    saved = load_map_files(options.map)
+    thinned = prune(saved)
+    save_map_files(thinned, options.out)
+    print(f"{len(saved.submaps)} submaps, {len(thinned.submaps)} kept")
+    print(f"map  {options.out}")
+    return OK
+
+
+def _export(options: argparse.Namespace) -> int:
+    for path in export(load_map_files(options.map), options.out):
+        print(path)
+    return OK
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m sceneslam.maps", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="info|check|merge|prune|export")
+    for name, act, about in (
+        ("info", _info, "say what a map holds"),
+        ("check", _check, "say what is wrong with a map"),
+        ("merge", _merge, "join maps, and the pieces of one, where they show the same place"),
+        ("prune", _prune, "drop submaps whose ground later ones show as well"),
+        ("export", _export, "write the grid for map_server and the graph as g2o"),
+    ):
+        command = commands.add_parser(name, help=about, description=about)
+        command.add_argument("map", type=Path, help="the folder of a saved map")
+        command.set_defaults(act=act)
+        if name == "merge":
+            command.add_argument("others", type=Path, nargs="*", help="more maps")
+        if name in ("merge", "prune", "export"):
+            command.add_argument(
+                "--out", type=Path, required=True, metavar="FOLDER", help="where the result goes"
+            )
+    return parser
+
+
+if __name__ == "__main__":
+    secure_streams()
+    sys.exit(main())

@@ -1,0 +1,61 @@
+"""Writes a saved map for other programs: map_server, g2o, TUM."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.atlas.lasting.saved_map import SavedMap
+from sceneslam.atlas.places.floor_plan import FloorPlan
+from sceneslam.atlas.save import save_grid, save_pose_graph
+from sceneslam.atlas.submaps.graph import Kind
+from sceneslam.types import planar
+from sceneslam.types.maps import GridLayer, PoseGraphLayer
+
+_CELL_M = 0.05
+_WALL, _FREE = 3.0, -3.0  # log odds: 0.95 and 0.05
+_UNMEASURED = 1e6  # 1/m^2, 1/rad^2: height, roll and pitch of a level base
+
+
+def export(saved: SavedMap, folder: Path) -> list[Path]:
+    """Write `grid.pgm` with `grid.yaml` and `pose_graph.g2o` with `.tum`, of the first piece."""
+    folder.mkdir(parents=True, exist_ok=True)
+    main = saved.of(np.flatnonzero(saved.pieces == 0).tolist())
+    grid, graph = folder / "grid.yaml", folder / "pose_graph.g2o"
+    save_grid(_grid(main.plan()), grid)
+    save_pose_graph(_graph(main), graph)
+    return [grid, graph]
+
+
+def _grid(plan: FloorPlan) -> GridLayer:
+    log_odds = np.where(plan.free, _FREE, 0.0).astype(np.float32)
+    cells = plan.cells(plan.points)
+    log_odds[cells[:, 1], cells[:, 0]] = _WALL
+    return GridLayer(log_odds=log_odds, resolution_m=_CELL_M, origin_xy_m=plan.origin_xy_m)
+
+
+def _graph(saved: SavedMap) -> PoseGraphLayer:
+    stamps = np.array([submap.stamps_ns[0] for submap in saved.submaps], np.int64)
+    nodes = np.array([planar.to_transform(pose) for pose in saved.T_map_node])
+    motions = np.array([planar.to_transform(edge.T_first_second) for edge in saved.edges])
+    return PoseGraphLayer(
+        stamps_ns=stamps,
+        T_world_base=nodes.reshape(-1, 4, 4),
+        edges=np.array([(edge.first, edge.second) for edge in saved.edges], np.int64).reshape(
+            -1, 2
+        ),
+        T_from_to=motions.reshape(-1, 4, 4),
+        information=np.array([_information(edge.covariance) for edge in saved.edges]).reshape(
+            -1, 6, 6
+        ),
+        is_loop=np.array([edge.kind is Kind.LOOP for edge in saved.edges], bool),
+    )
+
+
+def _information(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    spatial = np.eye(6) * _UNMEASURED
+    axes = np.ix_([0, 1, 5], [0, 1, 5])
+    spatial[axes] = np.linalg.inv(covariance)
+    return spatial

@@ -1,0 +1,79 @@
+"""What a saved map holds, and what is wrong with it, in plain sentences."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sceneslam.atlas.lasting.saved_map import SavedMap
+from sceneslam.atlas.places.floor_plan import CELL_M
+from sceneslam.atlas.submaps.graph import Kind
+from sceneslam.types import planar
+
+_CHI2_3 = 16.27  # of three degrees of freedom, exceeded by one in a thousand
+
+
+def described(saved: SavedMap) -> list[str]:
+    """Return what the map holds, a line per piece."""
+    loops = sum(edge.kind is Kind.LOOP for edge in saved.edges)
+    lines = [
+        f"{len(saved.submaps)} submaps of {saved.runs} runs, {len(saved.edges)} edges, "
+        f"{loops} of them loops"
+    ]
+    for piece in np.unique(saved.pieces).tolist():
+        own = np.flatnonzero(saved.pieces == piece).tolist()
+        plan = saved.plan(piece)
+        modules = sorted({saved.submaps[node].module or "(bridged)" for node in own})
+        rows, columns = plan.free.shape
+        lines.append(
+            f"piece {piece}: {len(own)} submaps by {', '.join(modules)}; "
+            f"{columns * CELL_M:.1f} m x {rows * CELL_M:.1f} m, "
+            f"{plan.free.sum() * CELL_M**2:.1f} m2 free, {len(plan)} wall cells"
+        )
+    return lines
+
+
+def flaws(saved: SavedMap) -> list[str]:
+    """Return a sentence for everything that does not fit together."""
+    found = []
+    for piece in np.unique(saved.pieces).tolist():
+        own = set(np.flatnonzero(saved.pieces == piece).tolist())
+        lost = own - _connected(saved, own)
+        if lost:
+            found.append(f"piece {piece}: no edge connects submaps {_some(lost)} with the rest")
+    for number, edge in enumerate(saved.edges):
+        name = f"edge {number} ({edge.kind.name.lower()}) from {edge.first} to {edge.second}"
+        if saved.pieces[edge.first] != saved.pieces[edge.second]:
+            found.append(f"{name}: its submaps are in two pieces")
+            continue
+        if np.linalg.eigvalsh(edge.covariance).min() <= 0.0:
+            found.append(f"{name}: its covariance is not positive")
+            continue
+        lies = planar.between(saved.T_map_node[edge.first], saved.T_map_node[edge.second])
+        off = planar.between(edge.T_first_second, lies)
+        if float(off @ np.linalg.solve(edge.covariance, off)) > _CHI2_3:
+            found.append(
+                f"{name}: the submaps lie {np.hypot(off[0], off[1]):.2f} m and "
+                f"{abs(np.degrees(off[2])):.1f} degrees from where it was measured"
+            )
+    return found
+
+
+def _connected(saved: SavedMap, own: set[int]) -> set[int]:
+    """Return the submaps that edges lead to from the first of some."""
+    neighbours: dict[int, set[int]] = {node: set() for node in own}
+    for edge in saved.edges:
+        if edge.first in own and edge.second in own:
+            neighbours[edge.first].add(edge.second)
+            neighbours[edge.second].add(edge.first)
+    reached, waiting = set[int](), [min(own)]
+    while waiting:
+        node = waiting.pop()
+        if node not in reached:
+            reached.add(node)
+            waiting += sorted(neighbours[node] - reached)
+    return reached
+
+
+def _some(nodes: set[int]) -> str:
+    names = [str(node) for node in sorted(nodes)]
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
