@@ -11,8 +11,10 @@ from evaluation_runs import first_events, loop, poseless_run, switch_events, swi
 
 from sceneslam.interfaces import ResultSink, Sink
 from sceneslam.sinks.rerun import RerunSink
+from sceneslam.sinks.rerun_legend import legend
 from sceneslam.sinks.rerun_viewer import Viewer
 from sceneslam.types.errors import ConfigError
+from sceneslam.types.files import part_of
 from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Camera, Laser, Rig, Sensor
 from sceneslam.types.truth import GroundTruth
@@ -27,7 +29,7 @@ RIG = Rig(
 def sink_to(path, **changes):
     values = {"viewer": None, "required": False}
     values |= {"image_every": 1, "depth_every": 5, "scan_every": 5}
-    return RerunSink(path, **(values | {"jpeg_quality": 80} | changes))
+    return RerunSink(path, **(values | {"jpeg_quality": 80, "map_colors": "modules"} | changes))
 
 
 def observe(stamp_ns: int) -> Observation:
@@ -61,7 +63,7 @@ def test_recording_holds_images_poses_and_detector_values(tmp_path):
             for event in switch_events(stamp_ns, stamp_ns):
                 sink.write_event(event)
     sink.write_truth(GroundTruth(trajectory=path_of_robot))
-    size = path.stat().st_size
+    size = part_of(path).stat().st_size
     sink.write_result(switched_run())
     sink.close()
     assert path.stat().st_size > size + 20_000  # the map and the errors
@@ -83,7 +85,14 @@ def test_observation_with_nothing_in_it_is_written(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"depth_every": 0}, {"image_every": -1}, {"scan_every": 0}, {"jpeg_quality": 101}]
+    "wrong",
+    [
+        {"depth_every": 0},
+        {"image_every": -1},
+        {"scan_every": 0},
+        {"jpeg_quality": 101},
+        {"map_colors": "red"},
+    ],
 )
 def test_arguments_out_of_range_are_named(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
@@ -164,3 +173,22 @@ def listening_on(port):
     if not table.exists():
         pytest.skip("sockets are not listed here")
     return re.search(rf"([0-9A-F]{{8}}):{port:04X} 00000000:0000 0A", table.read_text())[1]
+
+
+def test_legend_has_a_line_of_its_colour_for_every_name():
+    picture = legend({"bright": (0, 114, 178), "dark": (213, 94, 0)})
+    rows = [picture[16 + 32 * row, 20].tolist() for row in range(2)]
+    assert rows == [[0, 114, 178], [213, 94, 0]]
+    assert picture[:, 52:].any()  # the names
+
+
+def test_tracker_states_do_not_crowd_the_decisions(tmp_path):
+    pytest.importorskip("rerun", reason="the extra `rerun` is not installed")
+    sink, logged = sink_to("run.rrd"), []
+    sink.open(RIG, tmp_path)
+    log = sink._recording.log
+    sink._recording.log = lambda path, *a, **k: logged.append(path) or log(path, *a, **k)
+    for event in ("tracking", "decision"):
+        sink.write_event({"event": event, "stamp_ns": 1, "status": "tracking", "to": "bright"})
+    sink.close()
+    assert logged == ["tracking", "decisions"]

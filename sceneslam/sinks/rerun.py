@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from sceneslam.sinks import rerun_layout as at
 from sceneslam.sinks.rerun_end import write_end
+from sceneslam.sinks.rerun_legend import legend
 from sceneslam.sinks.rerun_sensors import SensorLog
 from sceneslam.sinks.rerun_viewer import Viewer
 from sceneslam.types import se3
@@ -31,6 +32,9 @@ _LEVELS = {
 }
 
 
+_MAP_COLORS = {"modules": at.BY_MODULE, "true": at.AS_SEEN}
+
+
 class RerunSink:
     """Logs a run. Only increments of the trajectory are logged, so that cost does not grow."""
 
@@ -44,14 +48,20 @@ class RerunSink:
         depth_every: int,
         scan_every: int,
         jpeg_quality: int,
+        map_colors: str,
     ) -> None:
         """Get ready to write to the file `path`, or to a viewer.
+
+        `map_colors`: modules (each its own) or true (as the camera saw them), to begin with.
 
         Where the extra `rerun` is not installed nothing is written, or, when it is `required`,
         ConfigError says what to install.
         """
         if (path is None) == (viewer is None):
             raise ConfigError("path", path, "a file, or null with a viewer")
+        if map_colors not in _MAP_COLORS:
+            raise ConfigError("map_colors", map_colors, " | ".join(_MAP_COLORS))
+        self._shown = _MAP_COLORS[map_colors]
         every = {"image": image_every, "depth": depth_every, "scan": scan_every}
         self._sensors = SensorLog(every, jpeg_quality)
         self._path, self._viewer = path, viewer
@@ -71,13 +81,14 @@ class RerunSink:
         # A fixed identity: two runs of one command differ in nothing but the viewer's own stamps.
         name = "sceneslam" if self._path is not None else folder.name
         self._recording = self._rr.RecordingStream("sceneslam", recording_id=name)
+        layout = at.layout(rig, shown=self._shown)
         if self._viewer is not None:
             sys.stderr.write(f"{self._viewer.open()}\n")
-            self._recording.connect_grpc(self._viewer.url, default_blueprint=at.layout(rig))
+            self._recording.connect_grpc(self._viewer.url, default_blueprint=layout)
         else:
             self._file = folder / str(self._path)
             self._file.parent.mkdir(parents=True, exist_ok=True)
-            self._recording.save(part_of(self._file), default_blueprint=at.layout(rig))
+            self._recording.save(part_of(self._file), default_blueprint=layout)
         self._recording.log("world", self._rr.ViewCoordinates.FLU, static=True)
         self._sensors.place(self._recording, rig)
 
@@ -105,7 +116,9 @@ class RerunSink:
         if event["event"] in _LEVELS:
             is_trouble = event.get("status", "tracking") != "tracking"
             level = "WARN" if is_trouble else _LEVELS[event["event"]]
-            recording.log(at.DECISIONS, self._rr.TextLog(_sentence(event), level=level))
+            is_state = event["event"] == "tracking"
+            panel = at.TRACKING if is_state else at.DECISIONS
+            recording.log(panel, self._rr.TextLog(_sentence(event), level=level))
 
     def write_truth(self, truth: GroundTruth) -> None:
         """Keep what is true for the end."""
@@ -162,7 +175,14 @@ class RerunSink:
             recording.log(f"{path}/{previous}", self._rr.Scalars([0.0]))
 
     def _color(self, key: str) -> tuple[int, int, int]:
-        return self._colors.setdefault(key, at.PALETTE_RGB[(len(self._colors) - 1) % 5])
+        """Return a module's colour; a new one is added to the legend."""
+        if key not in self._colors:
+            self._colors[key] = at.PALETTE_RGB[(len(self._colors) - 1) % 5]
+            if self._recording is not None:
+                shown = {name or "bridged": color for name, color in self._colors.items()}
+                picture = legend(shown | {"truth": at.TRUTH_RGB})
+                self._recording.log(at.LEGEND, self._rr.Image(picture), static=True)
+        return self._colors[key]
 
 
 def _import_rerun(required: bool) -> Any:

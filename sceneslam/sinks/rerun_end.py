@@ -54,10 +54,13 @@ def _write_map(recording: rr.RecordingStream, result: RunResult, colors: Colors)
 
     hybrid = result.map
     for number, key in enumerate(hybrid.modules):
-        points = hybrid.points.points[hybrid.point_modules == number]
-        points = points[:: 1 + len(points) // _POINTS_MAX]
-        cloud = rr.Points3D(points, colors=[colors[key]], radii=[0.01])
-        recording.log(f"{at.MAP}/{key}", cloud)
+        chosen = np.flatnonzero(hybrid.point_modules == number)
+        chosen = chosen[:: 1 + len(chosen) // _POINTS_MAX]
+        points, seen_bgr = hybrid.points.points[chosen], hybrid.points.colors_bgr
+        seen = [colors[key]] if seen_bgr is None else seen_bgr[chosen, ::-1]
+        for name, shades in ((at.BY_MODULE, [colors[key]]), (at.AS_SEEN, seen)):
+            cloud = rr.Points3D(points, colors=shades, radii=[0.01])
+            recording.log(f"{name}/{key}", cloud)
     if hybrid.grid is not None:
         walls = rr.Points3D(_walls(hybrid.grid), colors=[at.BRIDGED_RGB], radii=[0.02])
         recording.log(f"{at.MAP}/grid", walls)

@@ -11,7 +11,9 @@ ONLINE, REVISED = "world/trajectory/online", "world/trajectory/revised"
 TRUTH, MAP = "world/ground_truth", "world/map"
 VALUE, VOTES, CONFIRMED, ERRORS = "plots/value", "plots/votes", "plots/confirmed", "plots/error"
 POSTERIOR = "plots/posterior"
-DECISIONS = "decisions"
+DECISIONS, TRACKING = "decisions", "tracking"
+LEGEND = "legend"
+BY_MODULE, AS_SEEN = f"{MAP}/modules", f"{MAP}/true"  # the map's points, in either colours
 TIMELINE = "time"
 
 # Okabe and Ito's palette, as in the figures; grey for poses that no module gave.
@@ -19,8 +21,11 @@ PALETTE_RGB = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230
 BRIDGED_RGB, TRUTH_RGB = (119, 119, 119), (160, 160, 160)
 
 
-def layout(rig: Rig) -> Any:
-    """Return the blueprint: the map beside camera, votes, errors and decisions."""
+def layout(rig: Rig, *, shown: str) -> Any:
+    """Return the blueprint: the map beside camera, votes, errors and decisions.
+
+    `shown`: BY_MODULE or AS_SEEN; the other one is hidden, until its eye is clicked.
+    """
     import rerun.blueprint as rrb
 
     side: list[Any] = []
@@ -33,7 +38,13 @@ def layout(rig: Rig) -> Any:
             rrb.TimeSeriesView(origin=f"/{ERRORS}", name="errors [m]"),
         )
     )
-    side.append(rrb.TextLogView(origin=f"/{DECISIONS}", name="decisions"))
+    side.append(
+        rrb.Tabs(
+            rrb.TextLogView(origin=f"/{DECISIONS}", name="decisions"),
+            rrb.TextLogView(origin=f"/{TRACKING}", name="tracker states"),
+            rrb.Spatial2DView(origin=f"/{LEGEND}", name="colours"),
+        )
+    )
     # The trajectory is logged in steps: show all of them up to the time cursor.
     past = rrb.VisibleTimeRanges(
         timeline=TIMELINE,
@@ -41,7 +52,9 @@ def layout(rig: Rig) -> Any:
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
     seen = ["$origin/**", f"- /{CAMERA}/depth"]  # its cloud would hide the map's colours
-    space = rrb.Spatial3DView(origin="/world", contents=seen, name="map", overrides={ONLINE: past})
+    hidden = AS_SEEN if shown == BY_MODULE else BY_MODULE
+    overrides = {ONLINE: past, hidden: rrb.EntityBehavior(visible=False)}
+    space = rrb.Spatial3DView(origin="/world", contents=seen, name="map", overrides=overrides)
     views = rrb.Horizontal(space, rrb.Vertical(*side), column_shares=[3, 2])
     # Opens at the end, with the whole path in sight.
     at_end = rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following")
