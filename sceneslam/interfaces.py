@@ -200,6 +200,48 @@ class SlamModule(Protocol):
 
 
 @runtime_checkable
+class PipelinedSlam(Protocol):
+    """A SLAM system whose poses come later than their observations.
+
+    `sceneslam.modules.slam.pipelined.Pipelined` makes a `SlamModule` of it. All but `feed` is as
+    there; `local` is the robot's base at the first observation that it is fed.
+    """
+
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return the alternatives of sensors."""
+        ...
+
+    def activate(self, rig: Rig) -> None:
+        """Start anew."""
+        ...
+
+    def set_scene(self, scene: str) -> None:
+        """Hear of the confirmed scene."""
+        ...
+
+    def feed(self, observation: Observation) -> Sequence[Tracking]:
+        """Take an observation; return the poses that are ready by now, by rising stamp.
+
+        None of them ("not yet"), one, or several; each bears the stamp of an observation that was
+        fed and has no pose yet. One that is skipped gets none.
+        """
+        ...
+
+    def get_trajectory(self) -> Trajectory:
+        """Return all poses as best known at the end; empty: those that `feed` returned."""
+        ...
+
+    def get_map(self) -> MapLayers:
+        """Return the map in `local`."""
+        ...
+
+    def shutdown(self) -> None:
+        """Free what `activate` took."""
+        ...
+
+
+@runtime_checkable
 class Restartable(Protocol):
     """A SLAM module that can be activated again after it failed, as it is then built anew."""
 

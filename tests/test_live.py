@@ -110,6 +110,19 @@ def test_error_of_the_source_is_raised_after_what_came_before_it():
     assert len(taken) == 1
 
 
+def test_recording_that_is_read_too_slowly_is_played_later_and_says_so():
+    def slow():
+        for index, observation in enumerate(observations(4, 10**9, image_bgr=IMAGE)):
+            if index == 1:
+                threading.Event().wait(1.2)
+            yield observation
+
+    run = Run(slow())
+    assert len(run.taken) == 4 and max(run.tally.latencies_ms) < 500
+    (behind,) = [one for one in run.events if one["event"] == "behind"]
+    assert behind["by_s"] == pytest.approx(1.19, abs=0.3)
+
+
 def test_interrupted_run_still_knows_what_it_cost():
     tally = LiveTally()
 

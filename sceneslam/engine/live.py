@@ -14,6 +14,7 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.run import Event
 
 _LOOK_S = 0.2  # how late Ctrl-C may be noticed
+_BEHIND_S = 1.0  # a recording that cannot be read in time is played so much later
 _LEAVE_S = 2.0  # a source that does not end by then is left to itself
 
 
@@ -58,7 +59,8 @@ def run_live(
     A `tally` that is given holds that also where the run is interrupted.
 
     Without a `feed` they are a recording's and paced by their stamps. `note` takes what happens to
-    the input: `silent`, `returned`, and what the feed tells. Both run in the thread `bus`, the
+    the input: `silent`, `returned`, `behind` (a recording that cannot be read in time is played
+    so much later), and what the feed tells. Both run in the thread `bus`, the
     source in another. What they raise is raised here; Ctrl-C ends both.
     """
     run = _LiveRun(observations, step, note, settings=settings, feed=feed)
@@ -82,6 +84,8 @@ class _LiveRun:
         self.tally, self._errors = LiveTally(), list[BaseException]()
         self._lag_ns: int | None = None  # clock - stamp / rate, of the first observation
         self._last_ns = 0
+        self._due_at_ns: dict[int, int] = {}  # stamp -> when it was due, of what waits
+        self._behind_s = self._told_behind_s = 0.0  # by which a recording is played later
 
     def carry_out(self) -> LiveTally:
         source = threading.Thread(target=self._guard, args=(self._read,), name="source")
@@ -116,10 +120,27 @@ class _LiveRun:
     def _read(self) -> None:
         """Put every observation into the mailbox when its time has come."""
         for observation in self._observations:
-            wait_s = 0.0 if self._feed else (self._due_ns(observation) - monotonic_ns()) / 1e9
-            if self._is_over.wait(max(wait_s, 0.0)):
+            if not self._feed and not self._await(observation):
                 return
             self._mailbox.put(observation)
+            if self._is_over.is_set():
+                return
+
+    def _await(self, observation: Observation) -> bool:
+        """Wait until a recorded observation is due; return whether the run goes on.
+
+        A recording that is read too slowly is played later from then on: what it loses is not the
+        time that poses take.
+        """
+        elapsed_ns, now_ns = round(observation.stamp_ns / self._settings.rate), monotonic_ns()
+        if self._lag_ns is None:
+            self._lag_ns = now_ns - elapsed_ns
+        behind_s = (now_ns - elapsed_ns - self._lag_ns) / 1e9
+        if behind_s > _BEHIND_S:
+            self._lag_ns = now_ns - elapsed_ns
+            self._behind_s += behind_s
+        self._due_at_ns[observation.stamp_ns] = elapsed_ns + self._lag_ns
+        return not self._is_over.wait(max(-behind_s, 0.0))
 
     def _work(self) -> None:
         """Lead what comes through the bus."""
@@ -144,20 +165,26 @@ class _LiveRun:
                 silent_s = 0.0
             if not self._step(taken):
                 break
-            measured_ns = self._feed.measured_ns(taken) if self._feed else self._due_ns(taken)
+            stamp_ns = taken.stamp_ns
+            measured_ns = (
+                self._feed.measured_ns(taken) if self._feed else self._was_due_ns(stamp_ns)
+            )
             self.tally.latencies_ms.append((monotonic_ns() - measured_ns) / 1e6)
         self._is_over.set()
 
-    def _due_ns(self, observation: Observation) -> int:
-        """Return when a recorded observation is due, on this machine's monotonic clock."""
-        elapsed_ns = round(observation.stamp_ns / self._settings.rate)
-        if self._lag_ns is None:
-            self._lag_ns = monotonic_ns() - elapsed_ns
-        return elapsed_ns + self._lag_ns
+    def _was_due_ns(self, stamp_ns: int) -> int:
+        """Return when a recorded observation was due; forget those before, which were dropped."""
+        due_ns = self._due_at_ns[stamp_ns]
+        for earlier_ns in [one for one in list(self._due_at_ns) if one <= stamp_ns]:
+            del self._due_at_ns[earlier_ns]
+        return due_ns
 
     def _tell_notices(self) -> None:
         for notice in self._feed.notices() if self._feed else ():
             self._note(notice)
+        if self._behind_s > 2 * self._told_behind_s:  # not at every observation of a slow disk
+            self._told_behind_s = self._behind_s
+            self._tell("behind", by_s=self._behind_s)
 
     def _tell(self, event: str, **fields: object) -> None:
         self._note({"event": event, "stamp_ns": self._last_ns, **fields})

@@ -17,6 +17,7 @@ _TOLD_TROUBLES = 5  # of one kind and module; more are summed up
 _OF_INPUT = {  # events of a live run's input -> in words
     "silent": "the source gave nothing for {for_s:g} s",
     "returned": "the source is back",
+    "behind": "the recording was read too slowly, and is played {by_s:.1f} s later",
     "given_up": "the source gave nothing for {for_s:g} s, and the run ended",
     "stream_silent": "{topic} said nothing for {for_s:g} s",
     "stream_returned": "{topic} is back",

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.types import se3
 from sceneslam.types.maps import GridLayer, LandmarkLayer, MapLayers, PointLayer, PoseGraphLayer
-from sceneslam.types.observation import Observation, TrackingStatus
+from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
@@ -25,18 +24,6 @@ _LAYERS = {
 }
 _SKEW_MAX = 1e-3  # as the bus allows
 Layer = TypeVar("Layer")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Answer:
-    """One pose of a program."""
-
-    stamp_ns: int
-    T_local_base: se3.Transform
-    status: TrackingStatus
-    covariance: NDArray[np.float64] | None
-    quality_ratio: float
-    inliers: int
 
 
 def rig_fields(rig: Rig) -> dict[str, NDArray[Any]]:
@@ -68,7 +55,7 @@ def required(answer: Fields) -> tuple[frozenset[Sensor], ...]:
     return tuple(frozenset(known[name] for name in line) for line in lines)
 
 
-def answers(reply: Fields) -> list[Answer]:
+def answers(reply: Fields) -> list[Tracking]:
     """Return the poses of a reply to `track`, none where the program is not that far yet."""
     stamps_ns = _of(reply, "stamps_ns").reshape(-1)
     count = len(stamps_ns)
@@ -78,7 +65,7 @@ def answers(reply: Fields) -> list[Answer]:
     qualities = _optional(reply, "quality_ratio", (count,))
     inliers = _optional(reply, "inliers", (count,))
     return [
-        Answer(
+        Tracking(
             stamp_ns=int(stamps_ns[index]),
             T_local_base=T_local_base[index],
             status=_STATUSES[0] if statuses is None else _status(statuses[index]),

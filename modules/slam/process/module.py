@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from sceneslam.motion.late import Pipeline
 from sceneslam.supervision.limits import Limits
 from sceneslam.supervision.restarted import Restarted
 from sceneslam.types import se3
@@ -20,7 +21,6 @@ from sceneslam.types.run import Command
 from sceneslam.types.trajectory import Trajectory
 
 from .fields import answers, layers, observation_fields, required, rig_fields, trajectory
-from .late import Pipeline
 from .program import Program
 from .protocol import Fields, ProtocolError, text
 

@@ -10,9 +10,6 @@ from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.trajectory import Trajectory
 
-from .fields import Answer
-from .protocol import ProtocolError
-
 
 class Pipeline:
     """Matches answers with observations; the newest pose is carried on by odometry until the next.
@@ -25,7 +22,7 @@ class Pipeline:
         self._late_max_s = late_max_s
         self._waiting: dict[int, se3.Transform | None] = {}  # stamp -> T_odom_base
         self._is_late = False
-        self._newest: Answer | None = None
+        self._newest: Tracking | None = None
         self._T_odom_newest: se3.Transform | None = None
         self._first_ns: int | None = None
         self._T_local_base = se3.identity()  # as reported last
@@ -47,12 +44,12 @@ class Pipeline:
         if self._first_ns is None:
             self._first_ns, self._T_odom_newest = observation.stamp_ns, T_odom_base
 
-    def take(self, answers: Sequence[Answer]) -> None:
-        """Take answers by rising stamp; raises ProtocolError for one that nobody waits for."""
+    def take(self, answers: Sequence[Tracking]) -> None:
+        """Take answers by rising stamp; raises ValueError for one that nobody waits for."""
         for answer in answers:
             if answer.stamp_ns not in self._waiting:
                 given = f"the last was {max(self._waiting, default=None)}"
-                raise ProtocolError(
+                raise ValueError(
                     f"answered for the stamp {answer.stamp_ns}, which is not waiting ({given})"
                 )
             if answer.status is not TrackingStatus.LOST:
@@ -109,7 +106,7 @@ class Pipeline:
         self._T_local_base = se3.orthonormal(T_local_newest @ T_newest_base)
         return TrackingStatus.DEGRADED
 
-    def _keep(self, answer: Answer) -> None:
+    def _keep(self, answer: Tracking) -> None:
         if self._poses:
             T_prev_curr = se3.inverse(self._poses[-1]) @ answer.T_local_base
             gap_s = (answer.stamp_ns - self._stamps_ns[-1]) * 1e-9

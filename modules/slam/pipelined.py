@@ -1,0 +1,63 @@
+"""The `pipelined` SLAM module: a system whose poses come late, several at once, or not yet."""
+
+from __future__ import annotations
+
+from sceneslam.interfaces import PipelinedSlam
+from sceneslam.motion.late import Pipeline
+from sceneslam.types import se3
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.observation import Observation, Tracking
+from sceneslam.types.ranges import check_least
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
+
+
+class Pipelined:
+    """Fulfils `SlamModule` by a `PipelinedSlam`.
+
+    Until the pose of an observation comes, odometry carries the newest one on (constant velocity
+    where there is none), as DEGRADED; after `late_max_s` it is LOST.
+    """
+
+    def __init__(self, system: PipelinedSlam, late_max_s: float) -> None:
+        check_least(0, late_max_s=late_max_s)
+        self._system, self._late_max_s = system, late_max_s
+        self._pipeline, self._revision = Pipeline(late_max_s), 0
+
+    @property
+    def requires(self) -> tuple[frozenset[Sensor], ...]:
+        """Return the system's."""
+        return self._system.requires
+
+    def activate(self, rig: Rig) -> None:
+        """Start anew."""
+        self._pipeline, self._revision = Pipeline(self._late_max_s), 0
+        self._system.activate(rig)
+
+    def set_pose(self, T_map_local: se3.Transform) -> None:
+        """Do nothing: its poses are in `local` wherever that lies."""
+
+    def set_scene(self, scene: str) -> None:
+        """Tell the system."""
+        self._system.set_scene(scene)
+
+    def track(self, observation: Observation) -> Tracking:
+        """Return the pose at the observation; ValueError for poses that nobody waits for."""
+        self._pipeline.note(observation)
+        poses = self._system.feed(observation)
+        self._pipeline.take(poses)
+        self._revision = max((pose.revision for pose in poses), default=self._revision)
+        return self._pipeline.report(observation, self._revision)
+
+    def get_trajectory(self) -> Trajectory:
+        """Return what the system revised, else the poses that came late, if any."""
+        revised = self._system.get_trajectory()
+        return revised if len(revised) else self._pipeline.trajectory()
+
+    def get_map(self) -> MapLayers:
+        """Return the system's map."""
+        return self._system.get_map()
+
+    def shutdown(self) -> None:
+        """Shut the system down."""
+        self._system.shutdown()

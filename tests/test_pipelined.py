@@ -1,0 +1,131 @@
+"""A system that answers late: not yet, several poses at once, and never for what it skips."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fakes import PERIOD_NS, RIG, observation, true_pose
+
+from sceneslam.modules.slam.pipelined import Pipelined
+from sceneslam.testing import check_module
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.observation import Tracking, TrackingStatus
+from sceneslam.types.rig import Sensor
+from sceneslam.types.trajectory import Trajectory
+
+
+class Exact:
+    """Knows the motion exactly, and says it when `ready` of a number of observations is true."""
+
+    requires = (frozenset({Sensor.ODOMETRY}),)
+
+    def __init__(self, ready=lambda index: True, skips=()):
+        self._ready, self._skips = ready, skips
+
+    def activate(self, rig):
+        self._waiting, self._T_odom_first, self._count = [], None, 0
+
+    def set_scene(self, scene):
+        pass
+
+    def feed(self, observation):
+        if observation.T_odom_base is None:
+            return []
+        if self._T_odom_first is None:
+            self._T_odom_first = observation.T_odom_base
+        T_local_base = se3.inverse(self._T_odom_first) @ observation.T_odom_base
+        if self._count not in self._skips:
+            self._waiting.append(
+                Tracking(
+                    stamp_ns=observation.stamp_ns,
+                    T_local_base=T_local_base,
+                    status=TrackingStatus.TRACKING,
+                )
+            )
+        self._count += 1
+        poses, self._waiting = (
+            (self._waiting, []) if self._ready(self._count) else ([], self._waiting)
+        )
+        return poses
+
+    def get_trajectory(self):
+        return Trajectory.empty()
+
+    def get_map(self):
+        return MapLayers()
+
+    def shutdown(self):
+        pass
+
+
+def driven(system, steps=30, late_max_s=0.5, *, has_odometry=True):
+    module = Pipelined(system, late_max_s)
+    module.activate(RIG)
+    return module, [module.track(observation(index)) for index in range(steps)]
+
+
+def assert_true(tracking, atol=1e-9):
+    np.testing.assert_allclose(tracking.T_local_base, true_pose(tracking.stamp_ns), atol=atol)
+
+
+def test_poses_in_time_are_passed_on():
+    _, found = driven(Exact())
+    assert {one.status for one in found} == {TrackingStatus.TRACKING}
+    for one in found:
+        assert_true(one)
+
+
+def test_not_yet_is_bridged_and_several_at_once_are_kept():
+    module, found = driven(Exact(ready=lambda count: count % 4 == 0))
+    assert found[2].status is TrackingStatus.DEGRADED and found[3].status is TrackingStatus.TRACKING
+    for one in found:  # odometry is exact here
+        assert_true(one)
+    trajectory = module.get_trajectory()
+    assert trajectory.stamps_ns.tolist() == [index * PERIOD_NS for index in range(28)]
+
+
+def test_observation_that_is_skipped_gets_no_pose_of_its_own():
+    module, _ = driven(Exact(ready=lambda count: count % 4 == 0, skips=(5, 6)), steps=12)
+    assert set(module.get_trajectory().stamps_ns // PERIOD_NS) == set(range(12)) - {5, 6}
+
+
+def test_pose_that_is_too_late_is_lost_until_it_comes():
+    _, found = driven(Exact(ready=lambda count: count in (1, 20)), steps=22)
+    states = [one.status for one in found]
+    assert states[5] is TrackingStatus.DEGRADED  # 0.5 s of carrying on
+    assert set(states[6:19]) == {TrackingStatus.LOST}
+    assert states[19] is TrackingStatus.TRACKING
+
+
+@pytest.mark.parametrize("stamp_ns", [99 * PERIOD_NS, -1])
+def test_pose_that_nobody_waits_for_is_refused(stamp_ns):
+    class Wrong(Exact):
+        def feed(self, observation):
+            status = TrackingStatus.TRACKING
+            return [Tracking(stamp_ns=stamp_ns, T_local_base=np.eye(4), status=status)]
+
+    with pytest.raises(ValueError, match="not waiting"):
+        driven(Wrong(), steps=2)
+
+
+def test_contract_of_a_slam_module_is_kept_by_a_system_that_is_three_images_late():
+    class Behind(Exact):
+        """Always says what it knew three observations ago."""
+
+        def activate(self, rig):
+            super().activate(rig)
+            self._behind = []
+
+        def feed(self, observation):
+            self._behind += super().feed(observation)
+            poses, self._behind = self._behind[:-3], self._behind[-3:]
+            return poses
+
+    check_module(lambda: Pipelined(Behind(), late_max_s=0.5))
+
+
+def test_impossible_patience_is_refused():
+    with pytest.raises(ConfigError, match="late_max_s"):
+        Pipelined(Exact(), -1.0)
