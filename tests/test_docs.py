@@ -27,13 +27,15 @@ NOT_RUN = {  # first words -> why it is not run here
     "ros2": "needs a robot's ROS",
     "export": "is for the reader's shell",
     "python -m sceneslam doctor source=ros2": "needs a robot; tests of the doctor have one",
+    "python -m sceneslam doctor source=realsense": "needs a camera",
     "mkdocs serve": "serves until it is stopped; the site is built by a test",
     "python -m sceneslam.sweep": "goes on with a sweep; tests of sweeps stop one and do",
     "python experiments/": "takes minutes; its numbers stand beside it, a test finds the program",
 }
-# A viewer stays, a robot is not there: composed only. Tests of these sinks and sources have both.
 RECORDED = "python -m sceneslam +scenario=bright_to_dark"
-SHOWS = re.compile(r"viewer=rerun|source=ros2")
+# A viewer stays, a robot is not there: composed only. Tests of these sinks and sources have both.
+LIVE = re.compile(r"source=(ros2|realsense)")
+SHOWS = re.compile(rf"viewer=rerun|{LIVE.pattern}")
 ASKS = re.compile(r" \+experiment=(?!unswitched)")  # takes minutes; is composed only
 ALL = [(page, command) for page in PAGES for command in commands(page)]
 RUN = [
@@ -80,7 +82,7 @@ def test_command_runs(workshop, monkeypatch, capfd, page, command):
 
 
 @pytest.mark.parametrize(
-    "command", [c for _, c in ALL if ASKS.search(c) or ("source=ros2" in c and "doctor" not in c)]
+    "command", [c for _, c in ALL if ASKS.search(c) or (LIVE.search(c) and "doctor" not in c)]
 )
 def test_what_is_not_run_composes(workshop, monkeypatch, capfd, command):
     monkeypatch.chdir(workshop)
