@@ -17,7 +17,7 @@ FREE = Rig(sensors=frozenset({Sensor.DEPTH}))
 class Drive:
     """A robot that drives, its wheels, and a model that scans teach."""
 
-    def __init__(self, *, noise=0.02, seed=0, rig=WHEELED):
+    def __init__(self, *, noise=0.005, seed=0, rig=WHEELED):
         self.rng = np.random.default_rng(seed)
         self.model = MotionModel(rig)
         self.noise = noise
@@ -33,7 +33,7 @@ class Drive:
         T_true = se3.from_xy_yaw(forward_m, 0.0, turn_rad)
         wheels = np.array([factor * forward_m, 0.0, turn_rad + pull * forward_m])
         amounts = np.array([forward_m, forward_m, turn_rad])
-        wheels += self.noise * np.abs(amounts) * self.rng.standard_normal(3)
+        wheels += self.noise * np.sqrt(np.abs(amounts)) * self.rng.standard_normal(3)
         self.T_odom_base = self.T_odom_base @ se3.from_xy_yaw(*wheels)
         self.stamp_ns += round(PERIOD_S * 1e9)
         motion = self.model.predict(self.observation(gyro))
@@ -53,12 +53,24 @@ def constant_rate(rate_radps, bias_radps=0.0):
 
 def test_wheels_give_the_motion_and_a_covariance_that_grows_with_it():
     drive = Drive(noise=0.0)
-    near_m = drive.step(speed=0.2)
+    near_m = drive.step(speed=0.2, teaches=False)
     near = drive.last.covariance
-    far_m = drive.step(speed=2.0)
+    far_m = drive.step(speed=2.0, teaches=False)
     assert max(near_m, far_m) < 1e-9
     assert drive.last.is_measured
     assert drive.last.covariance[0, 0] > 4.0 * near[0, 0]
+
+
+def test_covariance_of_a_way_does_not_depend_on_how_often_it_is_told():
+    deviations_m = []
+    for count in (5, 100):
+        drive = Drive(noise=0.0)
+        steps = []
+        for _ in range(count):
+            drive.step(speed=1.0 / count / PERIOD_S, rate=0.0, teaches=False)
+            steps.append(drive.last.covariance[0, 0])
+        deviations_m.append(np.sqrt(sum(steps)))
+    assert deviations_m == pytest.approx([WHEELED.wheels.noise_ratio] * 2, rel=0.01)
 
 
 @pytest.mark.parametrize("noise", [0.04, 0.3])
@@ -125,6 +137,14 @@ def test_what_no_scan_sees_teaches_nothing():
         drive.model.learn(se3.from_xy_yaw(0.05, 0.0, 0.02), blind)
     assert drive.model.noise_ratios[0] == pytest.approx(before[0], rel=0.05)
     assert drive.model.lying[0] < 0.1
+
+
+@pytest.mark.parametrize("scale", [0.96, 1.03])
+def test_scale_of_the_wheels_is_learnt(scale):
+    drive = Drive()
+    for _ in range(400):
+        drive.step(factor=scale)
+    assert 1.0 + drive.model.missed_per_metre == pytest.approx(1.0 / scale, abs=0.006)
 
 
 def test_wheels_that_pull_to_one_side_are_corrected():

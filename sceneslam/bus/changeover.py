@@ -18,7 +18,7 @@ from sceneslam.types.observation import Observation
 
 _log = logging.getLogger(__name__)
 _TRIAL_NS = 1_000_000_000  # so long the first choice tracks beside the fallback, to come back
-_DOUBLINGS = 5  # of the time until the first choice is tried again
+_DOUBLINGS = 3  # of the time until the first choice is tried again
 
 
 class Outcome(Enum):
@@ -181,7 +181,7 @@ class Changeover:
             self._end_trial()
 
     def try_on(self, stamp_ns: int) -> None:
-        """Feed the module on trial, if there is one; it ends where it fails or is lost."""
+        """Feed the module on trial, if there is one; it ends where it fails or remains lost."""
         trial = self._trial
         if trial is None or stamp_ns < trial.ready_ns:
             return
@@ -194,7 +194,8 @@ class Changeover:
             self._fault(stamp_ns, str(error))
             self._end_trial()
             return
-        if handover.is_lost:
+        is_given_time = stamp_ns - trial.ready_ns < self._policy.retry_s * 1e9  # to see motion
+        if handover.is_lost and not is_given_time:
             self._end_trial()
 
     def close(self) -> None:

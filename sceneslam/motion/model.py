@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.motion.distance_error import DistanceError
 from sceneslam.motion.trust import LieDetector, NoiseRatio, evidence_of_a_lie
 from sceneslam.motion.turn_errors import TurnErrors
 from sceneslam.types import se3
@@ -58,7 +59,7 @@ class _Step:
 
     T: Transform
     variance: NDArray[np.float64]  # (2,) [m^2, rad^2]
-    amounts: NDArray[np.float64]  # (2,): what its noise is a ratio of
+    amounts: NDArray[np.float64]  # (2,) [m, rad]: what the variance of its noise grows with
     causes: NDArray[np.float64]  # (3,): metres, radians, seconds, of the turn's systematic error
 
     def then(self, step: _Step) -> _Step:
@@ -66,7 +67,7 @@ class _Step:
         return _Step(
             T=self.T @ step.T,
             variance=self.variance + step.variance,
-            amounts=np.sqrt(self.amounts**2 + step.amounts**2),
+            amounts=self.amounts + step.amounts,
             causes=self.causes + step.causes,
         )
 
@@ -95,6 +96,7 @@ class MotionModel:
         self._noise = [NoiseRatio(rig.wheels.noise_ratio) for _ in range(2)]  # distance, turn
         self._lies = [LieDetector() for _ in range(2)]
         self._turns = TurnErrors(rig.gyro.bias_radps)
+        self._distance = DistanceError(rig.wheels.drift_ratio)
         self._twist_s: NDArray[np.float64] | None = None  # motion per second, as last measured
         self._twist_variance = np.zeros(2)
         self._unmeasured_s = np.zeros(2)  # for so long nothing measured it: distance, turn
@@ -110,8 +112,13 @@ class MotionModel:
 
     @property
     def noise_ratios(self) -> NDArray[np.float64]:
-        """Return the wheels' deviation per metre and per radian (2,), as learnt so far."""
+        """Return the wheels' deviation after a metre and after a radian (2,), as learnt so far."""
         return np.array([noise.ratio for noise in self._noise])
+
+    @property
+    def missed_per_metre(self) -> float:
+        """Return what the wheels' distance misses per metre, as learnt so far."""
+        return self._distance.ratio
 
     @property
     def lying(self) -> NDArray[np.float64]:
@@ -206,6 +213,10 @@ class MotionModel:
                     variance=variance,
                     share=max(1.0 - self._lies[channel].lying, _TAUGHT_MIN) / len(R),
                 )
+        if self._lies[0].lying < _BELIEVED:
+            self._distance.learn(
+                float(off[0]), float(wheels.T[0, 3]), float(wheels.variance[0] + measured[0, 0])
+            )
         if self._lies[1].lying < _BELIEVED:
             self._turns.learn(
                 float(off[2]), wheels.causes, float(wheels.variance[1] + measured[2, 2])
@@ -278,9 +289,10 @@ class MotionModel:
             [distance_m + _METRE_PER_TURN * angle_rad, angle_rad + _TURN_PER_METRE * distance_m]
         )
         missed_rad = self._turns.of_wheels(forward_m, yaw_rad)
+        position_m = T_prev_curr[:3, 3] * (1.0 + self._distance.ratio)
         return _Step(
-            T=T_prev_curr @ se3.from_xy_yaw(0.0, 0.0, missed_rad),
-            variance=(self.noise_ratios * amounts) ** 2 + self._floors**2,
+            T=se3.from_parts(T_prev_curr[:3, :3], position_m) @ se3.from_xy_yaw(0, 0, missed_rad),
+            variance=self.noise_ratios**2 * amounts + self._floors**2,
             amounts=amounts,
             causes=np.array([forward_m, yaw_rad, 0.0]),
         )

@@ -18,11 +18,13 @@ _LYING_MAX = 0.999
 
 @dataclass(slots=True)
 class NoiseRatio:
-    """The standard deviation of an error per amount of motion, learnt robustly.
+    """The standard deviation of an error after a metre (or a radian), learnt robustly.
 
-    An error is normal with variance floor^2 + (ratio * amount)^2; ratio^2 has an inverse gamma
-    posterior over the newest comparisons. What the comparison itself is off by is taken out by
-    expectation maximisation; outliers count less, as under Student's distribution.
+    An error is normal with variance floor^2 + ratio^2 * amount, whatever the steps are in which
+    the way is told (Siegwart and Nourbakhsh, "Introduction to Autonomous Mobile Robots", 2004,
+    Eq. 5.6); ratio^2 has an inverse gamma posterior over the newest comparisons. What the
+    comparison itself is off by is taken out by expectation maximisation; outliers count less, as
+    under Student's distribution.
     """
 
     ratio: float
@@ -38,7 +40,7 @@ class NoiseRatio:
         self, missed: float, amount: float, *, floor: float, variance: float, share: float
     ) -> None:
         """Take in an error that was measured with a variance of its own; `share`: 0 to 1 of it."""
-        moved = (self.ratio * amount) ** 2
+        moved = self.ratio**2 * amount
         noise = floor**2 + moved
         if moved <= 0.0:
             return
@@ -50,7 +52,7 @@ class NoiseRatio:
         weight = share * gain * part
         kept = 1.0 - weight / self.memory
         total = kept * self._count + weight
-        self._square = (kept * self._count * self._square + weight * square / amount**2) / total
+        self._square = (kept * self._count * self._square + weight * square / amount) / total
         self._count = total
         self.ratio = math.sqrt(self._square)
 

@@ -91,8 +91,8 @@ class Lidar:
 class Wheels:
     """How far wheel odometry is off, as standard deviations, before anything is learnt of it."""
 
-    noise_ratio: float = 0.1  # per metre and per radian; and half as many radians per metre
-    drift_ratio: float = 0.02  # of that, what goes on alike and does not average out
+    noise_ratio: float = 0.07  # m after a metre, rad after a radian; it grows with the root of them
+    drift_ratio: float = 0.02  # per metre and radian: what goes on alike and does not average out
     drift_rad_per_m: float = 0.01
     floor_m: float = 0.0005  # of any step: encoders tick
     floor_rad: float = 0.0005

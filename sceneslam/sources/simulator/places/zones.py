@@ -36,6 +36,9 @@ from sceneslam.sources.simulator.places.surfaces import (
 )
 from sceneslam.sources.simulator.places.zone_kind import Kind, Pictures
 
+# Wheels turn in vain where a robot crosses what is wet or lies loose: a metre or so each time. A
+# dry floor, polished or not, takes a few per cent at most (rolling resistance is a fiftieth of the
+# weight, and rubber slips by as little below a third of what it holds).
 ROWS_APART_M = 20.0  # the two rows of zones, from door to door
 _RAMP_DEG = 8.0
 _RAMP_M = 4.0  # from the foot to the landing, level
@@ -113,7 +116,7 @@ def hall() -> Kind:
         lamps=tuple((float(x), float(y), 1.5, 0.4) for x in (3, 8, 13, 17) for y in (-5, 0, 5)),
         power=9.0,
         has_polished_floor=True,
-        slippery=(((8.0, 12.5), (-3.0, -0.9), 0.3), ((7.0, 10.0), (0.0, 3.0), 0.3)),
+        slippery=(((10.0, 11.0), (-3.0, -0.6), 0.3), ((7.0, 10.0), (0.9, 1.6), 0.3)),
     )
 
 
@@ -179,12 +182,12 @@ def atrium() -> Kind:
         ceiling=None,
         pictures={"north": bricks, "west": ends, "east": ends},
         windows={"south": (1.5, 1.9, 9.0, 2.1)},
-        slippery=(((3.5, 8.5), (-4.0, 1.0), 0.3),),
+        slippery=(((5.6, 6.4), (-4.0, 1.0), 0.3),),
     )
 
 
 def store() -> Kind:
-    """Return the store room, its lights off: black but for noise; foil on its floor."""
+    """Return the store room, its lights off: black but for noise; sheets of foil on its floor."""
     return Kind(
         name="store",
         size_m=(12.0, 6.0, 2.5),
@@ -198,7 +201,7 @@ def store() -> Kind:
         lamps=tuple((x_m, 0.0, 1.2, 0.3) for x_m in (2.0, 6.0, 10.0)),
         power=6.0,
         is_lit=False,
-        slippery=(((3.0, 7.6), (-2.0, 2.0), 0.35),),
+        slippery=(((3.2, 4.4), (-2.0, 2.0), 0.35), ((6.2, 7.4), (-2.0, 2.0), 0.35)),
     )
 
 

@@ -1,0 +1,34 @@
+"""The systematic error of the wheels' distance, learnt: tyres are known to a few per cent.
+
+The scale alone of Censi, Franchi, Marchionni and Oriolo, "Simultaneous calibration of odometry and
+sensor parameters for mobile robots", T-RO 2013.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+_DRIFT = 1e-3  # by which share of its start the deviation grows with each comparison: tyres wear
+_OUTLIER = 3.0  # deviations: beyond, an error is none of a tyre's
+
+
+@dataclass(slots=True)
+class DistanceError:
+    """A Kalman filter of what wheels miss per metre that they tell."""
+
+    deviation: float  # before anything is learnt
+    ratio: float = field(default=0.0, init=False)
+    _variance: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._variance = self.deviation**2
+
+    def learn(self, missed_m: float, forward_m: float, variance_m2: float) -> None:
+        """Take in by how much `forward_m` by the wheels missed a measured way, and its variance."""
+        self._variance += (_DRIFT * self.deviation) ** 2
+        innovation_m2 = self._variance * forward_m**2 + variance_m2
+        limit_m = _OUTLIER * math.sqrt(innovation_m2)
+        gain = self._variance * forward_m / innovation_m2
+        self.ratio += gain * min(max(missed_m, -limit_m), limit_m)
+        self._variance *= 1.0 - gain * forward_m
