@@ -53,14 +53,15 @@ def single_pose() -> RunResult:
 
 def test_all_figures_of_a_switched_run_are_drawn(tmp_path):
     names = draw(tmp_path, switched_run(), true_loop(), reference=loop(200))
-    assert names == ["map", "timeline", "grey_mean", "error", "error_path", "pose", "difference"]
+    drawn = ["map", "view", "timeline", "grey_mean", "error", "error_path", "pose", "difference"]
+    assert names == drawn
 
 
 def test_a_path_that_is_small_in_the_map_is_drawn_apart(tmp_path):
     wide, run = hybrid_map(), switched_run()
     far = replace(wide.points, points=20.0 * wide.points.points)
     names = draw(tmp_path, replace(run, map=replace(wide, points=far, grid=None)), true_loop())
-    assert names == ["map", "path", "timeline", "grey_mean", "error", "error_path", "pose"]
+    assert names == ["map", "path", "view", "timeline", "grey_mean", "error", "error_path", "pose"]
 
 
 def test_the_page_is_named_after_its_recording_and_says_when_no_truth_is_known(tmp_path):
@@ -118,12 +119,12 @@ def test_limits_of_rules_are_read_with_their_named_values():
 
 
 def test_figures_without_truth_leave_out_the_error(tmp_path):
-    assert draw(tmp_path, switched_run(), None) == ["map", "timeline", "grey_mean", "pose"]
+    assert draw(tmp_path, switched_run(), None) == ["map", "view", "timeline", "grey_mean", "pose"]
 
 
 def test_figures_with_truth_of_another_time_leave_out_the_error(tmp_path):
     late = GroundTruth(trajectory=loop(200, START_NS + 10**12))
-    assert draw(tmp_path, switched_run(), late) == ["map", "timeline", "grey_mean", "pose"]
+    assert draw(tmp_path, switched_run(), late) == ["map", "view", "timeline", "grey_mean", "pose"]
 
 
 def test_run_without_images_has_no_grey_mean(tmp_path):
@@ -148,12 +149,12 @@ def test_figures_survive_two_million_points_and_14_thousand_poses(tmp_path):
     count = 14_000
     run = replace(switched_run(count, 6000, 7000), map=hybrid_map(2_000_000))
     names = draw(tmp_path, run, true_loop(count, 6000))
-    assert names == ["map", "timeline", "grey_mean", "error", "error_path", "pose"]
+    assert names == ["map", "view", "timeline", "grey_mean", "error", "error_path", "pose"]
 
 
 def test_report_opens_alone_and_embeds_every_figure(tmp_path):
     html = report(tmp_path, switched_run(), true_loop(), reference=loop(200))
-    assert html.count("<svg ") == 7
+    assert html.count("<svg ") == 8
     links = re.findall(r"(?:src|href)=\"(?!data:|#)", html)
     assert not links
     assert "http" not in re.sub(r"base64,[^\"]*", "", html)

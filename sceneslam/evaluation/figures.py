@@ -18,6 +18,7 @@ from sceneslam.evaluation.figure_features import Limits, draw_features
 from sceneslam.evaluation.figure_map import draw_map, draw_path
 from sceneslam.evaluation.figure_pose import draw_error_path, draw_pose
 from sceneslam.evaluation.figure_time import draw_posterior, draw_series, draw_timeline, draw_votes
+from sceneslam.evaluation.figure_view import draw_view
 from sceneslam.types import se3
 from sceneslam.types.errors import told
 from sceneslam.types.run import RunResult
@@ -54,9 +55,9 @@ def write_figures(
 
     A figure that fails (no memory is left, say) is left out, with a sentence in `faults`.
 
-    `map`, `path` (where it is small in the map), `timeline`, `grey_mean`, `posterior` (of a
-    Bayes filter), `features` (of rules, with their `limits`), `error` and `error_path` (with
-    ground truth), `pose`, `difference` (with a reference).
+    `map`, `path` (where it is small in the map), `view` (with points), `timeline`, `grey_mean`,
+    `posterior` (of a Bayes filter), `features` (of rules, with their `limits`), `error` and
+    `error_path` (with ground truth), `pose`, `difference` (with a reference).
     """
     folder.mkdir(parents=True, exist_ok=True)
     true = truth.trajectory if truth else Trajectory.empty()
@@ -66,6 +67,7 @@ def write_figures(
     drawn: dict[str, Callable[[], Any]] = {
         "map": lambda: draw_map(result, truth, T_map_gt),
         "path": lambda: draw_path(result, truth, T_map_gt),
+        "view": lambda: draw_view(result),
         "timeline": lambda: draw_timeline(result, truth),
         "grey_mean": lambda: draw_votes(result, truth, threshold, value_label),
         "posterior": lambda: draw_posterior(result, truth),

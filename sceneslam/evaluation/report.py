@@ -27,6 +27,8 @@ _CAPTIONS = {
     "map": "The map from above: occupancy grid in grey, points and trajectory in the colour of "
     "the module that gave them, ground truth dashed.",
     "path": "The same, as near as the path allows.",
+    "view": "The map from above and one side, with the path. Points have the colour that the "
+    "camera saw, else that of their module.",
     "timeline": "Which module gave the poses. Hatched: degraded, it tracks with less hold than it "
     "needs and is less certain; crossed: lost, it has no pose.",
     "grey_mean": "What the detector measured. Shading: the true scene, where it is known; "
