@@ -129,3 +129,8 @@ def test_contract_of_a_slam_module_is_kept_by_a_system_that_is_three_images_late
 def test_impossible_patience_is_refused():
     with pytest.raises(ConfigError, match="late_max_s"):
         Pipelined(Exact(), -1.0)
+
+
+def test_system_of_another_kind_is_refused():
+    with pytest.raises(ConfigError, match="system"):
+        Pipelined("my_slam.MyPipeline", 0.5)

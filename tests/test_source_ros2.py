@@ -14,9 +14,9 @@ from omegaconf import OmegaConf
 from sceneslam.ros import names
 from sceneslam.ros.encode import Encoder
 from sceneslam.ros.transport.transport import Arrival
+from sceneslam.sources.live.clock import Order, StampClock
+from sceneslam.sources.live.inbox import Inbox
 from sceneslam.sources.ros2 import source as under_test
-from sceneslam.sources.ros2.clock import Order, StampClock
-from sceneslam.sources.ros2.inbox import Inbox
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import LaserScan

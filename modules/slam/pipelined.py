@@ -5,6 +5,7 @@ from __future__ import annotations
 from sceneslam.interfaces import PipelinedSlam
 from sceneslam.motion.late import Pipeline
 from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking
 from sceneslam.types.ranges import check_least
@@ -20,6 +21,8 @@ class Pipelined:
     """
 
     def __init__(self, system: PipelinedSlam, late_max_s: float) -> None:
+        if not isinstance(system, PipelinedSlam):
+            raise ConfigError("system", system, "a sceneslam.interfaces.PipelinedSlam")
         check_least(0, late_max_s=late_max_s)
         self._system, self._late_max_s = system, late_max_s
         self._pipeline, self._revision = Pipeline(late_max_s), 0

@@ -35,6 +35,11 @@ class Arrival:
     cdr: bytes  # with its four bytes of header
     arrived_ns: int  # CLOCK_MONOTONIC
 
+    @property
+    def size(self) -> int:
+        """Return the message's bytes."""
+        return len(self.cdr)
+
 
 Heard = Callable[[Arrival], None]
 

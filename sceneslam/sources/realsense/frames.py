@@ -30,6 +30,16 @@ class Frame:
     stamp_ns: int  # the camera's, or this machine's where the SDK translates it
     arrived_ns: int  # CLOCK_MONOTONIC
 
+    @property
+    def topic(self) -> str:
+        """Return the name of its stream."""
+        return str(self.sensor.value)
+
+    @property
+    def size(self) -> int:
+        """Return its bytes."""
+        return int(self.frame.get_data_size())
+
 
 Take = Callable[[Frame], None]
 

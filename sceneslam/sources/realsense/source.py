@@ -9,25 +9,23 @@ from time import monotonic_ns
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.interfaces import LiveFeed
 from sceneslam.ros.pixels import locked
 from sceneslam.sources.intrinsics import checked_above_zero, checked_range_m
-from sceneslam.sources.realsense.frames import OpenCamera, Wanted
+from sceneslam.sources.live.clock import Order
+from sceneslam.sources.live.inbox import Inbox
+from sceneslam.sources.live.measuring import Measuring
+from sceneslam.sources.live.streams import Streams
+from sceneslam.sources.realsense.frames import Frame, OpenCamera, Wanted
 from sceneslam.sources.realsense.pairing import Paired, Pairing, samples_of
-from sceneslam.sources.realsense.waiting import Waiting
-from sceneslam.sources.ros2.clock import Order, StampClock
-from sceneslam.sources.ros2.streams import Streams
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError, told
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor, optical_to_rep103
-from sceneslam.types.run import Event
-from sceneslam.types.truth import GroundTruth
 
 _TICK_S = 0.1  # how late a silence may be noticed
 
 
-class RealSense:
+class RealSense(Measuring):
     """Gives one observation per colour image, with the depth of the same instant.
 
     A camera that falls silent, or is unplugged, is opened again as soon as it is there. `mount` is
@@ -44,6 +42,7 @@ class RealSense:
         mount: Mapping[str, Sequence[float]],
         silent_after_s: float,
     ) -> None:
+        super().__init__()
         if len(size_wh) != 2:
             raise ConfigError("size_wh", size_wh, "[width, height] [px]")
         checked_above_zero("rate_hz", rate_hz)
@@ -57,9 +56,7 @@ class RealSense:
         )
         self._silent_after_s = silent_after_s
         self._tolerance_ns = round(0.5e9 / rate_hz)
-        self._waiting = Waiting()
-        self._clock = StampClock()
-        self._streams: Streams | None = None
+        self._waiting: Inbox[Frame] = Inbox()
         self._device: OpenCamera | None = None
         self._faults: list[str] = []
 
@@ -77,31 +74,9 @@ class RealSense:
         return self._rig
 
     @property
-    def length(self) -> int | None:
-        """Return None: nobody knows how long it will last."""
-        return None
-
-    @property
     def faults(self) -> Sequence[str]:
         """Return why the camera could not be opened again, if so."""
         return tuple(self._faults)
-
-    @property
-    def live(self) -> LiveFeed | None:
-        """Return itself."""
-        return self
-
-    def ground_truth(self) -> GroundTruth | None:
-        """Return None: nobody knows."""
-        return None
-
-    def measured_ns(self, observation: Observation) -> int:
-        """Return when an observation was measured, by the monotonic clock."""
-        return self._clock.measured_ns(observation.stamp_ns)
-
-    def notices(self) -> Sequence[Event]:
-        """Return what happened to the streams since the last call."""
-        return self._streams.notices() if self._streams is not None else ()
 
     def close(self) -> None:
         """Stop the camera and end the iteration."""

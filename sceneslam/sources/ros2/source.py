@@ -7,7 +7,6 @@ from dataclasses import replace
 from time import monotonic_ns
 from typing import Any
 
-from sceneslam.interfaces import LiveFeed
 from sceneslam.ros import decode
 from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.ros.pixels import DepthUnits
@@ -18,17 +17,17 @@ from sceneslam.sources.bag_rig import Given, make_rig, picture_size_wh, place, s
 from sceneslam.sources.bag_topics import NONE, TYPES, choose_topics, first
 from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.sources.intrinsics import checked_above_zero, given_intrinsics, given_range_m
-from sceneslam.sources.ros2.clock import Order, StampClock
+from sceneslam.sources.live.clock import Order
+from sceneslam.sources.live.inbox import Inbox
+from sceneslam.sources.live.measuring import Measuring
+from sceneslam.sources.live.streams import Streams
 from sceneslam.sources.ros2.heard import Heard
-from sceneslam.sources.ros2.inbox import Inbox
-from sceneslam.sources.ros2.streams import Streams
 from sceneslam.sources.survey.bag_sample import survey_recording
 from sceneslam.sources.survey.survey import Survey
 from sceneslam.sources.synchronise import Bundle, Sample, Synchroniser
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor, Wheels
-from sceneslam.types.truth import GroundTruth
 
 _TICK_S = 0.1  # how late a silence may be noticed
 _PATIENCE_S = 0.05  # an image waits so long for odometry of its instant: 20 Hz, as robots send it
@@ -45,7 +44,7 @@ _USUAL = {  # a RealSense camera's and a robot's names; other topics are found b
 }
 
 
-class Ros2:
+class Ros2(Measuring):
     """Gives one observation per message of the first of image, depth, points, scan, odometry.
 
     Where that falls silent, the next one takes its place until it is back. `topics` as for a bag.
@@ -70,6 +69,7 @@ class Ros2:
         silent_after_s: float,
         wheels: Mapping[str, float] | None,
     ) -> None:
+        super().__init__()
         for key, value in (
             ("depth_scale", depth_scale),
             ("sync_tolerance_s", sync_tolerance_s),
@@ -95,8 +95,7 @@ class Ros2:
         self._network = Network(transport=transport, domain_id=domain_id, discovery=discovery)
         self._faults = FaultLog()
         self._transport: Transport | None = None
-        self._inbox, self._clock = Inbox(), StampClock()
-        self._streams: Streams | None = None
+        self._inbox: Inbox[Arrival] = Inbox()
         self.heard = Heard()
 
     @property
@@ -110,19 +109,9 @@ class Ros2:
         return self._rig
 
     @property
-    def length(self) -> int | None:
-        """Return None: nobody knows how long it will last."""
-        return None
-
-    @property
     def faults(self) -> Sequence[str]:
         """Return what was wrong with single messages."""
         return self._faults.sentences()
-
-    @property
-    def live(self) -> LiveFeed | None:
-        """Return itself."""
-        return self
 
     def survey(self) -> Survey:
         """Return what was heard at the beginning."""
@@ -135,18 +124,6 @@ class Ros2:
             unplaced=self._unplaced(),
             silent=sorted(self.heard.announced.keys() - self.heard.topics.keys()),
         )
-
-    def ground_truth(self) -> GroundTruth | None:
-        """Return None: nobody knows."""
-        return None
-
-    def measured_ns(self, observation: Observation) -> int:
-        """Return when an observation was measured, by the monotonic clock."""
-        return self._clock.measured_ns(observation.stamp_ns)
-
-    def notices(self) -> Sequence[Any]:
-        """Return what happened to the topics since the last call."""
-        return self._streams.notices() if self._streams is not None else ()
 
     def close(self) -> None:
         """Leave the domain and end the iteration."""

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from sceneslam.sources.bag_observation import PRIMARY
-from sceneslam.sources.ros2.clock import Lined, Order
+from sceneslam.sources.live.clock import Lined, Order
 from sceneslam.types.rig import Sensor
 from sceneslam.types.run import Event
 

@@ -1,0 +1,1 @@
+"""What sources that measure now share: their clocks, their silences, and what waits."""
