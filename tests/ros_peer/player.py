@@ -21,6 +21,7 @@ import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Imu, LaserScan
 from std_msgs.msg import Bool, String
 from tf_type import TFMessage
@@ -47,8 +48,10 @@ def play(path, plan):
     """Play; return when the recording's first message was stamped, and how late messages left."""
     rclpy.init()
     node = rclpy.create_node("robot")
+    rate = float(plan.get("rate", 1.0))
     drive, fixed = _read(path)
-    robot = _Robot(node, drive, rate=float(plan.get("rate", 1.0)), steps=plan.get("steps", ()))
+    drive = [_slowed(one, rate) for one in drive]
+    robot = _Robot(node, drive, rate=rate, steps=plan.get("steps", ()))
     latched = [node.create_publisher(TFMessage, TF_STATIC, LATCHED) for _ in fixed]
     for publisher, data in zip(latched, fixed, strict=True):
         publisher.publish(data)
@@ -79,6 +82,18 @@ def _read(path):
     return drive, fixed
 
 
+def _slowed(one, rate):
+    """Return a message as a robot that drives at a part of the speed would have measured it."""
+    at_ns, topic, kind, data = one
+    if SENSORS[kind] is not Imu or rate == 1.0:
+        return one
+    message = deserialize_message(data, Imu)
+    turn, push = message.angular_velocity, message.linear_acceleration
+    turn.x, turn.y, turn.z = turn.x * rate, turn.y * rate, turn.z * rate
+    push.x, push.y = push.x * rate**2, push.y * rate**2
+    return at_ns, topic, kind, serialize_message(message)
+
+
 class _Robot:
     def __init__(self, node, drive, *, rate, steps):
         self._node, self._drive, self.rate = node, drive, rate
@@ -102,7 +117,7 @@ class _Robot:
         while not poses and time.monotonic() < until_s:
             self.began_ns, began_s = time.time_ns(), time.monotonic()
             for at_ns, topic, _, data in beginning:
-                due_s = began_s + (at_ns - self.first_ns) / 1e9
+                due_s = began_s + (at_ns - self.first_ns) / 1e9 / self.rate
                 while time.monotonic() < due_s:
                     rclpy.spin_once(self._node, timeout_sec=max(due_s - time.monotonic(), 0))
                 self._publish(topic, data)
