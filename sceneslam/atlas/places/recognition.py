@@ -9,7 +9,10 @@ from sceneslam.atlas.places.plan_search import PlanSearch, Window, is_apart
 from sceneslam.atlas.places.registration import Registration, register
 
 _SCORE_MIN = 0.3  # of the coarse search, whose cells are three of the plan's
-_CANDIDATES = 24  # that are refined
+_CANDIDATES = 24  # that are refined, at most ...
+_LIKELY_RATIO = (
+    0.6  # ... of this share of the best score; a rival has 0.85, off by a cell of 0.15 m
+)
 _RIVAL_RATIO = 0.85  # a second place that fits as well as this share of the best is as likely
 _POINTS_MIN = 40  # two metres of wall: less may stand anywhere
 _KNOWN_MIN = 0.6  # of the walls: where most is unknown, nothing is recognized
@@ -55,7 +58,8 @@ class Recognizer:
             return [register(query, self.field, window.around)]
         points = query.plan.points.astype(np.float64)
         peaks = self._search.find(points, window, score_min=_SCORE_MIN, most=_CANDIDATES)
-        return [register(query, self.field, peak.T_target_query) for peak in peaks]
+        likely = [peak for peak in peaks if peak.score >= _LIKELY_RATIO * peaks[0].score]
+        return [register(query, self.field, peak.T_target_query) for peak in likely]
 
 
 def _worth(one: Registration) -> float:

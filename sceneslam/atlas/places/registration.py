@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from sceneslam.types.planar import Matrix, Planar
 
 _KERNELS_M = (0.4, 0.2, 0.1)  # of the robust weight: coarse to fine
 _ITERATIONS = 10  # at most, per kernel
+_FEW, _HOPELESS = 120, 0.5  # walls for the first kernel; a start that leaves half of them far off
 _CONVERGED = np.array([1e-4, 1e-4, 5e-5])  # m, m, rad
 _INLIER_M = 0.1  # two cells
 _NOISE_MIN_M = CELL_M / np.sqrt(12.0)  # a point is somewhere in its cell
@@ -50,16 +51,25 @@ class Registration:
 def register(query: PlanField, target: PlanField, start: Planar) -> Registration:
     """Return where the query lies, from a start within about half a metre and 0.2 rad."""
     walls = _Walls.of(query)
-    pose = planar.compose(start, walls.T_query_centre)
-    for kernel_m in _KERNELS_M:
-        for _ in range(_ITERATIONS):
-            H, g, _, _ = _equations(walls, target, pose, kernel_m)
-            H, _ = _held(H, walls.spread_m)
-            step = -np.linalg.pinv(H, rcond=1e-9, hermitian=True) @ g
-            pose = planar.compose(pose, step)
-            if np.all(np.abs(step) < _CONVERGED):
-                break
+    few, pose = walls.thinned(), planar.compose(start, walls.T_query_centre)
+    pose = _refined(few, target, pose, _KERNELS_M[0])
+    far_m = target.nearest(planar.apply(pose, few.points)).distance_m
+    if (far_m <= _KERNELS_M[0]).mean() >= _HOPELESS:
+        for kernel_m in _KERNELS_M[1:]:
+            pose = _refined(walls, target, pose, kernel_m)
     return _judged(query, walls, target, pose)
+
+
+def _refined(walls: _Walls, target: PlanField, pose: Planar, kernel_m: float) -> Planar:
+    """Return the pose of the centre after Gauss-Newton with a robust weight."""
+    for _ in range(_ITERATIONS):
+        H, g, _, _ = _equations(walls, target, pose, kernel_m)
+        H, _ = _held(H, walls.spread_m)
+        step = -np.linalg.pinv(H, rcond=1e-9, hermitian=True) @ g
+        pose = planar.compose(pose, step)
+        if np.all(np.abs(step) < _CONVERGED):
+            break
+    return pose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -81,6 +91,11 @@ class _Walls:
             T_query_centre=np.array([*centre, 0.0]),
             spread_m=max(float(np.sqrt(((points - centre) ** 2).sum(axis=1).mean())), CELL_M),
         )
+
+    def thinned(self) -> _Walls:
+        """Return every so many of the walls: for a start, more of them tell nothing new."""
+        stride = max(1, len(self.points) // _FEW)
+        return replace(self, points=self.points[::stride], normals=self.normals[::stride])
 
 
 def _equations(
