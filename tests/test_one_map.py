@@ -1,5 +1,6 @@
 """One map of all modules and runs: places recognized, loops closed, maps that last."""
 
+from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
@@ -180,6 +181,52 @@ def test_a_run_finds_itself_in_a_loaded_map_and_its_poses_lie_in_it(saved, tmp_p
     assert drive.errors_m(true, map_of(first)).max() < 0.05
     both = load_map_files(tmp_path / "map")
     assert both.runs == 2 and set(both.pieces.tolist()) == {0}
+
+
+class Immediate:
+    """An executor that is never late."""
+
+    def __init__(self, _workers):
+        pass
+
+    def submit(self, function, *args):
+        future = Future()
+        future.set_result(function(*args))
+        return future
+
+    def shutdown(self):
+        pass
+
+
+def test_a_live_run_looks_for_itself_and_saves_beside_its_poses(saved, tmp_path, monkeypatch):
+    for module in ("mapper", "lasting.lasting_map"):
+        monkeypatch.setattr(f"sceneslam.atlas.{module}.ThreadPoolExecutor", Immediate)
+    folder, first = saved
+    true = through([(7.3, 0.9), (9.2, 1.0), (9.3, 2.0), (5.2, 2.0), (3.2, 0.9), (5.3, 0.9)])
+    live = atlas(load=str(folder), save=str(tmp_path / "map"), save_every_s=2.0)
+    drive = Drive(live, is_live=True).go(world(flat(), 5), true)
+    assert drive.faults == [] and len(drive.of_kind("relocalized")) == 1
+    assert drive.errors_m(true, map_of(first)).max() < 0.05
+    assert load_map_files(tmp_path / "map").runs == 2
+
+
+def test_the_grid_of_a_run_that_was_found_is_that_of_the_whole_map(saved):
+    folder, first = saved
+    true = through([(0.6, 2.6), (3.0, 2.4), (3.2, 0.8)])  # of one room
+    alone = Drive(atlas()).go(world(flat(), 7), true).atlas.fuse_maps()
+    drive = Drive(atlas(load=str(folder))).go(world(flat(), 7), true)
+    grid = drive.atlas.fuse_maps().grid
+    assert alone.grid is None  # dead reckoning draws none
+    at = planar.compose(map_of(first), np.array([9.5, 3.5, 0.0]))[:2]  # in the other
+    column, row = ((at - grid.origin_xy_m) / grid.resolution_m).astype(int)
+    assert grid.log_odds[row, column] < 0
+
+
+def test_a_back_end_that_fails_leaves_the_poses(monkeypatch):
+    monkeypatch.setattr("sceneslam.atlas.submaps.collector.make_submap", lambda *_: 1 / 0)
+    drive = Drive(atlas()).go(world(flat()), through(FLAT_TOUR[:4]))
+    assert "goes on without submaps" in drive.faults[0] and "division by zero" in drive.faults[0]
+    assert len(drive.atlas.trajectory) == len(through(FLAT_TOUR[:4]))
 
 
 def test_a_run_that_is_nowhere_in_the_map_says_so_and_keeps_its_own_piece(saved, tmp_path):

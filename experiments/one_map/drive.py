@@ -38,6 +38,7 @@ class Drive:
     """A run of an atlas."""
 
     atlas: Atlas
+    is_live: bool = False
     events: list[dict[str, Any]] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
 
@@ -50,7 +51,7 @@ class Drive:
         sessions: int = 1,
     ) -> Drive:
         """Drive along true poses (N, 3), in so many sessions of two modules by dead reckoning."""
-        self.atlas.open(RIG, self._note)
+        self.atlas.open(RIG, self._note, is_live=self.is_live)
         T_run_base, T_run_local, session = np.zeros(3), np.zeros(3), -1
         for row, pose in enumerate(true):
             step = planar.between(true[max(row - 1, 0)], pose)

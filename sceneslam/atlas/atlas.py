@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from bisect import bisect_left
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from sceneslam.atlas.fusion import fuse
 from sceneslam.atlas.lasting.lasting_map import EXTEND, LastingMap
 from sceneslam.atlas.mapper import Mapper, Note
+from sceneslam.atlas.places.floor_plan import grid_of
 from sceneslam.atlas.pose_path import OpenSession, PosePath, trajectory_of
 from sceneslam.atlas.revision import Revised, revise
 from sceneslam.atlas.submaps.collector import Known
@@ -62,6 +64,7 @@ class Atlas:
         """Get ready for observations; `note` takes events: a place that was recognized, a loop."""
         self._note = note
         loaded = self._lasting.loaded
+        self._lasting.open(is_live=is_live)
         self._mapper = Mapper(rig, known=self._known, note=note, loaded=loaded, is_live=is_live)
 
     def observe(self, observation: Observation) -> None:
@@ -70,7 +73,7 @@ class Atlas:
             return
         try:
             self._mapper.observe(observation)
-            self._lasting.keep(observation.stamp_ns, self._mapper, self._note)
+            self._lasting.keep(observation.stamp_ns, self._mapper)
         except Exception as error:  # the poses go on without a map
             self._give_up(error)
 
@@ -236,12 +239,18 @@ class Atlas:
         )
 
     def fuse_maps(self) -> HybridMap:
-        """Return the one map of all sessions (the paper's hybrid map)."""
+        """Return the one map of all sessions (the paper's hybrid map).
+
+        Where the run was found in a loaded map the grid is of both.
+        """
         placed = zip(self._sessions, self._placed(), strict=True)
-        return fuse(
+        fused = fuse(
             [(session.module, T_map_local, session.layers) for session, T_map_local in placed],
             voxel_m=self._voxel_m,
         )
+        if self._mapper is None or not self._mapper.is_placed:
+            return fused
+        return replace(fused, grid=grid_of(self._lasting.map_of(self._mapper).plan()))
 
     def _in_map(self, T_run_base: Transform) -> Transform:
         """Return a pose in the loaded map, from when the run was found in it."""

@@ -14,7 +14,7 @@ _SHORT_S = 0.5  # trouble that passes sooner is counted, not told
 _TOLD_TROUBLES = 5  # of one kind and module; more are summed up
 
 
-_OF_INPUT = {  # events of a live run's input -> in words
+_OF_INPUT = {  # events of the input, and of the map -> in words
     "silent": "the source gave nothing for {for_s:g} s",
     "returned": "the source is back",
     "behind": "the recording was read too slowly, and is played {by_s:.1f} s later",
@@ -22,6 +22,9 @@ _OF_INPUT = {  # events of a live run's input -> in words
     "stream_silent": "{topic} said nothing for {for_s:g} s",
     "stream_returned": "{topic} is back",
     "clock_jump": "the clock of {topic} jumped by {jumped_s:g} s",
+    "relocalized": "the run was found in the loaded map",
+    "not_relocalized": "the run was not found in the loaded map within {after_s:.1f} s",
+    "relocalization_withdrawn": "the loaded map is contradicted: the run is taken out of it",
     "odometry_jump": "odometry jumped: it was reset, or moved as no vehicle does",
 }
 
@@ -211,7 +214,8 @@ class _Writer:
 
     def _tell_input(self, event: Event) -> None:
         what = _OF_INPUT[event["event"]]
-        self._add(event["stamp_ns"], "trouble", what.format(**event))
+        kind = "decision" if event["event"] == "relocalized" else "trouble"
+        self._add(event["stamp_ns"], kind, what.format(**event))
 
 
 def _range(values: Sequence[float]) -> str:

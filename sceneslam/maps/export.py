@@ -8,14 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap
-from sceneslam.atlas.places.floor_plan import FloorPlan
+from sceneslam.atlas.places.floor_plan import grid_of
 from sceneslam.atlas.save import save_grid, save_pose_graph
 from sceneslam.atlas.submaps.graph import Kind
 from sceneslam.types import planar
-from sceneslam.types.maps import GridLayer, PoseGraphLayer
+from sceneslam.types.maps import PoseGraphLayer
 
-_CELL_M = 0.05
-_WALL, _FREE = 3.0, -3.0  # log odds: 0.95 and 0.05
 _UNMEASURED = 1e6  # 1/m^2, 1/rad^2: height, roll and pitch of a level base
 
 
@@ -24,16 +22,9 @@ def export(saved: SavedMap, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     main = saved.of(np.flatnonzero(saved.pieces == 0).tolist())
     grid, graph = folder / "grid.yaml", folder / "pose_graph.g2o"
-    save_grid(_grid(main.plan()), grid)
+    save_grid(grid_of(main.plan()), grid)
     save_pose_graph(_graph(main), graph)
     return [grid, graph]
-
-
-def _grid(plan: FloorPlan) -> GridLayer:
-    log_odds = np.where(plan.free, _FREE, 0.0).astype(np.float32)
-    cells = plan.cells(plan.points)
-    log_odds[cells[:, 1], cells[:, 0]] = _WALL
-    return GridLayer(log_odds=log_odds, resolution_m=_CELL_M, origin_xy_m=plan.origin_xy_m)
 
 
 def _graph(saved: SavedMap) -> PoseGraphLayer:

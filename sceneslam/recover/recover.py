@@ -50,7 +50,9 @@ def recover(folder: Path) -> Recovered:
     """Write the results of a run that was cut off; raises InputError where it left no journal."""
     config = _read_config(folder)
     # The code that a configuration names is run at the user's word alone, not at a file's.
-    builder = Builder(config | {"allow_targets": []})
+    # Submaps are made of observations, which a journal does not hold.
+    poses_alone = {**(config.get("atlas") or {}), "load": None, "save": None, "mode": "extend"}
+    builder = Builder(config | {"allow_targets": [], "atlas": poses_alone})
     atlas = builder.make("atlas", Atlas)
     kept = read_journal(folder / JOURNAL, _Retold(atlas))
     missing = list(_NEVER_KEPT)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from sceneslam.atlas.lasting.map_files import HEAD, load_map_files, save_map_files
@@ -35,6 +36,8 @@ class LastingMap:
         self.loaded: SavedMap | None = None
         self.faults: list[str] = []
         self._saved_ns: int | None = None
+        self._thread: ThreadPoolExecutor | None = None
+        self._writing: Future[None] | None = None
         try:
             if self._load is not None:
                 self.loaded = load_map_files(self._load)
@@ -45,13 +48,25 @@ class LastingMap:
             if foreign:
                 raise ConfigError("save", str(save), "a folder that is empty or holds a map")
 
-    def keep(self, stamp_ns: int, mapper: Mapper, note: Note) -> None:
+    def open(self, *, is_live: bool) -> None:
+        """Begin; a live run saves in a thread, beside its poses."""
+        self._thread = ThreadPoolExecutor(1) if is_live else None
+
+    def keep(self, stamp_ns: int, mapper: Mapper) -> None:
         """Save where it is time."""
         if self._saved_ns is None:
             self._saved_ns = stamp_ns
-        if self._save is not None and stamp_ns - self._saved_ns >= self._every_ns:
-            self._saved_ns = stamp_ns
-            self._write(mapper, stamp_ns, note)
+        if self._save is None or stamp_ns - self._saved_ns < self._every_ns:
+            return
+        self._saved_ns = stamp_ns
+        if self._thread is None:
+            self._write(mapper.saved(), mapper.is_found)
+        elif self._writing is None or self._writing.done():
+            self._writing = self._thread.submit(self._write, mapper.saved(), mapper.is_found)
+
+    def map_of(self, mapper: Mapper) -> SavedMap:
+        """Return the map with the run in it, as it would be saved."""
+        return self._updated(mapper.saved(), mapper.is_found)
 
     def finish(self, mapper: Mapper, stamp_ns: int, note: Note) -> None:
         """Save at the end, and say where the run was not found in the loaded map."""
@@ -59,22 +74,26 @@ class LastingMap:
             self.faults.append(
                 f"the run was not found in the map {self._load}, its poses are in its own frame"
             )
+        if self._thread is not None:
+            self._thread.shutdown()
         if self._save is not None:
-            self._write(mapper, stamp_ns, note)
+            saved = mapper.saved()
+            self._write(saved, mapper.is_found)
+            note("map_saved", stamp_ns, submaps=len(saved.submaps), loops=_loops(saved))
 
-    def _write(self, mapper: Mapper, stamp_ns: int, note: Note) -> None:
+    def _updated(self, saved: SavedMap, is_found: bool) -> SavedMap:
+        if self._mode == UPDATE and self.loaded is not None and is_found:
+            return forget_contradicted(saved, self.loaded.runs)
+        return saved
+
+    def _write(self, saved: SavedMap, is_found: bool) -> None:
         assert self._save is not None
-        saved = mapper.saved()
-        if self._mode == UPDATE and self.loaded is not None and mapper.is_found:
-            saved = forget_contradicted(saved, self.loaded.runs)
         try:
-            save_map_files(saved, self._save)
+            save_map_files(self._updated(saved, is_found), self._save)
         except (OSError, InputError) as error:
             fault = f"the map could not be saved: {told(error)}"
             if fault not in self.faults:
                 self.faults.append(fault)
-            return
-        note("map_saved", stamp_ns, submaps=len(saved.submaps), loops=_loops(saved))
 
 
 def _loops(saved: SavedMap) -> int:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sceneslam.scans.key_scan import KeyScan, line_normals
 from sceneslam.types import planar
+from sceneslam.types.maps import GridLayer
 from sceneslam.types.planar import Planar
 
 CELL_M = 0.05  # a depth camera's error at 4 m; every finer structure comes and goes with the view
@@ -18,6 +19,7 @@ _PAD = 10  # cells around everything
 _SHORT_CELLS = 1.5  # a ray ends so far before its return: the cell of a wall is not free
 _HITS_PER_MISS = 0.25  # a wall that rays graze is passed by many
 _AGREE_RATIO = 0.8  # of the length of the normals' sum over their number: they are one wall's
+_WALL, _FREE = 3.0, -3.0  # log odds of a grid: 0.95 and 0.05
 _CELLS_MAX = 5 * 10**7  # 350 m x 350 m
 
 
@@ -95,6 +97,14 @@ def join(placed: Sequence[tuple[Planar, FloorPlan]], *, newest_wins: bool = Fals
     index, _, centres, mean = _binned(left[:, :2], left[:, 2:], low, (rows, columns))
     free.reshape(-1)[index] = False
     return _plan(centres, mean, free, low)
+
+
+def grid_of(plan: FloorPlan) -> GridLayer:
+    """Return a plan as an occupancy grid."""
+    log_odds = np.where(plan.free, _FREE, 0.0).astype(np.float32)
+    cells = plan.cells(plan.points)
+    log_odds[cells[:, 1], cells[:, 0]] = _WALL
+    return GridLayer(log_odds=log_odds, resolution_m=CELL_M, origin_xy_m=plan.origin_xy_m)
 
 
 def _plan(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,13 +46,15 @@ class Drawing:
         self, plan: FloorPlan | None = None, scans: Sequence[tuple[Planar, KeyScan]] = ()
     ) -> None:
         self._plan, self._scans = plan, tuple(scans)
+        self._lock = Lock()  # a live run saves, and draws, in a thread
 
     @property
     def plan(self) -> FloorPlan:
         """Return the plan; the scans are forgotten with it."""
-        if self._plan is None:
-            self._plan, self._scans = draw(self._scans), ()
-        return self._plan
+        with self._lock:
+            if self._plan is None:
+                self._plan, self._scans = draw(self._scans), ()
+            return self._plan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
