@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.motion.distance_error import DistanceError
+from sceneslam.motion.step import Step, still
 from sceneslam.motion.trust import LieDetector, NoiseRatio, evidence_of_a_lie
 from sceneslam.motion.turn_errors import TurnErrors
 from sceneslam.types import se3
@@ -53,38 +54,6 @@ class Motion:
     rival: Motion | None = None  # the motion if whoever is not believed is right after all
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Step:
-    """A motion as one witness has it. Pairs are of the distance and of the turn."""
-
-    T: Transform
-    variance: NDArray[np.float64]  # (2,) [m^2, rad^2]
-    amounts: NDArray[np.float64]  # (2,) [m, rad]: what the variance of its noise grows with
-    causes: NDArray[np.float64]  # (3,): metres, radians, seconds, of the turn's systematic error
-
-    def then(self, step: _Step) -> _Step:
-        """Return both in a row."""
-        return _Step(
-            T=self.T @ step.T,
-            variance=self.variance + step.variance,
-            amounts=self.amounts + step.amounts,
-            causes=self.causes + step.causes,
-        )
-
-    def turned(self, turn: NDArray[np.float64], noise_rad: float, duration_s: float) -> _Step:
-        """Return the step with the gyro's turn."""
-        return _Step(
-            T=se3.from_parts(se3.so3_exp(turn), self.T[:3, 3]),
-            variance=np.array([self.variance[0], noise_rad**2]),
-            amounts=np.array([self.amounts[0], 0.0]),
-            causes=np.array([0.0, 0.0, duration_s]),
-        )
-
-
-def _still() -> _Step:
-    return _Step(T=se3.identity(), variance=np.zeros(2), amounts=np.zeros(2), causes=np.zeros(3))
-
-
 class MotionModel:
     """Predicts the motion to one observation after the other; learns from `learn` alone."""
 
@@ -105,8 +74,8 @@ class MotionModel:
         self._silent_s = 0.0  # ... so long ago
         self._gap: Transform | None = None  # the motion returned since then; None: it is not silent
         self._since_s = 0.0  # since the last measured motion; by wheels, if they told all of it
-        self._since_wheels: _Step | None = _still()
-        self._since_guess = _still()
+        self._since_wheels: Step | None = still()
+        self._since_guess = still()
         self._is_followed = True  # not stopped since then
         self._is_measured = True  # the wheels told of all motion since then
 
@@ -255,10 +224,10 @@ class MotionModel:
         """Begin anew to compare; odometry that is silent just now has to begin anew, too."""
         if self._gap is not None:
             self._T_odom_base, self._gap = None, None
-        self._since_s, self._since_wheels, self._since_guess = 0.0, _still(), _still()
+        self._since_s, self._since_wheels, self._since_guess = 0.0, still(), still()
         self._is_measured = True
 
-    def _take_odometry(self, observation: Observation, duration_s: float) -> _Step | None:
+    def _take_odometry(self, observation: Observation, duration_s: float) -> Step | None:
         """Return the motion since the last odometry, None where it is missing now or was before."""
         self._silent_s += duration_s
         T_before, T_odom_base = self._T_odom_base, _finite(observation.T_odom_base)
@@ -276,7 +245,7 @@ class MotionModel:
         self._T_odom_base, self._gap, self._silent_s = T_odom_base, None, 0.0
         return step
 
-    def _by_wheels(self, T_prev_curr: Transform, duration_s: float) -> _Step | None:
+    def _by_wheels(self, T_prev_curr: Transform, duration_s: float) -> Step | None:
         """Return a motion as odometry has it, None where it jumped."""
         forward_m, yaw_rad = float(T_prev_curr[0, 3]), se3.yaw_rad(T_prev_curr)
         distance_m = float(np.linalg.norm(T_prev_curr[:3, 3]))
@@ -284,25 +253,25 @@ class MotionModel:
         if distance_m > _LATE_M + _SPEED_MAX_M_S * duration_s:
             return None
         if distance_m < _STILL_M and angle_rad < _STILL_RAD:
-            return replace(_still(), variance=(_AT_REST * self._floors) ** 2)
+            return replace(still(), variance=(_AT_REST * self._floors) ** 2)
         amounts = np.array(
             [distance_m + _METRE_PER_TURN * angle_rad, angle_rad + _TURN_PER_METRE * distance_m]
         )
         missed_rad = self._turns.of_wheels(forward_m, yaw_rad)
         position_m = T_prev_curr[:3, 3] * (1.0 + self._distance.ratio)
-        return _Step(
+        return Step(
             T=se3.from_parts(T_prev_curr[:3, :3], position_m) @ se3.from_xy_yaw(0, 0, missed_rad),
             variance=self.noise_ratios**2 * amounts + self._floors**2,
             amounts=amounts,
             causes=np.array([forward_m, yaw_rad, 0.0]),
         )
 
-    def _by_velocity(self, duration_s: float) -> _Step:
+    def _by_velocity(self, duration_s: float) -> Step:
         """Return the motion if the base went on as it moved last."""
         before_s, self._unmeasured_s = self._unmeasured_s, self._unmeasured_s + duration_s
         variance = self._reach(self._unmeasured_s) ** 2 - self._reach(before_s) ** 2 + _STEP**2
         T_prev_curr = se3.exp(self.velocity * min(duration_s, _KEPT_S))
-        return replace(_still(), T=T_prev_curr, variance=variance)
+        return replace(still(), T=T_prev_curr, variance=variance)
 
     def _reach(self, unmeasured_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return by how much (2,) a guess is off after a while: deviations add up in a guess."""
@@ -311,7 +280,7 @@ class MotionModel:
             return reach
         return np.minimum(reach, 0.5 * _ACCELERATION * unmeasured_s**2)
 
-    def _compare(self, turn: NDArray[np.float64], wheels: _Step, duration_s: float) -> None:
+    def _compare(self, turn: NDArray[np.float64], wheels: Step, duration_s: float) -> None:
         self._turns.compare(
             turn,
             se3.yaw_rad(wheels.T),
@@ -320,7 +289,7 @@ class MotionModel:
             duration_s=duration_s,
         )
 
-    def _joined(self, wheels: _Step | None, guess: _Step) -> Motion:
+    def _joined(self, wheels: Step | None, guess: Step) -> Motion:
         """Return distance and turn by whom each is believed: the wheels unless they lie."""
         if wheels is None:
             return _motion(guess, guess, is_measured=False)
@@ -336,7 +305,7 @@ class MotionModel:
         )
 
 
-def _motion(distance: _Step, turn: _Step, *, is_measured: bool) -> Motion:
+def _motion(distance: Step, turn: Step, *, is_measured: bool) -> Motion:
     variance = np.repeat([distance.variance[0], turn.variance[1]], 3)
     return Motion(
         T_prev_curr=se3.from_parts(turn.T[:3, :3], distance.T[:3, 3]),
