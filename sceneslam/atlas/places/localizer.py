@@ -19,7 +19,8 @@ from sceneslam.types import planar
 from sceneslam.types.planar import Planar
 
 _SPAN_M, _SPAN_SCANS = 6.0, 60  # of the latest path: what is compared with the map
-_PERIOD_S, _PERIOD_MAX_S = 0.5, 8.0  # between two searches; doubled with every four in vain
+_PERIOD_S, _PERIOD_MAX_S = 0.5, 8.0  # between two searches; doubled with every ...
+_PATIENCE = 8  # ... so many in vain: each costs a tenth of a second or more
 _FIX_M, _FIX_S = 0.5, 1.0  # once found, so far and so long from one comparison to the next
 _AGREE_M, _AGREE_RAD = 0.1, 0.05  # two searches in a row that agree are believed
 _REACH_M, _REACH_RAD, _SIGMAS = 0.15, 0.05, 3.0  # of a fix around the prediction
@@ -87,10 +88,11 @@ class Localizer:
         if self.T_map_run is not None:
             return self._check(newest, field)
         match = self._map.recognize(field, None)
-        self._wait(newest, _PERIOD_S * 2.0 ** min(self._vain // 4, 4))
         if match is None or match.weak_directions:
             self._guess, self._vain = None, self._vain + 1
+            self._wait(newest, _PERIOD_S * 2.0 ** min(self._vain // _PATIENCE, 4))
             return Outcome.NOTHING
+        self._wait(newest, _PERIOD_S)
         T_map_run = _run_in_map(match, newest)
         before, self._guess = self._guess, T_map_run
         if before is None or not _agree(before, T_map_run, newest.T_run_base):

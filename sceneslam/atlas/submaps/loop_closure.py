@@ -31,7 +31,7 @@ class LoopFinder:
     def __init__(self, submaps: Sequence[Submap], closed: frozenset[int]) -> None:
         """Take all submaps; modules of the sessions in `closed` find the loops within them."""
         self._submaps, self._closed = submaps, closed
-        self._targets: dict[int, Recognizer] = {}
+        self._targets: dict[tuple[int, int], Recognizer] = {}
 
     def loops_to(
         self, second: int, T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
@@ -46,7 +46,7 @@ class LoopFinder:
         for first in self._candidates(second, T_map_node, drift):
             query = query or PlanField(self._submaps[second].plan)
             window = _window(first, second, T_map_node, drift)
-            target = self._target(first, T_map_node)
+            target = self._target(first, second, T_map_node)
             match = target.recognize(query, window, known_min=_KNOWN_MIN)
             if match is None:
                 continue
@@ -69,7 +69,7 @@ class LoopFinder:
     ) -> list[int]:
         """Return the nearest submaps that may overlap, of which none is another's neighbour."""
         near: list[tuple[float, int]] = []
-        for first in range(second - 1):
+        for first in range(second):
             if not self._may_close(first, second):
                 continue
             window = _window(first, second, T_map_node, drift)
@@ -88,23 +88,24 @@ class LoopFinder:
         a, b = self._submaps[first], self._submaps[second]
         if (a.run, a.session) != (b.run, b.session):
             return bool(len(a.plan) and len(b.plan))
-        return a.session not in self._closed and second - first > 2 * _NEIGHBOURS
+        return a.session not in self._closed and bool(len(a.plan) and len(b.plan))
 
-    def _target(self, first: int, T_map_node: NDArray[np.float64]) -> Recognizer:
-        if first not in self._targets:
+    def _target(self, first: int, second: int, T_map_node: NDArray[np.float64]) -> Recognizer:
+        """Return what lies around a submap, of its session and older than another."""
+        end = min(first + _NEIGHBOURS + 1, second)
+        if (first, end) not in self._targets:
             while len(self._targets) >= _CACHED:
                 del self._targets[next(iter(self._targets))]
             own = self._submaps[first]
-            around = range(max(first - _NEIGHBOURS, 0), first + _NEIGHBOURS + 1)
+            around = range(max(first - _NEIGHBOURS, 0), end)
             placed = [
                 (planar.between(T_map_node[first], T_map_node[index]), self._submaps[index].plan)
                 for index in around
-                if index < len(T_map_node)
-                and (self._submaps[index].run, self._submaps[index].session)
+                if (self._submaps[index].run, self._submaps[index].session)
                 == (own.run, own.session)
             ]
-            self._targets[first] = Recognizer(PlanField(join(placed)))
-        return self._targets[first]
+            self._targets[first, end] = Recognizer(PlanField(join(placed)))
+        return self._targets[first, end]
 
 
 def _window(
