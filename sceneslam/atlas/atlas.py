@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from bisect import bisect_left
 from dataclasses import replace
 from functools import partial
 
@@ -16,16 +15,15 @@ from sceneslam.atlas.mapper import Mapper, Note
 from sceneslam.atlas.places.floor_plan import grid_of
 from sceneslam.atlas.pose_path import OpenSession, PosePath, trajectory_of
 from sceneslam.atlas.revision import Revised, revise
-from sceneslam.atlas.submaps.collector import Known
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.submaps.own_loops import own_loops
-from sceneslam.atlas.uncertainty import VELOCITY, WHEELS, Covariance, Step, propagate
+from sceneslam.atlas.uncertainty import VELOCITY, WHEELS, Covariance, propagate
 from sceneslam.interfaces import TrajectoryLog
 from sceneslam.types.errors import ConfigError, told
 from sceneslam.types.maps import HybridMap, MapLayers
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
-from sceneslam.types.run import BRIDGED, Session, SessionStart
+from sceneslam.types.run import Session, SessionStart
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
@@ -65,7 +63,9 @@ class Atlas:
         self._note = note
         loaded = self._lasting.loaded
         self._lasting.open(is_live=is_live)
-        self._mapper = Mapper(rig, known=self._known, note=note, loaded=loaded, is_live=is_live)
+        self._mapper = Mapper(
+            rig, known=self._path.known_at, note=note, loaded=loaded, is_live=is_live
+        )
 
     def observe(self, observation: Observation) -> None:
         """Take an observation, after its pose."""
@@ -195,29 +195,14 @@ class Atlas:
 
     def session_starts(self) -> list[SessionStart]:
         """Return, per session, the first pose of the trajectory that its module gave."""
-        path = self._path
-        starts: dict[int, SessionStart] = {}
-        told = zip(path.sessions, path.modules, path.stamps_ns, strict=True)
-        for row, (session, module, stamp_ns) in enumerate(told):
-            if module != BRIDGED and session not in starts:
-                starts[session] = SessionStart(
-                    row=row, session=session, module=module, stamp_ns=stamp_ns
-                )
-        return list(starts.values())
+        return self._path.session_starts()
 
     def covariances(self, has_odometry: bool) -> NDArray[np.float64]:
         """Return the covariances of the trajectory (N, 6, 6), before modules revised the poses.
 
         In `base`, translation first. Bridges are the wheels' motion where there is odometry.
         """
-        path = self._path
-        steps = [
-            Step(T_map_base=T, session=session, is_bridged=module == BRIDGED, covariance=told)
-            for T, session, module, told in zip(
-                path.poses, path.sessions, path.modules, path.covariances, strict=True
-            )
-        ]
-        return propagate(steps, WHEELS if has_odometry else VELOCITY)
+        return propagate(self._path.steps(), WHEELS if has_odometry else VELOCITY)
 
     @property
     def pose_modules(self) -> tuple[str, ...]:
@@ -271,24 +256,9 @@ class Atlas:
                 placed[session] = self._correction.apply(stamp_ns, T_map_local[None])[0]
         return placed
 
-    def _known(self, stamp_ns: int) -> Known | None:
-        """Return what the path holds at a stamp."""
-        path = self._path
-        row = bisect_left(path.stamps_ns, stamp_ns)
-        if row == len(path.stamps_ns) or path.stamps_ns[row] != stamp_ns:
-            return None
-        return Known(
-            T_map_base=path.poses[row],
-            session=path.sessions[row],
-            module=path.modules[row],
-            covariance=path.covariances[row],
-        )
-
     def _revised_at(self, revised: NDArray[np.float64], stamp_ns: int) -> Transform | None:
-        row = bisect_left(self._path.stamps_ns, stamp_ns)
-        if row == len(self._path.stamps_ns) or self._path.stamps_ns[row] != stamp_ns:
-            return None
-        return np.asarray(revised[row])
+        row = self._path.row_at(stamp_ns)
+        return None if row is None else np.asarray(revised[row])
 
     def _revise(self) -> Revised:
         return revise(

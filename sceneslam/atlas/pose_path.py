@@ -9,8 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sceneslam.atlas.revision import Told
-from sceneslam.atlas.uncertainty import Covariance
+from sceneslam.atlas.submaps.collector import Known
+from sceneslam.atlas.uncertainty import Covariance, Step
 from sceneslam.types.maps import MapLayers
+from sceneslam.types.run import BRIDGED, SessionStart
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
@@ -73,6 +75,42 @@ class PosePath:
             self.covariances,
         ):
             del values[keep:]
+
+    def row_at(self, stamp_ns: int) -> int | None:
+        """Return the row of the pose at a stamp, None where it has none."""
+        row = bisect_left(self.stamps_ns, stamp_ns)
+        return row if row < len(self.stamps_ns) and self.stamps_ns[row] == stamp_ns else None
+
+    def known_at(self, stamp_ns: int) -> Known | None:
+        """Return what is known at a stamp."""
+        row = self.row_at(stamp_ns)
+        if row is None:
+            return None
+        return Known(
+            T_map_base=self.poses[row],
+            session=self.sessions[row],
+            module=self.modules[row],
+            covariance=self.covariances[row],
+        )
+
+    def session_starts(self) -> list[SessionStart]:
+        """Return, per session, the first pose that its module gave."""
+        starts: dict[int, SessionStart] = {}
+        told = zip(self.sessions, self.modules, self.stamps_ns, strict=True)
+        for row, (session, module, stamp_ns) in enumerate(told):
+            if module != BRIDGED and session not in starts:
+                starts[session] = SessionStart(
+                    row=row, session=session, module=module, stamp_ns=stamp_ns
+                )
+        return list(starts.values())
+
+    def steps(self) -> list[Step]:
+        """Return every pose with what its module said of it."""
+        rows = zip(self.poses, self.sessions, self.modules, self.covariances, strict=True)
+        return [
+            Step(T_map_base=T, session=session, is_bridged=module == BRIDGED, covariance=told)
+            for T, session, module, told in rows
+        ]
 
 
 def trajectory_of(stamps_ns: Sequence[int], poses: Sequence[Transform]) -> Trajectory:
