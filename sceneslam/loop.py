@@ -24,6 +24,7 @@ from sceneslam.engine.live import LiveTally, run_live
 from sceneslam.engine.steering import Operator, SteeredDetector
 from sceneslam.interfaces import CovarianceSink, Live, LiveFeed, ResultSink, Sink, Steering
 from sceneslam.keeping import Keeping
+from sceneslam.moments import Moments
 from sceneslam.results import Results
 from sceneslam.sources.survey.preflight import preflight
 from sceneslam.sources.survey.survey import Surveyed
@@ -56,6 +57,7 @@ class Loop:
         self._keeping = Keeping(parts, results)
         self._log = self._keeping.events
         self._events_written = 0
+        self._moments, self._events_seen = Moments(), 0
         self._observed_ns: list[int] = []
         self._live = LiveTally()
         self._covariances = np.zeros((0, 6, 6))
@@ -154,6 +156,7 @@ class Loop:
             missing=self._tally.missing,
             dropped=self._live.dropped,
             dropped_images=self._live.dropped_images,
+            moments=tuple(self._moments.kept),
             timings=Timings(
                 detector_us=np.array(bus.detector_us),
                 bus_us=np.array(bus.bus_us),
@@ -249,6 +252,9 @@ class Loop:
         self._bus.step(observation)
         self._parts.atlas.observe(observation)
         self._observed_ns.append(observation.stamp_ns)
+        events = self._log.since(self._events_seen)
+        self._events_seen += len(events)
+        self._moments.look(observation, events)
         module = self._parts.modules.get(self._bus.active)
         self._tally.add(observation, () if module is None else module.requires)
         self._keeping.keep(observation.stamp_ns)

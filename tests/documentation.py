@@ -60,6 +60,7 @@ def write_recordings(folder: Path) -> None:
             lists[name].append(f"{observation.stamp_ns * 1e-9:.6f} {name}/{index}.png")
     writer.close()
     _write_film(folder / "clip.mp4")
+    (folder / "exposures.txt").write_text("0.0 0.01 1\n0.2 0.02 2\n")
     shutil.copy(ROOT / "modules" / "detectors" / "bright_dark.yaml", folder / "my_scenes.yaml")
     for name, lines in lists.items():
         (folder / "freiburg1" / f"{name}.txt").write_text("\n".join(lines) + "\n")

@@ -56,11 +56,11 @@ def figure(svg: str, caption: str) -> str:
     return f"<figure>{labelled}<figcaption>{told}</figcaption></figure>\n"
 
 
-def picture(png: bytes, caption: str) -> str:
-    """Return a figure from the bytes of a PNG file, with its caption."""
-    told, data = escape(caption), b64encode(png).decode("ascii")
-    image = f'<img alt="{told}" src="data:image/png;base64,{data}">'
-    return f"<figure>{image}<figcaption>{told}</figcaption></figure>\n"
+def picture(image: bytes, caption: str, kind: str = "png") -> str:
+    """Return a figure from the bytes of a PNG or JPEG file, with its caption."""
+    told, data = escape(caption), b64encode(image).decode("ascii")
+    element = f'<img alt="{told}" src="data:image/{kind};base64,{data}">'
+    return f"<figure>{element}<figcaption>{told}</figcaption></figure>\n"
 
 
 def _escaped(cell: object) -> str:

@@ -26,6 +26,10 @@ def renamed(result: RunResult, names: Mapping[str, str]) -> RunResult:
         sessions=[replace(s, module=names.get(s.module, s.module)) for s in result.sessions],
         map=replace(hybrid, modules=tuple(names.get(key, key) for key in hybrid.modules)),
         events=[_renamed(event, names) for event in result.events],
+        moments=[
+            replace(one, events=[_renamed(event, names) for event in one.events])
+            for one in result.moments
+        ],
     )
 
 

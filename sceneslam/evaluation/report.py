@@ -14,6 +14,7 @@ from sceneslam.evaluation.chronicle import Entry, chronicle
 from sceneslam.evaluation.figure_features import feature_limits
 from sceneslam.evaluation.figures import write_figures
 from sceneslam.evaluation.metrics import Metrics
+from sceneslam.evaluation.moments import pictures
 from sceneslam.evaluation.names import module_names, renamed
 from sceneslam.evaluation.page import fill_page
 from sceneslam.evaluation.story import tell
@@ -64,9 +65,10 @@ def write_report(
     `threshold` is drawn with the detector's values, `faults` are sentences about the run: those
     of figures that could not be drawn are added.
     """
+    named = renamed(result, module_names(config.get("slam") or {}))
     figures = write_figures(
         folder / "figures",
-        renamed(result, module_names(config.get("slam") or {})),
+        named,
         truth,
         threshold=threshold,
         limits=feature_limits(config.get("detector") or {}),
@@ -83,12 +85,20 @@ def write_report(
         "made_of": markup.bullets(_made_of(config)),
         "faults": _faults(_amiss(metrics)),
         "figures": "".join(markup.figure(f.svg, _CAPTIONS[f.name]) for f in figures),
+        "moments": _seen(named),
         "chronicle": _chronicle(entries),
         "modules": _modules(metrics, config.get("slam") or {}),
         "versions": markup.table(["part", "version"], [[*item] for item in versions.items()]),
         "config": escape(config_yaml),
     }
     return fill_page(folder / "report.html", "sceneslam.evaluation", "report.html", told)
+
+
+def _seen(result: RunResult) -> str:
+    """Return what the camera saw at changes, under a heading."""
+    start_ns = int(result.observed_ns[0]) if len(result.observed_ns) else 0
+    images = pictures(result.moments, start_ns)
+    return f"<h2>What the camera saw when something changed</h2>{images}" if images else ""
 
 
 def _told(metrics: Metrics) -> dict[str, str]:

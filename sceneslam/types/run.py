@@ -41,6 +41,15 @@ class Session:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Moment:
+    """What the camera saw when the scene or the module changed."""
+
+    stamp_ns: int
+    events: Sequence[Event]  # the changes; empty: the first image
+    image_bgr: NDArray[np.uint8]  # (h, w, 3), small
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Timings:
     """What things cost by the wall clock; not part of the deterministic output."""
 
@@ -69,3 +78,4 @@ class RunResult:
     missing: Mapping[int, str] = field(default_factory=dict)  # stamp -> what the module lacked
     dropped: int = 0  # observations that live mode did not take ...
     dropped_images: int = 0  # ... and those of them that held an image
+    moments: Sequence[Moment] = ()  # by rising stamp

@@ -1,0 +1,40 @@
+"""Keeps small images of what the camera saw when the scene or the module changed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from sceneslam.evaluation.moments import change_of
+from sceneslam.types.observation import Observation
+from sceneslam.types.run import Event, Moment
+
+_WIDTH_PX = 240
+_MOST = 24  # images that are kept
+
+
+class Moments:
+    """The first image, and one of every observation at which the scene or the module changed."""
+
+    def __init__(self) -> None:
+        self.kept: list[Moment] = []
+
+    def look(self, observation: Observation, events: Sequence[Event]) -> None:
+        """Keep the observation's image where one of its events is a change."""
+        image_bgr = observation.image_bgr
+        if image_bgr is None or len(self.kept) == _MOST:
+            return
+        changes = tuple(event for event in events if change_of(event))
+        if changes or not self.kept:
+            height, width = image_bgr.shape[:2]
+            size = (_WIDTH_PX, max(1, round(height * _WIDTH_PX / width)))
+            small = cv2.resize(image_bgr, size, interpolation=cv2.INTER_AREA)
+            self.kept.append(
+                Moment(
+                    stamp_ns=observation.stamp_ns,
+                    events=changes,
+                    image_bgr=np.asarray(small, np.uint8),
+                )
+            )
