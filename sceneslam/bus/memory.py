@@ -26,7 +26,7 @@ class Moment:
     bridge: Bridge  # after the observation
     turn: NDArray[np.float64] | None  # (3, 3) since the moment before, as a believed module says
     covariance: NDArray[np.float64] | None  # (6, 6) of its T_local_base, as the module says
-    is_trusted: bool  # a module that was not suspect said it was tracking, as sure as usual
+    is_trusted: bool  # a module that was not suspect was tracking, as certain as usual
 
     @property
     def stamp_ns(self) -> int:

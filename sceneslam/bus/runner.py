@@ -31,7 +31,7 @@ class Legacy:
 
 
 class Runner:
-    """Turns whatever a module raises into a ModuleError, and refuses answers that are none.
+    """Turns whatever a module raises into a ModuleError, and refuses invalid answers.
 
     Its start and its end may take long: `executor` makes these calls, one after the other.
     """

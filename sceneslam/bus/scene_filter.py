@@ -27,13 +27,13 @@ class SceneFilter(Protocol):
 
     @property
     def posterior(self) -> Mapping[str, float] | None:
-        """Return the probability of every scene after the last vote, None where it has none."""
+        """Return the probability of every scene after the last vote, None without any."""
         ...
 
     def update(self, vote: SceneVote) -> ConfirmedScene | None:
         """Return the scene that this vote confirms, None when nothing changes.
 
-        An UNSURE vote is none: it speaks neither for a scene nor against it.
+        An UNSURE vote counts neither for a scene nor against it.
         """
         ...
 
