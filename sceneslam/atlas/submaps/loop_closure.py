@@ -69,7 +69,7 @@ class LoopFinder:
     ) -> list[int]:
         """Return the nearest submaps that may overlap, of which none is another's neighbour."""
         near: list[tuple[float, int]] = []
-        for first in range(second):
+        for first in range(second - 1):
             if not self._may_close(first, second):
                 continue
             window = _window(first, second, T_map_node, drift)
@@ -88,7 +88,8 @@ class LoopFinder:
         a, b = self._submaps[first], self._submaps[second]
         if (a.run, a.session) != (b.run, b.session):
             return bool(len(a.plan) and len(b.plan))
-        return a.session not in self._closed and bool(len(a.plan) and len(b.plan))
+        is_apart = second - first > 2 * _NEIGHBOURS
+        return a.session not in self._closed and is_apart and bool(len(a.plan) and len(b.plan))
 
     def _target(self, first: int, second: int, T_map_node: NDArray[np.float64]) -> Recognizer:
         """Return what lies around a submap, of its session and older than another."""
