@@ -1,4 +1,4 @@
-"""What a module answers, checked where it enters the bus: each raises TypeError or ValueError."""
+"""Check what a module returns before the bus uses it; checks raise TypeError or ValueError."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.trajectory import Trajectory
 
 _FAR_M = 1e8  # more than twice around the Earth
-_SKEW_MAX = 1e-3  # of R^T R off the identity; the rounding of float32 is a thousandth of that
+_SKEW_MAX = 1e-3  # largest deviation of R^T R from the identity; float32 rounds to 1e-6
 _Shapes = dict[str, tuple[str | int, ...]]
 _LAYERS: dict[str, tuple[type, _Shapes]] = {
     "points": (PointLayer, {"points": ("N", 3), "colors_bgr": ("N", 3)}),
@@ -38,7 +38,7 @@ Value = TypeVar("Value")
 
 
 def checked_tracking(tracking: object, stamp_ns: int) -> Tracking:
-    """Return the answer to the observation at `stamp_ns`, its pose a copy of the bus's own."""
+    """Return the module's answer to the observation at `stamp_ns`, with a copy of its pose."""
     tracking = _of("track's answer", tracking, Tracking)
     _of("status", tracking.status, TrackingStatus)
     _of("revision", tracking.revision, int)
@@ -56,7 +56,7 @@ def checked_tracking(tracking: object, stamp_ns: int) -> Tracking:
 
 
 def checked_trajectory(trajectory: object) -> Trajectory:
-    """Return a trajectory of poses by rising stamp."""
+    """Return a trajectory whose stamps increase."""
     trajectory = _of("get_trajectory's answer", trajectory, Trajectory)
     stamps_ns = _of("stamps_ns", trajectory.stamps_ns, np.ndarray)
     if stamps_ns.dtype.kind != "i" or (np.diff(stamps_ns) <= 0).any():
@@ -68,7 +68,7 @@ def checked_trajectory(trajectory: object) -> Trajectory:
 
 
 def checked_layers(layers: object) -> MapLayers:
-    """Return a map whose arrays have the shapes they promise, and hold finite numbers."""
+    """Return a map whose arrays have the declared shapes and hold finite numbers."""
     layers = _of("get_map's answer", layers, MapLayers)
     for name, (kind, shapes) in _LAYERS.items():
         layer = getattr(layers, name)

@@ -21,8 +21,8 @@ class BayesSettings:
     """The hidden Markov model, and when a scene counts as confirmed."""
 
     mean_dwell_s: float  # a scene lasts this long on average
-    error_ratio: float  # share of votes that say nothing about the scene
-    correlation_s: float  # votes nearer in time than this are one measurement
+    error_ratio: float  # share of votes that are noise, independent of the scene
+    correlation_s: float  # votes within this time count together as one measurement
     confirm_probability: float  # of a scene to be confirmed
 
     def __post_init__(self) -> None:
@@ -39,9 +39,11 @@ class BayesSettings:
 class BayesFilter:
     """Confirms another scene once its posterior probability is high enough.
 
-    Votes that tell likelihoods are taken by them, others as certain of the scene that they name;
-    `error_ratio` of either is taken to be noise. Of the votes in one `correlation_s` each counts by
-    its share of it, so that a faster camera is not more certain.
+    A vote with likelihoods is weighed by them; a vote without counts as certain of its scene. In
+    both
+    cases a share `error_ratio` of the votes is assumed to be noise. Votes within one
+    `correlation_s`
+    share the weight of one measurement, so that a higher frame rate does not add certainty.
     """
 
     def __init__(self, scenes: Sequence[str], settings: BayesSettings) -> None:
@@ -49,8 +51,8 @@ class BayesFilter:
         self._places = {scene: place for place, scene in enumerate(scenes)}
         self._belief = np.full(len(scenes), 1.0 / len(scenes))
         self._last_ns: int | None = None
-        # Page's cumulative sum per scene: the evidence for it against the confirmed one since the
-        # vote at which that evidence began to grow.
+        # Page's cumulative sum (CUSUM) per scene: the log-likelihood ratio of the scene to the
+        # confirmed one, summed since the vote at which it began to grow.
         self._evidence = np.zeros(len(scenes))
         self._began_ns = np.zeros(len(scenes), np.int64)
         self.scene: str | None = None
@@ -74,7 +76,7 @@ class BayesFilter:
         return self._confirmed(vote.stamp_ns)
 
     def _log_likelihoods(self, vote: SceneVote, elapsed_s: float) -> NDArray[np.float64]:
-        """Return (S,) log P(vote | scene), a mixture of what the vote says and of noise."""
+        """Return log P(vote | scene), shape (S,): a mixture of the vote's likelihood and noise."""
         told = vote.likelihoods or {vote.scene: 1.0}
         likelihoods = np.array([told.get(scene, 0.0) for scene in self._places])
         likelihoods /= likelihoods.sum()
@@ -83,7 +85,7 @@ class BayesFilter:
         return np.asarray(np.log(mixed) * min(elapsed_s / self._settings.correlation_s, 1.0))
 
     def _predict(self, elapsed_s: float) -> None:
-        """Let the scene change: the chain's transition matrix is exp(Q t), symmetric in scenes."""
+        """Predict the belief: the Markov chain's transition matrix is exp(Q t), symmetric."""
         count = len(self._belief)
         if count == 1:
             return
@@ -92,12 +94,12 @@ class BayesFilter:
         self._belief = even + (self._belief - even) * np.exp(-rate_hz * elapsed_s)
 
     def _correct(self, log_likelihoods: NDArray[np.float64]) -> None:
-        """Weigh the belief by the vote (Bayes' rule)."""
+        """Update the belief by the vote (Bayes' rule)."""
         self._belief = self._belief * np.exp(log_likelihoods - log_likelihoods.max())
         self._belief /= self._belief.sum()
 
     def _accumulate(self, log_likelihoods: NDArray[np.float64], stamp_ns: int) -> None:
-        """Note since when the votes have spoken for each scene, against the confirmed one."""
+        """Update, per scene, since when the votes have supported it over the confirmed scene."""
         confirmed = 0.0 if self.scene is None else log_likelihoods[self._places[self.scene]]
         begins = self._evidence <= 0.0
         self._began_ns[begins] = stamp_ns

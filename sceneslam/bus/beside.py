@@ -1,4 +1,4 @@
-"""Where calls that may take seconds are made: in step with a recording, or beside the pose."""
+"""Executors for calls that may take seconds: in the caller's thread, or live in another one."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _T = TypeVar("_T")
 
 
 class InStep(Executor):
-    """Makes every call at once, in the thread of its caller."""
+    """Runs every call immediately, in the thread of its caller."""
 
     def submit(self, fn: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
-        """Return what came of the call; KeyboardInterrupt is raised here."""
+        """Return the finished call's future; KeyboardInterrupt is raised here."""
         future: Future[_T] = Future()
         try:
             future.set_result(fn(*args, **kwargs))
@@ -24,5 +24,5 @@ class InStep(Executor):
 
 
 def executor(name: str, *, is_live: bool) -> Executor:
-    """Return what makes one call after the other: live, in a thread of that name."""
+    """Return an executor that runs calls one by one; if live, in a thread of that name."""
     return ThreadPoolExecutor(1, thread_name_prefix=name) if is_live else InStep()

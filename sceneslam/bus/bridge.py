@@ -1,4 +1,4 @@
-"""The robot's motion while no module tells it: odometry, else constant velocity."""
+"""Predict the robot's motion while no module tracks: by odometry, else at constant velocity."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ class Bridge:
         self._T_odom_base: Transform | None = None
         self._stamp_ns = 0
         self._before: tuple[int, Transform] | None = None  # the pose before the last known one
-        self._known: tuple[int, Transform] | None = None  # the last that was measured
+        self._known: tuple[int, Transform] | None = None  # the last pose that a module measured
 
     @property
     def T_map_base(self) -> Transform:
-        """Return the last pose, known or predicted; the identity before there is one."""
+        """Return the last pose, measured or predicted; the identity before the first."""
         return se3.identity() if self._T_map_base is None else self._T_map_base
 
     def copy(self) -> Bridge:
-        """Return a bridge that knows the same; poses are never changed in place."""
+        """Return a copy of the bridge; poses are shared, for they are never changed in place."""
         twin = Bridge.__new__(Bridge)
         twin.__dict__.update(self.__dict__)
         return twin
@@ -37,7 +37,10 @@ class Bridge:
     def update(
         self, observation: Observation, T_map_base: Transform, *, is_jump: bool = False
     ) -> None:
-        """Take a pose that a module gave; from a jump, a correction, no velocity can be told."""
+        """Take a pose that a module measured.
+
+        `is_jump`: the pose jumped by a correction, so that no velocity is derived from it.
+        """
         if is_jump:
             self._before, self._known = None, None
         self._note(observation.stamp_ns, T_map_base)
@@ -50,11 +53,11 @@ class Bridge:
         by_velocity: bool,
         turn: NDArray[np.float64] | None = None,
     ) -> Transform | None:
-        """Return T_map_base at the observation and go on from there, None when nothing tells it.
+        """Return T_map_base at the observation and continue from it; None when it is unknown.
 
-        Odometry bridges any gap, and begins the map where nothing else does; `turn` (3, 3) is a
-        rotation since the last observation whose heading is better. Constant velocity is allowed
-        by `by_velocity` and only within the horizon after the last known pose.
+        Odometry bridges any gap, and without any earlier pose it begins the map. `turn` (3, 3), the
+        rotation since the last observation, replaces the odometry's heading. Constant velocity is
+        used only with `by_velocity`, and within the horizon after the last measured pose.
         """
         if self._T_map_base is None:
             if not self._uses_odometry or observation.T_odom_base is None:
@@ -76,13 +79,13 @@ class Bridge:
         return self._T_map_base
 
     def _note(self, stamp_ns: int, T_map_base: Transform) -> None:
-        """Take a pose that was measured: it tells the velocity."""
+        """Take a measured pose, from which the velocity follows."""
         if self._known is not None and self._known[0] < stamp_ns:
-            self._before = self._known  # at a hand-over both modules give the same instant a pose
+            self._before = self._known  # at a hand-over two modules give a pose at the same stamp
         self._known = (stamp_ns, T_map_base)
 
     def follow(self, observation: Observation, T_prev_curr: Transform) -> Transform:
-        """Return T_map_base after a motion that something else told since the last observation."""
+        """Return T_map_base after a given motion since the last observation."""
         self._move(observation, self.T_map_base @ T_prev_curr)
         return self.T_map_base
 
@@ -90,7 +93,7 @@ class Bridge:
         return self._known is not None and stamp_ns - self._known[0] <= self._horizon_ns
 
     def _at_constant_velocity(self, elapsed_ns: int) -> Transform:
-        """Return the motion in `elapsed_ns` if the last two known poses tell the velocity."""
+        """Return the motion in `elapsed_ns` at the velocity of the last two measured poses."""
         if self._known is None or self._before is None:
             return se3.identity()
         step_ns = self._known[0] - self._before[0]

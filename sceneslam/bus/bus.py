@@ -28,14 +28,14 @@ _log = logging.getLogger(__name__)
 
 
 class Guards(Protocol):
-    """What the machine asks before it takes a failure's way out."""
+    """Conditions of the state machine's transitions after a failure."""
 
     def candidate_left(self) -> bool:
         """Tell whether another module could still be started."""
         ...
 
     def fallback_active(self) -> bool:
-        """Tell whether a fallback runs in place of the module that could not."""
+        """Tell whether a fallback runs in place of the module that failed."""
         ...
 
 
@@ -45,12 +45,12 @@ class BusMachine(StateMachine):
     | state     | success          | failure                                             |
     |-----------|------------------|-----------------------------------------------------|
     | init      | start            | terminate                                           |
-    | start     | run              | start with the next candidate; run without while one |
-    |           |                  | may come back, terminate if none                    |
+    | start     | run              | start with the next candidate; run without a module  |
+    |           |                  | while one may come back, terminate if none can      |
     | run       | - (it goes on)   | switch: the scene changed or the module is unhealthy |
     | switch    | run              | run with the fallback, terminate if none            |
 
-    What a state does is said by the owner's `on_enter_STATE`, if it has one.
+    On entering a state the owner's method `on_enter_STATE` is called, if it exists.
     """
 
     init = State(initial=True)
@@ -80,15 +80,15 @@ class BusMachine(StateMachine):
         return str(next(iter(self.configuration)).id)
 
 
-_Step = Callable[[Observation], Outcome | None]  # None: the state goes on
+_Step = Callable[[Observation], Outcome | None]  # None: the state does not change
 
 
 class Bus:
     """Feeds observations to the detector and the active module, one `step` at a time.
 
     `scenes` maps every scene to keys of `modules`: the one to run, then its fallbacks.
-    `catch_up_steps`: remembered observations led through a new module per observation, None: all.
-    `is_live`: modules are started and shut down beside the poses.
+    `catch_up_steps`: how many remembered observations a new module processes per new observation;
+    None: all at once. `is_live`: modules start and shut down in another thread.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class Bus:
         self._estimator = Estimator(
             policy=policy, rig=rig, back_end=back_end, log=log, has_choice=len(modules) > 1
         )
-        waits = catch_up_steps is None  # a recording does, a robot does not
+        waits = catch_up_steps is None  # a recording can wait for a module, a robot cannot
         self._candidates = Candidates(scenes, self.runners, policy.retry_s, waits=waits)
         self._changeover = Changeover(
             runners=self.runners,
@@ -131,14 +131,14 @@ class Bus:
             catch_up_steps=catch_up_steps,
         )
         self._decisions = DecisionLog(log)
-        self._do: _Step  # what the state does with an observation ...
-        self._go_on: _Step  # ... and with the one that it was entered at
+        self._do: _Step  # what the state does with an observation
+        self._go_on: _Step  # the same for the observation at which the state was entered
         self._machine = BusMachine(self)
         self._state = self._machine.state
 
     @property
     def detector_us(self) -> list[float]:
-        """Return what each vote cost."""
+        """Return the time [us] that each vote took."""
         return self._watch.spent_us
 
     @property
@@ -148,7 +148,7 @@ class Bus:
 
     @property
     def active(self) -> str:
-        """Return the key of the active module, "" when there is none."""
+        """Return the key of the active module, "" when no module is active."""
         return self._estimator.active.key if self._estimator.active else ""
 
     @property
@@ -183,17 +183,17 @@ class Bus:
             runner.close()
         self._watch.close()
 
-    # What the machine asks before it takes a failure's way out.
+    # Conditions of the state machine's transitions after a failure.
 
     def candidate_left(self) -> bool:
-        """Tell whether the scene has a module that was not tried yet."""
+        """Tell whether the scene has a module that has not been tried yet."""
         return bool(self._candidates.left())
 
     def fallback_active(self) -> bool:
-        """Tell whether a module runs, though not the first choice, or will again."""
+        """Tell whether a module other than the first choice runs, or will run again."""
         return self._estimator.active is not None or bool(self._candidates.returning(self.scene))
 
-    # What the states do.
+    # Actions on entering a state.
 
     def on_enter_init(self) -> None:
         """Wait for the first confirmed scene."""
@@ -212,7 +212,7 @@ class Bus:
         self._do = self._go_on = self._change_over
 
     def on_enter_terminate(self) -> None:
-        """Do nothing any more."""
+        """Ignore all further observations."""
         self._do = self._go_on = _wait
 
     def _await_scene(self, observation: Observation) -> Outcome | None:
@@ -248,7 +248,7 @@ class Bus:
         return None
 
     def _plan(self, now: Situation, verdict: Verdict) -> None:
-        """Set out to carry a verdict out."""
+        """Begin to carry out a verdict."""
         is_scene = verdict.reason == "scene"
         if is_scene:
             self._candidates.serve(now.scene)
@@ -263,7 +263,7 @@ class Bus:
             )
         )
 
-    # What they are made of.
+    # Steps that the states use.
 
     def _track(self, observation: Observation) -> None:
         try:
@@ -272,7 +272,7 @@ class Bus:
             self._fault(observation.stamp_ns, str(error))
 
     def _has_other(self) -> bool:
-        """Tell whether another module could take over, or the failed one could be back."""
+        """Tell whether another module could take over, or the failed one could return."""
         return any(key != self.active for key in self._candidates.of(self.scene))
 
     def _look(self, observation: Observation) -> Situation:

@@ -1,4 +1,4 @@
-"""Carries a decision out: starts the candidates in turn until one of them can take over."""
+"""Carry out a decision: start the candidates in turn until one of them can take over."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Observation
 
 _log = logging.getLogger(__name__)
-_TRIAL_NS = 1_000_000_000  # so long the first choice tracks beside the fallback, to come back
-_DOUBLINGS = 3  # of the time until the first choice is tried again
+_TRIAL_NS = 1_000_000_000  # the first choice tracks this long on standby before it takes over again
+_DOUBLINGS = 3  # how often the time until the first choice is tried again doubles
 
 
 class Outcome(Enum):
-    """What a state reports to the machine: the S and F of the paper."""
+    """What a state reports to the state machine: success (S) or failure (F) in the paper."""
 
     SUCCESS = "success"
     FAILURE = "failure"
@@ -35,8 +35,8 @@ class Plan:
     keys: tuple[str, ...]  # candidates, best first
     reason: str
     at_ns: int
-    since_ns: int | None  # when the scene that calls for it began, None where it is not the scene
-    held_ns: int  # how long the active module had held its pose
+    since_ns: int | None  # when the scene that calls for it began, None for another reason
+    held_ns: int  # how long the active module had tracked without a break
 
 
 class Candidates:
@@ -52,7 +52,7 @@ class Candidates:
     ) -> None:
         self.scene = ""  # the confirmed scene that the active module serves
         self.tried: frozenset[str] = frozenset()
-        self.rounds = 0  # how often all were tried in vain
+        self.rounds = 0  # how often all candidates were tried and failed
         self.retry_ns = 0  # when the first choice may be tried again
         self._scenes, self._runners, self._waits = scenes, runners, waits
         self._retry_ns, self._retries = round(retry_s * 1e9), 0
@@ -60,23 +60,23 @@ class Candidates:
     def of(self, scene: str) -> tuple[str, ...]:
         """Return the modules of a scene that can run, in the table's order.
 
-        Those that must be waited for are among them where that is allowed.
+        Modules that must be waited for are included where waiting is allowed.
         """
         if self._waits:
             return self.returning(scene)
         return tuple(key for key in self._scenes.get(scene, ()) if self._runners[key].can_run)
 
     def returning(self, scene: str) -> tuple[str, ...]:
-        """Return the modules of a scene that can run, at once or later."""
+        """Return the modules of a scene that can run, now or later."""
         return tuple(key for key in self._scenes.get(scene, ()) if self._runners[key].may_return)
 
     def serve(self, scene: str) -> None:
-        """Start with all modules of a scene."""
+        """Set the served scene; all of its modules may be tried."""
         if scene != self.scene:
             self.scene, self.rounds, self._retries = scene, 0, 0
 
     def limit(self, keys: Sequence[str], rounds: int) -> None:
-        """Leave only some of the scene's modules to be tried."""
+        """Allow only the modules `keys` of the scene to be tried."""
         self.tried, self.rounds = frozenset(self._scenes[self.scene]) - frozenset(keys), rounds
 
     def use(self, key: str) -> None:
@@ -88,7 +88,7 @@ class Candidates:
         return [key for key in self.of(self.scene) if key not in self.tried]
 
     def postpone(self, stamp_ns: int, *, is_in_vain: bool) -> None:
-        """Let the first choice be tried again after a while, longer after each vain trial."""
+        """Delay the next trial of the first choice, for longer after each trial that failed."""
         self._retries = self._retries + 1 if is_in_vain else 0
         self.retry_ns = stamp_ns + (self._retry_ns << min(self._retries, _DOUBLINGS))
 
@@ -100,7 +100,7 @@ class _Attempt:
     key: str
     ready_ns: int  # when it may be started
     is_begun: bool = False  # it is being started, or was
-    handover: Handover | None = None  # None until that is over
+    handover: Handover | None = None  # None until it has started
 
 
 class Changeover:
@@ -121,13 +121,13 @@ class Changeover:
         self._run_began_ns: int | None = None
         self._plan: Plan | None = None
         self._queue: list[str] = []
-        self._replaced: str | None = None  # the module that the plan is to replace
+        self._replaced: str | None = None  # the module that the plan replaces
         self._attempt: _Attempt | None = None
         self._trial: _Attempt | None = None
 
     @property
     def trial(self) -> Trial:
-        """Tell how the scene's first choice does beside the fallback."""
+        """Return the state of the scene's first choice, on standby beside the fallback."""
         if self._trial is None:
             return Trial.NONE
         handover = self._trial.handover
@@ -135,7 +135,7 @@ class Changeover:
         return Trial.PASSED if tracked_ns >= _TRIAL_NS else Trial.RUNNING
 
     def begin(self, plan: Plan) -> None:
-        """Set out to change the module."""
+        """Begin to change the module."""
         if plan.reason != "return":
             self._end_trial()
         self._plan, self._queue = plan, list(plan.keys)
@@ -143,13 +143,13 @@ class Changeover:
         self._replaced = active.key if active is not None else None
 
     def go_on(self, stamp_ns: int) -> Outcome | None:
-        """Bring the change on: with the next candidate, or by one observation; None meanwhile."""
+        """Advance the change by one candidate or one observation; return None until it is over."""
         assert self._plan is not None
         while self._attempt is not None or self._queue:
             if self._attempt is None:
                 key = self._queue.pop(0)
                 if self._is_running(key):
-                    return Outcome.FAILURE  # it stays, as the fallback
+                    return Outcome.FAILURE  # the active module stays, as the fallback
                 self._attempt = self._start(key, stamp_ns)
             is_accepted = self._lead(self._attempt, stamp_ns)
             if is_accepted is None:
@@ -160,18 +160,18 @@ class Changeover:
                 is_best = is_start or key == self._plan.keys[0]
                 return Outcome.SUCCESS if is_best else Outcome.FAILURE
             if is_start:
-                return Outcome.FAILURE  # to `start` again, with the next
+                return Outcome.FAILURE  # the machine enters `start` again, with the next candidate
         if self._estimator.active is not None and self._estimator.active.is_failed:
             self._estimator.retire()
         return Outcome.FAILURE
 
     def begin_trial(self, key: str, stamp_ns: int) -> None:
-        """Let the scene's first choice run beside the fallback, unseen, from now on."""
+        """Run the scene's first choice on standby beside the fallback; its poses are not used."""
         self._trial = _Attempt(key=key, ready_ns=self._ready_ns(key, stamp_ns))
         self.try_on(stamp_ns)
 
     def submit(self, observation: Observation) -> None:
-        """Let the module on trial begin with an observation, beside the active one."""
+        """Submit an observation to the module on trial, which runs beside the active one."""
         if self._trial is None or self._trial.handover is None:
             return
         try:
@@ -181,7 +181,7 @@ class Changeover:
             self._end_trial()
 
     def try_on(self, stamp_ns: int) -> None:
-        """Feed the module on trial, if there is one; it ends where it fails or remains lost."""
+        """Feed the module on trial, if any; the trial ends when it fails or stays lost."""
         trial = self._trial
         if trial is None or stamp_ns < trial.ready_ns:
             return
@@ -194,12 +194,12 @@ class Changeover:
             self._fault(stamp_ns, str(error))
             self._end_trial()
             return
-        is_given_time = stamp_ns - trial.ready_ns < self._policy.retry_s * 1e9  # to see motion
+        is_given_time = stamp_ns - trial.ready_ns < self._policy.retry_s * 1e9  # it may need motion
         if handover.is_lost and not is_given_time:
             self._end_trial()
 
     def close(self) -> None:
-        """Shut down whatever was being started."""
+        """Shut down every module that is being started."""
         self._end_trial()
         if self._attempt is not None:
             self._runners[self._attempt.key].retire()
@@ -214,7 +214,7 @@ class Changeover:
         return active is not None and active.key == key and not active.is_failed
 
     def _start(self, key: str, stamp_ns: int) -> _Attempt:
-        """Begin the start of a module, which may take a while."""
+        """Begin to start a module, which may take seconds."""
         self._candidates.use(key)
         if self._trial is not None and self._trial.key == key:
             attempt, self._trial = self._trial, None
@@ -223,11 +223,11 @@ class Changeover:
             return attempt
         ready_ns = self._ready_ns(key, stamp_ns)
         if self._policy.handover == "cold" and ready_ns > stamp_ns:
-            self._estimator.retire()  # the paper shuts one down before it starts the next
+            self._estimator.retire()  # the paper shuts a module down before it starts the next
         return _Attempt(key=key, ready_ns=ready_ns)
 
     def _lead(self, attempt: _Attempt, stamp_ns: int) -> bool | None:
-        """Bring one candidate on; return whether it took over, None while that is open."""
+        """Advance one candidate; return whether it took over, None while undecided."""
         assert self._plan is not None
         if stamp_ns < attempt.ready_ns:
             return None
@@ -261,7 +261,7 @@ class Changeover:
         return attempt.handover
 
     def _can_refuse(self) -> bool:
-        """Tell whether something better than a lost module is left; the paper does not ask."""
+        """Tell whether there is an alternative to a lost module; the paper has no such check."""
         if self._policy.handover == "cold":
             return False
         return bool(self._queue) or (

@@ -1,7 +1,7 @@
-"""The independent motion that bridges and judges: wheels and gyro, by the one motion model.
+"""Dead reckoning by wheels and gyro: it bridges gaps and checks the modules' motion.
 
-A judge is not taught by whom it judges: this model learns from wheels and gyro alone, and the
-wheels' scale beside a module is what the other modules measured.
+To stay independent of the module that it checks, the model is calibrated from wheels and gyro
+alone, and the wheels' scale used with a module is the one that other modules measured.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from sceneslam.types.se3 import Transform
 
 
 class DeadReckoning:
-    """Corrects one observation's odometry and gyro after the other.
+    """Corrects the odometry and gyro of one observation after the other.
 
-    Modules teach it distances alone, and only where a gate watches them.
+    Modules calibrate the wheels' scale only, and only where a gate checks them.
     """
 
     def __init__(self, policy: Policy, rig: Rig) -> None:
         self._learns = policy.gate is not None and policy.handover != "cold"
         self._motion = MotionModel(rig) if Sensor.GYRO in rig.sensors else None
-        self._scales: dict[str, WheelScale] = {}  # by the module that taught it
-        self._T_odom_base: Transform | None = None  # the last there was, as it came ...
-        self._T_corrected_base: Transform | None = None  # ... and as corrected
-        self._is_gap = False  # the last observation had none
-        self._turned_rad = 0.0  # by the newest observation
+        self._scales: dict[str, WheelScale] = {}  # by the module that measured it
+        self._T_odom_base: Transform | None = None  # the last odometry, uncorrected
+        self._T_corrected_base: Transform | None = None  # the same, corrected
+        self._is_gap = False  # the last observation had no odometry
+        self._turned_rad = 0.0  # rotation angle since the observation before [rad]
 
     def correct(self, observation: Observation, module: str) -> Observation:
-        """Return the observation without the errors that are known so far, for a module."""
+        """Return the observation for a module, corrected by the calibration so far."""
         yaw_rad = self._yaw_rad(observation)
         before, now = self._T_odom_base, observation.T_odom_base
         is_gap, self._is_gap = self._is_gap, now is None
@@ -48,13 +48,13 @@ class DeadReckoning:
             self._T_corrected_base = now
             return observation
         T_prev_curr = se3.inverse(before) @ now
-        if yaw_rad is not None and not is_gap:  # the gyro does not speak for a gap
+        if yaw_rad is not None and not is_gap:  # the gyro does not cover a gap
             T_prev_curr = se3.with_yaw(T_prev_curr, yaw_rad)
         if self._learns:
             self._turned_rad = float(se3.rotation_angle_rad(T_prev_curr))
         learnt = self._taught(module)
         if yaw_rad is None and learnt is None and self._T_corrected_base is before:
-            self._T_corrected_base = now  # nothing was ever corrected
+            self._T_corrected_base = now  # nothing was corrected so far
             return observation
         T_prev_curr[:3, 3] *= 1.0 if learnt is None else learnt.scale
         assert self._T_corrected_base is not None
@@ -63,13 +63,13 @@ class DeadReckoning:
         return replace(observation, T_odom_base=self._T_corrected_base)
 
     def learn(self, hold: Hold, module: str) -> None:
-        """Take in what the active module measured of the newest observation's distance."""
+        """Update the wheels' scale by the distance that the active module measured."""
         if self._learns and module:
             scale = self._scales.setdefault(module, WheelScale())
             scale.learn(hold, self._T_odom_base, self._turned_rad)
 
     def close(self, stamp_ns: int, log: EventLog) -> None:
-        """Log what was learnt, if anything. May be called twice."""
+        """Log the calibration, if there is one. May be called twice."""
         known: dict[str, object] = {}
         learnt = self._taught("")
         if learnt is not None:
@@ -81,7 +81,7 @@ class DeadReckoning:
         self._scales, self._motion = {}, None
 
     def _yaw_rad(self, observation: Observation) -> float | None:
-        """Return the yaw since the last observation, None where there is no gyro at all."""
+        """Return the yaw since the last observation [rad], None without a gyro."""
         if self._motion is None:
             return None
         return se3.yaw_rad(self._motion.predict(observation).T_prev_curr)
@@ -95,6 +95,6 @@ class DeadReckoning:
         return replace(observation, gyro_base=gyro)
 
     def _taught(self, module: str) -> WheelScale | None:
-        """Return the scale that any module but one knows best, None where none taught it."""
+        """Return the most certain scale of all modules but `module`, None without any."""
         others = (one for key, one in self._scales.items() if key != module and one.scale != 1.0)
         return min(others, key=lambda one: one.variance, default=None)

@@ -1,4 +1,4 @@
-"""Which module is to run: one pure function of what is known at an observation.
+"""Decide which module runs: a pure function of what is known at an observation.
 
 Its inputs are logged whenever they change, so that a run's decisions can be made again from the
 log alone (`python -m sceneslam.decisions RUN`).
@@ -13,17 +13,17 @@ from sceneslam.bus.policy import Policy
 
 
 class Health(Enum):
-    """What the active module's pose is worth."""
+    """How reliable the active module's pose is."""
 
     HELD = "held"
-    LOST = "lost"  # it says so itself
-    SILENT = "silent"  # its sensors have not spoken for longer than usual
-    SUSPECT = "suspect"  # its motion is not the robot's, by independent measurements
-    FAILED = "failed"  # it broke its promise and was stopped
+    LOST = "lost"  # the module reports it
+    SILENT = "silent"  # its sensors have delivered no data for longer than usual
+    SUSPECT = "suspect"  # its motion disagrees with independent measurements
+    FAILED = "failed"  # it violated its contract and was stopped
 
 
 class Trial(Enum):
-    """How the scene's first choice does beside the fallback that runs in its place."""
+    """State of the scene's first choice, on standby beside the fallback that runs in its place."""
 
     NONE = "none"
     RUNNING = "running"
@@ -36,28 +36,28 @@ class Situation:
 
     stamp_ns: int
     scene: str  # as confirmed by the detector
-    served_scene: str  # that the active module was chosen for
-    active: str  # "" where none is left for now
+    served_scene: str  # the scene that the active module was chosen for
+    active: str  # "" while no module is active
     health: Health
-    unheld_since_ns: int  # when health is not HELD
-    held_ns: int  # how long it had held its pose before that, without a break
-    is_blind: bool  # nothing but constant velocity bridges
+    unheld_since_ns: int  # since when health has not been HELD
+    held_ns: int  # how long it had tracked before that, without a break
+    is_blind: bool  # poses are bridged by constant velocity only
     choices: tuple[str, ...]  # modules of `scene` that can run, in the table's order
-    served_choices: tuple[str, ...]  # the same of `served_scene`
-    tried: frozenset[str]  # of these, since the scene was confirmed or one held its pose long
-    rounds: int  # how often all were tried in vain
+    served_choices: tuple[str, ...]  # the same for `served_scene`
+    tried: frozenset[str]  # choices tried since the scene was confirmed or one tracked for long
+    rounds: int  # how often all choices were tried and failed
     trial: Trial
     retry_ns: int  # when the first choice may be tried again
-    may_return: bool  # a module that failed will be there again: going on without any is worth it
+    may_return: bool  # a failed module will return: the run may go on without any
 
 
 class Action(Enum):
-    """What to do about the active module."""
+    """What to do with the active module."""
 
     GO_ON = "go on"
     TELL = "tell"  # the scene changed, the module stays
     SWITCH = "switch"
-    TRY = "try"  # let the first choice run beside the fallback
+    TRY = "try"  # run the first choice on standby beside the fallback
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,15 +67,15 @@ class Verdict:
     action: Action
     to: tuple[str, ...] = ()  # candidates, best first
     reason: str = ""
-    rounds: int = 0  # of vain tries, from now on
+    rounds: int = 0  # the new count of rounds in which all choices failed
 
 
-_BLIND = 0.1  # of the patience: a guessed velocity errs more than ten times as wheels do
+_BLIND = 0.1  # share of the patience: constant velocity errs more than ten times as much as wheels
 GO_ON = Verdict(action=Action.GO_ON)
 
 
 def decide(policy: Policy, now: Situation) -> Verdict:
-    """Return what to do at an observation: the scene first, then the module's health."""
+    """Return what to do at an observation, by the scene first, then by the module's health."""
     if now.scene != now.served_scene and now.choices:
         if now.choices[0] == now.active and now.health is not Health.FAILED:
             return Verdict(action=Action.TELL, reason="scene")
@@ -86,7 +86,7 @@ def decide(policy: Policy, now: Situation) -> Verdict:
 
 
 def _decide_on_return(policy: Policy, now: Situation) -> Verdict:
-    """Return whether the first choice, once lost or refused, gets another chance."""
+    """Return whether the first choice, after it was lost or refused, is tried again."""
     first = now.served_choices[:1]
     if not first or first[0] == now.active or policy.handover == "cold":
         return GO_ON
@@ -98,15 +98,15 @@ def _decide_on_return(policy: Policy, now: Situation) -> Verdict:
 
 
 def _decide_on_loss(policy: Policy, now: Situation) -> Verdict:
-    """Return whether another module has to take over from one that gives no pose.
+    """Return whether another module has to take over from one without a usable pose.
 
-    Modules that were tried get a new chance when the active one has earned it by its loss: it
-    held its pose for a window before, or none is left and it has been lost for a window, each
-    time for twice as long, so that they do not take turns.
+    Modules that were tried may be tried again in two cases: the active one had tracked for a
+    window before it was lost, or no other module is left and it has been lost for a window. The
+    window doubles each time, so that modules do not alternate.
     """
     lost_ns = now.stamp_ns - now.unheld_since_ns
     window_ns = round(policy.confirm_window_s * 1e9)
-    # Two that both disagree with the wheels do not take turns: the wheels bridge meanwhile.
+    # Two modules that both disagree with the wheels do not alternate: the wheels bridge meanwhile.
     may_return = now.stamp_ns >= now.retry_ns or now.health is not Health.SUSPECT
     barred = (now.active,) if may_return else (now.active, *now.served_choices[:1])
     others = tuple(key for key in now.served_choices if key not in barred)

@@ -1,4 +1,4 @@
-"""Writes down what decisions are made of, and makes them again from the log alone."""
+"""Log the inputs of all decisions, and repeat the decisions from the log alone."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _FACTS = attrgetter(*(field.name for field in fields(Situation) if field.name !=
 
 
 class DecisionLog:
-    """Logs a situation whenever more than the time changed, and every verdict but `go on`."""
+    """Logs a situation whenever more than its time changed, and every verdict but `go on`."""
 
     def __init__(self, log: EventLog) -> None:
         self._log = log
         self._last: tuple[Any, ...] | None = None
 
     def add(self, now: Situation, verdict: Verdict) -> None:
-        """Take a decision with all that it was made of."""
+        """Log a decision with its inputs."""
         facts = _FACTS(now)
         is_known, self._last = facts == self._last, facts
         if is_known and verdict == GO_ON:
@@ -35,10 +35,10 @@ class DecisionLog:
 
 
 def decide_again(events: Iterable[Event], policy: Policy) -> list[str]:
-    """Return one sentence for every logged decision that the log does not lead to again.
+    """Return one sentence for every logged decision that its logged inputs do not reproduce.
 
-    Every observation has a vote in the log, and every change of situation; in the state `run`
-    each of them is decided on anew.
+    The log holds a vote for every observation and every change of situation; each of them in the
+    state `run` is decided again.
     """
     wrong: list[str] = []
     state, pending, now = "init", None, None
@@ -71,7 +71,7 @@ def _situation(event: Event) -> Situation:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON has it."""
+    """Return a value in its JSON form."""
     if isinstance(value, dict):
         return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, Enum):

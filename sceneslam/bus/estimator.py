@@ -1,4 +1,4 @@
-"""The active session and what is known of the way so far; what a hand-over puts in its place."""
+"""The active session and the remembered trajectory, which a hand-over may rewrite."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from sceneslam.types.rig import Rig
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
 
-_VELOCITY_S = 0.5  # for which a robot that is not seen is taken to drive on as it did
+_VELOCITY_S = 0.5  # a robot without measurements is assumed to keep its velocity this long
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,17 +33,17 @@ class _Ending:
     """A module that is being shut down."""
 
     legacy: Future[Legacy]
-    placed: list[int]  # the back end's sessions of it
+    placed: list[int]  # its sessions in the back end
 
 
 class Estimator:
-    """Gives every observation one pose, and tells the back end and the log of it."""
+    """Gives every observation one pose, and reports it to the back end and the log."""
 
     def __init__(
         self, *, policy: Policy, rig: Rig, back_end: BackEnd, log: EventLog, has_choice: bool
     ) -> None:
         self._policy, self._rig, self._back_end, self._log = policy, rig, back_end, log
-        # The paper's hand-over knows the last pose of a module and nothing after it.
+        # The paper's (cold) hand-over uses a module's last pose and nothing after it.
         is_bridged = policy.handover != "cold"
         horizon_s = _VELOCITY_S if is_bridged else 0.0
         bridge = Bridge(velocity_horizon_s=horizon_s, uses_odometry=is_bridged)
@@ -53,14 +53,14 @@ class Estimator:
             limit_mb=policy.buffer_mb,
             keeps_sensors=has_choice,
         )
-        self._placed: list[int] = []  # the back end's sessions of the active one
+        self._placed: list[int] = []  # the active module's sessions in the back end
         self._ending: list[_Ending] = []  # modules that are being shut down
-        self._told: TrackingStatus | None = None  # what the log says of the active module ...
-        self._told_lie = False  # ... and of the wheels
+        self._told: TrackingStatus | None = None  # the active module's status as last logged
+        self._told_lie = False  # whether the wheels were last logged as wrong
 
     @property
     def active(self) -> Runner | None:
-        """Return the active module, None while there is none."""
+        """Return the active module, None while no module is active."""
         return self._session.runner
 
     @property
@@ -70,7 +70,7 @@ class Estimator:
 
     @property
     def health(self) -> Health:
-        """Return what the active module's pose is worth; FAILED where there is none."""
+        """Return the active module's health; FAILED while no module is active."""
         return self.hold.health if self._session.is_running else Health.FAILED
 
     @property
@@ -79,7 +79,7 @@ class Estimator:
         return self._memory.newest.stamp_ns
 
     def track(self, observation: Observation, *, by_velocity: bool) -> None:
-        """Give the observation its pose; raises ModuleError when the module broke its promise."""
+        """Give the observation its pose; raises ModuleError if the module violates its contract."""
         self._keep_maps(waits=False)
         session, was_placed = self._session, self._session.is_placed
         moment = session.advance(observation, by_velocity=by_velocity)
@@ -96,14 +96,14 @@ class Estimator:
             raise session.fault
 
     def start(self, runner: Runner, scene: str) -> None:
-        """Begin to activate a module that is to be handed over to."""
+        """Begin to activate a module that is to take over."""
         runner.start(self._rig, scene)
 
     def begin(self, runner: Runner, since_ns: int | None, *, is_trial: bool = False) -> Handover:
         """Begin to hand over to a module that has started.
 
-        `since_ns`: when the scene that calls for it began, None where it is not the scene. A
-        trial begins now, whatever the kind of hand-over.
+        `since_ns`: when the scene that calls for it began, None for another reason. A trial
+        begins now, whatever the kind of hand-over.
         """
         anchor = self._memory.newest
         if self._policy.handover == "rewind" and not is_trial:
@@ -113,7 +113,7 @@ class Estimator:
         return Handover(session, self._memory, anchor=anchor, pace=pace)
 
     def settle(self, handover: Handover) -> None:
-        """Place a module that was on trial at the pose of now: what it gave before is not used."""
+        """Place a module that was on trial at the current pose; its earlier poses are not used."""
         handover.settle(self._memory.newest)
 
     def accept(self, handover: Handover) -> None:
@@ -141,7 +141,7 @@ class Estimator:
         self._memory.clear()
 
     def _distrust(self, since_ns: int, moment: Moment) -> Moment:
-        """Bridge what a module gave since it may have been wrong; return the newest so, too."""
+        """Replace the poses after `since_ns` by bridged ones; return the newest moment, bridged."""
         self._log.add("suspect", moment.stamp_ns, module=self._session.key)
         untrusted, before = self._memory.after(since_ns), self._memory.last_until(since_ns)
         if before is None or not untrusted:
@@ -156,7 +156,7 @@ class Estimator:
         return bridged[-1]
 
     def _put(self, moments: list[Moment], stamp_ns: int) -> None:
-        """Put moments that are better known now in the place of those that were reported."""
+        """Replace reported moments by their corrected ones."""
         for moment in moments:
             self._report(moment)
         if moments:
@@ -166,13 +166,13 @@ class Estimator:
             self._log.add("revised", stamp_ns, from_ns=from_ns, poses=len(moments))
 
     def _report(self, moment: Moment) -> None:
-        """Tell the back end a pose."""
+        """Report a pose to the back end."""
         if moment.T_map_base is not None:
             given = (moment.T_map_base, moment.module, moment.covariance)
             self._back_end.add(moment.stamp_ns, *given)
 
     def _rewrite(self, handover: Handover) -> None:
-        """Put the poses of a module that has caught up in the place of the untrusted ones."""
+        """Replace the untrusted poses by those of a module that has caught up."""
         newest = self._memory.newest
         told, known = newest.T_map_base, handover.T_map_base
         jump = se3.identity() if told is None or known is None else se3.inverse(told) @ known
@@ -187,7 +187,7 @@ class Estimator:
     def _begin_session(self, stamp_ns: int, from_ns: int, *, jump: Transform) -> None:
         """Open the active module's session in the back end; it begins at `from_ns`.
 
-        `jump` is how the pose that was told at `stamp_ns` differs from the one now known.
+        `jump` is the transform from the pose reported at `stamp_ns` to the corrected one.
         """
         assert self.active is not None and self.active.T_map_local is not None
         T_map_local, last_ns = self.active.T_map_local, self._back_end.last_stamp_ns
@@ -207,7 +207,7 @@ class Estimator:
         )
 
     def _tell(self, stamp_ns: int) -> None:
-        """Log the active module's status, and whether the wheels are believed, where it changed."""
+        """Log changes of the active module's status and of whether the wheels are trusted."""
         if self.hold.wheels_lie is not self._told_lie:
             self._told_lie = self.hold.wheels_lie
             self._log.add("odometry", stamp_ns, is_believed=not self._told_lie)
@@ -218,13 +218,16 @@ class Estimator:
         self._log.add("tracking", stamp_ns, module=self.active.key, status=status.value)
 
     def _retire(self, runner: Runner | None, placed: list[int]) -> None:
-        """Shut a module down; its map lies where it was placed last."""
+        """Shut a module down; its map stays where it was placed last."""
         if runner is not None:
             self._ending.append(_Ending(runner.retire(), placed))
             self._keep_maps(waits=False)
 
     def _keep_maps(self, *, waits: bool) -> None:
-        """Give the back end what modules that have ended leave; `waits` for those that have not."""
+        """Pass the maps of modules that have shut down to the back end.
+
+        `waits`: wait for modules that are still shutting down.
+        """
         while self._ending and (waits or self._ending[0].legacy.done()):
             ending = self._ending.pop(0)
             legacy, placed = ending.legacy.result(), ending.placed

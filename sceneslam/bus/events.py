@@ -13,21 +13,21 @@ from sceneslam.types.run import Event
 
 
 class EventLog:
-    """Collects events in memory and writes them to `events.jsonl` as they come.
+    """Collects events in memory and writes them to `events.jsonl` as they occur.
 
-    All events but `cost` are functions of the recording and the configuration alone.
+    All events but `cost` depend on the recording and the configuration alone.
     """
 
     def __init__(
         self, path: Path | None = None, make_room: Callable[[], bool] = lambda: False
     ) -> None:
         self._events: list[Event] = []
-        self._written = 0  # how many of them are in the file
+        self._written = 0  # how many of the events are in the file
         self._file = LogFile(path, make_room) if path else None
 
     @property
     def fault(self) -> str:
-        """Return why the file ends before the run did, "" where it does not."""
+        """Return why the file ends before the run, "" if it is complete."""
         return self._file.fault if self._file is not None else ""
 
     @property
@@ -49,7 +49,7 @@ class EventLog:
             self.flush()
 
     def flush(self) -> None:
-        """Write what waits; where the disk does not take it, it stays in memory."""
+        """Write pending events to disk; if that fails, they stay in memory."""
         if self._file is None:
             return
         lines = [json.dumps(line) + "\n" for line in self._events[self._written :]]
@@ -58,7 +58,7 @@ class EventLog:
             self._file.append("".join(lines).encode())
 
     def sync(self) -> None:
-        """Wait until what was written outlives a loss of power; may be called by a thread."""
+        """Wait until written events would survive a loss of power; any thread may call it."""
         if self._file is not None:
             self._file.sync()
 

@@ -1,8 +1,8 @@
-"""The do-no-harm gate: did the robot move as a module says? Wheels, or another, bear witness.
+"""The gate: compare a module's motion with an independent one, from wheels or another source.
 
 Wheels measure distance well and turns badly; cameras the other way round, and one without a
-metric sensor guesses its scale. So distance and turn are judged apart: a module whose scale is
-off still tells the turn better than the wheels (Borenstein and Feng's gyrodometry, ICRA 1996).
+metric sensor guesses its scale. So distance and turn are checked separately: a module with a
+wrong scale still measures turns better than wheels (gyrodometry, Borenstein and Feng, ICRA 1996).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from sceneslam.types.se3 import Transform
 
 
 class Verdict(Enum):
-    """What the independent motion says of a module's."""
+    """Result of the comparison of a module's motion with the independent motion."""
 
     AGREE = "agree"
     DISAGREE = "disagree"
@@ -33,11 +33,11 @@ class Verdict(Enum):
 
 @dataclass(slots=True, kw_only=True)
 class GateSettings:
-    """How far two honest motions may differ: `sigmas` deviations of the independent one.
+    """How far two correct motions may differ: `sigmas` standard deviations of the independent one.
 
-    Its deviations are those of wheels on a floor: they grow with the way and the turn, on top of
-    what slips and the sensors' clocks make of any motion. A module's own covariance does not
-    widen the bounds: where a module is less sure than the wheels are, theirs is the better motion.
+    The standard deviation is that of wheels on a floor: it grows with the distance and the turn, on
+    top of a constant part from slip and clock offsets. A module's own covariance does not widen the
+    bounds: where a module is less certain than the wheels, the wheels' motion is the better one.
     """
 
     sigmas: float
@@ -48,43 +48,43 @@ class GateSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judgement:
-    """How far a module is to be believed at one observation."""
+    """How far a module's motion is trusted at one observation."""
 
     distance: Verdict
     turn: Verdict
     distance_excess: float = 0.0  # the largest difference over its bound; above 1 is too much
     turn_excess: float = 0.0
-    since_ns: int | None = None  # from when on the module was right, or may have been wrong
-    wheels_lie: bool = False  # they disagree with a module that is certain and moves as robots do
+    since_ns: int | None = None  # since when the module was right, or may have been wrong
+    wheels_lie: bool = False  # they disagree with a module that is certain and moves plausibly
 
     @property
     def is_trusted(self) -> bool:
-        """Tell whether the module's pose may be taken."""
+        """Tell whether the module's pose may be used."""
         return self.distance in _GOOD and self.turn in _GOOD
 
 
 _HORIZONS_S = (1.0, 5.0)  # over each: a jump shows in the shorter, a slow slide in the longer
 _PROBATION_NS = 1_000_000_000  # a module is trusted after agreeing over a whole horizon
-# Any motion differs by so much: clocks of sensors apart by 0.05 s at 0.6 m/s and 20 deg/s.
+# Any two motions differ by this: sensor clocks 0.05 s apart at 0.6 m/s and 20 deg/s.
 _DISTANCE_M, _TURN_RAD = 0.03, 0.0175
-_BROKEN_RATIO = 0.5  # off by more of the way than any wrong scale explains: not even the turn
-# A robot changes its velocity by 1.5 m/s^2, a point a metre ahead of it by its turns' start, too.
-_STEP_S = 0.3  # over which velocities are taken, and changes of them
+_BROKEN_RATIO = 0.5  # of the distance; no wrong scale explains more: the turn is wrong, too
+# A robot accelerates by up to 1.5 m/s^2; a point 1 m ahead also by the angular acceleration.
+_STEP_S = 0.3  # interval for velocities and their changes
 _LATE_NS = 1_900_000_000  # a disagreement shows within the shortest horizon after it began
 _JUMP_M_S = 0.2  # less is noise
-_JUMP_RATIO = 1.5  # times the other's, to be the one that began
-# Half the differences of normal errors are below 0.7 deviations; of the larger of two, below 1.
+_JUMP_RATIO = 1.5  # times the other's change of velocity, to be the one that jumped
+# Median difference of normal errors: below 0.7 standard deviations; of the larger of two: below 1.
 _USUAL_SIGMAS = 1.5
-_USUAL_STEP_M, _USUAL_STEP_NS = 0.02, 200_000_000  # between two that count, at least
-_USUAL_MIN, _USUAL_KEPT = 100, 150  # 20 to 30 s of driving: some seconds of a lie are no scale
+_USUAL_STEP_M, _USUAL_STEP_NS = 0.02, 200_000_000  # least spacing of the excesses
+_USUAL_MIN, _USUAL_KEPT = 100, 150  # 20 to 30 s of driving: a short fault is no wrong scale
 _GOOD = (Verdict.AGREE, Verdict.UNCHECKED)
 
 
 def with_heading(T_prev_curr_odom: Transform, rotation: NDArray[np.float64]) -> Transform:
-    """Return the odometry's motion with the heading of a module that is believed the turn.
+    """Return the odometry's motion (4, 4) with the heading of a module whose turn is trusted.
 
-    `rotation` (3, 3) is the module's over the same time. Wheels stay on the floor: the way is
-    theirs, and so are roll and pitch, which a module's tilt would turn into a climb.
+    `rotation` (3, 3) is the module's over the same time. Translation, roll and pitch stay the
+    wheels', which stay on the floor: a module's tilt error would appear as a climb.
     """
     return se3.with_yaw(T_prev_curr_odom, float(np.arctan2(rotation[1, 0], rotation[0, 0])))
 
@@ -92,12 +92,12 @@ def with_heading(T_prev_curr_odom: Transform, rotation: NDArray[np.float64]) -> 
 @dataclass(slots=True, kw_only=True, eq=False)
 class _Sample:
     stamp_ns: int
-    R_local_odom: NDArray[np.float64]  # (3, 3), constant while both turn alike
+    R_local_odom: NDArray[np.float64]  # (3, 3), constant while both rotate alike
     position_local: NDArray[np.float64]  # (3,) [m]
     position_odom: NDArray[np.float64]  # (3,) [m]
-    ahead_local: NDArray[np.float64]  # (3,) [m], a metre ahead of base: it moves in a turn, too
+    ahead_local: NDArray[np.float64]  # (3,) [m], 1 m ahead of base, so that it also moves in a turn
     ahead_odom: NDArray[np.float64]  # (3,) [m]
-    way_m: float  # driven until then
+    way_m: float  # distance driven until then
     turn_rad: float  # turned until then
 
 
@@ -110,25 +110,25 @@ class _Excess:
 
 
 class Gate:
-    """Follows one activation of one module; what it says depends on what it was given alone.
+    """Follows one activation of one module; its output depends on its inputs alone.
 
-    Two honest motions differ by a deviation or so: a distance that usually differs by more is of
-    another scale, though it seldom differs by as many as `sigmas`.
+    Two correct motions differ by about one standard deviation. If the distance usually differs by
+    more, the module's scale is wrong, even though it seldom differs by as much as `sigmas`.
     """
 
     def __init__(self, settings: GateSettings, wheels: Wheels) -> None:
         self._sigmas, self._wheels = settings.sigmas, wheels
         self._horizons_ns = [round(horizon_s * 1e9) for horizon_s in _HORIZONS_S]
         self._samples: list[_Sample] = []  # by rising stamp, back to the longest horizon
-        self._stamps_ns: list[int] = []  # theirs
+        self._stamps_ns: list[int] = []  # the samples' stamps
         self._T_odom_base: Transform | None = None
         self._held: tuple[Transform, Transform] | None = None  # T_local_base, T_odom_base then
         self._way_m, self._turn_rad = 0.0, 0.0
-        self._distance_since_ns: int | None = None  # since when it has not been too far off
-        self._has_jumped = False  # the module, as no robot does, since the two agreed
-        self._distances = RecentMedian(_USUAL_KEPT, width=1)  # excesses of late
+        self._distance_since_ns: int | None = None  # since when the distance has been within bounds
+        self._has_jumped = False  # the module has jumped as no robot can, since the two agreed
+        self._distances = RecentMedian(_USUAL_KEPT, width=1)  # the newest excesses
         self._usual_excess = 0.0  # their median
-        self._usual_m, self._usual_ns = 0.0, 0  # path and stamp at the last of them
+        self._usual_m, self._usual_ns = 0.0, 0  # path length and stamp at the newest
 
     def update(
         self,
@@ -139,11 +139,11 @@ class Gate:
         is_revised: bool = False,
         deviation_m: float | None = None,
     ) -> Judgement:
-        """Return how far the module is to be believed at an observation.
+        """Return how far the module is trusted at an observation.
 
-        `T_local_base` is None where the module is lost, `T_odom_base` where nothing else told the
-        motion. `is_revised`: the module corrected its past, and its pose jumps without motion.
-        `deviation_m`: the standard deviation that the module states, None where it states none.
+        `T_local_base` (4, 4) is None while the module is lost, `T_odom_base` (4, 4) without
+        independent motion. `is_revised`: the module corrected its past, so that its pose jumps
+        without motion. `deviation_m`: standard deviation of the module's position, None if unknown.
         """
         if T_odom_base is None:
             return Judgement(distance=Verdict.UNCHECKED, turn=Verdict.UNCHECKED)
@@ -178,7 +178,10 @@ class Gate:
         T_local_then: Transform,
         T_odom_then: Transform,
     ) -> None:
-        """Bring the samples to where the module now has them; since the last, odometry moved."""
+        """Move the samples by the module's correction of its past.
+
+        Since the last sample the robot moved as odometry measured.
+        """
         T_local_old = T_local_then @ se3.inverse(T_odom_then) @ T_odom_base
         T_new_old = T_local_base @ se3.inverse(T_local_old)
         for sample in self._samples:
@@ -195,7 +198,7 @@ class Gate:
         if self._distance_since_ns is None or max(distance, turn) > 1.0:
             self._distance_since_ns = now.stamp_ns
         elif now.stamp_ns - self._distance_since_ns >= _PROBATION_NS:
-            self._has_jumped = False  # that was another disagreement
+            self._has_jumped = False  # the jump belonged to another disagreement
         is_wrong = max(distance, turn) > 1.0
         if is_wrong and self._is_wheels_fault(found[-1], now, deviation_m):
             return Judgement(
@@ -214,10 +217,10 @@ class Gate:
         )
 
     def _is_wheels_fault(self, then: _Sample, now: _Sample, deviation_m: float | None) -> bool:
-        """Tell whether it is the wheels that lie, where the two disagree; inertia is the third.
+        """Tell whether a disagreement is the wheels' fault, by the robot's inertia.
 
-        Who lies begins to move otherwise at once, as no robot does, and the other does not. Where
-        neither did, a module that is more certain than wheels are is right: wheels err lastingly.
+        The one at fault changes its velocity abruptly, as no robot can, and the other does not. If
+        neither did, a module that is more certain than the wheels is right: wheel errors persist.
         """
         wheels_m = _DISTANCE_M + self._wheels.drift_ratio * (now.way_m - then.way_m)
         if deviation_m is None or deviation_m > wheels_m:
@@ -228,7 +231,7 @@ class Gate:
         return not self._has_jumped
 
     def _jumps(self, now: _Sample) -> tuple[float, float]:
-        """Return the largest changes of velocity [m/s] of late: the module's, the wheels'."""
+        """Return the largest recent changes of velocity [m/s]: the module's, the wheels'."""
         first = bisect_right(self._stamps_ns, now.stamp_ns - _LATE_NS)
         late = [*self._samples[first:], now]
         times_s = np.array([(sample.stamp_ns - now.stamp_ns) / 1e9 for sample in late])
@@ -246,7 +249,7 @@ class Gate:
         return found[0], found[1]
 
     def _usual(self, now: _Sample, excess: float) -> float:
-        """Return the median of the distance's excesses of late, 0 before it is known."""
+        """Return the median of the recent distance excesses, 0 before it is known."""
         is_far = now.way_m - self._usual_m >= _USUAL_STEP_M
         if is_far and now.stamp_ns - self._usual_ns >= _USUAL_STEP_NS:
             self._usual_m, self._usual_ns = now.way_m, now.stamp_ns
@@ -279,10 +282,10 @@ class Gate:
 
 
 def _turn_verdict(excess: float, is_known: bool) -> Verdict:
-    """Return whether a turn is believed: a sensor's own is better than the wheels', if it may be.
+    """Return whether the module's turn is trusted; within bounds it is better than the wheels'.
 
-    It is not on probation: a module that was wrong and is within the bounds again turns aright,
-    and the wheels' turn meanwhile would be the worse one.
+    There is no probation for turns: a module that was wrong and is within the bounds again turns
+    correctly, and the wheels' turn would be worse meanwhile.
     """
     if excess > 1.0:
         return Verdict.DISAGREE
@@ -290,7 +293,7 @@ def _turn_verdict(excess: float, is_known: bool) -> Verdict:
 
 
 def _excess(then: _Sample, now: _Sample, sigmas: float, wheels: Wheels) -> _Excess:
-    """Return by how much the module's motion differs from the odometry's, over the bounds."""
+    """Return the differences of the module's motion from the odometry's, divided by the bounds."""
     moved_local = now.position_local - then.position_local
     moved_odom = now.position_odom - then.position_odom
     apart_m = _norm(moved_local - then.R_local_odom @ moved_odom)

@@ -1,4 +1,4 @@
-"""A session on its way to become the active one: placed (Eq. 1), and caught up."""
+"""Hand-over: a session is placed (Eq. 1) and catches up before it becomes the active one."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from sceneslam.types.se3 import Transform
 
 
 class Handover:
-    """Leads a session from a remembered moment to now; nothing is changed until it is accepted.
+    """Advances a session from a remembered moment to now; nothing changes until it is accepted.
 
-    The module is placed at the pose of the last trusted moment at which it holds its own. From
-    there on its poses are the robot's, and what it does not hold is bridged as ever.
+    The module is placed at the pose of the last trusted moment at which it tracks. From there on
+    its poses are the robot's, and gaps in its tracking are bridged.
     """
 
     def __init__(
@@ -33,14 +33,14 @@ class Handover:
     ) -> None:
         assert session.runner is not None
         self.session, self.runner, self.anchor = session, session.runner, anchor
-        self.trail: list[Moment] = []  # all after the anchor, and itself if no module gave its pose
-        self.tracked: list[Tracking] = []  # what the module said from the anchor on, where it holds
+        self.trail: list[Moment] = []  # after the anchor, or from it if no module gave its pose
+        self.tracked: list[Tracking] = []  # its answers from the anchor on, while it tracks
         self._pace, self._memory = pace, memory
-        self._spared = 0  # observations since the last that the module was given ...
-        self._given_ns = anchor.stamp_ns  # ... and held its pose
+        self._spared = 0  # observations skipped since the last that the module was given
+        self._given_ns = anchor.stamp_ns  # the last that it was given and tracked
         self._began_ns, self._done_ns = anchor.stamp_ns, anchor.stamp_ns - 1
         self._reported: Transform | None = None  # the pose of the moment before, as known then
-        # What it took so far, the start among it; what is waited for between is not counted.
+        # Time taken so far, including the start; waiting in between is not counted.
         self._cost_ns = self.runner.start_ns
         self._first_cost_ns = 0  # the same until the first pose
 
@@ -51,13 +51,13 @@ class Handover:
 
     @property
     def is_lost(self) -> bool:
-        """Tell whether the module's last word was of no use."""
+        """Tell whether the module's last answer was not usable."""
         hold = self.session.hold
         return hold.status is TrackingStatus.LOST or hold.is_suspect
 
     @property
     def T_map_base(self) -> Transform | None:
-        """Return the newest pose, None when there is none."""
+        """Return the newest pose (4, 4), None before the first."""
         return self.trail[-1].T_map_base if self.trail else self.anchor.T_map_base
 
     def tracked_ns(self, stamp_ns: int) -> int:
@@ -67,7 +67,7 @@ class Handover:
         return stamp_ns - (hold.held_since_ns or 0) if is_tracking else -1
 
     def cost(self, stamp_ns: int) -> dict[str, object]:
-        """Return what it took, for the log; never part of what is reproducible."""
+        """Return the time it took, for the log; this is not reproducible between runs."""
         return {
             "module": self.runner.key,
             "handover_ms": self._cost_ns / 1e6,
@@ -78,7 +78,7 @@ class Handover:
     def advance(self, limit: int | None) -> bool:
         """Give the module up to `limit` observations; return whether it has caught up.
 
-        Raises ModuleError when the module breaks its promise.
+        Raises ModuleError when the module violates its contract.
         """
         given = 0
         with self._timed():
@@ -89,9 +89,9 @@ class Handover:
         return True
 
     def settle(self, anchor: Moment) -> None:
-        """Place the module, which has caught up, anew: at the pose of another moment, now.
+        """Place the module, which has caught up, anew: at the pose of the given moment.
 
-        What it did before was its trial, not the hand-over.
+        Its earlier observations belong to its trial, not to the hand-over.
         """
         last = self.tracked[-1]
         self._began_ns, self._cost_ns = anchor.stamp_ns, 0
@@ -110,7 +110,7 @@ class Handover:
             self._cost_ns += perf_counter_ns() - self._since_ns
 
     def _go_on_to(self, moment: Moment) -> bool:
-        """Give the module a moment's observation, or spare it that; return whether it was given."""
+        """Give the module a moment's observation or skip it; return whether it was given."""
         session, motion = self.session, self._motion_to(moment)
         self._done_ns, self._reported = moment.stamp_ns, moment.T_map_base
         if not session.is_placed and moment.is_trusted:
@@ -126,7 +126,7 @@ class Handover:
         return True
 
     def _ask(self, moment: Moment, motion: Transform | None) -> None:
-        """Give the module a moment's observation, with the gyro samples that it was spared."""
+        """Give the module a moment's observation, with the gyro samples of skipped ones."""
         session, given = self.session, moment.observation
         was_placed = session.is_placed
         if self.runner.can_use(given):
@@ -151,20 +151,21 @@ class Handover:
         self._remember(moment, replace(found, observation=moment.observation))
 
     def _motion_to(self, moment: Moment) -> Transform | None:
-        """Return the motion since the moment before as it was known then: better than none."""
+        """Return the motion (4, 4) since the moment before, as it was estimated then."""
         if self._reported is None or moment.T_map_base is None:
             return None
         return se3.inverse(self._reported) @ moment.T_map_base
 
     def _remember(self, moment: Moment, found: Moment) -> None:
-        """Go on to a moment with its pose as it is now known."""
+        """Continue to a moment with its newly estimated pose."""
         if moment is not self.anchor or moment.module == BRIDGED:
             self.trail.append(found)
 
     def _bend(self, count: int, tracking: Tracking, T_told_base: Transform) -> None:
-        """Lay the last poses of the trail, odometry's, between the module's before and after them.
+        """Distribute the drift of the trail's last `count` poses, bridged by odometry.
 
-        `T_told_base`: where the module is now, seen from where odometry led.
+        They lie between two poses of the module. `T_told_base` (4, 4) is the module's pose now, in
+        the frame of the pose that odometry led to.
         """
         xi, given_s = se3.log(T_told_base), (tracking.stamp_ns - self._given_ns) / 1e9
         for index in range(-count, 0):

@@ -1,4 +1,4 @@
-"""What the event log tells of the covariance at every hand-over."""
+"""Log the pose's covariance at every hand-over."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sceneslam.types.run import SessionStart
 def log_uncertainty(
     log: EventLog, starts: Iterable[SessionStart], covariances: NDArray[np.float64]
 ) -> None:
-    """Log, for every session, how sure the pose is where it begins, as known at the end.
+    """Log the standard deviations of the pose where each session begins, as known at the end.
 
     `covariances` (N, 6, 6) are those of the trajectory's poses, in `base`, translation first.
     """

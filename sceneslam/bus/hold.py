@@ -1,4 +1,4 @@
-"""How well a module has held its pose so far, and whether its motion is believed."""
+"""Health of an active module: whether it tracks, and whether its motion is trusted."""
 
 from __future__ import annotations
 
@@ -18,41 +18,41 @@ from sceneslam.types.se3 import Transform
 
 
 class Hold:
-    """Follows one activation of a module: since when it is held, lost, silent or suspect."""
+    """Follows one activation of a module: since when it tracks, is lost, silent or suspect."""
 
     def __init__(
         self, *, silence_ns: int, gate: GateSettings | None, wheels: Wheels | None = None
     ) -> None:
-        self.status: TrackingStatus | None = None  # None until it was fed
+        self.status: TrackingStatus | None = None  # None before its first answer
         self.is_suspect = False  # from a disagreement on until it has agreed for long enough
-        self.suspect_since_ns: int | None = None  # from when on it may have been wrong
+        self.suspect_since_ns: int | None = None  # since when it may have been wrong
         self.is_trusted = False  # another module may start from its last pose
-        self.wheels_lie = False  # by all that the module, and the robot's inertia, say
+        self.wheels_lie = False  # by the module's motion and the robot's inertia
         self.is_asked = False  # it was given the last observation
         self.inliers = 0  # measurements that agreed with its last pose
-        self.is_revised = False  # its last pose jumped, for it corrected its past
+        self.is_revised = False  # its last pose jumped because it corrected its past
         self.unheld_since_ns: int | None = None
         self.held_since_ns: int | None = None
-        self.held_ns = 0  # how long it had held its pose without a break before that
-        self.turn: NDArray[np.float64] | None = None  # its last (3, 3) rotation, where believed
-        self.covariance: NDArray[np.float64] | None = None  # of its pose, where that may be used
-        self.T_local_base: Transform | None = None  # at the last observation, where it told one
+        self.held_ns = 0  # how long it had tracked without a break before that
+        self.turn: NDArray[np.float64] | None = None  # its last (3, 3) rotation, if trusted
+        self.covariance: NDArray[np.float64] | None = None  # (6, 6) of its pose, if usable
+        self.T_local_base: Transform | None = None  # at the last observation, if it reported one
         self._T_odom_prev: Transform | None = None
-        self._agreed: tuple[Transform, Transform] | None = None  # local, odom, when turns did last
+        self._agreed: tuple[Transform, Transform] | None = None  # local, odom, as turns last agreed
         self._gate = Gate(gate, wheels or Wheels()) if gate is not None else None
         self._sureness = Sureness()
         self._revision = 0
-        self._fed_ns: int | None = None  # when its sensors last spoke ...
-        self._period_ns = silence_ns  # ... and how long after the time before; at first a guess
+        self._fed_ns: int | None = None  # when its sensors last delivered data
+        self._period_ns = silence_ns  # their last interval; at first a guess
 
     @property
     def is_held(self) -> bool:
-        """Tell whether the module holds its pose, as far as is known."""
+        """Tell whether the module tracks, as far as is known."""
         return self.held_since_ns is not None
 
     @property
     def health(self) -> Health:
-        """Return what the module's pose is worth."""
+        """Return the module's health."""
         if self.unheld_since_ns is None:
             return Health.HELD
         if self.is_suspect:
@@ -60,7 +60,7 @@ class Hold:
         return Health.LOST if self.status is TrackingStatus.LOST else Health.SILENT
 
     def ask(self, runner: Runner, observation: Observation) -> Tracking | None:
-        """Return a module's answer where its pose may be used; raises ModuleError as the runner."""
+        """Return a module's answer if its pose may be used; raises ModuleError as the runner."""
         self.is_trusted, self.covariance = False, None
         self.is_asked = runner.can_use(observation)
         if not self.is_asked:
@@ -85,7 +85,7 @@ class Hold:
         return tracking
 
     def spare(self, observation: Observation) -> None:
-        """Take note of an observation that a module which is catching up was not given."""
+        """Record an observation that was skipped while the module catches up."""
         self.is_trusted, self.covariance, self.is_asked = False, None, False
         self._judge(observation, None)
 
@@ -103,7 +103,7 @@ class Hold:
         T_local_base: Transform | None,
         covariance: NDArray[np.float64] | None = None,
     ) -> None:
-        """Hold the module's motion against the odometry's."""
+        """Compare the module's motion with the odometry's."""
         self.T_local_base, self.turn = T_local_base, None
         T_odom_prev, self._T_odom_prev = self._T_odom_prev, observation.T_odom_base
         if self._gate is None:
@@ -123,7 +123,7 @@ class Hold:
         elif judgement.is_trusted:
             self.is_suspect, self.suspect_since_ns = False, None
         if self.is_revised:
-            self._agreed = None  # what it said then is not what it would say now
+            self._agreed = None  # its earlier pose is not comparable with its corrected ones
         if judgement.turn is Verdict.AGREE and T_local_base is not None:
             assert observation.T_odom_base is not None
             now = (T_local_base, observation.T_odom_base)
@@ -132,7 +132,7 @@ class Hold:
             self._agreed = now
 
     def _wait(self, stamp_ns: int) -> None:
-        """Take note of an observation in which none of the module's sensors spoke."""
+        """Record an observation without data of the module's sensors."""
         if self._fed_ns is None or stamp_ns - self._fed_ns > 2 * self._period_ns:
             self._lose(stamp_ns)
 
@@ -150,12 +150,12 @@ def _turn(
     T_odom_now: Transform,
     T_odom_prev: Transform,
 ) -> NDArray[np.float64]:
-    """Return the last step's (3, 3) turn by a module: the wheels', and what they missed since then.
+    """Return the last step's rotation (3, 3): the wheels', corrected by the module's since `then`.
 
-    A module that was lost or doubted meanwhile knows its heading better than the wheels do.
+    A module that was lost or suspect in between knows its heading better than the wheels do.
     """
     if T_odom_then is T_odom_prev:
-        return np.asarray(T_local_then[:3, :3].T @ T_local_now[:3, :3])  # nothing was missed
+        return np.asarray(T_local_then[:3, :3].T @ T_local_now[:3, :3])  # no step in between
     by_module = se3.yaw_rad(se3.inverse(T_local_then) @ T_local_now)
     missed_rad = by_module - se3.yaw_rad(se3.inverse(T_odom_then) @ T_odom_now)
     step_rad = se3.yaw_rad(se3.inverse(T_odom_prev) @ T_odom_now)

@@ -1,4 +1,4 @@
-"""What was observed lately and what was known of the motion then, for a hand-over in the past."""
+"""Recent observations with their poses, for a hand-over that begins in the past."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ _BULKY = ("image_bgr", "depth_m", "points_lidar", "point_times_s")
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Moment:
-    """An observation with its pose, and all that later poses can be bridged from."""
+    """An observation with its pose, and the state from which later poses can be bridged."""
 
     observation: Observation
-    T_map_base: Transform | None  # None: it got no pose
-    module: str  # that gave it, BRIDGED for none
+    T_map_base: Transform | None  # None: no pose could be given
+    module: str  # the module that gave the pose, BRIDGED without one
     bridge: Bridge  # after the observation
-    turn: NDArray[np.float64] | None  # (3, 3) since the moment before, as a believed module says
-    covariance: NDArray[np.float64] | None  # (6, 6) of its T_local_base, as the module says
+    turn: NDArray[np.float64] | None  # (3, 3) rotation since the moment before, of a trusted module
+    covariance: NDArray[np.float64] | None  # (6, 6) of its T_local_base, as the module reports it
     is_trusted: bool  # a module that was not suspect was tracking, as certain as usual
 
     @property
     def stamp_ns(self) -> int:
-        """Return when it was."""
+        """Return the observation's stamp."""
         return self.observation.stamp_ns
 
     def bridged(self, T_map_base: Transform | None, bridge: Bridge) -> Moment:
-        """Return the moment with a pose that no module gave."""
+        """Return the moment with a bridged pose."""
         return replace(
             self,
             T_map_base=T_map_base,
@@ -48,17 +48,18 @@ class Moment:
 class Memory:
     """The moments of the last while, bounded in time and in bytes.
 
-    Where the bytes do not suffice, older moments lose their sensor data, so that those left lie
-    apart in proportion to their age: a module that is led through them sees fewer images of long
-    ago, and every moment still gets its pose.
+    When the bytes do not suffice, older moments lose their sensor data, so that the spacing of
+    those
+    left grows with their age: a module that catches up gets fewer of the older images, and every
+    moment still gets its pose.
     """
 
     def __init__(self, *, span_s: float, limit_mb: float, keeps_sensors: bool) -> None:
         self._span_ns, self._limit_bytes = round(span_s * 1e9), round(limit_mb * 1e6)
         self._keeps_sensors = keeps_sensors
         self._moments: list[Moment] = []  # by rising stamp
-        self._full_ns: list[int] = []  # the stamps of those that still have their sensor data ...
-        self._sizes: list[int] = []  # ... and its bytes
+        self._full_ns: list[int] = []  # stamps of the moments that still have their sensor data
+        self._sizes: list[int] = []  # bytes of that sensor data, in the same order
         self._bytes = 0  # in all
 
     @property
@@ -67,7 +68,7 @@ class Memory:
         return self._moments[-1]
 
     def add(self, moment: Moment) -> None:
-        """Remember a moment; forget what is too old."""
+        """Add a moment; remove those that are too old."""
         self._append(moment)
         old = self._count(moment.stamp_ns - self._span_ns - 1)
         if old:
@@ -81,7 +82,7 @@ class Memory:
     def anchor(self, until_ns: int | None) -> Moment:
         """Return the newest trusted moment, not after `until_ns` if that is given.
 
-        Where none is left, the oldest that has a pose; the very oldest where none has.
+        Without a trusted moment, the oldest that has a pose; without a pose, the oldest.
         """
         posed = [moment for moment in self._moments if moment.T_map_base is not None]
         for moment in reversed(posed):
@@ -94,12 +95,12 @@ class Memory:
         return self._moments[self._count(stamp_ns) :]
 
     def last_until(self, stamp_ns: int) -> Moment | None:
-        """Return the newest moment up to an instant, None where it is forgotten."""
+        """Return the newest moment up to an instant, None if it was removed."""
         count = self._count(stamp_ns)
         return self._moments[count - 1] if count else None
 
     def rewrite(self, moments: list[Moment]) -> None:
-        """Put moments that are now better known in the place of all from the first of them on."""
+        """Replace all moments from the first of `moments` on by these, with corrected poses."""
         from_ns = moments[0].stamp_ns
         del self._moments[self._count(from_ns - 1) :]
         self._drop(slice(bisect_left(self._full_ns, from_ns), None))
@@ -107,7 +108,7 @@ class Memory:
             self._append(moment)
 
     def clear(self) -> None:
-        """Forget everything: a run that is over may live on in its results."""
+        """Remove all moments, to free memory when a finished run is kept for its results."""
         self._moments, self._bytes = [], 0
         self._full_ns, self._sizes = [], []
 
@@ -124,18 +125,18 @@ class Memory:
             self._bytes += size
 
     def _drop(self, full: slice) -> None:
-        """Forget the sizes of moments that are forgotten."""
+        """Remove the sizes of moments that were removed."""
         self._bytes -= sum(self._sizes[full])
         del self._full_ns[full], self._sizes[full]
 
     def _least_missed(self) -> int:
-        """Return which of the moments with sensor data is best done without."""
+        """Return the index, among the moments with sensor data, of the one least needed."""
         stamps_ns = np.array(self._full_ns, np.float64)
         ages_ns = stamps_ns[-1] - stamps_ns[1:-1]
         return int(np.argmin((stamps_ns[2:] - stamps_ns[:-2]) / ages_ns)) + 1
 
     def _strip(self, full: int) -> None:
-        """Take the sensor data of one of the moments that have theirs."""
+        """Remove the sensor data of one of the moments that still have it."""
         index = self._count(self._full_ns[full]) - 1
         self._bytes -= self._sizes.pop(full)
         del self._full_ns[full]
@@ -147,7 +148,7 @@ def _stamp_ns(moment: Moment) -> int:
 
 
 def _size(observation: Observation) -> int:
-    """Return the bytes of the sensor data that can be done without."""
+    """Return the bytes of the sensor data that can be removed."""
     arrays = (getattr(observation, name) for name in _BULKY)
     return sum(array.nbytes for array in arrays if array is not None)
 

@@ -1,4 +1,4 @@
-"""How far apart the remembered observations are that a module which catches up is led through."""
+"""Which of the remembered observations a module processes while it catches up."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from sceneslam.types.observation import Observation
 
 @dataclass(slots=True, kw_only=True)
 class PaceSettings:
-    """What a module that catches up is spared: observations after so little time and motion."""
+    """Observations are skipped in a catch-up after less time and motion than this."""
 
-    period_s: float  # 0: none is spared
-    step_m: float  # and as many radians: what is seen is a metre away or more
+    period_s: float  # 0: no observation is skipped
+    step_m: float  # the same number limits turns [rad]: landmarks are 1 m away or more
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -26,15 +26,15 @@ class PaceSettings:
 
 
 class Pace:
-    """Follows one catch-up. Only where odometry tells the motion is an observation spared."""
+    """Follows one catch-up. Observations are skipped only where odometry measures the motion."""
 
     def __init__(self, settings: PaceSettings) -> None:
         self._settings = settings
-        self._last: Observation | None = None  # that the module was given
-        self._spared: list[Observation] = []  # since then
+        self._last: Observation | None = None  # last observation that the module was given
+        self._spared: list[Observation] = []  # skipped since then
 
     def spares(self, observation: Observation) -> bool:
-        """Tell whether a module can do without an observation, as little as happened since."""
+        """Tell whether an observation can be skipped because little time and motion passed."""
         last, settings = self._last, self._settings
         if last is None or last.T_odom_base is None or observation.T_odom_base is None:
             return False
@@ -46,11 +46,11 @@ class Pace:
         )
 
     def spare(self, observation: Observation) -> None:
-        """Note an observation that the module is not given."""
+        """Record a skipped observation."""
         self._spared.append(observation)
 
     def give(self, observation: Observation) -> Observation:
-        """Return an observation for the module, with the samples since its last."""
+        """Return an observation for the module, with the gyro samples of the skipped ones."""
         spared, self._spared, self._last = self._spared, [], observation
         for older in reversed(spared):
             observation = observation.with_samples_of(older)

@@ -12,7 +12,7 @@ from sceneslam.bus.scene_filter import SceneFilter, WindowFilter
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.run import HANDOVERS
 
-_OTHERS = (  # settings that are no durations
+_OTHERS = (  # settings that are not durations
     "handover",
     "catch_up",
     "gate",
@@ -22,7 +22,7 @@ _OTHERS = (  # settings that are no durations
 
 @dataclass(slots=True, kw_only=True)
 class Policy:
-    """The switching policy; every duration is of the recording's clock."""
+    """The switching policy; every duration is measured on the recording's clock."""
 
     handover: str  # how the pose passes from module to module
     confirm_window_s: float  # all images of this window must agree on a new scene
@@ -30,10 +30,10 @@ class Policy:
     scene_filter: BayesSettings | None  # confirms scenes in place of the window; None: the window
     lost_patience_s: float  # a lost module is bridged this long before its fallback takes over
     retry_s: float  # a fallback runs this long before the scene's first choice is tried again
-    buffer_s: float  # observations are remembered this long, for `rewind` ...
-    buffer_mb: float  # ... and up to this much; beyond it the older, the thinner
-    catch_up: PaceSettings  # what a module that is led through them is spared
-    gate: GateSettings | None  # how far a module's motion may differ from odometry's, None: any
+    buffer_s: float  # observations are remembered this long, for `rewind`
+    buffer_mb: float  # up to this size; beyond it, older sensor data is thinned
+    catch_up: PaceSettings  # which observations are skipped in a catch-up
+    gate: GateSettings | None  # how far a module's motion may differ from odometry, None: unchecked
     startup_s: dict[str, float]  # slam key -> time its start takes on the recording's clock
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""One SLAM module under the bus's care: called, timed, and stopped when it breaks its promise."""
+"""Run one SLAM module: call it, time it, and stop it when it violates its contract."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Legacy:
-    """What a module leaves behind."""
+    """The results of a module that was shut down."""
 
     layers: MapLayers
-    trajectory: Trajectory  # T_local_base as revised, empty where nothing was
-    lost: tuple[str, ...] = ()  # what it could not give, in a sentence each
+    trajectory: Trajectory  # T_local_base as revised, empty without revisions
+    lost: tuple[str, ...] = ()  # one sentence for each result that it could not give
 
 
 class Runner:
-    """Turns whatever a module raises into a ModuleError, and refuses invalid answers.
+    """Turns every exception of a module into a ModuleError, and rejects invalid answers.
 
-    Its start and its end may take long: `executor` makes these calls, one after the other.
+    Start and shutdown may take seconds: `executor` makes these calls, one after the other.
     """
 
     def __init__(self, key: str, module: SlamModule, executor: Executor) -> None:
@@ -41,15 +41,15 @@ class Runner:
         self.is_failed = False
         self.T_map_local: Transform | None = None  # None until it is placed
         self.track_ms: list[float] = []
-        self.spent_ns = 0  # that callers waited, in all calls together
-        self.start_ns = 0  # that the last start took
+        self.spent_ns = 0  # total time that callers waited
+        self.start_ns = 0  # time that the last start took
         self._executor = executor
         self._starting: Future[None] | None = None
         self._ending: Future[Legacy] | None = None
         self._is_active = False
-        self._submitted: Observation | None = None  # its answer was not collected yet
+        self._submitted: Observation | None = None  # observation whose answer was not collected yet
         self._module = module
-        # What every set holds is what it works on; without such, any of them may be.
+        # Sensors in every set are needed; if the sets share none, any of their sensors will do.
         common = frozenset[Sensor].intersection(*module.requires)
         self._sensors = common or frozenset[Sensor]().union(*module.requires)
 
@@ -58,7 +58,7 @@ class Runner:
         """Tell whether the module can be activated at once."""
         module = self._module
         if self._ending is not None and not self._ending.done():
-            return not self.is_failed  # it is activated once it has ended; it cannot be asked now
+            return not self.is_failed  # it can be activated again once it has shut down
         return not self.is_failed or (isinstance(module, Restartable) and module.is_ready)
 
     @property
@@ -68,13 +68,13 @@ class Runner:
         return not self.is_failed or (isinstance(module, Restartable) and not module.is_spent)
 
     def start(self, rig: Rig, scene: str) -> None:
-        """Begin to activate the module anew; `has_started` tells what came of it."""
+        """Begin to activate the module anew; `has_started` gives the result."""
         self.T_map_local, self.is_failed = None, False
         with self._timed():
             self._starting = self._executor.submit(self._activate, rig, scene)
 
     def has_started(self) -> bool:
-        """Return whether the start is over; raises ModuleError where the module cannot start."""
+        """Return whether the start is over; raises ModuleError if the module cannot start."""
         assert self._starting is not None, "started first"
         if not self._starting.done():
             return False
@@ -82,24 +82,24 @@ class Runner:
         return True
 
     def place(self, T_map_local: Transform) -> None:
-        """Place the module's frame in the map."""
+        """Set T_map_local (4, 4), which places the module's frame in the map."""
         self.T_map_local = T_map_local
         with self._timed(), self._asking("could not be placed"):
             self._module.set_pose(T_map_local)
 
     def set_scene(self, scene: str) -> None:
-        """Tell the module of a confirmed scene that it goes on with."""
+        """Inform the running module of a newly confirmed scene."""
         with self._timed(), self._asking("could not take the scene"):
             self._module.set_scene(scene)
 
     def can_use(self, observation: Observation) -> bool:
-        """Tell whether the observation holds any sensor that the module works on."""
+        """Tell whether the observation holds data of any sensor that the module uses."""
         return any(observation.has(sensor) for sensor in self._sensors)
 
     def submit(self, observation: Observation) -> None:
-        """Let a module with a process of its own begin; `track` with the same observation ends it.
+        """Submit an observation to a module in its own process; `track` collects the answer.
 
-        Does nothing for any other. Raises ModuleError as `track`.
+        Does nothing for any other module. Raises ModuleError as `track`.
         """
         if isinstance(self._module, Concurrent) and self.can_use(observation):
             with self._timed(), self._asking("failed while tracking"):
@@ -107,7 +107,7 @@ class Runner:
                 self._submitted = observation
 
     def track(self, observation: Observation) -> Tracking:
-        """Return the module's answer; raises ModuleError on an exception or no proper pose."""
+        """Return the module's answer; raises ModuleError on an exception or an invalid pose."""
         began_ns = perf_counter_ns()
         try:
             with self._timed(), self._asking("failed while tracking"):
@@ -116,13 +116,13 @@ class Runner:
             self.track_ms.append((perf_counter_ns() - began_ns) / 1e6)
 
     def retire(self) -> Future[Legacy]:
-        """Shut the module down; return what it leaves, empty where it cannot give it."""
+        """Shut the module down; return its results, empty where it cannot give them."""
         with self._timed():
             self._ending = self._executor.submit(self._retire)
         return self._ending
 
     def close(self) -> None:
-        """Wait for the module's end."""
+        """Wait until the module has shut down."""
         self._executor.shutdown()
 
     def _activate(self, rig: Rig, scene: str) -> None:
@@ -155,15 +155,15 @@ class Runner:
         return self._module.track(observation)
 
     def _drain(self) -> None:
-        """Take an answer that nobody waits for any more: the module is to be asked for another."""
+        """Discard a pending answer, so that the module can take another observation."""
         submitted, self._submitted = self._submitted, None
         if submitted is not None and isinstance(self._module, Concurrent):
-            with suppress(Exception):  # what is wrong with it shows when it is asked again
+            with suppress(Exception):  # a fault shows at the next call
                 self._module.collect()
 
     @contextmanager
     def _asking(self, what: str) -> Iterator[None]:
-        """Note a failure before it is passed on."""
+        """Record a failure before it is raised again."""
         try:
             with self._calling(what):
                 yield
@@ -175,7 +175,7 @@ class Runner:
 
     @contextmanager
     def _parting(self, what: str, lost: list[str]) -> Iterator[None]:
-        """Go on without what a module cannot give any more, which is added to `lost`."""
+        """Continue without a result that a module cannot give; add its description to `lost`."""
         try:
             with self._calling(what):
                 yield
@@ -185,7 +185,7 @@ class Runner:
 
     @contextmanager
     def _calling(self, what: str) -> Iterator[None]:
-        """Turn whatever a call raises, but Ctrl-C, into a ModuleError."""
+        """Turn any exception of a call, but Ctrl-C, into a ModuleError."""
         try:
             yield
         except KeyboardInterrupt:
@@ -197,7 +197,7 @@ class Runner:
 
     @contextmanager
     def _timed(self) -> Iterator[None]:
-        """Count what the caller waits."""
+        """Add up the time that the caller waits."""
         began_ns = perf_counter_ns()
         try:
             yield

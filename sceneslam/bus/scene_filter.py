@@ -1,4 +1,4 @@
-"""Which scene is confirmed, by the votes so far: the contract, and the paper's window."""
+"""Confirm a scene by the votes so far: the filter's interface, and the paper's window."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class ConfirmedScene:
     """A scene that the votes so far confirm."""
 
     stamp_ns: int  # of the vote that confirmed it
-    since_ns: int  # of the first vote that speaks for it
+    since_ns: int  # of the first vote that supports it
     scene: str
     previous: str | None
 
@@ -23,11 +23,11 @@ class SceneFilter(Protocol):
     """Turns votes, given by rising stamp, into confirmed scenes."""
 
     scene: str | None  # confirmed last, None before the first
-    since_ns: int  # the first vote that spoke for it
+    since_ns: int  # stamp of the first vote that supported it
 
     @property
     def posterior(self) -> Mapping[str, float] | None:
-        """Return the probability of every scene after the last vote, None without any."""
+        """Return the probability of every scene after the last vote, None if unknown."""
         ...
 
     def update(self, vote: SceneVote) -> ConfirmedScene | None:
@@ -55,7 +55,7 @@ class WindowFilter:
     def update(self, vote: SceneVote) -> ConfirmedScene | None:
         """Return the scene that this vote confirms, None when nothing changes.
 
-        A silence longer than the window holds no evidence, so that the window starts anew.
+        After a gap between votes longer than the window, the window starts anew.
         """
         if vote.scene == UNSURE:
             return None

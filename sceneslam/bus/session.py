@@ -1,4 +1,4 @@
-"""One activation of a module: it is asked and judged, then placed or bridged, and remembered."""
+"""One activation of a module: track, check, place or bridge each observation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sceneslam.types.se3 import Transform
 
 
 class Session:
-    """Advances by one observation at a time: live, and in the past while it catches up.
+    """Advances by one observation at a time: the newest, or remembered ones in a catch-up.
 
     Without a runner there is no module, and every pose is bridged.
     """
@@ -25,7 +25,7 @@ class Session:
         self.runner, self.hold, self.bridge = runner, hold, bridge
         self.is_placed = False
         self.tracking: Tracking | None = None  # of the last observation, where its pose is used
-        self.fault: ModuleError | None = None  # that the last observation led to
+        self.fault: ModuleError | None = None  # failure at the last observation
 
     @property
     def key(self) -> str:
@@ -34,7 +34,7 @@ class Session:
 
     @property
     def is_running(self) -> bool:
-        """Tell whether there is a module that did not fail."""
+        """Tell whether there is a module that has not failed."""
         return self.runner is not None and not self.runner.is_failed
 
     def advance(
@@ -47,7 +47,7 @@ class Session:
         """Return the observation with its pose: the module's, or a bridged one.
 
         Odometry bridges; else constant velocity, if `by_velocity` or while the module's sensors
-        are silent; else `T_prev_curr`, the motion as it was known at the time.
+        are silent; else `T_prev_curr`, the motion as it was estimated at the time.
         """
         self.fault, self.tracking = None, None
         try:
@@ -60,21 +60,21 @@ class Session:
         return self._bridged(observation, by_velocity or is_silent, T_prev_curr)
 
     def skip(self, observation: Observation, T_prev_curr: Transform | None) -> Moment:
-        """Return an observation with a bridged pose; the module is spared it."""
+        """Return an observation with a bridged pose; it is not given to the module."""
         self.hold.spare(observation)
         return self._bridged(observation, True, T_prev_curr)
 
     def _ask(self, observation: Observation) -> Tracking | None:
-        """Return the module's answer where it may be used; raises ModuleError as the runner."""
+        """Return the module's answer if it may be used; raises ModuleError as the runner does."""
         if self.runner is None or self.runner.is_failed:
             return None
         tracking = self.hold.ask(self.runner, observation)
         if self.hold.is_suspect:
-            self.is_placed = False  # it is placed anew where the robot then is
+            self.is_placed = False  # it is placed anew at the robot's next pose
         return tracking
 
     def _place(self, observation: Observation, tracking: Tracking) -> Transform:
-        """Return T_map_base; a module's first pose is the one handed over (Eq. 1)."""
+        """Return T_map_base; a module's first pose is the bridged one, handed over (Eq. 1)."""
         assert self.runner is not None
         if not self.is_placed:
             self.bridge.predict(observation, by_velocity=True)

@@ -1,4 +1,4 @@
-"""Asks the detector about every observation, and says which scene is confirmed."""
+"""Ask the detector about every observation, and report the confirmed scene."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def log_vote(
 
 
 class Watch:
-    """A detector under the bus's care: where it fails, the last scene stays."""
+    """Runs the detector; if it fails, the last confirmed scene stays."""
 
     def __init__(
         self, detector: Detector, rig: Rig, log: EventLog, *, scene_filter: SceneFilter
@@ -62,11 +62,11 @@ class Watch:
 
     @property
     def since_ns(self) -> int:
-        """Return the first image that said so."""
+        """Return the stamp of the first vote that supported the confirmed scene."""
         return self._filter.since_ns
 
     def look(self, observation: Observation) -> None:
-        """Take a vote and log it, and what it confirms."""
+        """Get a vote for the observation; log it and the scene that it confirms."""
         began_ns = perf_counter_ns()
         vote: SceneVote | None = None
         try:
@@ -93,7 +93,7 @@ class Watch:
             _log.warning("the detector could not be shut down: %s", told(error))
 
     def _checked(self, vote: object) -> SceneVote:
-        """Return a vote for a scene that the detector has; raises TypeError or ValueError."""
+        """Return a vote for a scene that the detector knows; raises TypeError or ValueError."""
         if not isinstance(vote, SceneVote):
             raise TypeError(f"get_scene returned {type(vote).__name__}, expected SceneVote")
         if vote.scene not in (*self._detector.scenes, UNSURE):
@@ -104,7 +104,7 @@ class Watch:
 
 
 def _check_likelihoods(told: Mapping[str, float] | None, scenes: Sequence[str]) -> None:
-    """Raise ValueError unless they are of known scenes, 0 or more, and not all 0."""
+    """Raise ValueError unless likelihoods are of known scenes, at least 0, and not all 0."""
     if told is None:
         return
     values = list(told.values())

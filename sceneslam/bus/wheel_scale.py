@@ -1,9 +1,9 @@
-"""Wheels whose size is learnt from modules that measure distances themselves.
+"""Estimate the wheels' scale from modules that measure distances themselves.
 
-A tyre's diameter is known to a per cent or two, and no wheel measures it. A camera or laser that
-tracks over half a metre does (the scale alone of Censi, Franchi, Marchionni and Oriolo,
-"Simultaneous calibration of odometry and sensor parameters for mobile robots", T-RO 2013). What is
-learnt from one module corrects the odometry for the others, which did not teach it.
+A tyre's diameter is known to 1 or 2 per cent, and wheel encoders cannot measure it. A camera or
+laser that tracks over half a metre can (the scale alone of Censi, Franchi, Marchionni and Oriolo,
+"Simultaneous calibration of odometry and sensor parameters for mobile robots", T-RO 2013). The
+scale estimated from one module corrects the odometry for the other modules.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from sceneslam.bus.hold import Hold
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
-_UNKNOWN = 0.02  # standard deviation of the scale before anything is learnt
-_LIMIT = 0.03  # no further from 1: half of what the gate lets pass, for it is judged by this
-_DRIFT = 0.002  # from span to span: tyres wear, floors change
-_SPAN_M = 0.5  # between two poses that are compared ...
-_TURN_MAX_RAD = 0.3  # ... which turned no more in all: an arc is longer than its chord
-_SLIP = 0.015  # standard deviation of what wheels slip over a span, each time anew
-_SIGMAS = 3.0  # more is no scale: a wheel spun, or the module erred
+_UNKNOWN = 0.02  # standard deviation of the scale before the first measurement
+_LIMIT = 0.03  # largest difference from 1: half of what the gate accepts, which uses this odometry
+_DRIFT = 0.002  # standard deviation of the change between spans: tyres wear, floors change
+_SPAN_M = 0.5  # distance between two poses that are compared
+_TURN_MAX_RAD = 0.3  # largest turn between them: an arc is longer than its chord
+_SLIP = 0.015  # standard deviation of the wheels' slip over a span, independent for each span
+_SIGMAS = 3.0  # larger innovations are rejected: a wheel slipped, or the module erred
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,18 +38,18 @@ class _Mark:
 
 
 class WheelScale:
-    """Learns by how much the wheels' distances are short, from one module."""
+    """Estimates the scale of the wheels' distances from one module."""
 
     def __init__(self) -> None:
         self.scale, self.variance = 1.0, _UNKNOWN**2
         self._mark: _Mark | None = None
-        self._turned_rad = 0.0  # in all, since the mark
+        self._turned_rad = 0.0  # sum since the mark
 
     def learn(self, hold: Hold, T_odom_base: Transform | None, turned_rad: float) -> None:
-        """Compare odometry as it came, and by how much it turned, with the module's pose."""
+        """Compare uncorrected odometry (4, 4) and its yaw [rad] with the module's pose."""
         self._turned_rad += turned_rad
         if not hold.is_asked or T_odom_base is None:
-            return  # one of them speaks more seldom
+            return  # one of them has a lower rate
         here = _here(hold, T_odom_base)
         mark, self._mark = self._mark, here
         if here is None or mark is None or mark.hold is not hold:
@@ -66,11 +66,11 @@ class WheelScale:
             self._turned_rad = 0.0
 
     def _take(self, ratio: float, noise: float) -> None:
-        """Learn the scale by a span's, whose variance is `noise`."""
+        """Update the scale by the ratio measured over a span, with variance `noise`."""
         self.variance += _DRIFT**2
         missed = ratio - self.scale
         if abs(missed) > _SIGMAS * math.sqrt(self.variance + noise):
-            self.variance = min(2.0 * self.variance, _UNKNOWN**2)  # or what is known is wrong
+            self.variance = min(2.0 * self.variance, _UNKNOWN**2)  # else a wrong estimate stays
             return
         gain = self.variance / (self.variance + noise)
         self.scale = min(max(self.scale + gain * missed, 1.0 - _LIMIT), 1.0 + _LIMIT)
@@ -78,7 +78,7 @@ class WheelScale:
 
 
 def _here(hold: Hold, T_odom_base: Transform) -> _Mark | None:
-    """Return where a span may begin or end: where the module measured its pose."""
+    """Return the current pose as a span's end, None unless the module measured it."""
     is_known = hold.is_trusted and hold.inliers > 0 and not hold.is_revised
     if not is_known or hold.covariance is None or hold.T_local_base is None:
         return None
@@ -91,7 +91,7 @@ def _here(hold: Hold, T_odom_base: Transform) -> _Mark | None:
 
 
 def _measured(mark: _Mark, here: _Mark) -> tuple[float, float]:
-    """Return the length [m] of a module's way, and the variance along it of both its ends."""
+    """Return the length [m] of the module's motion, and the variance along it of both its ends."""
     way = _way(mark.T_local_base, here.T_local_base)
     way_m = float(np.linalg.norm(way))
     ahead = way / max(way_m, 1e-9)
@@ -103,5 +103,5 @@ def _measured(mark: _Mark, here: _Mark) -> tuple[float, float]:
 
 
 def _way(T_from: Transform, T_to: Transform) -> NDArray[np.float64]:
-    """Return where (3,) `T_to` is, seen from `T_from`."""
+    """Return the position (3,) [m] of `T_to` in the frame of `T_from`."""
     return np.asarray((se3.inverse(T_from) @ T_to)[:3, 3])
