@@ -1,4 +1,4 @@
-"""The systematic error of the wheels' distance, learnt: tyres are known to a few per cent.
+"""Estimate the systematic error of the wheels' distance; tyre sizes are known to a few per cent.
 
 The scale alone of Censi, Franchi, Marchionni and Oriolo, "Simultaneous calibration of odometry and
 sensor parameters for mobile robots", T-RO 2013.
@@ -9,15 +9,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-_DRIFT = 1e-3  # by which share of its start the deviation grows with each comparison: tyres wear
-_OUTLIER = 3.0  # deviations: beyond, an error is none of a tyre's
+_DRIFT = 1e-3  # growth of the deviation per comparison, as a share of the first: tyres wear
+_OUTLIER = 3.0  # standard deviations: larger errors do not come from the tyres
 
 
 @dataclass(slots=True)
 class DistanceError:
-    """A Kalman filter of what wheels miss per metre that they tell."""
+    """A Kalman filter of the wheels' distance error per metre of odometry."""
 
-    deviation: float  # before anything is learnt
+    deviation: float  # standard deviation before the first measurement
     ratio: float = field(default=0.0, init=False)
     _variance: float = field(init=False)
 
@@ -25,7 +25,10 @@ class DistanceError:
         self._variance = self.deviation**2
 
     def learn(self, missed_m: float, forward_m: float, variance_m2: float) -> None:
-        """Take in by how much `forward_m` by the wheels missed a measured way, and its variance."""
+        """Update by the error of the wheels' `forward_m` against a measured distance.
+
+        `missed_m` is the measured distance less the wheels'; `variance_m2` is its variance.
+        """
         self._variance += (_DRIFT * self.deviation) ** 2
         innovation_m2 = self._variance * forward_m**2 + variance_m2
         limit_m = _OUTLIER * math.sqrt(innovation_m2)

@@ -1,4 +1,4 @@
-"""Poses that come later than their observations: where the robot is meanwhile."""
+"""Predict the current pose when a module's poses arrive later than their observations."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from sceneslam.types.trajectory import Trajectory
 
 
 class Pipeline:
-    """Matches answers with observations; the newest pose is carried on by odometry until the next.
+    """Matches answers with observations; odometry extends the newest pose until the next one.
 
-    Without odometry it is carried on at constant velocity. Either way the pose is DEGRADED, and
-    LOST when the newest answer is older than `late_max_s`.
+    Without odometry the pose is extended at constant velocity. In both cases it is DEGRADED, or
+    LOST
+    when the newest answer is older than `late_max_s`.
     """
 
     def __init__(self, late_max_s: float) -> None:
@@ -25,18 +26,18 @@ class Pipeline:
         self._newest: Tracking | None = None
         self._T_odom_newest: se3.Transform | None = None
         self._first_ns: int | None = None
-        self._T_local_base = se3.identity()  # as reported last
+        self._T_local_base = se3.identity()  # the last reported pose
         self._twist_s = np.zeros(6)
         self._stamps_ns: list[int] = []
         self._poses: list[se3.Transform] = []
 
     @property
     def T_local_base(self) -> se3.Transform:
-        """Return the pose as reported last."""
+        """Return the last reported pose (4, 4)."""
         return self._T_local_base
 
     def note(self, observation: Observation) -> None:
-        """Remember an observation that the program was given."""
+        """Record an observation that was given to the program."""
         T_odom_base = observation.T_odom_base
         if T_odom_base is not None and not np.isfinite(T_odom_base).all():
             T_odom_base = None
@@ -45,7 +46,7 @@ class Pipeline:
             self._first_ns, self._T_odom_newest = observation.stamp_ns, T_odom_base
 
     def take(self, answers: Sequence[Tracking]) -> None:
-        """Take answers by rising stamp; raises ValueError for one that nobody waits for."""
+        """Take answers by increasing stamp; raises ValueError for one that is not expected."""
         for answer in answers:
             if answer.stamp_ns not in self._waiting:
                 given = f"the last was {max(self._waiting, default=None)}"
@@ -60,7 +61,7 @@ class Pipeline:
         self._is_late = self._is_late or bool(self._waiting)
 
     def report(self, observation: Observation, revision: int) -> Tracking:
-        """Return the pose at an observation that was noted."""
+        """Return the pose at an observation that was recorded."""
         newest = self._newest
         if newest is not None and newest.status is TrackingStatus.LOST:
             status = TrackingStatus.LOST
@@ -81,7 +82,7 @@ class Pipeline:
         )
 
     def trajectory(self) -> Trajectory:
-        """Return the poses as the program gave them, nothing where all were in time."""
+        """Return T_local_base as the program gave it; empty if no answer was late."""
         if not self._is_late or not self._stamps_ns:
             return Trajectory.empty()
         return Trajectory(
@@ -89,7 +90,7 @@ class Pipeline:
         )
 
     def _carry_on(self, observation: Observation) -> TrackingStatus:
-        """Carry the newest pose on to an observation that has none yet."""
+        """Extend the newest pose to an observation without an answer."""
         since_ns = self._stamps_ns[-1] if self._stamps_ns else self._first_ns
         assert since_ns is not None
         gap_s = (observation.stamp_ns - since_ns) * 1e-9

@@ -1,9 +1,10 @@
-"""The one motion model: how the base moved from one observation to the next.
+"""The motion model: the base's motion from one observation to the next.
 
-Wheel odometry where there is any, else constant velocity; a gyro turns either (Borenstein and Feng,
-"Gyrodometry", ICRA 1996). What the wheels and the gyro are off by is learnt from motions that
-another sensor measured, and from one another; so is how far they can be trusted, and whether the
-wheels lie just now. Every user has a model of its own: a judge's is not taught by whom it judges.
+It uses wheel odometry, or else constant velocity, and replaces the turn of either by the gyro's
+(Borenstein and Feng, "Gyrodometry", ICRA 1996). Systematic errors and noise of wheels and gyro are
+estimated from motions that another sensor measured, and by comparing wheels and gyro; so is the
+probability that the wheels are wrong now. Every user has its own model, so that a model that checks
+a module is not calibrated by that module.
 """
 
 from __future__ import annotations
@@ -24,21 +25,21 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
 
-_ACCELERATION = np.array([1.5, 4.0])  # m/s^2, rad/s^2: of a robot
-_FADE_S = {False: 0.5, True: 5.0}  # in which a velocity that nothing measures is forgotten
-_JUMP = 3.0  # of these is no acceleration any more
-_KEPT_S = 0.5  # no velocity is kept for longer than this
-_UNKNOWN = np.array([1.0, 2.0])  # m/s, rad/s: of a base of which no velocity is known
-_STEP = np.array([1e-4, 1e-4])  # m, rad: no guess is better
-_STILL_M, _STILL_RAD = 1e-5, 1e-5  # of a step: less than a tick of any encoder
-_FASTEST = np.array([25.0, 20.0])  # m/s, rad/s: a velocity measured worse is not measured
-_AT_REST = 0.3  # of the wheels' floor: wheels that do not turn say so
-_TURN_PER_METRE = 0.5  # rad/m per unit of noise: a wheel base of a metre or two
-_METRE_PER_TURN = 0.1  # turning on the spot moves base by 2 cm per radian: no axle is quite below
-_LATE_M, _SPEED_MAX_M_S = 1.0, 25.0  # odometry that moves further has jumped: it was reset
-_BELIEVED = 0.5  # wheels that lie with this probability or more are not
-_RIVAL_MIN = 0.01  # the probability of the rival, at least
-_TAUGHT_MIN = 0.25  # what noisy wheels that are taken for lying teach, beside honest ones
+_ACCELERATION = np.array([1.5, 4.0])  # m/s^2, rad/s^2: largest usual of a robot
+_FADE_S = {False: 0.5, True: 5.0}  # time constant of an unmeasured velocity, by: has wheels
+_JUMP = 3.0  # times the acceleration: a larger change of velocity is a jump
+_KEPT_S = 0.5  # longest time that an unmeasured velocity is kept
+_UNKNOWN = np.array([1.0, 2.0])  # m/s, rad/s: standard deviation of an unknown velocity
+_STEP = np.array([1e-4, 1e-4])  # m, rad: least standard deviation of a predicted step
+_STILL_M, _STILL_RAD = 1e-5, 1e-5  # per step: less than one encoder tick
+_FASTEST = np.array([25.0, 20.0])  # m/s, rad/s: with a larger deviation a velocity is unknown
+_AT_REST = 0.3  # share of the wheels' constant noise while the wheels stand still
+_TURN_PER_METRE = 0.5  # rad/m per unit of noise: a wheel base of 1 to 2 m
+_METRE_PER_TURN = 0.1  # base moves 2 cm per radian in place: it is not exactly above the axle
+_LATE_M, _SPEED_MAX_M_S = 1.0, 25.0  # odometry that moves farther was reset
+_BELIEVED = 0.5  # wheels are not used if they are wrong with this probability
+_RIVAL_MIN = 0.01  # least probability of the alternative
+_TAUGHT_MIN = 0.25  # least weight of wheels that are probably wrong, in estimating their noise
 _PLANAR = np.array([0, 1, 5])  # forward, left, yaw
 
 
@@ -48,14 +49,14 @@ class Motion:
 
     T_prev_curr: Transform
     covariance: NDArray[np.float64]  # (6, 6) of se3.log order [m, rad], axes of curr
-    is_measured: bool  # wheels told all of the motion since another sensor measured; else guessed
-    is_doubted: bool = False  # the wheels seem to lie: the motion is a guess nevertheless
-    probability: float = 1.0  # that it is this motion and not the rival
-    rival: Motion | None = None  # the motion if whoever is not believed is right after all
+    is_measured: bool  # wheels covered all motion since another sensor measured
+    is_doubted: bool = False  # the wheels are probably wrong: it is predicted without
+    probability: float = 1.0  # that this motion is right and not the alternative
+    rival: Motion | None = None  # the alternative: the motion by the source that is not used
 
 
 class MotionModel:
-    """Predicts the motion to one observation after the other; learns from `learn` alone."""
+    """Predicts the motion to one observation after the other; only `learn` calibrates it."""
 
     def __init__(self, rig: Rig) -> None:
         self._wheels, self._gyro = rig.wheels, rig.gyro
@@ -66,50 +67,50 @@ class MotionModel:
         self._lies = [LieDetector() for _ in range(2)]
         self._turns = TurnErrors(rig.gyro.bias_radps)
         self._distance = DistanceError(rig.wheels.drift_ratio)
-        self._twist_s: NDArray[np.float64] | None = None  # motion per second, as last measured
+        self._twist_s: NDArray[np.float64] | None = None  # (6,) last measured twist per second
         self._twist_variance = np.zeros(2)
-        self._unmeasured_s = np.zeros(2)  # for so long nothing measured it: distance, turn
+        self._unmeasured_s = np.zeros(2)  # time since it was measured: distance, turn
         self._stamp_ns: int | None = None
-        self._T_odom_base: Transform | None = None  # the last there was ...
-        self._silent_s = 0.0  # ... so long ago
-        self._gap: Transform | None = None  # the motion returned since then; None: it is not silent
-        self._since_s = 0.0  # since the last measured motion; by wheels, if they told all of it
+        self._T_odom_base: Transform | None = None  # the last odometry
+        self._silent_s = 0.0  # time since then
+        self._gap: Transform | None = None  # predicted motion since then; None: no gap
+        self._since_s = 0.0  # since the last measured motion
         self._since_wheels: Step | None = still()
         self._since_guess = still()
-        self._is_followed = True  # not stopped since then
-        self._is_measured = True  # the wheels told of all motion since then
+        self._is_followed = True  # `stop` was not called since then
+        self._is_measured = True  # the wheels covered all motion since then
 
     @property
     def noise_ratios(self) -> NDArray[np.float64]:
-        """Return the wheels' deviation after a metre and after a radian (2,), as learnt so far."""
+        """Return the estimated standard deviations (2,) of wheels: after 1 m [m], 1 rad [rad]."""
         return np.array([noise.ratio for noise in self._noise])
 
     @property
     def missed_per_metre(self) -> float:
-        """Return what the wheels' distance misses per metre, as learnt so far."""
+        """Return the estimated error of the wheels' distance per metre."""
         return self._distance.ratio
 
     @property
     def lying(self) -> NDArray[np.float64]:
-        """Return the probability that the wheels lie now: of the distance, of the turn (2,)."""
+        """Return the probabilities (2,) that the wheels are wrong now: distance, turn."""
         return np.array([lie.lying for lie in self._lies])
 
     @property
     def gyro_bias(self) -> NDArray[np.float64]:
-        """Return the gyro's bias (3,) [rad/s], base axes, as learnt so far."""
+        """Return the estimated gyro bias (3,) [rad/s], base axes."""
         return self._turns.gyro_bias
 
     @property
     def velocity(self) -> NDArray[np.float64]:
-        """Return the base's twist per second (6,), 0 where it is not known."""
+        """Return the base's twist (6,) [m/s, rad/s] in se3.log order, 0 if unknown."""
         return np.zeros(6) if self._twist_s is None else self._twist_s
 
     def copy(self) -> MotionModel:
-        """Return a model that knows the same and learns on its own."""
+        """Return an independent copy with the same state."""
         return copy.deepcopy(self)
 
     def predict(self, observation: Observation) -> Motion:
-        """Return the motion from the observation before to this one, and go on from here."""
+        """Return the motion from the last observation to this one, which becomes the last."""
         before_ns, self._stamp_ns = self._stamp_ns, observation.stamp_ns
         if before_ns is None:
             self._take_odometry(observation, 0.0)
@@ -135,7 +136,7 @@ class MotionModel:
         self._since_guess = self._since_guess.then(guess)
         if wheels is not None and self._since_wheels is not None:
             self._since_wheels = self._since_wheels.then(wheels)
-        if wheels is not None and gap is not None:  # of the gap, the guesses were taken already
+        if wheels is not None and gap is not None:  # motion in the gap was predicted already
             wheels = replace(wheels, T=se3.inverse(gap) @ wheels.T)
         motion = self._joined(wheels, guess)
         if self._gap is not None:
@@ -143,14 +144,14 @@ class MotionModel:
         return motion
 
     def learn(self, T_before_now: Transform, covariance: NDArray[np.float64]) -> None:
-        """Learn from the motion since the last call, as measured by another sensor alone.
+        """Calibrate by the motion (4, 4) since the last call, as measured by another sensor alone.
 
-        `covariance` (6, 6) is its own, without any prediction in it: large where the sensor
-        measured nothing. Axes of `now`.
+        `covariance` (6, 6) is the measurement's alone, without any prediction: large in
+        directions that the sensor did not measure. Axes of `now`.
         """
         duration_s, wheels, guess = self._since_s, self._since_wheels, self._since_guess
         had_velocity = self._twist_s is not None
-        if duration_s <= 0.0 or not self._is_followed:  # nobody knows since when it moved so
+        if duration_s <= 0.0 or not self._is_followed:  # the interval is unknown
             self.skip()
             return
         before = self._twist_variance * duration_s**2
@@ -192,27 +193,27 @@ class MotionModel:
             )
 
     def skip(self) -> None:
-        """Learn nothing from the motion since the last call: it was not measured."""
+        """Discard the motion since the last call, which no sensor measured."""
         self._forget()
         self._is_followed = True
 
     def stop(self) -> None:
-        """Forget the velocity, too, and that wheels told all: the base is no longer followed."""
+        """Reset velocity and odometry: the base is no longer tracked."""
         self.slow_down()
         self._forget()
         self._is_measured, self._is_followed = False, False
 
     def slow_down(self) -> None:
-        """Forget the velocity alone."""
+        """Reset the velocity only."""
         self._twist_s = None
 
     def _note_velocity(self, twist_s: NDArray[np.float64], covariance: NDArray[np.float64]) -> None:
-        """Take a velocity; what the sensor did not measure of it is forgotten after a while."""
+        """Take a velocity; components that the sensor did not measure decay."""
         unknown = np.diag(np.repeat(_FASTEST**2, 3))
         gain = unknown @ np.linalg.inv(unknown + covariance)
         kept = self.velocity * math.exp(-self._since_s / self._fade_s)
         twist_s = kept + gain @ (twist_s - kept)
-        if self._has_wheels and self._twist_s is not None:  # else nothing else can tell a jump
+        if self._has_wheels and self._twist_s is not None:  # else a jump cannot be detected
             reach = np.repeat(_JUMP * _ACCELERATION * self._since_s, 3)
             twist_s = self._twist_s + np.clip(twist_s - self._twist_s, -reach, reach)
         self._twist_s = twist_s
@@ -221,14 +222,14 @@ class MotionModel:
         self._unmeasured_s = np.where(is_measured, 0.0, self._unmeasured_s)
 
     def _forget(self) -> None:
-        """Begin anew to compare; odometry that is silent just now has to begin anew, too."""
+        """Restart the comparison; odometry that is missing now has to restart, too."""
         if self._gap is not None:
             self._T_odom_base, self._gap = None, None
         self._since_s, self._since_wheels, self._since_guess = 0.0, still(), still()
         self._is_measured = True
 
     def _take_odometry(self, observation: Observation, duration_s: float) -> Step | None:
-        """Return the motion since the last odometry, None where it is missing now or was before."""
+        """Return the motion since the last odometry, None if it is missing now or was before."""
         self._silent_s += duration_s
         T_before, T_odom_base = self._T_odom_base, _finite(observation.T_odom_base)
         if T_odom_base is None:
@@ -246,7 +247,7 @@ class MotionModel:
         return step
 
     def _by_wheels(self, T_prev_curr: Transform, duration_s: float) -> Step | None:
-        """Return a motion as odometry has it, None where it jumped."""
+        """Return the motion by odometry, None if odometry jumped."""
         forward_m, yaw_rad = float(T_prev_curr[0, 3]), se3.yaw_rad(T_prev_curr)
         distance_m = float(np.linalg.norm(T_prev_curr[:3, 3]))
         angle_rad = float(se3.rotation_angle_rad(T_prev_curr))
@@ -267,14 +268,14 @@ class MotionModel:
         )
 
     def _by_velocity(self, duration_s: float) -> Step:
-        """Return the motion if the base went on as it moved last."""
+        """Return the motion at constant velocity."""
         before_s, self._unmeasured_s = self._unmeasured_s, self._unmeasured_s + duration_s
         variance = self._reach(self._unmeasured_s) ** 2 - self._reach(before_s) ** 2 + _STEP**2
         T_prev_curr = se3.exp(self.velocity * min(duration_s, _KEPT_S))
         return replace(still(), T=T_prev_curr, variance=variance)
 
     def _reach(self, unmeasured_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how much (2,) a guess is off after a while: deviations add up in a guess."""
+        """Return the standard deviations (2,) [m, rad] of a prediction; they add up over time."""
         reach = _UNKNOWN * unmeasured_s
         if self._twist_s is None:
             return reach
@@ -290,7 +291,7 @@ class MotionModel:
         )
 
     def _joined(self, wheels: Step | None, guess: Step) -> Motion:
-        """Return distance and turn by whom each is believed: the wheels unless they lie."""
+        """Return the motion with distance and turn by the wheels, unless they are wrong."""
         if wheels is None:
             return _motion(guess, guess, is_measured=False)
         lies = self.lying >= _BELIEVED

@@ -1,4 +1,4 @@
-"""Where the base is expected to be: a pose that the motion model carries on from the last one."""
+"""Predict the base's pose from the last one by the motion model."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from sceneslam.types.se3 import Transform
 
 Matrix = NDArray[np.float64]
 
-_FIRST_DEVIATION = 1e-4  # m and rad: of the pose that `local` is defined by
-_COAST_S = 0.5  # without a measurement for longer, a guessed pose is no pose
-_UNMEASURED = 1e-6  # 1/m^2, 1/rad^2: the information along what a sensor does not measure
+_FIRST_DEVIATION = 1e-4  # m and rad: of the first pose, which defines `local`
+_COAST_S = 0.5  # after this time without a measurement a predicted pose is lost
+_UNMEASURED = 1e-6  # 1/m^2, 1/rad^2: information in directions that a sensor does not measure
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -25,37 +25,37 @@ class Prediction:
     """The expected pose of the base at an observation."""
 
     T_local_base: Transform
-    covariance: Matrix  # (6, 6) of se3.log order [m, rad], base, relative to the map around
+    covariance: Matrix  # (6, 6), se3.log order [m, rad], base, relative to the local map
     motion: Motion  # since the observation before
 
     @property
     def is_measured(self) -> bool:
-        """Tell whether odometry that can be believed led here from the last measured pose."""
+        """Tell whether trusted odometry covers all motion since the last measured pose."""
         return self.motion.is_measured and not self.motion.is_doubted
 
 
 class Predictor:
-    """Carries a pose and its covariance from one observation to the next.
+    """Propagates a pose and its covariance from one observation to the next.
 
-    Every observation is first predicted, then either measured, or else coasted or lost.
+    For every observation call `predict`, then one of `measure`, `coast`, `lose`, `bridge`.
     """
 
     def __init__(self, rig: Rig) -> None:
         self.model = MotionModel(rig)
-        self.T_local_base = se3.identity()  # of the last observation, measured or predicted ...
+        self.T_local_base = se3.identity()  # of the last observation, measured or predicted
         self.covariance = np.eye(6) * _FIRST_DEVIATION**2
-        self.T_local_measured = se3.identity()  # ... and the last that was measured
+        self.T_local_measured = se3.identity()  # the last that was measured
         self._measured_ns: int | None = None
         self._is_lost = False
         self._alone = np.zeros((6, 6))  # the sensor's own covariance of the last measured pose
 
     @property
     def is_lost(self) -> bool:
-        """Tell whether the motion to the last observation is not known."""
+        """Tell whether the motion to the last observation is unknown."""
         return self._is_lost
 
     def predict(self, observation: Observation) -> Prediction:
-        """Return where the base should be at an observation."""
+        """Return the predicted pose of the base at an observation."""
         motion = self.model.predict(observation)
         carried = se3.adjoint(se3.inverse(motion.T_prev_curr))
         return Prediction(
@@ -65,7 +65,7 @@ class Predictor:
         )
 
     def unmeasured_s(self, observation: Observation) -> float:
-        """Return for how long no pose was measured; 0 before there was any."""
+        """Return the time [s] since the last measured pose; 0 before the first."""
         if self._measured_ns is None:
             return 0.0
         return (observation.stamp_ns - self._measured_ns) * 1e-9
@@ -77,10 +77,10 @@ class Predictor:
         covariance: Matrix,
         information: Matrix | None = None,
     ) -> None:
-        """Go on from a measured pose with its covariance (6, 6), in base.
+        """Continue from a measured pose (4, 4) with its covariance (6, 6), in base.
 
-        `information` (6, 6) is what a sensor alone says of it, the prediction left out: the motion
-        model learns from that. None: nothing, as the pose was inferred in another way.
+        `information` (6, 6) is that of the sensor alone, without the prediction; it calibrates the
+        motion model. None: the pose was not measured directly, and the model is not calibrated.
         """
         if information is None or self._is_lost or self._measured_ns is None:
             self.model.skip()
@@ -95,11 +95,11 @@ class Predictor:
         self._measured_ns, self._is_lost = observation.stamp_ns, False
 
     def coast(self, prediction: Prediction) -> None:
-        """Go on from a prediction at the velocity that was measured last."""
+        """Continue from a prediction; the last measured velocity is kept."""
         self.T_local_base, self.covariance = prediction.T_local_base, prediction.covariance
 
     def lose(self, prediction: Prediction) -> None:
-        """Go on from a prediction; where no wheels told of it, as if the base only turned."""
+        """Continue from a prediction while lost; without wheels only its rotation is used."""
         rotation, position = prediction.T_local_base[:3, :3], self.T_local_base[:3, 3]
         self.coast(prediction)
         if not prediction.is_measured:
@@ -110,10 +110,10 @@ class Predictor:
     def bridge(
         self, observation: Observation, prediction: Prediction, *, can_coast: bool
     ) -> TrackingStatus:
-        """Go on without a measurement; return what the pose is worth then.
+        """Continue without a measurement; return the status of the pose.
 
-        Odometry leads on (DEGRADED), else the last velocity for a moment where `can_coast`
-        (TRACKING), else the pose is lost.
+        With odometry it is DEGRADED; else at the last velocity, for a short time and if
+        `can_coast`, TRACKING; else LOST.
         """
         is_brief = self.unmeasured_s(observation) <= _COAST_S
         if prediction.is_measured or (can_coast and is_brief):
@@ -124,6 +124,6 @@ class Predictor:
         return TrackingStatus.LOST
 
     def correct(self, T_new_old: Transform) -> None:
-        """Take that the map, and the poses with it, was corrected."""
+        """Apply a correction (4, 4) of the map to the poses."""
         self.T_local_base = se3.orthonormal(T_new_old @ self.T_local_base)
         self.T_local_measured = se3.orthonormal(T_new_old @ self.T_local_measured)

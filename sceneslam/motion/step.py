@@ -1,4 +1,4 @@
-"""A motion as one witness has it, and what its error grows with."""
+"""A motion by one source, with the quantities that its error grows with."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from sceneslam.types.se3 import Transform
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Step:
-    """A motion as one witness has it. Pairs are of the distance and of the turn."""
+    """A motion by one source. Pairs (2,) hold the distance, then the turn."""
 
     T: Transform
     variance: NDArray[np.float64]  # (2,) [m^2, rad^2]
-    amounts: NDArray[np.float64]  # (2,) [m, rad]: what the variance of its noise grows with
-    causes: NDArray[np.float64]  # (3,): metres, radians, seconds, of the turn's systematic error
+    amounts: NDArray[np.float64]  # (2,) [m, rad]: the variance of the noise grows with these
+    causes: NDArray[np.float64]  # (3,) [m, rad, s]: the turn's systematic error grows with these
 
     def then(self, step: Step) -> Step:
-        """Return both in a row."""
+        """Return this step followed by another."""
         return Step(
             T=self.T @ step.T,
             variance=self.variance + step.variance,
@@ -30,7 +30,7 @@ class Step:
         )
 
     def turned(self, turn: NDArray[np.float64], noise_rad: float, duration_s: float) -> Step:
-        """Return the step with the gyro's turn."""
+        """Return the step with its turn replaced by the gyro's rotation vector (3,) [rad]."""
         return Step(
             T=se3.from_parts(se3.so3_exp(turn), self.T[:3, 3]),
             variance=np.array([self.variance[0], noise_rad**2]),
@@ -40,5 +40,5 @@ class Step:
 
 
 def still() -> Step:
-    """Return no motion at all."""
+    """Return the step without motion."""
     return Step(T=se3.identity(), variance=np.zeros(2), amounts=np.zeros(2), causes=np.zeros(3))

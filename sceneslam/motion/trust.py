@@ -1,4 +1,4 @@
-"""How far a witness of motion can be trusted: learnt from how it disagrees with another."""
+"""Estimate the noise and faults of a motion source from its differences to another source."""
 
 from __future__ import annotations
 
@@ -10,26 +10,25 @@ from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
 
-_STUDENT = 4.0  # degrees of freedom: an error of five deviations counts a sixth
-_HONEST_S, _LYING_S = 300.0, 5.0  # mean time for which wheels are right, and for which they lie
-_EVIDENCE_MAX = 3.0  # of one comparison, as log-likelihood ratio: comparisons in a row err together
+_STUDENT = 4.0  # degrees of freedom: an error of 5 standard deviations has weight 1/6
+_HONEST_S, _LYING_S = 300.0, 5.0  # mean durations of correct and of wrong odometry
+_EVIDENCE_MAX = 3.0  # log-likelihood ratio of one comparison; consecutive ones correlate
 _LYING_MAX = 0.999
 
 
 @dataclass(slots=True)
 class NoiseRatio:
-    """The standard deviation of an error after a metre (or a radian), learnt robustly.
+    """Robust estimate of the standard deviation of an error after 1 m (or 1 rad).
 
-    An error is normal with variance floor^2 + ratio^2 * amount, whatever the steps are in which
-    the way is told (Siegwart and Nourbakhsh, "Introduction to Autonomous Mobile Robots", 2004,
-    Eq. 5.6); ratio^2 has an inverse gamma posterior over the newest comparisons. What the
-    comparison itself is off by is taken out by expectation maximisation; outliers count less, as
-    under Student's distribution.
+    An error is normal with variance floor^2 + ratio^2 * amount, independent of the step size
+    (Siegwart and Nourbakhsh, "Introduction to Autonomous Mobile Robots", 2004, Eq. 5.6); ratio^2
+    has an inverse gamma posterior over the newest comparisons. Expectation maximisation removes the
+    error of the comparison itself; outliers have less weight, by Student's distribution.
     """
 
     ratio: float
-    doubt: float = 10.0  # so many comparisons say as much as what is believed before any
-    memory: float = 200.0  # comparisons that are remembered
+    doubt: float = 10.0  # weight of the prior, in comparisons
+    memory: float = 200.0  # comparisons in the posterior, about
     _square: float = field(init=False)
     _count: float = field(init=False)
 
@@ -39,7 +38,7 @@ class NoiseRatio:
     def learn(
         self, missed: float, amount: float, *, floor: float, variance: float, share: float
     ) -> None:
-        """Take in an error that was measured with a variance of its own; `share`: 0 to 1 of it."""
+        """Update by an error measured with `variance`; `share` (0 to 1) is its weight."""
         moved = self.ratio**2 * amount
         noise = floor**2 + moved
         if moved <= 0.0:
@@ -47,7 +46,7 @@ class NoiseRatio:
         gain = noise / (noise + variance)
         robust = (_STUDENT + 1.0) / (_STUDENT + missed**2 / (noise + variance))
         square = robust * (gain * missed) ** 2 + (1.0 - gain) * noise  # of the error itself
-        part = moved / noise  # ... and of what the motion made of it
+        part = moved / noise  # share of the noise that is caused by motion
         square = part**2 * square + part * (1.0 - part) * noise
         weight = share * gain * part
         kept = 1.0 - weight / self.memory
@@ -59,7 +58,7 @@ class NoiseRatio:
 
 @dataclass(slots=True)
 class LieDetector:
-    """The probability that a witness lies just now: two states, honest and lying, that last.
+    """Estimates the probability that a source is wrong now: two lasting states, right and wrong.
 
     The forward recursion of a hidden Markov model: Rabiner, "A tutorial on hidden Markov models",
     Proc. IEEE 1989.
@@ -68,13 +67,13 @@ class LieDetector:
     lying: float = _LYING_S / (_HONEST_S + _LYING_S)
 
     def wait(self, duration_s: float) -> None:
-        """Let time go by: a lie may begin or end."""
+        """Predict over `duration_s`: a fault may begin or end."""
         rest = _LYING_S / (_HONEST_S + _LYING_S)
         stays = math.exp(-duration_s * (1.0 / _HONEST_S + 1.0 / _LYING_S))
         self.lying = rest + (self.lying - rest) * stays
 
     def judge(self, evidence: float) -> None:
-        """Take in how much likelier a comparison is if the witness lies (log-likelihood ratio)."""
+        """Update by a comparison's log-likelihood ratio, wrong against right."""
         evidence = min(max(evidence, -_EVIDENCE_MAX), _EVIDENCE_MAX)
         odds = self.lying / (1.0 - self.lying) * math.exp(evidence)
         self.lying = min(odds / (1.0 + odds), _LYING_MAX)
@@ -88,11 +87,11 @@ def evidence_of_a_lie(
     guess_variance: float,
     covariance: Matrix,
 ) -> float:
-    """Return how much likelier a measured motion is if the wheels lie (log-likelihood ratio).
+    """Return the log-likelihood ratio of a measured motion: wheels wrong against wheels right.
 
-    `wheels`, `guess` (N,): by what each differs from the measured motion, whose own `covariance`
-    is (N, N). Inertia is no better a witness than wheels are: a drive that it predicts well does
-    not make liars of wheels that are right within their noise.
+    `wheels`, `guess` (N,): difference of the wheels' and of the predicted motion from the measured
+    one, whose `covariance` is (N, N). A good prediction at constant velocity is no evidence against
+    wheels that are right within their noise.
     """
     unit = np.eye(len(wheels))
     by_inertia = _log_likelihood(guess, max(guess_variance, wheels_variance) * unit + covariance)
@@ -100,7 +99,7 @@ def evidence_of_a_lie(
 
 
 def _log_likelihood(missed: NDArray[np.float64], covariance: Matrix) -> float:
-    """Return the log-density of an error (N,) under a normal distribution, less a constant."""
+    """Return the log-density of an error (N,) under a normal distribution, up to a constant."""
     factor = np.linalg.cholesky(covariance)
     whitened = np.linalg.solve(factor, missed)
     return float(-0.5 * whitened @ whitened - np.log(np.diag(factor)).sum())

@@ -1,4 +1,4 @@
-"""Systematic errors of the turn, learnt: they add up however little they weigh."""
+"""Estimate the systematic errors of the turn, which accumulate even if they are small."""
 
 from __future__ import annotations
 
@@ -10,22 +10,23 @@ from numpy.typing import NDArray
 
 from sceneslam.types.observation import Observation
 
-# Deviations before anything is learnt: unequal wheels turn a robot with every metre, a wrong wheel
-# base with every radian.
+# Standard deviations before the first measurement: unequal wheels cause an error per metre, a wrong
+# wheel base an error per radian.
 _PER_METRE_RAD, _PER_RADIAN = 0.05, 0.05
-_DRIFT = 1e-3  # by which share of its start a deviation grows with each comparison: tyres wear
-_OUTLIER = 3.0  # deviations: beyond, an error is none of these
+_DRIFT = 1e-3  # growth of a deviation per comparison, as a share of the first: tyres wear
+_OUTLIER = 3.0  # standard deviations: larger errors have other causes
 _WINDOW_S = 0.5  # over which the gyro is compared with the wheels
-_REST_RAD = 5e-4  # of a robot whose wheels stand still, over a window
+_REST_RAD = 5e-4  # largest turn of a robot at rest, over a window
 
 
 @dataclass(slots=True)
 class TurnErrors:
     """A Kalman filter of the turn's errors: wheels per metre, wheels per radian, gyro per second.
 
-    Two of three witnesses at a time: a measured motion with wheels or gyro, or the gyro with the
-    wheels (the bias of a gyro is what it says while the wheels stand still). About the level axes
-    wheels say nothing unless they stand still.
+    It compares a measured motion with wheels or gyro, or the gyro with the wheels (while the wheels
+    stand still, the gyro measures its bias). About the horizontal axes wheels measure nothing
+    unless
+    they stand still.
     """
 
     gyro_bias_radps: float  # its standard deviation
@@ -42,11 +43,11 @@ class TurnErrors:
 
     @property
     def gyro_bias(self) -> NDArray[np.float64]:
-        """Return the gyro's bias (3,) [rad/s], base axes, as far as it is known."""
+        """Return the estimated gyro bias (3,) [rad/s], base axes."""
         return np.array([*self._level_radps, -self._errors[2]])
 
     def of_wheels(self, distance_m: float, turn_rad: float) -> float:
-        """Return what the wheels' turn misses [rad]."""
+        """Return the estimated error of the wheels' turn [rad]."""
         return float(self._errors[0] * distance_m + self._errors[1] * turn_rad)
 
     def by_gyro(self, observation: Observation, duration_s: float) -> NDArray[np.float64] | None:
@@ -55,7 +56,7 @@ class TurnErrors:
         return None if turn is None else turn - self.gyro_bias * duration_s
 
     def learn(self, missed_rad: float, causes: NDArray[np.float64], variance: float) -> None:
-        """Take in by how much a turn missed a measured one, and metres, radians, seconds of it."""
+        """Update by the error of a turn against a measured one; `causes` (3,) [m, rad, s]."""
         spread, innovation = self._spread(causes, variance)
         limit = _OUTLIER * math.sqrt(innovation)
         self._update(min(max(missed_rad, -limit), limit), causes, spread / innovation)
@@ -69,7 +70,10 @@ class TurnErrors:
         variance: float,
         duration_s: float,
     ) -> None:
-        """Take in a turn of gyro and wheels; `causes` and `variance` are the wheels' error's."""
+        """Compare the turn by gyro (3,) [rad] with the wheels'.
+
+        `causes` (3,) [m, rad, s] and `variance` [rad^2] are those of the wheels' error.
+        """
         window = self._window
         window.missed_rad += float(by_gyro[2]) - by_wheels_rad
         window.causes = window.causes + causes - np.array([0.0, 0.0, duration_s])
@@ -106,7 +110,7 @@ class TurnErrors:
 
 @dataclass(slots=True)
 class _Window:
-    """What gyro and wheels said since they were last compared."""
+    """Measurements of gyro and wheels since they were last compared."""
 
     missed_rad: float = 0.0
     causes: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
