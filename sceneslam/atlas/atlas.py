@@ -45,21 +45,21 @@ class Atlas:
         if not 0 < voxel_m < float("inf"):
             raise ConfigError("voxel_m", voxel_m, "metres above 0")
         self._lasting = LastingMap(load=load, save=save, mode=mode, save_every_s=save_every_s)
-        self._mapper: Mapper | None = None  # None where there are no observations, but poses alone
+        self._mapper: Mapper | None = None  # None while only poses are given
         self._note: Note | None = None
         self._correction: Correction | None = None
         self._voxel_m = voxel_m
         self._sessions: list[OpenSession] = []
         self._online = PosePath()  # as reported at the time
-        self._path = PosePath()  # as known now
+        self._path = PosePath()  # after corrections
         self._journal: TrajectoryLog | None = None
 
     def keep_journal(self, journal: TrajectoryLog) -> None:
-        """Write every call to a log from now on; the same calls, repeated, give the same atlas."""
+        """Write every further call to a log; repeating these calls gives the same atlas."""
         self._journal = journal
 
     def open(self, rig: Rig, note: Note, *, is_live: bool = False) -> None:
-        """Get ready for observations; `note` takes events: a place that was recognized, a loop."""
+        """Prepare for observations; `note` receives events, such as recognized places and loops."""
         self._note = note
         loaded = self._lasting.loaded
         self._lasting.open(is_live=is_live)
@@ -68,19 +68,19 @@ class Atlas:
         )
 
     def observe(self, observation: Observation) -> None:
-        """Take an observation, after its pose."""
+        """Take an observation; its pose must have been added before."""
         if self._mapper is None or self._note is None:
             return
         try:
             self._mapper.observe(observation)
             self._lasting.keep(observation.stamp_ns, self._mapper)
-        except Exception as error:  # the poses go on without a map
+        except Exception as error:  # poses continue without a map
             self._give_up(error)
 
     def finish(self) -> list[str]:
-        """Close the loops between sessions and save the map; return what went wrong.
+        """Close the loops between sessions and save the map; return one sentence per failure.
 
-        After the last session was closed.
+        Call it after the last session was closed.
         """
         if self._mapper is None or not self._path.stamps_ns:
             return self._lasting.faults
@@ -107,20 +107,20 @@ class Atlas:
         self._lasting.finish(self._mapper, self._path.stamps_ns[-1], self._note)
 
     def _give_up(self, error: Exception) -> None:
-        """Go on without submaps: the trajectory stays as the modules have it."""
+        """Continue without submaps: the trajectory stays as the modules reported it."""
         _log.info("submaps", exc_info=error)
         self._mapper, self._correction = None, None
         self._lasting.faults.append(f"the run goes on without submaps and loops: {told(error)}")
 
     def begin_session(self, module: str, T_map_local: Transform) -> int:
-        """Open a session of a module that was placed in the map (Eq. 1); return its number."""
+        """Open a session of a module placed at T_map_local (4, 4) (Eq. 1); return its number."""
         if self._journal is not None:
             self._journal.add_session(module, T_map_local)
         self._sessions.append(OpenSession(module, T_map_local))
         return len(self._sessions) - 1
 
     def add_local(self, stamp_ns: int, T_local_base: Transform) -> None:
-        """Add a pose to the current session's own trajectory."""
+        """Add a pose (4, 4) to the current session's own trajectory."""
         if self._journal is not None:
             self._journal.add_local(stamp_ns, T_local_base)
         self._sessions[-1].stamps_ns.append(stamp_ns)
@@ -133,9 +133,9 @@ class Atlas:
         module: str,
         covariance: Covariance | None = None,
     ) -> None:
-        """Add a pose to the global trajectory; a stamp has one pose, the first.
+        """Add a pose (4, 4) to the global trajectory; further poses of one stamp are ignored.
 
-        `covariance` is that of T_local_base, where the module tells it.
+        `covariance` (6, 6) is that of T_local_base, None if the module does not report it.
         """
         if self._journal is not None:
             self._journal.add_pose(stamp_ns, T_map_base, module, covariance)
@@ -144,24 +144,24 @@ class Atlas:
         self._path.add(stamp_ns, T_map_base, module, session, covariance)
 
     def rewind(self, stamp_ns: int) -> None:
-        """Take the poses from an instant on back, for better ones; `online` keeps them."""
+        """Remove the poses from an instant on, to be replaced; `online` keeps them."""
         if self._journal is not None:
             self._journal.add_rewind(stamp_ns)
         self._path.cut(stamp_ns)
 
     def close_session(self, session: int, layers: MapLayers, revised: Trajectory) -> None:
-        """Take the map that a session leaves behind, and its own poses (T_local_base) at the end.
+        """Take the final map of a session, and its revised poses (T_local_base).
 
-        `revised` is empty where the module stands by what it told.
+        `revised` is empty if the module did not revise its poses.
         """
         if self._journal is not None:
             self._journal.add_end(session, revised)
         self._sessions[session].layers, self._sessions[session].revised = layers, revised
 
     def pose_at(self, stamp_ns: int) -> Transform | None:
-        """Return T_map_base at the newest stamp, None when it got no pose.
+        """Return T_map_base (4, 4) at the newest stamp, None if it has no pose.
 
-        In the loaded map, from when the run was found in it.
+        It is in the frame of the loaded map as soon as the run was located in it.
         """
         if self.last_stamp_ns != stamp_ns:
             return None
@@ -169,7 +169,7 @@ class Atlas:
 
     @property
     def last_covariance(self) -> Covariance | None:
-        """Return the (6, 6) of the newest pose as its module told it, None where it did not."""
+        """Return the newest pose's (6, 6) covariance as its module reported it, else None."""
         return self._path.covariances[-1] if self._path.covariances else None
 
     @property
@@ -184,7 +184,7 @@ class Atlas:
 
     @property
     def trajectory(self) -> Trajectory:
-        """Return T_map_base over time as known now: after hand-overs in the past and revisions."""
+        """Return T_map_base over time, with the corrections by hand-overs and revisions so far."""
         if not self._path.stamps_ns:
             return Trajectory.empty()
         stamps_ns = np.array(self._path.stamps_ns, np.int64)
@@ -198,15 +198,16 @@ class Atlas:
         return self._path.session_starts()
 
     def covariances(self, has_odometry: bool) -> NDArray[np.float64]:
-        """Return the covariances of the trajectory (N, 6, 6), before modules revised the poses.
+        """Return the covariances (N, 6, 6) of the trajectory before its revision by modules.
 
-        In `base`, translation first. Bridges are the wheels' motion where there is odometry.
+        In `base`, translation [m] first, then rotation [rad]. With odometry, bridged poses have the
+        wheels' uncertainty, else that of constant velocity.
         """
         return propagate(self._path.steps(), WHEELS if has_odometry else VELOCITY)
 
     @property
     def pose_modules(self) -> tuple[str, ...]:
-        """Return, per pose of the trajectory, the module that gave it, BRIDGED for none."""
+        """Return, per pose of the trajectory, the module that gave it, or BRIDGED."""
         return tuple(self._path.modules)
 
     @property
@@ -226,7 +227,7 @@ class Atlas:
     def fuse_maps(self) -> HybridMap:
         """Return the one map of all sessions (the paper's hybrid map).
 
-        Where the run was found in a loaded map the grid is of both.
+        If the run was located in a loaded map, the grid shows both.
         """
         placed = zip(self._sessions, self._placed(), strict=True)
         fused = fuse(
@@ -238,13 +239,13 @@ class Atlas:
         return replace(fused, grid=grid_of(self._lasting.map_of(self._mapper).plan()))
 
     def _in_map(self, T_run_base: Transform) -> Transform:
-        """Return a pose in the loaded map, from when the run was found in it."""
+        """Return a pose in the frame of the loaded map as soon as the run was located in it."""
         if self._mapper is None or not self._mapper.is_placed:
             return T_run_base
         return np.asarray(self._mapper.T_map_run @ T_run_base)
 
     def _placed(self) -> list[Transform]:
-        """Return T_map_local of every session, moved as the middle of its poses was."""
+        """Return T_map_local of every session, corrected as the middle one of its poses."""
         placed = self._revise().T_map_local
         if self._correction is None:
             return placed

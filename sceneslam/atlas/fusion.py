@@ -16,8 +16,8 @@ from sceneslam.types.se3 import Transform
 
 _log = logging.getLogger(__name__)
 _GREY = 160  # colour of points that no camera saw
-_CELLS_MAX = 10**8  # 500 m x 500 m at 5 cm: 400 MB while it is made
-_LOG_ODDS_LIMIT = 10.0  # a cell stays open to change, however many sessions agree on it
+_CELLS_MAX = 10**8  # 500 m x 500 m at 5 cm: 400 MB during the fusion
+_LOG_ODDS_LIMIT = 10.0  # limited, so that a cell can still change after many sessions
 
 Placed = tuple[str, Transform, MapLayers]  # module, T_map_local, its layers in `local`
 
@@ -54,7 +54,7 @@ def fuse(placed: Sequence[Placed], *, voxel_m: float) -> HybridMap:
 def _owners(
     counts: Sequence[tuple[str, int]], modules: tuple[str, ...]
 ) -> NDArray[np.uint8] | None:
-    """Return per row the index of its module, from how many rows each module has in turn."""
+    """Return each row's module index; `counts` gives the number of rows per module, in order."""
     if not counts:
         return None
     numbers = np.array([modules.index(name) for name, _ in counts], np.uint8)
@@ -121,5 +121,5 @@ def _resample(
 
 
 def _planar(T_map_local: Transform) -> Transform:
-    """Return the part of a transform that a floor plan can follow."""
+    """Return the planar part (x, y, yaw) of a transform."""
     return se3.from_xy_yaw(T_map_local[0, 3], T_map_local[1, 3], se3.yaw_rad(T_map_local))

@@ -1,4 +1,4 @@
-"""Puts the pose graphs and landmarks of all sessions side by side in `map`."""
+"""Join the pose graphs and landmarks of all sessions in `map`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sceneslam.types.se3 import Transform
 def join_pose_graphs(placed: Sequence[tuple[Transform, PoseGraphLayer]]) -> PoseGraphLayer | None:
     """Return one graph in `map`, the nodes of a session after those of the one before it.
 
-    Sessions stay unconnected: what links them is T_map_local, which nobody measured.
+    Sessions stay unconnected: they are linked by T_map_local, which is not a measurement.
     """
     if not placed:
         return None
@@ -33,7 +33,7 @@ def join_pose_graphs(placed: Sequence[tuple[Transform, PoseGraphLayer]]) -> Pose
 
 
 def join_landmarks(placed: Sequence[tuple[Transform, LandmarkLayer]]) -> LandmarkLayer | None:
-    """Return all sessions' landmarks in `map`; what two sessions saw is there twice."""
+    """Return all sessions' landmarks in `map`; a landmark that two sessions saw occurs twice."""
     if not placed:
         return None
     layers = [layer for _, layer in placed]

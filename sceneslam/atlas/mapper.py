@@ -1,7 +1,7 @@
-"""The back end of a run: submaps, its place in a loaded map, and the graph at its end.
+"""The back end of a run: submaps, localization in a loaded map, and the final pose graph.
 
-Planar: for a robot whose base stays level. What is not level is left out, and a run without level
-scans keeps its trajectory as its modules have it.
+Planar: for a robot whose base stays level. Scans that are not level are ignored, and a run without
+level scans keeps the trajectory that its modules reported.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from sceneslam.types.planar import Planar
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
 
-_REST_NS = 1_000_000_000  # between two looks for the map while the robot stands
-_UNFOUND_NS = 5_000_000_000  # after which a run says that it was not found
-_RECENT = 80  # scans that the localizer is given
+_REST_NS = 1_000_000_000  # between two searches in the map while the robot stands
+_UNFOUND_NS = 5_000_000_000  # after this time a run reports that it was not located
+_RECENT = 80  # newest scans that the localizer gets
 
 Note = Callable[..., None]  # event, stamp_ns, and its fields
 
@@ -46,7 +46,7 @@ class Mapper:
         loaded: SavedMap | None = None,
         is_live: bool = False,
     ) -> None:
-        """Begin. `is_live`: a search in the loaded map runs beside the poses, in a thread."""
+        """Begin. `is_live`: searches in the loaded map run in another thread."""
         self._loaded = loaded if loaded is not None else empty_map()
         self._scanner, self._known, self._note = KeyScanner(rig), known, note
         self._collector = Collector(rig, known, self._loaded.runs)
@@ -59,26 +59,26 @@ class Mapper:
         self._began_ns: int | None = None
         self._has_told = False
         self._loops: list[Edge] = []
-        self._T_map_node: NDArray[np.float64] | None = None  # all nodes, once solved
+        self._T_map_node: NDArray[np.float64] | None = None  # (N, 3) all nodes, once solved
 
     @property
     def is_placed(self) -> bool:
-        """Tell whether the run was found in a loaded map."""
+        """Tell whether the run was located in a loaded map."""
         return self._T_map_run is not None
 
     @property
     def is_found(self) -> bool:
-        """Tell whether the run lies in the loaded map, or there is none."""
+        """Tell whether the run was located in the loaded map, or no map was loaded."""
         return self._localizer is None or self.is_placed
 
     @property
     def T_map_run(self) -> Transform:
-        """Return where the run lies in the loaded map; the identity until it was found there."""
+        """Return T_map_run (4, 4) in the loaded map; the identity until the run was located."""
         found = self._T_map_run
         return se3.identity() if found is None else planar.to_transform(found)
 
     def observe(self, observation: Observation) -> None:
-        """Take what was observed, once its pose is known."""
+        """Take an observation whose pose is known."""
         known = self._known(observation.stamp_ns)
         if known is None:
             return
@@ -102,10 +102,10 @@ class Mapper:
     def finish(
         self, path: Path, own_loops: Sequence[OwnLoop], closed: frozenset[int]
     ) -> Correction:
-        """Solve the graph; return what it does to the poses.
+        """Solve the graph; return the correction of the poses.
 
-        `path` is as the modules revised it, `own_loops` are theirs; `closed` are the sessions whose
-        modules look for loops in them.
+        `path` is revised by the modules, `own_loops` are the loops that they closed; `closed` are
+        the sessions whose modules close loops themselves.
         """
         self._collector.finish()
         if self._thread is not None:
@@ -130,7 +130,7 @@ class Mapper:
         return Correction(stamps_ns=stamps_ns, T_new_old=np.array(T_new_old))
 
     def saved(self) -> SavedMap:
-        """Return the loaded map with this run in it: a piece of its own where it was not found."""
+        """Return the loaded map with this run in it: a separate piece if it was not located."""
         count, pieces = len(self._loaded.submaps), self._loaded.pieces
         T_map_run, own = planar.from_transform(self.T_map_run), self._collector
         nodes = self._T_map_node
@@ -149,10 +149,10 @@ class Mapper:
             ),
         )
 
-    # While it runs.
+    # During the run.
 
     def _looks(self, stamp_ns: int) -> bool:
-        """Tell whether a robot that stands should look for the map."""
+        """Tell whether a robot at rest should search the map."""
         if self.is_found or not self._recent:
             return False
         return stamp_ns - self._recent[-1].scan.stamp_ns >= _REST_NS
@@ -173,7 +173,7 @@ class Mapper:
         self._take(outcome, localizer, stamp_ns)
 
     def _take(self, outcome: Outcome, localizer: Localizer, stamp_ns: int) -> None:
-        """Take what a comparison with the map led to."""
+        """Process the result of a comparison with the map."""
         assert self._began_ns is not None
         after_s = (stamp_ns - self._began_ns) / 1e9
         self._T_map_run = localizer.T_map_run
@@ -190,7 +190,7 @@ class Mapper:
     def _solve(
         self, new: NDArray[np.float64], path: Path, closed: frozenset[int]
     ) -> NDArray[np.float64]:
-        """Find the loops and solve; return the run's nodes (N, 3), from where they are now."""
+        """Find the loops and solve; return the run's nodes (N, 3), from the initial `new`."""
         own, count = self._collector, len(self._loaded.submaps)
         nodes = np.concatenate([self._loaded.T_map_node, new])
         drift = np.concatenate([np.zeros((count, 3)), np.array(own.drift)])
@@ -201,7 +201,7 @@ class Mapper:
             candidates = [*candidates, *(edge.shifted(count) for edge in found)]
         loops = consistent(candidates, nodes, drift)
         if len(loops) < 2 and not fixes:
-            loops = []  # nothing agrees with it
+            loops = []  # no other loop agrees with it
         motions = [*self._loaded.edges, *(edge.shifted(count) for edge in own.motions)]
         solved = solve(nodes, motions, loops, fixed=range(count), loose=count)
         self._loops, self._T_map_node = list(solved.loops), solved.T_map_node
@@ -232,9 +232,9 @@ class Mapper:
         )
 
     def _fix_edges(self, path: Path) -> list[Edge]:
-        """Return the loops from the loaded map's submaps to those of the run, one to each of these.
+        """Return the loops from the loaded map's submaps to the run's, at most one per run submap.
 
-        Fixes in one place share their errors.
+        More would not be independent: fixes in one place share their errors.
         """
         if self._localizer is None or not self.is_placed:
             return []

@@ -1,4 +1,4 @@
-"""The poses of a run as they come: the path of the robot, and each session's own."""
+"""The poses of a run as they arrive: the robot's trajectory, and that of each session."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sceneslam.types.trajectory import Trajectory
 
 @dataclass(slots=True)
 class OpenSession:
-    """A session while it grows."""
+    """A session that receives poses."""
 
     module: str
     T_map_local: Transform
@@ -39,12 +39,12 @@ class OpenSession:
 
 @dataclass(slots=True)
 class PosePath:
-    """Poses by rising stamp."""
+    """Poses ordered by stamp."""
 
     stamps_ns: list[int] = field(default_factory=list)
     poses: list[Transform] = field(default_factory=list)  # T_map_base
     modules: list[str] = field(default_factory=list)
-    sessions: list[int] = field(default_factory=list)  # that was open, -1 before the first
+    sessions: list[int] = field(default_factory=list)  # the open session, -1 before the first
     covariances: list[Covariance | None] = field(default_factory=list)  # as reported
 
     def add(
@@ -55,7 +55,7 @@ class PosePath:
         session: int,
         covariance: Covariance | None,
     ) -> None:
-        """Add a pose unless its stamp has one."""
+        """Add a pose unless its stamp already has one."""
         if self.stamps_ns and stamp_ns <= self.stamps_ns[-1]:
             return
         self.covariances.append(covariance)
@@ -65,7 +65,7 @@ class PosePath:
         self.sessions.append(session)
 
     def cut(self, stamp_ns: int) -> None:
-        """Forget the poses from an instant on."""
+        """Remove the poses from an instant on."""
         keep = bisect_left(self.stamps_ns, stamp_ns)
         for values in (
             self.stamps_ns,
@@ -77,12 +77,12 @@ class PosePath:
             del values[keep:]
 
     def row_at(self, stamp_ns: int) -> int | None:
-        """Return the row of the pose at a stamp, None where it has none."""
+        """Return the index of the pose at a stamp, None without one."""
         row = bisect_left(self.stamps_ns, stamp_ns)
         return row if row < len(self.stamps_ns) and self.stamps_ns[row] == stamp_ns else None
 
     def known_at(self, stamp_ns: int) -> Known | None:
-        """Return what is known at a stamp."""
+        """Return the pose at a stamp with its module and covariance, None without one."""
         row = self.row_at(stamp_ns)
         if row is None:
             return None
@@ -105,7 +105,7 @@ class PosePath:
         return list(starts.values())
 
     def steps(self) -> list[Step]:
-        """Return every pose with what its module said of it."""
+        """Return every pose with its module and the covariance that this reported."""
         rows = zip(self.poses, self.sessions, self.modules, self.covariances, strict=True)
         return [
             Step(T_map_base=T, session=session, is_bridged=module == BRIDGED, covariance=told)

@@ -1,4 +1,4 @@
-"""The poses of a run after its modules corrected their past: loop closures and the like."""
+"""The poses of a run after its modules' corrections, such as loop closures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Told:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Revised:
-    """The same run with every correction in it."""
+    """The run with all corrections."""
 
     T_map_local: list[Transform]  # per session
     T_map_base: NDArray[np.float64]  # (N, 4, 4)
@@ -41,14 +41,17 @@ def revise(
 ) -> Revised:
     """Return the poses after all revisions; `pose_sessions` (N,) is -1 before the first session.
 
-    Every pose moves with the newest pose of its session that was revised, so that bridged motion
-    stays what it was. A session starts where the one before it, revised, left off (Eq. 1), unless
-    its module moved its start too: it knew the place from an earlier session. Then what drifted
-    in between is put right, by the way covered.
+    Every pose is corrected as the last revised pose of its session before it, so that bridged
+    motions
+    do not change. A session starts where the revised session before it ended (Eq. 1), unless its
+    module
+    corrected its start, too, because it recognized the place from an earlier session. Then the
+    drift in
+    between is corrected in proportion to the distance travelled.
     """
     moved = np.array(T_map_base)
     placed: list[Transform] = []
-    carried = se3.identity()  # corrects `map` where the session begins
+    carried = se3.identity()  # correction of `map` at the session's start
     for index, session in enumerate(sessions):
         placed.append(carried @ session.T_map_local)
         rows = np.flatnonzero(pose_sessions == index)
@@ -75,7 +78,7 @@ def _spread(
     placed: list[Transform],
     pose_sessions: NDArray[np.int64],
 ) -> None:
-    """Move poses, and the sessions' places by their middle ones, by their share of a step."""
+    """Distribute a correction over poses by distance; sessions move with their middle pose."""
     if not len(rows) or np.allclose(step, np.eye(4), rtol=0.0, atol=_ROUNDING):
         return
     ways_m = np.linalg.norm(

@@ -24,7 +24,7 @@ _PLY_TYPES = {
 
 
 def save_map(hybrid: HybridMap, folder: Path) -> None:
-    """Write `points.ply` and, of what the modules built, the grid, pose graph and landmarks.
+    """Write `points.ply` and, if the modules built them, the grid, pose graph and landmarks.
 
     `grid.pgm` and `grid.yaml`; `pose_graph.g2o`, whose vertices are the poses in `pose_graph.tum`,
     in that order; `landmarks.ply`.

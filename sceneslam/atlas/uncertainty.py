@@ -1,4 +1,4 @@
-"""The covariance of every pose in `map`: carried through hand-overs, growing with the distance."""
+"""The covariance of every pose in `map`, propagated through hand-overs and by distance."""
 
 from __future__ import annotations
 
@@ -19,34 +19,34 @@ Covariance = NDArray[np.float64]  # (6, 6): T_true = T_told @ exp(xi), xi in bas
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drift:
-    """Standard deviations by which a motion of one kind goes wrong.
+    """Standard deviations of the drift of one kind of motion.
 
-    A wrong scale or unequal wheels err the same way all along: these deviations add up. What a map
-    makes of the rotation is sometimes too much, sometimes too little: variances add up.
+    Errors by a wrong scale or unequal wheels are systematic: standard deviations add up. The
+    rotation error of a map is random: variances add up.
     """
 
-    per_m: float  # of the position [m], per metre of the way
-    rad_per_m: float  # of the rotation
-    rad_per_rad: float  # of the rotation, per radian turned
-    rad_per_root: float  # of the rotation at random, per root of a metre, and of a radian
+    per_m: float  # of the position [m], per metre travelled
+    rad_per_m: float  # of the rotation [rad], per metre travelled
+    rad_per_rad: float  # of the rotation [rad], per radian turned
+    rad_per_root: float  # random, of the rotation [rad], per root of a metre and of a radian
 
 
-# A module's own covariance is that of its pose beside the map around it, which drifts as it grows.
+# A module's own covariance is that of its pose relative to its local map, which itself drifts.
 MAPPED = Drift(per_m=0.005, rad_per_m=0.0, rad_per_rad=0.0, rad_per_root=0.003)
-# As `Wheels` of a rig has them, unless its source says otherwise.
+# Defaults of `Wheels` in a rig.
 WHEELS = Drift(per_m=0.02, rad_per_m=0.01, rad_per_rad=0.02, rad_per_root=0.0)
-# Guessed: it may have braked meanwhile.
+# Constant velocity: the robot may have braked meanwhile.
 VELOCITY = Drift(per_m=0.5, rad_per_m=0.1, rad_per_rad=0.5, rad_per_root=0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Step:
-    """A pose of the trajectory, and what is known of it."""
+    """A pose of the trajectory with its session and covariance."""
 
     T_map_base: Transform
     session: int
     is_bridged: bool
-    covariance: Covariance | None  # of T_local_base, as its module says; None: it does not
+    covariance: Covariance | None  # of T_local_base, as its module reported it; None: unknown
 
 
 @dataclass(slots=True)
@@ -59,12 +59,14 @@ class _Known:
 
 
 def propagate(steps: Sequence[Step], bridge: Drift) -> NDArray[np.float64]:
-    """Return the covariance (N, 6, 6) of every pose; the first one is where `map` begins.
+    """Return the covariance (N, 6, 6) of every pose; `map` begins at the first pose.
 
-    A module's pose is as sure as the pose it was placed at, carried along its motion (adjoint),
-    with the drift of its map since, and its own covariance, taken as independent of these. A
-    bridged pose is as sure as the one before it, less the drift of what bridges. A module that
-    does not say how sure it is adds no more than its map's drift.
+    The covariance of a module's pose is the sum of three parts, assumed independent: that of the
+    pose
+    at which it was placed, propagated along its motion (adjoint); the drift of its map since; and
+    its
+    own covariance, if it reports one. A bridged pose has the covariance of the pose before it, plus
+    the drift of the bridge.
     """
     if not steps:
         return np.zeros((0, 6, 6))
@@ -93,7 +95,7 @@ def _total(known: _Known) -> Covariance:
 
 
 def _grown(covariance: Covariance, T_prev_curr: Transform, drift: Drift) -> Covariance:
-    """Return the covariance after a motion, and what went wrong in it."""
+    """Return the covariance (6, 6) after a motion, including the motion's drift."""
     way_m = float(np.linalg.norm(T_prev_curr[:3, 3]))
     turned_rad = float(se3.rotation_angle_rad(T_prev_curr))
     adjoint = se3.adjoint(se3.inverse(T_prev_curr))

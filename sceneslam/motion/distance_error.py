@@ -27,7 +27,7 @@ class DistanceError:
     def learn(self, missed_m: float, forward_m: float, variance_m2: float) -> None:
         """Update by the error of the wheels' `forward_m` against a measured distance.
 
-        `missed_m` is the measured distance less the wheels'; `variance_m2` is its variance.
+        `missed_m` is that error, `variance_m2` the variance of its measurement.
         """
         self._variance += (_DRIFT * self.deviation) ** 2
         innovation_m2 = self._variance * forward_m**2 + variance_m2

@@ -45,7 +45,7 @@ class NoiseRatio:
             return
         gain = noise / (noise + variance)
         robust = (_STUDENT + 1.0) / (_STUDENT + missed**2 / (noise + variance))
-        square = robust * (gain * missed) ** 2 + (1.0 - gain) * noise  # of the error itself
+        square = robust * (gain * missed) ** 2 + (1.0 - gain) * noise  # of the error alone
         part = moved / noise  # share of the noise that is caused by motion
         square = part**2 * square + part * (1.0 - part) * noise
         weight = share * gain * part

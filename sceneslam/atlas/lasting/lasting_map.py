@@ -1,4 +1,4 @@
-"""Where a run's map comes from and where it goes: load, save now and then, save at the end."""
+"""Load a run's map, save it at intervals, and save it at the end."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class LastingMap:
     def __init__(
         self, *, load: str | None, save: str | None, mode: str, save_every_s: float
     ) -> None:
-        """Load the map, if there is one; raises ConfigError where that fails."""
+        """Load the map `load`, if given; raises ConfigError if that fails."""
         if mode not in (LOCALIZE, EXTEND, UPDATE):
             raise ConfigError("mode", mode, f"{LOCALIZE} | {EXTEND} | {UPDATE}")
         if mode == LOCALIZE and save is not None:
@@ -49,11 +49,11 @@ class LastingMap:
                 raise ConfigError("save", str(save), "a folder that is empty or holds a map")
 
     def open(self, *, is_live: bool) -> None:
-        """Begin; a live run saves in a thread, beside its poses."""
+        """Begin; a live run saves in another thread."""
         self._thread = ThreadPoolExecutor(1) if is_live else None
 
     def keep(self, stamp_ns: int, mapper: Mapper) -> None:
-        """Save where it is time."""
+        """Save if `save_every_s` have passed since the last time."""
         if self._saved_ns is None:
             self._saved_ns = stamp_ns
         if self._save is None or stamp_ns - self._saved_ns < self._every_ns:
@@ -65,11 +65,11 @@ class LastingMap:
             self._writing = self._thread.submit(self._write, mapper.saved(), mapper.is_found)
 
     def map_of(self, mapper: Mapper) -> SavedMap:
-        """Return the map with the run in it, as it would be saved."""
+        """Return the map including the run, as it would be saved."""
         return self._updated(mapper.saved(), mapper.is_found)
 
     def finish(self, mapper: Mapper, stamp_ns: int, note: Note) -> None:
-        """Save at the end, and say where the run was not found in the loaded map."""
+        """Save at the end, and report if the run was not located in the loaded map."""
         if self._load is not None and not mapper.is_found:
             self.faults.append(
                 f"the run was not found in the map {self._load}, its poses are in its own frame"

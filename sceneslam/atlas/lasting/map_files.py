@@ -1,7 +1,7 @@
-"""Writes and reads a saved map: a YAML that names and seals one file of arrays.
+"""Write and read a saved map: a YAML with the name and checksum of one file of arrays.
 
-`docs/map.md` documents the format. The arrays are written first, under a name of their own; the
-YAML that names them takes its place in one step. Whoever is killed on the way leaves the old map.
+`docs/map.md` documents the format. The arrays are written first, under a new name; the YAML that
+names them is replaced atomically. If the process is killed meanwhile, the old map remains.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from sceneslam.types.errors import InputError, told
 from sceneslam.types.files import PART, replacing
 
 HEAD, FORMAT, VERSION = "map.yaml", "sceneslam-map", 1
-_ARRAYS = "arrays-"  # and the beginning of their checksum: two maps never share a file
+_ARRAYS = "arrays-"  # prefix, followed by the start of their checksum
 _SHAPES: Mapping[str, tuple[str, str, tuple[int, ...]]] = {  # name -> dtype, row of, inner shape
     "node_run": ("<i8", "submaps", ()),
     "node_session": ("<i8", "submaps", ()),
@@ -49,9 +49,9 @@ _SHAPES: Mapping[str, tuple[str, str, tuple[int, ...]]] = {  # name -> dtype, ro
 
 
 def save_map_files(saved: SavedMap, folder: Path) -> None:
-    """Write the map into a folder of its own; the same map gives the same bytes.
+    """Write the map into its own folder; the same map gives the same bytes.
 
-    Raises InputError where the folder holds something else, OSError where it cannot be written.
+    Raises InputError if the folder holds something else, OSError if it cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     others = [path for path in folder.iterdir() if not _is_ours(path)]
@@ -135,7 +135,7 @@ def _read_head(folder: Path) -> dict[str, Any]:
 
 
 def _check(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
-    """Raise InputError where arrays do not fit together."""
+    """Raise InputError if the arrays are inconsistent."""
     counts: dict[str, int] = {}
     for name, (dtype, rows, inner) in _SHAPES.items():
         found = arrays.get(name)

@@ -1,4 +1,4 @@
-"""Joins the pieces of two maps, or of one, where they show the same place."""
+"""Join the pieces of one or two maps where they show the same place."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.submaps.graph import Edge, Kind, consistent, solve
 from sceneslam.types import planar
 
-_AROUND = 1  # submaps to either side that are looked for together with one
-_LOOPS_MIN = 2  # that agree: one place may look like another
+_AROUND = 1  # neighbouring submaps on either side that are searched together with one
+_LOOPS_MIN = 2  # agreeing loops, as a single one may come from a similar place
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Joined:
-    """A map, and what became of the pieces that were to be joined to its first."""
+    """The map after joining pieces to its first piece."""
 
     map: SavedMap
     joined: int
-    apart: int  # pieces of which no two submaps were recognized in the first
+    apart: int  # pieces that stay separate: fewer than two submaps were recognized
 
 
 def side_by_side(first: SavedMap, second: SavedMap) -> SavedMap:
@@ -41,7 +41,7 @@ def side_by_side(first: SavedMap, second: SavedMap) -> SavedMap:
 
 
 def join_pieces(saved: SavedMap) -> Joined:
-    """Return the map with every piece in the first that is recognized in it."""
+    """Return the map with every recognized piece joined to the first."""
     joined = apart = 0
     for piece in np.unique(saved.pieces[saved.pieces > 0]).tolist():
         found = _joined(saved, piece)
@@ -51,7 +51,7 @@ def join_pieces(saved: SavedMap) -> Joined:
 
 
 def _joined(saved: SavedMap, piece: int) -> SavedMap | None:
-    """Return the map with a piece in the first, None where it is not recognized."""
+    """Return the map with a piece joined to the first, None if it is not recognized."""
     own = np.flatnonzero(saved.pieces == piece).tolist()
     loops = _loops(saved, own)
     drift = np.zeros_like(saved.T_map_node)
@@ -72,7 +72,7 @@ def _joined(saved: SavedMap, piece: int) -> SavedMap | None:
 
 
 def _loops(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
-    """Return where the submaps of a piece lie in the first piece."""
+    """Return loops from the first piece to the submaps `own` of another piece."""
     main = np.flatnonzero(saved.pieces == 0)
     target, found = Recognizer(PlanField(saved.plan())), []
     for row, node in enumerate(own):
@@ -104,7 +104,7 @@ def _loops(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
 def _solve(
     saved: SavedMap, nodes: NDArray[np.float64], own: Sequence[int], loops: Sequence[Edge]
 ) -> NDArray[np.float64]:
-    """Return the nodes; those of the other pieces stay."""
+    """Return the optimised nodes (N, 3); those of the other pieces stay."""
     inside = set(own)
     motions = [edge for edge in saved.edges if edge.first in inside and edge.second in inside]
     fixed = [node for node in range(len(nodes)) if node not in inside]

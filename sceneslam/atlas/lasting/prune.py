@@ -1,4 +1,4 @@
-"""Thins a map out: submaps go whose ground later ones show as well."""
+"""Prune a map: remove submaps whose area later ones cover."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.submaps.graph import Edge, Kind
 from sceneslam.types import planar
 
-_COVERED_RATIO = 0.95  # of a submap's walls: what is left is within a wall's noise
+_COVERED_RATIO = 0.95  # of a submap's walls, covered by later submaps
 
 
 def prune(saved: SavedMap) -> SavedMap:
-    """Return the map without submaps whose walls all later ones of their piece have.
+    """Return the map without submaps whose walls are covered by later ones of their piece.
 
-    The newest stay. Motions through what goes are joined, in a row; its loops go with it.
+    The newest stay. Motions through removed submaps are composed; loops to them are removed.
     """
     kept = list(range(len(saved.submaps)))
     for node in range(len(saved.submaps)):
@@ -55,7 +55,7 @@ def _is_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
 
 
 def _bridges(saved: SavedMap, kept: set[int]) -> list[Edge]:
-    """Return the motions over runs of submaps that go."""
+    """Return the composed motions across removed submaps."""
     onward = {edge.first: edge for edge in saved.edges if edge.kind is not Kind.LOOP}
     found = []
     for start in sorted(kept):

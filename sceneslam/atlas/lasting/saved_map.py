@@ -1,4 +1,4 @@
-"""A map that lasts: submaps, where they lie, and what was measured between them."""
+"""A saved map: submaps, their poses, and the measured motions between them."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ class SavedMap:
     """The graph of all runs; nodes of one piece lie in one frame, pieces are not connected."""
 
     submaps: tuple[Submap, ...]
-    T_map_node: NDArray[np.float64]  # (N, 3)
-    pieces: NDArray[np.int64]  # (N,), 0 the first
+    T_map_node: NDArray[np.float64]  # (N, 3) [m, m, rad]
+    pieces: NDArray[np.int64]  # (N,), piece of every node; 0 is the first
     edges: tuple[Edge, ...]
 
     @property
     def runs(self) -> int:
-        """Return how many runs it was made in."""
+        """Return how many runs the map was made from."""
         return 1 + max((submap.run for submap in self.submaps), default=-1)
 
     def plan(self, piece: int = 0, *, newest_wins: bool = True) -> FloorPlan:
@@ -38,7 +38,7 @@ class SavedMap:
         return join(placed, newest_wins=newest_wins)
 
     def of(self, keep: Sequence[int]) -> SavedMap:
-        """Return the map of some of the nodes, and of the edges between them."""
+        """Return the map of the nodes `keep`, with the edges between them."""
         number = {node: index for index, node in enumerate(keep)}
         return SavedMap(
             submaps=tuple(self.submaps[node] for node in keep),
@@ -53,15 +53,15 @@ class SavedMap:
 
 
 def empty_map() -> SavedMap:
-    """Return a map of nothing."""
+    """Return an empty map."""
     return SavedMap(submaps=(), T_map_node=np.zeros((0, 3)), pieces=np.zeros(0, np.int64), edges=())
 
 
 def forget_contradicted(saved: SavedMap, run: int) -> SavedMap:
     """Return the map without walls of earlier runs that stand where `run` saw free space.
 
-    Nor is free in an earlier run what is a wall in this one. Within a cell of either, where the
-    registration is no better, nothing is forgotten.
+    Likewise free cells of earlier runs are removed where this run saw a wall. Within one cell, the
+    registration's accuracy, nothing is removed.
     """
     newest = [index for index, submap in enumerate(saved.submaps) if submap.run == run]
     if not newest:
@@ -77,7 +77,7 @@ def forget_contradicted(saved: SavedMap, run: int) -> SavedMap:
 
 
 def _without(plan: FloorPlan, T_today_plan: planar.Planar, today: FloorPlan) -> FloorPlan:
-    """Return a plan without what another, in which it lies at T_today_plan, contradicts."""
+    """Return a plan without what `today`, in which it lies at T_today_plan, contradicts."""
     points = planar.apply(T_today_plan, plan.points.astype(np.float64))
     kept = ~_clear(today, points)
     free = plan.free.copy()

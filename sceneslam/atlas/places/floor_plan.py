@@ -1,4 +1,4 @@
-"""A floor plan: where walls stand and where it is free, drawn from scans at known poses."""
+"""A floor plan: walls and free space, drawn from scans at known poses."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from sceneslam.types import planar
 from sceneslam.types.maps import GridLayer
 from sceneslam.types.planar import Planar
 
-CELL_M = 0.05  # a depth camera's error at 4 m; every finer structure comes and goes with the view
+CELL_M = 0.05  # a depth camera's error at 4 m; finer structure is not repeatable
 _PAD = 10  # cells around everything
-_SHORT_CELLS = 1.5  # a ray ends so far before its return: the cell of a wall is not free
-_HITS_PER_MISS = 0.25  # a wall that rays graze is passed by many
-_AGREE_RATIO = 0.8  # of the length of the normals' sum over their number: they are one wall's
+_SHORT_CELLS = 1.5  # a ray ends this far before its return, so that walls are not free
+_HITS_PER_MISS = 0.25  # low, as many rays pass a wall at grazing incidence
+_AGREE_RATIO = 0.8  # length of the mean normal, above which normals belong to one wall
 _WALL, _FREE = 3.0, -3.0  # log odds of a grid: 0.95 and 0.05
 _CELLS_MAX = 5 * 10**7  # 350 m x 350 m
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FloorPlan:
-    """Walls as points, at most one per cell, and free cells; what is neither is unknown."""
+    """Walls as points, at most one per cell, and free cells; other cells are unknown."""
 
     points: NDArray[np.float32]  # (P, 2) [m]
-    normals: NDArray[np.float32]  # (P, 2) unit, to where the wall was seen from; 0: no line
+    normals: NDArray[np.float32]  # (P, 2) unit, towards the sensor; 0: no line
     free: NDArray[np.bool_]  # (rows, columns); row 0 is the lowest y
     origin_xy_m: tuple[float, float]  # outer corner of cell (0, 0), a multiple of the cell
 
@@ -42,7 +42,7 @@ class FloorPlan:
 
 
 def empty() -> FloorPlan:
-    """Return a plan of nothing."""
+    """Return an empty plan."""
     nothing = np.zeros((0, 2), np.float32)
     return FloorPlan(
         points=nothing, normals=nothing, free=np.zeros((1, 1), bool), origin_xy_m=(0.0, 0.0)
@@ -74,9 +74,9 @@ def draw(scans: Sequence[tuple[Planar, KeyScan]]) -> FloorPlan:
 
 
 def join(placed: Sequence[tuple[Planar, FloorPlan]], *, newest_wins: bool = False) -> FloorPlan:
-    """Return one plan of many at poses T_joined_plan, oldest first.
+    """Return one plan joined from plans at poses T_joined_plan, oldest first.
 
-    `newest_wins`: a wall goes where a later plan saw free space around its cell.
+    `newest_wins`: a wall is removed if a later plan saw free space around its cell.
     """
     placed = [(T, plan) for T, plan in placed if len(plan) or plan.free.any()]
     if not placed:
@@ -151,7 +151,7 @@ def _binned(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the cells that hold points (flat indices), how many, their mean and normal (P, 2).
 
-    The normal is 0 where those of a cell disagree.
+    The normal is 0 if those of a cell disagree.
     """
     cells = np.floor(points / CELL_M).astype(np.int64) - low
     flat = cells[:, 1] * shape[1] + cells[:, 0]

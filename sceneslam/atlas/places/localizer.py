@@ -1,4 +1,4 @@
-"""Finds a run in a map that was loaded, and goes on to check that it is there."""
+"""Localize a run in a loaded map, and keep checking the result."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar
 from sceneslam.types.planar import Planar
 
-_SPAN_M, _SPAN_SCANS = 6.0, 60  # of the latest path: what is compared with the map
-_PERIOD_S, _PERIOD_MAX_S = 0.5, 8.0  # between two searches; doubled with every ...
-_PATIENCE = 8  # ... so many in vain: each costs a tenth of a second or more
-_FIX_M, _FIX_S = 0.5, 1.0  # once found, so far and so long from one comparison to the next
-_AGREE_M, _AGREE_RAD = 0.1, 0.05  # two searches in a row that agree are believed
-_REACH_M, _REACH_RAD, _SIGMAS = 0.15, 0.05, 3.0  # of a fix around the prediction
-_DOUBTS = 3  # comparisons in a row that contradict the map: it was another place
+_SPAN_M, _SPAN_SCANS = 6.0, 60  # length of path, and scans, that are compared with the map
+_PERIOD_S, _PERIOD_MAX_S = 0.5, 8.0  # time between two searches; it doubles
+_PATIENCE = 8  # after this many failed searches: each takes 0.1 s or more
+_FIX_M, _FIX_S = 0.5, 1.0  # distance and time between comparisons once located
+_AGREE_M, _AGREE_RAD = 0.1, 0.05  # two consecutive searches that agree within this are accepted
+_REACH_M, _REACH_RAD, _SIGMAS = 0.15, 0.05, 3.0  # search window of a fix around the prediction
+_DOUBTS = 3  # consecutive comparisons that contradict the map: the place was wrong
 _KNOWN_MIN = 0.6
 
 
 class Outcome(Enum):
-    """What a comparison with the map led to."""
+    """Result of a comparison with the map."""
 
     NOTHING = "nothing"
     FOUND = "relocalized"
-    FIXED = "fixed"  # found before, and confirmed
-    WITHDRAWN = "relocalization_withdrawn"  # found before, and contradicted since
+    FIXED = "fixed"  # located before, and confirmed
+    WITHDRAWN = "relocalization_withdrawn"  # located before, and contradicted since
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Placed:
-    """A scan at its pose in the frame of the run."""
+    """A scan with its pose in the frame of the run."""
 
     scan: KeyScan
     T_run_base: Planar
@@ -47,7 +47,7 @@ class Placed:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fix:
-    """Where the robot is in the map, as its newest scans have it."""
+    """The robot's pose in the map by its newest scans."""
 
     stamp_ns: int
     match: Registration  # of `base` at the stamp, in the map
@@ -62,7 +62,7 @@ class Localizer:
     """Compares the last metres of a run with a map."""
 
     def __init__(self, plan: FloorPlan) -> None:
-        self.T_map_run: Planar | None = None  # None until the run was found
+        self.T_map_run: Planar | None = None  # None until the run was located
         self.fixes: list[Fix] = []
         self._map = Recognizer(PlanField(plan))
         self._next_ns = 0
@@ -101,7 +101,7 @@ class Localizer:
         return Outcome.FOUND
 
     def _check(self, newest: Placed, query: PlanField) -> Outcome:
-        """Compare near where the robot should be; what contradicts often enough ends it."""
+        """Compare near the predicted pose; repeated contradictions withdraw the localization."""
         assert self.T_map_run is not None and self._fixed_at is not None
         self._wait(newest, _FIX_S)
         expected = planar.compose(self.T_map_run, newest.T_run_base)
@@ -157,7 +157,7 @@ def _run_in_map(match: Registration, newest: Placed) -> Planar:
 
 
 def _agree(first: Planar, second: Planar, T_run_base: Planar) -> bool:
-    """Tell whether two placements of the run have the robot in the same place."""
+    """Tell whether two estimates of T_map_run put the robot in the same place."""
     off = planar.between(planar.compose(first, T_run_base), planar.compose(second, T_run_base))
     return bool(np.hypot(off[0], off[1]) <= _AGREE_M and abs(off[2]) <= _AGREE_RAD)
 

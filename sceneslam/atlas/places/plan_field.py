@@ -1,4 +1,4 @@
-"""Looks walls and free space up in a floor plan: the nearest wall of any point in one step."""
+"""Look-up tables of a floor plan: the nearest wall and free space at any point."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan
 
-_MARGIN = 20  # cells around the plan: a point that is further out has no wall near
-_CLEAR_M = 0.2  # free cells so far from all walls are evidence that no wall stands there
+_MARGIN = 20  # cells around the plan; points farther out have no wall near
+_CLEAR_M = 0.2  # least distance to walls of free cells that count as evidence of no wall
 _LIKELIHOOD_M = 0.1  # standard deviation of a wall in the coarse search
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Nearest:
-    """What a plan holds around points."""
+    """The walls and free space of a plan around N points."""
 
     error: NDArray[np.float64]  # (N, 2) [m]: from the nearest wall point to the point
     normals: NDArray[np.float64]  # (N, 2)
@@ -28,7 +28,7 @@ class Nearest:
 
 
 class PlanField:
-    """The look-up tables of one plan, which must hold a wall."""
+    """The look-up tables of one plan, which must contain a wall."""
 
     def __init__(self, plan: FloorPlan) -> None:
         self.plan = plan
@@ -47,7 +47,7 @@ class PlanField:
         self._normals = plan.normals.astype(np.float64)
 
     def nearest(self, points: NDArray[np.float64]) -> Nearest:
-        """Return what lies around points (N, 2) [m] of the plan's frame."""
+        """Return walls and free space around points (N, 2) [m] of the plan's frame."""
         rows, columns = self._free.shape
         cells = self._cells(points)
         inside = ((cells >= 0) & (cells < [columns, rows])).all(axis=1)
@@ -66,9 +66,9 @@ class PlanField:
 
     @cached_property
     def likelihood(self) -> NDArray[np.float32]:
-        """Return (rows, columns): 1 on a wall, falling with the distance; below 0 where it is free.
+        """Return an image (rows, columns): 1 on a wall, less with distance, below 0 in free space.
 
-        The margin is part of it: `origin_xy_m` is its corner.
+        It includes the margin; `origin_xy_m` is its corner.
         """
         near = np.exp(-0.5 * (self._far_m / _LIKELIHOOD_M) ** 2)
         clear = self._free & (self._far_m > _CLEAR_M)
@@ -76,7 +76,7 @@ class PlanField:
 
     @property
     def origin_xy_m(self) -> NDArray[np.float64]:
-        """Return the outer corner (2,) of the likelihood's cell (0, 0)."""
+        """Return the outer corner (2,) [m] of the likelihood's cell (0, 0)."""
         return self._origin
 
     def _cells(self, points: NDArray[np.floating]) -> NDArray[np.int64]:

@@ -1,8 +1,8 @@
-"""Finds where a small floor plan may lie in another, whatever its heading.
+"""Search the possible poses of a small floor plan in another, at any heading.
 
 Correlative search (Olson, "Real-time correlative scan matching", ICRA 2009) over all shifts at
 once: for every heading, one multiplication in the frequency domain. The score of a pose is the mean
-over the walls of what the other plan holds there: 1 on a wall, 0 unknown, -1 where it is free.
+over the walls of the other plan's value there: 1 on a wall, 0 unknown, -1 free.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.types import planar
 from sceneslam.types.planar import Planar
 
-_FACTOR = 3  # cells of the search are 0.15 m: the refinement goes on from twice as far
+_FACTOR = 3  # search cells are 0.15 m: the refinement converges from twice that
 _PER_HEADING = 6  # peaks
-_APART_M, _APART_RAD = 0.4, 0.2  # nearer peaks are one
+_APART_M, _APART_RAD = 0.4, 0.2  # nearer peaks are merged
 _RADIUS_MIN_M = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Peak:
-    """A place that fits."""
+    """A candidate pose with its score."""
 
     T_target_query: Planar
     score: float  # -1 to 1
@@ -34,7 +34,7 @@ class Peak:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Window:
-    """Where to search."""
+    """The poses to search."""
 
     around: Planar  # T_target_query
     half_m: float
@@ -42,7 +42,7 @@ class Window:
 
 
 class PlanSearch:
-    """Searches one target; made once, as its transform is kept."""
+    """Searches one target; reuse it, as it caches the target's Fourier transform."""
 
     def __init__(self, field: PlanField) -> None:
         self._cell_m = _FACTOR * CELL_M
@@ -84,7 +84,7 @@ class PlanSearch:
         shape: tuple[int, ...],
         reach: int,
     ) -> NDArray[np.float64]:
-        """Return the mean value under the points, by the cell that their centre lies in."""
+        """Return the mean value under the points, per cell of their centre."""
         cells = np.floor(turned / self._cell_m + 0.5).astype(np.int64) + reach
         flat = cells[:, 1] * shape[1] + cells[:, 0]
         count = np.bincount(flat, minlength=shape[0] * shape[1])
@@ -129,7 +129,7 @@ def _headings(window: Window | None, step_rad: float) -> NDArray[np.float64]:
 
 
 def _apart(peaks: list[Peak], most: int) -> list[Peak]:
-    """Return the best peaks of which none is another's neighbour."""
+    """Return the best peaks, at most one per neighbourhood."""
     kept: list[Peak] = []
     for peak in peaks:
         if len(kept) == most:
@@ -140,6 +140,6 @@ def _apart(peaks: list[Peak], most: int) -> list[Peak]:
 
 
 def is_apart(first: Planar, second: Planar) -> bool:
-    """Tell whether two poses are two places, not one that is known roughly."""
+    """Tell whether two poses are different places, beyond the accuracy of the search."""
     away_m = float(np.hypot(*(first - second)[:2]))
     return away_m > _APART_M or abs(planar.wrap(float(first[2] - second[2]))) > _APART_RAD

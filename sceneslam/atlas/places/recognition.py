@@ -1,4 +1,4 @@
-"""Recognizes a place: the one pose of a plan in another that nothing speaks against."""
+"""Place recognition: find the only pose of a plan in another that is not contradicted."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.plan_search import PlanSearch, Window, is_apart
 from sceneslam.atlas.places.registration import Registration, register
 
-_SCORE_MIN = 0.3  # of the coarse search, whose cells are three of the plan's
-_CANDIDATES = 24  # that are refined, at most ...
+_SCORE_MIN = 0.3  # of the coarse search, whose cells are 3 x 3 of the plan's
+_CANDIDATES = 24  # that are refined, at most,
 _LIKELY_RATIO = (
-    0.6  # ... of this share of the best score; a rival has 0.85, off by a cell of 0.15 m
+    0.6  # with this share of the best score; a second match has 0.85, less a cell of 0.15 m
 )
-_RIVAL_RATIO = 0.85  # a second place that fits as well as this share of the best is as likely
-_POINTS_MIN = 40  # two metres of wall: less may stand anywhere
-_KNOWN_MIN = 0.6  # of the walls: where most is unknown, nothing is recognized
-_NEAR_M, _NEAR_RAD = 0.3, 0.1  # a window so small needs no search: the refinement reaches as far
+_RIVAL_RATIO = 0.85  # a second place with this share of the best score is equally likely
+_POINTS_MIN = 40  # 2 m of wall: less is not distinctive
+_KNOWN_MIN = 0.6  # share of the walls in known space of the target
+_NEAR_M, _NEAR_RAD = 0.3, 0.1  # a window this small needs no search: the refinement converges
 
 
 class Recognizer:
@@ -28,10 +28,10 @@ class Recognizer:
     def recognize(
         self, query: PlanField, window: Window | None, *, known_min: float = _KNOWN_MIN
     ) -> Registration | None:
-        """Return the pose of the query, None where there is none, or more than one.
+        """Return the pose of the query in the target, None if no pose or more than one fits.
 
-        A pose is refuted where walls of the one stand in free space of the other, or away from its
-        walls. `window` None: anywhere in the target.
+        A pose is refuted if walls of one plan lie in free space of the other, or away from its
+        walls. `window` None: search the whole target.
         """
         if len(query.plan) < _POINTS_MIN:
             return None

@@ -1,4 +1,4 @@
-"""Lays one floor plan on another: point to line, with a covariance, and what speaks against it."""
+"""Register one floor plan to another: point-to-line, with covariance and contradictions."""
 
 from __future__ import annotations
 
@@ -14,42 +14,42 @@ from sceneslam.types.planar import Matrix, Planar
 
 _KERNELS_M = (0.4, 0.2, 0.1)  # of the robust weight: coarse to fine
 _ITERATIONS = 10  # at most, per kernel
-_FEW, _HOPELESS = 120, 0.5  # walls for the first kernel; a start that leaves half of them far off
+_FEW, _HOPELESS = 120, 0.5  # wall points for the first kernel; unmatched share that rejects a start
 _CONVERGED = np.array([1e-4, 1e-4, 5e-5])  # m, m, rad
 _INLIER_M = 0.1  # two cells
-_NOISE_MIN_M = CELL_M / np.sqrt(12.0)  # a point is somewhere in its cell
-_CORRELATION = 10.0  # cells of one wall share their errors over half a metre
-_COMMON = np.array([0.005, 0.005, 0.002])  # m, m, rad: of a whole plan, drawn at poses that drift
-_HELD_RATIO = 0.03  # of the walls that face a direction: below, they do not hold it
-_OTHER_MAX = 0.2  # of the walls may stand elsewhere: doors, and furniture that was moved
-_OPEN = 25.0  # m^2, rad^2: the variance along what is not held, twice the size of a submap
+_NOISE_MIN_M = CELL_M / np.sqrt(12.0)  # uniform distribution of a point in its cell
+_CORRELATION = 10.0  # cells of one wall have common errors over 0.5 m
+_COMMON = np.array([0.005, 0.005, 0.002])  # m, m, rad: of a whole plan, as its poses drift
+_HELD_RATIO = 0.03  # least share of the walls that constrains a direction
+_OTHER_MAX = 0.2  # share of walls that may have moved: doors, furniture
+_OPEN = 25.0  # m^2, rad^2: variance in unconstrained directions, twice a submap's size
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Registration:
-    """A query plan laid on a target plan."""
+    """The pose of a query plan in a target plan, with its quality."""
 
     T_target_query: Planar
     covariance: Matrix  # (3, 3), axes of the query
-    weak_directions: int  # 0 to 3, that the walls do not hold
-    inlier_ratio: float  # of the walls where the target is known, that lie on a wall
-    known_ratio: float  # of the walls, where the target is known
-    conflict_ratio: float  # of the walls of either, that stand where the other is free
+    weak_directions: int  # 0 to 3, that the walls do not constrain
+    inlier_ratio: float  # share of the walls in known space that lie on a wall
+    known_ratio: float  # share of the walls in known space of the target
+    conflict_ratio: float  # share of walls of either that lie in free space of the other
 
     @property
     def is_verified(self) -> bool:
-        """Tell whether what is known of both agrees, but for what may have moved."""
+        """Tell whether both plans agree, except for a share that may have moved."""
         return self.inlier_ratio >= 1.0 - _OTHER_MAX and self.conflict_ratio <= _OTHER_MAX
 
     @property
     def is_refuted(self) -> bool:
-        """Tell whether twice as much is other as may have moved."""
+        """Tell whether the plans differ by more than twice the share that may have moved."""
         is_off = self.inlier_ratio < 1.0 - 2.0 * _OTHER_MAX
         return is_off or self.conflict_ratio > 2.0 * _OTHER_MAX
 
 
 def register(query: PlanField, target: PlanField, start: Planar) -> Registration:
-    """Return where the query lies, from a start within about half a metre and 0.2 rad."""
+    """Return the query's pose in the target, from a start within about 0.5 m and 0.2 rad."""
     walls = _Walls.of(query)
     few, pose = walls.thinned(), planar.compose(start, walls.T_query_centre)
     pose = _refined(few, target, pose, _KERNELS_M[0])
@@ -61,7 +61,7 @@ def register(query: PlanField, target: PlanField, start: Planar) -> Registration
 
 
 def _refined(walls: _Walls, target: PlanField, pose: Planar, kernel_m: float) -> Planar:
-    """Return the pose of the centre after Gauss-Newton with a robust weight."""
+    """Return the centre's pose after Gauss-Newton iterations with a robust weight."""
     for _ in range(_ITERATIONS):
         H, g, _, _ = _equations(walls, target, pose, kernel_m)
         H, _ = _held(H, walls.spread_m)
@@ -74,7 +74,7 @@ def _refined(walls: _Walls, target: PlanField, pose: Planar, kernel_m: float) ->
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Walls:
-    """A query's walls about their centre: a turn about it is no shift."""
+    """A query's walls relative to their centre, so that rotation and translation decouple."""
 
     points: NDArray[np.float64]  # (N, 2) [m]
     normals: NDArray[np.float64]  # (N, 2)
@@ -93,7 +93,7 @@ class _Walls:
         )
 
     def thinned(self) -> _Walls:
-        """Return every so many of the walls: for a start, more of them tell nothing new."""
+        """Return a subset of the walls, which suffices for the first kernel."""
         stride = max(1, len(self.points) // _FEW)
         return replace(self, points=self.points[::stride], normals=self.normals[::stride])
 
@@ -101,13 +101,13 @@ class _Walls:
 def _equations(
     walls: _Walls, target: PlanField, pose: Planar, kernel_m: float
 ) -> tuple[Matrix, NDArray[np.float64], float, float]:
-    """Return H and g of a step of the centre, the weights' sum and the squared error."""
+    """Return H (3, 3) and g (3,) of a step, the sum of weights and the squared error."""
     points, own_normals = walls.points, walls.normals
     turn = planar.rotation(float(pose[2]))
     near = target.nearest(points @ turn.T + pose[:2])
     error, normals = near.error @ turn, near.normals @ turn  # in the query's axes
     is_line = (normals != 0).any(axis=1) & (own_normals != 0).any(axis=1)
-    is_line &= (normals * own_normals).sum(axis=1) > 0.7  # one side of one wall
+    is_line &= (normals * own_normals).sum(axis=1) > 0.7  # the same side of a wall
     across = (error * normals).sum(axis=1)
     along = np.sqrt(np.maximum(near.distance_m**2 - across**2, 0.0))
     weight = (kernel_m**2 / (kernel_m**2 + across**2)) ** 2
@@ -118,7 +118,7 @@ def _equations(
 
 
 def _held(H: Matrix, spread_m: float) -> tuple[Matrix, int]:
-    """Return H without the directions that hardly any wall holds, and how many those are."""
+    """Return H without unconstrained directions, and the number of these."""
     total = float(H[0, 0] + H[1, 1])  # the normals are unit vectors
     if total <= 0:
         return np.zeros((3, 3)), 3
@@ -155,12 +155,12 @@ def _judged(query: PlanField, walls: _Walls, target: PlanField, pose: Planar) ->
 
 
 def _back(query: PlanField, target: PlanField, pose: Planar) -> Nearest:
-    """Return what the query holds where the target has walls."""
+    """Return the query's walls and free space at the target's walls."""
     T_query_target = planar.between(pose, np.zeros(3))
     return query.nearest(planar.apply(T_query_target, target.plan.points.astype(np.float64)))
 
 
 def _conflicts(nearest: Nearest) -> float:
-    """Return the share of walls, where the other plan is known, that it holds to be free."""
+    """Return the share of walls in known space of the other plan that lie in its free space."""
     known = int(nearest.is_known.sum())
     return int((nearest.is_known & nearest.is_clear).sum()) / max(known, 1)

@@ -1,4 +1,4 @@
-"""Collects scans at the poses of a run, and cuts them into submaps once the poses are settled."""
+"""Collect scans at the poses of a run, and group them into submaps once the poses are final."""
 
 from __future__ import annotations
 
@@ -27,36 +27,36 @@ from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
 
-_SETTLED_NS = 20_000_000_000  # what is older is not taken back by a hand-over (policy.buffer_s)
-_LEVEL_COS = np.cos(np.radians(3.0))  # a wall 4 m away is then seen 0.2 m higher or lower
-_SLOPE = 0.2  # m per m: steeper than any ramp, so that it is no floor that the base moves on
-_LEVEL_RATIO = 0.5  # of all steps, at least: else it is a sensor that is carried by hand
+_SETTLED_NS = 20_000_000_000  # a hand-over does not replace older poses (policy.buffer_s)
+_LEVEL_COS = np.cos(np.radians(3.0))  # at this tilt a wall 4 m away is seen 0.2 m higher or lower
+_SLOPE = 0.2  # m per m: steeper than any ramp on a floor
+_LEVEL_RATIO = 0.5  # least share of level steps; less with a hand-held sensor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Known:
-    """What the path holds at a stamp."""
+    """The pose of a run at a stamp."""
 
     T_map_base: Transform  # frame of the run
     session: int
-    module: str  # BRIDGED where none gave the pose
-    covariance: NDArray[np.float64] | None  # (6, 6), as the module has it
+    module: str  # BRIDGED if no module gave the pose
+    covariance: NDArray[np.float64] | None  # (6, 6), as the module reported it
 
 
 class Collector:
     """The submaps of one run so far, and the motions between them."""
 
     def __init__(self, rig: Rig, known: Callable[[int], Known | None], run: int) -> None:
-        """Begin; `known` tells the path at a stamp, as it is known when asked."""
+        """Begin; `known` returns the current estimate of the pose at a stamp."""
         self.submaps: list[Submap] = []
         self.T_run_node: list[Planar] = []
         self.motions: list[Edge] = []
-        self.drift = [np.zeros(3)]  # per submap: deviations [m, m, rad], summed up along the path
+        self.drift = [np.zeros(3)]  # per submap: summed standard deviations [m, m, rad]
         self._known, self._run = known, run
         self._bridge = WHEELS if Sensor.ODOMETRY in rig.sensors else VELOCITY
         self._scans: list[KeyScan] = []  # not yet in a submap
-        self._part: list[KeyPose] = []  # the newest submap's
-        self._last: Transform | None = None  # where the last scan was taken
+        self._part: list[KeyPose] = []  # of the newest submap
+        self._last: Transform | None = None  # pose of the last scan
         self._level = self._steps = 0
 
     @property
@@ -72,7 +72,7 @@ class Collector:
         return bool(np.hypot(*step[:2, 3]) >= STEP_M or abs(se3.yaw_rad(step)) >= STEP_RAD)
 
     def step_to(self, T_run_base: Transform) -> bool:
-        """Note a step; return whether it led to a pose as a robot on a floor takes it."""
+        """Record a step; return whether the new pose is level, as of a robot on a floor."""
         is_level = bool(T_run_base[2, 2] >= _LEVEL_COS)
         if self._last is not None:
             step_m = T_run_base[:3, 3] - self._last[:3, 3]
@@ -82,7 +82,7 @@ class Collector:
         return is_level
 
     def add(self, scan: KeyScan) -> None:
-        """Take a scan after its step, and cut what is settled."""
+        """Add a scan after its step, and make submaps of scans with final poses."""
         self._scans.append(scan)
         settled = bisect_right(
             self._scans, scan.stamp_ns - _SETTLED_NS, key=lambda each: each.stamp_ns
@@ -91,11 +91,11 @@ class Collector:
             self._cut(settled, is_end=False)
 
     def finish(self) -> None:
-        """Cut what is left."""
+        """Make submaps of the remaining scans."""
         self._cut(len(self._scans), is_end=True)
 
     def remeasure(self, poses: NDArray[np.float64]) -> None:
-        """Take where the submaps lie (N, 3), and so the motions, as the modules revised them."""
+        """Set the submaps' poses (N, 3) [m, m, rad] as revised, and the motions between them."""
         self.T_run_node = list(poses)
         self.motions = [
             replace(edge, T_first_second=planar.between(poses[edge.first], poses[edge.second]))
@@ -103,12 +103,12 @@ class Collector:
         ]
 
     def node_at(self, stamp_ns: int) -> int:
-        """Return the submap that a stamp lies in, or the last before it."""
+        """Return the index of the submap at a stamp, or of the last before it."""
         starts = [int(submap.stamps_ns[0]) for submap in self.submaps]
         return max(bisect_right(starts, stamp_ns) - 1, 0)
 
     def _cut(self, count: int, *, is_end: bool) -> None:
-        """Make submaps of the oldest scans; the last may go on, unless this is the end."""
+        """Make submaps of the oldest scans; the last may still grow, unless `is_end`."""
         poses = [pose for scan in self._scans[:count] if (pose := self._posed(scan)) is not None]
         parts = split(poses)
         for part in parts if is_end else parts[:-1]:
@@ -148,7 +148,7 @@ class Collector:
         self._part = part
 
     def _kind(self, pose: KeyPose) -> Kind:
-        """Return by what the motion from the newest submap to a pose was measured."""
+        """Return which source measured the motion from the newest submap to a pose."""
         if self._part[0].session != pose.session:
             return Kind.HANDOVER
         bridged = sum(each.module == BRIDGED for each in [*self._part, pose])

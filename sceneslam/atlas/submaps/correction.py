@@ -1,4 +1,4 @@
-"""What the graph made of a run's poses."""
+"""The pose graph's correction of a run's poses."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from sceneslam.types import planar, se3
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Correction:
-    """A motion of the map at each node of a run, by rising stamp."""
+    """A correction of the map at each node of a run, ordered by stamp."""
 
     stamps_ns: NDArray[np.int64]  # (N,)
     T_new_old: NDArray[np.float64]  # (N, 3)
 
     @classmethod
     def none(cls) -> Correction:
-        """Return the correction that leaves all poses as they are, to the bit."""
+        """Return the correction that leaves all poses unchanged, bit by bit."""
         return cls(stamps_ns=np.zeros(0, np.int64), T_new_old=np.zeros((0, 3)))
 
     def apply(
         self, stamps_ns: NDArray[np.int64], T_map_base: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return poses (M, 4, 4) corrected; between two nodes by their share of the time."""
+        """Return the corrected poses (M, 4, 4); between two nodes it interpolates over time."""
         if not len(self.stamps_ns):
             return T_map_base
         newest = len(self.stamps_ns) - 1

@@ -1,8 +1,8 @@
-"""The one graph: submaps of all modules and runs, and every motion that was measured between them.
+"""The pose graph: submaps of all modules and runs, and the measured motions between them.
 
-Wrong loops are kept out twice: only the largest set of loops that agree with one another is taken
-(Mangelson et al., "Pairwise consistent measurement set maximization", ICRA 2018), and what is
-taken is weighed by graduated non-convexity (Yang et al., RA-L 2020), which can give each up again.
+Wrong loops are rejected in two steps: only the largest pairwise consistent set is used (Mangelson
+et al., "Pairwise consistent measurement set maximization", ICRA 2018), and its loops are weighed by
+graduated non-convexity (Yang et al., RA-L 2020), which can still reject each of them.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from numpy.typing import NDArray
 from sceneslam.types import planar
 from sceneslam.types.planar import Matrix, Planar
 
-_CHI2_3 = 11.34  # of three degrees of freedom, exceeded by one in a hundred
+_CHI2_3 = 11.34  # chi-square with 3 degrees of freedom, 99th percentile
 _FIXED = np.array([1e-4, 1e-4, 1e-5])  # m, m, rad
 _LOOSE = np.array([10.0, 10.0, 3.0])  # m, m, rad: any loop moves it
 
 
 class Kind(IntEnum):
-    """What an edge was measured by."""
+    """The source of an edge."""
 
-    MOTION = 0  # a module's own
-    BRIDGE = 1  # wheels, gyro or velocity
-    HANDOVER = 2  # from a module to the next, over observations that both saw
-    LOOP = 3  # a place that was seen again
+    MOTION = 0  # by one module
+    BRIDGE = 1  # by wheels, gyro or constant velocity
+    HANDOVER = 2  # from one module to the next, over observations that both processed
+    LOOP = 3  # a revisited place
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,7 +43,7 @@ class Edge:
     kind: Kind
 
     def shifted(self, by: int) -> Edge:
-        """Return the edge between nodes whose numbers are higher."""
+        """Return the edge with its node numbers increased by `by`."""
         return replace(self, first=self.first + by, second=self.second + by)
 
 
@@ -52,7 +52,7 @@ class Solved:
     """The graph after optimisation."""
 
     T_map_node: NDArray[np.float64]  # (N, 3)
-    loops: tuple[Edge, ...]  # that were believed
+    loops: tuple[Edge, ...]  # that were accepted
 
 
 def solve(
@@ -63,10 +63,11 @@ def solve(
     fixed: Sequence[int],
     loose: int,
 ) -> Solved:
-    """Return the poses (N, 3) that fit the motions and the believed loops best.
+    """Return the poses (N, 3) [m, m, rad] that best fit the motions and the accepted loops.
 
-    `fixed` nodes stay; so does `loose` unless a loop to one of them moves it. Every node must be
-    connected to one of these. Same input, same bits.
+    `fixed` nodes stay; `loose` has a weak prior, so that only a loop to a fixed node moves it.
+    Every
+    node must be connected to one of these. The result is deterministic.
     """
     import gtsam
 
@@ -106,7 +107,7 @@ def _factor(gtsam: Any, edge: Edge) -> Any:
 def consistent(
     loops: Sequence[Edge], T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
 ) -> list[Edge]:
-    """Return the largest set of loops of which any two agree within the drift between them.
+    """Return the largest set of loops that agree pairwise within the drift between them.
 
     `drift` (N, 3): standard deviations [m, m, rad], summed up along the path to each node.
     """
@@ -120,7 +121,7 @@ def consistent(
 
 
 def _agree(a: Edge, b: Edge, T_map_node: NDArray[np.float64], drift: NDArray[np.float64]) -> bool:
-    """Tell whether the circle a, the path between their ends, b and the path back closes."""
+    """Tell whether the cycle of a, the path to b's end, b and the path back closes."""
     T_ends = planar.between(T_map_node[a.second], T_map_node[b.second])
     T_starts = planar.between(T_map_node[a.first], T_map_node[b.first])
     around = planar.compose(a.T_first_second, T_ends)

@@ -1,4 +1,4 @@
-"""Loops between submaps of whatever module, by their floor plans alone."""
+"""Loop closure between submaps of any modules, by their floor plans alone."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.types import planar
 from sceneslam.types.planar import Planar
 
-_SIGMAS = 3.0  # of the drift: so far a candidate may lie from where the graph has it
-_GAIN_M = 0.02  # drift below this cannot be measured better by two plans
-_HALF_MAX_M = 15.0  # more drift than that: only a search of the whole map helps
-_NEIGHBOURS = 2  # submaps to either side that a target is made of
-_TARGETS = 3  # per submap: three loops to different places already outvote a wrong one
-_KNOWN_MIN = 0.35  # of a submap's walls, as two submaps need not cover the same ground
+_SIGMAS = 3.0  # of the drift: search range around the graph's estimate
+_GAIN_M = 0.02  # registration of two plans cannot improve on less drift
+_HALF_MAX_M = 15.0  # largest search range
+_NEIGHBOURS = 2  # neighbouring submaps on either side in a target
+_TARGETS = 3  # per submap: three loops to different places outvote a wrong one
+_KNOWN_MIN = 0.35  # share of a submap's walls, as two submaps may overlap partly
 _CACHED = 8  # targets
 
 
@@ -29,17 +29,17 @@ class LoopFinder:
     """Measures the motion between submaps of different sessions."""
 
     def __init__(self, submaps: Sequence[Submap], closed: frozenset[int]) -> None:
-        """Take all submaps; modules of the sessions in `closed` find the loops within them."""
+        """Take all submaps; in sessions in `closed` the modules close loops themselves."""
         self._submaps, self._closed = submaps, closed
         self._targets: dict[tuple[int, int], Recognizer] = {}
 
     def loops_to(
         self, second: int, T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
     ) -> list[Edge]:
-        """Return the loops from earlier submaps to one, which the graph makes likely.
+        """Return the verified loops from earlier submaps to one, near the graph's estimate.
 
-        `T_map_node` (N, 3) are the nodes as known, `drift` (N, 3) the standard deviations summed
-        up to each of them [m, m, rad].
+        `T_map_node` (N, 3) are the estimated nodes [m, m, rad], `drift` (N, 3) the standard
+        deviations summed up to each of them [m, m, rad].
         """
         query: PlanField | None = None
         found = []
@@ -67,7 +67,7 @@ class LoopFinder:
     def _candidates(
         self, second: int, T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
     ) -> list[int]:
-        """Return the nearest submaps that may overlap, of which none is another's neighbour."""
+        """Return the nearest submaps that may overlap; no two of them are neighbours."""
         near: list[tuple[float, int]] = []
         for first in range(second - 1):
             if not self._may_close(first, second):
@@ -92,7 +92,7 @@ class LoopFinder:
         return a.session not in self._closed and is_apart and bool(len(a.plan) and len(b.plan))
 
     def _target(self, first: int, second: int, T_map_node: NDArray[np.float64]) -> Recognizer:
-        """Return what lies around a submap, of its session and older than another."""
+        """Return a recognizer for the plan around `first`, of its session, older than `second`."""
         end = min(first + _NEIGHBOURS + 1, second)
         if (first, end) not in self._targets:
             while len(self._targets) >= _CACHED:
@@ -119,7 +119,7 @@ def _window(
 
 
 def _gap_m(first: FloorPlan, second: FloorPlan, T_first_second: Planar) -> float:
-    """Return how far the boxes around two plans lie apart, 0 or less where they overlap."""
+    """Return the distance [m] of two plans' bounding boxes, 0 or less if they overlap."""
     a = first.points.astype(np.float64)
     b = planar.apply(T_first_second, second.points.astype(np.float64))
     gaps = np.maximum(a.min(axis=0) - b.max(axis=0), b.min(axis=0) - a.max(axis=0))

@@ -1,4 +1,4 @@
-"""The loops that modules closed by themselves, as measurements between two stamps of a run."""
+"""The loops that modules closed themselves, as measured motions between two stamps."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from sceneslam.types.se3 import Transform
 
 Path = Callable[[int], Transform | None]  # T_run_base at a stamp, None without a pose
 
-_ROUNDING = np.diag([1e-6, 1e-6, 1e-6])  # a covariance that can be inverted: a millimetre
-# A module that recognizes an earlier session of its own does so by dozens of features, some
-# millimetres each (experiments/rgbd_loop.md); it states no covariance.
+_ROUNDING = np.diag([1e-6, 1e-6, 1e-6])  # makes a covariance invertible: 1 mm, 1 mrad
+# A module recognizes its own earlier session by dozens of features, accurate to some
+# millimetres each (experiments/rgbd_loop.md); it reports no covariance.
 _RECOGNIZED = np.diag([5e-3, 5e-3, 2e-3]) ** 2
 
 
@@ -70,7 +70,7 @@ def _loops_of(graph: PoseGraphLayer) -> list[OwnLoop]:
 
 
 def _recognized(sessions: Sequence[OpenSession], index: int) -> OpenSession | None:
-    """Return the session in which a module recognized where this one of its own begins."""
+    """Return the earlier session in which the module recognized this session's start."""
     session, revised = sessions[index], sessions[index].revised
     before = [one for one in sessions[:index] if one.module == session.module and one.stamps_ns]
     if not before or not len(revised) or int(revised.stamps_ns[0]) not in session.stamps_ns:

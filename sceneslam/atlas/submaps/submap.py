@@ -1,4 +1,4 @@
-"""Submaps: a few metres of a session with the floor plan that was drawn on them."""
+"""Submaps: a few metres of a session's path with the floor plan of their scans."""
 
 from __future__ import annotations
 
@@ -16,41 +16,41 @@ from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar
 from sceneslam.types.planar import Matrix, Planar
 
-LENGTH_M = 2.5  # of the path in a submap: by MAPPED it bends by a centimetre
-TURN_RAD = 2 * np.pi  # or so much turning: everything around was seen
+LENGTH_M = 2.5  # length of path in a submap: by MAPPED it drifts 1 cm
+TURN_RAD = 2 * np.pi  # or this much turning, after which everything around was seen
 STEP_M, STEP_RAD = 0.1, 0.1  # between two scans of a submap
-_FLOOR = np.array([0.003, 0.003, 0.002])  # m, m, rad: of any motion between two submaps
+_FLOOR = np.array([0.003, 0.003, 0.002])  # m, m, rad: least standard deviation between two submaps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KeyPose:
-    """A scan with its pose, and what is known of the motion to it."""
+    """A scan with its pose and the uncertainty of the motion to it."""
 
     scan: KeyScan
-    T_map_base: Planar  # as known when it was added
+    T_map_base: Planar  # as estimated when it was added
     session: int
     module: str
     drift: Drift  # of the motion from the one before
-    told: Matrix | None  # (3, 3) of T_local_base, as the module has it
+    told: Matrix | None  # (3, 3) covariance of T_local_base, as the module reported it
 
     @property
     def stamp_ns(self) -> int:
-        """Return when it was."""
+        """Return the scan's stamp."""
         return self.scan.stamp_ns
 
 
 class Drawing:
-    """A floor plan, drawn when it is asked for first: most runs have no use for it."""
+    """A floor plan, drawn on first access, as most runs do not need it."""
 
     def __init__(
         self, plan: FloorPlan | None = None, scans: Sequence[tuple[Planar, KeyScan]] = ()
     ) -> None:
         self._plan, self._scans = plan, tuple(scans)
-        self._lock = Lock()  # a live run saves, and draws, in a thread
+        self._lock = Lock()  # a live run saves, and draws, in another thread
 
     @property
     def plan(self) -> FloorPlan:
-        """Return the plan; the scans are forgotten with it."""
+        """Return the plan; the scans are released once it is drawn."""
         with self._lock:
             if self._plan is None:
                 self._plan, self._scans = draw(self._scans), ()
@@ -61,7 +61,7 @@ class Drawing:
 class Submap:
     """A node of the graph; its frame is base, level, at its first scan."""
 
-    run: int  # which recording of a saved map it is from, by age
+    run: int  # index of the run, by age, in a saved map
     session: int
     module: str
     stamps_ns: NDArray[np.int64]  # (K,) of its scans
@@ -70,7 +70,7 @@ class Submap:
 
     @property
     def plan(self) -> FloorPlan:
-        """Return its floor plan, in its frame."""
+        """Return the floor plan, in the submap's frame."""
         return self.drawing.plan
 
     def with_plan(self, plan: FloorPlan) -> Submap:
@@ -79,7 +79,7 @@ class Submap:
 
 
 def make_submap(poses: Sequence[KeyPose], run: int) -> Submap:
-    """Return the submap of scans that follow one another in one session."""
+    """Return the submap of consecutive scans of one session."""
     first = poses[0]
     T_submap_base = [planar.between(first.T_map_base, pose.T_map_base) for pose in poses]
     return Submap(
@@ -93,7 +93,7 @@ def make_submap(poses: Sequence[KeyPose], run: int) -> Submap:
 
 
 def split(poses: Sequence[KeyPose]) -> list[list[KeyPose]]:
-    """Return the poses in submaps: a session, a length and a turn at most."""
+    """Group the poses into submaps of one session, up to LENGTH_M and TURN_RAD each."""
     parts: list[list[KeyPose]] = []
     length_m = turn_rad = 0.0
     for pose in poses:
@@ -112,7 +112,8 @@ def split(poses: Sequence[KeyPose]) -> list[list[KeyPose]]:
 def motion_covariance(poses: Sequence[KeyPose]) -> Matrix:
     """Return the covariance (3, 3), axes of the last, of the motion from the first to the last.
 
-    Errors of one kind go on alike: their deviations add up, those of a map's rotation at random.
+    Errors of one kind are systematic: standard deviations add up. The error of a map's rotation is
+    random: variances add up.
     """
     motions = np.array(
         [planar.between(a.T_map_base, b.T_map_base) for a, b in pairwise(poses)]
@@ -133,7 +134,7 @@ def motion_covariance(poses: Sequence[KeyPose]) -> Matrix:
 
 
 def _grown(first: KeyPose, last: KeyPose) -> Matrix:
-    """Return by how much a module's own covariance grew between two poses of its session."""
+    """Return the growth (3, 3) of a module's covariance between two poses of its session."""
     if first.session != last.session or first.told is None or last.told is None:
         return np.zeros((3, 3))
     x, y, _ = planar.between(last.T_map_base, first.T_map_base)
