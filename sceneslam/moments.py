@@ -24,7 +24,7 @@ class Moments:
     def look(self, observation: Observation, events: Sequence[Event]) -> None:
         """Keep the observation's image where one of its events is a change."""
         image_bgr = observation.image_bgr
-        if image_bgr is None or len(self.kept) == _MOST:
+        if image_bgr is None or image_bgr.dtype != np.uint8 or len(self.kept) == _MOST:
             return
         changes = tuple(event for event in events if change_of(event))
         if changes or not self.kept:

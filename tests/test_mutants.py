@@ -61,7 +61,9 @@ def test_every_shipped_component_and_scenario_is_mutated(recordings):
     named |= {"detect_only", "video"}  # builds no modules; none lives on images alone
     named |= {"onnx", "indoor_outdoor"}  # need a network's file
     named |= {"process", "orb_slam3"}  # need a program that the user's word allows
-    named |= {"ros2", "ros2_node"}  # need a robot, a node
+    named |= {"ros2", "ros2_node", "realsense"}  # need a robot, a node, a camera
+    named |= {"pipelined"}  # needs a system of the user's
+    named |= {"light_mean", "exposure_times", "laps"}  # need an exposure, a recorded lap
     named |= {"genz_icp", "rko_lio"}  # need an extra
     named |= {"failures", "sensor_failure"}  # in a scenario
     for group in ("source", "detector", "effects", "policy", "atlas", "run", "slam", "sinks"):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from test_rgbd import drive, make
 
+from sceneslam.bus.beside import InStep
 from sceneslam.bus.runner import Runner
 from sceneslam.testing.room import observation_at
 from sceneslam.types import se3
@@ -92,6 +93,6 @@ def test_depth_is_not_used_in_a_monocular_scene(scene):
 
 
 def test_observation_without_an_image_is_not_asked_of_it():
-    runner = Runner("rgbd", make())
+    runner = Runner("rgbd", make(), InStep())
     assert runner.can_use(seen(0)) and runner.can_use(replace(seen(0), depth_m=None))
     assert not runner.can_use(replace(seen(0), image_bgr=None))
