@@ -1,7 +1,7 @@
-"""Where the depth image shows what the colour image shows, when one was not made for the other.
+"""Map colour pixels to depth pixels when the depth image is not registered to the colours.
 
-A rig's depth should be registered to its colours. Recordings of raw Kinects come without that: the
-depth camera sits 2.5 cm beside the colour camera and has a tenth more focal length.
+A rig's depth should be registered to its colours. Raw Kinect recordings are not: the depth camera
+is 2.5 cm beside the colour camera, and its focal length is 10 % longer.
 """
 
 from __future__ import annotations
@@ -15,29 +15,29 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
-_ROUNDS = 3  # of looking up a depth and correcting where to look
-_FAR = 1e-3  # [1/m], inverse depth where there is none
+_ROUNDS = 3  # iterations: look up a depth, correct the pixel
+_FAR = 1e-3  # [1/m], inverse depth assumed where depth is missing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Alignment:
-    """The colour camera, looked at from the depth camera, whose intrinsics the rig tells."""
+    """The colour camera relative to the depth camera, whose intrinsics are the rig's."""
 
     focal_ratio: float = 1.0  # focal length of the colour camera over that of the depth camera
     baseline_m: float = 0.0  # to the right
 
     @property
     def is_registered(self) -> bool:
-        """Tell whether both images are of one camera."""
+        """Tell whether both images have the same camera model and pose."""
         return self == Alignment()
 
     @property
     def T_depth_color(self) -> Transform:
-        """Return the colour camera's place in the depth camera."""
+        """Return T_depth_color (4, 4)."""
         return se3.from_parts(np.eye(3), np.array([self.baseline_m, 0.0, 0.0]))
 
     def color_camera(self, camera: Camera) -> Camera:
-        """Return the camera that took the colours beside a depth camera."""
+        """Return the colour camera's intrinsics, given the depth camera's."""
         return replace(
             camera,
             fx=self.focal_ratio * camera.fx,
@@ -52,7 +52,7 @@ class Alignment:
         depths_m: NDArray[np.float32],
         images: NDArray[np.int64],
     ) -> NDArray[np.float64]:
-        """Return where (N, 2) depth images show what pixels (N, 2) of colours show.
+        """Return the depth pixels (N, 2) that show the same points as colour pixels (N, 2).
 
         `camera` is the depth camera, `images` (N,) the row of each in `depths_m` (M, H, W).
         """
@@ -70,7 +70,7 @@ class Alignment:
 def look_up(
     depths_m: NDArray[np.float32], images: NDArray[np.int64], uv_px: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return depth images (M, H, W) at pixels (N, 2) of the images (N,); 0 outside of them."""
+    """Return depths (N,) [m] at pixels (N, 2) of `images` (N,), rows of (M, H, W); 0 outside."""
     height, width = depths_m.shape[1:]
     column, row = np.rint(uv_px).astype(np.int64).T
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)

@@ -1,7 +1,7 @@
-"""Finds out whether colours and depth are of one camera, from what both say of the same motion.
+"""Detect whether depth is registered to the colours, by comparing the motion that both show.
 
-Surfaces tell how the depth camera moved, without the colours (see `ties`). Where a corner of one
-image should then be in another depends on the colour camera's focal length and place alone.
+Surfaces give the depth camera's motion without the colours (see `ties`). The pixel of a corner in
+another image then depends on the colour camera's focal length and position alone.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from .corners import SCALE
 from .features import Features
 
 _STARTS = (Alignment(), Alignment(focal_ratio=0.9, baseline_m=0.025))  # registered; a raw Kinect
-_ASKED_AT = (6, 9, 14, 20)  # pairs of keyframes; unregistered after none of them: registered
+_ASKED_AT = (6, 9, 14, 20)  # pairs of keyframes; not unregistered at any: registered
 _CORNERS = 200  # of a pair
 _MAX_HAMMING = 40
 _STEPS = 10
-_WIDTHS = np.array([0.004, 0.004])  # of the differences that stand for slopes
-_LONGEST = np.array([0.03, 0.02])  # of one step
+_WIDTHS = np.array([0.004, 0.004])  # steps of the numerical derivatives
+_LONGEST = np.array([0.03, 0.02])  # largest step of an iteration
 _HUBER, _WORST = 2.0, 3.0  # [sigma] of a corner, [its root cost]
 _MIN_CHANGE = 0.03  # of the focal length: 10 px at the edge of the image
-_SAME = 0.02  # difference of two answers that agree
-_MIN_GAIN = 0.4  # of the cost
+_SAME = 0.02  # largest difference of two results that agree
+_MIN_GAIN = 0.4  # least share by which the cost must fall
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Pair:
-    """Two keyframes: corners that both show, and how the depth camera moved between."""
+    """Two keyframes: corners that both show, and the depth camera's motion between them."""
 
     one_px: NDArray[np.float64]  # (N, 2), without distortion
     other_px: NDArray[np.float64]  # (N, 2)
@@ -45,14 +45,14 @@ class Pair:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Shown:
-    """What one keyframe shows."""
+    """Features and depth image of one keyframe."""
 
     features: Features
     depth_m: NDArray[np.float32]  # (H, W)
 
 
 def pair_of(one: Shown, other: Shown, T_other_one: Transform) -> Pair:
-    """Return the corners that look most like each other, whatever any pose says of them."""
+    """Return the corners matched by descriptors alone, independent of any pose."""
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
     matches = matcher.match(one.features.descriptors, other.features.descriptors)
     alike = [(m.queryIdx, m.trainIdx) for m in matches if m.distance < _MAX_HAMMING]
@@ -67,15 +67,15 @@ def pair_of(one: Shown, other: Shown, T_other_one: Transform) -> Pair:
 
 
 class AlignmentSearch:
-    """Collects pairs of keyframes until they tell, or do not."""
+    """Collects pairs of keyframes until the alignment is decided."""
 
     def __init__(self, camera: Camera, *, is_over: bool) -> None:
         self._camera, self.is_over = camera, is_over
         self._pairs: list[Pair] = []
-        self._guess = Alignment()  # when last asked
+        self._guess = Alignment()  # the last result
 
     def add(self, pair: Pair) -> Alignment | None:
-        """Take a pair; return the cameras' alignment when they turn out to be two."""
+        """Add a pair; return the alignment once it shows that there are two cameras."""
         self._pairs.append(pair)
         count = len(self._pairs)
         if self.is_over or count not in _ASKED_AT:
@@ -98,7 +98,7 @@ class AlignmentSearch:
 
 
 class _Costs:
-    """How badly corners of all pairs fit an alignment."""
+    """Reprojection costs of the corners of all pairs for an alignment."""
 
     def __init__(self, camera: Camera, pairs: list[Pair]) -> None:
         chosen = [slice(None, None, 1 + len(pair.sigma_px) // _CORNERS) for pair in pairs]
@@ -113,11 +113,11 @@ class _Costs:
         self._T_other_one = np.stack([pair.T_other_one for pair in pairs])[self._images]
 
     def total(self, alignment: Alignment) -> float:
-        """Return the mean square, of the corners that have a depth."""
+        """Return the mean cost of the corners with a depth."""
         return float(np.nanmean(self.roots(alignment) ** 2))
 
     def roots(self, alignment: Alignment) -> NDArray[np.float64]:
-        """Return the root of each corner's cost (N,), NaN where there is no depth."""
+        """Return the root of each corner's cost (N,), NaN where depth is missing."""
         camera = self._camera
         color, right = alignment.color_camera(camera), alignment.T_depth_color[:3, 3]
         focal_px, centre_px = np.array([color.fx, color.fy]), np.array([color.cx, color.cy])
@@ -137,7 +137,7 @@ class _Costs:
 
 
 def _descend(costs: _Costs, start: Alignment) -> Alignment:
-    """Return the alignment that Gauss-Newton ends at."""
+    """Return the alignment after Gauss-Newton iterations."""
     best = start
     for _ in range(_STEPS):
         roots = costs.roots(best)

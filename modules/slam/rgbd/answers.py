@@ -1,4 +1,4 @@
-"""What the module tells of an observation: where it held a pose, began one, or has none."""
+"""Build the module's answers: tracked, started, repeated image, or lost."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _START_VARIANCE = 1e-8  # the first pose is the origin by definition
 
 
 def started(view: View, T_local_base: Transform, *, is_first: bool, revision: int) -> Tracking:
-    """Return the answer where a keyframe was hung on a prediction, not on the map.
+    """Return the answer when a keyframe was placed by the prediction, not by the map.
 
-    What the robot did before the first usable image is known from odometry at best.
+    The motion before the first usable image is known by odometry at best.
     """
     return Tracking(
         stamp_ns=view.observation.stamp_ns,
@@ -41,7 +41,7 @@ def held(
     covariance: NDArray[np.float64] | None,
     revision: int,
 ) -> Tracking:
-    """Return the answer where the map was seen; a reckoned pose has no covariance."""
+    """Return the answer when the map was seen; a pose by odometry has no covariance."""
     return Tracking(
         stamp_ns=view.observation.stamp_ns,
         T_local_base=T_local_base.copy(),
@@ -54,7 +54,7 @@ def held(
 
 
 def placed(answer: Tracking, segments: Segments, segment: set[int]) -> Tracking:
-    """Return an answer with what is not known of where its segment of the map lies."""
+    """Return an answer whose covariance includes that of its map segment's position."""
     measured = np.zeros((6, 6)) if answer.covariance is None else answer.covariance
     covariance = segments.covariance(segment, answer.T_local_base, measured)
     if covariance is None:
@@ -63,9 +63,9 @@ def placed(answer: Tracking, segments: Segments, segment: set[int]) -> Tracking:
 
 
 def repeated(stamp_ns: int, T_local_base: Transform, *, revision: int) -> Tracking:
-    """Return the answer where no new image came: odometry's pose, else the last, for it may stand.
+    """Return the answer when the image repeats: the pose by odometry, else the last pose.
 
-    Nobody knows how exact it is.
+    The robot may stand still; the covariance is unknown.
     """
     return Tracking(
         stamp_ns=stamp_ns,
@@ -77,7 +77,7 @@ def repeated(stamp_ns: int, T_local_base: Transform, *, revision: int) -> Tracki
 
 
 def lost(stamp_ns: int, T_local_base: Transform, *, revision: int) -> Tracking:
-    """Return the answer where no pose can be told: the last one that was held."""
+    """Return the answer when tracking is lost, with the last tracked pose."""
     return Tracking(
         stamp_ns=stamp_ns,
         T_local_base=T_local_base.copy(),

@@ -1,4 +1,4 @@
-"""Bundle adjustment: keyframes and landmarks that agree best with all that was measured.
+"""Bundle adjustment: the keyframes and landmarks that best fit all measurements.
 
 Levenberg-Marquardt on the Schur complement (Triggs et al. 2000), in NumPy: the arrays of a local
 window are small enough for dense algebra.
@@ -24,12 +24,12 @@ _SMALL_GAIN = 1e-3
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Bundle:
-    """Keyframes, landmarks, and which saw which where."""
+    """Keyframes, landmarks, and the sightings that connect them."""
 
     T_local_cam: NDArray[np.float64]  # (K, 4, 4)
-    is_free: NDArray[np.bool_]  # (K,), False: a keyframe that only holds the others
+    is_free: NDArray[np.bool_]  # (K,), False: a fixed keyframe
     points_local: NDArray[np.float64]  # (L, 3) [m]
-    keyframe_rows: NDArray[np.int64]  # (N,), of each sighting, rising
+    keyframe_rows: NDArray[np.int64]  # (N,), of each sighting, ascending
     landmark_rows: NDArray[np.int64]  # (N,); a keyframe sees a landmark once
     seen: Sightings  # (N,)
     ties: Ties
@@ -37,16 +37,16 @@ class Bundle:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Adjusted:
-    """A bundle with its least squares solved."""
+    """A bundle after optimisation."""
 
     bundle: Bundle
-    agrees: NDArray[np.bool_]  # (N,), sightings whose pixel is where it should be
-    information: NDArray[np.float64]  # (L, 3, 3) [1/m^2], of landmarks, were the keyframes known
+    agrees: NDArray[np.bool_]  # (N,), sightings whose pixel agrees
+    information: NDArray[np.float64]  # (L, 3, 3) [1/m^2], of landmarks, given the keyframes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Slopes:
-    """Weighted residuals, and how they follow keyframes and landmarks."""
+    """Weighted residuals and their Jacobians by keyframes and landmarks."""
 
     residuals: NDArray[np.float64]  # (3, N)
     by_pose: NDArray[np.float64]  # (6, 3, N), by a twist of the camera
@@ -130,7 +130,7 @@ def _slopes(bundle: Bundle, found: Errors, use: NDArray[np.float64]) -> _Slopes:
 
 
 def _point_blocks(bundle: Bundle, slopes: _Slopes) -> NDArray[np.float64]:
-    """Return the information (L, 3, 3) on landmarks, were the keyframes known."""
+    """Return the landmarks' information (L, 3, 3), given the keyframes."""
     squares = np.einsum("rin,rjn->ijn", slopes.by_point, slopes.by_point).reshape(9, -1)
     return _per_landmark(bundle, squares).T.reshape(-1, 3, 3)
 
@@ -186,7 +186,7 @@ def _step(bundle: Bundle, normal: _Normal, damping: float) -> Bundle:
 
 
 def _damped(blocks: NDArray[np.float64], damping: float) -> NDArray[np.float64]:
-    """Return the blocks (M, n, n) with more on their diagonals; never singular."""
+    """Return the blocks (M, n, n) with damped diagonals; never singular."""
     size = blocks.shape[1]
     diagonals = np.einsum("mii->mi", blocks)
     return np.asarray(blocks + (damping * diagonals + 1e-9)[:, :, None] * np.eye(size))

@@ -1,7 +1,7 @@
-"""How exactly a pose is known beside the map around it, by more than its pixels' noise.
+"""The covariance of a pose relative to the local map, including errors beyond pixel noise.
 
-What a wrong model of the camera does to a pose (intrinsics, shutter, depth against colours) no
-covariance of pixels knows, and without depth the map's scale drifts, which no image shows.
+Pixel noise does not cover the errors of a wrong camera model (intrinsics, shutter, registration of
+depth), nor, without depth, the drift of the map's scale, which no image shows.
 """
 
 from __future__ import annotations
@@ -19,38 +19,38 @@ from .pose_graph import motion_covariance
 from .pose_solver import Linearised
 from .view import View
 
-_CELLS = 8  # across the image, within which residuals are summed up
-_INDEPENDENT = 1.5  # common ratio up to which no wrong model shows: 1.0 to 1.7 in simulations,
+_CELLS = 8  # per image width, in which residuals are summed
+_INDEPENDENT = 1.5  # common ratio of a correct model, at most: 1.0 to 1.7 in simulations,
 # 2.1 to 3.8 on freiburg1_rpy, 1.3 to 2.6 on RedKitchen
-_NOT_HELD = 1e-9  # of all information, added to every direction
-_AROUND_M = 1.5  # five keyframes, as are adjusted at a time: beyond, wheels measured the scale anew
-_KEPT = 0.95  # from image to image, of what residuals have in common
+_NOT_HELD = 1e-9  # share of all information, added to every direction
+_AROUND_M = 1.5  # length of five keyframes, adjusted together; beyond, wheels give the scale
+_KEPT = 0.95  # smoothing of the common ratio from image to image
 
 
 class Certainty:
-    """Widens the covariance of a pose by what its residuals and landmarks say of the model."""
+    """Increases a pose's covariance by the model errors that residuals and landmarks show."""
 
     def __init__(self, landmarks: LandmarkTable) -> None:
         self._landmarks = landmarks
-        self._common: float | None = None  # see `common_ratio`, followed over images
-        self._scaled_local = np.zeros(3)  # [m], where the camera was when its scale was known
-        self.by_wheels = np.zeros((6, 6))  # the share of the last one that is also the wheels'
+        self._common: float | None = None  # `common_ratio`, smoothed over images
+        self._scaled_local = np.zeros(3)  # (3,) [m], the last position with known scale
+        self.by_wheels = np.zeros((6, 6))  # share of the last covariance due to wheels
 
     def covariance(
         self, view: View, fix: Fix, T_local_base: Transform, T_keyframe_base: Sequence[Transform]
     ) -> NDArray[np.float64]:
         """Return the covariance (6, 6) of a pose, of se3.log order [m, rad], in base.
 
-        It is that of the pose beside the map around it. Residuals that neighbouring pixels have
-        in common are no noise: where they say so, it holds the share of the motion from the
-        keyframes around it that no noise explains, and as much less of the pixels' information.
-        What triangulated landmarks do not know of the scale counts from where depth was seen last.
+        It is relative to the local map. If neighbouring pixels have common residuals, which are
+        not noise, the pixels' information is reduced accordingly, and a share of the motion from
+        the surrounding keyframes is added. The scale error of triangulated landmarks grows from
+        the place where depth was seen last.
         """
         common = self._follow(common_ratio(view, fix))
         measured = fix.estimate.covariance * common
         motions = motion_covariance(np.stack(T_keyframe_base), np.zeros((6, 6)))
         model = motions.mean(axis=0) * np.clip(common - _INDEPENDENT, 0.0, 1.0)
-        # A turn that is wrong is made up for by a shift, by as much as what is seen is far.
+        # A shift compensates a wrong turn, in proportion to the landmarks' distance.
         away_m = self._landmarks.points_local[fix.landmark_ids] - T_local_base[:3, 3]
         model[:3, :3] += np.median((away_m**2).sum(axis=1)) * model[3:, 3:]
         scale = np.zeros((6, 6))
@@ -64,7 +64,7 @@ class Certainty:
         return max(1.0, self._common)
 
     def scale_variance(self, view: View, fix: Fix, T_local_base: Transform) -> NDArray[np.float64]:
-        """Return (3, 3) [m^2]: the way since the scale was known, times how unsure it is."""
+        """Return (3, 3) [m^2]: variance by the scale's error over the motion since it was known."""
         sigmas = self._landmarks.scale_sigma[fix.landmark_ids]
         if not view.is_monocular or not sigmas.any():
             self._scaled_local = T_local_base[:3, 3].copy()
@@ -77,15 +77,15 @@ class Certainty:
 
 
 def common_ratio(view: View, fix: Fix) -> float:
-    """Return how much more residuals pull at the pose than independent ones would.
+    """Return how much stronger the residuals' gradient is than that of independent residuals.
 
-    The pulls of all pixels of a cell, summed and squared, over the sum of squares: 1 where they
-    are independent. As in a covariance that is robust against clusters (Liang and Zeger 1986).
+    The squared sum of the gradients of a cell's pixels over the sum of their squares: 1 if they are
+    independent, as in a cluster-robust covariance (Liang and Zeger 1986).
     """
     seen: Linearised = fix.estimate.linearised
     pulls = (seen.jacobian * seen.residuals).reshape(6, 2, -1).sum(axis=1)  # (6, N)
     normal = seen.jacobian @ seen.jacobian.T
-    # Pixels alone do not hold every pose: corners on a line, say, whose depths do.
+    # Pixels alone do not constrain every pose, e.g. corners on a line; their depths may.
     root = np.linalg.cholesky(normal + _NOT_HELD * np.trace(normal) * np.eye(6))
     pulls = np.linalg.solve(root, pulls)
     side_px = view.gray.shape[1] / _CELLS

@@ -1,4 +1,4 @@
-"""What is done beside the tracking, where this process has a core to spare for it."""
+"""Run work in another process or thread if a spare core is available."""
 
 from __future__ import annotations
 
@@ -17,40 +17,40 @@ Result = TypeVar("Result")
 def worker_beside(
     build: Callable[..., Callable[[Task], Result]], *arguments: object
 ) -> SideProcess[Task, Result] | Here[Task, Result]:
-    """Return what does tasks in a process of its own, or here: with the same results."""
+    """Return a worker that does tasks in another process, or here, with the same results."""
     if _has_spare_core():
         return SideProcess(build, *arguments)
     return Here(build(*arguments))
 
 
 def thread_beside(name: str) -> Executor:
-    """Return what runs functions in a thread of its own, or here."""
+    """Return an executor that runs functions in another thread, or here."""
     if _has_spare_core():
         return ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
     return _AtOnce()
 
 
 def _has_spare_core() -> bool:
-    """Tell whether more than one core is this run's: a sweep says so where its jobs take all."""
+    """Tell whether this run may use more than one core; a sweep may reserve all for its jobs."""
     return os.environ.get("SCENESLAM_CORES") != "1"
 
 
 class Here(Generic[Task, Result]):
-    """Does each task when it comes, on a copy, as another process would."""
+    """Does each task at once on a copy, as another process would."""
 
     def __init__(self, work: Callable[[Task], Result]) -> None:
         self._work = work
 
     def submit(self, task: Task) -> Future[Result]:
-        """Return when it is done."""
+        """Return the future of the finished task."""
         return _AtOnce().submit(self._work, deepcopy(task))
 
     def end(self) -> None:
-        """Do nothing: it is at nothing."""
+        """Do nothing: no task is pending."""
 
 
 class _AtOnce(Executor):
-    """Runs functions when they come."""
+    """Runs functions at once."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         done = Future[Any]()

@@ -14,13 +14,13 @@ from .cores import thread_beside
 
 LEVELS = 8
 SCALE = 1.2  # between two levels of the pyramid
-_FIRST, _REST, _BESIDE = (0,), (3, 5, 6, 7), (1, 2, 4)  # levels; both threads take as long
+_FIRST, _REST, _BESIDE = (0,), (3, 5, 6, 7), (1, 2, 4)  # levels; both threads take equally long
 _CELL_PX = 40  # side of the cells that share out the corners
 _SURPLUS = 2  # corners detected per corner kept
-_BOLDNESS = 0.8  # of the last image's weakest corner, where this one's are looked for first
+_BOLDNESS = 0.8  # share of the last image's weakest corner, as the first threshold
 _THRESHOLD_MAX = 20  # ORB's own default, right for a bright and clean image
 _STRONGEST = 255  # grey step
-_ROW_BY_ROW = np.array([1e-4, 1.0])  # puts pixels (u, v) in order
+_ROW_BY_ROW = np.array([1e-4, 1.0])  # weights that order pixels (u, v) by row
 _ROW_BITS = 20  # of a sort key that holds a row below
 
 Image = NDArray[np.uint8]
@@ -28,16 +28,16 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Corners:
-    """Corners with what they look like."""
+    """Corners with their descriptors."""
 
     uv_px: NDArray[np.float64]  # (N, 2), in pixels of the image
-    levels: NDArray[np.int64]  # (N,), of the pyramid, rising
+    levels: NDArray[np.int64]  # (N,), of the pyramid, ascending
     descriptors: NDArray[np.uint8]  # (N, 32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Detected:
-    """Corners of one level, strongest first, before they are shared out."""
+    """Corners of one level, strongest first, before they are spread over the image."""
 
     keypoints: Sequence[cv2.KeyPoint]  # (N,)
     uv_px: NDArray[np.float64]  # (N, 2), in pixels of the image
@@ -46,7 +46,7 @@ class _Detected:
 
 
 class _Octave:
-    """ORB on one level; OpenCV lets two threads do so at a time."""
+    """ORB on one level; OpenCV allows two threads at a time."""
 
     def __init__(self, quota: int, scale: float) -> None:
         self._quota, self._scale, self._weakest = quota, scale, 0
@@ -55,8 +55,9 @@ class _Octave:
     def detect(self, image: Image, threshold: int) -> _Detected:
         """Return the strongest corners, as many as wanted, of those above a threshold.
 
-        Most images have many more: it begins near the last image's weakest, and looks again where
-        that was too bold. What is found does not depend on it, only how fast.
+        Most images have many more: detection begins near the strength of the last image's weakest
+        corner, and is repeated with a lower threshold if too few are found. This only saves time:
+        the result is the same.
         """
         bold = round(_BOLDNESS * self._weakest)
         keypoints = self._detect(image, bold) if bold > threshold else ()
@@ -87,7 +88,7 @@ class _Octave:
 
 
 class CornerFinder:
-    """Finds corners on all levels of an image, on half of them in a thread of its own."""
+    """Finds corners on all levels of an image, on half of them in a second thread."""
 
     def __init__(self, *, count: int, fast_threshold_min: int, fast_noise_ratio: float) -> None:
         self._count = count
@@ -119,7 +120,7 @@ class CornerFinder:
         )
 
     def _threshold(self, gray: Image) -> int:
-        """Return the grey step that makes a corner: a multiple of the noise, within limits.
+        """Return the FAST threshold [grey levels]: a multiple of the noise, within limits.
 
         The noise is the median response of a Laplacian, whose gain on white noise is sqrt(20).
         """
@@ -151,7 +152,7 @@ class CornerFinder:
 
 
 def _pyramid(gray: Image) -> list[Image]:
-    """Return an image on all levels; the same to the bit on every machine."""
+    """Return the image on all levels, bit by bit the same on every machine."""
     images = [gray]
     for level in range(1, LEVELS):
         height, width = (max(1, round(side / SCALE**level)) for side in gray.shape)
@@ -163,7 +164,8 @@ def _pyramid(gray: Image) -> list[Image]:
 def _spread(detected: Sequence[_Detected], count: int) -> list[NDArray[np.int64]]:
     """Return which `count` corners to keep, as rows of each level.
 
-    Every cell's best first, then every cell's second, and on; of equals the finest and first.
+    Each cell's strongest corner first, then each cell's second, and so on; of equal corners the one
+    on the finer level, then the first.
     """
     ends = np.cumsum([len(corners.strength) for corners in detected])
     cells = np.concatenate([corners.cells for corners in detected])

@@ -1,4 +1,4 @@
-"""From an observation to its features, as a camera would see them that reads all rows at once."""
+"""Extract an observation's features and correct them for the rolling shutter."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from .view import View
 from .visual_map import VisualMap
 
 _ROW_STEP = 32  # rows that are compared first
-_ROUNDS = 2  # of straightening and looking again where nothing was known of the turn
+_ROUNDS = 2  # of correcting and matching again if the turn rate was unknown
 
 
 class Eye:
-    """Finds features and straightens them; learns how from the poses that they led to."""
+    """Finds features and corrects the rolling shutter, which it calibrates by the poses found."""
 
     def __init__(
         self, visual_map: VisualMap, localizer: Localizer, extractor: FeatureExtractor
@@ -38,9 +38,9 @@ class Eye:
         self._last_bgr: NDArray[np.uint8] | None = None
 
     def is_repeated(self, image_bgr: NDArray[np.uint8]) -> bool:
-        """Tell whether an image is the last one again, to the bit: a sensor's noise never is.
+        """Tell whether an image (H, W, 3) equals the last one bit by bit, which noise rules out.
 
-        Then the camera hangs, or what brings its images does, and nothing was measured.
+        Then the camera or its driver hangs, and nothing was measured.
         """
         last, self._last_bgr = self._last_bgr, image_bgr
         if last is None or not np.array_equal(last[::_ROW_STEP], image_bgr[::_ROW_STEP]):
@@ -55,7 +55,7 @@ class Eye:
         T_predicted: Transform,
         rate_base: NDArray[np.float64],
     ) -> View:
-        """Return what an image shows, taken while the base turned by (3,) [rad/s]."""
+        """Return the view of an image taken while the base turned at `rate_base` (3,) [rad/s]."""
         gray = np.asarray(cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY), np.uint8)
         features = self._extractor.extract(gray, observation.depth_m)
         turning = Turning(
@@ -71,7 +71,7 @@ class Eye:
         )
 
     def settle(self, view: View, fix: Fix, predictor: Predictor) -> tuple[View, Fix]:
-        """Return a view and the pose that it led to, now that it tells how the camera turned."""
+        """Return the view and its pose, corrected by the turn rate that the pose gives."""
         turn = measured_rate(view.observation, predictor, fix.estimate.T_local_base)
         if self._shutter.readout_s and turn.is_unknown:
             for _ in range(_ROUNDS):
@@ -81,11 +81,11 @@ class Eye:
         return self._learn(view, fix), fix
 
     def step_s(self) -> float:
-        """Return by how much longer reading takes than was taken so far, which is taken now."""
+        """Apply the new readout time, if it changed enough; return the change [s]."""
         return self._shutter.step_s()
 
     def _turn(self, view: View, fix: Fix, turn: TurnRate) -> tuple[View, Fix]:
-        """Let the rows say how fast the camera turned, beside what is known of it."""
+        """Estimate the turn rate from the rows' residuals and the prior rate."""
         camera, seen = self._camera, fix.estimate.linearised
         rotation_cam_base = camera.T_base_cam[:3, :3].T
         change = rotation_cam_base @ turn.rate_base - view.turning.rate_cam
@@ -104,7 +104,7 @@ class Eye:
         return replace(view, features=features, turning=turning), replace(fix, estimate=estimate)
 
     def _learn(self, view: View, fix: Fix) -> View:
-        """Return a view with how its pose goes with the readout, of which it tells."""
+        """Update the readout time; return the view with its pose's derivative by it."""
         uv_px = view.features.uv_px[fix.feature_rows]
         slope_px = moves_px_per_s(self._camera, uv_px, view.turning.rate_cam)
         slope_px -= shifts_px_per_s(

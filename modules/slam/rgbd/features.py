@@ -13,20 +13,20 @@ from sceneslam.types.rig import Camera
 from .alignment import Alignment
 from .corners import CornerFinder
 
-_DEPTH_REACH_PX = 2  # of a corner, that should lie on the same surface
+_DEPTH_REACH_PX = 2  # around a corner, in which the surface should be the same
 _CROSS_PX = _DEPTH_REACH_PX * np.array([[0, -1, 1, 0, 0], [0, 0, 0, -1, 1]])  # columns, rows
-_DEPTH_SPREAD_RATIO = 0.03  # neighbours further apart than this lie across an edge
+_DEPTH_SPREAD_RATIO = 0.03  # a larger difference of neighbours is an edge
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Features:
-    """What is recognisable in one image."""
+    """The features of one image."""
 
     uv_px: NDArray[np.float64]  # (N, 2), without distortion
     levels: NDArray[np.int64]  # (N,), of the pyramid
     descriptors: NDArray[np.uint8]  # (N, 32)
     depth_m: NDArray[np.float64]  # (N,), along the optical axis, 0 = missing
-    depth_slope_m_per_px: NDArray[np.float64]  # (N,), how steeply it changes around there
+    depth_slope_m_per_px: NDArray[np.float64]  # (N,), slope of the depth there
 
     def __len__(self) -> int:
         return len(self.levels)

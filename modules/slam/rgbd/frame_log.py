@@ -1,4 +1,4 @@
-"""Where every frame was, told by its keyframe, so that it moves when the keyframe is corrected."""
+"""Poses of all frames relative to their keyframes, so that they follow its corrections."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FIRST_CAPACITY = 1024
 
 
 class FrameLog:
-    """Frames by rising stamp: 156 bytes each, so 17 MB per hour at 30 Hz."""
+    """Frames ordered by stamp: 156 bytes each, so 17 MB per hour at 30 Hz."""
 
     def __init__(self) -> None:
         self._stamps_ns = np.zeros(_FIRST_CAPACITY, np.int64)
@@ -34,7 +34,7 @@ class FrameLog:
         T_keyframe_base: Transform,
         twist_per_s: NDArray[np.float64],
     ) -> None:
-        """Remember a frame relative to a keyframe, and how it moves when reading takes longer."""
+        """Add a frame relative to a keyframe; `twist_per_s` (6,): per second of longer readout."""
         if self._count == len(self._stamps_ns):
             self._grow()
         self._stamps_ns[self._count] = stamp_ns
@@ -45,19 +45,19 @@ class FrameLog:
 
     @property
     def newest(self) -> tuple[int, Transform]:
-        """Return the keyframe of the newest frame, and where beside it that is."""
+        """Return the newest frame's keyframe and T_keyframe_base."""
         last = np.array([self._count - 1])
         return int(self._keyframe_ids[last[0]]), self._poses(last)[0]
 
     def hand_over(self, gone: int, heir: int, T_heir_gone: Transform) -> None:
-        """Tell the frames of a keyframe that is forgotten by another one."""
+        """Refer the frames of a removed keyframe `gone` to another one, `heir`."""
         rows = np.flatnonzero(self._keyframe_ids[: self._count] == gone)
         T_gone_base = self._poses(rows)
         self._T_keyframe_base[rows] = (T_heir_gone @ T_gone_base)[:, :3]
         self._keyframe_ids[rows] = heir
 
     def straighten(self, readout_s: float, twist_per_s: Mapping[int, NDArray[np.float64]]) -> None:
-        """Take it that reading every image took so much longer, those of keyframes too."""
+        """Correct all frames for a readout that is longer by `readout_s`, with their keyframes'."""
         for keyframe_id, twist in twist_per_s.items():
             rows = np.flatnonzero(self._keyframe_ids[: self._count] == keyframe_id)
             T_new_old = [se3.exp(readout_s * moved) for moved in self._twist_per_s[rows]]
@@ -66,7 +66,7 @@ class FrameLog:
                 self._T_keyframe_base[rows] = poses[:, :3]
 
     def trajectory(self, T_local_keyframe: Mapping[int, Transform]) -> Trajectory:
-        """Return T_local_base of the frames whose keyframes are given."""
+        """Return T_local_base of the frames whose keyframes are given, ordered by stamp."""
         if not T_local_keyframe:
             return Trajectory.empty()
         known = np.array(sorted(T_local_keyframe))
@@ -88,7 +88,7 @@ class FrameLog:
 
 
 def joined(first: Trajectory, then: Trajectory) -> Trajectory:
-    """Return one trajectory after the other."""
+    """Return both trajectories, one after the other."""
     return Trajectory(
         stamps_ns=np.concatenate([first.stamps_ns, then.stamps_ns]),
         T_world_base=np.concatenate([first.T_world_base, then.T_world_base]),
@@ -96,12 +96,12 @@ def joined(first: Trajectory, then: Trajectory) -> Trajectory:
 
 
 def moved(trajectory: Trajectory, T_new_old: Transform) -> Trajectory:
-    """Return a trajectory as a whole where a transform takes it."""
+    """Return a trajectory transformed as a whole by T_new_old (4, 4)."""
     return Trajectory(
         stamps_ns=trajectory.stamps_ns, T_world_base=T_new_old @ trajectory.T_world_base
     )
 
 
 def _rigid(T_a_b: np.ndarray) -> np.ndarray:
-    """Return the transforms without the rounding that products leave in their rotations."""
+    """Return the transforms (N, 4, 4) with orthonormal rotations."""
     return se3.from_quat_xyzw(T_a_b[:, :3, 3], se3.to_quat_xyzw(T_a_b))

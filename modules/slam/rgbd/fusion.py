@@ -1,4 +1,4 @@
-"""Landmarks that are one: what a keyframe shows again, but was mapped anew, is joined."""
+"""Join duplicate landmarks: points that were mapped again when they were seen again."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from .visual_map import VisualMap
 
 _RADIUS_PX = 25.0
 _RATIO = 0.85
-_MIN_FOUND = 8  # of landmarks that were mapped together
+_MIN_FOUND = 8  # landmarks of one group (mapped together), at least
 _MIN_FOUND_RATIO = 0.2
-_MAX_GAP_M = 0.1  # between two landmarks that are one
+_MAX_GAP_M = 0.1  # largest distance of two duplicates
 
 
 def join_duplicates(
     visual_map: VisualMap, keyframe: Keyframe, segment: Iterable[int] | None
 ) -> None:
-    """Join landmarks that should show where the keyframe shows others that look the same.
+    """Join landmarks that project to features of the keyframe with similar descriptors.
 
     `segment` are the keyframes whose landmarks these may be, None: all.
     """
@@ -51,9 +51,9 @@ def join_duplicates(
 
 
 def _are_many(groups: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return for the rows found (N,) whether much of what should show of their group was found.
+    """Return for the rows found (N,) whether enough landmarks of their group were found.
 
-    Few are chance, or a part of the map that has drifted away: a matter for loop closure.
+    Few matches are chance, or a part of the map with drift, which loop closure corrects.
     """
     size = int(groups.max(initial=0)) + 1
     expected, found = np.bincount(groups, minlength=size), np.bincount(groups[rows], minlength=size)

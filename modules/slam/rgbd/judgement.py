@@ -1,4 +1,4 @@
-"""Decisions on a view: how far to trust its pose, whether to keep it, whether to begin with it."""
+"""Rules for a view: its tracking status, whether it becomes a keyframe, whether a map begins."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from .localizer import Fix
 from .pose_solver import PoseEstimate
 from .view import View
 
-_MIN_DEPTH_AGREEMENT_RATIO = 0.2  # below, image and depth do not show the same place
+_MIN_DEPTH_AGREEMENT_RATIO = 0.2  # with less, image and depth do not show the same place
 
-_SEARCHED_IMAGES = 3  # looked for in the map before a place is begun
+_SEARCHED_IMAGES = 3  # images searched in the map before a new segment begins
 
-_RECENT = 20  # keyframes that belong to the way here
-_KNOWN_RATIO = 0.2  # of the step: a way taken before, of which there is nothing more to keep
+_RECENT = 20  # newest keyframes, which belong to the current path
+_KNOWN_RATIO = 0.2  # of the step: the path was driven before
 
 
 class HealthRule:
-    """Calls a pose degraded that few landmarks hold, or that some direction is unsure of,
-    or that the depth image contradicts.
+    """Calls a pose degraded if few landmarks support it, its position is uncertain in some
+    direction, or the depth image contradicts it.
     """
 
     def __init__(self, *, degraded_inliers: int, degraded_sigma_m: float) -> None:
@@ -43,12 +43,12 @@ class HealthRule:
         return TrackingStatus.TRACKING
 
     def is_unsure(self, covariance: NDArray[np.float64]) -> bool:
-        """Tell whether a position is not known well enough in some direction."""
+        """Tell whether the position of a (6, 6) covariance is too uncertain in some direction."""
         return bool(np.linalg.eigvalsh(covariance[:3, :3])[-1] > self._variance)
 
 
 class KeyframeRule:
-    """Asks for a keyframe where none is near, or where the map is running out of the image."""
+    """Requests a keyframe if none is near, or if the image shows too few known landmarks."""
 
     def __init__(self, *, step_m: float, turn_rad: float, inlier_ratio: float) -> None:
         self._per_m, self._per_rad = 1.0 / step_m, 1.0 / turn_rad
@@ -56,7 +56,7 @@ class KeyframeRule:
         self._most_inliers = 0
 
     def restart(self) -> None:
-        """Hear that a keyframe was made."""
+        """Restart after a new keyframe."""
         self._most_inliers = 0
 
     def wants(
@@ -66,7 +66,7 @@ class KeyframeRule:
         keyframes: KeyframeStore,
         segment: Collection[int] | None,
     ) -> bool:
-        """Tell whether the view from T_local_base should become a keyframe of a segment."""
+        """Tell whether the view from T_local_base (4, 4) should become a keyframe of a segment."""
         count = len(fix.landmark_ids)
         self._most_inliers = max(self._most_inliers, count)
         is_running_out = count < self._inlier_ratio * self._most_inliers
@@ -80,28 +80,28 @@ class KeyframeRule:
         return distance > (_KNOWN_RATIO if is_running_out else 1.0)
 
     def is_far(self, T_local_base: Transform, keyframes: KeyframeStore) -> bool:
-        """Tell whether T_local_base is more than a step from every keyframe."""
+        """Tell whether T_local_base (4, 4) is more than a step from every keyframe."""
         return keyframes.nearest(T_local_base, per_m=self._per_m, per_rad=self._per_rad) > 1.0
 
 
 class PlaceRule:
-    """Decides whether a place that the map does not show is begun anew."""
+    """Decides whether a new map segment begins at a place that the map does not contain."""
 
     def __init__(self, *, patience_s: float) -> None:
         self._patience_s = patience_s
-        self._images = 0  # that showed enough, since the map was last seen
+        self._images = 0  # images with enough features since the map was last seen
 
     def restart(self) -> None:
-        """Hear that there is a pose."""
+        """Restart after a tracked pose."""
         self._images = 0
 
     def wants(
         self, view: View, prediction: Prediction, *, unmeasured_s: float, is_far: bool
     ) -> bool:
-        """Tell whether the place was often enough looked for in the map.
+        """Tell whether enough images were searched in the map for a new segment to begin.
 
-        Where odometry led there, and else once the patience is over, for that is a guess. Without
-        depth, odometry has to have led far from all keyframes, to see anything in two.
+        Without odometry `patience_s` must have passed, too, as the pose is a guess. Without depth,
+        odometry must have led far from all keyframes, so that landmarks have parallax.
         """
         self._images += view.shows_enough
         if self._images <= _SEARCHED_IMAGES:

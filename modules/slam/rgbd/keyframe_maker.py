@@ -1,4 +1,4 @@
-"""Makes a keyframe of a view, and tells all who work with keyframes."""
+"""Make a keyframe of a view, and pass it to all parts that use keyframes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .visual_map import VisualMap
 
 
 class KeyframeMaker:
-    """Extends the map by what a view shows."""
+    """Extends the map by a view."""
 
     def __init__(
         self, visual_map: VisualMap, layers: LayerBuilder, memory: Memory, mapping: LocalMapping
@@ -36,10 +36,10 @@ class KeyframeMaker:
         fix: Fix | None,
         guessed_s: float | None,
     ) -> NDArray[np.int64]:
-        """Insert a keyframe at a pose and return the landmarks that it shows.
+        """Insert a keyframe at a pose (4, 4) and return the ids (N,) of its landmarks.
 
-        `segment`: the keyframes whose landmarks these may be, None: all. `fix` is what placed it
-        there, None for odometry; `guessed_s`: how long no pose was known, where nothing did.
+        `segment`: the keyframes whose landmarks these may be, None: all. `fix`: the pose found in
+        the map, None for odometry. `guessed_s`: time without a pose if the pose is a guess.
         """
         landmark_ids = np.full(len(view.features), NO_LANDMARK)
         if fix is not None:

@@ -1,4 +1,4 @@
-"""The keyframe store: where the camera was, what it saw, and which keyframes saw the same."""
+"""The keyframe store: poses, features, and covisibility of keyframes."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ NO_LANDMARK = -1
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DepthView:
-    """What is kept of a depth image for the map layers."""
+    """The part of a depth image that is kept for the map layers."""
 
     points_base: NDArray[np.float32]  # (M, 3) [m]
     colors_bgr: NDArray[np.uint8]  # (M, 3)
-    scan: LaserScan | None  # None where the camera does not see the scan's band
+    scan: LaserScan | None  # None if the camera does not see the scan's band of heights
 
 
 def nothing_seen() -> DepthView:
-    """Return what is kept where there is no depth image."""
+    """Return the empty view, for an observation without a depth image."""
     nothing = np.zeros((0, 3))
     points_base, colors_bgr = nothing.astype(np.float32), nothing.astype(np.uint8)
     return DepthView(points_base=points_base, colors_bgr=colors_bgr, scan=None)
@@ -37,15 +37,15 @@ def nothing_seen() -> DepthView:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reckoned:
-    """Where odometry alone led."""
+    """A pose by odometry alone."""
 
     T_reckoned_base: Transform  # never corrected
-    stretch: int  # along which odometry was there without a gap
+    stretch: int  # number of the section of odometry without a gap
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Keyframe:
-    """One image that the map is built of. Pose and landmarks may be corrected later."""
+    """One image in the map. Pose and landmarks may be corrected later."""
 
     stamp_ns: int
     T_local_base: Transform
@@ -57,18 +57,18 @@ class Keyframe:
     reckoned: Reckoned | None = None
 
     def straighten(self, camera: Camera, readout_s: float) -> None:
-        """Take it that reading the image took so much longer."""
+        """Correct the keyframe for a readout that is longer by `readout_s`."""
         self.features = straightened(camera, self.features, self.turning.rate_cam, readout_s)
         self.T_local_base = self.T_local_base @ se3.exp(readout_s * self.turning.twist_per_s)
 
 
 class KeyframeStore:
-    """Keyframes by rising id, with what they have in common."""
+    """Keyframes ordered by id, with the landmarks that they share."""
 
     def __init__(self) -> None:
         self._keyframes: dict[int, Keyframe] = {}
         self._next_id = 0
-        self._id_limit = 1  # above all landmark ids ever referred to
+        self._id_limit = 1  # above all landmark ids used so far
 
     def __len__(self) -> int:
         return len(self._keyframes)
@@ -95,7 +95,7 @@ class KeyframeStore:
     def show(
         self, keyframe_id: int, rows: NDArray[np.int64], landmark_ids: NDArray[np.int64]
     ) -> None:
-        """Let features of a keyframe, by row, refer to landmarks."""
+        """Assign landmarks (N,) to features of a keyframe, by row (N,)."""
         self._keyframes[keyframe_id].landmark_ids[rows] = landmark_ids
         self._id_limit = max(self._id_limit, int(landmark_ids.max(initial=0)) + 1)
 
@@ -104,7 +104,7 @@ class KeyframeStore:
         del self._keyframes[keyframe_id]
 
     def covisible(self, landmark_ids: NDArray[np.int64], *, limit: int) -> list[int]:
-        """Return the keyframes that share most of these landmarks, most first."""
+        """Return up to `limit` keyframes that share most of these landmarks, most first."""
         ids, shared = np.array(self.ids), self.shared(landmark_ids, self.ids)
         order = np.argsort(-shared, kind="stable")[:limit]
         return [int(keyframe_id) for keyframe_id in ids[order][shared[order] > 0]]
@@ -118,13 +118,13 @@ class KeyframeStore:
         return np.array([np.count_nonzero(wanted[ids]) for ids in shows], np.int64)
 
     def landmarks_of(self, keyframe_ids: Iterable[int]) -> NDArray[np.int64]:
-        """Return the ids of all landmarks that these keyframes saw, rising."""
+        """Return the ids of all landmarks that these keyframes saw, ascending."""
         seen = [self._keyframes[keyframe_id].landmark_ids for keyframe_id in keyframe_ids]
         marks = self._marked(np.concatenate([*seen, np.array([NO_LANDMARK])]))
         return np.flatnonzero(marks)
 
     def owned_landmarks(self) -> dict[int, NDArray[np.int64]]:
-        """Return for every keyframe the landmarks that it saw before any other did."""
+        """Return for every keyframe the landmarks that it saw first."""
         taken, owned = np.zeros(self._id_limit + 1, bool), {}
         taken[NO_LANDMARK] = True
         for keyframe_id, keyframe in self._keyframes.items():
@@ -133,13 +133,13 @@ class KeyframeStore:
         return owned
 
     def forget_landmarks(self, landmark_ids: NDArray[np.int64]) -> None:
-        """Let no keyframe refer to these landmarks any more."""
+        """Remove these landmarks from all keyframes."""
         gone = self._marked(landmark_ids)
         for keyframe in self.all():
             keyframe.landmark_ids[gone[keyframe.landmark_ids]] = NO_LANDMARK
 
     def rename_landmarks(self, old_ids: NDArray[np.int64], new_ids: NDArray[np.int64]) -> None:
-        """Let keyframes refer to other landmarks (N,) than these (N,)."""
+        """Replace landmarks `old_ids` (N,) by `new_ids` (N,) in all keyframes."""
         names = np.arange(NO_LANDMARK, self._id_limit)
         names[old_ids + 1] = new_ids
         for keyframe in self.all():
@@ -162,9 +162,10 @@ class KeyframeStore:
         but_latest: int = 0,
         among: Collection[int] | None = None,
     ) -> float:
-        """Return how far the nearest keyframe is, metres and radians weighed and added.
+        """Return the distance of the nearest keyframe: weighted sum of metres and radians.
 
-        Infinitely far where there are none `among` these (None: all) but the `but_latest`.
+        Only keyframes `among` these (None: all) without the `but_latest` newest ones count;
+        infinity if there are none.
         """
         ids = self.ids[: len(self) - but_latest]
         asked = [self._keyframes[k] for k in ids if among is None or k in among]
@@ -178,7 +179,7 @@ class KeyframeStore:
         )
 
     def most_redundant(self) -> int:
-        """Return the keyframe that stands closest to another, the latest and first left out."""
+        """Return the keyframe that is closest to another, except for the first and the latest."""
         ids = self.ids
         positions_m = np.stack([keyframe.T_local_base[:3, 3] for keyframe in self.all()])
         axes = np.stack([keyframe.T_local_base[:3, :3] for keyframe in self.all()])

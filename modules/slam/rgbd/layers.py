@@ -1,4 +1,4 @@
-"""The map for others: a coloured cloud and an occupancy grid from the keyframes' depth."""
+"""The map layers: a coloured cloud and an occupancy grid from the keyframes' depth."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PLANAR_TILT_RAD = 0.15
 
 
 class LayerBuilder:
-    """Keeps from every keyframe's depth what the map layers need, and builds them on demand."""
+    """Keeps the part of every keyframe's depth that the map layers need; builds them on demand."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class LayerBuilder:
     def view(
         self, depth_m: NDArray[np.float32] | None, image_bgr: NDArray[np.uint8], *, stamp_ns: int
     ) -> DepthView:
-        """Return what the layers will need of a depth image, every stride-th pixel of it."""
+        """Return the part of a depth image (H, W) [m] for the layers: every stride-th pixel."""
         if depth_m is None:
             return nothing_seen()
         camera, step = self._camera, self._stride_px
@@ -58,7 +58,7 @@ class LayerBuilder:
         return DepthView(points_base=points_base, colors_bgr=image_bgr[v, u], scan=scan)
 
     def build(self, keyframes: Sequence[Keyframe]) -> MapLayers:
-        """Return the layers in `local`; a grid only of a robot that moves in the plane."""
+        """Return the layers in `local`; a grid only for planar motion."""
         return MapLayers(points=self._points(keyframes), grid=self._grid(keyframes))
 
     def _points(self, keyframes: Sequence[Keyframe]) -> PointLayer | None:
@@ -101,7 +101,7 @@ def _make_scanner(camera: Camera) -> DepthScanner | None:
 def _thin_by_voxel(
     points: NDArray[np.floating], colors_bgr: NDArray[np.uint8], voxel_m: float
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return one point per voxel: the means of what fell into it."""
+    """Return one point per voxel: the mean of its points (M, 3) and of their colours (M, 3)."""
     cells = np.floor(points / voxel_m).astype(np.int64)
     cells -= cells.min(axis=0, initial=0)
     spans = cells.max(axis=0, initial=0) + 1

@@ -1,4 +1,4 @@
-"""What the constructor's arguments and the images may be."""
+"""Check the constructor's arguments and the images' sizes."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def check_limits(arguments: Mapping[str, object]) -> None:
 
 
 def check_sizes(observation: Observation, camera: Camera) -> None:
-    """Raise InputError where an array has not the camera's size."""
+    """Raise InputError if an array does not have the camera's size."""
     width, height = camera.size_wh
     image_bgr, depth_m = observation.image_bgr, observation.depth_m
     if image_bgr is not None and image_bgr.shape != (height, width, 3):

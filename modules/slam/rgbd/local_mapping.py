@@ -1,4 +1,4 @@
-"""Local bundle adjustment beside the tracking, its result merged at fixed images."""
+"""Local bundle adjustment in a worker; results are merged at fixed image counts."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from .visual_map import VisualMap
 from .window import Window, merge_window, take_window
 
 _Worker = SideProcess[Task, Outcome] | Here[Task, Outcome]
-_TIED_IMAGES = 10  # for what has depth: registering it takes the worker 100 to 200 ms
-_FREE_IMAGES = 5  # for what has none: triangulated landmarks wait for it, and drift in scale
-_BEGINNING = 16  # views that the map can be made anew of: 2.4 MB each
+_TIED_IMAGES = 10  # between merges with depth, whose registration takes 100 to 200 ms
+_FREE_IMAGES = 5  # without depth: triangulated landmarks need it early, as they drift in scale
+_BEGINNING = 16  # first views, kept to rebuild the map: 2.4 MB each
 
 
 class LocalMapping:
-    """Adjusts the newest keyframes and their landmarks, every so many images.
+    """Adjusts the newest keyframes and their landmarks at fixed intervals of images.
 
-    A worker has all images between two merges to do it; a merge waits for it, so that what the
-    map is at an image depends on the images alone. How many these are depends on its work.
+    A worker does it between two merges, and a merge waits for the worker, so that the map at an
+    image depends on the images alone.
     """
 
     def __init__(
@@ -42,13 +42,13 @@ class LocalMapping:
         self._window: Window | None = None
         self._result: Future[Outcome] | None = None
         self._images_left, self._newest = _FREE_IMAGES, -1
-        self._fresh: dict[int, Shown] = {}  # keyframes that the worker has not seen yet
+        self._fresh: dict[int, Shown] = {}  # keyframes that the worker has not received yet
         self._is_aligned = alignment is not None
-        self.alignment: Alignment | None = None  # where it was found not to be what was taken
-        self.beginning: dict[int, View] = {}  # what newest keyframes show, until that is known
+        self.alignment: Alignment | None = None  # if it differs from the assumed one
+        self.beginning: dict[int, View] = {}  # by keyframe id, until that is known
 
     def insert(self, keyframe_id: int, view: View) -> None:
-        """Take what a new keyframe shows; without depth it is tied to none."""
+        """Take a new keyframe's view; without depth it gets no relative-pose constraint."""
         self._process()
         if not self._is_aligned:
             self.beginning[keyframe_id] = view
@@ -58,9 +58,9 @@ class LocalMapping:
             self._fresh[keyframe_id] = Shown(features=view.features, depth_m=view.depth_m)
 
     def step(self) -> Transform:
-        """Count an image; merge what is due and begin what is next.
+        """Count an image; merge a finished task and begin the next when they are due.
 
-        Returns T_new_old, by which the newest keyframe and what is near it were moved.
+        Returns T_new_old (4, 4), the correction of the newest keyframe and its surroundings.
         """
         self._images_left -= 1
         if self._images_left:
@@ -86,7 +86,7 @@ class LocalMapping:
         return T_new_old
 
     def shutdown(self) -> None:
-        """End the worker; what it was at is not merged."""
+        """End the worker; its pending task is not merged."""
         if self._worker is not None:
             self._worker.end()
 
@@ -102,7 +102,7 @@ class LocalMapping:
         return merge_window(self._map, window, outcome.adjusted)
 
     def _process(self) -> _Worker:
-        """Return the worker; it starts with the first keyframe, to be there when it is needed."""
+        """Return the worker; it starts with the first keyframe, to be ready when it is needed."""
         if self._worker is None:
             self._worker = worker_beside(
                 MappingWork, self._map.camera, self._depth_camera, self._known

@@ -1,4 +1,4 @@
-"""Finds the camera in the map: near a predicted pose, or anywhere."""
+"""Localize the camera in the map: near a predicted pose, or anywhere."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from .residuals import Sightings
 from .visual_map import VisualMap
 
 _RADIUS_REFINED_PX = 10.0
-_WIDER = 2.5  # last try of a guided search
-_MIN_INLIER_RATIO = 0.4  # of the matches around a pose that is right
-_MIN_FOUND_RATIO = 0.1  # of the landmarks that should show: chance finds 0.05, an image 0.2
+_WIDER = 2.5  # factor on the search radius, in the last try of a guided search
+_MIN_INLIER_RATIO = 0.4  # least share of inliers among the matches at a correct pose
+_MIN_FOUND_RATIO = 0.1  # found, of the expected landmarks: 0.05 by chance, 0.2 in an image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fix:
-    """A pose and the landmarks that hold it."""
+    """A pose and the landmarks that support it."""
 
     estimate: PoseEstimate
     landmark_ids: NDArray[np.int64]  # (N,), pixels agree
     feature_rows: NDArray[np.int64]  # (N,)
-    deep_rows: NDArray[np.int64]  # those of them whose depth agrees too
-    expected_ids: NDArray[np.int64]  # landmarks that the image should show
+    deep_rows: NDArray[np.int64]  # the feature rows whose depth agrees, too
+    expected_ids: NDArray[np.int64]  # landmarks that the image should contain
 
     def found_ratio(self, features: Features) -> float:
-        """Return the share of the landmarks that the image should show, which it does."""
+        """Return the share of the expected landmarks that the image contains."""
         possible = min(len(self.expected_ids), len(features))
         return len(self.landmark_ids) / max(1, possible)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Found:
-    """Landmarks that were looked for, and the features taken for them."""
+    """Expected landmarks, and the features matched to them."""
 
     expected_ids: NDArray[np.int64]  # (M,)
     landmark_ids: NDArray[np.int64]  # (N,)
@@ -63,9 +63,10 @@ class Localizer:
     def near(
         self, features: Features, T_predicted: Transform, held_ids: NDArray[np.int64]
     ) -> Fix | None:
-        """Return the pose found by looking for landmarks where a predicted pose shows them.
+        """Return the pose found by matching landmarks near their pixels at a predicted pose.
 
-        First for those that were held last; then for all that are around them, then further away.
+        First the landmarks tracked last (`held_ids`), then all around them, then with a larger
+        radius.
         """
         found = self._look(features, T_predicted, held_ids, self._radius_px)
         if len(found) >= self._min_inliers:
@@ -81,7 +82,7 @@ class Localizer:
         return None
 
     def beside(self, features: Features, fix: Fix) -> Fix | None:
-        """Return the pose found by looking again from another one of the same image."""
+        """Return the pose found by matching again from a pose of the same image."""
         found = self._look(
             features, fix.estimate.T_local_base, fix.expected_ids, _RADIUS_REFINED_PX
         )
@@ -90,11 +91,11 @@ class Localizer:
         )
 
     def around(self, features: Features, held_ids: NDArray[np.int64]) -> Fix | None:
-        """Return the pose found by comparing the descriptors of all around some landmarks."""
+        """Return the pose found by descriptors alone, among all landmarks around `held_ids`."""
         return self.anywhere(features, self._map.around(held_ids))
 
     def anywhere(self, features: Features, landmark_ids: NDArray[np.int64]) -> Fix | None:
-        """Return the pose found by comparing all descriptors."""
+        """Return the pose found by descriptors alone, among `landmark_ids`."""
         matches = match_anywhere(
             self._map.landmarks.descriptors.take(landmark_ids, axis=0), features
         )
@@ -109,7 +110,7 @@ class Localizer:
     def _confirm(
         self, features: Features, rough: _Found, consensus: Consensus | None
     ) -> Fix | None:
-        """Return the final pose from all landmarks that a nearly right pose lets us find."""
+        """Return the final pose, from all landmarks that are found with a nearly correct pose."""
         if consensus is None or len(consensus.inlier_rows) < self._min_inliers:
             return None
         T_local_base = consensus.T_local_base
@@ -139,7 +140,7 @@ class Localizer:
         landmark_ids: NDArray[np.int64],
         radius_px: float,
     ) -> _Found:
-        """Return which landmarks are found where a pose shows them."""
+        """Return the landmarks found within `radius_px` of their pixels at a pose."""
         prediction = self._map.predict(T_local_base, landmark_ids)
         matches = match_near(
             prediction.uv_px,
@@ -172,7 +173,7 @@ class Localizer:
         rows: NDArray[np.int64],
         T_local_base: Transform,
     ) -> Measurements:
-        """Return what to solve for, seen from about T_local_base, with the landmarks' own doubt."""
+        """Return the measurements, with the landmarks' own covariance as seen from T_local_base."""
         doubts = self._map.doubts(T_local_base, ids)
         return Measurements(
             points_local=self._map.landmarks.points_local.take(ids, axis=0),

@@ -1,4 +1,4 @@
-"""Closes loops: a little work per image; the pose graph in a worker, merged at a fixed image."""
+"""Close loops: some work per image; the pose graph in a worker, merged at a fixed image."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from .loop_fusion import fuse_duplicates
 from .pose_graph import PoseGraph, solve
 from .visual_map import VisualMap
 
-_MERGE_IMAGES = 10  # that the worker has; then it is waited for, so that a run can be repeated
-_QUEUE = 3  # keyframes that wait to be looked up; older ones are let go
+_MERGE_IMAGES = 10  # after which the merge waits for the worker, so that runs are repeatable
+_QUEUE = 3  # keyframes waiting for a query; older ones are dropped
 
 Poses = Mapping[int, Transform]
 
 
 class LoopCloser:
-    """Looks new keyframes up, and corrects the map where two of them say that it drifted."""
+    """Queries new keyframes, and corrects the map when two of them agree on a loop."""
 
     def __init__(self, visual_map: VisualMap, detector: LoopDetector, graph: PoseGraph) -> None:
         self._map, self._detector, self._graph = visual_map, detector, graph
         self._worker = thread_beside("pose_graph")
         self._queries: deque[Query] = deque(maxlen=_QUEUE)
-        self._candidate: int | None = None  # of the first query, once it was looked up
+        self._candidate: int | None = None  # candidate of the first query, once it was found
         self._solution: Future[dict[int, Transform]] | None = None
         self._before: Poses = {}  # the poses that the worker began with
         self._loops: list[Loop] = []
@@ -36,11 +36,11 @@ class LoopCloser:
 
     @property
     def is_solving(self) -> bool:
-        """Tell whether the worker is at a pose graph, or its poses are not merged yet."""
+        """Tell whether a pose graph is being solved, or its poses are not merged yet."""
         return self._solution is not None
 
     def insert(self, query: Query) -> None:
-        """Take a new keyframe to look up."""
+        """Add a new keyframe to the queue of queries."""
         if len(self._queries) == _QUEUE:
             self._candidate = None
         self._queries.append(query)
@@ -58,7 +58,7 @@ class LoopCloser:
         return {}
 
     def finish(self) -> dict[int, Transform]:
-        """Merge at once what the worker is at; return T_new_old per keyframe that was moved."""
+        """Merge the pending solution at once; return T_new_old per keyframe that was moved."""
         return {} if self._solution is None else self._merge(self._solution)
 
     def shutdown(self) -> None:
@@ -89,7 +89,7 @@ class LoopCloser:
             self._fuse(loops)
 
     def _met(self, loop: Loop) -> Poses:
-        """Return where a segment comes to lie that a loop is the first to connect, as a whole."""
+        """Return the new poses of a whole segment that a loop connects for the first time."""
         segment = self._graph.connected(loop.keyframe_id)
         poses = self._poses()
         T_new_old = loop.T_local_base @ se3.inverse(poses[loop.keyframe_id])
@@ -101,7 +101,7 @@ class LoopCloser:
         return {k: T_new_old @ poses[k] for k in segment}
 
     def _begin(self, loops: list[Loop], met: Poses) -> None:
-        """Set the worker on the part of the graph that the loops are in; `met` lies elsewhere."""
+        """Start solving the part of the graph with the loops; `met`: poses of a moved segment."""
         part = self._graph.connected(loops[0].keyframe_id)
         self._before = {k: T for k, T in self._poses().items() if k in part}
         edges = [edge for edge in self._graph.edges if edge.start in part]
@@ -110,7 +110,7 @@ class LoopCloser:
         self._solution = self._worker.submit(solve, first_guess, edges, held=min(part))
 
     def _merge(self, solution: Future[dict[int, Transform]]) -> dict[int, Transform]:
-        """Move the keyframes, those that are newer along with the one they hang on."""
+        """Move the keyframes; newer ones move with the keyframe that they are connected to."""
         solved = solution.result()
         T_new_old = {k: T @ se3.inverse(self._before[k]) for k, T in solved.items()}
         for keyframe_id in self._graph.ids:

@@ -1,4 +1,4 @@
-"""Finds loops: keyframes that show a place seen before, twice and in agreement."""
+"""Detect loops: two new keyframes that agree on showing a place seen before."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from .pose_graph import Edge, PoseGraph, Way, motion_covariance
 from .recognition import PlaceRecognizer, Recognition
 from .visual_map import VisualMap
 
-_RECENT = 5  # keyframes that are no loop, whatever they look like
-_OUTSTANDING = 2.0  # sigmas above what unrelated keyframes have in common
-_FEWEST = 5  # keyframes that tell what is usual
+_RECENT = 5  # newest keyframes, which are never loop candidates
+_OUTSTANDING = 2.0  # sigmas above the similarity of unrelated keyframes
+_FEWEST = 5  # keyframes needed for the usual similarity
 _CHI2 = 22.5  # 99.9 % of six degrees of freedom
-_DRIFT_RATIO = 0.05  # of the way: more drift is not believed of any camera
+_DRIFT_RATIO = 0.05  # of the path length: a loop with more drift is rejected
 _SIGMAS = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Query:
-    """A new keyframe, and the depth image that it was made of."""
+    """A new keyframe with its depth image."""
 
     keyframe_id: int
-    depth_m: NDArray[np.float32] | None  # None: it has none
+    depth_m: NDArray[np.float32] | None  # (H, W) [m], None: no depth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Loop:
-    """A keyframe seen again: the edge from the old to the new one, and where that puts it."""
+    """A loop: the edge from an old to a new keyframe, and the new one's pose by it."""
 
     edge: Edge
-    T_local_base: Transform  # of the new keyframe, as the old part of the map has it
+    T_local_base: Transform  # of the new keyframe, by the old part of the map
 
     @property
     def keyframe_id(self) -> int:
@@ -44,7 +44,7 @@ class Loop:
 
 
 class LoopDetector:
-    """Looks one keyframe up at a time: first what it looks like, then whether it is that."""
+    """Checks one keyframe at a time: first by appearance, then by geometry."""
 
     def __init__(
         self, visual_map: VisualMap, recognizer: PlaceRecognizer, graph: PoseGraph
@@ -53,7 +53,7 @@ class LoopDetector:
         self._hypothesis: Loop | None = None
 
     def candidate(self, query: Query) -> int | None:
-        """Return the unconnected keyframe that looks outstandingly like the new one."""
+        """Return the unconnected keyframe that is exceptionally similar to the new one."""
         keyframes = self._map.keyframes
         new = keyframes[query.keyframe_id]
         known = set(keyframes.covisible(new.landmark_ids, limit=len(keyframes)))
@@ -88,7 +88,7 @@ class LoopDetector:
         return [earlier, loop]
 
     def is_news(self, loop: Loop) -> bool:
-        """Tell whether a loop moves its keyframe by more than it is unsure of."""
+        """Tell whether a loop moves its keyframe by more than its uncertainty."""
         T_local_base = self._map.keyframes[loop.keyframe_id].T_local_base
         xi = se3.log(se3.inverse(T_local_base) @ loop.T_local_base)
         return float(xi @ np.linalg.solve(loop.edge.covariance, xi)) > _CHI2
@@ -107,7 +107,7 @@ class LoopDetector:
         return Loop(edge=edge, T_local_base=T_local_base)
 
     def _agree(self, earlier: Loop, later: Loop) -> bool:
-        """Tell whether both say the same of the motion between the two new keyframes."""
+        """Tell whether both loops imply the same motion between the two new keyframes."""
         T_first, T_second = (
             self._map.keyframes[loop.keyframe_id].T_local_base for loop in (earlier, later)
         )
@@ -119,7 +119,7 @@ class LoopDetector:
 
 
 def _believable(loop: Loop, T_local_base: Transform, way: Way) -> bool:
-    """Tell whether the way may have drifted by as much as the loop says it has."""
+    """Tell whether the drift that the loop implies is plausible for the path."""
     T_error = se3.inverse(T_local_base) @ loop.T_local_base
     sigmas = np.sqrt(np.diag(loop.edge.covariance))
     turn_rad = _DRIFT_RATIO * way.turned_rad + _SIGMAS * way.sigma_rad

@@ -1,4 +1,4 @@
-"""Makes one landmark of two, where a loop shows that they are the same."""
+"""Join duplicate landmarks after a loop closure."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from .keyframes import NO_LANDMARK
 from .matching import match_near
 from .visual_map import VisualMap
 
-_RADIUS_PX = 6.0  # around where an old landmark should show in a new keyframe
+_RADIUS_PX = 6.0  # around the projection of an old landmark in a new keyframe
 _MOST = 10  # keyframes on the new side
 
 
 def fuse_duplicates(visual_map: VisualMap, *, old: int, new: int) -> None:
-    """Let keyframes around `new` refer to the landmarks around `old` that they show.
+    """Assign the landmarks around `old` to the features around `new` that show them.
 
-    Both are keyframe ids; the map has just been corrected, so that the landmarks are where the
-    keyframes should show them.
+    Both are keyframe ids; the map has just been corrected, so that the landmarks project close to
+    these features.
     """
     keyframes = visual_map.keyframes
     old_side = keyframes.covisible(keyframes[old].landmark_ids, limit=_MOST)
@@ -47,7 +47,7 @@ def _fuse_into(visual_map: VisualMap, keyframe_id: int, old_ids: NDArray[np.int6
 
 
 def _unite(visual_map: VisualMap, kept: NDArray[np.int64], doubles: NDArray[np.int64]) -> None:
-    """Give what is known of the doubles (N,) to the landmarks that are kept (N,)."""
+    """Merge the measurements of duplicates (N,) into the landmarks that are kept (N,)."""
     table = visual_map.landmarks
     table.fuse(
         kept, points_local=table.points_local[doubles], information=table.information[doubles]

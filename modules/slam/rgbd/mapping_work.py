@@ -1,4 +1,4 @@
-"""What local mapping has done beside the tracking: ties between keyframes, bundle adjustment."""
+"""The worker's part of local mapping: relative-pose constraints and bundle adjustment."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ class Task:
     """A part of the map to adjust."""
 
     bundle: Bundle
-    keyframe_ids: list[int]  # (K,) of the bundle's keyframes, rising
+    keyframe_ids: list[int]  # (K,) of the bundle's keyframes, ascending
     free_ids: list[int]
-    fresh: Mapping[int, Shown]  # what new keyframes show, by their ids
+    fresh: Mapping[int, Shown]  # views of new keyframes, by id
     reckoned: Mapping[tuple[int, int], Tie]  # by odometry, by keyframe ids
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Outcome:
-    """The part adjusted, and the cameras' alignment where it is not what was taken."""
+    """The adjusted part, and the cameras' alignment if it differs from the assumed one."""
 
     adjusted: Adjusted
     alignment: Alignment | None
-    is_aligned: bool  # or is it still asked whether colours and depth are of one camera?
+    is_aligned: bool  # False while the alignment is still being estimated
 
 
 class MappingWork:
-    """Does the tasks of one map, in order; remembers ties and what was seen of the alignment."""
+    """Does the tasks of one map in order; keeps constraints and the alignment's estimate."""
 
     def __init__(self, camera: Camera, depth_camera: Camera, alignment: Alignment | None) -> None:
         self._camera = camera
@@ -46,7 +46,7 @@ class MappingWork:
         self._ties: dict[tuple[int, int], Tie] = {}  # by keyframe ids
 
     def __call__(self, task: Task) -> Outcome:
-        """Return the task's bundle adjusted, held by ties too."""
+        """Return the task's bundle adjusted with its relative-pose constraints."""
         self._tie(task)
         rows = {keyframe_id: row for row, keyframe_id in enumerate(task.keyframe_ids)}
         ties = {
@@ -78,7 +78,7 @@ class MappingWork:
                         self._compare(one, other, tie)
 
     def _compare(self, one: int, other: int, tie: Tie) -> None:
-        """Ask the colours of two keyframes whether they are the depth camera's."""
+        """Compare the colours of two keyframes with the depth camera's motion."""
         if one in self._searched and other in self._searched:
             here, there = self._searched[one], self._searched[other]
             found = self._search.add(pair_of(here, there, se3.inverse(tie.T_one_other)))

@@ -1,4 +1,4 @@
-"""Which landmark is which feature: by descriptor, near a predicted pixel or anywhere."""
+"""Match landmarks to features by descriptor, near a predicted pixel or anywhere."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NO_RIVAL = 1 << 60
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Matches:
-    """Pairs of rows: of the landmarks asked for, and of the features."""
+    """Pairs of rows: of the queried landmarks, and of the features."""
 
     landmark_rows: NDArray[np.int64]  # (N,)
     feature_rows: NDArray[np.int64]  # (N,), each at most once
@@ -44,7 +44,7 @@ def match_near(
     radius_px: float,
     ratio: float = 1.0,
 ) -> Matches:
-    """Return the features that look like the landmarks expected within `radius_px` of them.
+    """Return the matches of landmarks to features within `radius_px` of the predicted pixels.
 
     `uv_px` (M, 2), `levels` (M,) and `descriptors` (M, 32) are the landmarks' predictions.
     """
@@ -65,7 +65,7 @@ def match_pairs(
     *,
     ratio: float,
 ) -> Matches:
-    """Return the pairs that look alike, of those given (P,): by rising row of `descriptors`."""
+    """Return the matches among given pairs (P,), which are ordered by row of `descriptors`."""
     if not len(rows):
         return _no_matches()
     words = descriptors.view(np.uint64).take(rows, axis=0)
@@ -75,7 +75,7 @@ def match_pairs(
 
 
 def match_anywhere(descriptors: NDArray[np.uint8], features: Features) -> Matches:
-    """Return mutual best matches of descriptors (M, 32), wherever in the image they are."""
+    """Return mutual best matches of descriptors (M, 32), anywhere in the image."""
     if len(descriptors) < 2 or len(features) < 2:
         return _no_matches()
     distances, rows = cv2.batchDistance(
@@ -126,7 +126,7 @@ def _clear_winners(
     distances: NDArray[np.int64],
     ratio: float,
 ) -> Matches:
-    """Return each row's best candidate where it is near and clearly better than the next."""
+    """Return each row's best candidate if it is close enough and clearly better than the next."""
     starts = np.flatnonzero(np.diff(rows, prepend=-1))
     keys = _keys(distances)
     best = np.minimum.reduceat(keys, starts)
@@ -140,7 +140,7 @@ def _clear_winners(
 
 
 def _first_claims(claims: NDArray[np.int64], distances: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the rows, rising, of each claimed number's nearest claim."""
+    """Return, ascending, the row with the smallest distance for each claimed feature."""
     keys = _keys(distances)
     nearest = np.full(claims.max(initial=0) + 1, _NO_RIVAL)
     np.minimum.at(nearest, claims, keys)
@@ -148,7 +148,7 @@ def _first_claims(claims: NDArray[np.int64], distances: NDArray[np.int64]) -> ND
 
 
 def _keys(distances: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return numbers that sort as the distances (N,) do, and equal ones by their row."""
+    """Return sort keys (N,): by distance (N,), equal distances by row."""
     return (distances << _ROW_BITS) + np.arange(len(distances))
 
 

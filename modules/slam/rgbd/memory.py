@@ -1,4 +1,4 @@
-"""What the module remembers of its past: places, the pose graph, and where every frame was."""
+"""The module's history: places, the pose graph, and the poses of all frames."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from .reunion import Reunion
 from .segments import Segments
 from .visual_map import VisualMap
 
-_MIN_SHARE = 0.1  # of a pose's landmarks, for the keyframe they come from to have an edge
-_RECKONED_VARIANCE = 0.05**2  # [m^2] and [rad^2], of a keyframe that only odometry leads to
+_MIN_SHARE = 0.1  # least share of a pose's landmarks from a keyframe, for an edge to it
+_RECKONED_VARIANCE = 0.05**2  # [m^2] and [rad^2], of a keyframe placed by odometry alone
 _NEVER_SAW = -1
 
 
 class Memory:
-    """Follows the map as it grows and shrinks, and corrects it where it knows a place again."""
+    """Records the map's growth and pruning, and corrects the map when a place is recognized."""
 
     def __init__(
         self,
@@ -43,17 +43,17 @@ class Memory:
     ) -> None:
         self._map, self._eye, self._reunion = visual_map, eye, reunion
         self._graph, self._frames = PoseGraph(), FrameLog()
-        self._keyframes: dict[int, Keyframe] = {}  # also those that the map has just let go
+        self._keyframes: dict[int, Keyframe] = {}  # including those just removed from the map
         self.recognizer = PlaceRecognizer(visual_map, localizer, min_inliers=min_inliers)
         detector = LoopDetector(visual_map, self.recognizer, self._graph)
         self._closer = LoopCloser(visual_map, detector, self._graph)
         self.segments = Segments(self._graph)
-        self.reference = _NEVER_SAW  # the keyframe that the newest frame hangs on
-        self.revision = 0  # rises with every correction
-        self._before = Trajectory.empty()  # what the map that this one replaces held
+        self.reference = _NEVER_SAW  # the keyframe that the newest frame refers to
+        self.revision = 0  # increases with every correction
+        self._before = Trajectory.empty()  # poses of the map that this one replaced
 
     def follow(self, before: Memory, T_local_keyframe: Mapping[int, Transform]) -> None:
-        """End a map and go on from it; some of its keyframes lie elsewhere by now."""
+        """Continue from a map that is replaced; `T_local_keyframe` are its corrected keyframes."""
         before._closer.finish()
         before.shutdown()
         poses = {k: keyframe.T_local_base for k, keyframe in before._keyframes.items()}
@@ -61,29 +61,29 @@ class Memory:
         self._before, self.revision = joined(before._before, frames), before.revision + 1
 
     def hold(self, stamp_ns: int, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> None:
-        """Remember where a frame was, by the keyframe that shares most landmarks with it."""
+        """Record a frame's pose relative to the keyframe that shares most landmarks with it."""
         keyframes = self._map.keyframes
         near = [self.reference, keyframes.ids[-1], *self._graph.neighbours(self.reference)]
         shared = keyframes.shared(landmark_ids, near)
         if shared.any():
             self.reference = near[int(np.argmax(shared))]
-        else:  # it was found somewhere else
+        else:  # it was relocalized elsewhere
             self.reference = [*keyframes.covisible(landmark_ids, limit=1), *near][0]
         T_local_keyframe = keyframes[self.reference].T_local_base
         T_keyframe_base = se3.inverse(T_local_keyframe) @ T_local_base
         self._frames.add(stamp_ns, self.reference, T_keyframe_base, self._eye.twist_per_s)
 
     def around(self, T_local_base: Transform) -> list[Transform]:
-        """Return T_keyframe_base of a pose for the keyframes around that of the newest frame."""
+        """Return T_keyframe_base of a pose for the keyframes around the newest frame's."""
         near = [self.reference, *self._graph.neighbours(self.reference)]
         return [se3.inverse(self._map.keyframes[k].T_local_base) @ T_local_base for k in near]
 
     def insert(
         self, fix: Fix | None, depth_m: NDArray[np.float32] | None, *, guessed_s: float | None
     ) -> None:
-        """Take the map's newest keyframe; `fix` is what placed it there, None for odometry.
+        """Add the map's newest keyframe; `fix` is its pose in the map, None for odometry.
 
-        `guessed_s`: how long no pose was known, where nothing placed it: it begins a segment.
+        `guessed_s`: time without a pose if its pose is a guess; then it begins a segment.
         """
         self._follow_removals()
         keyframe_id = self._map.keyframes.ids[-1]
@@ -100,13 +100,13 @@ class Memory:
         self.reference = keyframe_id
 
     def segment(self, landmark_ids: NDArray[np.int64]) -> set[int] | None:
-        """Return the keyframes of the segment that these landmarks are of; None: all are of one."""
+        """Return the keyframes of these landmarks' segment; None: there is only one segment."""
         if not self.segments.are_many:
             return None
         return self.segments.around(self._map.keyframes.covisible(landmark_ids, limit=1)[0])
 
     def step(self) -> Transform | None:
-        """Do an image's share of recognising; return T_new_old of here when the map moved."""
+        """Do one image's share of loop closing; return T_new_old of the current pose, if moved."""
         self._follow_removals()
         corrections = self._closer.step()
         if corrections:
@@ -125,13 +125,13 @@ class Memory:
         return T_new_old
 
     def trajectory(self) -> Trajectory:
-        """Return T_local_base of all frames that were held, with loops that were found last."""
+        """Return T_local_base of all tracked frames, corrected by all loops."""
         self._closer.finish()
         frames = self._frames.trajectory({k: v.T_local_base for k, v in self._keyframes.items()})
         return joined(self._before, frames)
 
     def pose_graph(self) -> PoseGraphLayer | None:
-        """Return the keyframes and what was measured between them."""
+        """Return the keyframes and the measured motions between them."""
         if not self._keyframes:
             return None
         rows = {keyframe_id: row for row, keyframe_id in enumerate(self._keyframes)}
@@ -146,7 +146,7 @@ class Memory:
         )
 
     def landmarks(self) -> LandmarkLayer | None:
-        """Return the landmarks with the stamp of the first keyframe that still shows them."""
+        """Return the landmarks with the stamp of the first remaining keyframe that saw them."""
         owned = self._map.keyframes.owned_landmarks()
         if not owned:
             return None
@@ -160,11 +160,11 @@ class Memory:
         )
 
     def shutdown(self) -> None:
-        """End the worker; what is remembered stays readable."""
+        """End the worker; the history stays readable."""
         self._closer.shutdown()
 
     def _straighten(self, readout_s: float) -> Transform | None:
-        """Take it that reading images took so much longer; return T_new_old of here."""
+        """Correct for a readout longer by `readout_s`; return T_new_old of the current pose."""
         if not readout_s or not len(self._frames):
             return None
         T_local_old = self._newest()
@@ -180,10 +180,10 @@ class Memory:
         return np.asarray(self._keyframes[keyframe_id].T_local_base @ T_keyframe_base)
 
     def _edges(self, keyframe_id: int, fix: Fix | None) -> list[Edge]:
-        """Return what a new keyframe's pose was measured against.
+        """Return the edges to the keyframes against which a new keyframe's pose was measured.
 
-        A landmark belongs to the keyframe that saw it first; every such keyframe gets the share
-        of the information that its landmarks have, so that nothing is counted twice.
+        A landmark belongs to the keyframe that saw it first; the edge to each such keyframe gets
+        its landmarks' share of the information, so that nothing is counted twice.
         """
         earlier = self._keyframes
         if not earlier:
@@ -208,7 +208,7 @@ class Memory:
         ]
 
     def _origins(self, landmark_ids: NDArray[np.int64]) -> dict[int, int]:
-        """Return how many of these landmarks each keyframe saw before any other did."""
+        """Return how many of these landmarks each keyframe saw first."""
         owned = self._map.keyframes.owned_landmarks()
         owners = np.repeat(list(owned), [len(ids) for ids in owned.values()])
         wanted = np.isin(np.concatenate(list(owned.values())), landmark_ids)
@@ -216,7 +216,7 @@ class Memory:
         return dict(zip(keyframe_ids.tolist(), counts.tolist(), strict=True))
 
     def _follow_removals(self) -> None:
-        """Let what hung on keyframes that the map has let go hang on others."""
+        """Refer frames and edges of removed keyframes to other keyframes."""
         for keyframe_id in sorted(set(self._keyframes) - set(self._map.keyframes.ids)):
             edge = self._graph.remove(keyframe_id)
             if edge is not None:

@@ -29,10 +29,10 @@ from .view import View
 
 
 class RgbdSlam:
-    """Tracks a camera, with depth or without: the map and its scale stay when depth ends.
+    """Tracks a camera with or without depth: the map and its scale stay when depth is missing.
 
     After ORB-SLAM2's front end (Mur-Artal and Tardos 2017). Without depth, new landmarks are
-    triangulated, and odometry or the map that is there tells the scale.
+    triangulated, with the scale of odometry or of the existing map.
     """
 
     def __init__(
@@ -68,14 +68,14 @@ class RgbdSlam:
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return that colour suffices with anything that tells how large the scene is."""
+        """Return the sensor sets: colour with any sensor that gives the scale."""
         scales = (Sensor.DEPTH, Sensor.ODOMETRY)
         return tuple(frozenset({Sensor.IMAGE, scale}) for scale in scales)
 
     def activate(self, rig: Rig) -> None:
-        """Start anew with an empty map; raises InputError for a rig without a camera.
+        """Start with an empty map; raises InputError for a rig without a camera.
 
-        Where it sees what an earlier, placed session saw, its poses are moved to fit beside it.
+        When it recognizes a place of an earlier, placed session, its poses are aligned to that.
         """
         if rig.camera is None:
             raise InputError("rig: rgbd needs the camera's intrinsics, got none")
@@ -84,7 +84,7 @@ class RgbdSlam:
         self._reunion.begin()
         self._build(None)
         self._T_local_base = se3.identity()
-        self._held_ids = np.zeros(0, np.int64)  # landmarks that hold the newest pose
+        self._held_ids = np.zeros(0, np.int64)  # landmarks that support the newest pose
         self._observations, self._is_lost = 0, False
 
     def set_pose(self, T_map_local: Transform) -> None:
@@ -92,11 +92,11 @@ class RgbdSlam:
         self._reunion.place(T_map_local)
 
     def set_scene(self, scene: str) -> None:
-        """Hear of the scene; in some of them depth is not to be trusted."""
+        """Set the scene; in `monocular_scenes` depth is not used."""
         self._ignores_depth = scene in self._monocular_scenes
 
     def track(self, observation: Observation) -> Tracking:
-        """Return T_local_base at the observation; LOST where the image does not show the map."""
+        """Return T_local_base at the observation; LOST if the image does not show the map."""
         check_sizes(observation, self._camera)
         if self._ignores_depth:
             observation = replace(observation, depth_m=None)
@@ -129,7 +129,7 @@ class RgbdSlam:
         return self._lose(observation, prediction)
 
     def get_trajectory(self) -> Trajectory:
-        """Return T_local_base of every frame that was held, with all that loops corrected."""
+        """Return T_local_base of every tracked frame, corrected by all loops."""
         return self._memory.trajectory()
 
     def get_map(self) -> MapLayers:
@@ -154,7 +154,7 @@ class RgbdSlam:
         return parts
 
     def _build_anew(self, view: View, alignment: Alignment) -> None:
-        """Make the map anew of its views: the old one has its depths at wrong corners."""
+        """Rebuild the map from its views, as the old one assigned depths to wrong corners."""
         before, newest = self._memory, Seen(view=view, T_local_base=self._T_local_base)
         segment = before.segment(self._held_ids)
         seen = seen_by(self._map.keyframes, self._mapping.beginning, segment, newest)
@@ -166,7 +166,7 @@ class RgbdSlam:
         self._held_ids = self._map.keyframes.landmarks_of(self._map.keyframes.ids[-1:])
 
     def _recall(self) -> None:
-        """Go on from where the map is: adjusted, after a loop, or beside an earlier session's."""
+        """Continue from the map as corrected by adjustment, loops, or an earlier session."""
         self._predictor.correct(self._mapping.step())
         T_new_old = self._memory.step()
         if T_new_old is not None:
@@ -179,7 +179,7 @@ class RgbdSlam:
         return self._place_rule.wants(view, prediction, unmeasured_s=unmeasured_s, is_far=is_far)
 
     def _start(self, view: View, prediction: Prediction) -> Tracking:
-        """Hang a keyframe on the prediction; wait, lost, for features with depth or odometry."""
+        """Begin with a keyframe at the prediction; LOST until there is depth or odometry."""
         is_scaled = not view.is_monocular or view.observation.T_odom_base is not None
         if not (view.shows_enough and is_scaled):
             return self._lose(view.observation, prediction)
@@ -192,19 +192,19 @@ class RgbdSlam:
         return started(view, self._T_local_base, is_first=is_first, revision=revision)
 
     def _hold(self, view: View, fix: Fix, prediction: Prediction) -> Tracking:
-        """Accept a pose, and extend the map where it is due."""
+        """Accept a pose, and extend the map if a keyframe is due."""
         if view.is_monocular and prediction.is_measured:
             scale = self._certainty.scale_variance(view, fix, fix.estimate.T_local_base)
             fix = led(fix, prediction, scale)
         status = self._health.judge(fix.estimate)
-        # Over a few frames odometry errs less than few landmarks do.
+        # Over a few frames odometry is more accurate than a pose by few landmarks.
         is_reckoned = status is TrackingStatus.DEGRADED and prediction.is_measured
         if is_reckoned:
             T_local_base = view.T_predicted
             self._hold_pose(view.observation, T_local_base, prediction.covariance)
         else:
             T_local_base = fix.estimate.T_local_base
-            # Without depth the map's scale is the wheels', and teaches them nothing.
+            # Without depth the scale comes from the wheels and cannot calibrate them.
             is_seen = not view.is_monocular
             self._hold_pose(
                 view.observation, T_local_base, fix.estimate.covariance, is_seen=is_seen
@@ -244,7 +244,7 @@ class RgbdSlam:
         self._predictor.measure(observation, T_local_base, covariance, information)
 
     def _repeat(self, observation: Observation, prediction: Prediction) -> Tracking:
-        """Stay where odometry leads, else where the camera was: its image is the last one again."""
+        """Use odometry's pose, else the last one, as the image repeats the last one."""
         if self._is_lost or not len(self._map.keyframes):
             return self._lose(observation, prediction)
         self._predictor.coast(prediction)

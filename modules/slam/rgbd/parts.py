@@ -1,4 +1,4 @@
-"""Builds what the module works with, from its arguments and the camera."""
+"""Build the module's parts from its arguments and the camera."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .visual_map import VisualMap
 
 
 class Parts:
-    """An empty map, and all that looks, locates, maps, judges and remembers."""
+    """An empty map with the parts for extraction, localization, mapping, rules and history."""
 
     def __init__(
         self,
@@ -34,7 +34,7 @@ class Parts:
         alignment: Alignment | None,
         reunion: Reunion,
     ) -> None:
-        """Build; without an alignment colours count as registered until they turn out not to be."""
+        """Build; `alignment` None: assume registered depth until the search shows otherwise."""
 
         def chosen(**names: str) -> dict[str, Any]:
             return {name: arguments[argument] for name, argument in names.items()}

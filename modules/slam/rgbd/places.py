@@ -1,8 +1,8 @@
-"""Recognises places by their binary descriptors, without a vocabulary that was learned elsewhere.
+"""Recognise places by their binary descriptors, without a pre-trained vocabulary.
 
-Locality-sensitive hashing (Indyk and Motwani 1998): a word is what some bits of a descriptor say.
-Descriptors of one corner differ in few bits, so some of several such choices agree exactly.
-Words are weighed by how rare they are among the places (Sivic and Zisserman 2003).
+Locality-sensitive hashing (Indyk and Motwani 1998): a word is the value of a selection of bits of a
+descriptor. Descriptors of one corner differ in few bits, so that some of several selections agree
+exactly. Words are weighted by their rarity among the places (Sivic and Zisserman 2003).
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 _DESCRIPTOR_BITS = 256
-_TABLES = 8  # choices of bits
-_WORD_BITS = 16  # with 12, words are shared by chance; with 20, four times the time for no more
+_TABLES = 8  # selections of bits
+_WORD_BITS = 16  # with 12, words are shared by chance; with 20, four times the time for no gain
 _WORDS = _TABLES << _WORD_BITS
 _SEED = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Likeness:
-    """A place that looks like what was asked for."""
+    """A similar place."""
 
     place_id: int
-    ratio: float  # of the weight of the words asked for, that the place shares
+    ratio: float  # share of the query's total word weight that the place has in common
 
 
 class PlaceIndex:
@@ -36,27 +36,27 @@ class PlaceIndex:
         self._bits = np.stack(
             [rng.permutation(_DESCRIPTOR_BITS)[:_WORD_BITS] for _ in range(_TABLES)]
         )
-        self._places: dict[int, NDArray[np.int32]] = {}  # words, rising
+        self._places: dict[int, NDArray[np.int32]] = {}  # words, ascending
         self._holders = np.zeros(_WORDS, np.int32)  # how many places have the word
-        self._weights = np.zeros(_WORDS, np.float32)  # zero but during a query
+        self._weights = np.zeros(_WORDS, np.float32)  # zero except during a query
 
     def __len__(self) -> int:
         return len(self._places)
 
     def insert(self, place_id: int, descriptors: NDArray[np.uint8]) -> None:
-        """Remember a place by its descriptors (N, 32)."""
+        """Add a place by its descriptors (N, 32)."""
         words = self._words(descriptors)
         self._places[place_id] = words
         self._holders[words] += 1
 
     def remove(self, place_id: int) -> None:
-        """Forget a place."""
+        """Remove a place."""
         self._holders[self._places.pop(place_id)] -= 1
 
     def alike(
         self, descriptors: NDArray[np.uint8], place_ids: Collection[int] | None = None
     ) -> list[Likeness]:
-        """Return the places (of `place_ids`, or all), the one most alike first."""
+        """Return the places (of `place_ids`, or all), the most similar first."""
         words = self._words(descriptors)
         rarity = np.log((1.0 + len(self._places)) / np.maximum(self._holders[words], 1))
         self._weights[words] = rarity
@@ -70,7 +70,7 @@ class PlaceIndex:
         return sorted(found, key=lambda likeness: (-likeness.ratio, likeness.place_id))
 
     def _words(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:
-        """Return the different words of descriptors (N, 32), rising; each table has its own."""
+        """Return the distinct words of descriptors (N, 32), ascending; each table has its own."""
         bits = np.unpackbits(descriptors, axis=1)
         powers = 1 << np.arange(_WORD_BITS, dtype=np.int32)
         tables = [(bits[:, chosen] @ powers) for chosen in self._bits]

@@ -1,6 +1,6 @@
-"""How far one pose is from all that its image measured, written out for speed.
+"""Residuals of one pose for all measurements of its image, written out for speed.
 
-The same residuals as in `residuals`, whose slopes by a twist of the camera have many zeros.
+The same residuals as in `residuals`, using that their Jacobian has many zeros.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from .residuals import CHI2_DEPTH, CHI2_PIXEL, HUBER, MIN_DEPTH_M, Sightings
 
 
 class PoseErrors:
-    """Residuals of pixels and inverse depths in sigmas, at the pose it was moved to last."""
+    """Residuals of pixels and inverse depths in sigmas, at the pose of the last `move`."""
 
     def __init__(self, camera: Camera, points_local: NDArray[np.float64], seen: Sightings) -> None:
-        """Take in landmarks (N, 3) [m] and where they are seen."""
+        """Set the landmarks (N, 3) [m] and their measurements."""
         self._points = points_local.T.copy()
         per_px = 1.0 / seen.sigma_px
         per_m = seen.measures_depth / seen.inverse_depth_sigma_per_m
@@ -31,7 +31,7 @@ class PoseErrors:
         self._rows = np.zeros((7, *self._gains.shape))
 
     def move(self, T_cam_local: Transform) -> None:
-        """Look from another pose."""
+        """Compute the residuals at another pose (4, 4)."""
         points_cam = T_cam_local[:3, :3] @ self._points + T_cam_local[:3, 3:]
         inverse_z = 1.0 / np.maximum(points_cam[2], MIN_DEPTH_M)
         self._view = points_cam * inverse_z  # (3, N): x / z, y / z, 1 / z
@@ -45,7 +45,7 @@ class PoseErrors:
     ) -> NDArray[np.float64]:
         """Return the roots of Huber's weights (3, N), zero for what is not used (N,).
 
-        The pixel's two share one, by their joint length.
+        Both pixel residuals have the same weight, by their norm.
         """
         sizes = np.sqrt(np.stack([self._pixel2, self._depth2]))
         pixel, depth = np.sqrt(HUBER / np.maximum(sizes, HUBER))
@@ -60,9 +60,9 @@ class PoseErrors:
         return np.asarray(self._depth2 <= CHI2_DEPTH)
 
     def rows(self, scale: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return slopes by a twist of the camera and, last, residuals (7, 3, N), scaled (3, N).
+        """Return the Jacobian by a twist of the camera and, last, the residuals (7, 3, N), scaled.
 
-        They are overwritten by the next call. A turn phi of the camera moves a point p by p x phi.
+        The next call overwrites them. A turn phi of the camera moves a point p by p x phi.
         """
         x, y, inverse_z = self._view
         by_u, by_v, by_w = self._gains * scale

@@ -1,4 +1,4 @@
-"""The pose graph: keyframes, what was measured between them, and the poses that fit it best."""
+"""The pose graph: keyframes, measured motions between them, and the optimised poses."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
-_MODEL_ERROR_RATIO = 0.03  # of a motion: what no noise explains, wrong intrinsics before all
-_HUBER_SIGMAS = 1.345  # 95 % as efficient as least squares where there is no outlier
-_HELD_SIGMA = 1e-6  # [m] and [rad] of the pose that stays
+_MODEL_ERROR_RATIO = 0.03  # of a motion: model errors, mainly by wrong intrinsics
+_HUBER_SIGMAS = 1.345  # 95 % efficiency relative to least squares, without outliers
+_HELD_SIGMA = 1e-6  # [m] and [rad] of the fixed pose
 _ROTATION_FIRST = [3, 4, 5, 0, 1, 2]  # gtsam's order
-_RADIAN_M = 1.0  # what a radian counts as in the length of a way
+_RADIAN_M = 1.0  # metres that a radian counts in the length of a path
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -30,7 +30,7 @@ class Edge:
     is_loop: bool = False
 
     def turned(self) -> Edge:
-        """Return the same measurement from the end to the start."""
+        """Return the measurement inverted, from the end to the start."""
         adjoint = se3.adjoint(self.T_start_end)
         return Edge(
             start=self.end,
@@ -41,7 +41,7 @@ class Edge:
         )
 
     def then(self, after: Edge) -> Edge:
-        """Return the motion along this edge and one that begins where it ends."""
+        """Return the composition of this edge and one that begins at its end."""
         adjoint = se3.adjoint(se3.inverse(after.T_start_end))
         return Edge(
             start=self.start,
@@ -54,12 +54,12 @@ class Edge:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Way:
-    """A way through the graph: what was moved on it, and how exactly that was measured."""
+    """A path through the graph: its motion and the uncertainty of that."""
 
     length_m: float
     turned_rad: float
     reach_m: float  # from its end to the farthest keyframe on it
-    sigma_m: float  # of all steps, without what turns make of it farther on
+    sigma_m: float  # of all steps' translations, without the effect of rotation errors
     sigma_rad: float
 
 
@@ -67,7 +67,7 @@ class PoseGraph:
     """Keyframes by id, and the edges between them."""
 
     def __init__(self) -> None:
-        self._edges: dict[int, dict[int, Edge]] = {}  # at both ends, each turned to begin there
+        self._edges: dict[int, dict[int, Edge]] = {}  # stored at both ends, beginning there
 
     def __contains__(self, keyframe_id: int) -> bool:
         return keyframe_id in self._edges
@@ -83,22 +83,22 @@ class PoseGraph:
         return [e for near in self._edges.values() for e in near.values() if e.start < e.end]
 
     def insert(self, keyframe_id: int) -> None:
-        """Add a keyframe, connected to none."""
+        """Add a keyframe without edges."""
         self._edges[keyframe_id] = {}
 
     def connect(self, edge: Edge) -> None:
-        """Add an edge between two keyframes; it replaces the one that they had."""
+        """Add an edge between two keyframes; it replaces an existing one."""
         self._edges[edge.start][edge.end] = edge
         self._edges[edge.end][edge.start] = edge.turned()
 
     def neighbours(self, keyframe_id: int) -> list[int]:
-        """Return the ids of the keyframes that an edge leads to."""
+        """Return the ids of the keyframes connected by an edge."""
         return list(self._edges[keyframe_id])
 
     def remove(self, keyframe_id: int) -> Edge | None:
-        """Forget a keyframe, whose other neighbours its surest one takes over.
+        """Remove a keyframe; its most certain neighbour takes over the other edges.
 
-        Returns the edge from that neighbour to the keyframe, None where it had none.
+        Returns the edge from that neighbour to the keyframe, None without neighbours.
         """
         near = self._edges.pop(keyframe_id)
         for other in near:
@@ -113,14 +113,14 @@ class PoseGraph:
         return to_gone
 
     def remeasure(self, T_local_base: Mapping[int, Transform]) -> None:
-        """Measure the edges along the way anew from poses that were adjusted since."""
+        """Set all edges but loops from the keyframes' adjusted poses."""
         for edge in self.edges:
             if not edge.is_loop:
                 T_start_end = se3.inverse(T_local_base[edge.start]) @ T_local_base[edge.end]
                 self.connect(_moved(edge, T_start_end))
 
     def connected(self, keyframe_id: int) -> set[int]:
-        """Return the keyframes that some way leads to, this one with them."""
+        """Return the keyframes that are connected to this one, including itself."""
         found, queue = {keyframe_id}, [keyframe_id]
         while queue:
             for other in self._edges[queue.pop()]:
@@ -130,7 +130,7 @@ class PoseGraph:
         return found
 
     def way(self, start: int, end: int) -> Way | None:
-        """Return the shortest way (Dijkstra), None where the two are not connected."""
+        """Return the shortest path (Dijkstra), None if the two are not connected."""
         heap: list[tuple[float, int, int]] = [(0.0, start, start)]
         before: dict[int, int] = {}
         while heap:
@@ -169,9 +169,9 @@ class PoseGraph:
 def solve(
     T_local_base: Mapping[int, Transform], edges: Iterable[Edge], *, held: int
 ) -> dict[int, Transform]:
-    """Return the poses that fit the edges best (Levenberg-Marquardt, Huber's kernel on loops).
+    """Return the poses that best fit the edges (Levenberg-Marquardt, Huber's kernel on loops).
 
-    `held` is the id of the pose that stays as it is.
+    `held` is the id of the fixed pose.
     """
     import gtsam
 
@@ -193,7 +193,7 @@ def solve(
 
 
 def motion_covariance(T_start_end: Transform, measured: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a measured covariance (6, 6) with the share of the motion that no noise explains.
+    """Return a measured covariance (6, 6) plus model errors in proportion to the motion.
 
     Works on stacks (..., 4, 4) too.
     """

@@ -1,4 +1,4 @@
-"""The camera's pose from matched landmarks: Gauss-Newton, and PnP where nothing is known."""
+"""The camera's pose from matched landmarks: Gauss-Newton, and PnP without a prediction."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from sceneslam.types.se3 import Transform
 from .pose_errors import PoseErrors
 from .residuals import Sightings
 
-_RANSAC_PX = 8.0  # rows of a camera that begins to turn are that far from where they should be
+_RANSAC_PX = 8.0  # error of rows while a camera begins to turn (rolling shutter)
 _RANSAC_TRIALS = 200
 _RANSAC_CONFIDENCE = 0.999
 _APPROACH_STEPS, _REFINEMENT_STEPS = 2, 5
-_SMALL_STEP = 0.3  # [sigma], the last: what is left then is a third of it
-_MAX_CONDITION = 1e12  # of the normal matrix; beyond, some motion is not measured at all
+_SMALL_STEP = 0.3  # [sigma], size of the last step; a third of it remains
+_MAX_CONDITION = 1e12  # of the normal matrix; beyond, some motion is not observable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Measurements:
-    """Landmarks and where the image shows them."""
+    """Landmarks with their measurements in the image."""
 
     points_local: NDArray[np.float64]  # (N, 3) [m]
     seen: Sightings  # (N,)
@@ -41,7 +41,7 @@ class Consensus:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Linearised:
-    """The pixels that agree with a pose, and what moves they would follow."""
+    """The inlier pixels of a pose, with the linearised equations."""
 
     residuals: NDArray[np.float64]  # (2 N,) in sigmas, all u before all v
     jacobian: NDArray[np.float64]  # (6, 2 N), by a twist of the camera
@@ -49,7 +49,7 @@ class Linearised:
     normal: NDArray[np.float64]  # (6, 6), of a twist of the camera, depths included
 
     def follow(self, moved: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the twist of the camera (6,) that the pose follows pixels by (2 N,) sigmas."""
+        """Return the camera's twist (6,) if the pixels move by `moved` (2 N,) sigmas."""
         return np.asarray(np.linalg.solve(self.normal, self.jacobian @ moved))
 
 
@@ -61,13 +61,13 @@ class PoseEstimate:
     covariance: NDArray[np.float64]  # (6, 6), se3.log order, base frame
     inliers: NDArray[np.bool_]  # (N,), pixels agree
     depth_inliers: NDArray[np.bool_]  # (N,), depths agree too
-    depth_agreement_ratio: float  # of the inliers that have a depth; 1 where none has
+    depth_agreement_ratio: float  # of the inliers that have a depth; 1 without any
     linearised: Linearised  # of the inliers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Descent:
-    """Where Gauss-Newton has come to, and who agrees with it."""
+    """The result of Gauss-Newton, with its inliers."""
 
     T_local_cam: Transform
     errors: PoseErrors
@@ -84,7 +84,7 @@ class PoseSolver:
         self._T_cam_base = se3.inverse(camera.T_base_cam)
 
     def search(self, measured: Measurements) -> Consensus | None:
-        """Return the pose that most pixels agree with (AP3P, RANSAC), None where none is found."""
+        """Return the pose that most pixels agree with (AP3P, RANSAC), None if not found."""
         if len(measured.points_local) < 4:
             return None
         cv2.setRNGSeed(self._seed)
@@ -108,7 +108,7 @@ class PoseSolver:
         )
 
     def approach(self, measured: Measurements, T_local_base: Transform) -> Consensus | None:
-        """Return a rough pose beside a predicted one, None where the pixels agree on none."""
+        """Return a rough pose near a predicted one (4, 4), None if the pixels disagree."""
         end = self._descend(measured, T_local_base, _APPROACH_STEPS)
         if end is None:
             return None
@@ -118,7 +118,7 @@ class PoseSolver:
         )
 
     def refine(self, measured: Measurements, T_local_base: Transform) -> PoseEstimate | None:
-        """Return the pose that minimises pixel and inverse-depth errors, None if it has none.
+        """Return the pose that minimises pixel and inverse-depth errors, None if that fails.
 
         Its covariance is of a twist of the base, T_local_base @ exp(xi). Residuals as in stereo
         bundle adjustment: a depth camera's disparity error is constant, so its depth error grows
@@ -131,7 +131,7 @@ class PoseSolver:
         slopes = end.errors.rows(np.ones((3, 1)))[:6]
         by_pixel = slopes[:, :2, inliers].reshape(6, -1)
         by_depth = slopes[:, 2, end.depth_inliers]
-        # Where the errors are larger than their sigmas say, so is the covariance.
+        # If the errors are larger than their sigmas, the covariance is scaled up.
         pixel_variance = float(residuals @ residuals) / (len(residuals) - 6)
         carry = se3.adjoint(self._camera.T_base_cam)
         covariance = carry @ np.linalg.inv(end.normal) @ carry.T * max(1.0, pixel_variance)
@@ -152,7 +152,7 @@ class PoseSolver:
     def _descend(
         self, measured: Measurements, T_local_base: Transform, steps: int
     ) -> _Descent | None:
-        """Return where Gauss-Newton ends that asks after every step who is an outlier."""
+        """Return the result of Gauss-Newton, which rejects outliers after every step."""
         T_cam_local = se3.inverse(T_local_base @ self._camera.T_base_cam)
         found = PoseErrors(self._camera, measured.points_local, measured.seen)
         found.move(T_cam_local)
@@ -183,7 +183,7 @@ class PoseSolver:
 
 
 def _solve(normal: NDArray[np.float64], slopes: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return the twist (6,) that the normal equations ask for, None where they leave it open."""
+    """Return the twist (6,) that solves the normal equations, None if they are singular."""
     if not np.isfinite(normal).all():
         return None
     squares, axes = np.linalg.eigh(normal)

@@ -1,8 +1,7 @@
-"""How far wheels and gyro say that the robot went between keyframes that have no depth.
+"""Odometry constraints between keyframes without depth, from wheels and gyro.
 
-Two images tell a direction and no distance, and landmarks that are chosen for how well their
-distance is known are, in the mean, taken for nearer than they are: without this the scale shrinks
-from keyframe to keyframe.
+Two images give a direction but no distance, and selecting landmarks with a certain distance favours
+those estimated too near: without these constraints the scale shrinks from keyframe to keyframe.
 """
 
 from __future__ import annotations
@@ -23,19 +22,19 @@ from .ties import Tie
 
 _SIGMA_M, _SIGMA_PER_M = 0.003, 0.02  # of the wheels' distance; a slip is an outlier
 _SIGMA_RAD, _SIGMA_RAD_PER_M = 0.005, 0.01  # of the gyro's turn, and of the floor's tilt
-_FARTHEST_M = 3.0  # apart: what wheels say of more adds nothing
-_CORRELATED = 4.0  # images that show the same landmarks err alike; 1 and 4 were tried in one hall
+_FARTHEST_M = 3.0  # largest distance between two keyframes: odometry over more adds nothing
+_CORRELATED = 4.0  # images of the same landmarks err alike; 1 and 4 were tried in one hall
 _CHI2 = 16.8  # 99 % of six degrees of freedom
 
 
 class Reckoner:
-    """Adds up what wheels and gyro measure; never corrected."""
+    """Integrates wheels and gyro; never corrected by the map."""
 
     def __init__(self) -> None:
         self._now = Reckoned(T_reckoned_base=se3.identity(), stretch=0)
 
     def add(self, prediction: Prediction) -> Reckoned | None:
-        """Return the pose by odometry alone; None without odometry that can be believed."""
+        """Return the pose by odometry alone; None without trusted odometry."""
         T_now = se3.orthonormal(self._now.T_reckoned_base @ prediction.motion.T_prev_curr)
         is_broken = not prediction.is_measured
         self._now = Reckoned(T_reckoned_base=T_now, stretch=self._now.stretch + is_broken)
@@ -43,10 +42,11 @@ class Reckoner:
 
 
 def led(fix: Fix, prediction: Prediction, scale_variance: Matrix) -> Fix:
-    """Return a pose that was found without depth, corrected by where odometry led.
+    """Return a pose that was found without depth, fused with odometry.
 
-    `scale_variance` (3, 3) [m^2] is what the map's scale makes of the pose, in base. Where the two
-    contradict each other it is the image's: wheels slip.
+    `scale_variance` (3, 3) [m^2], in base, is the pose's variance by the map's scale error. If
+    image
+    and odometry contradict each other, the image's pose is returned, as wheels may slip.
     """
     found = fix.estimate
     measured = _CORRELATED * found.covariance
@@ -68,7 +68,7 @@ def led(fix: Fix, prediction: Prediction, scale_variance: Matrix) -> Fix:
 def reckoned_ties(
     keyframes: Mapping[int, Keyframe], T_base_cam: Transform
 ) -> dict[tuple[int, int], Tie]:
-    """Return what odometry says of keyframes that follow each other, where one has no depth."""
+    """Return odometry's constraints between consecutive keyframes of which one has no depth."""
     ties: dict[tuple[int, int], Tie] = {}
     for one, other in _neighbours(keyframes):
         here, there = keyframes[one].reckoned, keyframes[other].reckoned
@@ -89,7 +89,7 @@ def reckoned_ties(
 
 
 def _neighbours(keyframes: Mapping[int, Keyframe]) -> Iterable[tuple[int, int]]:
-    """Yield the keyframes that follow each other in time, where the later one has no depth."""
+    """Yield pairs of consecutive keyframes of which the later one has no depth."""
     for one, other in pairwise(sorted(keyframes)):
         if keyframes[other].is_monocular:
             yield one, other

@@ -1,4 +1,4 @@
-"""Decides whether an image shows a place of the map, by evidence that look-alikes do not have."""
+"""Decide whether an image shows a place of the map, with checks that similar places fail."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from .localizer import Fix, Localizer
 from .places import PlaceIndex
 from .visual_map import VisualMap
 
-_MIN_FOUND_RATIO = 0.2  # of the landmarks that the image should show
-_MIN_SURFACE_RATIO = 0.7  # of the surfaces that both depth images show
+_MIN_FOUND_RATIO = 0.2  # of the expected landmarks, found at least
+_MIN_SURFACE_RATIO = 0.7  # of the surfaces in both depth images, agreeing at least
 _MIN_SURFACE_POINTS = 100
-_SURFACE_SLACK_M = 0.05  # for what the pose is wrong by
+_SURFACE_SLACK_M = 0.05  # tolerance for the pose error
 _SURFACE_SIGMAS = 4.0  # of one depth, so 2.8 of a difference
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Recognition:
-    """A pose in the map, and the keyframe that showed the way to it."""
+    """A pose in the map, and the keyframe by which it was found."""
 
     keyframe_id: int
     fix: Fix
 
 
 class PlaceRecognizer:
-    """Knows the map's keyframes again in images, wherever the camera is thought to be.
+    """Recognises the map's keyframes in images, independent of the predicted pose.
 
-    One poster on two walls agrees with itself alone: the other landmarks are not found, and the
-    walls around it do not have the same depths.
+    The same poster on two walls is told apart: at the wrong wall the other landmarks are not found,
+    and the depths around it differ.
     """
 
     def __init__(self, visual_map: VisualMap, localizer: Localizer, *, min_inliers: int) -> None:
@@ -46,7 +46,7 @@ class PlaceRecognizer:
     def recognize(
         self, keyframe_id: int, features: Features, depth_m: NDArray[np.float32] | None
     ) -> Recognition | None:
-        """Return the pose that a keyframe's landmarks and depth agree on with an image's."""
+        """Return the pose at which a keyframe's landmarks and depth agree with an image's."""
         if len(features) < self._min_inliers:
             return None
         keyframe = self._map.keyframes[keyframe_id]
@@ -63,9 +63,9 @@ class PlaceRecognizer:
     def _shows(
         self, keyframe: Keyframe, T_local_base: Transform, depth_m: NDArray[np.float32]
     ) -> bool:
-        """Tell whether a depth image from a pose has a keyframe's surfaces where they should be.
+        """Tell whether a depth image (H, W) [m] at a pose agrees with a keyframe's surfaces.
 
-        True for a keyframe that was made without depth: there is nothing to hold it against.
+        True for a keyframe without depth, as nothing can be compared.
         """
         camera = self._map.depth_camera
         if not len(keyframe.view.points_base):

@@ -1,4 +1,4 @@
-"""Finds the camera again after it was lost, wherever in the map it is."""
+"""Relocalize the camera anywhere in the map after tracking was lost."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from .localizer import Fix
 from .recognition import PlaceRecognizer, Recognition
 
 _ALIKE = 3  # keyframes tried per image
-_RECENT = 1  # and the latest, whatever they look like
-_RIVALS = 2  # other places that must not confirm one too
-_SAME_M = 0.3  # two parts of a map that drifted may disagree by this much on one place
+_RECENT = 1  # newest keyframes tried in any case
+_RIVALS = 2  # other places tried, which must not be confirmed as well
+_SAME_M = 0.3  # parts of a map with drift may differ this much at one place
 _SAME_RAD = 0.2
-_AWAY_M = 1.0  # from here on a keyframe is another place
+_AWAY_M = 1.0  # farther keyframes show another place
 _AWAY_RAD = 0.7
 
 
 class Relocalizer:
-    """Tries the keyframes that look most like the image; does not choose between two places."""
+    """Tries the keyframes most similar to the image; rejects ambiguous places."""
 
     def __init__(self, keyframes: KeyframeStore, recognizer: PlaceRecognizer) -> None:
         self._keyframes, self._recognizer = keyframes, recognizer
 
     def find(self, features: Features, depth_m: NDArray[np.float32] | None) -> Fix | None:
-        """Return the pose in the map, None when no keyframe confirms one or two places do."""
+        """Return the pose in the map, None if no place or more than one is confirmed."""
         if not len(features):
             return None
         alike = [found.place_id for found in self._recognizer.places.alike(features.descriptors)]
@@ -44,7 +44,7 @@ class Relocalizer:
         return None
 
     def _rivals(self, seen: Recognition, alike: list[int]) -> list[int]:
-        """Return the most alike of the keyframes that were taken elsewhere."""
+        """Return the most similar keyframes that were taken elsewhere."""
         here = seen.fix.estimate.T_local_base
         poses = {k: self._keyframes[k].T_local_base for k in alike}
         return [k for k, T in poses.items() if not _is_near(here, T, _AWAY_M, _AWAY_RAD)][:_RIVALS]

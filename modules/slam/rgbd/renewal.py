@@ -1,4 +1,4 @@
-"""Makes the map anew of the views it was made of, for cameras that turned out to be two."""
+"""Rebuild the map from its views after depth was found not to be registered."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from .keyframes import KeyframeStore
 from .parts import Parts
 from .view import View
 
-NEWEST = -1  # id of the view that may be no keyframe yet
+NEWEST = -1  # id of the newest view, which may not be a keyframe
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Seen:
-    """A view, and where the old map has it."""
+    """A view with its pose in the old map."""
 
     view: View
     T_local_base: Transform
@@ -31,9 +31,9 @@ def seen_by(
     segment: Collection[int] | None,
     newest: Seen,
 ) -> dict[int, Seen]:
-    """Return what the keyframes of a segment (None: all) show, by id, and the newest view, last.
+    """Return the views of a segment's keyframes (None: all) by id, and the newest view last.
 
-    Those that there are views of, and that were made before the newest one.
+    Only keyframes with a stored view that are older than the newest view.
     """
     now_ns = newest.view.observation.stamp_ns
     seen = {
@@ -45,10 +45,11 @@ def seen_by(
 
 
 def renew(parts: Parts, seen: Mapping[int, Seen]) -> dict[int, Transform]:
-    """Insert a keyframe for each view, in this order; return where they are now, by the same ids.
+    """Insert a keyframe for each view in this order; return their new poses by the same ids.
 
-    The first stays where it is, the others are found beside those before them. Where one is not,
-    it is put where the old map has it beside the last.
+    The first keeps its pose; the others are localized relative to those before them. If that fails,
+    the
+    motion from the last one in the old map is used.
     """
     T_new_old, held_ids, poses = se3.identity(), np.zeros(0, np.int64), dict[int, Transform]()
     for keyframe_id, old in seen.items():

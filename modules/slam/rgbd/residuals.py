@@ -1,4 +1,4 @@
-"""How far measurements are from where landmarks should be seen: pixels and inverse depths."""
+"""Reprojection residuals of landmarks: pixels and inverse depths."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MIN_DEPTH_M = 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sightings:
-    """Where images show landmarks, how far off, and how exactly that is known."""
+    """Measured pixels and depths of landmarks, with standard deviations."""
 
     uv_px: NDArray[np.float64]  # (N, 2), without distortion
     sigma_px: NDArray[np.float64]  # (N,)
@@ -26,7 +26,7 @@ class Sightings:
 
     @property
     def measures_depth(self) -> NDArray[np.bool_]:
-        """Return (N,) where there is a depth."""
+        """Return (N,) True where depth is measured."""
         return np.asarray(self.depth_m > 0)
 
 
@@ -42,7 +42,7 @@ class Errors:
     by_point: NDArray[np.float64]  # (3, 3, N): residual, component of the point in cam
 
     def by_twist(self) -> NDArray[np.float64]:
-        """Return the slopes (6, 3, N) by a twist of the camera."""
+        """Return the Jacobian (6, 3, N) by a twist of the camera."""
         slopes = np.empty((6, *self.of.shape))
         slopes[:3] = -np.swapaxes(self.by_point, 0, 1)
         p, move = self.points_cam, slopes[:3]
@@ -53,7 +53,7 @@ class Errors:
         return slopes
 
     def huber_weights(self) -> NDArray[np.float64]:
-        """Return weights (3, N); u and v share one, by their joint length."""
+        """Return weights (3, N); u and v have the same weight, by their norm."""
         pixel = np.sqrt(self.of[0] ** 2 + self.of[1] ** 2)
         sizes = np.stack([pixel, pixel, np.abs(self.of[2])])
         return np.asarray(HUBER / np.maximum(sizes, HUBER))
@@ -68,7 +68,7 @@ class Errors:
 
 
 def errors(camera: Camera, points_cam: NDArray[np.float64], seen: Sightings) -> Errors:
-    """Return the errors of landmarks (3, N) [m] in the camera, and their slopes."""
+    """Return the residuals of landmarks (3, N) [m] in the camera, with Jacobians."""
     inverse_z = 1.0 / np.maximum(points_cam[2], MIN_DEPTH_M)
     x, y = points_cam[0] * inverse_z, points_cam[1] * inverse_z
     per_px = 1.0 / seen.sigma_px

@@ -1,7 +1,7 @@
-"""Knows the places of earlier sessions again, so that all sessions lie in one map.
+"""Relocalize across sessions, so that all sessions of the module lie in one map.
 
-Every session has a map of its own, and what another module did in between has drifted. Where the
-camera sees what an earlier session saw, it is known where in `map` it is.
+Every session has its own map, and the poses of other modules in between have drifted. When the
+camera sees a place of an earlier session, its pose in `map` is known again.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from .recognition import PlaceRecognizer
 from .view import View
 from .visual_map import VisualMap
 
-_EVERY = 15  # images, of which one is looked up
-_TRIED = 2  # keyframes per past session that an image is held against
-_SAME_M, _SAME_RAD = 0.1, 0.05  # two images that agree on where the session lies
-_DRIFT_M, _DRIFT_RAD = 0.3, 0.2  # that is believed of what happened in between ...
-_DRIFT_M_PER_S, _DRIFT_RAD_PER_S = 0.05, 0.05  # ... and for its time: 5 % of walking pace
+_EVERY = 15  # one of this many images is searched
+_TRIED = 2  # keyframes per past session that an image is compared with
+_SAME_M, _SAME_RAD = 0.1, 0.05  # largest difference of two agreeing results
+_DRIFT_M, _DRIFT_RAD = 0.3, 0.2  # accepted drift between the sessions
+_DRIFT_M_PER_S, _DRIFT_RAD_PER_S = 0.05, 0.05  # accepted drift per second: 5 % of walking pace
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -36,14 +36,14 @@ class _Past:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Query:
-    """A view, and where the present session has it."""
+    """A view with its pose in the current session."""
 
     view: View
     T_local_base: Transform
 
 
 class Reunion:
-    """Looks for past sessions in the present one, a little per image, until it is known."""
+    """Searches past sessions, some work per image, until the current session is aligned."""
 
     def __init__(self, *, keyframe_limit: int) -> None:
         self._limit = keyframe_limit
@@ -54,17 +54,17 @@ class Reunion:
         self._is_known, self._images, self._end_ns = False, 0, 0
 
     def begin(self) -> None:
-        """Start a session, which is not placed yet."""
+        """Begin a session, which is not placed yet."""
         self._T_map_local, self._end_ns = None, 0
         self._forget()
 
     def place(self, T_map_local: Transform) -> None:
-        """Hear where the session lies; what was found out before is not relied on any more."""
+        """Set the session's T_map_local (4, 4); earlier search results are dropped."""
         self._T_map_local = T_map_local.copy()
         self._forget()
 
     def see(self, view: View, T_local_base: Transform) -> None:
-        """Take a view whose pose is held."""
+        """Take a view with a tracked pose."""
         self._end_ns = view.observation.stamp_ns
         self._images += 1
         if self._past and not self._is_known and not self._queries and self._images % _EVERY == 0:
@@ -72,7 +72,7 @@ class Reunion:
             self._queries = [(past, query) for past in self._past]
 
     def step(self) -> Transform | None:
-        """Do one image's share; return T_new_old where two views agree on where all poses lie."""
+        """Do one image's share; return T_new_old (4, 4) once two views agree on it, else None."""
         if not self._queries or self._T_map_local is None:
             return None
         past, query = self._queries.pop()
@@ -86,7 +86,7 @@ class Reunion:
         return T_new_old
 
     def end(self, visual_map: VisualMap, recognizer: PlaceRecognizer) -> None:
-        """Keep the map of the session, where it was placed; forget the oldest beyond the limit."""
+        """Keep the session's map if it was placed; remove the oldest maps beyond the limit."""
         if self._T_map_local is None or not len(visual_map.keyframes):
             return
         self._past.append(
@@ -109,7 +109,7 @@ class Reunion:
         self._is_known, self._images = False, 0
 
     def _recognise(self, past: _Past, query: _Query, T_map_local: Transform) -> Transform | None:
-        """Return what moves the session's poses to where a past session has the view."""
+        """Return T_new_old (4, 4) that aligns the session with a past one, by this view."""
         view = query.view
         alike = past.recognizer.places.alike(view.features.descriptors)
         for place in alike[:_TRIED]:

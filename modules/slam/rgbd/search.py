@@ -1,4 +1,4 @@
-"""The order in which the camera is looked for: where it should be, near there, anywhere."""
+"""Search the camera's pose: at the prediction, then near it, then anywhere."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from .localizer import Fix, Localizer
 from .relocalizer import Relocalizer
 from .view import View
 
-_CLEAR_RATIO = 0.2  # of the landmarks that should show: chance holds up to 0.12 where it was seen
+_CLEAR_RATIO = 0.2  # of the expected landmarks; up to 0.12 were observed by chance
 
 
 class Search:
-    """Finds the camera in the map, by the cheapest way that succeeds clearly."""
+    """Finds the camera in the map by the cheapest method that succeeds clearly."""
 
     def __init__(self, localizer: Localizer, relocalizer: Relocalizer) -> None:
         self._localizer, self._relocalizer = localizer, relocalizer
 
     def find(self, view: View, held_ids: NDArray[np.int64], *, is_lost: bool) -> Fix | None:
-        """Return the pose of a view; what was held last is worth less if lost.
+        """Return the pose of a view; `held_ids` are the landmarks tracked last.
 
-        Where the prediction was far off, landmarks that look alike around it may agree by chance:
-        the right pose has more of them.
+        If the prediction is far off, similar landmarks around it may agree by chance: then the
+        correct pose has more inliers.
         """
         fix = self._localizer.near(view.features, view.T_predicted, held_ids)
         if fix is not None and fix.found_ratio(view.features) >= _CLEAR_RATIO:
@@ -33,7 +33,7 @@ class Search:
 
 
 def _better(one: Fix | None, other: Fix | None) -> Fix | None:
-    """Return the pose that more landmarks hold."""
+    """Return the pose with more inliers."""
     if one is None or other is None:
         return one or other
     return other if len(other.landmark_ids) > len(one.landmark_ids) else one

@@ -1,4 +1,4 @@
-"""Where landmarks move when reading an image takes longer than was taken (see `shutter`)."""
+"""The shift of landmarks by a longer readout time (see `shutter`)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def shifts_px_per_s(
     T_local_base: Transform,
     landmark_ids: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Return how landmarks (N, 2) move in a camera that stays, per second that reading takes."""
+    """Return the landmarks' pixel shifts (N, 2) for a fixed camera, per second of readout."""
     T_local_cam = T_local_base @ camera.T_base_cam
     points_local = landmarks.points_local.take(landmark_ids, axis=0)
     points_cam = se3.apply(se3.inverse(T_local_cam), points_local)
@@ -33,7 +33,7 @@ def shifts_px_per_s(
 
 
 def learn_shifts(landmarks: LandmarkTable, camera: Camera, keyframe: Keyframe) -> None:
-    """Tell landmarks where a keyframe will have them when reading takes longer than taken."""
+    """Update the landmarks' shifts per second of readout by a keyframe."""
     rows, turning = np.flatnonzero(keyframe.landmark_ids != NO_LANDMARK), keyframe.turning
     ids = keyframe.landmark_ids[rows]
     T_local_cam = keyframe.T_local_base @ camera.T_base_cam

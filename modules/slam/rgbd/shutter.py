@@ -1,7 +1,7 @@
-"""Rolling shutters: rows are read one after the other, while the camera turns.
+"""Rolling shutter: rows are read one after the other while the camera turns.
 
-How long reading takes is learnt from the residuals that a turning camera leaves (after Ringaby
-and Forssen 2011, who measured 26 ms for a Kinect).
+The readout time is estimated from the residuals of a turning camera (after Ringaby and Forssen
+2011, who measured 26 ms for a Kinect).
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ from sceneslam.types.rig import Camera
 from .features import Features
 from .pose_solver import Linearised
 
-_FIRST_SIGMA_S = 0.02  # of the readout, before anything was seen
-_CORRELATED = 30.0  # residuals of one image that say the same
-_LAST_SIGMA_S = 0.001  # what was learnt before as much as says this is forgotten: poses were worse
+_FIRST_SIGMA_S = 0.02  # of the readout, before the first image
+_CORRELATED = 30.0  # residuals of one image with common errors
+_LAST_SIGMA_S = 0.001  # forgetting keeps the deviation above this, as earlier poses were worse
 _MAX_READOUT_S = 0.04
 _SIGNIFICANT = 3.0  # sigmas
-_STEP_S = 0.002  # a smaller change is not worth moving the map
+_STEP_S = 0.002  # smaller changes are not applied to the map
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Turning:
-    """How a camera turned while an image was read, and what that does to its pose."""
+    """A camera's turn rate during readout, and its effect on the pose."""
 
     rate_cam: NDArray[np.float64]  # (3,) [rad/s]
-    twist_per_s: NDArray[np.float64]  # (6,) of the base, per second that reading takes longer
+    twist_per_s: NDArray[np.float64]  # (6,) of the base, per second of longer readout
 
 
 class RollingShutter:
-    """Puts features where a camera that reads all rows at once would have seen them."""
+    """Moves features to their pixels in a global-shutter camera."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
         self._information, self._pull = _FIRST_SIGMA_S**-2, 0.0  # of the readout [1/s^2, 1/s]
-        self.readout_s = 0.0  # from the first row to the last, as taken so far
+        self.readout_s = 0.0  # from the first row to the last, as applied so far
 
     def straighten(self, features: Features, rate_cam: NDArray[np.float64]) -> Features:
-        """Return features as of the middle row, for a camera that turns by (3,) [rad/s]."""
+        """Return features at the time of the middle row, for a turn rate (3,) [rad/s]."""
         return straightened(self._camera, features, rate_cam, self.readout_s)
 
     def turn(
@@ -53,8 +53,7 @@ class RollingShutter:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the change of turn rate (3,) and the pose's twist (6,) that fit an image best.
 
-        `change` [rad/s]: by how much faster than the image was straightened for the camera turned,
-        by what else is known.
+        `change` (3,) [rad/s]: the prior turn rate minus the one for which the image was corrected.
         """
         if not self.readout_s:
             return change, np.zeros(6)
@@ -62,18 +61,18 @@ class RollingShutter:
         slopes = self.readout_s * np.stack([(m / seen.sigma_px[:, None]).T.ravel() for m in moves])
         weight = _CORRELATED / sigma_rad_per_s**2
         across = slopes @ seen.jacobian.T
-        # What the pose follows is taken out (Schur); there its residuals pull at nothing.
+        # The pose is eliminated (Schur complement).
         normal = slopes @ slopes.T - across @ np.linalg.solve(seen.normal, across.T)
         pull = slopes @ seen.residuals + weight * change
         found = np.linalg.solve(normal + weight * np.eye(3), pull)
         return np.asarray(found), seen.follow(found @ slopes)
 
     def learn(self, seen: Linearised, slope_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Take in an image's residuals and return how its pose goes with the readout.
+        """Update by an image's residuals; return its pose's derivative by the readout time.
 
-        `slope_px` (N, 2): how much farther than their landmarks the pixels would be straightened,
-        per second of readout. Returns a twist of the camera per second (6,): what a motion
-        explains as well tells nothing about the shutter.
+        `slope_px` (N, 2): the pixels' shift relative to their landmarks, per second of readout.
+        Returns a twist of the camera per second (6,). Shifts that a camera motion explains as well
+        do not count for the readout.
         """
         slope = (slope_px / seen.sigma_px[:, None]).T.ravel()
         twist = seen.follow(slope)
@@ -88,7 +87,7 @@ class RollingShutter:
         return twist
 
     def step_s(self) -> float:
-        """Return by how much longer reading takes than was taken so far, which is taken now."""
+        """Apply the new readout time, if it changed enough; return the change [s]."""
         readout_s = self._pull / self._information
         is_known = abs(readout_s) > _SIGNIFICANT * self._information**-0.5
         readout_s = float(np.clip(readout_s, -_MAX_READOUT_S, _MAX_READOUT_S))
@@ -102,7 +101,7 @@ class RollingShutter:
 def straightened(
     camera: Camera, features: Features, rate_cam: NDArray[np.float64], readout_s: float
 ) -> Features:
-    """Return features as of the middle row, of a camera that turned by (3,) [rad/s]."""
+    """Return features at the time of the middle row, for a turn rate (3,) [rad/s]."""
     if not readout_s or not len(features):
         return features
     moves_px = readout_s * moves_px_per_s(camera, features.uv_px, rate_cam)
@@ -112,7 +111,7 @@ def straightened(
 def moves_px_per_s(
     camera: Camera, uv_px: NDArray[np.float64], rate_cam: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return how pixels (N, 2) move to the middle row's time, per second of readout."""
+    """Return the shift (N, 2) of pixels to the middle row's time, per second of readout."""
     x = (uv_px[:, 0] - camera.cx) / camera.fx
     y = (uv_px[:, 1] - camera.cy) / camera.fy
     late = uv_px[:, 1] / camera.size_wh[1] - 0.5

@@ -1,4 +1,4 @@
-"""A process that works beside the tracking: many small NumPy calls would hold its thread up."""
+"""A worker process: many small NumPy calls in a thread would delay the tracking."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
 
 
 class SideProcess(Generic[Task, Result]):
-    """Does tasks one after the other, by what is built in the process; it keeps its state there.
+    """Does tasks one after the other with an object that is built, and kept, in the process.
 
-    Not by multiprocessing, which runs the caller's main module anew. The process ends with this
-    object, and with its parent, however that ends: its input is closed then.
+    It does not use multiprocessing, which runs the caller's main module again. The process ends
+    with
+    this object and with its parent, in whatever way that ends, because its input is closed then.
     """
 
     def __init__(self, build: Callable[..., Callable[[Task], Result]], *arguments: object) -> None:
-        """Start the process; do not wait until it is there."""
+        """Start the process without waiting until it runs."""
         main = f"import sys; sys.path[:] = sys.argv[1:]; from {__name__} import main; main()"
         popen = subprocess.Popen(
             [sys.executable, "-P", "-c", main, *sys.path],
@@ -41,16 +42,16 @@ class SideProcess(Generic[Task, Result]):
         self._end = finalize(self, _end, popen, line)
 
     def submit(self, task: Task) -> Future[Result]:
-        """Return at once; the future raises ModuleError where the process is no more."""
+        """Submit a task and return at once; the future raises ModuleError if the process ended."""
         return self._line.submit(_ask, self._popen, task)
 
     def end(self) -> None:
-        """End the process, whatever it is at; may be called twice."""
+        """End the process, even during a task; may be called twice."""
         self._end()
 
 
 def main() -> None:
-    """Do what standard input asks for until it is closed; answers go to standard output."""
+    """Process tasks from standard input until it is closed; answers go to standard output."""
     output = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever a library prints
     build, arguments = pickle.load(sys.stdin.buffer)
@@ -58,7 +59,7 @@ def main() -> None:
     while True:
         try:
             _send(output, work(pickle.load(sys.stdin.buffer)))
-        except (EOFError, BrokenPipeError):  # the parent is no more
+        except (EOFError, BrokenPipeError):  # the parent ended
             return
 
 
@@ -78,7 +79,7 @@ def _send(stream: IO[bytes] | None, value: Any) -> None:
 
 
 def _end(popen: subprocess.Popen[bytes], line: ThreadPoolExecutor) -> None:
-    """Kill the process, and leave no zombie, thread or open pipe."""
+    """Kill the process; no zombie, thread or open pipe remains."""
     popen.kill()
     line.shutdown(wait=True, cancel_futures=True)
     popen.wait()

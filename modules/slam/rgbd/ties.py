@@ -1,7 +1,7 @@
-"""Ties between keyframes: relative poses that two whole depth images agree on.
+"""Relative-pose constraints between keyframes by registration of their depth images.
 
-Corners hold a pose well where they are near and their depth is right; surfaces hold it by all
-pixels, whatever the colours' calibration. Both together err less than either.
+Corners constrain a pose well if they are near and their depth is right; surfaces constrain it by
+all pixels, independent of the colours' calibration. Both together err less than either.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from ..surfaces.keyframe import Keyframe as DepthKeyframe
 from ..surfaces.registration import Prior, Samples, register, samples_of
 from ..surfaces.surface import SurfaceReader
 
-_MIN_MATCHED_RATIO = 0.5  # of what both images show, on the same surface
-_WEAK_RATIO = 0.005  # localizability below which surfaces do not hold a direction
-_PRIOR_INFORMATION = 1.0  # [1/m^2] and [1/rad^2]: next to nothing
+_MIN_MATCHED_RATIO = 0.5  # of the common area, on the same surface
+_WEAK_RATIO = 0.005  # localizability below which surfaces do not constrain a direction
+_PRIOR_INFORMATION = 1.0  # [1/m^2] and [1/rad^2]: negligible
 _KEPT = 60  # views, of 0.6 MB each
-_TRUST = 3.0  # of a registration's information, beside that of corners
+_TRUST = 3.0  # weight of a registration's information relative to that of corners
 _HUBER = 3.5  # [sigma], 95 % of six degrees of freedom
 
 
@@ -38,7 +38,7 @@ class Tie:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Ties:
-    """The ties between keyframes of a bundle, by their rows."""
+    """The relative-pose constraints of a bundle, by rows of its keyframes."""
 
     one: NDArray[np.int64]  # (M,)
     other: NDArray[np.int64]  # (M,)
@@ -47,7 +47,7 @@ class Ties:
 
     @staticmethod
     def of(ties: Mapping[tuple[int, int], Tie]) -> Ties:
-        """Return ties by the rows of the two keyframes."""
+        """Return the constraints, given by the rows of the two keyframes."""
         rows = np.array(list(ties), np.int64).reshape(-1, 2)
         T_one_other = np.array([tie.T_one_other for tie in ties.values()]).reshape(-1, 4, 4)
         roots = np.array([tie.root for tie in ties.values()]).reshape(-1, 6, 6)
@@ -55,7 +55,7 @@ class Ties:
         return Ties(one=one, other=other, T_other_one=se3.inverse(T_one_other), roots=roots)
 
     def pull(self, T_local_cam: NDArray[np.float64]) -> Pulls:
-        """Return how the ties pull at the keyframes at these poses (K, 4, 4)."""
+        """Return the constraints' residuals at these poses (K, 4, 4)."""
         T_one_other = se3.inverse(T_local_cam[self.one]) @ T_local_cam[self.other]
         off = se3.log(self.T_other_one @ T_one_other)
         return Pulls(
@@ -67,7 +67,7 @@ class Ties:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Pulls:
-    """What ties say of the poses that keyframes have."""
+    """Residuals and weights of the constraints at the keyframes' poses."""
 
     ties: Ties
     T_one_other: NDArray[np.float64]  # (M, 4, 4)
@@ -107,7 +107,7 @@ class Pulls:
 
 
 class DepthTies:
-    """Registers keyframes' depth images with each other; works in one thread."""
+    """Registers keyframes' depth images with each other; for use in one thread."""
 
     def __init__(self, depth_camera: Camera, T_depth_cam: Transform) -> None:
         self._reader, self._T_depth_cam = SurfaceReader(depth_camera), T_depth_cam
@@ -115,7 +115,7 @@ class DepthTies:
         self._samples: dict[int, Samples] = {}
 
     def look(self, keyframe_id: int, depth_m: NDArray[np.float32]) -> None:
-        """Take a keyframe's depth image."""
+        """Add a keyframe's depth image (H, W) [m]."""
         surface = self._reader.read(depth_m)
         self._views[keyframe_id] = DepthKeyframe(surface, se3.identity(), stamp_ns=0)
         self._samples[keyframe_id] = samples_of(surface, self._reader.grid)
@@ -123,9 +123,9 @@ class DepthTies:
             del self._views[oldest], self._samples[oldest]
 
     def tie(self, one: int, other: int, T_one_other: Transform) -> Tie | None:
-        """Return where two keyframes are by their surfaces, None where these do not agree.
+        """Return the constraint between two keyframes by their surfaces, None if these disagree.
 
-        `T_one_other` is about where they are.
+        `T_one_other` (4, 4) is the initial relative pose.
         """
         if one not in self._views or other not in self._views:
             return None

@@ -1,4 +1,4 @@
-"""Landmarks from two images, where no depth image shows how far they are."""
+"""Triangulate landmarks from two images, without depth."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from .residuals import Sightings, errors
 from .visual_map import VisualMap
 
 _NEIGHBOURS = 4  # keyframes that a new one is compared with
-_MIN_PARALLAX_RATIO = 0.02  # way between two keyframes over the distance of what they see
+_MIN_PARALLAX_RATIO = 0.02  # baseline over distance of the landmarks
 _LINE_SIGMAS = 2.0  # from the epipolar line
 _LEVEL_TOLERANCE = 1
 _RATIO = 0.8
 _STEPS = 3
 _NEAREST_M = 0.1
-_NEAREST_SHARE = 0.05  # of what a keyframe shows is known to be nearer than the rest ...
-_NEARER_RATIO = 0.5  # ... and what seems half as far as that is a wrong match
-_CORRELATED = 10.0  # errors of one pair of images that say the same
-_WHEELS_RATIO = 0.03  # of the way between two keyframes: 3 mm and 2 % of 0.3 m and more
-_MAX_DOUBT_RATIO = 0.3  # of its distance: a landmark less well known waits for another keyframe
+_NEAREST_SHARE = 0.05  # quantile of the landmarks' depths in a keyframe;
+_NEARER_RATIO = 0.5  # a point nearer than this share of it is a wrong match
+_CORRELATED = 10.0  # errors within one pair of images are correlated
+_WHEELS_RATIO = 0.03  # of the baseline: 3 mm and 2 % of 0.3 m or more
+_MAX_DOUBT_RATIO = 0.3  # of its distance: a less certain landmark waits for another keyframe
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Eye:
-    """Features of one keyframe that show no landmark."""
+    """Features of one keyframe without a landmark."""
 
     keyframe: Keyframe
     rows: NDArray[np.int64]  # (N,)
     T_cam_local: Transform
     rays: NDArray[np.float64]  # (N, 3), in cam, z = 1
     sigma_px: NDArray[np.float64]  # (N,)
-    nearest_m: float  # [m] ahead: nothing that it shows is nearer
+    nearest_m: float  # least depth of the points in its view
 
     @property
     def features(self) -> Features:
@@ -55,10 +55,10 @@ class _Found:
 
 
 def triangulate(visual_map: VisualMap, keyframe_id: int) -> None:
-    """Add landmarks that a keyframe and one that shares its view both show, but none is known.
+    """Add landmarks for unmatched features of a keyframe and of covisible keyframes.
 
-    Matches lie on the epipolar line; the point that fits both pixels best is kept where it is in
-    front of both cameras, agrees with them, and its distance is known (Mur-Artal et al. 2015).
+    Matches lie on the epipolar line; the point that best fits both pixels is kept if it is in front
+    of both cameras, agrees with both, and its distance is certain (Mur-Artal et al. 2015).
     """
     store = visual_map.keyframes
     new = store[keyframe_id]
@@ -106,10 +106,10 @@ def _triangulate_with(visual_map: VisualMap, new_id: int, other_id: int) -> None
 
 
 def _scale_sigma(visual_map: VisualMap, keyframe: Keyframe, found: _Found) -> float:
-    """Return by what share of their distance landmarks of a keyframe are wrong together.
+    """Return the common scale error of a keyframe's new landmarks, as a share of their distance.
 
-    As wrong as the landmarks that placed it, and by what new ones add: many pixels of two images
-    say the same. Wheels measure it anew with every keyframe.
+    It is that of the landmarks that placed the keyframe, plus that of the triangulation, as errors
+    within a pair of images are correlated. Wheels measure it anew with every keyframe.
     """
     known = keyframe.landmark_ids[keyframe.landmark_ids != NO_LANDMARK]
     before = float(np.mean(visual_map.landmarks.scale_sigma[known] ** 2)) if len(known) else 0.0
@@ -137,10 +137,10 @@ def _eye(visual_map: VisualMap, keyframe: Keyframe) -> _Eye:
 
 
 def _nearest_m(visual_map: VisualMap, keyframe: Keyframe, T_cam_local: Transform) -> float:
-    """Return how near the camera a keyframe may show anything, by the landmarks that it shows.
+    """Return the least plausible depth [m] of a point in a keyframe, by its landmarks.
 
-    A wrong match that seems to be right before the camera is no small error: as a landmark it
-    outweighs hundreds that are some metres away, and no pose that follows it contradicts it.
+    A wrong match that seems to lie right in front of the camera is a large error: as a landmark it
+    outweighs hundreds that are some metres away, and a pose that follows it does not contradict it.
     """
     known = keyframe.landmark_ids[keyframe.landmark_ids != NO_LANDMARK]
     if len(known) * _NEAREST_SHARE < 1.0:
@@ -150,7 +150,7 @@ def _nearest_m(visual_map: VisualMap, keyframe: Keyframe, T_cam_local: Transform
 
 
 def _match(visual_map: VisualMap, new: _Eye, other: _Eye) -> Matches:
-    """Return pairs (row of new, row of other) that look alike and lie on epipolar lines."""
+    """Return pairs (row of new, row of other) with similar descriptors on epipolar lines."""
     T_other_new = other.T_cam_local @ se3.inverse(new.T_cam_local)
     essential = se3.hat(T_other_new[:3, 3]) @ T_other_new[:3, :3]
     lines = new.rays @ essential.T  # (N, 3), in the other's image at z = 1
@@ -167,7 +167,7 @@ def _match(visual_map: VisualMap, new: _Eye, other: _Eye) -> Matches:
 
 
 def _intersect(visual_map: VisualMap, new: _Eye, other: _Eye, matches: Matches) -> _Found:
-    """Return the points that fit two pixels each best (midpoint, then Gauss-Newton)."""
+    """Return the points that each best fit two pixels (midpoint, then Gauss-Newton)."""
     pairs = ((new, matches.landmark_rows), (other, matches.feature_rows))
     points = _midpoints(new, other, matches)
     for _ in range(_STEPS):

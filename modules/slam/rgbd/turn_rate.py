@@ -1,4 +1,4 @@
-"""How fast the base turns while an image is read out, row by row."""
+"""The base's turn rate while an image is read out, row by row."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
-_GYRO_RAD_PER_S = 0.02  # deviation of a gyro's turn rate
-_TURN_RAD_PER_S2 = 6.0  # of a hand: a rate is that of half a step ago
-_TURN_RAD_PER_S = 1.0  # of a camera of which nothing is known
-_STEP_MAX_S = 0.5  # over a longer one, a mean rate says nothing
+_GYRO_RAD_PER_S = 0.02  # standard deviation of a gyro's turn rate
+_TURN_RAD_PER_S2 = 6.0  # hand-held acceleration: a mean rate is half a step old
+_TURN_RAD_PER_S = 1.0  # standard deviation without any measurement
+_STEP_MAX_S = 0.5  # over a longer step a mean rate is useless
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TurnRate:
-    """How fast the base turns, and how certain that is."""
+    """The base's turn rate with its standard deviation."""
 
     rate_base: NDArray[np.float64]  # (3,) [rad/s]
     sigma_rad_per_s: float
 
     @property
     def is_unknown(self) -> bool:
-        """Tell whether nothing but an image can say it."""
+        """Tell whether only the image can give the rate."""
         return self.sigma_rad_per_s >= _TURN_RAD_PER_S
 
 
 def expected_rate(observation: Observation, predictor: Predictor) -> NDArray[np.float64]:
-    """Return how fast the base should turn (3,) [rad/s], by the gyro if there is one."""
+    """Return the predicted turn rate (3,) [rad/s], by the gyro if available."""
     rate = _gyro_rate(observation, predictor)
     return predictor.model.velocity[3:] if rate is None else rate
 
@@ -40,9 +40,9 @@ def expected_rate(observation: Observation, predictor: Predictor) -> NDArray[np.
 def measured_rate(
     observation: Observation, predictor: Predictor, T_local_base: Transform
 ) -> TurnRate:
-    """Return how fast the base turned at an observation whose pose is found.
+    """Return the base's turn rate at an observation whose pose was found.
 
-    The gyro's rate, else that of the motion from the last pose; after the camera was lost, none.
+    By the gyro, else by the motion from the last pose; unknown after tracking was lost.
     """
     rate = _gyro_rate(observation, predictor)
     if rate is not None:

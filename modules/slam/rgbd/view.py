@@ -1,4 +1,4 @@
-"""What the module works on for the time of one observation."""
+"""The data of one observation that the module's parts share."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from .features import Features
 from .keyframes import Reckoned
 from .shutter import Turning
 
-_FEWEST = 50  # features, with a depth where one is asked for, that a keyframe can be made of
+_FEWEST = 50  # features (with depth, if required) that a keyframe needs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """An observation with what was found in its image."""
+    """An observation with the features of its image."""
 
     observation: Observation
     image_bgr: NDArray[np.uint8]  # (H, W, 3)
     gray: NDArray[np.uint8]  # (H, W)
     features: Features
-    T_predicted: Transform  # T_local_base, before the image was asked
+    T_predicted: Transform  # T_local_base, before the image is used
     turning: Turning
     reckoned: Reckoned | None = None
 
     @property
     def shows_enough(self) -> bool:
-        """Tell whether there is enough in the image to begin a map with."""
+        """Tell whether the image has enough features to begin a map."""
         return len(self.features) >= _FEWEST
 
     @property
     def is_monocular(self) -> bool:
-        """Tell whether the image has to do without depth."""
+        """Tell whether depth is missing or not used."""
         return self.features.deep_count < _FEWEST
 
     @property
     def depth_m(self) -> NDArray[np.float32] | None:
-        """Return the depth image (H, W) [m], None where it is worth nothing."""
+        """Return the depth image (H, W) [m], None if it is not usable."""
         return None if self.is_monocular else self.observation.depth_m

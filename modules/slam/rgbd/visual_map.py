@@ -1,4 +1,4 @@
-"""The map that the camera is tracked against: landmarks held together by keyframes."""
+"""The map that the camera is tracked against: landmarks and keyframes."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from .shifts import learn_shifts
 
 _SCALES = SCALE ** np.arange(LEVELS)
 _COVISIBLE = 12
-_MIN_COS_VIEW = 0.5  # a landmark looks like itself within 60 degrees of where it was seen from
+_MIN_COS_VIEW = 0.5  # a landmark is recognizable within 60 degrees of its viewing direction
 _MIN_FOUND_RATIO = 0.25
-_PROBATION = 8  # images that should show a landmark before it is judged
+_PROBATION = 8  # images that should contain a landmark before it may be removed
 _NEAREST_M = 0.1
 _FEWEST_KEYFRAMES = 3
-_SHIFT_PX = 2.0  # of the depth image against the colours, by calibration and time
+_SHIFT_PX = 2.0  # of the depth image relative to the colours, by calibration and time
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Prediction:
-    """Landmarks that the camera should see."""
+    """Landmarks that the image should contain, with their predicted pixels."""
 
     ids: NDArray[np.int64]  # (N,)
     uv_px: NDArray[np.float64]  # (N, 2)
@@ -39,7 +39,7 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Doubts:
-    """Standard deviations that landmarks add to those of their measurements."""
+    """Standard deviations by the landmarks' positions, in addition to the measurements'."""
 
     across_px: NDArray[np.float64]  # (N,)
     inverse_depth_per_m: NDArray[np.float64]  # (N,)
@@ -65,13 +65,13 @@ class VisualMap:
         self.corrections = 0  # how often keyframes were moved
 
     def sigma_px(self, levels: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return how exactly features of these pyramid levels are located [px]."""
+        """Return the standard deviations (N,) [px] of features of these pyramid levels (N,)."""
         return np.asarray(self._sigma_px * _SCALES.take(levels))
 
     def inverse_depth_sigmas_per_m(self, features: Features) -> NDArray[np.float64]:
-        """Return how exactly the features' depths are known [1/m].
+        """Return the standard deviations (N,) [1/m] of the features' inverse depths.
 
-        What the sensor adds, and what a shift of the depth against the image does on a slope.
+        They include the sensor's noise and, on a slope, a shift of the depth image.
         """
         z = np.where(features.depth_m > 0, features.depth_m, 1.0)
         by_shift = _SHIFT_PX * features.depth_slope_m_per_px / z**2
@@ -85,8 +85,8 @@ class VisualMap:
         z = np.maximum(z, _NEAREST_M)
         x, y = x / z, y / z
         right, down, ahead = T_cam_local[:3, :3]
-        # A landmark moves across its ray by what it moves sideways less the ray's slope times what
-        # it moves ahead, in two ways; each product is one entry of its covariance in cam.
+        # The motion across the ray is the sideways motion minus the ray's slope times the motion
+        # ahead, in both axes; each product is one entry of the covariance in cam.
         pairs = ((right, right), (down, down), (right, ahead), (down, ahead), (ahead, ahead))
         entries = np.stack([np.outer(one, other).ravel() for one, other in pairs])
         covariance = self.landmarks.covariance.take(landmark_ids, axis=0).reshape(-1, 9)
@@ -98,11 +98,11 @@ class VisualMap:
         )
 
     def around(self, landmark_ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the local map: the landmarks of the keyframes that saw these ones."""
+        """Return the local map: all landmarks of the keyframes that saw these landmarks."""
         return self.keyframes.landmarks_of(self.keyframes.covisible(landmark_ids, limit=_COVISIBLE))
 
     def predict(self, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> Prediction:
-        """Return which of these landmarks the image should show from a pose, and where."""
+        """Return which of these landmarks the image should contain at a pose, and their pixels."""
         camera, table = self.camera, self.landmarks
         T_local_cam = T_local_base @ camera.T_base_cam
         # Component by component: NumPy is slow along axes of two or three.
@@ -133,12 +133,12 @@ class VisualMap:
     def count_sightings(
         self, expected_ids: NDArray[np.int64], found_ids: NDArray[np.int64]
     ) -> None:
-        """Remember which landmarks an image should have shown, and which it did."""
+        """Count the images that should contain landmarks, and those that did."""
         self.landmarks.expected[expected_ids] += 1
         self.landmarks.found[found_ids] += 1
 
     def insert(self, keyframe: Keyframe, *, deep_rows: NDArray[np.int64]) -> int:
-        """Add a keyframe: sharpen the landmarks it saw, make new ones of its other features.
+        """Add a keyframe: fuse the landmarks it saw, make new ones of its other features.
 
         Returns its id. `deep_rows` are the features whose depth agrees with their landmark.
         """
@@ -162,8 +162,8 @@ class VisualMap:
     def correct(self, T_local_base: Mapping[int, Transform]) -> None:
         """Give keyframes, by id, new poses; each landmark moves along with its first keyframe.
 
-        Poses are often products of those that they replace: what rounding leaves in the rotations
-        would double with every correction.
+        Rotations are orthonormalized: poses are often products of those that they replace, so that
+        rounding errors would double with every correction.
         """
         T_local_base = {k: se3.orthonormal(T_new) for k, T_new in T_local_base.items()}
         T_new_old = {
@@ -178,7 +178,7 @@ class VisualMap:
         self.corrections += 1
 
     def straighten(self, readout_s: float) -> None:
-        """Take it that reading every image took so much longer."""
+        """Correct all keyframes and landmarks for a readout that is longer by `readout_s`."""
         for keyframe in self.keyframes.all():
             keyframe.straighten(self.camera, readout_s)
         self.landmarks.points_local += readout_s * self.landmarks.shift_local
@@ -203,7 +203,7 @@ class VisualMap:
     def looks(
         self, keyframe: Keyframe, rows: NDArray[np.int64], points_local: NDArray[np.float64]
     ) -> Looks:
-        """Return how landmarks (N, 3) look that features of a keyframe show."""
+        """Return the appearance of landmarks (N, 3) [m] in a keyframe's features `rows`."""
         viewer_local = (keyframe.T_local_base @ self.camera.T_base_cam)[:3, 3]
         to_viewer = viewer_local - points_local
         distance_m = np.maximum(np.linalg.norm(to_viewer, axis=1), _NEAREST_M)
@@ -214,7 +214,7 @@ class VisualMap:
         )
 
     def _keep_limits(self) -> None:
-        """Drop landmarks that are seldom found again, and keyframes beyond the limits."""
+        """Remove landmarks that are seldom found again, and keyframes beyond the limits."""
         table = self.landmarks
         judged = table.alive & (table.expected >= _PROBATION)
         self.drop(np.flatnonzero(judged & (table.found < _MIN_FOUND_RATIO * table.expected)))
@@ -227,12 +227,12 @@ class VisualMap:
             self.drop(np.flatnonzero(orphans))
 
     def join(self, kept_ids: NDArray[np.int64], gone_ids: NDArray[np.int64]) -> None:
-        """Let the kept landmarks (N,) take the places of those that go (N,)."""
+        """Replace landmarks `gone_ids` (N,) by `kept_ids` (N,)."""
         self.keyframes.rename_landmarks(gone_ids, kept_ids)
         self.landmarks.remove(gone_ids)
 
     def drop(self, landmark_ids: NDArray[np.int64]) -> None:
-        """Forget landmarks."""
+        """Remove landmarks."""
         self.keyframes.forget_landmarks(landmark_ids)
         self.landmarks.remove(landmark_ids)
 

@@ -1,4 +1,4 @@
-"""The part of the map that is adjusted at a time: copied out, and merged back."""
+"""The window of the map that is adjusted at a time: copied, and merged back."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from .visual_map import VisualMap
 
 _FREE = 5
 _HELD = 15
-_MAX_SIGMA_M, _MAX_SIGMA_RATIO = 1.0, 0.3  # of a landmark worth keeping; the second of its distance
+_MAX_SIGMA_M, _MAX_SIGMA_RATIO = 1.0, 0.3  # limits of a landmark; the second of its distance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Window:
-    """A part of the map, copied, and where it came from."""
+    """A copied part of the map, with its origin in the map."""
 
     bundle: Bundle
-    keyframe_ids: list[int]  # (K,), rising
+    keyframe_ids: list[int]  # (K,), ascending
     free_ids: list[int]
-    landmark_ids: NDArray[np.int64]  # (L,), rising
-    births: NDArray[np.int64]  # (L,), to tell a landmark from a later one of the same id
+    landmark_ids: NDArray[np.int64]  # (L,), ascending
+    births: NDArray[np.int64]  # (L,), to distinguish a landmark from a later one of the same id
     feature_rows: NDArray[np.int64]  # (N,), of each sighting in its keyframe
     reckoned: dict[tuple[int, int], Tie]  # by keyframe ids
     corrections: int  # of the map, when it was copied
 
 
 def take_window(visual_map: VisualMap, keyframe_id: int) -> Window | None:
-    """Return a copy of what surrounds a keyframe: landmarks that two or more keyframes saw.
+    """Return a copy of a keyframe's surroundings: landmarks that two or more keyframes saw.
 
-    None where it shares none with another keyframe.
+    None if it shares no landmark with another keyframe.
     """
     store = visual_map.keyframes
     free = store.covisible(store.landmarks_of([keyframe_id]), limit=_FREE)
@@ -91,10 +91,10 @@ def take_window(visual_map: VisualMap, keyframe_id: int) -> Window | None:
 
 
 def merge_window(visual_map: VisualMap, window: Window, adjusted: Adjusted) -> Transform:
-    """Move keyframes and landmarks to where they were found to be; forget wrong sightings.
+    """Apply the adjusted keyframes and landmarks to the map; remove wrong sightings.
 
-    Returns T_new_old of the window's newest keyframe, with which all newer ones move. A map that
-    was corrected since the copy was taken stays as it is.
+    Returns T_new_old (4, 4) of the window's newest keyframe, with which all newer ones move. A map
+    that was corrected after the copy was taken does not change.
     """
     store, table = visual_map.keyframes, visual_map.landmarks
     newest = window.keyframe_ids[-1]
@@ -121,7 +121,7 @@ def merge_window(visual_map: VisualMap, window: Window, adjusted: Adjusted) -> T
 
 
 def _forget(visual_map: VisualMap, window: Window, adjusted: Adjusted) -> None:
-    """Take sightings that disagree out of their keyframes."""
+    """Remove disagreeing sightings from their keyframes."""
     store = visual_map.keyframes
     for row, keyframe_id in enumerate(window.keyframe_ids):
         wrong = ~adjusted.agrees & (adjusted.bundle.keyframe_rows == row)
