@@ -1,4 +1,4 @@
-"""The back end: a pose graph over the keyframes, and the loops that correct it."""
+"""The back end: a pose graph over the keyframes, corrected by loop closures."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from .keyframes import Keyframes
 from .loop_closure import LoopCloser
 from .pose_graph import Edge, PoseGraph, optimise
 
-_FELT = np.array([5e-3, 5e-3, 2e-3])  # m, m, rad: less is within the noise of the pose itself
+_FELT = np.array([5e-3, 5e-3, 2e-3])  # m, m, rad: smaller corrections are within the pose's noise
 
 
 @dataclass(slots=True)
 class BackEnd:
-    """Takes keyframes one by one, and moves all of them when a loop closes."""
+    """Takes keyframes one by one, and corrects all of them when a loop closes."""
 
     keyframes: Keyframes
-    closer: LoopCloser | None  # None: odometry by laser alone
+    closer: LoopCloser | None  # None: laser odometry without loop closure
     graph: PoseGraph = field(default_factory=PoseGraph)
     revision: int = field(default=0, init=False)
 
     def take(self) -> bool:
-        """Take the newest keyframe; tell whether poses were corrected for it."""
+        """Take the newest keyframe; return whether poses were corrected."""
         number = len(self.keyframes) - 1
         frames = self.keyframes.frames
         if number > 0:
@@ -50,6 +50,6 @@ class BackEnd:
         return True
 
     def finish(self) -> None:
-        """Fit all edges once more, from the poses as they are."""
+        """Optimise all edges once more, starting from the current poses."""
         if any(edge.is_loop for edge in self.graph.edges):
             self.keyframes.move(optimise(self.graph.edges, self.keyframes.poses))

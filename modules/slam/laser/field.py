@@ -1,4 +1,4 @@
-"""What a scan is matched with: mean surface points in cells, and the nearest of them anywhere."""
+"""The likelihood field for scan matching: mean surface points per cell, and the nearest ones."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from .surface import SurfacePoints
 
 _REACH_M = 0.3  # the likelihood falls to 0 at this distance from a surface
 _MARGIN_CELLS = 8
-_AROUND_CELLS = 2  # a surface goes on, or ends, in the cells so near
-_POST = 1.1  # trace of the shape: a line's is 1, and from here on it holds along itself, too
-_END_RATIO = 0.4  # of a cell: so far from the middle of these is a point at the very end
+_AROUND_CELLS = 2  # neighbourhood that shows whether a surface continues or ends
+_POST = 1.1  # trace of the shape: 1 for a line; above, it also constrains along itself
+_END_RATIO = 0.4  # of a cell: a point this far from the centre of its neighbours is an end
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Nearest:
-    """The surface nearest to each of N points."""
+    """The nearest surface to each of N points."""
 
     points: NDArray[np.float64]  # (N, 2) [m], local
     shape: NDArray[np.float64]  # (N, 3)
-    outward: NDArray[np.float64]  # (N, 2), out of the map: 1 long for a post at its end, else 0
+    outward: NDArray[np.float64]  # (N, 2), out of the map: unit vector at a surface's end, else 0
 
 
 class LikelihoodField:
-    """Surfaces around the robot, in `local`, with look-ups that cost the same anywhere."""
+    """Surfaces around the robot, in `local`, with look-ups in constant time."""
 
     def __init__(self, surfaces: SurfacePoints, resolution_m: float) -> None:
-        """Build the field of a local map of at least one point."""
+        """Build the field of a local map with at least one point."""
         self.resolution_m = resolution_m
         cells = np.floor(surfaces.points / resolution_m).astype(np.int64)
         self._origin = cells.min(axis=0) - _MARGIN_CELLS
@@ -65,7 +65,7 @@ class LikelihoodField:
     def likelihood(
         self, points_local: NDArray[np.float64], offsets_m: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Return how well points (A, N, 2) fit (A, K) when moved by each offset (K, 2): 0 to 1."""
+        """Return likelihoods (A, K), 0 to 1, of points (A, N, 2) [m] moved by offsets (K, 2)."""
         columns = int(self._limit[0]) + 1
         start = np.floor(points_local / self.resolution_m).astype(np.int64) - self._origin
         shift = np.round(offsets_m / self.resolution_m).astype(np.int64)
@@ -75,7 +75,7 @@ class LikelihoodField:
         return np.asarray(found.mean(axis=-1))
 
     def pooled(self, factor: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """Return the best likelihood per `factor`^2 cells, and which of them is at the corner."""
+        """Return the best likelihood per `factor`^2 cells, and the corner's cell."""
         before = self._origin % factor
         rows, columns = self._likelihood.shape
         behind = -(before + np.array([columns, rows])) % factor
@@ -103,7 +103,7 @@ class LikelihoodField:
     def _out_of_map(
         self, image: NDArray[np.uint8], occupied: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return per surface the direction (M, 2) in which the map does not go on, 0 for a line."""
+        """Return per surface the direction (M, 2) in which the map ends, 0 for a line."""
         is_post = self._shape[:, 0] + self._shape[:, 2] >= _POST
         steps = np.arange(-_AROUND_CELLS, _AROUND_CELLS + 1)
         around = occupied[is_post, None] + (steps[:, None] * image.shape[1] + steps).reshape(-1)

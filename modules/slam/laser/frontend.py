@@ -29,17 +29,17 @@ from .loop_search import LoopSearch
 from .matcher import Match, Matcher, Prior, novelty
 from .surface import SurfacePoints
 
-_OVERLAP_MIN_RATIO = 0.5  # with less, the map does not reach here yet
-_FAILURES_MAX = 10  # matches that fail in a row before the map goes on from dead reckoning
+_OVERLAP_MIN_RATIO = 0.5  # with less, the map does not cover this place yet
+_FAILURES_MAX = 10  # consecutive failed matches before mapping continues from dead reckoning
 _LOST_WINDOW_M, _LOST_WINDOW_RAD, _LOST_SCORE_MIN = 3.0, 0.8, 0.5
-_STEP_MIN = np.array([5e-3, 5e-3, 2e-3])  # m, m, rad: of the motion between two keyframes
-_UNSEEN = np.diag([1e-2, 1e-2, 1e-1])  # 1/m^2, 1/rad^2: information of what a scan does not hold
-_DEVIATION_MIN = np.array([1e-3, 1e-3, 5e-4])  # m, m, rad: no pose is believed to be better
+_STEP_MIN = np.array([5e-3, 5e-3, 2e-3])  # m, m, rad: least deviation of a keyframe's motion
+_UNSEEN = np.diag([1e-2, 1e-2, 1e-1])  # 1/m^2, 1/rad^2: information in unconstrained directions
+_DEVIATION_MIN = np.array([1e-3, 1e-3, 5e-4])  # m, m, rad: least standard deviation of a pose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Estimate:
-    """Where the robot is, and how well that is known."""
+    """The robot's pose with its covariance."""
 
     T_local_base: Planar
     covariance: Matrix  # axes of local
@@ -50,7 +50,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScanSettings:
-    """Which scans are matched, and when a match is believed."""
+    """Which scans are matched, and when a match is accepted."""
 
     resolution_m: float
     beams_min: int
@@ -60,7 +60,7 @@ class ScanSettings:
 
 @dataclass(slots=True)
 class FrontEnd:
-    """One activation's estimate, from the first observation on."""
+    """The pose estimation of one activation."""
 
     settings: ScanSettings
     matcher: Matcher
@@ -80,7 +80,7 @@ class FrontEnd:
     _field: LikelihoodField | None = field(default=None, init=False)
 
     def track(self, observation: Observation, scan: LaserScan | None) -> Estimate:
-        """Return the pose at the observation, corrected by its scan where it has one."""
+        """Return the pose at the observation, corrected by its scan if it has one."""
         estimate = self._track(observation, scan)
         if estimate.status is not TrackingStatus.LOST:
             self.history.add(observation.stamp_ns, self._pose)
@@ -98,7 +98,7 @@ class FrontEnd:
         surfaces = self._read(scan)
         if scan is None or surfaces is None:
             return self._predict(observation, predicted, motion)
-        # The sweep may be older than the observation: match where the robot was then.
+        # The scan may be older than the observation: match at the robot's pose then.
         ratio = _share(scan.stamp_ns, before_ns, observation.stamp_ns)
         predicted_then = compose(before, ratio * T_prev_curr)
         T_then_now = between(predicted_then, predicted)
@@ -137,7 +137,7 @@ class FrontEnd:
     def _find_again(
         self, surfaces: SurfacePoints, field: LikelihoodField, predicted: Planar
     ) -> Match | None:
-        """Return the match of a wide search: where nothing measures motion, any may have been."""
+        """Return the match of a wide search, as without odometry any motion is possible."""
         found = LoopSearch(field).find(
             surfaces.points,
             predicted,
@@ -158,7 +158,7 @@ class FrontEnd:
         )
 
     def _teach(self, match: Match, T_then_now: Planar) -> None:
-        """Let the motion model learn from the motion since a scan last held the pose."""
+        """Calibrate the motion model by the motion since the last matched scan."""
         G = turn(-float(match.T_local_base[2]))
         known = np.linalg.inv(match.information + _UNSEEN) + self._held_covariance
         alone = compose(match.T_local_alone, T_then_now)
@@ -168,7 +168,7 @@ class FrontEnd:
         )
 
     def _hold(self, observation: Observation, pose: Planar, match: Match | None) -> Estimate:
-        """Take over a pose that a scan holds."""
+        """Accept a pose that was measured by a scan."""
         weak = match is not None and match.weak_directions > 0
         if match is None:
             self.motion.skip()
@@ -187,7 +187,7 @@ class FrontEnd:
         )
 
     def _predict(self, observation: Observation, predicted: Planar, motion: Motion) -> Estimate:
-        """Go on without a scan: a gap between scans is normal, a longer one is not."""
+        """Continue without a scan: short gaps between scans are normal, longer ones are not."""
         since_ns = None if self._held_ns is None else observation.stamp_ns - self._held_ns
         if since_ns is not None and since_ns <= self.settings.predict_max_s * 1e9:
             return self._guess(predicted, TrackingStatus.TRACKING)
@@ -204,7 +204,7 @@ class FrontEnd:
         scan: LaserScan,
         surfaces: SurfacePoints,
     ) -> Estimate:
-        """Go on without the match: dead reckoning holds the pose, or nothing does."""
+        """Continue without the match: by dead reckoning, or else as lost."""
         self._failures += 1
         if not motion.is_measured:
             return self._lose()
@@ -225,7 +225,7 @@ class FrontEnd:
         )
 
     def _lose(self) -> Estimate:
-        """Stay at the last held pose and look for it in the whole window from now on."""
+        """Stay at the last tracked pose, and search the whole window from now on."""
         self._pose = self._held_pose
         window = np.array([self.matcher.window_m, self.matcher.window_m, self.matcher.window_rad])
         self._covariance = np.diag(window**2)
@@ -241,7 +241,7 @@ class FrontEnd:
     def _extend(
         self, T_local_base: Planar, match: Match | None, scan: LaserScan, surfaces: SurfacePoints
     ) -> None:
-        """Make the scan a keyframe; where that closes a loop, go on from the corrected map."""
+        """Make the scan a keyframe; if that closes a loop, continue from the corrected map."""
         frames = self.keyframes.frames
         information = np.linalg.inv(self._step + np.diag(_STEP_MIN**2)) + _UNSEEN
         if match is not None:
@@ -271,7 +271,7 @@ class FrontEnd:
 
 
 def _share(stamp_ns: int, before_ns: int | None, now_ns: int) -> float:
-    """Return where a stamp lies between the last observation (0) and this one (1)."""
+    """Return the position of a stamp between the last observation (0) and this one (1)."""
     if before_ns is None or now_ns <= before_ns:
         return 1.0
     return float(np.clip((stamp_ns - before_ns) / (now_ns - before_ns), 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""Where the robot was at every stamp, told relative to keyframes, which may be corrected."""
+"""The robot's pose at every stamp, relative to keyframes, which may be corrected."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from sceneslam.types.trajectory import Trajectory
 
 from .keyframes import Keyframes
 
-_NONE = -1  # before the first keyframe: the pose is as it was told
+_NONE = -1  # before the first keyframe: the pose as it was reported
 
 
 @dataclass(slots=True)
 class History:
-    """40 bytes per stamp."""
+    """Poses relative to keyframes; 40 bytes per stamp."""
 
     keyframes: Keyframes
     _stamps_ns: array[int] = field(default_factory=lambda: array("q"))
@@ -26,7 +26,7 @@ class History:
     _motions: array[float] = field(default_factory=lambda: array("d"))  # T_keyframe_base
 
     def add(self, stamp_ns: int, T_local_base: Planar) -> None:
-        """Remember a pose relative to the newest keyframe."""
+        """Add a pose, stored relative to the newest keyframe."""
         owner = len(self.keyframes) - 1
         if owner != _NONE:
             T_local_base = between(self.keyframes.frames[owner].T_local_base, T_local_base)
@@ -35,9 +35,9 @@ class History:
         self._motions.extend(T_local_base.tolist())
 
     def trajectory(self) -> Trajectory:
-        """Return T_local_base at every stamp, by the keyframes' poses as they are now.
+        """Return T_local_base at every stamp, by the keyframes' current poses.
 
-        What a correction changed between two keyframes is spread over the time between them.
+        A correction of the motion between two keyframes is distributed over the time between them.
         """
         if not self._stamps_ns:
             return Trajectory.empty()
@@ -52,7 +52,7 @@ class History:
         own = owners[follows]
         measured = np.array([frame.T_prev_curr for frame in frames]).reshape(-1, 3)
         missed = betweens(composed(poses[own], measured[own + 1]), poses[own + 1])
-        between_ns = np.maximum(kept_ns[own + 1] - kept_ns[own], 1)  # a scan may come twice
+        between_ns = np.maximum(kept_ns[own + 1] - kept_ns[own], 1)  # stamps may repeat
         share = (stamps_ns[follows] - kept_ns[own]) / between_ns
         told[follows] = composed(told[follows], np.clip(share, 0.0, 1.0)[:, None] * missed)
         planar = np.stack([se3.from_xy_yaw(x, y, yaw) for x, y, yaw in told.tolist()])

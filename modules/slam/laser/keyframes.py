@@ -1,4 +1,4 @@
-"""The scans that are kept: what is matched with now, and what the map is made of later."""
+"""Keyframe scans: the latest for scan matching, all for the map."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class Keyframe:
 
     stamp_ns: int
     T_local_base: Planar
-    T_prev_curr: Planar  # from the keyframe before, as measured
+    T_prev_curr: Planar  # from the previous keyframe, as measured
     covariance: Matrix  # of T_prev_curr, axes of curr
-    distance_m: float  # driven from the keyframe before
+    distance_m: float  # driven since the previous keyframe
     scan: LaserScan
 
 
@@ -30,10 +30,12 @@ class Keyframe:
 class Keyframes:
     """All keyframes of one activation, in the order they were taken.
 
-    A submap is `submap_keyframes` of them in a row. Scans are matched with the latest two
-    submaps, the last being built, as in Cartographer (Hess et al., "Real-time loop closure in 2D
-    LIDAR SLAM", ICRA 2016). The surfaces of older keyframes are read from the scan when asked
-    for: a scan is a tenth of their size.
+    A submap is `submap_keyframes` consecutive keyframes. Scans are matched with the latest two
+    submaps, of which the last is being built, as in Cartographer (Hess et al., "Real-time loop
+    closure
+    in 2D LIDAR SLAM", ICRA 2016). The surfaces of older keyframes are computed from the scan on
+    demand:
+    a scan has a tenth of their size.
     """
 
     reader: SurfaceReader
@@ -56,14 +58,14 @@ class Keyframes:
         return moved_m > self.keyframe_distance_m or turned_rad > self.keyframe_angle_rad
 
     def add(self, frame: Keyframe, surfaces_base: SurfacePoints) -> None:
-        """Append a keyframe and what was read from its scan."""
+        """Append a keyframe with its scan's surfaces, in its base."""
         self._surfaces[len(self.frames)] = surfaces_base
         self.frames.append(frame)
         for number in [number for number in self._surfaces if number < self.latest.start]:
             del self._surfaces[number]
 
     def surfaces_base(self, number: int) -> SurfacePoints:
-        """Return what a keyframe saw, in its base."""
+        """Return a keyframe's surfaces, in its base."""
         kept = self._surfaces.get(number)
         return self.reader.read(self.frames[number].scan) if kept is None else kept
 
@@ -75,7 +77,7 @@ class Keyframes:
 
     @property
     def finished_submaps(self) -> int:
-        """Return how many submaps are no longer matched with."""
+        """Return the number of submaps that are no longer used for scan matching."""
         return self.latest.start // self.submap_keyframes
 
     def of_submap(self, submap: int) -> range:
@@ -84,9 +86,9 @@ class Keyframes:
         return range(start, min(start + self.submap_keyframes, len(self.frames)))
 
     def around(self, number: int, numbers: range) -> Sequence[int]:
-        """Return those of `numbers` that may have seen what keyframe `number` sees.
+        """Return those of the keyframes `numbers` whose view may overlap that of keyframe `number`.
 
-        Others share no surface with it: a jump of the pose must not make a map as large as it.
+        The others are left out, so that a jump of the pose does not make the field too large.
         """
         reach_m = 2.0 * self.reader.range_max_m
         centre = self.frames[number].T_local_base
@@ -94,15 +96,15 @@ class Keyframes:
         return [i for i, away_m in zip(numbers, away, strict=True) if away_m <= reach_m]
 
     def surfaces(self, numbers: Sequence[int]) -> SurfacePoints:
-        """Return the surfaces (local) that these keyframes saw."""
+        """Return these keyframes' surfaces, in `local`."""
         return joined([self.surfaces_base(i).moved(self.frames[i].T_local_base) for i in numbers])
 
     def move(self, poses: NDArray[np.float64]) -> None:
-        """Give all keyframes new poses (N, 3)."""
+        """Set new poses T_local_base (N, 3) [m, m, rad] of all keyframes."""
         for frame, T_local_base in zip(self.frames, poses, strict=True):
             frame.T_local_base = np.asarray(T_local_base)
 
     @property
     def poses(self) -> NDArray[np.float64]:
-        """Return T_local_base (N, 3) of all."""
+        """Return T_local_base (N, 3) [m, m, rad] of all keyframes."""
         return np.array([frame.T_local_base for frame in self.frames]).reshape(-1, 3)

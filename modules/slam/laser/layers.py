@@ -18,11 +18,11 @@ from .keyframes import Keyframes
 from .pose_graph import Edge
 
 _PLANAR = [0, 1, 5]  # x, y, yaw in se3.log's order
-_LEVEL_DEVIATION = 0.01  # m and rad: what a floor's z, roll and pitch are believed to vary by
+_LEVEL_DEVIATION = 0.01  # m and rad: standard deviation of z, roll and pitch on a floor
 
 
 def map_layers(keyframes: Keyframes, edges: Sequence[Edge], *, resolution_m: float) -> MapLayers:
-    """Return everything that the keyframes saw, in `local`."""
+    """Return the grid, points and pose graph of the keyframes, in `local`."""
     reader = keyframes.reader
     grid = OccupancyGrid(resolution_m)
     clouds = [np.zeros((0, 2))]
@@ -64,14 +64,14 @@ def _stack(transforms: Sequence[se3.Transform]) -> NDArray[np.float64]:
 
 
 def _cut(scan: LaserScan, range_max_m: float) -> LaserScan:
-    """Return the scan without what is too far to be believed."""
+    """Return the scan without returns beyond `range_max_m`."""
     far = scan.ranges_m > range_max_m
     ranges = np.where(far & np.isfinite(scan.ranges_m), np.inf, scan.ranges_m)
     return replace(scan, ranges_m=ranges.astype(np.float32))
 
 
 def _thin(points: NDArray[np.float64], cell_m: float) -> NDArray[np.float64]:
-    """Return one point (the first) per square of `cell_m`, in their order."""
+    """Return the first point per square of `cell_m`, (M, 2) [m], in their order."""
     cells = np.floor(points / cell_m).astype(np.int64)
     if not len(cells):
         return points

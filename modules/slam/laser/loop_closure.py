@@ -1,4 +1,4 @@
-"""Finds places again: which submaps a keyframe may see, where in them, and when to believe it."""
+"""Loop closure: candidate submaps for a keyframe, its pose in them, and verification."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from .places import Place, Places
 from .pose_graph import Edge
 from .surface import SurfacePoints
 
-_NEAR_M = 3.0  # a submap is seen well from so near its keyframes
-_DRIFT_M = 0.05  # per metre driven since: half width of the search
+_NEAR_M = 3.0  # a submap is visible within this distance of its keyframes
+_DRIFT_M = 0.05  # half width of the search, per metre driven since
 _DRIFT_RAD = 0.004
-_WINDOW_M, _WINDOW_RAD = 0.15, 0.05  # at no distance
+_WINDOW_M, _WINDOW_RAD = 0.15, 0.05  # half width at zero distance
 _WINDOW_MAX_M, _WINDOW_MAX_RAD = 6.0, 0.6
-_WIDE_M, _WIDE_RAD = 0.5, 0.2  # wider windows are searched, and need a second witness
-_SUBMAPS_MAX = 2  # tried per keyframe
+_WIDE_M, _WIDE_RAD = 0.5, 0.2  # wider windows need the wide search and a second loop to confirm
+_SUBMAPS_MAX = 2  # submaps tried per keyframe
 _PAUSE = 4  # keyframes between two loops into the same submap
 _SCORE_MIN = 0.6
 _INLIER_MIN_RATIO = 0.65
-_THROUGH_M, _THROUGH_MAX_RATIO = 0.3, 0.15  # points so far before the scan's returns: doors, people
-_BESIDE_RAD = 0.02  # a beam passes a point so near
+_THROUGH_M, _THROUGH_MAX_RATIO = 0.3, 0.15  # points this far before the returns: doors, people
+_BESIDE_RAD = 0.02  # angle within which a beam passes a point
 _AGREE_M, _AGREE_RAD = 0.25, 0.05
-_FLOOR = np.diag(np.array([0.02, 0.02, 0.005]) ** 2)  # m, m, rad: no loop is believed to be better
+_FLOOR = np.diag(np.array([0.02, 0.02, 0.005]) ** 2)  # m, m, rad: least covariance of a loop
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,12 +44,12 @@ class LoopCloser:
     keyframes: Keyframes
     places: Places
     matcher: Matcher
-    _links: list[dict[int, float]] = field(default_factory=list)  # submap: to which, how far [m]
-    _tried: dict[int, int] = field(default_factory=dict)  # submap: at which keyframe last
+    _links: list[dict[int, float]] = field(default_factory=list)  # submap: {other: distance [m]}
+    _tried: dict[int, int] = field(default_factory=dict)  # submap: keyframe of the last trial
     _witnesses: list[_Witness] = field(default_factory=list)
 
     def close(self, number: int) -> list[Edge]:
-        """Return what a new keyframe saw again (mostly nothing)."""
+        """Return the loop edges of a new keyframe, mostly none."""
         self._link(number)
         finished = self.keyframes.finished_submaps
         if finished == 0:
@@ -123,7 +123,7 @@ class LoopCloser:
         )
 
     def _confirm(self, number: int, edge: Edge) -> list[Edge]:
-        """Return this edge and the earlier one that says the same, none as long as it is alone."""
+        """Return this edge and the earlier one that agrees with it, or nothing without one."""
         size = self.keyframes.submap_keyframes
         self._witnesses = [w for w in self._witnesses if number - w.keyframe <= size]
         poses = self.keyframes.poses
@@ -139,7 +139,7 @@ class LoopCloser:
         return []
 
     def _link(self, number: int) -> None:
-        """Make the graph of submaps longer by one keyframe."""
+        """Add a keyframe to the graph of submaps."""
         size = self.keyframes.submap_keyframes
         submap = number // size
         if submap == len(self._links):
@@ -159,7 +159,7 @@ class LoopCloser:
         self._links[one][other] = self._links[other][one] = least
 
     def _drives(self, number: int) -> NDArray[np.float64]:
-        """Return how far it is driven to each submap by the shortest way of edges (Dijkstra)."""
+        """Return the length [m] of the shortest path of edges to each submap (Dijkstra)."""
         far_m = np.full(len(self._links), np.inf)
         far_m[number // self.keyframes.submap_keyframes] = 0.0
         waiting = np.ones(len(far_m), dtype=bool)
@@ -173,10 +173,10 @@ class LoopCloser:
     def _seen_through_ratio(
         self, scan_base: SurfacePoints, points_submap: NDArray[np.float64], T_submap_base: Planar
     ) -> float:
-        """Return the share of the submap's points in view that the scan looked through.
+        """Return the share of the submap's points in view that the scan's beams passed through.
 
-        What stands behind the scan's returns is not in view. Beams graze corners: a point counts
-        as looked through when the beams beside its own went on, too.
+        Points behind the scan's returns are not in view. As beams graze corners, a point counts
+        only if the neighbouring beams passed it, too.
         """
         T_base_laser = from_transform(self.keyframes.reader.T_base_laser)
         T_laser_submap = between(compose(T_submap_base, T_base_laser), np.zeros(3))

@@ -1,8 +1,8 @@
 """A wide search for a scan in an old part of the map: branch and bound over a score pyramid.
 
 After Hess et al., "Real-time loop closure in 2D LIDAR SLAM" (ICRA 2016), section V-B: a node of
-the search tree is a turn and a square of shifts, its bound the score in a grid that holds, per
-cell, the best of the square that begins there. Here each level is searched at once.
+the search tree is a rotation and a square of shifts; its bound is the score in a grid that holds,
+per cell, the maximum over the square that begins there. Each level is searched in one batch.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from sceneslam.types.planar import Planar, wrap
 
 from .field import LikelihoodField
 
-_CELL_M = 0.1  # or a little more: the finest shift; the refinement goes on from there
+_CELL_M = 0.1  # the finest shift, at least; the refinement starts from there
 _LEVELS = 4  # shifts of 0.1, 0.2, 0.4, 0.8 m
-_POINTS = 100  # of the scan; more do not change what is found
-_BEAM = 32  # nodes of the first descent, whose score is the bound of the second
-_NODES_MAX = 4000  # per level, the best: where more are as good, the answer is ambiguous
-_ALIKE_RATIO = 0.85  # a second place that fits as well as this share of the best ...
-_APART_M, _APART_RAD = 0.5, 0.15  # ... and is so far from it makes the answer ambiguous
+_POINTS = 100  # of the scan; more do not change the result
+_BEAM = 32  # nodes of the first descent, whose best score bounds the second
+_NODES_MAX = 4000  # best nodes kept per level; with more, the result is ambiguous
+_ALIKE_RATIO = 0.85  # a second pose with this share of the best score, at least
+_APART_M, _APART_RAD = 0.5, 0.15  # this far away, makes the result ambiguous
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Found:
-    """The likeliest pose in a window."""
+    """The most likely pose in a window."""
 
     T_submap_base: Planar
     score: float  # 0 to 1
@@ -64,7 +64,7 @@ class LoopSearch:
         for level in range(1, _LEVELS):
             half = 2 ** (level - 1)
             kernel = np.zeros((2 * half + 1, 2 * half + 1), np.uint8)
-            kernel[[half, half, -1, -1], [half, -1, half, -1]] = 1  # itself and `half` further on
+            kernel[[half, half, -1, -1], [half, -1, half, -1]] = 1  # the cell, those at `half`
             above = cv2.dilate(grid, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
             grid = np.asarray(above, dtype=np.float32)
             self._pyramid.append(grid)
@@ -78,7 +78,7 @@ class LoopSearch:
         window_rad: float,
         score_min: float,
     ) -> Found | None:
-        """Return the best pose within a window of `around` (submap), None where none fits."""
+        """Return the best pose within a window of `around` (submap), None if no pose fits."""
         points = points_base[:: max(1, len(points_base) // _POINTS)]
         radius_m = float(np.median(np.linalg.norm(points, axis=1))) + 0.1
         step_rad = self._cell_m / radius_m
@@ -106,7 +106,7 @@ class LoopSearch:
         return self._scored(cells, turn, x, y, _LEVELS - 1)
 
     def _descend(self, cells: NDArray[np.int32], nodes: _Nodes, limit: float, most: int) -> _Nodes:
-        """Return the leaves under the `most` best nodes of each level, with scores of `limit`."""
+        """Return the leaves under the `most` best nodes per level, scored at least `limit`."""
         for level in range(_LEVELS - 1, -1, -1):
             if level < _LEVELS - 1:
                 size = 2**level

@@ -2,17 +2,17 @@
 
 The search (after Olson, "Real-time correlative scan matching", ICRA 2009) finds the basin; the
 refinement is point-to-line where the map holds lines, with the prediction as one more measurement.
-Directions that the geometry does not hold are taken out of the laser's information (after Zhang,
-Kaess, Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016), so that
-there the prior alone decides.
+Directions that the geometry does not constrain are removed from the laser's information (after
+Zhang, Kaess, Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016), so
+that there the prior alone decides.
 
-What a scan made of a band of heights shows is not quite a wall: which of the things in the band is
-the nearest changes with the view, for many beams together. Such an error does not average out over
-beams, nor over scans taken from almost the same place.
+A scan made from a band of heights does not show exact walls: the nearest object in the band changes
+with the viewpoint, for many beams together. Such an error does not average out over beams, nor over
+scans taken from almost the same place.
 
-Where the map ends, what lies beyond is no part of its last surface: pairs there are dropped (after
-Turk and Levoy, "Zippered polygon meshes from range images", SIGGRAPH 1994). Kept, they turn a robot
-that turns against its turn: on that side of the view there is always more than in the map.
+Scan points beyond the end of a mapped surface do not belong to it: such pairs are dropped (after
+Turk and Levoy, "Zippered polygon meshes from range images", SIGGRAPH 1994). Otherwise they would
+bias a turn: on the side to which the robot turns, the scan always shows more than the map.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _KERNELS_M = (0.25, 0.12, 0.06)  # of the robust weight: coarse to fine
 _ITERATIONS = (3, 3, 8)  # at most, per kernel
 _CONVERGED = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: a step this small is the last
 _INLIER_M = 0.1
-_END_M = 0.1  # a mapped surface may go on so far, or twice as far as the beams are apart
-_CORRELATION = 4.0  # neighbouring beams share their errors: information is this much less
-_STUDENT = 4.0  # degrees of freedom of the prior: an error of ten deviations weighs a twentieth
-_NORMAL = 1e6  # so many make it normal
-_APART_M, _APART_RAD = 0.06, 0.02  # nearer starts end in the same place
-_VIEW_M, _VIEW_RAD = 0.1, 0.1  # scans taken so far apart err each in its own way
+_END_M = 0.1  # a mapped surface may continue this far, or twice the beams' spacing
+_CORRELATION = 4.0  # neighbouring beams have common errors: information is divided by this
+_STUDENT = 4.0  # degrees of freedom of the prior: an error of 10 sigmas has weight 1/20
+_NORMAL = 1e6  # degrees of freedom of a normal distribution
+_APART_M, _APART_RAD = 0.06, 0.02  # nearer starts converge to the same pose
+_VIEW_M, _VIEW_RAD = 0.1, 0.1  # scans this far apart have independent errors
 _NOVELTY_MIN = 1e-3
 
 
@@ -52,33 +52,33 @@ class Match:
     """A scan's pose in the local map."""
 
     T_local_base: Planar
-    information: Matrix  # of the laser alone, as if nothing was seen before; axes of local
+    information: Matrix  # of the laser alone, without correlation to earlier scans; axes of local
     covariance: Matrix  # of the pose: laser and prior together, axes of local
     inliers: int
     inlier_ratio: float
-    overlap_ratio: float  # share of points where the map has anything near
-    weak_directions: int  # 0 to 3: how many the geometry does not hold
-    T_local_alone: Planar  # where the laser alone has it, but for weak directions
-    cost: float  # negative log-likelihood of scan and pose, less a constant
+    overlap_ratio: float  # share of points near a mapped surface
+    weak_directions: int  # 0 to 3: unconstrained by the geometry
+    T_local_alone: Planar  # by the laser alone, except for weak directions
+    cost: float  # negative log-likelihood of scan and pose, up to a constant
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Prior:
-    """Where a scan should have been taken, if one of the witnesses of motion is right.
+    """The predicted pose of a scan by one source of motion.
 
-    That of wheels has heavy tails, Student's distribution: a scan that contradicts it wins.
-    Position and heading are weighed on their own: wheels that slip may turn rightly.
+    The wheels' prior has heavy tails (Student's distribution), so that a contradicting scan
+    prevails. Position and heading are weighted separately: slipping wheels may turn correctly.
     """
 
     pose: Planar
     covariance: Matrix
     information: Matrix
-    cost: float  # negative logarithm of the probability that it is this one, and of its spread
+    cost: float  # negative logarithm of the prior's probability and of its density's peak
     freedom: float  # degrees of freedom of Student's distribution
 
     @classmethod
     def of(cls, pose: Planar, covariance: Matrix, probability: float = 1.0) -> Prior:
-        """Return the prior of a pose with its covariance; normal where it is the only one."""
+        """Return the prior of a pose (3,) with covariance (3, 3); normal if it is the only one."""
         information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         spread = 0.5 * float(np.linalg.slogdet(covariance)[1])
         return cls(
@@ -90,31 +90,31 @@ class Prior:
         )
 
     def off(self, pose: Planar) -> Planar:
-        """Return how far a pose is from this."""
+        """Return the difference (3,) of a pose from this prior."""
         off = pose - self.pose
         off[2] = wrap(float(off[2]))
         return off
 
     def weighed(self, pose: Planar) -> Matrix:
-        """Return the information that is left of this at a pose."""
+        """Return the prior's information (3, 3) at a pose, reduced by the heavy tails."""
         squared = self._squared(pose)
         weight = [min((self.freedom + n) / (self.freedom + squared[n]), 1.0) for n in (2, 1)]
         root = np.sqrt([weight[0], weight[0], weight[1]])
         return np.asarray(self.information * np.outer(root, root))
 
     def cost_at(self, pose: Planar) -> float:
-        """Return the negative log-likelihood of a pose, less a constant."""
+        """Return the negative log-likelihood of a pose, up to a constant."""
         return self.cost + sum(
             float(_tail(each, n, self.freedom)) for n, each in self._squared(pose).items()
         )
 
     def is_apart(self, pose: Planar) -> bool:
-        """Tell whether a refinement from here might end elsewhere than from a pose."""
+        """Tell whether a refinement from here may converge differently than from `pose`."""
         off = np.abs(self.off(pose))
         return bool(max(off[0], off[1]) > _APART_M or off[2] > _APART_RAD)
 
     def _squared(self, pose: Planar) -> dict[int, float]:
-        """Return the squared deviations of position and heading by their number of axes."""
+        """Return the squared normalised deviations of position and heading by number of axes."""
         off, information = self.off(pose), self.information
         position = float(off[:2] @ information[:2, :2] @ off[:2])
         return {2: position, 1: float(off[2] ** 2 * information[2, 2])}
@@ -127,7 +127,7 @@ class Matcher:
     window_m: float
     window_rad: float
     degeneracy_ratio: float
-    shift_m: float  # standard deviation of what a scan's points are off by together
+    shift_m: float  # standard deviation of a scan's common error
 
     def match(
         self,
@@ -137,10 +137,10 @@ class Matcher:
         *,
         novelty: float = 1.0,
     ) -> Match:
-        """Return the likeliest pose of a scan, near the first prior or where another one has it.
+        """Return the most likely pose of a scan, near the first prior or another one.
 
-        `novelty` (0 to 1): how much of its error the scan does not share with the scan before; 1
-        where the prediction is a guess, which outweighs no scan.
+        `novelty` (0 to 1): the share of the scan's error that is independent of the scan before;
+        1 if the prediction is not measured.
         """
         first = priors[0]
         starts = [first.pose, self._search(scan_base, field, first)]
@@ -154,11 +154,11 @@ class Matcher:
     def refine(
         self, scan_base: SurfacePoints, field: LikelihoodField, start: Planar, prior: Matrix
     ) -> Match:
-        """Return the pose of a scan at `start`, whose covariance is `prior`, without a search."""
+        """Return the pose of a scan, without a search, from `start` with covariance `prior`."""
         return self._refine(scan_base, field, start, [Prior.of(start, prior)], self.shift_m)
 
     def _search(self, scan_base: SurfacePoints, field: LikelihoodField, prior: Prior) -> Planar:
-        """Return the likeliest pose on a grid around the prediction."""
+        """Return the most likely pose on a grid around the prediction."""
         predicted, sigma = prior.pose, np.sqrt(np.diag(prior.covariance))
         stride = max(1, len(scan_base) // _SEARCH_POINTS)
         points = scan_base.points[::stride]
@@ -190,7 +190,7 @@ class Matcher:
         priors: Sequence[Prior],
         shift_m: float,
     ) -> Match:
-        """Return the pose that Gauss-Newton finds from a start, under its likeliest prior."""
+        """Return the pose by Gauss-Newton from a start, with its most likely prior."""
         expected = min(priors, key=lambda prior: prior.cost_at(start))
         pose = start.copy()
         for kernel_m, iterations in zip(_KERNELS_M, _ITERATIONS, strict=True):
@@ -232,7 +232,7 @@ class Matcher:
         kernel_m: float,
         shift_m: float,
     ) -> tuple[Matrix, Planar, int]:
-        """Return the normal equations H, g in (x, y, yaw), and how many directions are weak."""
+        """Return the normal equations H, g in (x, y, yaw), and the number of weak directions."""
         arms = scan_base.points @ rotation(pose[2]).T
         near = field.nearest(arms + pose[:2])
         ex, ey = (arms + pose[:2] - near.points).T
@@ -240,7 +240,7 @@ class Matcher:
         ax, ay = xx * ex + xy * ey, xy * ex + yy * ey  # the error across the surface
         robust = (kernel_m**2 / (kernel_m**2 + ax * ex + ay * ey)) ** 2
         gate = ex * ex + ey * ey < (4.0 * kernel_m) ** 2
-        along = (ex - ax) ** 2 + (ey - ay) ** 2  # a surface's end is further away
+        along = (ex - ax) ** 2 + (ey - ay) ** 2  # a surface's end is farther away
         gate &= along < np.maximum(_END_M, 2.0 * scan_base.spacing_m) ** 2
         beyond = near.outward[:, 0] * ex + near.outward[:, 1] * ey
         is_dense = scan_base.spacing_m < field.resolution_m  # else cells between beams are empty
@@ -248,7 +248,7 @@ class Matcher:
         weight = scan_base.weight * robust * gate / _CORRELATION
         total = float(weight.sum())
         centre = (weight @ arms) / max(total, 1e-12)
-        lx, ly = -(arms[:, 1] - centre[1]), arms[:, 0] - centre[0]  # what a turn moves a point by
+        lx, ly = -(arms[:, 1] - centre[1]), arms[:, 0] - centre[0]  # a point's motion per radian
         tx, ty = xx * lx + xy * ly, xy * lx + yy * ly
         H = np.empty((3, 3))
         H[0, 0], H[0, 1], H[1, 1] = weight @ xx, weight @ xy, weight @ yy
@@ -258,7 +258,7 @@ class Matcher:
         spread_m = float(np.sqrt(weight @ (lx * lx + ly * ly) / max(total, 1e-12)))
         spread_m = max(spread_m, 1e-3)
         H, g, weak = self._keep_held(H, g, total, spread_m)
-        if shift_m > 0:  # (H^-1 + C)^-1 of what is held, for a common error of covariance C
+        if shift_m > 0:  # (H^-1 + C)^-1 in constrained directions, for a common error C
             C = shift_m**2 * np.diag([1.0, 1.0, spread_m**-2])
             damping = np.linalg.inv(np.eye(3) + H @ C)
             H, g = damping @ H, damping @ g
@@ -270,7 +270,7 @@ class Matcher:
     def _keep_held(
         self, H: Matrix, g: Planar, total: float, spread_m: float
     ) -> tuple[Matrix, Planar, int]:
-        """Take directions out that fewer than `degeneracy_ratio` of the points hold."""
+        """Remove directions that fewer than `degeneracy_ratio` of the points constrain."""
         if total <= 0:
             return np.zeros((3, 3)), np.zeros(3), 3
         scale = np.array([1.0, 1.0, 1.0 / spread_m])
@@ -285,7 +285,7 @@ class Matcher:
 
 
 def novelty(T_before_now: Planar) -> float:
-    """Return how much of a scan's error is its own, by the motion since the scan before."""
+    """Return the independent share of a scan's error, by the motion since the last scan."""
     moved = np.hypot(*T_before_now[:2]) / _VIEW_M, abs(T_before_now[2]) / _VIEW_RAD
     return float(np.clip(max(moved), _NOVELTY_MIN, 1.0))
 
@@ -294,7 +294,7 @@ def _residuals(
     scan_base: SurfacePoints, field: LikelihoodField, pose: Planar
 ) -> tuple[Planar, Planar, Planar]:
     """Return the points' distances [m] to the nearest surface, to its nearest point, and the first
-    of those that are evidence: where beams are sparse, surfaces are only near by chance.
+    again only for points that are evidence: with sparse beams, a surface is near only by chance.
     """
     points = scan_base.points @ rotation(pose[2]).T + pose[:2]
     near = field.nearest(points)
@@ -310,12 +310,12 @@ def _residuals(
 
 
 def _tail(squared: NDArray[np.float64] | float, size: int, freedom: float) -> NDArray[np.float64]:
-    """Return the negative log-density of Student's distribution by squared deviations."""
+    """Return the negative log-density of Student's distribution at squared deviations."""
     return np.asarray(0.5 * (freedom + size) * np.log1p(squared / freedom))
 
 
 def _scan_cost(scan_base: SurfacePoints, residual: NDArray[np.float64]) -> float:
-    """Return the negative log-likelihood of the points, none of which counts more than it may."""
+    """Return the negative log-likelihood of the points, with a bounded cost per point."""
     squared, limit = residual**2, _KERNELS_M[-1] ** 2
     each = 0.5 * scan_base.weight * limit * squared / (limit + squared)
     return float(each.sum()) / _CORRELATION

@@ -1,4 +1,4 @@
-"""The `laser` SLAM module: its settings, its life and its map."""
+"""The `laser` SLAM module: its settings, life cycle and map."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ _RATIO = "inlier_min_ratio degeneracy_ratio"
 
 @dataclass(kw_only=True, eq=False)
 class LaserSlam:
-    """2D SLAM from a laser, or a lidar or depth seen as one: x, y and yaw in `local`.
+    """2D SLAM from a laser, or from a lidar or depth image converted to a scan: x, y, yaw.
 
-    The fields are the settings; `conf/slam/laser.yaml` says what each one is.
+    The fields are the settings; `conf/slam/laser.yaml` describes each one.
     """
 
     resolution_m: float
@@ -86,7 +86,7 @@ class LaserSlam:
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return the sensors, one of which suffices; odometry and gyro are used when present."""
+        """Return the sensors, of which one suffices; odometry and gyro are used if present."""
         return (
             frozenset({Sensor.SCAN}),
             frozenset({Sensor.POINTS}),
@@ -94,7 +94,7 @@ class LaserSlam:
         )
 
     def activate(self, rig: Rig) -> None:
-        """Start anew, with the laser where there is one, else a lidar's slice, else depth."""
+        """Start with an empty map: by the laser if present, else a lidar's slice, else depth."""
         self._scanner = self._make_scanner(rig)
         if self._scanner is not None:
             self._T_base_laser = self._scanner.T_base_laser
@@ -103,7 +103,7 @@ class LaserSlam:
         self._front_end = self._make_front_end(rig)
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Do nothing: its poses are in `local` wherever that lies."""
+        """Do nothing: the poses are in `local`, independent of T_map_local."""
 
     def set_scene(self, scene: str) -> None:
         """Do nothing: a laser sees the same by day and by night."""
@@ -124,7 +124,7 @@ class LaserSlam:
         )
 
     def get_trajectory(self) -> Trajectory:
-        """Return all poses with every loop closed."""
+        """Return T_local_base over time, corrected by all loop closures."""
         if self._front_end is None:
             return Trajectory.empty()
         self._front_end.back_end.finish()
@@ -208,7 +208,7 @@ class LaserSlam:
 
 
 def _covariance_base(estimate: Estimate) -> NDArray[np.float64] | None:
-    """Return the (6, 6) covariance in base's axes, None where there is no pose."""
+    """Return the (6, 6) covariance in base's axes, None without a pose."""
     if estimate.status is TrackingStatus.LOST:
         return None
     G = turn(-float(estimate.T_local_base[2]))

@@ -1,4 +1,4 @@
-"""Submaps as places to be found again: fields and searches, made when asked for."""
+"""Submaps for loop closure: likelihood fields and searches, built on demand."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Place:
 
     @property
     def search(self) -> LoopSearch:
-        """Return the wide search, made at first use."""
+        """Return the wide search, built at first use."""
         if self._search is None:
             self._search = LoopSearch(self.field)
         return self._search

@@ -1,4 +1,4 @@
-"""Keyframes and the motions measured between them, optimised."""
+"""The pose graph: keyframes and measured motions between them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from sceneslam.types.planar import Matrix, Planar
 
-_HUBER = 1.345  # sigmas; 95 % as good as least squares where nothing is wrong
-_RELINEARIZE = 0.005  # m and rad: poses that moved less keep their linearization
-_ROUNDS = 3  # of relinearization after a loop; more change millimetres
+_HUBER = 1.345  # sigmas; 95 % efficiency relative to least squares, without outliers
+_RELINEARIZE = 0.005  # m and rad: poses that moved less are not relinearized
+_ROUNDS = 3  # relinearizations after a loop; more change the poses by millimetres
 _ORIGIN_DEVIATION = 1e-4  # m and rad
 
 
@@ -29,18 +29,18 @@ class Edge:
 
 @dataclass(slots=True)
 class PoseGraph:
-    """Smooths incrementally (iSAM2), so that a closed loop costs what it changes."""
+    """Smooths incrementally (iSAM2): the cost of a loop grows with the poses it changes."""
 
     edges: list[Edge] = field(default_factory=list)
     _smoother: Any = field(default=None, init=False)
-    _told: int = field(default=0, init=False)  # edges that the smoother knows
+    _told: int = field(default=0, init=False)  # number of edges already in the smoother
 
     def add(self, edge: Edge) -> None:
-        """Take a measurement; keyframes come with the edge from the one before."""
+        """Add an edge; a new keyframe is added with the edge from the previous one."""
         self.edges.append(edge)
 
     def smooth(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the best poses (N, 3), given where the keyframes are believed to be now."""
+        """Return the optimised poses (N, 3), from the current estimates `poses` (N, 3)."""
         import gtsam
 
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -60,7 +60,7 @@ class PoseGraph:
 
 
 def optimise(edges: list[Edge], poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the poses (N, 3) that fit all edges best (Levenberg-Marquardt), from `poses` on."""
+    """Return the optimised poses (N, 3) (Levenberg-Marquardt), from the initial `poses`."""
     import gtsam
 
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()

@@ -1,4 +1,4 @@
-"""A scan as points on surfaces: where they are, and in which directions each one holds the pose."""
+"""A scan as points on surfaces, with the directions in which each one constrains the pose."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from sceneslam.types import se3
 from sceneslam.types.observation import LaserScan
 from sceneslam.types.planar import Planar, rotation
 
-_SPAN_M = 0.2  # neighbours within this distance along the scan make a point's surface
-_NEIGHBOURS_MIN = 4  # fewer points do not tell a surface
+_SPAN_M = 0.2  # neighbours along the scan within this distance form a point's surface
+_NEIGHBOURS_MIN = 4  # fewer points do not define a surface
 _BLOB_RATIO = (0.04, 0.24)  # least to largest variance: up to the first a line, from the second not
 
 Array = NDArray[np.float64]
@@ -21,18 +21,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SurfacePoints:
-    """Points and what they tell: `shape` is n n' for a wall with normal n, I for a post."""
+    """Points with their shape matrix: n n' for a wall with normal n, I for a post."""
 
     points: Array  # (N, 2) [m], frame as in the owner's name
-    shape: Array  # (N, 3): xx, xy, yy; 0 where too few neighbours tell the surface
+    shape: Array  # (N, 3): xx, xy, yy; 0 with too few neighbours
     weight: Array  # (N,) [1/m^2], inverse variance of the range
-    spacing_m: Array  # (N,), between beams there
+    spacing_m: Array  # (N,), between neighbouring beams
 
     def __len__(self) -> int:
         return len(self.points)
 
     def moved(self, T_a_b: Planar) -> SurfacePoints:
-        """Return these points of b in a."""
+        """Return the points, given in frame b, in frame a."""
         R = rotation(T_a_b[2])
         c, s = R[0, 0], R[1, 0]
         xx, xy, yy = self.shape.T
@@ -65,8 +65,9 @@ def joined(parts: Sequence[SurfacePoints]) -> SurfacePoints:
 class SurfaceReader:
     """Reads the scans of one laser.
 
-    A range's standard deviation is noise_m + noise_per_m * range^2 (0 for a laser; that of a
-    triangulating camera grows so).
+    A range's standard deviation is noise_m + noise_per_m * range^2; noise_per_m is 0 for a laser,
+    and
+    describes a triangulating depth camera.
     """
 
     T_base_laser: se3.Transform
