@@ -16,7 +16,7 @@ from sceneslam.types.trajectory import Trajectory
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AbsoluteErrors:
-    """Distance of each matched pose from its true position, after one rigid alignment."""
+    """Distance of each matched pose from its true position, after one rigid alignment (ATE)."""
 
     stamps_ns: NDArray[np.int64]  # (N,), of the estimate
     errors_m: NDArray[np.float64]  # (N,)
@@ -60,10 +60,10 @@ def absolute_errors(estimate: Trajectory, truth: Trajectory, max_gap_s: float) -
 
 
 def rotation_rmse_rad(estimate: Trajectory, truth: Trajectory, max_gap_s: float) -> float:
-    """Return the rotation error that is left after one rigid alignment [rad], NaN of nothing.
+    """Return the RMS rotation error [rad] after one rigid alignment, NaN without matches.
 
-    The alignment counts each pose as a body of 0.1 m, as Correct Rate's does: positions on a
-    straight line alone leave the rotation about it open.
+    As for the Correct Rate, the alignment also uses three points 0.1 m along each pose's axes:
+    positions on a straight line alone do not determine the rotation about the line.
     """
     matches = associate(estimate, truth, max_gap_s)
     if not len(matches):
@@ -79,10 +79,10 @@ def relative_errors(
 ) -> RelativeErrors:
     """Return the errors of all motions over `interval_s`.
 
-    Every matched pose i that has the whole interval of trajectory after it (less half a usual
-    step) is paired with the matched pose j nearest to the interval's end, if that is within a
-    tenth of the interval. The error is inv(inv(Q_i) Q_j) inv(P_i) P_j with true poses Q and
-    estimates P; neither frame has to be aligned.
+    Every matched pose i with a whole interval of trajectory after it (less half a usual step) is
+    paired with the matched pose j nearest to the interval's end, if that is within a tenth of the
+    interval. The error is inv(inv(Q_i) Q_j) inv(P_i) P_j with true poses Q and estimates P; the
+    frames need no alignment.
     """
     matches = associate(estimate, truth, max_gap_s)
     if len(matches) < 2:
@@ -104,5 +104,5 @@ def relative_errors(
 
 
 def root_mean_square(values: NDArray[np.float64]) -> float:
-    """Return the root of the mean square, NaN of nothing."""
+    """Return the root mean square, NaN of an empty array."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

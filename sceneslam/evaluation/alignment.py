@@ -1,4 +1,4 @@
-"""The rigid motion that lays one trajectory on another."""
+"""The rigid transform that aligns one trajectory with another."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ def align(
 ) -> Transform:
     """Return T_target_source that minimises the squared distance of paired poses (N, 4, 4).
 
-    Umeyama (PAMI 1991) without scale. With `lever_m` above 0 each pose is a body: three points
-    at that distance along its axes count too. That settles the rotation about a straight path,
-    which positions alone leave open, and hardly moves the result elsewhere. A path that does not
-    spread at all (one pose, or standing still) is always aligned so; N has to be at least 1.
+    Umeyama (PAMI 1991) without scale. With `lever_m` above 0, three points at that distance along
+    each pose's axes are aligned, too. They determine the rotation about a straight path, which
+    positions alone do not, and hardly change the result otherwise. A path without extent (one
+    pose, or standing still) is always aligned in this way; N has to be at least 1.
     """
     source, target = T_source_base[:, :3, 3], T_target_base[:, :3, 3]
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)

@@ -1,4 +1,4 @@
-"""What the reader of a report asks first: did it work, if not where and why, what to change."""
+"""The summary of a report: did the run work, if not where and why, and what to change."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from sceneslam.evaluation.metrics import Metrics
 from sceneslam.evaluation.summary import number, percent
 
-_SHARE = 0.01  # of the observations: less is not worth a change
+_SHARE = 0.01  # of the observations: a smaller share gives no advice
 _CORRECT = 0.99  # of the time
-_ADVICE = (  # what stands in a reason for a missing pose -> what to change
+_ADVICE = (  # part of the reason for a missing pose -> advice
     (
         r"while (.+) was lost",
         "“{0}” lost track. Give its scene another module to fall back on, as in "
@@ -41,7 +41,7 @@ _ADVICE = (  # what stands in a reason for a missing pose -> what to change
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
-    """The answer, in plain sentences."""
+    """The summary, in plain sentences."""
 
     kind: str  # worked | partly | failed
     headline: str
@@ -50,7 +50,7 @@ class Answer:
 
 
 def answer(metrics: Metrics, faults: Sequence[str]) -> Answer:
-    """Return whether a run worked; `faults` are what was wrong with the input or ended it early."""
+    """Return whether a run worked; `faults`: errors of the input, or why the run ended early."""
     where = list(dict.fromkeys([*faults, *metrics["shortfalls"]]))
     advice = [*dict.fromkeys(_advice(metrics))]
     if not metrics["poses"]:
@@ -72,7 +72,7 @@ def answer(metrics: Metrics, faults: Sequence[str]) -> Answer:
 
 
 def _advice(metrics: Metrics) -> Iterator[str]:
-    """Yield what would mend what cost the most poses, then what would mend wrong switches."""
+    """Yield advice on the most frequent causes of missing poses, then on wrong switches."""
     least = _SHARE * metrics["observations"]
     for reason, count in _reasons(metrics).items():
         if count < least:
@@ -89,7 +89,7 @@ def _advice(metrics: Metrics) -> Iterator[str]:
 
 
 def _reasons(metrics: Metrics) -> Mapping[str, int]:
-    """Return why poses were bridged or missing, with how many."""
+    """Return the reasons for bridged or missing poses, with the number of poses."""
     reasons: dict[str, int] = dict(metrics["bridged_why"])
     for sentence in metrics["shortfalls"]:
         for count, reason in re.findall(r"(\d+) ([^,;]+)", sentence.partition("without: ")[2]):

@@ -1,4 +1,4 @@
-"""Which pose belongs to which stamp: nearest in time, or interpolated."""
+"""Associate poses with stamps: nearest in time, or interpolated."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Matches:
 def nearest(stamps_ns: NDArray[np.int64], wanted_ns: NDArray[np.int64]) -> Indices:
     """Return for each wanted stamp the index of the nearest of `stamps_ns` (sorted, not empty).
 
-    Of two that are equally near it is the earlier one.
+    Of two equally near stamps it is the earlier one.
     """
     right = np.clip(np.searchsorted(stamps_ns, wanted_ns), 0, len(stamps_ns) - 1)
     left = np.maximum(right - 1, 0)
@@ -39,8 +39,8 @@ def nearest(stamps_ns: NDArray[np.int64], wanted_ns: NDArray[np.int64]) -> Indic
 def associate(first: Trajectory, second: Trajectory, max_gap_s: float) -> Matches:
     """Return, for each pose of the shorter trajectory, the nearest of the longer.
 
-    Pairs further apart than `max_gap_s` are left out. The rule is the one of evo
-    (`sync.associate_trajectories`), so that numbers can be compared.
+    Pairs farther apart than `max_gap_s` are left out, as in evo (`sync.associate_trajectories`), so
+    that numbers can be compared.
     """
     if len(second) <= len(first):
         swapped = _nearest_within(second.stamps_ns, first.stamps_ns, max_gap_s)
@@ -58,7 +58,7 @@ def select(trajectory: Trajectory, index: Indices) -> Trajectory:
 def clip(trajectory: Trajectory, start_ns: int, end_ns: int) -> Trajectory:
     """Return the poses from the last up to `start_ns` to the first from `end_ns` on.
 
-    So each instant of the span keeps its neighbours on both sides.
+    Each instant of the span thus keeps its neighbours on both sides.
     """
     first = int(np.searchsorted(trajectory.stamps_ns, start_ns, side="right")) - 1
     last = int(np.searchsorted(trajectory.stamps_ns, end_ns))
@@ -82,7 +82,7 @@ def covered(trajectory: Trajectory, stamps_ns: NDArray[np.int64], max_gap_s: flo
 def interpolated(trajectory: Trajectory, stamps_ns: NDArray[np.int64]) -> Trajectory:
     """Return the poses at the given stamps, which the trajectory has to cover.
 
-    Positions lie on the straight line, rotations on the great arc between the neighbours.
+    Positions are interpolated linearly, rotations by slerp.
     """
     times = trajectory.stamps_ns
     right = np.clip(np.searchsorted(times, stamps_ns), min(1, len(times) - 1), len(times) - 1)
@@ -110,7 +110,7 @@ def _slerp(
     q0: NDArray[np.float64], q1: NDArray[np.float64], ratio: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     cosine = np.sum(q0 * q1, axis=-1, keepdims=True)
-    q1 = np.where(cosine < 0, -q1, q1)  # q and -q are one rotation: take the short way
+    q1 = np.where(cosine < 0, -q1, q1)  # q and -q are the same rotation: take the shorter arc
     angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
     sine = np.sin(angle)
     straight = sine < 1e-9

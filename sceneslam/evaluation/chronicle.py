@@ -1,4 +1,4 @@
-"""A run's event log as an account that a person reads: what happened, when, and why."""
+"""Convert a run's event log to readable entries: what happened, when, and why."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 from sceneslam.evaluation.reasons import why_chosen
 from sceneslam.types.run import Event, RunResult
 
-_SHORT_S = 0.5  # trouble that passes sooner is counted, not told
+_SHORT_S = 0.5  # shorter trouble is only counted
 _TOLD_TROUBLES = 5  # of one kind and module; more are summed up
 
 
-_OF_INPUT = {  # events of the input, and of the map -> in words
+_OF_INPUT = {  # events of the input and of the map -> text
     "silent": "the source gave nothing for {for_s:g} s",
     "returned": "the source is back",
     "behind": "the recording was read too slowly, and is played {by_s:.1f} s later",
@@ -31,7 +31,7 @@ _OF_INPUT = {  # events of the input, and of the map -> in words
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Trouble:
-    """A stretch in which a module did not track as it should."""
+    """A period in which a module did not track normally."""
 
     what: str  # "“key” is lost"
     stamp_ns: int
@@ -40,7 +40,7 @@ class _Trouble:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
-    """One thing that happened; `details` are sentences."""
+    """One entry; `details` are sentences."""
 
     at_s: float  # since the first observation
     kind: str  # scene | decision | trouble | fault
@@ -51,13 +51,13 @@ class Entry:
 def chronicle(
     result: RunResult, switches: Sequence[Mapping[str, Any]], *, value_label: str
 ) -> list[Entry]:
-    """Return what happened in a run, by time; `switches` are those of its metrics."""
+    """Return the entries of a run, ordered by time; `switches` are those of its metrics."""
     origin_ns = int(result.observed_ns[0]) if len(result.observed_ns) else 0
     return _Writer(result.events, switches, origin_ns, value_label).write()
 
 
 class _Writer:
-    """Goes through the log once, keeping what later lines refer to."""
+    """Goes through the log once, with the state that later entries refer to."""
 
     def __init__(
         self,
@@ -122,7 +122,7 @@ class _Writer:
         self._add(event["stamp_ns"], "scene", what, f"{why}." if why else "")
 
     def _why_confirmed(self, event: Event, since_ns: int) -> str:
-        """Return in words what spoke for a scene: all images of a window, or its probability."""
+        """Return as text why a scene was confirmed: all images of a window, or its probability."""
         votes = (e for e in self._events if e["event"] == "vote" and "posterior" in e)
         cast = next((e for e in votes if e["stamp_ns"] == event["stamp_ns"]), None)
         since = f"since {self._seconds(since_ns):.2f} s"
@@ -173,7 +173,7 @@ class _Writer:
         self._troubles.append(_Trouble(what=what, stamp_ns=began_ns, lasted_s=lasted_s))
 
     def _tell_troubles(self, end_ns: int) -> None:
-        """Tell long troubles one by one, many of a kind together; count the short ones."""
+        """Write long troubles one by one, many of a kind together; count the short ones."""
         long = [one for one in self._troubles if one.lasted_s >= _SHORT_S]
         for what in dict.fromkeys(one.what for one in long):
             same = [one for one in long if one.what == what]

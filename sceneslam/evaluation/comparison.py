@@ -1,4 +1,4 @@
-"""How far two runs over the same path are apart (the paper's Fig. 8)."""
+"""The distance between two runs over the same path (the paper's Fig. 8)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Difference:
 def compare(trajectory: Trajectory, reference: Trajectory, max_gap_s: float = 0.01) -> Difference:
     """Return the distance of poses with the same stamp, directly in `map`.
 
-    Nothing is aligned: both runs start at the identity at the same place.
+    There is no alignment: both runs start at the identity at the same place.
     """
     matches = associate(trajectory, reference, max_gap_s)
     offset_m = trajectory.positions_m[matches.first] - reference.positions_m[matches.second]

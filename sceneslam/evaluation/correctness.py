@@ -1,4 +1,4 @@
-"""Correct Rate: for how much of the time the robot knew where it was."""
+"""Correct Rate: the share of time with a correct pose."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
 
 _TRUTH_GAP_S = 0.5  # ground truth is not interpolated over more
-_POSE_GAP_NS = 10**9  # a pose vouches for no more than this
+_POSE_GAP_NS = 10**9  # longest time that one pose counts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Judged:
-    """The poses that the truth covers, by rising stamp."""
+    """The poses within the ground truth's time span, ordered by stamp."""
 
     stamps_ns: NDArray[np.int64]  # (N,)
     is_correct: NDArray[np.bool_]  # (N,)
@@ -27,7 +27,7 @@ class _Judged:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CorrectLimits:
-    """Within which error a pose is correct."""
+    """The error limits of a correct pose."""
 
     limit_m: float
     limit_rad: float
@@ -39,8 +39,8 @@ def correct_rate(estimate: Trajectory, truth: Trajectory, limits: CorrectLimits)
 
     The definition of OpenLORIS-Scene (Shi et al., ICRA 2020): the estimate is aligned as a whole
     (SE(3), least squares, ground truth interpolated to its stamps); a pose is correct within both
-    limits and then counts the time to the next pose, at most 1 s. Unlike the mean error it
-    cannot be improved by giving no poses. NaN when there is no truth.
+    limits and then counts for the time to the next pose, at most 1 s. Unlike the mean error, it
+    cannot be improved by omitting poses. NaN without ground truth.
     """
     if len(truth) < 2 or truth.stamps_ns[0] == truth.stamps_ns[-1]:
         return float("nan")
@@ -57,9 +57,9 @@ def correct_rate_observed(
 ) -> float:
     """Return the share of the time of a run with a correct pose, in [0, 1].
 
-    As `correct_rate`, but of the time between those successive observations (N,) that the truth
-    covers both: a run answers for no time at which it was given nothing or the truth is unknown,
-    and one that is right at each observation gets 1. NaN when there is no such time.
+    As `correct_rate`, but only time between successive observations (N,) that the ground truth both
+    covers counts: time without observations or ground truth is left out, and a run that is correct
+    at each observation gets 1. NaN when there is no such time.
     """
     known = covered(truth, observed_ns, _TRUTH_GAP_S)
     begins = known[:-1][np.diff(known) == 1]
@@ -81,7 +81,7 @@ def _judge(estimate: Trajectory, truth: Trajectory, limits: CorrectLimits) -> _J
         return _Judged(stamps_ns=np.zeros(0, np.int64), is_correct=np.zeros(0, bool))
     matched = select(estimate, index)
     true = interpolated(truth, matched.stamps_ns)
-    # 0.1 m: a robot that drives straight on must not fail for a roll that nothing determines.
+    # 0.1 m: on a straight path the positions alone do not determine the roll.
     T_gt_map = align(matched.T_world_base, true.T_world_base, lever_m=0.1)
     T_gt_base = T_gt_map @ matched.T_world_base
     distance_m = np.linalg.norm(T_gt_base[:, :3, 3] - true.positions_m, axis=1)

@@ -1,4 +1,4 @@
-"""How well the confirmed scenes follow the true ones, whatever the modules made of them."""
+"""Compare the confirmed scenes with the true ones, independent of the modules."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sceneslam.evaluation.switches import true_changes, true_scene
 from sceneslam.types.run import Event
 from sceneslam.types.truth import GroundTruth
 
-Seen = Sequence[tuple[int, str]]  # when which scene was confirmed
+Seen = Sequence[tuple[int, str]]  # (stamp, confirmed scene)
 
 
 def score_detection(
@@ -19,12 +19,12 @@ def score_detection(
     end_ns: int,
     scenes: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Return what `scene` events of a run are worth; what takes the true scenes is None without.
+    """Return scores of a run's `scene` events; None where the true scenes are needed but missing.
 
-    A true change is found when its scene is the confirmed one before the next true change comes;
-    `delay_s` is the mean over those found, 0 where it was confirmed too early. A confirmation of
-    a scene that is not the true one is false. `wrong_s` is how long the confirmed scene was not
-    the true one, until `end_ns`. `scenes` gives own scenes the name that the truth has for them.
+    A true change is found if its scene is confirmed before the next true change; `delay_s` is the
+    mean over those found, 0 for a scene that was confirmed too early. A confirmation of a scene
+    other than the true one is false. `wrong_s` is how long the confirmed scene was not the true
+    one, until `end_ns`. `scenes` maps own scenes to the ground truth's names for them.
     """
     scores: dict[str, Any] = {"confirmed": len(confirmed)}
     names = ("false", "missed", "delay_s", "delay_max_s", "wrong_s")
@@ -48,12 +48,12 @@ def score_detection(
 
 
 def _are_of(truth: GroundTruth, seen: Seen) -> bool:
-    """Tell whether the truth speaks of the scenes that were seen, or none was."""
+    """Tell whether the truth contains the confirmed scenes, or no scene was confirmed."""
     return not seen or bool({change.scene for change in truth.scenes} & {name for _, name in seen})
 
 
 def _delays_s(seen: Seen, truth: GroundTruth, end_ns: int) -> list[float | None]:
-    """Return how late each true change was found, None where it was not."""
+    """Return the delay [s] of each true change, None if it was not found."""
     changes = [change for change in true_changes(truth) if change.stamp_ns <= end_ns]
     stops_ns = [*(change.stamp_ns for change in changes[2:]), end_ns + 1]
     delays_s: list[float | None] = []

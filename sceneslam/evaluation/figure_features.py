@@ -1,4 +1,4 @@
-"""What the detector measured over time, with the limits of its rules."""
+"""The detector's features over time, with the limits of its rules."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from sceneslam.evaluation import figure_style as look
 from sceneslam.types.run import RunResult
 from sceneslam.types.truth import GroundTruth
 
-_HEIGHT_IN = 1.1  # of a curve
-Limits = Mapping[str, Sequence[float]]  # feature -> the limits that rules set to it
+_HEIGHT_IN = 1.1  # per curve
+Limits = Mapping[str, Sequence[float]]  # feature -> limits in its rules
 
 
 def feature_limits(detector: Mapping[str, Any]) -> dict[str, list[float]]:
-    """Return the limits in a detector's configuration; empty where it has no rules."""
+    """Return the limits in a detector's configuration; empty without rules."""
     values = detector.get("values") or {}
     found: dict[str, set[float]] = {}
     for rule in (detector.get("rules") or {}).values():
@@ -27,7 +27,7 @@ def feature_limits(detector: Mapping[str, Any]) -> dict[str, list[float]]:
 
 
 def draw_features(result: RunResult, truth: GroundTruth | None, limits: Limits) -> Any:
-    """Return a curve per feature that rules limit, None where votes do not tell any."""
+    """Return a curve per feature with a rule, None if the votes contain no features."""
     votes = [event for event in result.events if event["event"] == "vote" and "features" in event]
     names = [name for name in (votes[0]["features"] if votes else ()) if name in limits]
     if not names:

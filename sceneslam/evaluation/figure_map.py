@@ -16,24 +16,24 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import GroundTruth
 
 _CELLS = 420  # along the longer side of the drawn area
-_SMALL = 0.3  # of the map's extent: a path that is smaller is drawn apart
-_UNKNOWN, _OCCUPIED = 0.55, 0.4  # greys that are seen on white and on black
+_SMALL = 0.3  # of the map's extent: a smaller path is drawn separately
+_UNKNOWN, _OCCUPIED = 0.55, 0.4  # greys that are visible on white and on black
 
 
 def draw_map(result: RunResult, truth: GroundTruth | None, T_map_gt: Transform | None) -> Any:
-    """Return the map seen from above; None when there is neither a map nor a pose.
+    """Return the map from above; None when there is neither a map nor a pose.
 
-    Points are drawn as their density, so that walls stand out from the floor and any number of
-    points costs the same. `T_map_gt` places the ground truth; without it none is drawn.
+    The points' density is drawn, so that walls stand out from the floor and any number of points
+    costs the same. `T_map_gt` (4, 4) places the ground truth, which is not drawn without it.
     """
     bounds = _bounds(result)
     return None if bounds is None else _draw(result, truth, T_map_gt, bounds)
 
 
 def draw_path(result: RunResult, truth: GroundTruth | None, T_map_gt: Transform | None) -> Any:
-    """Return the part of the map where the path lies; None where that is not much smaller.
+    """Return the part of the map around the path; None if it is not much smaller.
 
-    A camera that is held and turned sees a room and moves by a hand's breadth.
+    A hand-held camera that turns sees a whole room but moves by centimetres.
     """
     whole, path = _bounds(result), result.trajectory.positions_m[:, :2]
     if whole is None or len(path) < 2:
@@ -106,7 +106,7 @@ def _bounds(result: RunResult) -> NDArray[np.float64] | None:
 
 
 def _draw_grid(axes: Any, grid: GridLayer) -> None:
-    """Draw what is occupied in a grey, and what is unknown in a faint one, on any paper."""
+    """Draw occupied cells in grey and unknown cells faintly, visible on light and dark."""
     occupied = np.maximum(np.tanh(grid.log_odds.astype(float) / 2.0), 0.0)  # 2 p - 1
     alpha = np.where(grid.log_odds == 0, 0.22, np.round(occupied, 1))
     shade = np.where(grid.log_odds == 0, _UNKNOWN, _OCCUPIED)

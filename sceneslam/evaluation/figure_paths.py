@@ -13,14 +13,14 @@ from sceneslam.evaluation.association import interpolated
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
 
-_MARGIN = 0.08  # of the true path's extent: what leads further off leaves the picture
+_MARGIN = 0.08  # of the true path's extent: paths beyond it are cut off
 _STYLES = ("-", "--", "-.")
 
 
 def draw_paths(path: Path, paths: Mapping[str, Trajectory], truth: Trajectory | None) -> None:
     """Write a PNG with every path from above, in `map`; the true one is dashed.
 
-    The truth is laid on the first trajectory's first pose: nothing else is aligned.
+    The truth is aligned to the first trajectory by its first pose only.
     """
     first = next((one for one in paths.values() if len(one)), Trajectory.empty())
     true_m = _true_m(first, truth)

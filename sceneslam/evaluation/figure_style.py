@@ -1,7 +1,7 @@
-"""How all figures look: size, colours that the colour-blind can tell apart, bands of time.
+"""The style of all figures: size, colour-blind-safe colours, bands of time.
 
-A figure is drawn once and written twice, as PNG and as SVG; the SVG is put into the report as well,
-where its neutral colours become the page's own, so that it follows light and dark.
+A figure is drawn once and written as PNG and as SVG. The SVG is also part of the report, where its
+neutral colours are replaced by the page's, so that it follows light and dark mode.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sceneslam.types.files import replacing
 from sceneslam.types.run import RunResult
 from sceneslam.types.truth import GroundTruth
 
-# Okabe and Ito's palette, darkest first; yellow is left out, it vanishes on paper.
+# Okabe and Ito's palette, darkest first, without yellow, which is hardly visible on white.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 BRIDGED = "#777777"
 INK, MUTED, LINE, PAPER = "#222222", "#666666", "#DDDDDD", "#FFFFFF"
@@ -54,7 +54,7 @@ def new_figure(width_in: float = WIDTH_IN, height_in: float = 3.6) -> Any:
 
 
 def style(axes: Any, *, x_label: str = "time [s]", y_label: str = "") -> None:
-    """Give axes their labels, sizes that a phone shows, and a light grid."""
+    """Give axes labels, sizes that are legible on a phone, and a light grid."""
     axes.set_xlabel(x_label, fontsize=12, color=INK)
     axes.set_ylabel(y_label, fontsize=12, color=INK)
     axes.tick_params(labelsize=11, colors=INK)
@@ -67,8 +67,7 @@ def style(axes: Any, *, x_label: str = "time [s]", y_label: str = "") -> None:
 def save(figure: Any, path: Path) -> Path:
     """Write a PNG whose bytes depend on the data alone.
 
-    A palette of 256 colours loses nothing that one can see in a chart, and three quarters of the
-    size.
+    A palette of 256 colours makes the file four times smaller without a visible difference.
     """
     from PIL import Image
 
@@ -131,7 +130,7 @@ def elapsed_s(result: RunResult, stamps_ns: NDArray[np.int64]) -> NDArray[np.flo
 def thinned(
     times_s: NDArray[np.float64], values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a long curve as the lowest and highest value of equal stretches; it looks the same."""
+    """Return a long curve as minima and maxima of equal intervals; it looks the same."""
     if len(values) <= 2 * _STRETCHES:
         return times_s, values
     starts = np.linspace(0, len(values), _STRETCHES, endpoint=False).astype(int)
@@ -158,7 +157,7 @@ def spans(times_s: NDArray[np.float64], labels: Sequence[str], end_s: float) -> 
 
 
 def module_spans(result: RunResult) -> list[Span]:
-    """Return who gave the poses when; "" where they were bridged."""
+    """Return the spans of the modules that gave the poses; "" for bridged poses."""
     times_s = elapsed_s(result, result.trajectory.stamps_ns)
     return spans(times_s, result.modules, duration_s(result))
 

@@ -1,4 +1,4 @@
-"""Figures over time: what the detector saw, who worked, and how far off the poses were."""
+"""Figures over time: the detector's votes, the active modules, and the pose errors."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def draw_votes(
 
 
 def draw_posterior(result: RunResult, truth: GroundTruth | None) -> Any:
-    """Return the scenes' probabilities over time, None where the scene filter has none."""
+    """Return the scenes' probabilities over time, None if the scene filter has none."""
     votes = [event for event in result.events if event["event"] == "vote" and "posterior" in event]
     if not votes:
         return None
@@ -105,7 +105,7 @@ def draw_series(
 
 
 def draw_timeline(result: RunResult, truth: GroundTruth | None) -> Any:
-    """Return who worked when: scenes above, one row per module, its bad moments hatched."""
+    """Return the active modules over time: scenes above, a row per module, troubles hatched."""
     if not len(result.observed_ns):
         return None
     confirmed = _confirmed_spans(result)
@@ -210,7 +210,7 @@ def _draw_trouble(axes: Any, result: RunResult, module: str, row: int) -> None:
 
 
 def _trouble(result: RunResult, module: str) -> list[look.Span]:
-    """Return when a module was not simply tracking, until it was replaced."""
+    """Return the spans in which a module was not TRACKING, until it was replaced."""
     changes = [e for e in result.events if e["event"] == "tracking" and e["module"] == module]
     times_s = look.elapsed_s(result, np.array([e["stamp_ns"] for e in changes], np.int64))
     found = look.spans(times_s, [e["status"] for e in changes], look.duration_s(result))

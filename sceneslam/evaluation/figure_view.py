@@ -1,4 +1,4 @@
-"""The map in third person: what the modules saw, in its own colours, from above and one side."""
+"""The map in a third-person view: its coloured points, seen obliquely from above."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _AZIMUTH_RAD, _ELEVATION_RAD = (
 _DISTANCE = 3.4  # from the map's centre, in radii of the sphere around the map
 _FILLED = 0.9  # of the picture's width or height
 _PAPER = 0.94  # grey, so that dark points are seen on a dark page, too
-_POINTS_MIN = 500  # fewer show no room
+_POINTS_MIN = 500  # with fewer, no view is drawn
 _INSIDE = (1.0, 99.0)  # percentiles of the points: strays must not shrink the rest
 _POINT_PX = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Viewer:
-    """A pinhole camera that has the map in its picture."""
+    """A pinhole camera whose image contains the map."""
 
     position_map: NDArray[np.float64]  # (3,) [m]
     R_map_view: NDArray[np.float64]  # columns: right, down, forward

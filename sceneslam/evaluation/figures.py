@@ -51,9 +51,9 @@ def write_figures(
     association_gap_s: float = 0.01,
     faults: list[str] | None = None,
 ) -> list[Drawn]:
-    """Write what can be drawn of a run; return the figures, in the order of the story.
+    """Write all figures of a run; return them in the report's order.
 
-    A figure that fails (no memory is left, say) is left out, with a sentence in `faults`.
+    A figure that fails (e.g. out of memory) is left out, with a sentence in `faults`.
 
     `map`, `path` (where it is small in the map), `view` (with points), `timeline`, `grey_mean`,
     `posterior` (of a Bayes filter), `features` (of rules, with their `limits`), `error` and
@@ -99,7 +99,7 @@ def write_figures(
 
 
 def _written(folder: Path, name: str, draw: Callable[[], Any], faults: list[str]) -> Drawn | None:
-    """Draw and write one figure; None where there is nothing to draw, or it fails."""
+    """Draw and write one figure; None if there is nothing to draw or it fails."""
     try:
         figure = draw()
         if figure is None:
@@ -114,7 +114,7 @@ def _written(folder: Path, name: str, draw: Callable[[], Any], faults: list[str]
 
 
 def _online(errors: AbsoluteErrors, online: AbsoluteErrors) -> NDArray[np.float64] | None:
-    """Return the online errors at the stamps of the revised ones, None where they are the same."""
+    """Return the online errors at the stamps of the revised ones, None if they are equal."""
     if not np.array_equal(errors.stamps_ns, online.stamps_ns):
         return None
     differs = np.abs(errors.errors_m - online.errors_m) > _ONLINE_DIFFERS_M

@@ -1,4 +1,4 @@
-"""Trajectory files of either layout, told apart by their numbers per line."""
+"""Trajectory files in TUM or KITTI layout, distinguished by the numbers per line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def read_poses(path: Path) -> Trajectory:
     """Return the poses of a TUM file (eight numbers per line) or a KITTI file (twelve).
 
     KITTI poses have no stamps: pose k gets k seconds, so that equal files match line by line.
-    Raises InputError where the file is missing, empty or neither.
+    Raises InputError if the file is missing, empty or in neither layout.
     """
     if not path.is_file():
         raise InputError(f"trajectory file not found: {path}")

@@ -1,4 +1,4 @@
-"""Why no module gave a pose at an observation: a sensor that was silent, or the module's state."""
+"""Why no module gave a pose at an observation: missing sensor data, or the module's state."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from sceneslam.types.run import Event, RunResult
 
 
 def why_bridged(result: RunResult) -> dict[str, int]:
-    """Return how many poses were bridged for which reason, the most frequent first."""
+    """Return the number of bridged poses per reason, the most frequent first."""
     stamps_ns = result.trajectory.stamps_ns
     is_bridged = np.array([module == "" for module in result.modules], bool)
     return _reasons(stamps_ns[is_bridged] if len(stamps_ns) else stamps_ns, result)
 
 
 def why_without_pose(result: RunResult) -> dict[str, int]:
-    """Return how many observations got no pose for which reason, the most frequent first."""
+    """Return the number of observations without a pose per reason, the most frequent first."""
     has_pose = np.isin(result.observed_ns, result.trajectory.stamps_ns)
     return _reasons(result.observed_ns[~has_pose], result)
 
@@ -47,7 +47,7 @@ _STATES: Sequence[str] = ("tracking", "suspect", "fault")
 
 
 def _state(event: Event, state: str) -> str:
-    """Return what an event says of the module that is to give the pose."""
+    """Return the state of the active module after an event."""
     if event["event"] == "fault":
         return "after a module failed"
     if event["event"] == "suspect":

@@ -1,4 +1,4 @@
-"""The few pieces of HTML that pages are made of. Whatever is given is escaped."""
+"""HTML elements of the pages. All text that is passed in is escaped."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 
 class Markup(str):
-    """Text that is HTML already."""
+    """Text that is already HTML and is not escaped again."""
 
     __slots__ = ()
 
@@ -25,7 +25,7 @@ def paragraphs(sentences: Iterable[str]) -> str:
 
 
 def tiles(numbers: Mapping[str, str]) -> str:
-    """Return numbers under their names, as tiles; a dash is not known and left out."""
+    """Return numbers with their names as tiles; unknown numbers (a dash) are left out."""
     items = "".join(
         f"<li><b>{escape(value)}</b><span>{escape(name)}</span></li>"
         for name, value in numbers.items()

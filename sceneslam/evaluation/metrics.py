@@ -42,11 +42,12 @@ def evaluate(
     peak_rss_mb: float | None = None,
     reference: Trajectory | None = None,
 ) -> Metrics:
-    """Return all metrics of a run; what cannot be known (no ground truth) is None.
+    """Return all metrics of a run; unknown ones (e.g. without ground truth) are None.
 
     `reference` is another run's trajectory over the same path, compared without alignment.
-    `notes` says in sentences why a number is missing although it could be expected, `shortfalls`
-    what a run that is complete would not have: they make the exit code 1.
+    `notes` are sentences on why an expected number is missing; `shortfalls` are sentences on why
+    the
+    run is incomplete, which makes the exit code 1.
     """
     switches = list_switches(result, truth)
     told = {str(e["scene"]) for e in result.events if e["event"] == "scene"}
@@ -78,7 +79,7 @@ def evaluate(
 
 
 def write_metrics(path: Path, metrics: Metrics) -> None:
-    """Write the metrics as JSON that any reader takes (no NaN)."""
+    """Write the metrics as standard JSON (no NaN)."""
     with replacing(path) as file:
         file.write(json.dumps(metrics, indent=2, allow_nan=False) + "\n")
 
@@ -100,7 +101,7 @@ def _accuracy(
 ) -> Metrics:
     true, observed_ns = truth.trajectory if truth else Trajectory.empty(), result.observed_ns
     if len(observed_ns):
-        # What a longer ground truth says about other times is not this run's to answer for.
+        # Ground truth outside the run's time span is not used.
         true = clip(true, int(observed_ns[0]), int(observed_ns[-1]))
     estimate, gap_s = result.trajectory, settings.association_gap_s
     absolute = absolute_errors(estimate, true, gap_s)
@@ -175,7 +176,7 @@ def _median_p95(values: NDArray[np.float64]) -> Metrics:
 
 
 def _percentiles(values: NDArray[np.float64], **percents: float) -> Metrics:
-    """Return the percentiles under their names; None of nothing."""
+    """Return the percentiles by name; None of an empty array."""
     known = len(values) > 0
     return {
         name: float(np.percentile(values, percent)) if known else None
@@ -202,7 +203,7 @@ def _span(trajectory: Trajectory) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value that JSON knows: plain numbers, and None for NaN and infinity."""
+    """Return a value for JSON: plain numbers, and None for NaN and infinity."""
     if isinstance(value, Mapping):
         return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""What the camera saw when the scene or the module changed, for the report."""
+"""The camera images at changes of scene or module, for the report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Modules by the names that a reader knows: `rgbd (bright)` for the key `bright`."""
+"""Readable names of modules: `rgbd (bright)` for the key `bright`."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _NAMING = ("module", "from", "to", "active")  # keys of events whose value is a 
 
 
 def module_names(slam: Mapping[str, Any]) -> dict[str, str]:
-    """Return a name for each key of `slam`: what it is, and its key where that says more."""
+    """Return a name for each key of `slam`: the module's type, and its key if that differs."""
     return {key: _name(key, node or {}) for key, node in slam.items()}
 
 
 def renamed(result: RunResult, names: Mapping[str, str]) -> RunResult:
-    """Return a run's result with its modules under other names, for figures."""
+    """Return a run's result with its modules renamed, for figures."""
     hybrid = result.map
     return replace(
         result,

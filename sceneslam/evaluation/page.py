@@ -1,4 +1,4 @@
-"""One HTML file that opens alone: a template, filled, with the style that all pages share."""
+"""Write a self-contained HTML file from a template and the common style."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sceneslam.types.files import replacing
 
 
 def fill_page(path: Path, package: str, template: str, told: Mapping[str, str]) -> Path:
-    """Fill a template that lies in a package, which is given the style as well; return its path."""
+    """Fill a package's template, including the style; return the page's path."""
     page = Template(files(package).joinpath(template).read_text("utf-8"))
     style = files("sceneslam.evaluation").joinpath("page.css").read_text("utf-8")
     with replacing(path, encoding="utf-8") as file:

@@ -1,4 +1,4 @@
-"""What the absolute error hides: the error over stretches of the path, and the path's length."""
+"""Errors over segments of the path, and the ratio of path lengths."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sceneslam.types.trajectory import Trajectory
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SegmentErrors:
-    """Error of the estimated motion over stretches of the true path, one per stretch."""
+    """Error of the estimated motion over segments of the true path, one per segment."""
 
     trans_m: NDArray[np.float64]  # (N,)
     rot_rad: NDArray[np.float64]  # (N,)
@@ -28,9 +28,9 @@ def driven_m(trajectory: Trajectory, stamps_ns: NDArray[np.int64]) -> NDArray[np
 def segment_errors(
     estimate: Trajectory, truth: Trajectory, max_gap_s: float, segment_m: float
 ) -> SegmentErrors:
-    """Return the errors of the estimated motion over all stretches of `segment_m`.
+    """Return the errors of the estimated motion over all segments of `segment_m`.
 
-    A stretch begins at every matched pose and ends at the first one that is `segment_m` further
+    A segment begins at every matched pose and ends at the first one that is `segment_m` farther
     along the true path. As KITTI's odometry benchmark (Geiger et al., CVPR 2012), but over one
     length and from every pose. Neither frame has to be aligned.
     """
@@ -49,9 +49,9 @@ def segment_errors(
 
 
 def length_ratio(estimate: Trajectory, truth: Trajectory, max_gap_s: float) -> float:
-    """Return the length of the estimated path over the true one's, NaN where nothing was driven.
+    """Return the ratio of the estimated to the true path length, NaN without motion.
 
-    Both are measured over the matched poses: what was not estimated counts for neither.
+    Both are measured over the matched poses only.
     """
     matches = associate(estimate, truth, max_gap_s)
     estimated_m = _distances_m(estimate.positions_m[matches.first])[-1:].sum()

@@ -1,4 +1,4 @@
-"""Why a module was chosen, how the pose was handed to it, and what that cost, in sentences."""
+"""Sentences on why a module was chosen, how it was handed the pose, and the cost of that."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def why_chosen(
 ) -> Iterator[str]:
     """Yield sentences about a decision.
 
-    `situation` is what it was made of, `at_once` are the events of its stamp, `switch` is its
-    entry in the metrics, empty for the first choice.
+    `situation` holds its inputs, `at_once` the events of its stamp, `switch` its entry in the
+    metrics, empty for the first choice.
     """
     if situation is None:
         yield f"It is the table's first choice for {decision['scene']}."

@@ -13,12 +13,12 @@ from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.trajectory import Trajectory
 
-_SAME_STAMP_S = 0.0005  # files print stamps with three decimals or more; few scans are nearer
+_SAME_STAMP_S = 0.0005  # files have stamps with three decimals or more
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Relations:
-    """True motions between pairs of instants, in no order."""
+    """True motions between pairs of instants, unordered."""
 
     first_ns: NDArray[np.int64]  # (N,)
     second_ns: NDArray[np.int64]  # (N,)
@@ -28,7 +28,7 @@ class Relations:
     def read(cls, path: Path) -> Relations:
         """Return the lines `t1 t2 x y z roll pitch yaw` [s, m, rad] of a relations file.
 
-        Raises InputError where the file is missing, empty or not of this form.
+        Raises InputError if the file is missing, empty or not of this form.
         """
         if not path.is_file():
             raise InputError(f"relations file not found: {path}")
@@ -47,7 +47,7 @@ class Relations:
 
 
 def relation_errors(trajectory: Trajectory, relations: Relations) -> dict[str, float | int]:
-    """Return mean and deviation of the motions' errors, and of their squares.
+    """Return mean and standard deviation of the motions' errors, and of their squares.
 
     A relation is matched when the trajectory has a pose within 0.5 ms of both its instants. The
     translation error is the length, the rotation error the angle of inv(true) @ estimated.

@@ -62,8 +62,9 @@ def write_report(
 ) -> Path:
     """Write `figures/` (PNG and SVG) and `report.html` into the run's folder; return its path.
 
-    `threshold` is drawn with the detector's values, `faults` are sentences about the run: those
-    of figures that could not be drawn are added.
+    `threshold` is drawn with the detector's values. `faults` are sentences about the run; sentences
+    on
+    figures that could not be drawn are added to it.
     """
     named = renamed(result, module_names(config.get("slam") or {}))
     figures = write_figures(
@@ -95,14 +96,14 @@ def write_report(
 
 
 def _seen(result: RunResult) -> str:
-    """Return what the camera saw at changes, under a heading."""
+    """Return the camera images at changes, under a heading."""
     start_ns = int(result.observed_ns[0]) if len(result.observed_ns) else 0
     images = pictures(result.moments, start_ns)
     return f"<h2>What the camera saw when something changed</h2>{images}" if images else ""
 
 
 def _told(metrics: Metrics) -> dict[str, str]:
-    """Return the parts of the page that say what the metrics say."""
+    """Return the parts of the page that present the metrics."""
     return {
         "story": markup.paragraphs(tell(metrics)),
         "numbers": _numbers(metrics),
@@ -112,13 +113,13 @@ def _told(metrics: Metrics) -> dict[str, str]:
 
 
 def _titled(title: str, config: Mapping[str, Any]) -> str:
-    """Return the title with the name of the recording, so that pages are told apart."""
+    """Return the title with the name of the recording, to distinguish pages."""
     path = (config.get("source") or {}).get("path")
     return f"{title} · {Path(path).name}" if path else title
 
 
 def _made_of(config: Mapping[str, Any]) -> list[str]:
-    """Return what was put together: one line per part."""
+    """Return the components of the run, one line each."""
     source = config.get("source") or {}
     given = [str(source[key]) for key in ("path", "story") if source.get(key)]
     parts = {
@@ -147,7 +148,7 @@ def _kind(node: Mapping[str, Any]) -> str:
 
 
 def _plain_values(node: Mapping[str, Any]) -> str:
-    """Return a component's numbers, which are its settings that matter most."""
+    """Return a component's numeric settings, which matter most."""
     told = [f"{key} {value:g}" for key, value in node.items() if isinstance(value, float)]
     return f" ({', '.join(told)})" if told else ""
 
@@ -187,7 +188,7 @@ def _answer(told: Answer) -> str:
 
 
 def _amiss(metrics: Metrics) -> list[str]:
-    """Return what else is not as it should be, what weighs most first."""
+    """Return further problems, the most important first."""
     kinds = ("warnings", "faults", "notes")
     return [sentence for kind in kinds for sentence in metrics[kind]]
 
@@ -246,7 +247,7 @@ def _switches(metrics: Metrics) -> str:
 
 
 def _modules(metrics: Metrics, slam: Mapping[str, Any]) -> str:
-    """Return what every part cost per observation, and who gave how many poses."""
+    """Return the cost per observation of every part, and the poses per module."""
     rows = [
         [
             key,

@@ -1,4 +1,4 @@
-"""What counts as matched and as correct when a run is compared with its ground truth."""
+"""Limits for matched and correct poses in the comparison with ground truth."""
 
 from __future__ import annotations
 

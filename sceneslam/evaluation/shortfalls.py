@@ -1,4 +1,4 @@
-"""What keeps a run that went to its end from being complete: missing poses, failed modules."""
+"""Why a finished run is incomplete: missing poses, failed modules."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from sceneslam.types.run import Event, RunResult
 
 
 def shortfalls(result: RunResult, coverage_min_ratio: float) -> list[str]:
-    """Return a sentence per module that failed, and one where too few observations got a pose."""
+    """Return a sentence per failed module, and one if too few observations got a pose."""
     faults = [event for event in result.events if event["event"] == "fault"]
     return [*_coverage(result, coverage_min_ratio), *_failures(faults, _origin_ns(result))]
 
 
 def _coverage(result: RunResult, least_ratio: float) -> list[str]:
-    """Return a sentence where less than a share of the observations got a pose.
+    """Return a sentence if less than a share of the observations got a pose.
 
-    They count from the first confirmed scene on: the wait for that is the policy's.
+    Only observations from the first confirmed scene on count.
     """
     if not len(result.observed_ns) or not len(result.trajectory):
         return []  # that there is no pose at all is said with its reason
@@ -37,7 +37,7 @@ def _coverage(result: RunResult, least_ratio: float) -> list[str]:
 
 
 def _failures(faults: Sequence[Event], origin_ns: int) -> list[str]:
-    """Return a sentence per component that broke its promise, whether or not it came back."""
+    """Return a sentence per component that failed, even if it was restarted."""
     failed: dict[str, list[Event]] = {}
     for event in faults:
         failed.setdefault(str(event["what"]).partition(" ")[0], []).append(event)

@@ -1,4 +1,4 @@
-"""Every change of module in a run: when, why, how late, and what it did to the trajectory."""
+"""All switches of a run: time, reason, delay, and effect on the trajectory."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def list_switches(result: RunResult, truth: GroundTruth | None) -> list[dict[str
     """Return one entry for every decision that replaced a module, for `metrics.json`.
 
     `jump_m` and `jump_rad` are the error of the estimated motion across the seam against the true
-    motion; where the truth does not cover it, what the hand-over itself measured. None is unknown:
-    a module that gave no pose before it was replaced has neither jump nor gap.
+    motion, or else the jump that the hand-over measured. None is unknown: a module without a pose
+    before it was replaced has neither jump nor gap.
     """
     decisions = [event for event in result.events if is_switch(event)]
     return [_describe(decision, result, truth) for decision in decisions]
@@ -46,9 +46,8 @@ def count_false(
 ) -> int | None:
     """Return how many switches followed a scene that was not the true one; None without truth.
 
-    `told` are the scenes that the detector found. Where the truth knows none of their names it
-    speaks of other scenes, and says nothing about these. `scenes` gives own scenes the name that
-    the truth has for them.
+    `told` are the scenes that the detector found. If the truth contains none of their names, it is
+    about other scenes, and the result is None. `scenes` maps own scenes to the truth's names.
     """
     named = {scenes.get(scene, scene) for scene in told}
     if truth is None or not {change.scene for change in truth.scenes} & named:
@@ -76,9 +75,8 @@ def true_scene(truth: GroundTruth, stamp_ns: int) -> str | None:
 def find_seam(result: RunResult, decision: Event) -> Seam | None:
     """Return the seam of a switch, None when there is no pose on one of its sides.
 
-    The module's side ends with the next decision: what it gives later is not this switch's doing.
-    With `rewind` the new module also gives poses for stamps before the decision; the seam is
-    where its poses begin.
+    Poses after the next decision do not belong to this switch. With `rewind` the new module also
+    gives poses for stamps before the decision; the seam is where its poses begin.
     """
     modules = np.array(result.modules, dtype=object)
     stamps_ns = result.trajectory.stamps_ns

@@ -1,4 +1,4 @@
-"""An experiment as one HTML file that opens alone: what was asked, promised, found, and run."""
+"""An experiment as a self-contained HTML file: question, bounds, results and runs."""
 
 from __future__ import annotations
 
