@@ -1,4 +1,4 @@
-"""What can go wrong, each as one sentence that a user can act on."""
+"""The errors of SceneSLAM; each message is one sentence that a user can act on."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ class SceneSlamError(Exception):
 
 
 class InputError(SceneSlamError):
-    """A recording, file or sensor stream is not what it has to be."""
+    """A recording, file or sensor stream is invalid."""
 
 
 class ConfigError(SceneSlamError):
@@ -31,11 +31,11 @@ class ConfigError(SceneSlamError):
 
 
 class ModuleError(SceneSlamError):
-    """A SLAM module or detector broke its contract and was stopped."""
+    """A SLAM module or detector violated its contract and was stopped."""
 
 
 def told(error: BaseException) -> str:
-    """Return what kind of error it is and what it says, on one line where it can say it at all."""
+    """Return the error's type and message on one line."""
     kind = type(error).__name__
     try:
         said = str(error)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointLayer:
-    """A cloud, with colours where the module saw any."""
+    """A point cloud, with colours if the module has them."""
 
     points: NDArray[np.float32]  # (N, 3) [m]
     colors_bgr: NDArray[np.uint8] | None = None  # (N, 3)
@@ -37,12 +37,12 @@ class PoseGraphLayer:
     edges: NDArray[np.int64]  # (M, 2), nodes from and to
     T_from_to: NDArray[np.float64]  # (M, 4, 4), as measured
     information: NDArray[np.float64]  # (M, 6, 6) [1/m^2, 1/rad^2]
-    is_loop: NDArray[np.bool_]  # (M,): a place seen again, not the way from one to the next
+    is_loop: NDArray[np.bool_]  # (M,): a loop closure, not consecutive nodes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LandmarkLayer:
-    """Points that a module knows again when it sees them."""
+    """Points that a module recognizes when it sees them again."""
 
     points: NDArray[np.float32]  # (N, 3) [m]
     first_stamps_ns: NDArray[np.int64]  # (N,), of the keyframe that saw it first
@@ -51,7 +51,7 @@ class LandmarkLayer:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapLayers:
-    """What one module knows of the world, in its `local` frame."""
+    """The map of one module, in its `local` frame."""
 
     points: PointLayer | None = None
     grid: GridLayer | None = None
@@ -61,7 +61,7 @@ class MapLayers:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HybridMap:
-    """The one map of a run, in `map`: what every module left behind, and one grid."""
+    """The map of a run, in `map`: the layers of all modules, and one grid."""
 
     points: PointLayer
     point_modules: NDArray[np.uint8]  # (N,), index into `modules`: who saw the point

@@ -1,4 +1,4 @@
-"""What the sensors saw at one instant, and what is made of it."""
+"""Measurements of all sensors at one instant, and the answers to them: votes and poses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sceneslam.types.rig import Sensor
 from sceneslam.types.se3 import Transform
 
-_GYRO_GAP_S = 0.1  # over which a rate is not taken to be constant
+_GYRO_GAP_S = 0.1  # a turn rate is not extrapolated over a longer gap
 UNSURE = "Unsure"  # the scene of a vote that could not be cast
 
 
@@ -36,7 +36,7 @@ class LaserScan:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Observation:
-    """All that a source measured at one stamp; a sensor that was silent is None.
+    """All measurements of a source at one stamp; None for a sensor without data.
 
     One observation gets one pose in the trajectory. Arrays are read-only.
     """
@@ -58,7 +58,7 @@ class Observation:
         return getattr(self, sensor.field) is not None
 
     def with_samples_of(self, older: Observation) -> Observation:
-        """Return this observation with the gyro's and the like's samples of an older one, too."""
+        """Return this observation with the gyro and accelerometer samples of an older one, too."""
         shift = np.array([(older.stamp_ns - self.stamp_ns) / 1e9, 0.0, 0.0, 0.0])
         joined: dict[str, NDArray[np.float64]] = {}
         for name in (sensor.field for sensor in Sensor if sensor.is_sampled):
@@ -71,7 +71,7 @@ class Observation:
     def turn_by_gyro(self, duration_s: float) -> NDArray[np.float64] | None:
         """Return the base's rotation vector (3,) [rad] over the last `duration_s`.
 
-        None where the gyro was silent in it for a tenth of a second.
+        None if the gyro has a gap of more than 0.1 s in it.
         """
         gyro = self.gyro_base
         if gyro is None or duration_s <= 0:
@@ -88,17 +88,17 @@ class Observation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneVote:
-    """What a detector takes one observation to show."""
+    """A detector's estimate of the scene of one observation."""
 
     stamp_ns: int
     scene: str  # one of the detector's scenes, or UNSURE
     value: float = float("nan")  # what the detector measured (grey mean, probability, ...)
     likelihoods: Mapping[str, float] | None = None  # scene -> P(measured | scene), up to a factor
-    features: Mapping[str, float] | None = None  # all that was measured, for figures; NaN: nothing
+    features: Mapping[str, float] | None = None  # all measured features, for figures; NaN: missing
 
 
 class TrackingStatus(Enum):
-    """How far a module's pose can be trusted."""
+    """The state of a module's tracking."""
 
     TRACKING = "tracking"
     DEGRADED = "degraded"  # a pose, but the measurements do not constrain every direction
@@ -115,4 +115,4 @@ class Tracking:
     covariance: NDArray[np.float64] | None = None  # (6, 6) of se3.log order [m, rad], base frame
     quality_ratio: float = 1.0  # 0 (nothing matched) to 1
     inliers: int = 0  # measurements that agree with the pose
-    revision: int = 0  # rises when the module corrected its past: the pose then jumps unmoved
+    revision: int = 0  # increases when the module corrects its past; the pose may then jump

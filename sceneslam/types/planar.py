@@ -82,7 +82,7 @@ def propagate(covariance: Matrix, T_a_b: Planar, T_b_c: Planar, noise: Matrix) -
 
 
 def turn(yaw_rad: float) -> Matrix:
-    """Return the matrix that turns x and y of a motion and leaves its yaw."""
+    """Return the (3, 3) matrix that rotates x and y of a motion and keeps its yaw."""
     G = np.eye(3)
     G[:2, :2] = rotation(yaw_rad)
     return G
@@ -94,7 +94,7 @@ def planar_covariance(covariance: NDArray[np.float64]) -> Matrix:
 
 
 def spatial_covariance(covariance: Matrix) -> NDArray[np.float64]:
-    """Return the (6, 6) covariance of se3.log order; what a planar one does not know is 0."""
+    """Return the (6, 6) covariance of se3.log order; entries of z, roll and pitch are 0."""
     spatial = np.zeros((6, 6))
     spatial[np.ix_(_PLANAR, _PLANAR)] = covariance
     return spatial

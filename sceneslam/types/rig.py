@@ -1,4 +1,4 @@
-"""What sensors a robot carries and where they sit on it."""
+"""The sensors of a robot, with intrinsics, extrinsics and noise."""
 
 from __future__ import annotations
 
@@ -89,12 +89,12 @@ class Lidar:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wheels:
-    """How far wheel odometry is off, as standard deviations, before anything is learnt of it."""
+    """Standard deviations of wheel odometry, before its calibration."""
 
     noise_ratio: float = 0.07  # m after a metre, rad after a radian; it grows with the root of them
-    drift_ratio: float = 0.02  # per metre and radian: what goes on alike and does not average out
+    drift_ratio: float = 0.02  # per metre and radian: systematic error
     drift_rad_per_m: float = 0.01
-    floor_m: float = 0.0005  # of any step: encoders tick
+    floor_m: float = 0.0005  # of any step: encoder resolution
     floor_rad: float = 0.0005
 
     def __post_init__(self) -> None:
@@ -117,7 +117,7 @@ class Wheels:
 class Gyro:
     """A rate gyro's errors, as standard deviations."""
 
-    bias_radps: float = 0.02  # before it is learnt
+    bias_radps: float = 0.02  # before its calibration
     noise_rad: float = 3e-4  # of the turn between two observations, at least
 
 

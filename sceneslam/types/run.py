@@ -1,4 +1,4 @@
-"""What a run leaves behind, in memory: the input of evaluation, figures and report."""
+"""The results of a run in memory: the input of evaluation, figures and report."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Event = Mapping[str, Any]  # one line of events.jsonl: `event` (kind), `stamp_ns
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionStart:
-    """Where a session begins in the trajectory."""
+    """The first pose of a session in the trajectory."""
 
     row: int  # of the trajectory
     session: int
@@ -42,7 +42,7 @@ class Session:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Moment:
-    """What the camera saw when the scene or the module changed."""
+    """The camera image at a change of scene or module."""
 
     stamp_ns: int
     events: Sequence[Event]  # the changes; empty: the first image
@@ -51,7 +51,7 @@ class Moment:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Timings:
-    """What things cost by the wall clock; not part of the deterministic output."""
+    """Wall-clock times; not part of the deterministic output."""
 
     detector_us: NDArray[np.float64]  # per observation
     bus_us: NDArray[np.float64]  # per observation, all but detector and module
@@ -76,6 +76,6 @@ class RunResult:
     events: Sequence[Event]
     timings: Timings
     missing: Mapping[int, str] = field(default_factory=dict)  # stamp -> what the module lacked
-    dropped: int = 0  # observations that live mode did not take ...
-    dropped_images: int = 0  # ... and those of them that held an image
-    moments: Sequence[Moment] = ()  # by rising stamp
+    dropped: int = 0  # observations that live mode skipped
+    dropped_images: int = 0  # those of them with an image
+    moments: Sequence[Moment] = ()  # ordered by stamp

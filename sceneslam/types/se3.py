@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 Transform = NDArray[np.float64]  # (4, 4), rigid
 Vector = NDArray[np.float64]
 
-_SMALLEST_RAD = 1e-4  # below, the factors of the series stay what they are, to 1e-9
+_SMALLEST_RAD = 1e-4  # below, the series' factors are constant to 1e-9
 
 
 def identity() -> Transform:
-    """Return the transform that moves nothing."""
+    """Return the identity transform (4, 4)."""
     return np.eye(4)
 
 
