@@ -42,12 +42,9 @@ def revise(
     """Return the poses after all revisions; `pose_sessions` (N,) is -1 before the first session.
 
     Every pose is corrected as the last revised pose of its session before it, so that bridged
-    motions
-    do not change. A session starts where the revised session before it ended (Eq. 1), unless its
-    module
-    corrected its start, too, because it recognized the place from an earlier session. Then the
-    drift in
-    between is corrected in proportion to the distance travelled.
+    motions do not change. A session starts where the revised session before it ended (Eq. 1),
+    unless its module corrected its start, too, because it recognized the place from an earlier
+    session. Then the drift in between is corrected in proportion to the distance travelled.
     """
     moved = np.array(T_map_base)
     placed: list[Transform] = []

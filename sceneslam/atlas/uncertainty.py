@@ -62,11 +62,9 @@ def propagate(steps: Sequence[Step], bridge: Drift) -> NDArray[np.float64]:
     """Return the covariance (N, 6, 6) of every pose; `map` begins at the first pose.
 
     The covariance of a module's pose is the sum of three parts, assumed independent: that of the
-    pose
-    at which it was placed, propagated along its motion (adjoint); the drift of its map since; and
-    its
-    own covariance, if it reports one. A bridged pose has the covariance of the pose before it, plus
-    the drift of the bridge.
+    pose at which it was placed, propagated along its motion (adjoint); the drift of its map since;
+    and its own covariance, if it reports one. A bridged pose has the covariance of the pose before
+    it, plus the drift of the bridge.
     """
     if not steps:
         return np.zeros((0, 6, 6))

@@ -40,10 +40,9 @@ class BayesFilter:
     """Confirms another scene once its posterior probability is high enough.
 
     A vote with likelihoods is weighed by them; a vote without counts as certain of its scene. In
-    both
-    cases a share `error_ratio` of the votes is assumed to be noise. Votes within one
-    `correlation_s`
-    share the weight of one measurement, so that a higher frame rate does not add certainty.
+    both cases a share `error_ratio` of the votes is assumed to be noise. Votes within one
+    `correlation_s` share the weight of one measurement, so that a higher frame rate does not add
+    certainty.
     """
 
     def __init__(self, scenes: Sequence[str], settings: BayesSettings) -> None:

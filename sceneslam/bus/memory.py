@@ -49,9 +49,8 @@ class Memory:
     """The moments of the last while, bounded in time and in bytes.
 
     When the bytes do not suffice, older moments lose their sensor data, so that the spacing of
-    those
-    left grows with their age: a module that catches up gets fewer of the older images, and every
-    moment still gets its pose.
+    those left grows with their age: a module that catches up gets fewer of the older images, and
+    every moment still gets its pose.
     """
 
     def __init__(self, *, span_s: float, limit_mb: float, keeps_sensors: bool) -> None:

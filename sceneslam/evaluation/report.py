@@ -63,8 +63,7 @@ def write_report(
     """Write `figures/` (PNG and SVG) and `report.html` into the run's folder; return its path.
 
     `threshold` is drawn with the detector's values. `faults` are sentences about the run; sentences
-    on
-    figures that could not be drawn are added to it.
+    on figures that could not be drawn are added to it.
     """
     named = renamed(result, module_names(config.get("slam") or {}))
     figures = write_figures(

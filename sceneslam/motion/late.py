@@ -15,8 +15,7 @@ class Pipeline:
     """Matches answers with observations; odometry extends the newest pose until the next one.
 
     Without odometry the pose is extended at constant velocity. In both cases it is DEGRADED, or
-    LOST
-    when the newest answer is older than `late_max_s`.
+    LOST when the newest answer is older than `late_max_s`.
     """
 
     def __init__(self, late_max_s: float) -> None:

@@ -25,8 +25,7 @@ class TurnErrors:
 
     It compares a measured motion with wheels or gyro, or the gyro with the wheels (while the wheels
     stand still, the gyro measures its bias). About the horizontal axes wheels measure nothing
-    unless
-    they stand still.
+    unless they stand still.
     """
 
     gyro_bias_radps: float  # its standard deviation

@@ -32,10 +32,8 @@ class Keyframes:
 
     A submap is `submap_keyframes` consecutive keyframes. Scans are matched with the latest two
     submaps, of which the last is being built, as in Cartographer (Hess et al., "Real-time loop
-    closure
-    in 2D LIDAR SLAM", ICRA 2016). The surfaces of older keyframes are computed from the scan on
-    demand:
-    a scan has a tenth of their size.
+    closure in 2D LIDAR SLAM", ICRA 2016). The surfaces of older keyframes are computed from the
+    scan on demand: a scan has a tenth of their size.
     """
 
     reader: SurfaceReader

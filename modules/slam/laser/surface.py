@@ -66,8 +66,7 @@ class SurfaceReader:
     """Reads the scans of one laser.
 
     A range's standard deviation is noise_m + noise_per_m * range^2; noise_per_m is 0 for a laser,
-    and
-    describes a triangulating depth camera.
+    and describes a triangulating depth camera.
     """
 
     T_base_laser: se3.Transform

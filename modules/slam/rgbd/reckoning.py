@@ -45,8 +45,7 @@ def led(fix: Fix, prediction: Prediction, scale_variance: Matrix) -> Fix:
     """Return a pose that was found without depth, fused with odometry.
 
     `scale_variance` (3, 3) [m^2], in base, is the pose's variance by the map's scale error. If
-    image
-    and odometry contradict each other, the image's pose is returned, as wheels may slip.
+    image and odometry contradict each other, the image's pose is returned, as wheels may slip.
     """
     found = fix.estimate
     measured = _CORRELATED * found.covariance

@@ -48,8 +48,7 @@ def renew(parts: Parts, seen: Mapping[int, Seen]) -> dict[int, Transform]:
     """Insert a keyframe for each view in this order; return their new poses by the same ids.
 
     The first keeps its pose; the others are localized relative to those before them. If that fails,
-    the
-    motion from the last one in the old map is used.
+    the motion from the last one in the old map is used.
     """
     T_new_old, held_ids, poses = se3.identity(), np.zeros(0, np.int64), dict[int, Transform]()
     for keyframe_id, old in seen.items():

@@ -22,8 +22,8 @@ class SideProcess(Generic[Task, Result]):
     """Does tasks one after the other with an object that is built, and kept, in the process.
 
     It does not use multiprocessing, which runs the caller's main module again. The process ends
-    with
-    this object and with its parent, in whatever way that ends, because its input is closed then.
+    with this object and with its parent, in whatever way that ends, because its input is closed
+    then.
     """
 
     def __init__(self, build: Callable[..., Callable[[Task], Result]], *arguments: object) -> None:

@@ -66,8 +66,7 @@ def solve(
     """Return the poses (N, 3) [m, m, rad] that best fit the motions and the accepted loops.
 
     `fixed` nodes stay; `loose` has a weak prior, so that only a loop to a fixed node moves it.
-    Every
-    node must be connected to one of these. The result is deterministic.
+    Every node must be connected to one of these. The result is deterministic.
     """
     import gtsam
 
