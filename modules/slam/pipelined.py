@@ -17,7 +17,7 @@ class Pipelined:
     """Fulfils `SlamModule` by a `PipelinedSlam`.
 
     Until the pose of an observation comes, odometry carries the newest one on (constant velocity
-    where there is none), as DEGRADED; after `late_max_s` it is LOST.
+    without odometry), as DEGRADED; after `late_max_s` it is LOST.
     """
 
     def __init__(self, system: PipelinedSlam, late_max_s: float) -> None:

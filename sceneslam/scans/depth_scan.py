@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.scans.band import checked_band
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import LaserScan
@@ -73,14 +74,9 @@ class DepthScanner:
         floor.
         """
         height_m = float(camera.T_base_cam[2, 3])
-        self.band_m = (
-            height_m - 0.15 if height_min_m is None else height_min_m,
-            height_m + 0.15 if height_max_m is None else height_max_m,
+        self.band_m = checked_band(
+            height_m, height_min_m=height_min_m, height_max_m=height_max_m, beams=beams
         )
-        if self.band_m[0] >= self.band_m[1]:
-            raise ConfigError("height_max_m", self.band_m[1], f"above {self.band_m[0]:g} m")
-        if beams < 2:
-            raise ConfigError("beams", beams, "2 or more")
         if stride_px < 1:
             raise ConfigError("stride_px", stride_px, "1 or more")
         self.T_base_laser = scan_frame(camera)

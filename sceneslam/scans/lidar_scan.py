@@ -10,8 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.scans.band import checked_band
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.errors import InputError
 from sceneslam.types.observation import LaserScan
 from sceneslam.types.rig import Lidar
 
@@ -34,14 +35,9 @@ class LidarScanner:
         """
         T_base_lidar = lidar.T_base_lidar
         height_m = float(T_base_lidar[2, 3])
-        self.band_m = (
-            height_m - 0.15 if height_min_m is None else height_min_m,
-            height_m + 0.15 if height_max_m is None else height_max_m,
+        self.band_m = checked_band(
+            height_m, height_min_m=height_min_m, height_max_m=height_max_m, beams=beams
         )
-        if self.band_m[0] >= self.band_m[1]:
-            raise ConfigError("height_max_m", self.band_m[1], f"above {self.band_m[0]:g} m")
-        if beams < 2:
-            raise ConfigError("beams", beams, "2 or more")
         x_m, y_m = T_base_lidar[:2, 3]
         self.T_base_laser = se3.from_xy_yaw(x_m, y_m, se3.yaw_rad(T_base_lidar))
         self._T_laser_lidar = se3.inverse(self.T_base_laser) @ T_base_lidar

@@ -70,7 +70,7 @@ def _loops_of(graph: PoseGraphLayer) -> list[OwnLoop]:
 
 
 def _recognized(sessions: Sequence[OpenSession], index: int) -> OpenSession | None:
-    """Return the earlier session in which the module recognized this session's start."""
+    """Return the earlier session in which the module recognized where this one starts."""
     session, revised = sessions[index], sessions[index].revised
     before = [one for one in sessions[:index] if one.module == session.module and one.stamps_ns]
     if not before or not len(revised) or int(revised.stamps_ns[0]) not in session.stamps_ns:

@@ -94,7 +94,7 @@ class Device:
             part.start(_taker(take))
 
     def depth_m(self, depth: Frame, image: Frame) -> NDArray[np.float32]:
-        """Return the depth (H, W) [m] of an image's pixels, 0 where there is none."""
+        """Return the depth (H, W) [m] of an image's pixels, 0 where nothing was measured."""
         units = self._alignment.registered(depth.frame, image.frame)
         return units.astype(np.float32) * np.float32(self._depth_scale_m)
 
@@ -123,7 +123,7 @@ def _taker(take: Take) -> Callable[[Any], None]:
 
 
 def _profile(part: Any, sensor: Sensor, wanted: Wanted) -> Any:
-    """Return the stream that is asked for, of motion the fastest; None where there is none."""
+    """Return the wanted stream, of a motion sensor the fastest; None if the camera lacks it."""
     stream, form = _STREAMS[sensor]
     found = [
         one for one in part.get_stream_profiles()

@@ -65,7 +65,7 @@ class OpenCamera(Protocol):
         ...
 
     def depth_m(self, depth: Frame, image: Frame) -> NDArray[np.float32]:
-        """Return the depth (H, W) [m] of an image's pixels, 0 where there is none."""
+        """Return the depth (H, W) [m] of an image's pixels, 0 where nothing was measured."""
         ...
 
     def stop(self) -> None:

@@ -142,7 +142,7 @@ class RealSense(Measuring):
     def _in_base(
         self, paired: Paired, sensor: Sensor, device: OpenCamera
     ) -> NDArray[np.float64] | None:
-        """Return a motion sensor's samples along base's axes, None where there is none."""
+        """Return a motion sensor's samples (N, 4) along base's axes, None without samples."""
         rows = samples_of(paired, sensor)
         if not len(rows):
             return None
