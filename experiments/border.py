@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from sceneslam.bus.policy import Policy
 from sceneslam.config.build import make_source
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.resolve import resolved
 from sceneslam.detection.decide import confirm
 from sceneslam.interfaces import FeatureDetector
@@ -122,7 +122,7 @@ def build(words: Sequence[str]) -> dict[str, Any]:
 def load(words: Sequence[str]) -> list[Image]:
     """Return a recording's images, small, at about 10 Hz."""
     config = build(words)
-    source = make_source(config, Builder(config))
+    source = make_source(config, ComponentBuilder(config))
     images: list[Image] = []
     next_ns = 0
     for one in source:
@@ -214,7 +214,7 @@ def drives(detector: FeatureDetector, camera: Camera, seeds: Sequence[int]) -> I
 
 def score(config: Mapping[str, Any], all_drives: Sequence[Drive]) -> Score:
     """Return what a configuration is worth over drives."""
-    builder = Builder(config)
+    builder = ComponentBuilder(config)
     detector, policy = builder.make("detector", FeatureDetector), builder.make("policy", Policy)
     false, missed, delays_s = 0, 0, []
     for drive in all_drives:
@@ -254,7 +254,7 @@ def settings() -> Iterator[tuple[str, Sequence[str]]]:
 
 def flip_s(config: Mapping[str, Any]) -> float:
     """Return for how long clear votes for another scene change nothing: longer than a drop-out."""
-    policy = Builder(config).make("policy", Policy)
+    policy = ComponentBuilder(config).make("policy", Policy)
     scenes = ["Bright"] * 600 + ["Dark"] * 100
     cast = [SceneVote(stamp_ns=_stamp_ns(n), scene=scene) for n, scene in enumerate(scenes)]
     seen = confirm(cast, policy, ("Bright", "Dark"))
@@ -302,7 +302,7 @@ def main() -> None:
     for recording, words in RECORDINGS.items():
         images = load([word.format(data=folder) for word in words])
         for (exposure, gain_max), kind in product(EXPOSURES.items(), KINDS):
-            detector = Builder(build(KINDS[kind])).make("detector", FeatureDetector)
+            detector = ComponentBuilder(build(KINDS[kind])).make("detector", FeatureDetector)
             camera = Camera(images, gain_max)
             name = f"{recording}, exposure {exposure}"
             if kind == "learned":

@@ -16,7 +16,7 @@ from hydra import compose, initialize_config_module
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.scene_filter import ConfirmedScene
 from sceneslam.config.build import make_source
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.resolve import resolved
 from sceneslam.detection.decide import confirm
 from sceneslam.interfaces import FeatureDetector, Source
@@ -72,7 +72,7 @@ class Kept:
 class Seen:
     """What the scenario `failing_sensors` makes of a source: votes and confirmed scenes."""
 
-    def __init__(self, source: Source, builder: Builder) -> None:
+    def __init__(self, source: Source, builder: ComponentBuilder) -> None:
         detector = builder.make("detector", FeatureDetector)
         detector.activate(source.rig)
         self.votes = [detector.get_scene(observation) for observation in source]
@@ -90,16 +90,16 @@ class Seen:
         return sum(one.scene in SCENES and one.scene not in expected for one in named)
 
 
-def build(words: Sequence[str]) -> tuple[Source, Builder]:
+def build(words: Sequence[str]) -> tuple[Source, ComponentBuilder]:
     """Return a source of the scenario, and what builds its detector and policy."""
     with initialize_config_module("sceneslam.conf", version_base="1.3"):
         overrides = ["+scenario=failing_sensors", "run.progress=false", "effects=none", *words]
         config: dict[str, Any] = resolved(compose("config", overrides=overrides))
-    builder = Builder(config)
+    builder = ComponentBuilder(config)
     return make_source(config, builder), builder
 
 
-def failing(failure: str, drives: Mapping[int, tuple[Source, Builder]]) -> str:
+def failing(failure: str, drives: Mapping[int, tuple[Source, ComponentBuilder]]) -> str:
     """Return a line: one failure in the drives of all seeds."""
     delays_s, others = [], 0
     for (seed, (drive, builder)), span_s in product(drives.items(), SPANS_S):
@@ -128,7 +128,7 @@ def calm(name: str, runs: Sequence[Sequence[str]]) -> str:
 
 def main() -> None:
     """Print two tables."""
-    drives: dict[int, tuple[Source, Builder]] = {}
+    drives: dict[int, tuple[Source, ComponentBuilder]] = {}
     for seed in SEEDS:
         source, builder = build([*CAMERA, f"seed={seed}"])
         kept = Kept(source)

@@ -15,7 +15,7 @@ from time import process_time_ns
 import numpy as np
 
 from sceneslam.bus.events import EventLog
-from sceneslam.storage.journal import Head, Journal
+from sceneslam.storage.journal import Journal, JournalHeader
 from sceneslam.storage.syncing import Syncing
 
 _OBSERVATIONS = 20_000
@@ -23,7 +23,7 @@ _OBSERVATIONS = 20_000
 
 def main(folder: Path) -> None:
     """Print the table."""
-    head = Head(title="cost", value_label="", has_odometry=False, began_in="")
+    head = JournalHeader(title="cost", value_label="", has_odometry=False, began_in="")
     journal = Journal(folder / "journal.bin", head)
     log = EventLog(folder / "events.jsonl")
     syncing = Syncing(journal.sync, log.sync)

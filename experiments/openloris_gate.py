@@ -19,7 +19,7 @@ from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from numpy.typing import NDArray
 
-from sceneslam.bus.gate import Gate, GateSettings, Judgement, Verdict, with_heading
+from sceneslam.bus.gate import Gate, GateSettings, GateVerdict, Judgement, with_heading
 from sceneslam.config.resolve import resolved
 from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.evaluation.correctness import CorrectLimits, correct_rate
@@ -34,8 +34,8 @@ from sceneslam.types.trajectory import Trajectory
 RULES = ("never trusted", "always trusted", "both as one", "gate")
 FACTORS = (0.5, 1.0, 2.0)  # of the bounds
 DRIFTS = (0.0, 1.0)  # [deg/m] added to the odometry
-TRUSTED = Judgement(distance=Verdict.UNCHECKED, turn=Verdict.UNCHECKED)
-REFUSED = Judgement(distance=Verdict.DISAGREE, turn=Verdict.DISAGREE)
+TRUSTED = Judgement(distance=GateVerdict.UNCHECKED, turn=GateVerdict.UNCHECKED)
+REFUSED = Judgement(distance=GateVerdict.DISAGREE, turn=GateVerdict.DISAGREE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -134,7 +134,7 @@ def _drive(
         T_prev_curr = se3.inverse(wheels[index - 1]) @ wheels[index]
         if judgement.is_trusted and module is not None:
             T_prev_curr, trusted = module, trusted + 1
-        elif rule == "gate" and judgement.turn is Verdict.AGREE and module is not None:
+        elif rule == "gate" and judgement.turn is GateVerdict.AGREE and module is not None:
             T_prev_curr = with_heading(T_prev_curr, module[:3, :3])
         T_map_base.append(T_map_base[-1] @ T_prev_curr)
     driven = Trajectory(stamps_ns=odometry.stamps_ns, T_world_base=np.stack(T_map_base))

@@ -24,7 +24,7 @@ from hydra import compose, initialize_config_module
 from numpy.typing import NDArray
 from omegaconf import OmegaConf
 
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.evaluation.alignment import align
 from sceneslam.evaluation.association import interpolated
@@ -56,7 +56,7 @@ def build(
     words = ["+scenario=single", f"slam@slam.only={module_name}", *overrides]
     with initialize_config_module("sceneslam.conf", version_base="1.3"):
         config = OmegaConf.to_container(compose("config", overrides=words), resolve=True)
-    builder = Builder(cast(dict[str, Any], config))
+    builder = ComponentBuilder(cast(dict[str, Any], config))
     source = Ordered(builder.make("source", Source))
     module = cast(RgbdSlam, builder.make("slam.only", SlamModule))
     module.activate(source.rig)

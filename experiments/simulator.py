@@ -27,12 +27,12 @@ from omegaconf import OmegaConf
 
 from sceneslam.sources.simulator import settings, stories
 from sceneslam.sources.simulator.optics.exposure import follow
-from sceneslam.sources.simulator.places.floor import FloorPlan
+from sceneslam.sources.simulator.places.floor import BuildingLayout
 from sceneslam.sources.simulator.robot import motion
 from sceneslam.sources.simulator.shot import (
-    Frame,
     Photographer,
     Shot,
+    SimulatedFrame,
     build_place,
     floor_plan,
     light_place,
@@ -66,7 +66,7 @@ class Scenery:
     """A story made ready to be rendered."""
 
     shot: Shot
-    plan: FloorPlan
+    plan: BuildingLayout
     length: int  # frames
 
     def zone(self, time_s: float) -> str:
@@ -118,7 +118,7 @@ def _sheet(ready: Scenery) -> NDArray[np.uint8]:
     return np.vstack([np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)])
 
 
-def _tile(shot: Shot, index: int, frame: Frame, zone: str) -> NDArray[np.uint8]:
+def _tile(shot: Shot, index: int, frame: SimulatedFrame, zone: str) -> NDArray[np.uint8]:
     image = cv2.resize(frame.image_bgr, _TILE_WH, interpolation=cv2.INTER_AREA)
     depth = cv2.resize(frame.depth_mm, _TILE_WH, interpolation=cv2.INTER_NEAREST)
     scale = 255.0 / (1000.0 * shot.camera.depth_range_m[1])
@@ -177,7 +177,7 @@ def _print_cost(overrides: Sequence[str]) -> None:
     print(f"its file                   {ready.length * size_bytes / 1e9:.2f} GB")
 
 
-def _encoded_bytes(frame: Frame) -> int:
+def _encoded_bytes(frame: SimulatedFrame) -> int:
     jpeg = cv2.imencode(".jpg", frame.image_bgr, [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
     return len(jpeg) + len(cv2.imencode(".png", frame.depth_mm)[1])
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from sceneslam.evaluation.association import interpolated
-from sceneslam.sources.simulator.places.floor import FloorPlan
+from sceneslam.sources.simulator.places.floor import BuildingLayout
 from sceneslam.sources.simulator.shot import floor_plan
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
@@ -72,7 +72,7 @@ def _order(run: Path) -> int | None:
     return None if order is None else int(order)
 
 
-def _zones(truth: Trajectory, plan: FloorPlan) -> Any:
+def _zones(truth: Trajectory, plan: BuildingLayout) -> Any:
     at = truth.T_world_base[:, :2, 3].tolist()
     held = [next((zone.name for zone in plan.zones if zone.holds(*xy)), "") for xy in at]
     return np.array(held)

@@ -12,12 +12,12 @@ from typing import Any
 
 import cv2
 
-from sceneslam.config.build import Parts, build
+from sceneslam.config.build import RunParts, build
 from sceneslam.config.provenance import save_config
 from sceneslam.evaluation.metrics import Metrics
 from sceneslam.evaluation.summary import summary_lines
 from sceneslam.interrupts import termination_as_interrupt, uninterrupted
-from sceneslam.loop import Loop
+from sceneslam.loop import RunLoop
 from sceneslam.results import Results
 from sceneslam.storage.folder import RunFolder, give_back
 from sceneslam.types.errors import ConfigError, SceneSlamError, told
@@ -65,7 +65,7 @@ def run(
             cv2.setNumThreads(parts.run.threads)
             try:
                 results = _begin(config, parts, folder, title)
-                loop = Loop(parts, results, say)
+                loop = RunLoop(parts, results, say)
             except SceneSlamError:
                 give_back(folder)
                 raise
@@ -75,7 +75,7 @@ def run(
                     return _end(loop, results, reference)
 
 
-def _begin(config: Mapping[str, Any], parts: Parts, folder: Path, title: str) -> Results:
+def _begin(config: Mapping[str, Any], parts: RunParts, folder: Path, title: str) -> Results:
     """Write the configuration, which a run that is cut off can be recovered with."""
     try:
         versions = save_config(config, folder / "config.yaml")
@@ -94,7 +94,7 @@ def _begin(config: Mapping[str, Any], parts: Parts, folder: Path, title: str) ->
     )
 
 
-def _end(loop: Loop, results: Results, reference: Trajectory | None) -> Finished:
+def _end(loop: RunLoop, results: Results, reference: Trajectory | None) -> Finished:
     """Write the results, the trajectories before anything else."""
     loop.finish()
     faults = len(results.faults)

@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from sceneslam.bus.decision_log import decide_again
 from sceneslam.bus.policy import Policy
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.types.errors import InputError, SceneSlamError
 from sceneslam.types.run import Event
 
@@ -65,7 +65,7 @@ def _read_policy(folder: Path) -> Policy:
         config: Any = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
     except (OmegaConfBaseException, ValueError) as error:
         raise InputError(f"not a configuration ({error}): {path}") from error
-    return Builder(config).make("policy", Policy)
+    return ComponentBuilder(config).make("policy", Policy)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from importlib.resources import files
 from typing import Any
 
 from sceneslam.config.build import make_source
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.interfaces import Live, SlamModule
 from sceneslam.script import composed
 from sceneslam.sources.survey.preflight import Preflight, preflight
@@ -37,7 +37,7 @@ def examine(words: Sequence[str]) -> list[str]:
         raise ConfigError("doctor", " ".join(words) or "nothing", "source=NAME, as source=ros2")
     words = [word for word in words if word.startswith(("source", "effects"))]
     config: dict[str, Any] = composed(tuple(words), None)
-    source = make_source(config, Builder(config))
+    source = make_source(config, ComponentBuilder(config))
     feed = source.live if isinstance(source, Live) else None
     try:
         rig = source.rig
@@ -88,7 +88,7 @@ def _modules(words: Sequence[str], rig: Rig) -> Iterator[str]:
             config: dict[str, Any] = composed(
                 ("+scenario=single", *words, f"slam@{_KEY}={name}"), None
             )
-            requires = Builder(config).make(_KEY, SlamModule).requires
+            requires = ComponentBuilder(config).make(_KEY, SlamModule).requires
         except (ConfigError, InputError) as error:
             _log.debug("slam=%s: %s", name, told(error))
             yield f"{name:12} not tried: {_first_line(error)}"

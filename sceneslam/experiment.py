@@ -19,7 +19,7 @@ from tqdm import tqdm
 from sceneslam.app import run
 from sceneslam.config.build import make_source
 from sceneslam.config.check import check_given, first_line
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.overlay import command_of, comment_of
 from sceneslam.config.provenance import provenance, save_config
 from sceneslam.config.resolve import resolved
@@ -30,7 +30,7 @@ from sceneslam.evaluation.verdict import write_verdict
 from sceneslam.evaluation.verdict_page import Asked, Ran, write_verdict_page
 from sceneslam.interfaces import Experiment
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.experiment import Outcome, Trial, Verdict
+from sceneslam.types.experiment import Trial, TrialResult, Verdict
 from sceneslam.types.files import replacing
 from sceneslam.types.ranges import check_least
 from sceneslam.types.trajectory import Trajectory
@@ -48,7 +48,7 @@ def run_experiment(config: DictConfig, folder: Path) -> Verdict:
     key = str(config.experiment)
     plain = resolved(config)
     check_given(plain.get(key), key)
-    experiment = Builder(plain).make(key, Experiment)
+    experiment = ComponentBuilder(plain).make(key, Experiment)
     folder.mkdir(parents=True, exist_ok=True)
     hydra = HydraConfig.get()
     with tqdm(desc=key, unit="run", leave=False) as bar:
@@ -77,7 +77,7 @@ class _Trials:
         self._bar = bar  # of all runs: some experiments ask for one after the other
         self.done: list[Ran] = []
 
-    def run(self, trials: Iterable[Trial]) -> Iterator[Outcome]:
+    def run(self, trials: Iterable[Trial]) -> Iterator[TrialResult]:
         """Yield the outcomes in order.
 
         Before the first is run all are composed, and each input is opened once. With several
@@ -113,11 +113,11 @@ class _Trials:
             plain = [config for _, config in configs]
             yield from pool.map(_run_unless_finished, plain, folders, names)
 
-    def _outcome(self, trial: Trial, folder: Path, has_poses: bool) -> Outcome:
+    def _outcome(self, trial: Trial, folder: Path, has_poses: bool) -> TrialResult:
         metrics = json.loads((folder / "metrics.json").read_text())
         faults = json.loads((folder / _END).read_text())["faults"]
         self.done.append(Ran(trial=trial, folder=folder, metrics=metrics, faults=faults))
-        return Outcome(
+        return TrialResult(
             trial=trial,
             folder=folder,
             metrics=metrics,
@@ -166,13 +166,13 @@ def _run_unless_finished(config: dict[str, Any], folder: Path, name: str) -> Non
 
 def _prepare(config: dict[str, Any]) -> None:
     """Read a first observation: the simulator renders its whole story for it, and keeps it."""
-    next(iter(make_source(config, Builder(config))), None)
+    next(iter(make_source(config, ComponentBuilder(config))), None)
 
 
 def _try_sources(configs: Iterable[Mapping[str, Any]]) -> None:
     """Raise the error of any source that cannot be opened."""
     for config in {_input_of(config): config for config in configs}.values():
-        make_source(config, Builder(config))
+        make_source(config, ComponentBuilder(config))
 
 
 def _input_of(config: Mapping[str, Any]) -> str:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from sceneslam.bus.events import EventLog
-from sceneslam.config.build import Parts
+from sceneslam.config.build import RunParts
 from sceneslam.results import Results
-from sceneslam.storage.journal import JOURNAL, Head, Journal
+from sceneslam.storage.journal import JOURNAL, Journal, JournalHeader
 from sceneslam.storage.reserve import Reserve
 from sceneslam.storage.syncing import Syncing
 from sceneslam.types.errors import ConfigError, told
@@ -17,9 +17,9 @@ from sceneslam.types.rig import Sensor
 class Keeping:
     """What `python -m sceneslam.recover` makes the results of, should the run be cut off."""
 
-    def __init__(self, parts: Parts, results: Results) -> None:
+    def __init__(self, parts: RunParts, results: Results) -> None:
         folder, self._faults = results.folder, results.faults
-        head = Head(
+        head = JournalHeader(
             title=results.title,
             value_label=results.value_label,
             has_odometry=Sensor.ODOMETRY in parts.rig.sensors,

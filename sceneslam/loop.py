@@ -18,7 +18,7 @@ from sceneslam.atlas.save import save_map
 from sceneslam.bus.beside import executor
 from sceneslam.bus.bus import Bus
 from sceneslam.bus.handover_log import log_uncertainty
-from sceneslam.config.build import Parts
+from sceneslam.config.build import RunParts
 from sceneslam.config.settings import LIVE
 from sceneslam.engine.live import LiveTally, run_live
 from sceneslam.engine.steering import Operator, SteeredDetector
@@ -41,11 +41,11 @@ _LINE_S = 10.0  # the same where it is written into a file
 _log = logging.getLogger(__name__)
 
 
-class Loop:
+class RunLoop:
     """Feeds the bus and the sinks; `faults` says what went wrong on the way."""
 
     def __init__(
-        self, parts: Parts, results: Results, say: Callable[[str], None] | None = None
+        self, parts: RunParts, results: Results, say: Callable[[str], None] | None = None
     ) -> None:
         self._say = say  # what a user reads before the run
         self._warnings: tuple[str, ...] = ()

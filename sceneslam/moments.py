@@ -9,7 +9,7 @@ import numpy as np
 
 from sceneslam.evaluation.moments import change_of
 from sceneslam.types.observation import Observation
-from sceneslam.types.run import Event, Moment
+from sceneslam.types.run import Event, KeyMoment
 
 _WIDTH_PX = 240
 _MOST = 24  # images that are kept
@@ -19,7 +19,7 @@ class Moments:
     """The first image, and one of every observation at which the scene or the module changed."""
 
     def __init__(self) -> None:
-        self.kept: list[Moment] = []
+        self.kept: list[KeyMoment] = []
 
     def look(self, observation: Observation, events: Sequence[Event]) -> None:
         """Keep the observation's image where one of its events is a change."""
@@ -32,7 +32,7 @@ class Moments:
             size = (_WIDTH_PX, max(1, round(height * _WIDTH_PX / width)))
             small = cv2.resize(image_bgr, size, interpolation=cv2.INTER_AREA)
             self.kept.append(
-                Moment(
+                KeyMoment(
                     stamp_ns=observation.stamp_ns,
                     events=changes,
                     image_bgr=np.asarray(small, np.uint8),

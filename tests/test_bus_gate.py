@@ -7,7 +7,7 @@ import pytest
 from driving import GATE, drive, events, policy
 from fakes import PERIOD_NS, RIG, TWIST, ExactModule, observation, true_pose
 
-from sceneslam.bus.decision import Action, Health, Situation, Trial, decide
+from sceneslam.bus.decision import Action, Health, Situation, StandbyTrial, decide
 from sceneslam.types import se3
 from sceneslam.types.rig import Sensor
 from sceneslam.types.run import BRIDGED
@@ -134,7 +134,7 @@ def test_two_that_the_wheels_contradict_do_not_take_turns():
             served_choices=("bright", "dark"),
             tried=frozenset({"bright"}),
             rounds=0,
-            trial=Trial.NONE,
+            trial=StandbyTrial.NONE,
             may_return=True,
             **more,
         )

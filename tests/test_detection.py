@@ -16,7 +16,7 @@ from hydra import compose, initialize_config_module
 
 from sceneslam.app import run
 from sceneslam.config.resolve import resolved
-from sceneslam.detection.features import Features
+from sceneslam.detection.features import RecordingFeatures
 from sceneslam.detection.grid import Axis, try_all
 from sceneslam.detection.run import detect
 from sceneslam.types.errors import ConfigError
@@ -124,14 +124,14 @@ def test_thousand_settings_take_seconds(config):
 
 
 def test_features_are_kept_to_the_bit(tmp_path):
-    features = Features(
+    features = RecordingFeatures(
         stamps_ns=np.array([1, 2**60 + 1]),
         values=np.array([[0.1], [np.pi]]),
         is_there=np.array([False, True]),
         scenes=(SceneChange(stamp_ns=2**60 + 1, scene="Bright"),),
     )
     features.write(tmp_path / "features.npz")
-    read = Features.read(tmp_path / "features.npz")
+    read = RecordingFeatures.read(tmp_path / "features.npz")
     for name in ("stamps_ns", "values", "is_there"):
         assert np.array_equal(getattr(read, name), getattr(features, name))
     assert read.scenes == features.scenes

@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_module
 from networks import SIZE_WH, footage, write_network
 
 from sceneslam.config.check import check_keys
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.resolve import resolved
 from sceneslam.interfaces import FeatureDetector
 from sceneslam.types.errors import ConfigError, InputError
@@ -33,7 +33,7 @@ def make(network):
         with initialize_config_module("sceneslam.conf", version_base="1.3"):
             config = resolved(compose("config", overrides=[*given, *words]))
         check_keys({**config, "source": {}})
-        detector = Builder(config).make("detector", FeatureDetector)
+        detector = ComponentBuilder(config).make("detector", FeatureDetector)
         detector.activate(RIG)
         return detector
 

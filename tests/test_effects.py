@@ -16,7 +16,7 @@ from sceneslam.interfaces import Source
 from sceneslam.sources.dim_sensor import DimSensor
 from sceneslam.sources.effects import LightsOut
 from sceneslam.sources.light_schedule import LightSchedule
-from sceneslam.sources.spanned import Span
+from sceneslam.sources.spanned import TimeSpan
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
 from sceneslam.types.truth import GroundTruth, SceneChange
@@ -32,8 +32,10 @@ class Film(Listed):
     scenes: tuple[SceneChange, ...] = ()
 
     @property
-    def span(self) -> Span:
-        return Span(start_ns=self.observations[0].stamp_ns, end_ns=self.observations[-1].stamp_ns)
+    def span(self) -> TimeSpan:
+        return TimeSpan(
+            start_ns=self.observations[0].stamp_ns, end_ns=self.observations[-1].stamp_ns
+        )
 
     def ground_truth(self) -> GroundTruth:
         return GroundTruth(scenes=self.scenes)

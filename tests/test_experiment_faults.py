@@ -14,7 +14,7 @@ from sceneslam.experiments.faults.survival import survival
 from sceneslam.experiments.faults.torn import torn_files
 from sceneslam.experiments.faults.witness import TOLD
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.experiment import Outcome
+from sceneslam.types.experiment import TrialResult
 
 FAULTS = ["raise", "kill", "nan", "hang"]
 SETTINGS = {
@@ -33,7 +33,7 @@ SETTINGS = {
 def faulty(trial):
     """Return the configuration of a trial: both modules are struck."""
     module = {
-        "_target_": "sceneslam.modules.slam.faulty.Faulty",
+        "_target_": "sceneslam.modules.slam.faulty.FaultyModule",
         "module": {"_target_": "fakes.ExactModule"},
         "faults": FAULTS,
         "rate_ratio": 0.1,
@@ -61,7 +61,7 @@ def found(tmp_path_factory):
     def run_trials(trials):
         for trial in trials:
             done = run(faulty(trial), folder / "runs" / trial.name)
-            yield Outcome(
+            yield TrialResult(
                 trial=trial,
                 folder=folder / "runs" / trial.name,
                 metrics=done.metrics,

@@ -11,8 +11,8 @@ import pytest
 from fakes import RIG, ExactModule, FakeSource, observation
 
 from sceneslam.interfaces import SlamModule, Source
-from sceneslam.modules.slam.faulty import Faulty as FaultyModule
-from sceneslam.sources.faulty import Faulty as FaultySource
+from sceneslam.modules.slam.faulty import FaultyModule
+from sceneslam.sources.faulty import FaultySource
 from sceneslam.sources.ordered import Ordered
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.fault_plan import FaultPlan

@@ -8,12 +8,12 @@ from driving import GATE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneslam.bus.gate import Gate, GateSettings, Verdict, with_heading
+from sceneslam.bus.gate import Gate, GateSettings, GateVerdict, with_heading
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.rig import Wheels
 
-AGREE, DISAGREE = Verdict.AGREE, Verdict.DISAGREE
+AGREE, DISAGREE = GateVerdict.AGREE, GateVerdict.DISAGREE
 PERIOD_S = 0.1
 
 
@@ -55,7 +55,7 @@ def trusted(judgements):
 def test_a_module_that_moves_like_the_wheels_is_trusted_after_its_probation():
     judgements = judged(arc)
     assert trusted(judgements) == [False] * 10 + [True] * 90
-    assert judgements[5].distance is Verdict.PROBATION
+    assert judgements[5].distance is GateVerdict.PROBATION
     assert judgements[10].since_ns == 0  # it was right all along
 
 
@@ -131,7 +131,7 @@ def test_a_module_back_from_a_loss_elsewhere_is_not():
 
 def test_without_odometry_nothing_is_held_against_a_module():
     judgement = judged(jumping(30, 1.0), odometry=lambda step: None)[31]
-    assert judgement.distance is Verdict.UNCHECKED and judgement.is_trusted
+    assert judgement.distance is GateVerdict.UNCHECKED and judgement.is_trusted
 
 
 def test_a_corrected_past_is_no_motion():

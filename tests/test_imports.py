@@ -1,4 +1,4 @@
-"""Imports run one way: packages know only what they may, in no circle, and modules no other."""
+"""Imports run one way: packages import only what they may, in no circle; class names are unique."""
 
 from __future__ import annotations
 
@@ -84,6 +84,15 @@ def test_no_slam_module_reaches_into_another():
             parts = name.split(".")
             if parts[:3] == ["sceneslam", "modules", "slam"]:
                 assert parts[3] in {own, *SLAM}, f"{path}: {name}"
+
+
+def test_a_public_class_name_stands_for_one_thing():
+    homes = {}
+    for path in [*sources("sceneslam"), *sources("modules")]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                homes.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
+    assert not {name: paths for name, paths in homes.items() if len(paths) > 1}
 
 
 def test_a_relative_import_is_seen(tmp_path):

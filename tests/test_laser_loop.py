@@ -11,8 +11,8 @@ from test_laser_world import box, drive, loop_path, room, scan_at
 from sceneslam.modules.slam.laser.field import LikelihoodField
 from sceneslam.modules.slam.laser.loop_search import LoopSearch
 from sceneslam.modules.slam.laser.module import LaserSlam
-from sceneslam.modules.slam.laser.pose_graph import Edge, PoseGraph, optimise
-from sceneslam.modules.slam.laser.surface import SurfaceReader
+from sceneslam.modules.slam.laser.pose_graph import ScanEdge, ScanPoseGraph, optimise
+from sceneslam.modules.slam.laser.surface import ScanSurfaceReader
 from sceneslam.types import se3
 from sceneslam.types.planar import between, betweens, compose, composed
 from sceneslam.types.rig import Laser, Rig, Sensor
@@ -148,7 +148,9 @@ def test_places_that_look_alike_close_no_wrong_loop():
 
 
 def test_wide_search_finds_the_pose_and_says_where_it_cannot():
-    reader = SurfaceReader(T_base_laser=np.eye(4), range_max_m=20.0, noise_m=0.02, noise_per_m=0.0)
+    reader = ScanSurfaceReader(
+        T_base_laser=np.eye(4), range_max_m=20.0, noise_m=0.02, noise_per_m=0.0
+    )
     walls = furnished(np.random.default_rng(2))
     seen = [
         reader.read(scan_at(walls, se3.from_xy_yaw(x, 0.0, 0.0), stamp_ns=0)).moved(
@@ -168,7 +170,9 @@ def test_wide_search_finds_the_pose_and_says_where_it_cannot():
 
 
 def test_wide_search_in_a_corridor_is_ambiguous():
-    reader = SurfaceReader(T_base_laser=np.eye(4), range_max_m=20.0, noise_m=0.02, noise_per_m=0.0)
+    reader = ScanSurfaceReader(
+        T_base_laser=np.eye(4), range_max_m=20.0, noise_m=0.02, noise_per_m=0.0
+    )
     walls = np.array([[[-200, -1], [200, -1]], [[-200, 1], [200, 1]]], float)
     scan = reader.read(scan_at(walls, np.eye(4), stamp_ns=0, beams=1440))
     search = LoopSearch(LikelihoodField(scan, 0.05))
@@ -185,7 +189,7 @@ def test_graph_closes_a_ring_and_a_wrong_loop_does_little_harm():
     covariance = np.diag([0.01, 0.01, 0.02]) ** 2
 
     def edge(first, second, motion, is_loop=True):
-        return Edge(
+        return ScanEdge(
             first=first,
             second=second,
             T_first_second=motion,
@@ -197,7 +201,7 @@ def test_graph_closes_a_ring_and_a_wrong_loop_does_little_harm():
     edges += [edge(0, i, between(true[0], true[i])) for i in (12, 16, 18, 19)]
     found = optimise(edges, np.array(poses))
     assert np.abs(found - true).max() < 0.05
-    graph = PoseGraph()
+    graph = ScanPoseGraph()
     for one in edges:
         graph.add(one)
     np.testing.assert_allclose(graph.smooth(np.array(poses)), found, atol=0.02)

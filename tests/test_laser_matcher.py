@@ -4,13 +4,13 @@ import numpy as np
 from test_laser_world import box, room, scan_at
 
 from sceneslam.modules.slam.laser.field import LikelihoodField
-from sceneslam.modules.slam.laser.matcher import Matcher, Prior
-from sceneslam.modules.slam.laser.surface import SurfaceReader
+from sceneslam.modules.slam.laser.matcher import Matcher, MotionPrior
+from sceneslam.modules.slam.laser.surface import ScanSurfaceReader
 from sceneslam.types import se3
 
 
 def test_scans_that_err_together_leave_the_pose_to_the_prediction():
-    reader = SurfaceReader(
+    reader = ScanSurfaceReader(
         T_base_laser=se3.identity(), range_max_m=25.0, noise_m=0.01, noise_per_m=0.0
     )
     seen = reader.read(scan_at(room(), se3.from_xy_yaw(2.0, 1.5, 0.3), stamp_ns=0))
@@ -20,7 +20,7 @@ def test_scans_that_err_together_leave_the_pose_to_the_prediction():
 
     def told_m(shift_m, novelty):
         matcher = Matcher(window_m=0.5, window_rad=0.5, degeneracy_ratio=0.01, shift_m=shift_m)
-        match = matcher.match(seen, field, [Prior.of(predicted, prior)], novelty=novelty)
+        match = matcher.match(seen, field, [MotionPrior.of(predicted, prior)], novelty=novelty)
         return float(match.T_local_base[0])
 
     assert abs(told_m(0.0, 1.0)) < 0.002
@@ -31,7 +31,7 @@ def test_scans_that_err_together_leave_the_pose_to_the_prediction():
 
 def pull_m(seen, new, *, beams):
     """Return by how much new walls (N, 2, 2) draw a robot at rest, whose map has the seen ones."""
-    reader = SurfaceReader(
+    reader = ScanSurfaceReader(
         T_base_laser=se3.identity(), range_max_m=25.0, noise_m=0.01, noise_per_m=0.0
     )
 
@@ -42,7 +42,7 @@ def pull_m(seen, new, *, beams):
     matcher = Matcher(window_m=0.5, window_rad=0.5, degeneracy_ratio=0.01, shift_m=0.0)
     prior = np.diag([0.05**2, 0.05**2, 0.01**2])
     match = matcher.match(
-        points(np.concatenate([seen, new])), field, [Prior.of(np.zeros(3), prior)]
+        points(np.concatenate([seen, new])), field, [MotionPrior.of(np.zeros(3), prior)]
     )
     return np.hypot(*match.T_local_base[:2])
 

@@ -7,7 +7,7 @@ import pytest
 
 from sceneslam.experiments.liars.experiment import LiarsExperiment
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.experiment import Outcome
+from sceneslam.types.experiment import TrialResult
 from sceneslam.types.trajectory import Trajectory
 
 SETTINGS = {
@@ -35,7 +35,7 @@ def found(errors_m, **settings):
             trials.append(trial)
             error_m = errors_m[trial.name]
             metrics = {"ate_rmse_m": error_m, "correct_rate": 1.0}
-            yield Outcome(
+            yield TrialResult(
                 trial=trial,
                 folder=Path(),
                 metrics=metrics,

@@ -13,7 +13,7 @@ from sceneslam.experiments.matrix.oracle import best_of
 from sceneslam.experiments.matrix.promises import Promises
 from sceneslam.experiments.matrix.sweep import Grid, sweep
 from sceneslam.types import se3
-from sceneslam.types.experiment import Outcome, Trial
+from sceneslam.types.experiment import Trial, TrialResult
 from sceneslam.types.trajectory import Trajectory
 
 RATE_HZ = 10
@@ -168,7 +168,7 @@ def outcome_of(folder, greys):
     ]
     folder.mkdir(parents=True)
     (folder / "events.jsonl").write_text("".join(json.dumps(one) + "\n" for one in events))
-    return Outcome(
+    return TrialResult(
         trial=Trial(name="dusk/rewind/0"),
         folder=folder,
         metrics={},

@@ -6,14 +6,14 @@ import numpy as np
 from fakes import PERIOD_NS, observation
 
 from sceneslam.bus.bridge import Bridge
-from sceneslam.bus.memory import Memory, Moment
+from sceneslam.bus.observation_buffer import BufferedObservation, ObservationBuffer
 from sceneslam.bus.sureness import Sureness
 from sceneslam.types import se3
 
 
 def moment(index, *, is_trusted=True, has_pose=True):
     image = np.zeros((100, 100, 3), np.uint8)  # 30 kB
-    return Moment(
+    return BufferedObservation(
         observation=replace(observation(index), image_bgr=image),
         T_map_base=se3.identity() if has_pose else None,
         module="a",
@@ -25,7 +25,7 @@ def moment(index, *, is_trusted=True, has_pose=True):
 
 
 def filled(count, *, limit_mb=100.0, span_s=5.0, keeps_sensors=True, **kinds):
-    memory = Memory(span_s=span_s, limit_mb=limit_mb, keeps_sensors=keeps_sensors)
+    memory = ObservationBuffer(span_s=span_s, limit_mb=limit_mb, keeps_sensors=keeps_sensors)
     for index in range(count):
         memory.add(moment(index, **{name: kind(index) for name, kind in kinds.items()}))
     return memory

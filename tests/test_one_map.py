@@ -12,7 +12,7 @@ from sceneslam.atlas.lasting.saved_map import forget_contradicted
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.places.registration import register
-from sceneslam.atlas.submaps.graph import Edge, Kind, consistent, solve
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind, consistent, solve
 from sceneslam.experiments.one_map.drive import Drive, Odometry, map_of, plan_of
 from sceneslam.maps.__main__ import main
 from sceneslam.testing.floor_plans import (
@@ -107,13 +107,13 @@ def ring(count=12, step_m=1.0):
         drifted.append(planar.compose(drifted[-1], motion + np.array([0.02, 0.0, 0.01])))
     true, drifted = np.array(true), np.array(drifted)
     motions = [
-        edge_of(row, row + 1, planar.between(drifted[row], drifted[row + 1]), 0.03, Kind.MOTION)
+        edge_of(row, row + 1, planar.between(drifted[row], drifted[row + 1]), 0.03, EdgeKind.MOTION)
         for row in range(count)
     ]
     return true, drifted, motions
 
 
-def edge_of(first, second, T_first_second, sigma, kind=Kind.LOOP):
+def edge_of(first, second, T_first_second, sigma, kind=EdgeKind.LOOP):
     covariance = np.diag([sigma, sigma, 0.5 * sigma]) ** 2
     return Edge(
         first=first, second=second, T_first_second=T_first_second, covariance=covariance, kind=kind

@@ -14,14 +14,14 @@ from sceneslam.app import run
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.recover.__main__ import main
 from sceneslam.recover.recover import _Retold
-from sceneslam.storage.journal import Head, Journal, read_journal
+from sceneslam.storage.journal import Journal, JournalHeader, read_journal
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.files import AppendedFile
 from sceneslam.types.trajectory import Trajectory
 
 RESULTS = ("trajectory.tum", "trajectory_online.tum", "metrics.json", "report.html")
-HEAD = Head(title="test", value_label="grey", has_odometry=True, began_in="/")
+HEAD = JournalHeader(title="test", value_label="grey", has_odometry=True, began_in="/")
 
 
 def killed(tmp_path, at, has_report=False, **changes):

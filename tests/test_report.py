@@ -25,7 +25,7 @@ from sceneslam.evaluation.figure_time import draw_timeline
 from sceneslam.evaluation.figures import write_figures
 from sceneslam.evaluation.metrics import evaluate
 from sceneslam.evaluation.report import write_report
-from sceneslam.types.run import Moment, RunResult
+from sceneslam.types.run import KeyMoment, RunResult
 from sceneslam.types.truth import GroundTruth
 
 LIMIT_BYTES = 150_000
@@ -247,7 +247,7 @@ def test_images_of_changes_are_in_the_report_with_what_changed(tmp_path):
     run = switched_run()
     image = np.full((6, 8, 3), 90, np.uint8)
     change = {"event": "scene", "stamp_ns": START_NS, "scene": "Dark"}
-    seen = Moment(stamp_ns=int(run.observed_ns[0]), events=[change], image_bgr=image)
+    seen = KeyMoment(stamp_ns=int(run.observed_ns[0]), events=[change], image_bgr=image)
     html = report(tmp_path, replace(run, moments=(seen,)), true_loop())
     assert "What the camera saw" in html and "0.0 s: scene Dark confirmed" in html
     assert "data:image/jpeg;base64," in html

@@ -12,7 +12,7 @@ from sceneslam.modules.slam.rgbd.features import FeatureExtractor
 from sceneslam.modules.slam.rgbd.keyframes import DepthView, Keyframe, KeyframeStore
 from sceneslam.modules.slam.rgbd.landmarks import LandmarkTable, Looks
 from sceneslam.modules.slam.rgbd.layers import LayerBuilder
-from sceneslam.modules.slam.rgbd.localizer import Localizer
+from sceneslam.modules.slam.rgbd.localizer import VisualLocalizer
 from sceneslam.modules.slam.rgbd.pose_solver import PoseSolver
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
@@ -230,7 +230,9 @@ def test_a_pose_is_told_only_where_a_tenth_of_what_should_show_is_found(shown, i
     descriptors = random_descriptors(rng, 800)
     descriptors[:shown] = mapped.features.descriptors[:shown]
     features = features_at(uv_px, descriptors, depth_m=np.full(800, 2.0))
-    localizer = Localizer(visual_map, PoseSolver(CAMERA, seed=0), radius_px=20.0, min_inliers=20)
+    localizer = VisualLocalizer(
+        visual_map, PoseSolver(CAMERA, seed=0), radius_px=20.0, min_inliers=20
+    )
     ids = visual_map.keyframes.landmarks_of([0])
     fix = localizer.near(features, se3.identity(), ids)
     assert (fix is not None) == is_found

@@ -6,14 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sceneslam.modules.slam.rgbd.frame_log import FrameLog
-from sceneslam.modules.slam.rgbd.pose_graph import Edge, PoseGraph, solve
+from sceneslam.modules.slam.rgbd.pose_graph import KeyframeEdge, PoseGraph, solve
 from sceneslam.types import se3
 
 TWISTS = st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6).map(np.array)
 
 
 def edge(start, end, T_start_end, sigma=0.01, is_loop=False):
-    return Edge(
+    return KeyframeEdge(
         start=start,
         end=end,
         T_start_end=T_start_end,
@@ -50,7 +50,7 @@ def test_covariance_of_a_turned_edge_is_that_of_turned_measurements():
     rng = np.random.default_rng(0)
     sigmas = np.array([0.01, 0.02, 0.03, 0.01, 0.02, 0.005])
     T = se3.exp(np.array([1.0, -2.0, 0.5, 0.4, 0.8, -0.3]))
-    turned = Edge(start=0, end=1, T_start_end=T, covariance=np.diag(sigmas**2)).turned()
+    turned = KeyframeEdge(start=0, end=1, T_start_end=T, covariance=np.diag(sigmas**2)).turned()
     samples = [
         se3.log(T @ se3.inverse(T @ se3.exp(sigmas * rng.standard_normal(6)))) for _ in range(4000)
     ]

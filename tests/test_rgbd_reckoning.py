@@ -10,7 +10,7 @@ from test_rgbd_bundle import CAMERA, exact_bundle, keyframe_at, true_poses
 
 from sceneslam.modules.slam.rgbd.bundle import adjust
 from sceneslam.modules.slam.rgbd.keyframes import Reckoned
-from sceneslam.modules.slam.rgbd.localizer import Fix
+from sceneslam.modules.slam.rgbd.localizer import VisualFix
 from sceneslam.modules.slam.rgbd.pose_solver import PoseEstimate
 from sceneslam.modules.slam.rgbd.reckoning import led, reckoned_ties
 from sceneslam.modules.slam.rgbd.ties import Ties
@@ -82,7 +82,7 @@ def found_at(x_m):
         depth_agreement_ratio=1.0,
         linearised=None,
     )
-    return Fix(
+    return VisualFix(
         estimate=estimate,
         landmark_ids=nothing,
         feature_rows=nothing,

@@ -8,7 +8,7 @@ from test_rgbd import camera_only, drive, make, true_pose
 
 from sceneslam.modules.slam.rgbd.alignment import Alignment
 from sceneslam.modules.slam.rgbd.keyframes import KeyframeStore
-from sceneslam.modules.slam.rgbd.renewal import NEWEST, Seen, seen_by
+from sceneslam.modules.slam.rgbd.renewal import NEWEST, LocatedView, seen_by
 from sceneslam.types import se3
 from sceneslam.types.observation import TrackingStatus
 
@@ -61,7 +61,7 @@ def test_views_of_other_segments_and_of_the_same_image_are_left_out():
         )
         views[keyframes.insert(keyframe)] = None
     view = SimpleNamespace(observation=SimpleNamespace(stamp_ns=30))
-    newest = Seen(view=view, T_local_base=np.eye(4))
+    newest = LocatedView(view=view, T_local_base=np.eye(4))
     assert list(seen_by(keyframes, views, None, newest)) == [0, 1, 2, NEWEST]
     assert list(seen_by(keyframes, views, {1, 3}, newest)) == [1, NEWEST]
     del views[0]

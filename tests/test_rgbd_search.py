@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sceneslam.modules.slam.rgbd.localizer import Fix
+from sceneslam.modules.slam.rgbd.localizer import VisualFix
 from sceneslam.modules.slam.rgbd.search import Search
 
 EXPECTED = 500
@@ -13,7 +13,7 @@ EXPECTED = 500
 
 def fix_of(count):
     rows = np.arange(count)
-    return Fix(
+    return VisualFix(
         estimate=None,
         landmark_ids=rows,
         feature_rows=rows,

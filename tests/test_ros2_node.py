@@ -17,8 +17,8 @@ from isolation import limits
 from omegaconf import OmegaConf
 
 from sceneslam.config.check import check_node
-from sceneslam.modules.slam.ros2_node.heard import moved
-from sceneslam.modules.slam.ros2_node.module import Ros2Node, Topics
+from sceneslam.modules.slam.ros2_node.listener import moved
+from sceneslam.modules.slam.ros2_node.module import NodeTopics, Ros2Node
 from sceneslam.ros.transport.transport import Network
 from sceneslam.testing import RIG, room_observation
 from sceneslam.types import se3
@@ -36,7 +36,7 @@ def build(behaviour, **changes):
     values = {
         "command": command,
         "needs": ["odometry"],
-        "topics": Topics(**NONE, odometry="/odom", pose="/slam/pose"),
+        "topics": NodeTopics(**NONE, odometry="/odom", pose="/slam/pose"),
         "pose_kind": "odometry",
         "map_kind": "grid",
         "pose_frame": "base",

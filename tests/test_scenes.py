@@ -14,7 +14,7 @@ from hydra import compose, initialize_config_module
 from networks import footage
 from ros_recordings import make_source
 
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.resolve import resolved
 from sceneslam.detection.run import detect
 from sceneslam.interfaces import FeatureDetector
@@ -55,7 +55,7 @@ def model(folders) -> Path:
 def learned(path: Path | None, name: str = "detector") -> FeatureDetector:
     target = "sceneslam.modules.detectors.learned.Learned"
     node = {"_target_": target, "path": None if path is None else str(path)}
-    return Builder({name: node}).make(name, FeatureDetector)
+    return ComponentBuilder({name: node}).make(name, FeatureDetector)
 
 
 def test_recordings_that_it_was_not_trained_on_get_their_scene(folders, model, capsys):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sceneslam.sources.simulator import stories
-from sceneslam.sources.simulator.optics.camera import Eye, View
+from sceneslam.sources.simulator.optics.camera import CameraRenderer, RenderedView
 from sceneslam.sources.simulator.optics.exposure import Shutter, split
 from sceneslam.sources.simulator.optics.noise_table import NoiseTable
 from sceneslam.sources.simulator.optics.people import add_people, reach_people
@@ -20,7 +20,7 @@ from sceneslam.sources.simulator.places import building
 from sceneslam.sources.simulator.places.building import floor_plan
 from sceneslam.sources.simulator.places.walker import Walker
 from sceneslam.sources.simulator.robot.motion import STEP_HZ, Drive, Path, plan
-from sceneslam.sources.simulator.robot.wheels import Gyro, WheelOdometry
+from sceneslam.sources.simulator.robot.wheels import SimulatedGyro, WheelOdometry
 from sceneslam.sources.simulator.settings import (
     CameraSettings,
     ExposureSettings,
@@ -78,7 +78,7 @@ def zone_of(x_m: float, y_m: float, order: int | None = None) -> str:
 def measured() -> dict[str, list[tuple[float, float]]]:
     """Return (grey mean, share of pixels with depth) along the tour, by zone; settled exposure."""
     place = replace(building.build(np.random.default_rng(0), None), cell_m=0.6)
-    eye = Eye(place, light_place(place, 0), RayCaster(place.panels), _CAMERA)
+    eye = CameraRenderer(place, light_place(place, 0), RayCaster(place.panels), _CAMERA)
     story, noise = stories.find("office_tour", None), NoiseTable(np.random.default_rng(0))
     levels = story.levels(place.groups, 0.0, "story")
     found: dict[str, list[tuple[float, float]]] = {}
@@ -193,10 +193,12 @@ def test_wheels_that_lie_report_another_way_for_a_while(lie: str, factor: float)
 
 
 def test_the_gyro_feels_the_ramp_and_its_bias_walks() -> None:
-    clean = Gyro(tour(), _GYRO, np.random.default_rng(0)).samples(-1.0, tour().duration_s)
+    clean = SimulatedGyro(tour(), _GYRO, np.random.default_rng(0)).samples(-1.0, tour().duration_s)
     assert np.abs(clean[:, 2]).max() > 0.1  # pitch, at the ramp's foot
     walking = replace(_GYRO, bias_walk_radps_per_sqrt_s=1e-3)
-    walked = Gyro(tour(), walking, np.random.default_rng(0)).samples(-1.0, tour().duration_s)
+    walked = SimulatedGyro(tour(), walking, np.random.default_rng(0)).samples(
+        -1.0, tour().duration_s
+    )
     assert np.std((walked - clean)[-1000:, 3]) < 3e-3
     assert 1e-3 < np.abs((walked - clean)[-1, 1:]).max() < 0.1
 
@@ -215,7 +217,7 @@ def test_nobody_walks_where_the_robot_drives() -> None:
 def test_a_person_is_seen_by_image_and_depth() -> None:
     person = Walker(start_m=(3.0, 0.0), end_m=(3.0, 1.0), group="a", light=0.5)
     shape = (_CAMERA.size_wh[1], _CAMERA.size_wh[0])
-    view = View(
+    view = RenderedView(
         image_bgr=np.zeros((*shape, 3), np.float32),
         depth_m=np.full(shape, 4.0, np.float32),
         cosine=np.zeros(shape, np.float32),

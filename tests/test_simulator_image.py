@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sceneslam.sources.simulator.optics.camera import Eye, View
+from sceneslam.sources.simulator.optics.camera import CameraRenderer, RenderedView
 from sceneslam.sources.simulator.optics.exposure import NOMINAL, Shutter, follow, split
 from sceneslam.sources.simulator.optics.lighting import bake
 from sceneslam.sources.simulator.optics.noise_table import NoiseTable
@@ -18,7 +18,7 @@ from sceneslam.sources.simulator.optics.rays import RayCaster
 from sceneslam.sources.simulator.optics.sensor_noise import expose as expose_with
 from sceneslam.sources.simulator.optics.sensor_noise import measure_depth as measure_with
 from sceneslam.sources.simulator.optics.sheet import pack
-from sceneslam.sources.simulator.places.place import Builder, Lamp, Place
+from sceneslam.sources.simulator.places.place import Lamp, PanelBuilder, SimulatedPlace
 from sceneslam.sources.simulator.places.surfaces import WHITE, fabric, paint
 from sceneslam.sources.simulator.settings import ExposureSettings
 from sceneslam.types import se3
@@ -30,11 +30,11 @@ _FULL = {"a": 1.0, "sun": 0.0}
 _NOISE = NoiseTable(np.random.default_rng(7))
 
 
-def expose(view: View, rng: np.random.Generator, shutter: Shutter = NOMINAL) -> Any:
+def expose(view: RenderedView, rng: np.random.Generator, shutter: Shutter = NOMINAL) -> Any:
     return expose_with(view, _NOISE, rng, shutter)
 
 
-def measure_depth(view: View, cam: Camera, rng: np.random.Generator) -> Any:
+def measure_depth(view: RenderedView, cam: Camera, rng: np.random.Generator) -> Any:
     return measure_with(view, cam, _NOISE, rng)
 
 
@@ -53,9 +53,9 @@ def camera() -> Camera:
 
 
 @pytest.fixture(scope="module")
-def room() -> Place:
+def room() -> SimulatedPlace:
     """A closed room, 4 x 4 x 2.5 m, with one lamp, a cloth on its east wall and a box."""
-    builder, plain = Builder(np.random.default_rng(0)), paint(WHITE)
+    builder, plain = PanelBuilder(np.random.default_rng(0)), paint(WHITE)
     builder.level((0, 4), (0, 4), 0.0, plain)
     builder.level((0, 4), (0, 4), 2.5, plain, faces_up=False)
     corners = [(0, 0), (0, 4), (4, 4), (4, 0), (0, 0)]
@@ -64,23 +64,25 @@ def room() -> Place:
         builder.wall(left, right, (0, 2.5), look)
     builder.box((3.0, 1.4), (0.4, 0.4, 1.2), plain, yaw_deg=20)
     lamp = Lamp(group="a", centre_m=(2.0, 2.0, 2.49), size_xy_m=(0.5, 0.5), power=4.0)
-    return Place(panels=tuple(builder.panels), lamps=(lamp,))
+    return SimulatedPlace(panels=tuple(builder.panels), lamps=(lamp,))
 
 
 @pytest.fixture(scope="module")
-def eye(room: Place) -> Eye:
+def eye(room: SimulatedPlace) -> CameraRenderer:
     caster = RayCaster(room.panels)
-    return Eye(room, bake(room, caster, np.random.default_rng(0)), caster, camera())
+    return CameraRenderer(room, bake(room, caster, np.random.default_rng(0)), caster, camera())
 
 
-def look(eye: Eye, x_m: float, y_m: float, yaw_deg: float, level: float = 1.0) -> View:
+def look(
+    eye: CameraRenderer, x_m: float, y_m: float, yaw_deg: float, level: float = 1.0
+) -> RenderedView:
     T_gt_base = se3.from_xy_yaw(x_m, y_m, np.deg2rad(yaw_deg))
     return eye.look(T_gt_base @ camera().T_base_cam, _FULL | {"a": level})
 
 
-def plain_view(depth_m: float, cosine: float = 1.0, grey: float = 120.0) -> View:
+def plain_view(depth_m: float, cosine: float = 1.0, grey: float = 120.0) -> RenderedView:
     shape = (120, 160)
-    return View(
+    return RenderedView(
         image_bgr=np.full((*shape, 3), grey, np.float32),
         depth_m=np.full(shape, depth_m, np.float32),
         cosine=np.full(shape, cosine, np.float32),
@@ -88,12 +90,12 @@ def plain_view(depth_m: float, cosine: float = 1.0, grey: float = 120.0) -> View
     )
 
 
-def test_depth_is_the_distance_along_the_optical_axis(eye: Eye) -> None:
+def test_depth_is_the_distance_along_the_optical_axis(eye: CameraRenderer) -> None:
     view = look(eye, 1.0, 2.0, 180.0)
     assert np.allclose(view.depth_m[40:80], 1.0, atol=1e-4)
 
 
-def test_two_views_of_one_point_show_the_same_colour(eye: Eye) -> None:
+def test_two_views_of_one_point_show_the_same_colour(eye: CameraRenderer) -> None:
     first, second = look(eye, 1.0, 3.0, 0.0), look(eye, 1.3, 2.9, 4.0)
     cam = camera()
     T_gt_1 = se3.from_xy_yaw(1.0, 3.0, 0.0) @ cam.T_base_cam
@@ -108,14 +110,14 @@ def test_two_views_of_one_point_show_the_same_colour(eye: Eye) -> None:
     assert correlation > 0.8
 
 
-def test_light_of_two_levels_adds_up(eye: Eye) -> None:
+def test_light_of_two_levels_adds_up(eye: CameraRenderer) -> None:
     full, half = look(eye, 1.0, 2.0, 0.0), look(eye, 1.0, 2.0, 0.0, level=0.5)
     lit = (full.image_bgr > 20) & (full.image_bgr < 250)
     adds_up = np.isclose((half.image_bgr**2)[lit] * 2.0, (full.image_bgr**2)[lit], rtol=1e-3)
     assert adds_up.mean() > 0.995  # an edge too faint to be softened may differ
 
 
-def test_the_box_throws_a_shadow(room: Place) -> None:
+def test_the_box_throws_a_shadow(room: SimulatedPlace) -> None:
     light = bake(room, RayCaster(room.panels), np.random.default_rng(0))
     x, across, y, down = light.lookup[0]  # of the floor: u along x, v from y = 4 to 0
 
@@ -126,12 +128,12 @@ def test_the_box_throws_a_shadow(room: Place) -> None:
     assert light_at(3.5, 1.0) < 0.5 * light_at(3.5, 3.0)  # as far from the lamp, free of the box
 
 
-def test_plain_walls_hold_no_features(eye: Eye) -> None:
+def test_plain_walls_hold_no_features(eye: CameraRenderer) -> None:
     image = expose(look(eye, 1.0, 2.0, 180.0), np.random.default_rng(0))
     assert len(cv2.ORB_create(500).detect(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))) == 0
 
 
-def test_textured_walls_hold_many_features(eye: Eye) -> None:
+def test_textured_walls_hold_many_features(eye: CameraRenderer) -> None:
     image = expose(look(eye, 2.2, 3.2, 0.0), np.random.default_rng(0))
     assert len(cv2.ORB_create(500).detect(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))) > 50
 
@@ -173,7 +175,9 @@ def test_photon_noise_is_even_in_the_light_and_read_noise_wins_in_the_dark() -> 
     assert expose(plain_view(2.0, grey=120.0), rng).mean() == pytest.approx(120.0, abs=0.5)
 
 
-def test_depth_and_colour_from_planes_are_those_of_a_ray_per_pixel(room: Place, eye: Eye) -> None:
+def test_depth_and_colour_from_planes_are_those_of_a_ray_per_pixel(
+    room: SimulatedPlace, eye: CameraRenderer
+) -> None:
     view, cam, caster = look(eye, 1.0, 2.0, 0.0), camera(), RayCaster(room.panels)
     T_gt_cam = se3.from_xy_yaw(1.0, 2.0, 0.0) @ cam.T_base_cam
     v, u = np.mgrid[0:120, 0:160]

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sceneslam.sources.simulator.optics.camera import Eye
+from sceneslam.sources.simulator.optics.camera import CameraRenderer
 from sceneslam.sources.simulator.optics.lighting import LightMap
 from sceneslam.sources.simulator.optics.rays import RayCaster
-from sceneslam.sources.simulator.places.place import Place
+from sceneslam.sources.simulator.places.place import SimulatedPlace
 from sceneslam.sources.simulator.robot.motion import (
     STEP_HZ,
     Drive,
@@ -24,7 +24,7 @@ from sceneslam.sources.simulator.robot.motion import (
     advance,
     plan,
 )
-from sceneslam.sources.simulator.robot.wheels import Gyro, WheelOdometry
+from sceneslam.sources.simulator.robot.wheels import SimulatedGyro, WheelOdometry
 from sceneslam.sources.simulator.settings import CameraSettings, GyroSettings, OdometrySettings
 from sceneslam.sources.simulator.shot import build_place, floor_plan, light_place
 from sceneslam.sources.simulator.stories import STORIES
@@ -50,7 +50,7 @@ def path_of(story: str) -> Path:
 
 
 @cache
-def place_of(kind: str) -> Place:
+def place_of(kind: str) -> SimulatedPlace:
     return build_place(kind, seed=0, order=None)
 
 
@@ -72,7 +72,7 @@ def greys_of(story: str, lights: str = "story") -> np.ndarray:
         forward_m=0.0,
         tilt_deg=3.0,
     ).camera()
-    eye = Eye(place_of(kind), light_of(kind), RayCaster(place_of(kind).panels), camera)
+    eye = CameraRenderer(place_of(kind), light_of(kind), RayCaster(place_of(kind).panels), camera)
     path = path_of(story)
     greys = []
     for time_s in np.arange(0.0, path.duration_s, 1.0 / _RATE_HZ).tolist():
@@ -279,6 +279,6 @@ def test_slips_make_odometry_jump_ahead_of_the_robot() -> None:
 def test_the_gyro_integrates_to_the_true_turn_but_for_its_bias() -> None:
     path = path_of("there_and_back")
     settings = gyro_settings(noise_radps=0.003)
-    samples = Gyro(path, settings, np.random.default_rng(0)).samples(-1.0, path.duration_s)
+    samples = SimulatedGyro(path, settings, np.random.default_rng(0)).samples(-1.0, path.duration_s)
     turned_rad = samples[:, 3].sum() / 100.0
     assert turned_rad == pytest.approx(path.x_y_yaw[-1, 2] - path.x_y_yaw[0, 2], abs=0.02)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sceneslam.interfaces import Source
 from sceneslam.sources.ordered import Ordered
-from sceneslam.sources.spanned import Span
+from sceneslam.sources.spanned import TimeSpan
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
@@ -31,7 +31,7 @@ class Listed:
         return len(self.observations)
 
     @property
-    def span(self) -> Span | None:
+    def span(self) -> TimeSpan | None:
         return None
 
     def __iter__(self) -> Iterator[Observation]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sceneslam.sources.prefetch import prefetched
-from sceneslam.sources.synchronise import Bundle, Sample, Synchroniser
+from sceneslam.sources.synchronise import Sample, SynchronisedSamples, Synchroniser
 from sceneslam.types import se3
 from sceneslam.types.rig import Sensor
 
@@ -51,10 +51,10 @@ def test_an_exception_comes_where_its_result_would() -> None:
 
 def bundles(
     primary: Sensor, samples: list[tuple[Sensor, int, object]], tolerance_s: float = 0.02
-) -> list[Bundle]:
+) -> list[SynchronisedSamples]:
     streams = frozenset(sensor for sensor, _, _ in samples)
     synchroniser = Synchroniser(primary, streams, tolerance_s)
-    found: list[Bundle] = []
+    found: list[SynchronisedSamples] = []
     for sensor, stamp_ms, value in samples:
         found += synchroniser.add(sensor, Sample(stamp_ns=stamp_ms * MS, value=value))
     return [*found, *synchroniser.flush()]

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from sceneslam.ros import names
 from sceneslam.ros.encode import Encoder
 from sceneslam.ros.transport.transport import Arrival
-from sceneslam.sources.live.clock import Order, StampClock
+from sceneslam.sources.live.clock import StampClock, StampOrder
 from sceneslam.sources.live.inbox import Inbox
 from sceneslam.sources.ros2 import source as under_test
 from sceneslam.types import se3
@@ -254,7 +254,7 @@ class TestClock:
     def test_steady_clock_is_left_alone(self):
         lined = self.lines(*[("/a", index * 33 * MS, S + index * 33 * MS) for index in range(9)])
         assert [one.stamp_ns for one in lined] == [index * 33 * MS for index in range(9)]
-        assert {one.order for one in lined} == {Order.RISING}
+        assert {one.order for one in lined} == {StampOrder.RISING}
 
     @pytest.mark.parametrize("jump_ns", [-100 * S, 3600 * S])
     def test_jump_is_taken_out_of_all_topics_alike(self, jump_ns):
@@ -264,7 +264,7 @@ class TestClock:
             ("/a", 10 * S + 33 * MS + jump_ns, 40 * MS),  # 7 ms late, as they come
             ("/b", 10 * S + 33 * MS + jump_ns, 34 * MS),
         )
-        assert [one.order for one in lined[2:]] == [Order.JUMPED, Order.JUMPED]
+        assert [one.order for one in lined[2:]] == [StampOrder.JUMPED, StampOrder.JUMPED]
         assert lined[2].stamp_ns == lined[3].stamp_ns  # what belongs together stays so
         assert lined[2].stamp_ns == pytest.approx(10 * S + 40 * MS)
 
@@ -272,22 +272,31 @@ class TestClock:
         lined = self.lines(
             ("/a", 0, 0), ("/a", 33 * MS, 5 * S), ("/a", 66 * MS, 5 * S), ("/a", 5 * S, 5 * S + 1)
         )
-        assert [one.order for one in lined] == [Order.RISING, Order.LATE, Order.LATE, Order.RISING]
+        assert [one.order for one in lined] == [
+            StampOrder.RISING,
+            StampOrder.LATE,
+            StampOrder.LATE,
+            StampOrder.RISING,
+        ]
         assert all(one.shift_ns == 0 for one in lined)
 
     def test_message_behind_the_one_before_is_unordered(self):
         lined = self.lines(("/a", 66 * MS, 0), ("/a", 33 * MS, 1), ("/a", 99 * MS, 33 * MS))
-        assert [one.order for one in lined] == [Order.RISING, Order.UNORDERED, Order.RISING]
+        assert [one.order for one in lined] == [
+            StampOrder.RISING,
+            StampOrder.UNORDERED,
+            StampOrder.RISING,
+        ]
 
     def test_driver_that_restarts_with_another_clock_goes_on_from_where_it_was(self):
         lined = self.lines(("/a", 500 * S, 0), ("/a", 2 * S, 20 * S))
-        assert lined[1].order is Order.JUMPED and lined[1].stamp_ns == 520 * S
+        assert lined[1].order is StampOrder.JUMPED and lined[1].stamp_ns == 520 * S
 
     def test_clocks_that_drift_apart_are_not_late(self):
         clock = StampClock()
         for second in range(20_000):  # the robot's is slow by 100 ppm: 2 s in the end
             lined = clock.line_up("/a", round(second * S * 0.9999), second * S)
-        assert lined.order is Order.RISING
+        assert lined.order is StampOrder.RISING
 
 
 def test_inbox_keeps_the_newest_of_each_topic():

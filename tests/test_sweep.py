@@ -23,7 +23,7 @@ from sceneslam.collect.status import State, Status
 from sceneslam.config.check import check_keys
 from sceneslam.sweep.__main__ import main
 from sceneslam.sweep.backends import Basic, Joblib, Ray, Submitit
-from sceneslam.sweep.supervise import Order
+from sceneslam.sweep.supervise import JobOrder
 from sceneslam.types.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
@@ -177,7 +177,7 @@ def test_folder_that_is_no_sweep_is_named(tmp_path, capsys):
 def test_jobs_are_told_how_many_cores_they_may_take(backend, cores, tmp_path, monkeypatch):
     told = []
     monkeypatch.setattr("sceneslam.sweep.backends.run_job", told.append)
-    order = Order(folder=tmp_path, code=tmp_path, began_in=tmp_path, stop=tmp_path / "stop")
+    order = JobOrder(folder=tmp_path, code=tmp_path, began_in=tmp_path, stop=tmp_path / "stop")
     backend.run([order] * 5)
     assert [order.cores for order in told] == [cores] * 5
 
@@ -210,7 +210,7 @@ def test_impossible_worker_is_named(make, key):
 )
 def test_cluster_that_cannot_be_used_is_named(backend, sentence, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))  # a machine that has SLURM has none here
-    order = Order(folder=tmp_path, code=tmp_path, began_in=tmp_path, stop=tmp_path / "stop")
+    order = JobOrder(folder=tmp_path, code=tmp_path, began_in=tmp_path, stop=tmp_path / "stop")
     with pytest.raises(ConfigError, match=re.escape(sentence)):
         backend.run([order])
 

@@ -14,7 +14,7 @@ from sceneslam.experiments.tune.overlay import write_overlay
 from sceneslam.experiments.tune.space import read_space
 from sceneslam.experiments.tune.study import Search
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.experiment import Outcome, Trial
+from sceneslam.types.experiment import Trial, TrialResult
 from sceneslam.types.trajectory import Trajectory
 
 pytest.importorskip("optuna", reason="needs the extra `tune`")
@@ -88,7 +88,7 @@ def test_a_parameter_without_sense_is_named(node):
 
 def outcome(metrics, tmp_path=None):
     empty = Trajectory.empty()
-    return Outcome(
+    return TrialResult(
         trial=Trial(name="x"),
         folder=tmp_path,
         metrics=metrics,

@@ -10,7 +10,7 @@ from sceneslam.atlas.uncertainty import (
     VELOCITY,
     WHEELS,
     Drift,
-    Step,
+    SessionPose,
     propagate,
     read_covariances,
     write_covariances,
@@ -29,7 +29,7 @@ def steps(kinds, covariance=None):
         session = session if kind == "-" else int(kind)
         T_map_base = np.linalg.matrix_power(T_STEP, index)
         found.append(
-            Step(
+            SessionPose(
                 T_map_base=T_map_base,
                 session=session,
                 is_bridged=kind == "-",
@@ -78,7 +78,7 @@ def test_an_uncertain_heading_becomes_an_uncertain_position_along_the_way():
     start = np.diag([0, 0, 0, 0, 0, 0.1**2])
     turned = steps("0-", covariance=start)
     T_ahead = se3.from_xy_yaw(10.0, 0.0, 0.0)
-    far = Step(T_map_base=T_ahead, session=0, is_bridged=True, covariance=None)
+    far = SessionPose(T_map_base=T_ahead, session=0, is_bridged=True, covariance=None)
     found = propagate([turned[0], far], NO_DRIFT)[-1]
     assert np.sqrt(found[1, 1]) == pytest.approx(10 * 0.1) and found[0, 0] == pytest.approx(0.0)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sceneslam.types.experiment import Outcome, RunTrials, Trial
+from sceneslam.types.experiment import RunTrials, Trial, TrialResult
 from sceneslam.types.trajectory import Trajectory
 
 
@@ -26,21 +26,21 @@ class Told:
 def teller(folder: Path, tell: Callable[[Trial], Told]) -> RunTrials:
     """Return what an experiment calls to run trials; their folders are below `folder`."""
 
-    def run_trials(trials: Iterable[Trial]) -> Iterator[Outcome]:
+    def run_trials(trials: Iterable[Trial]) -> Iterator[TrialResult]:
         for trial in trials:
             yield _outcome(folder / trial.name, trial, tell(trial))
 
     return run_trials
 
 
-def _outcome(folder: Path, trial: Trial, told: Told) -> Outcome:
+def _outcome(folder: Path, trial: Trial, told: Told) -> TrialResult:
     folder.mkdir(parents=True)
     (folder / "events.jsonl").write_text("".join(json.dumps(e) + "\n" for e in told.events))
     if told.truth is not None:
         told.truth.write_tum(folder / "groundtruth.tum")
     for name, trajectory in told.sessions.items():
         trajectory.write_tum(folder / f"trajectory_{name}.tum")
-    return Outcome(
+    return TrialResult(
         trial=trial,
         folder=folder,
         metrics=told.metrics,

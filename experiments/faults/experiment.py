@@ -19,7 +19,15 @@ from tqdm import tqdm
 from sceneslam.experiments.faults.cut_off import KINDS, Cut, Program, can_mount
 from sceneslam.experiments.faults.survival import Survival, survival
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.experiment import Figure, Outcome, Relation, RunTrials, Table, Trial, Verdict
+from sceneslam.types.experiment import (
+    Figure,
+    Relation,
+    RunTrials,
+    Table,
+    Trial,
+    TrialResult,
+    Verdict,
+)
 from sceneslam.types.ranges import check_above, check_between, check_least, check_some
 
 _AT_ONCE = 4  # runs that are struck; each waits for the disk most of the time
@@ -122,7 +130,7 @@ class FaultsExperiment:
             _put(values, key, {"seed": seed, "record": str(record)})
         return Trial(name=name, values=values)
 
-    def _survival(self, outcome: Outcome) -> Survival:
+    def _survival(self, outcome: TrialResult) -> Survival:
         records = [outcome.folder / _record(key) for key in self._struck]
         return survival(outcome.trial.name, outcome.folder, records, right_m=self._right_m)
 

@@ -17,7 +17,7 @@ from sceneslam.atlas.uncertainty import read_covariances
 from sceneslam.evaluation.association import interpolated
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.trajectory import Trajectory
 
 _PARTS = {"position": slice(0, 3), "rotation": slice(3, 6)}
@@ -73,7 +73,7 @@ class ConsistencyExperiment:
         return [story, part, ratio, band, 1.0 - above - below, above, below], figure
 
 
-def _nees(outcome: Outcome) -> dict[str, NDArray[np.float64]]:
+def _nees(outcome: TrialResult) -> dict[str, NDArray[np.float64]]:
     """Return the NEES (N,) of position and of rotation, 3 degrees of freedom each, at every pose.
 
     Estimate and truth begin at the same pose.

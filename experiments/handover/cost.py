@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 
 _KINDS = ("warm", "rewind")
 _SHORT_S = 0.5  # of the recording: so few images say nothing of the rate
@@ -85,7 +85,7 @@ class SwitchCostExperiment:
         yield Figure.at_least(name, rate, self._catch_up_min)
 
 
-def _costs(outcome: Outcome, story: str, kind: str) -> Iterator[Cost]:
+def _costs(outcome: TrialResult, story: str, kind: str) -> Iterator[Cost]:
     for switch in outcome.metrics["switches"]:
         yield Cost(
             story=story,

@@ -8,7 +8,7 @@ import numpy as np
 
 from sceneslam.evaluation.association import interpolated
 from sceneslam.types import se3
-from sceneslam.types.experiment import Outcome
+from sceneslam.types.experiment import TrialResult
 from sceneslam.types.trajectory import Trajectory
 
 
@@ -31,7 +31,13 @@ class Seam:
 
 
 def measure(
-    outcome: Outcome, kind: str, startup_s: float, lost_s: float, *, since_s: float, after_s: float
+    outcome: TrialResult,
+    kind: str,
+    startup_s: float,
+    lost_s: float,
+    *,
+    since_s: float,
+    after_s: float,
 ) -> Seam:
     """Return the seam of a run with one hand-over.
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sceneslam.evaluation.relations import Relations, relation_errors
-from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_above, check_least, check_some
 
 CLEAN = "none"
@@ -29,7 +29,7 @@ class Drive:
     overrides: tuple[str, ...]
     relations: Path | None = None  # true relative poses of a log
 
-    def error_m(self, outcome: Outcome) -> float:
+    def error_m(self, outcome: TrialResult) -> float:
         """Return the mean error of the relations, else the ATE; NaN where neither is known."""
         if self.relations is not None:
             errors = relation_errors(outcome.trajectory, Relations.read(self.relations))

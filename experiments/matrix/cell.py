@@ -11,7 +11,7 @@ import numpy as np
 from sceneslam.evaluation.accuracy import absolute_errors, root_mean_square
 from sceneslam.evaluation.correctness import CorrectLimits, correct_rate
 from sceneslam.evaluation.path import segment_errors
-from sceneslam.types.experiment import Outcome
+from sceneslam.types.experiment import TrialResult
 from sceneslam.types.trajectory import Trajectory
 
 _GAP_S = 0.02
@@ -36,7 +36,7 @@ class Cell:
 
     @classmethod
     def of(
-        cls, story: str, seed: int, strategy: str, outcome: Outcome, *, observations: int
+        cls, story: str, seed: int, strategy: str, outcome: TrialResult, *, observations: int
     ) -> Cell:
         """Return a run's numbers; what it could not have (no pose) is NaN.
 

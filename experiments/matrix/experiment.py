@@ -20,7 +20,7 @@ from sceneslam.experiments.matrix.figure import draw_errors, draw_sweep
 from sceneslam.experiments.matrix.oracle import best_of
 from sceneslam.experiments.matrix.promises import Promises
 from sceneslam.experiments.matrix.sweep import Grid, sweep
-from sceneslam.types.experiment import Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.experiment import RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_above, check_among, check_least, check_some
 from sceneslam.types.trajectory import Trajectory
 
@@ -103,13 +103,13 @@ class MatrixExperiment:
         overrides = (f"story={story}", f"seed={seed}", *self._strategies[strategy])
         return Trial(name=name, overrides=overrides)
 
-    def _oracle(self, group: Mapping[str, Outcome]) -> Trajectory:
+    def _oracle(self, group: Mapping[str, TrialResult]) -> Trajectory:
         alone = [group[name].trajectory for name in self._alone]
         best: Trajectory = best_of(alone, _truth(group), self._piece_s)
         return best
 
     def _cells(
-        self, story: str, seed: int, group: Mapping[str, Outcome], oracle: Trajectory
+        self, story: str, seed: int, group: Mapping[str, TrialResult], oracle: Trajectory
     ) -> Iterator[Cell]:
         best = self._judge.cell(story, seed, ORACLE, oracle, _truth(group))
         most = max(outcome.metrics["observations"] for outcome in group.values())
@@ -121,9 +121,9 @@ class MatrixExperiment:
         self,
         folder: Path,
         cells: Sequence[Cell],
-        group: Mapping[str, Outcome],
+        group: Mapping[str, TrialResult],
         oracle: Trajectory,
-        outcomes: Sequence[Outcome],
+        outcomes: Sequence[TrialResult],
     ) -> dict[str, str]:
         """Draw the pictures; return them with their captions."""
         draw_errors(folder / "errors.png", mean(cells))
@@ -139,7 +139,7 @@ class MatrixExperiment:
         return pictures
 
 
-def _truth(group: Mapping[str, Outcome]) -> Trajectory:
+def _truth(group: Mapping[str, TrialResult]) -> Trajectory:
     first = next(iter(group.values()))
     return Trajectory.read_tum(first.folder / "groundtruth.tum")
 

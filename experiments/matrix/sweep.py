@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sceneslam.bus.scene_filter import WindowFilter
 from sceneslam.modules.detectors.grey_mean import GreyMean
-from sceneslam.types.experiment import Outcome
+from sceneslam.types.experiment import TrialResult
 from sceneslam.types.ranges import check_between, check_least, check_some
 
 Votes = Sequence[tuple[int, NDArray[np.float64] | None]]  # stamp [ns], mean of grey
@@ -44,7 +44,7 @@ class Grid:
         check_least(0, hystereses=self.hystereses, windows_s=self.windows_s)
 
 
-def sweep(outcomes: Sequence[Outcome], grid: Grid) -> list[Setting]:
+def sweep(outcomes: Sequence[TrialResult], grid: Grid) -> list[Setting]:
     """Return the confirmed changes per story, each story's votes read once per seed."""
     votes: dict[str, dict[str, Votes]] = {}
     for outcome in outcomes:
@@ -67,7 +67,7 @@ def sweep(outcomes: Sequence[Outcome], grid: Grid) -> list[Setting]:
     ]
 
 
-def _read(outcome: Outcome) -> Votes:
+def _read(outcome: TrialResult) -> Votes:
     with (outcome.folder / "events.jsonl").open() as file:
         events = [json.loads(line) for line in file if '"event": "vote"' in line]
     values = [(event["stamp_ns"], event["value"]) for event in events]

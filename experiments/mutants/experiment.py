@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from sceneslam.config.build import build
 from sceneslam.config.check import check_given
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.resolve import composed, resolved
 from sceneslam.experiments.mutants.bases import Base, bases
 from sceneslam.experiments.mutants.combinations import combinations
@@ -139,7 +139,7 @@ def _make(config: dict[str, Any]) -> None:
         build(config).close()
         return
     check_given(config.get(key), key)
-    Builder(config).make(key, Experiment)
+    ComponentBuilder(config).make(key, Experiment)
 
 
 @contextmanager

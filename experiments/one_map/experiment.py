@@ -34,7 +34,7 @@ from sceneslam.testing.floor_plans import (
     twins,
 )
 from sceneslam.types import planar, se3
-from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_above, check_least, check_some
 from sceneslam.types.trajectory import Trajectory
 
@@ -209,7 +209,7 @@ class OneMapExperiment:
         return World(flat(), np.random.default_rng(self._seeds[0]), Scanner())
 
 
-def _truth(outcome: Outcome) -> Trajectory:
+def _truth(outcome: TrialResult) -> Trajectory:
     return Trajectory.read_tum(outcome.folder / "groundtruth.tum")
 
 

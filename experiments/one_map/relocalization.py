@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneslam.atlas.places.floor_plan import FloorPlan
-from sceneslam.atlas.places.localizer import Localizer, Outcome, Placed
+from sceneslam.atlas.places.localizer import LocalizationEvent, MapLocalizer, PlacedScan
 from sceneslam.experiments.one_map.drive import key_scan, plan_of
 from sceneslam.testing.floor_plans import FLAT_TOUR, Scanner, Wall, World, through
 from sceneslam.types import planar
@@ -69,13 +69,15 @@ def random_starts(
 
 def _start(plan: FloorPlan, world: World, T_world_map: Planar, within_s: float) -> Planar | None:
     """Return by how much a start was found beside the truth, None where it was not found."""
-    localizer, latest = Localizer(plan), list[Placed]()
+    localizer, latest = MapLocalizer(plan), list[PlacedScan]()
     pose = start = _free_pose(world)
     for step in range(round(within_s / _STEP_S) + 1):
         T_run_base = planar.between(start, pose)
         scan = key_scan(world, pose, round(step * _STEP_S * 1e9))
-        latest.append(Placed(scan=scan, T_run_base=T_run_base))
-        is_found = localizer.is_due(latest[-1]) and localizer.compare(latest) is Outcome.FOUND
+        latest.append(PlacedScan(scan=scan, T_run_base=T_run_base))
+        is_found = (
+            localizer.is_due(latest[-1]) and localizer.compare(latest) is LocalizationEvent.FOUND
+        )
         if is_found and localizer.T_map_run is not None:
             T_map_base = planar.compose(localizer.T_map_run, T_run_base)
             return planar.between(planar.between(T_world_map, pose), T_map_base)

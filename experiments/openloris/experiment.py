@@ -14,7 +14,7 @@ from sceneslam.experiments.openloris.dataset import Dataset, Sequence
 from sceneslam.experiments.openloris.figure import draw_rates
 from sceneslam.experiments.openloris.rates import Rates, mean, table
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.experiment import Figure, Outcome, Relation, RunTrials, Trial, Verdict
+from sceneslam.types.experiment import Figure, Relation, RunTrials, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_above, check_between, check_least
 from sceneslam.types.trajectory import Trajectory
 
@@ -73,7 +73,7 @@ class OpenLorisExperiment:
         }
         return Trial(name=name, values={**values, "slam": {"recorded": module}})
 
-    def _rates(self, system: str, key: Sequence, outcome: Outcome) -> Rates:
+    def _rates(self, system: str, key: Sequence, outcome: TrialResult) -> Rates:
         recorded = self._data.systems[system].get(key)
         stamps_ns = self._data.truth[key].stamps_ns
         return Rates(

@@ -10,7 +10,7 @@ from sceneslam.evaluation import figure_style as look
 from sceneslam.experiments.paper.images import draw_rooms
 from sceneslam.experiments.paper.runs import keep_figure, number
 from sceneslam.experiments.paper.views import cloud_of, draw_third_person, read_ply
-from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_above, check_among, check_some
 
 
@@ -55,7 +55,7 @@ class AloneExperiment:
         return Verdict(figures=figures, table=table, pictures=pictures)
 
 
-def _draw_features(outcome: Outcome, path: Path) -> None:
+def _draw_features(outcome: TrialResult, path: Path) -> None:
     """Draw the 3D feature points, where the module keeps any (Fig. 6a)."""
     landmarks = outcome.folder / "map" / "landmarks.ply"
     if landmarks.is_file():

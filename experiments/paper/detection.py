@@ -11,7 +11,7 @@ import numpy as np
 
 from sceneslam.experiments.paper.images import draw_images
 from sceneslam.experiments.paper.runs import events_of, keep_figure, number
-from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_above, check_least
 
 Row = tuple[str, float, float, float | None, float, float, float | None]
@@ -50,7 +50,7 @@ class DetectionExperiment:
             },
         )
 
-    def _figures(self, outcome: Outcome) -> Iterator[Figure]:
+    def _figures(self, outcome: TrialResult) -> Iterator[Figure]:
         switches, cost_us = outcome.metrics["switches"], outcome.metrics["detector_us"]
         for switch in switches:
             delay_s = number(switch["confirm_delay_s"])
@@ -61,7 +61,7 @@ class DetectionExperiment:
             value_ms = number(cost_us[share]) / 1e3
             yield Figure.at_most(f"detection per frame, {share}", value_ms, self._vote_max_ms, "ms")
 
-    def _rows(self, outcome: Outcome) -> Sequence[Row]:
+    def _rows(self, outcome: TrialResult) -> Sequence[Row]:
         votes = list(events_of(outcome, "vote"))
         stamps_ns = np.array([vote["stamp_ns"] for vote in votes])
         values = np.array([vote["value"] for vote in votes], float)
@@ -84,12 +84,12 @@ class DetectionExperiment:
             if event is not None
         ]
 
-    def _shown_ns(self, outcome: Outcome) -> Iterator[int]:
+    def _shown_ns(self, outcome: TrialResult) -> Iterator[int]:
         """Yield, of every change, an instant before it and the one at which it was confirmed."""
         for event in _changes(outcome):
             yield event["since_ns"] - round(self._window_s * 1e9)
             yield event["stamp_ns"]
 
 
-def _changes(outcome: Outcome) -> list[Mapping[str, Any]]:
+def _changes(outcome: TrialResult) -> list[Mapping[str, Any]]:
     return [event for event in events_of(outcome, "scene") if event["previous"] is not None]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sceneslam.evaluation import figure_style as look
 from sceneslam.evaluation.comparison import Difference, compare
 from sceneslam.experiments.paper.runs import number
-from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_above, check_some
 
 
@@ -73,7 +73,7 @@ def _elapsed_s(one: Difference) -> NDArray[np.float64]:
 
 
 def _row(
-    name: str, one: Difference, switched: Outcome, unswitched: Outcome
+    name: str, one: Difference, switched: TrialResult, unswitched: TrialResult
 ) -> tuple[str | float, ...]:
     ates = (100 * number(run.metrics["ate_rmse_m"]) for run in (switched, unswitched))
     return (name, 100 * one.max_m, 100 * one.rms_m, float(len(one.stamps_ns)), *ates)

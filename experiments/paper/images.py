@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from omegaconf import OmegaConf
 
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.evaluation import figure_style as look
 from sceneslam.evaluation.association import interpolated
 from sceneslam.experiments.paper.views import Cloud, draw_third_person
@@ -30,7 +30,7 @@ def source_of(folder: Path) -> Source:
     """Return the recording of a finished run."""
     config = OmegaConf.load(folder / "config.yaml")
     plain = cast(Mapping[str, Any], OmegaConf.to_container(config, resolve=True))
-    source: Source = Builder(plain).make("source", Source)
+    source: Source = ComponentBuilder(plain).make("source", Source)
     return source
 
 

@@ -16,7 +16,7 @@ from sceneslam.evaluation.association import select
 from sceneslam.evaluation.comparison import Difference, compare
 from sceneslam.evaluation.figure_paths import draw_paths
 from sceneslam.experiments.paper.runs import number
-from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_above, check_among, check_some
 from sceneslam.types.trajectory import Trajectory
 
@@ -66,7 +66,7 @@ class OrderedSwitchExperiment:
             pictures={"paths.png": "All runs over the same images, from above."},
         )
 
-    def _before(self, switched: Outcome, kept: Outcome) -> float:
+    def _before(self, switched: TrialResult, kept: TrialResult) -> float:
         """Return how far two runs are apart at most before the switch, as they told it live [m]."""
         stamps_ns = switched.online.stamps_ns
         ordered_ns = stamps_ns[0] + round(self._at_s * 1e9)
@@ -83,11 +83,11 @@ class OrderedSwitchExperiment:
 
 
 def _row(
-    name: str, outcome: Outcome, before_m: float, apart: Difference
+    name: str, outcome: TrialResult, before_m: float, apart: Difference
 ) -> tuple[str | float | None, ...]:
     return (name, 100 * before_m, 100 * apart.max_m, 100 * apart.rms_m, *_errors_cm(outcome))
 
 
-def _errors_cm(outcome: Outcome) -> tuple[float, float]:
+def _errors_cm(outcome: TrialResult) -> tuple[float, float]:
     metrics = outcome.metrics
     return 100 * number(metrics["ate_rmse_m"]), 100 * number(metrics["ate_max_m"])

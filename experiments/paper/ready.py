@@ -13,7 +13,7 @@ from time import perf_counter
 
 from hydra import compose, initialize_config_module
 
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.resolve import resolved
 from sceneslam.interfaces import SlamModule, Source
 from sceneslam.types import se3
@@ -29,7 +29,7 @@ def measure(key: str, overrides: Sequence[str]) -> dict[str, float]:
     decoding of the observations is not counted.
     """
     with initialize_config_module("sceneslam.conf", version_base="1.3"):
-        builder = Builder(resolved(compose("config", overrides=list(overrides))))
+        builder = ComponentBuilder(resolved(compose("config", overrides=list(overrides))))
     source = builder.make("source", Source)
     observations, rig = list(islice(source, _IMAGES)), source.rig
     began_s = perf_counter()

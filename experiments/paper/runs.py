@@ -9,10 +9,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from sceneslam.types.experiment import Outcome
+from sceneslam.types.experiment import TrialResult
 
 
-def events_of(outcome: Outcome, kind: str) -> Iterator[Mapping[str, Any]]:
+def events_of(outcome: TrialResult, kind: str) -> Iterator[Mapping[str, Any]]:
     """Yield the events of one kind from a run's log."""
     with (outcome.folder / "events.jsonl").open() as file:
         for line in file:
@@ -20,7 +20,7 @@ def events_of(outcome: Outcome, kind: str) -> Iterator[Mapping[str, Any]]:
                 yield json.loads(line)
 
 
-def keep_figure(outcome: Outcome, figure: str, path: Path) -> None:
+def keep_figure(outcome: TrialResult, figure: str, path: Path) -> None:
     """Copy one of the run's own figures, where it drew it."""
     drawn = outcome.folder / "figures" / f"{figure}.png"
     if drawn.is_file():

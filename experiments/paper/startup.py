@@ -12,7 +12,7 @@ from statistics import median
 
 from sceneslam.experiments.paper.runs import events_of
 from sceneslam.types.errors import InputError
-from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_above, check_least, check_some
 
 Row = tuple[str, str, float, float, float]
@@ -76,7 +76,7 @@ class StartupExperiment:
             yield Figure.at_most(f"{name}: decision to caught up", whole_s, self._switch_max_s, "s")
 
 
-def _switches(outcome: Outcome) -> Iterator[Row]:
+def _switches(outcome: TrialResult) -> Iterator[Row]:
     """Yield the wall-clock costs of a run's switches; the first decision is the run's start."""
     costs = {event["stamp_ns"]: event for event in events_of(outcome, "cost")}
     for switch in outcome.metrics["switches"]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from sceneslam.evaluation import figure_style as look
 from sceneslam.experiments.paper.runs import keep_figure, number
 from sceneslam.experiments.paper.views import cloud_of, draw_third_person, modules_of, read_ply
-from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_above, check_among, check_least, check_some
 from sceneslam.types.run import HANDOVERS
 
@@ -60,7 +60,7 @@ class SwitchExperiment:
         return Trial(name=kind, overrides=(f"policy.handover={kind}", *starts))
 
 
-def _draw_map(outcome: Outcome, path: Path) -> None:
+def _draw_map(outcome: TrialResult, path: Path) -> None:
     """Draw the points of every module in its colour, the path, and the robot."""
     points, trajectory = outcome.folder / "map" / "points.ply", outcome.trajectory
     if not points.is_file() or not len(trajectory):
@@ -73,7 +73,7 @@ def _draw_map(outcome: Outcome, path: Path) -> None:
     draw_third_person(path, clouds, {"path": trajectory}, [trajectory.T_world_base[-1]])
 
 
-def _row(kind: str, outcome: Outcome) -> tuple[str | float, ...]:
+def _row(kind: str, outcome: TrialResult) -> tuple[str | float, ...]:
     metrics = outcome.metrics
     switches = metrics["switches"]
     return (

@@ -17,7 +17,7 @@ from sceneslam.experiments.table.figure import draw_scores
 from sceneslam.experiments.table.overlay import write_scenario
 from sceneslam.experiments.table.stretch import Motions, measure
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_above, check_between, check_some
 
 
@@ -86,7 +86,7 @@ class TableExperiment:
             for scene, found in motions.items()
         ]
 
-    def _outcomes(self, run_trials: RunTrials, module: str) -> Iterator[tuple[str, Outcome]]:
+    def _outcomes(self, run_trials: RunTrials, module: str) -> Iterator[tuple[str, TrialResult]]:
         """Yield what the module did on each recording that has its sensors."""
         left = {
             name: Trial(name=f"{name}/{module}", overrides=(*words, f"slam@slam.only={module}"))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sceneslam.evaluation.accuracy import relative_errors
 from sceneslam.evaluation.association import covered, interpolated
-from sceneslam.types.experiment import Outcome
+from sceneslam.types.experiment import TrialResult
 from sceneslam.types.run import Event
 from sceneslam.types.trajectory import Trajectory
 
@@ -38,7 +38,7 @@ class Motions:
     rot_rad: NDArray[np.float64]  # (N,)
 
 
-def measure(outcome: Outcome, interval_s: float) -> list[Motions]:
+def measure(outcome: TrialResult, interval_s: float) -> list[Motions]:
     """Return the motions of a module that ran alone, stretch by stretch.
 
     Only what the module itself told counts: each of its sessions for itself, nothing bridged.

@@ -17,10 +17,10 @@ from sceneslam.experiments.tune.overlay import write_overlay
 from sceneslam.experiments.tune.space import read_space
 from sceneslam.experiments.tune.study import Drawn, Search
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.experiment import Figure, Outcome, RunTrials, Table, Trial, Verdict
+from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_least, check_some
 
-Outcomes = Mapping[str, Outcome]  # by recording
+Outcomes = Mapping[str, TrialResult]  # by recording
 
 
 class TuneExperiment:

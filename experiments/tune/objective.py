@@ -8,7 +8,7 @@ from statistics import fmean
 from typing import Any
 
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.experiment import Outcome
+from sceneslam.types.experiment import TrialResult
 
 
 class Objective:
@@ -24,11 +24,11 @@ class Objective:
             raise ConfigError("weights", dict(weights), "one or more metrics with their weights")
         self.weights, self._unknown = weights, unknown
 
-    def of(self, outcome: Outcome) -> float:
+    def of(self, outcome: TrialResult) -> float:
         """Return the weighted sum of a run."""
         return sum(weight * self.value(outcome, name) for name, weight in self.weights.items())
 
-    def value(self, outcome: Outcome, name: str) -> float:
+    def value(self, outcome: TrialResult, name: str) -> float:
         """Return a metric of a run; raises ConfigError where a run has no such metric."""
         value = _find(outcome.metrics, name)
         return self._unknown if math.isnan(value) else value

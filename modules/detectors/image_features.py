@@ -72,7 +72,7 @@ _OF_GRID: Mapping[str, Measure] = {
 NAMES = (*_OF_GRID, *FEATURES)
 
 
-class Features:
+class ImageFeatures:
     """The named features of an observation, in their order."""
 
     def __init__(self, names: Sequence[str]) -> None:

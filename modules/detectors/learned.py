@@ -13,7 +13,7 @@ from sceneslam.types.errors import InputError
 from sceneslam.types.observation import UNSURE, Observation, SceneVote
 from sceneslam.types.rig import Rig, Sensor
 
-from .image_features import Features
+from .image_features import ImageFeatures
 
 _SHIPPED = Path(__file__).with_name("bright_dark.yaml")
 _KEYS = ("scenes", "features", "mean", "scale", "weights", "bias")
@@ -33,7 +33,7 @@ class Learned:
         model = _read(file)
         try:
             self.scenes: tuple[str, ...] = tuple(map(str, model["scenes"]))
-            self._features = Features(model["features"])
+            self._features = ImageFeatures(model["features"])
             scale = np.array(model["scale"], np.float64)
             weights = np.array([model["weights"][scene] for scene in self.scenes], np.float64)
             bias = np.array([model["bias"][scene] for scene in self.scenes], np.float64)

@@ -29,7 +29,7 @@ _HANG_S = 3600.0
 _GULP = 1 << 22  # numbers of 8 bytes
 
 
-class Faulty:
+class FaultyModule:
     """Passes everything on to `module`, but strikes at random observations.
 
     `silence`: it says that it is lost for `lasting_s`. `jump`: its poses are off by `jump_m` in a

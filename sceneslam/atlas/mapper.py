@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map
-from sceneslam.atlas.places.localizer import Fix, Localizer, Outcome, Placed
+from sceneslam.atlas.places.localizer import Fix, LocalizationEvent, MapLocalizer, PlacedScan
 from sceneslam.atlas.submaps.collector import Collector, Known
 from sceneslam.atlas.submaps.correction import Correction
-from sceneslam.atlas.submaps.graph import Edge, Kind, consistent, solve
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind, consistent, solve
 from sceneslam.atlas.submaps.loop_closure import LoopFinder
 from sceneslam.atlas.submaps.own_loops import OwnLoop, Path
 from sceneslam.scans.key_scan import KeyScanner
@@ -51,10 +51,10 @@ class Mapper:
         self._scanner, self._known, self._note = KeyScanner(rig), known, note
         self._collector = Collector(rig, known, self._loaded.runs)
         plan = self._loaded.plan()
-        self._localizer = Localizer(plan) if len(plan) else None
+        self._localizer = MapLocalizer(plan) if len(plan) else None
         self._thread = ThreadPoolExecutor(1) if is_live else None
-        self._search: Future[Outcome] | None = None
-        self._recent: list[Placed] = []
+        self._search: Future[LocalizationEvent] | None = None
+        self._recent: list[PlacedScan] = []
         self._T_map_run: Planar | None = None
         self._began_ns: int | None = None
         self._has_told = False
@@ -96,7 +96,10 @@ class Mapper:
             self._collector.add(scan)
         if self._localizer is not None:
             T_run_base = planar.from_transform(known.T_map_base)
-            self._recent = [*self._recent[1 - _RECENT :], Placed(scan=scan, T_run_base=T_run_base)]
+            self._recent = [
+                *self._recent[1 - _RECENT :],
+                PlacedScan(scan=scan, T_run_base=T_run_base),
+            ]
             self._localize(self._localizer, scan.stamp_ns)
 
     def finish(
@@ -157,14 +160,14 @@ class Mapper:
             return False
         return stamp_ns - self._recent[-1].scan.stamp_ns >= _REST_NS
 
-    def _localize(self, localizer: Localizer, stamp_ns: int) -> None:
+    def _localize(self, localizer: MapLocalizer, stamp_ns: int) -> None:
         if self._search is not None:
             if not self._search.done():
                 return
             self._take(self._search.result(), localizer, stamp_ns)
             self._search = None
         if not localizer.is_due(self._recent[-1]):
-            outcome = Outcome.NOTHING
+            outcome = LocalizationEvent.NOTHING
         elif self._thread is not None:
             self._search = self._thread.submit(localizer.compare, tuple(self._recent))
             return
@@ -172,14 +175,14 @@ class Mapper:
             outcome = localizer.compare(self._recent)
         self._take(outcome, localizer, stamp_ns)
 
-    def _take(self, outcome: Outcome, localizer: Localizer, stamp_ns: int) -> None:
+    def _take(self, outcome: LocalizationEvent, localizer: MapLocalizer, stamp_ns: int) -> None:
         """Process the result of a comparison with the map."""
         assert self._began_ns is not None
         after_s = (stamp_ns - self._began_ns) / 1e9
         self._T_map_run = localizer.T_map_run
-        if outcome is Outcome.FOUND:
+        if outcome is LocalizationEvent.FOUND:
             self._note(outcome.value, stamp_ns, after_s=after_s, T_map_run=self.T_map_run.tolist())
-        elif outcome is Outcome.WITHDRAWN:
+        elif outcome is LocalizationEvent.WITHDRAWN:
             self._note(outcome.value, stamp_ns, after_s=after_s)
         elif not self.is_found and not self._has_told and after_s * 1e9 >= _UNFOUND_NS:
             self._note("not_relocalized", stamp_ns, after_s=after_s)
@@ -228,7 +231,7 @@ class Mapper:
             second=second,
             T_first_second=planar.compose(self._away(start, first), T_from_second),
             covariance=loop.covariance,
-            kind=Kind.LOOP,
+            kind=EdgeKind.LOOP,
         )
 
     def _fix_edges(self, path: Path) -> list[Edge]:
@@ -259,7 +262,7 @@ class Mapper:
             second=count + node,
             T_first_second=planar.between(nodes[first], T_map_node),
             covariance=turn @ carried @ turn.T,
-            kind=Kind.LOOP,
+            kind=EdgeKind.LOOP,
         )
 
     def _away(self, T_run_base: Transform, node: int) -> Planar:

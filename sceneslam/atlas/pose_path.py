@@ -10,7 +10,7 @@ import numpy as np
 
 from sceneslam.atlas.revision import Told
 from sceneslam.atlas.submaps.collector import Known
-from sceneslam.atlas.uncertainty import Covariance, Step
+from sceneslam.atlas.uncertainty import Covariance, SessionPose
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.run import BRIDGED, SessionStart
 from sceneslam.types.se3 import Transform
@@ -104,11 +104,13 @@ class PosePath:
                 )
         return list(starts.values())
 
-    def steps(self) -> list[Step]:
+    def steps(self) -> list[SessionPose]:
         """Return every pose with its module and the covariance that this reported."""
         rows = zip(self.poses, self.sessions, self.modules, self.covariances, strict=True)
         return [
-            Step(T_map_base=T, session=session, is_bridged=module == BRIDGED, covariance=told)
+            SessionPose(
+                T_map_base=T, session=session, is_bridged=module == BRIDGED, covariance=told
+            )
             for T, session, module, told in rows
         ]
 

@@ -40,7 +40,7 @@ VELOCITY = Drift(per_m=0.5, rad_per_m=0.1, rad_per_rad=0.5, rad_per_root=0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Step:
+class SessionPose:
     """A pose of the trajectory with its session and covariance."""
 
     T_map_base: Transform
@@ -58,7 +58,7 @@ class _Known:
     told: Covariance = field(default_factory=lambda: np.zeros((6, 6)))
 
 
-def propagate(steps: Sequence[Step], bridge: Drift) -> NDArray[np.float64]:
+def propagate(steps: Sequence[SessionPose], bridge: Drift) -> NDArray[np.float64]:
     """Return the covariance (N, 6, 6) of every pose; `map` begins at the first pose.
 
     The covariance of a module's pose is the sum of three parts, assumed independent: that of the

@@ -12,7 +12,7 @@ from statemachine import State, StateMachine
 from sceneslam.bus.beside import executor
 from sceneslam.bus.changeover import Candidates, Changeover, Outcome, Plan
 from sceneslam.bus.dead_reckoning import DeadReckoning
-from sceneslam.bus.decision import Action, Health, Situation, Verdict, decide
+from sceneslam.bus.decision import Action, Decision, Health, Situation, decide
 from sceneslam.bus.decision_log import DecisionLog
 from sceneslam.bus.estimator import Estimator
 from sceneslam.bus.events import EventLog
@@ -247,7 +247,7 @@ class Bus:
             return Outcome.FAILURE
         return None
 
-    def _plan(self, now: Situation, verdict: Verdict) -> None:
+    def _plan(self, now: Situation, verdict: Decision) -> None:
         """Begin to carry out a verdict."""
         is_scene = verdict.reason == "scene"
         if is_scene:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from sceneslam.bus.decision import Trial
+from sceneslam.bus.decision import StandbyTrial
 from sceneslam.bus.estimator import Estimator
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.handover import Handover
@@ -126,13 +126,13 @@ class Changeover:
         self._trial: _Attempt | None = None
 
     @property
-    def trial(self) -> Trial:
+    def trial(self) -> StandbyTrial:
         """Return the state of the scene's first choice, on standby beside the fallback."""
         if self._trial is None:
-            return Trial.NONE
+            return StandbyTrial.NONE
         handover = self._trial.handover
         tracked_ns = -1 if handover is None else handover.tracked_ns(self._estimator.now_ns)
-        return Trial.PASSED if tracked_ns >= _TRIAL_NS else Trial.RUNNING
+        return StandbyTrial.PASSED if tracked_ns >= _TRIAL_NS else StandbyTrial.RUNNING
 
     def begin(self, plan: Plan) -> None:
         """Begin to change the module."""

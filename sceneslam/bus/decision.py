@@ -22,7 +22,7 @@ class Health(Enum):
     FAILED = "failed"  # it violated its contract and was stopped
 
 
-class Trial(Enum):
+class StandbyTrial(Enum):
     """State of the scene's first choice, on standby beside the fallback that runs in its place."""
 
     NONE = "none"
@@ -46,7 +46,7 @@ class Situation:
     served_choices: tuple[str, ...]  # the same for `served_scene`
     tried: frozenset[str]  # choices tried since the scene was confirmed or one tracked for long
     rounds: int  # how often all choices were tried and failed
-    trial: Trial
+    trial: StandbyTrial
     retry_ns: int  # when the first choice may be tried again
     may_return: bool  # a failed module will return: the run may go on without any
 
@@ -61,7 +61,7 @@ class Action(Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
+class Decision:
     """A decision and its reason."""
 
     action: Action
@@ -71,33 +71,33 @@ class Verdict:
 
 
 _BLIND = 0.1  # share of the patience: constant velocity errs more than ten times as much as wheels
-GO_ON = Verdict(action=Action.GO_ON)
+GO_ON = Decision(action=Action.GO_ON)
 
 
-def decide(policy: Policy, now: Situation) -> Verdict:
+def decide(policy: Policy, now: Situation) -> Decision:
     """Return what to do at an observation, by the scene first, then by the module's health."""
     if now.scene != now.served_scene and now.choices:
         if now.choices[0] == now.active and now.health is not Health.FAILED:
-            return Verdict(action=Action.TELL, reason="scene")
-        return Verdict(action=Action.SWITCH, to=now.choices, reason="scene")
+            return Decision(action=Action.TELL, reason="scene")
+        return Decision(action=Action.SWITCH, to=now.choices, reason="scene")
     if now.health is Health.HELD:
         return _decide_on_return(policy, now)
     return _decide_on_loss(policy, now)
 
 
-def _decide_on_return(policy: Policy, now: Situation) -> Verdict:
+def _decide_on_return(policy: Policy, now: Situation) -> Decision:
     """Return whether the first choice, after it was lost or refused, is tried again."""
     first = now.served_choices[:1]
     if not first or first[0] == now.active or policy.handover == "cold":
         return GO_ON
-    if now.trial is Trial.PASSED:
-        return Verdict(action=Action.SWITCH, to=first, reason="return")
-    if now.trial is Trial.NONE and now.stamp_ns >= now.retry_ns:
-        return Verdict(action=Action.TRY, to=first)
+    if now.trial is StandbyTrial.PASSED:
+        return Decision(action=Action.SWITCH, to=first, reason="return")
+    if now.trial is StandbyTrial.NONE and now.stamp_ns >= now.retry_ns:
+        return Decision(action=Action.TRY, to=first)
     return GO_ON
 
 
-def _decide_on_loss(policy: Policy, now: Situation) -> Verdict:
+def _decide_on_loss(policy: Policy, now: Situation) -> Decision:
     """Return whether another module has to take over from one without a usable pose.
 
     Modules that were tried may be tried again in two cases: the active one had tracked for a
@@ -119,7 +119,7 @@ def _decide_on_loss(policy: Policy, now: Situation) -> Verdict:
     is_waiting = not left and not now.active and now.may_return
     if not is_over or is_waiting or (not left and now.health is not Health.FAILED):
         return GO_ON
-    return Verdict(action=Action.SWITCH, to=left, reason=now.health.value, rounds=rounds)
+    return Decision(action=Action.SWITCH, to=left, reason=now.health.value, rounds=rounds)
 
 
 def _patience_ns(policy: Policy, now: Situation) -> int:

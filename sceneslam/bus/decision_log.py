@@ -8,7 +8,7 @@ from enum import Enum
 from operator import attrgetter
 from typing import Any
 
-from sceneslam.bus.decision import GO_ON, Health, Situation, Trial, Verdict, decide
+from sceneslam.bus.decision import GO_ON, Decision, Health, Situation, StandbyTrial, decide
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.policy import Policy
 from sceneslam.types.run import Event
@@ -23,7 +23,7 @@ class DecisionLog:
         self._log = log
         self._last: tuple[Any, ...] | None = None
 
-    def add(self, now: Situation, verdict: Verdict) -> None:
+    def add(self, now: Situation, verdict: Decision) -> None:
         """Log a decision with its inputs."""
         facts = _FACTS(now)
         is_known, self._last = facts == self._last, facts
@@ -65,7 +65,7 @@ def _check(policy: Policy, now: Situation, logged: Any) -> list[str]:
 
 def _situation(event: Event) -> Situation:
     values = {field.name: event[field.name] for field in fields(Situation)}
-    values |= {"health": Health(values["health"]), "trial": Trial(values["trial"])}
+    values |= {"health": Health(values["health"]), "trial": StandbyTrial(values["trial"])}
     values |= {key: tuple(values[key]) for key in ("choices", "served_choices")}
     return Situation(**values | {"tried": frozenset(values["tried"])})
 

@@ -12,11 +12,11 @@ from sceneslam.bus.decision import Health
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.handover import Handover
 from sceneslam.bus.hold import Hold
-from sceneslam.bus.memory import Memory, Moment
+from sceneslam.bus.observation_buffer import BufferedObservation, ObservationBuffer
 from sceneslam.bus.pace import Pace
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.runner import Legacy, Runner
-from sceneslam.bus.session import Session
+from sceneslam.bus.session import ModuleSession
 from sceneslam.interfaces import BackEnd
 from sceneslam.types import se3
 from sceneslam.types.maps import MapLayers
@@ -47,8 +47,8 @@ class Estimator:
         is_bridged = policy.handover != "cold"
         horizon_s = _VELOCITY_S if is_bridged else 0.0
         bridge = Bridge(velocity_horizon_s=horizon_s, uses_odometry=is_bridged)
-        self._session = Session(None, self._new_hold(), bridge)
-        self._memory = Memory(
+        self._session = ModuleSession(None, self._new_hold(), bridge)
+        self._memory = ObservationBuffer(
             span_s=policy.buffer_s if policy.handover == "rewind" else 0.0,
             limit_mb=policy.buffer_mb,
             keeps_sensors=has_choice,
@@ -108,7 +108,7 @@ class Estimator:
         anchor = self._memory.newest
         if self._policy.handover == "rewind" and not is_trial:
             anchor = self._memory.anchor(since_ns)
-        session = Session(runner, self._new_hold(), anchor.bridge.copy())
+        session = ModuleSession(runner, self._new_hold(), anchor.bridge.copy())
         pace = Pace(self._policy.catch_up)
         return Handover(session, self._memory, anchor=anchor, pace=pace)
 
@@ -131,7 +131,7 @@ class Estimator:
     def retire(self) -> None:
         """Shut the active module down and keep its map."""
         self._retire(self.active, self._placed)
-        self._session = Session(None, self._new_hold(), self._session.bridge)
+        self._session = ModuleSession(None, self._new_hold(), self._session.bridge)
         self._placed = []
 
     def close(self) -> None:
@@ -140,7 +140,7 @@ class Estimator:
         self._keep_maps(waits=True)
         self._memory.clear()
 
-    def _distrust(self, since_ns: int, moment: Moment) -> Moment:
+    def _distrust(self, since_ns: int, moment: BufferedObservation) -> BufferedObservation:
         """Replace the poses after `since_ns` by bridged ones; return the newest moment, bridged."""
         self._log.add("suspect", moment.stamp_ns, module=self._session.key)
         untrusted, before = self._memory.after(since_ns), self._memory.last_until(since_ns)
@@ -155,7 +155,7 @@ class Estimator:
         self._session.bridge = bridge
         return bridged[-1]
 
-    def _put(self, moments: list[Moment], stamp_ns: int) -> None:
+    def _put(self, moments: list[BufferedObservation], stamp_ns: int) -> None:
         """Replace reported moments by their corrected ones."""
         for moment in moments:
             self._report(moment)
@@ -165,7 +165,7 @@ class Estimator:
             from_ns = moments[0].stamp_ns
             self._log.add("revised", stamp_ns, from_ns=from_ns, poses=len(moments))
 
-    def _report(self, moment: Moment) -> None:
+    def _report(self, moment: BufferedObservation) -> None:
         """Report a pose to the back end."""
         if moment.T_map_base is not None:
             given = (moment.T_map_base, moment.module, moment.covariance)

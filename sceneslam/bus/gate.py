@@ -22,7 +22,7 @@ from sceneslam.types.rig import Wheels
 from sceneslam.types.se3 import Transform
 
 
-class Verdict(Enum):
+class GateVerdict(Enum):
     """Result of the comparison of a module's motion with the independent motion."""
 
     AGREE = "agree"
@@ -50,8 +50,8 @@ class GateSettings:
 class Judgement:
     """How far a module's motion is trusted at one observation."""
 
-    distance: Verdict
-    turn: Verdict
+    distance: GateVerdict
+    turn: GateVerdict
     distance_excess: float = 0.0  # the largest difference over its bound; above 1 is too much
     turn_excess: float = 0.0
     since_ns: int | None = None  # since when the module was right, or may have been wrong
@@ -77,7 +77,7 @@ _JUMP_RATIO = 1.5  # times the other's change of velocity, to be the one that ju
 _USUAL_SIGMAS = 1.5
 _USUAL_STEP_M, _USUAL_STEP_NS = 0.02, 200_000_000  # least spacing of the excesses
 _USUAL_MIN, _USUAL_KEPT = 100, 150  # 20 to 30 s of driving: a short fault is no wrong scale
-_GOOD = (Verdict.AGREE, Verdict.UNCHECKED)
+_GOOD = (GateVerdict.AGREE, GateVerdict.UNCHECKED)
 
 
 def with_heading(T_prev_curr_odom: Transform, rotation: NDArray[np.float64]) -> Transform:
@@ -146,13 +146,13 @@ class Gate:
         without motion. `deviation_m`: standard deviation of the module's position, None if unknown.
         """
         if T_odom_base is None:
-            return Judgement(distance=Verdict.UNCHECKED, turn=Verdict.UNCHECKED)
+            return Judgement(distance=GateVerdict.UNCHECKED, turn=GateVerdict.UNCHECKED)
         T_odom_prev, self._T_odom_base = self._T_odom_base, T_odom_base
         if T_odom_prev is not None:
             self._way_m += _norm(T_odom_base[:3, 3] - T_odom_prev[:3, 3])
             self._turn_rad += _angle_rad(T_odom_base[:3, :3] - T_odom_prev[:3, :3])
         if T_local_base is None:
-            return Judgement(distance=Verdict.PROBATION, turn=Verdict.PROBATION)
+            return Judgement(distance=GateVerdict.PROBATION, turn=GateVerdict.PROBATION)
         if is_revised and self._held is not None:
             self._move_past(T_local_base, T_odom_base, *self._held)
         now = _Sample(
@@ -202,8 +202,8 @@ class Gate:
         is_wrong = max(distance, turn) > 1.0
         if is_wrong and self._is_wheels_fault(found[-1], now, deviation_m):
             return Judgement(
-                distance=Verdict.UNCHECKED,
-                turn=Verdict.UNCHECKED,
+                distance=GateVerdict.UNCHECKED,
+                turn=GateVerdict.UNCHECKED,
                 distance_excess=distance,
                 turn_excess=turn,
                 wheels_lie=True,
@@ -258,11 +258,11 @@ class Gate:
                 self._usual_excess = float(self._distances.median[0])
         return self._usual_excess
 
-    def _verdict(self, excess: float, since_ns: int, now: _Sample, is_known: bool) -> Verdict:
+    def _verdict(self, excess: float, since_ns: int, now: _Sample, is_known: bool) -> GateVerdict:
         if excess > 1.0:
-            return Verdict.DISAGREE
+            return GateVerdict.DISAGREE
         is_long = now.stamp_ns - since_ns >= _PROBATION_NS
-        return Verdict.AGREE if is_known and is_long else Verdict.PROBATION
+        return GateVerdict.AGREE if is_known and is_long else GateVerdict.PROBATION
 
     def _anchors(self, stamp_ns: int) -> list[_Sample]:
         """Return, per horizon, the newest sample before it, or the oldest while it is not filled.
@@ -281,15 +281,15 @@ class Gate:
         return found
 
 
-def _turn_verdict(excess: float, is_known: bool) -> Verdict:
+def _turn_verdict(excess: float, is_known: bool) -> GateVerdict:
     """Return whether the module's turn is trusted; within bounds it is better than the wheels'.
 
     There is no probation for turns: a module that was wrong and is within the bounds again turns
     correctly, and the wheels' turn would be worse meanwhile.
     """
     if excess > 1.0:
-        return Verdict.DISAGREE
-    return Verdict.AGREE if is_known else Verdict.PROBATION
+        return GateVerdict.DISAGREE
+    return GateVerdict.AGREE if is_known else GateVerdict.PROBATION
 
 
 def _excess(then: _Sample, now: _Sample, sigmas: float, wheels: Wheels) -> _Excess:

@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from time import perf_counter_ns
 
-from sceneslam.bus.memory import Memory, Moment
+from sceneslam.bus.observation_buffer import BufferedObservation, ObservationBuffer
 from sceneslam.bus.pace import Pace
-from sceneslam.bus.session import Session
+from sceneslam.bus.session import ModuleSession
 from sceneslam.types import se3
 from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.run import BRIDGED
@@ -25,15 +25,17 @@ class Handover:
 
     def __init__(
         self,
-        session: Session,
-        memory: Memory,
+        session: ModuleSession,
+        memory: ObservationBuffer,
         *,
-        anchor: Moment,
+        anchor: BufferedObservation,
         pace: Pace,
     ) -> None:
         assert session.runner is not None
         self.session, self.runner, self.anchor = session, session.runner, anchor
-        self.trail: list[Moment] = []  # after the anchor, or from it if no module gave its pose
+        self.trail: list[
+            BufferedObservation
+        ] = []  # after the anchor, or from it if no module gave its pose
         self.tracked: list[Tracking] = []  # its answers from the anchor on, while it tracks
         self._pace, self._memory = pace, memory
         self._spared = 0  # observations skipped since the last that the module was given
@@ -88,7 +90,7 @@ class Handover:
                 given += self._go_on_to(moment)
         return True
 
-    def settle(self, anchor: Moment) -> None:
+    def settle(self, anchor: BufferedObservation) -> None:
         """Place the module, which has caught up, anew: at the pose of the given moment.
 
         Its earlier observations belong to its trial, not to the hand-over.
@@ -109,7 +111,7 @@ class Handover:
         finally:
             self._cost_ns += perf_counter_ns() - self._since_ns
 
-    def _go_on_to(self, moment: Moment) -> bool:
+    def _go_on_to(self, moment: BufferedObservation) -> bool:
         """Give the module a moment's observation or skip it; return whether it was given."""
         session, motion = self.session, self._motion_to(moment)
         self._done_ns, self._reported = moment.stamp_ns, moment.T_map_base
@@ -125,7 +127,7 @@ class Handover:
         self._ask(moment, motion)
         return True
 
-    def _ask(self, moment: Moment, motion: Transform | None) -> None:
+    def _ask(self, moment: BufferedObservation, motion: Transform | None) -> None:
         """Give the module a moment's observation, with the gyro samples of skipped ones."""
         session, given = self.session, moment.observation
         was_placed = session.is_placed
@@ -150,13 +152,13 @@ class Handover:
             self._given_ns = moment.stamp_ns
         self._remember(moment, replace(found, observation=moment.observation))
 
-    def _motion_to(self, moment: Moment) -> Transform | None:
+    def _motion_to(self, moment: BufferedObservation) -> Transform | None:
         """Return the motion (4, 4) since the moment before, as it was estimated then."""
         if self._reported is None or moment.T_map_base is None:
             return None
         return se3.inverse(self._reported) @ moment.T_map_base
 
-    def _remember(self, moment: Moment, found: Moment) -> None:
+    def _remember(self, moment: BufferedObservation, found: BufferedObservation) -> None:
         """Continue to a moment with its newly estimated pose."""
         if moment is not self.anchor or moment.module == BRIDGED:
             self.trail.append(found)

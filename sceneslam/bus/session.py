@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.hold import Hold
-from sceneslam.bus.memory import Moment
+from sceneslam.bus.observation_buffer import BufferedObservation
 from sceneslam.bus.runner import Runner
 from sceneslam.types import se3
 from sceneslam.types.errors import ModuleError
@@ -15,7 +15,7 @@ from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
 
 
-class Session:
+class ModuleSession:
     """Advances by one observation at a time: the newest, or remembered ones in a catch-up.
 
     Without a runner there is no module, and every pose is bridged.
@@ -43,7 +43,7 @@ class Session:
         *,
         by_velocity: bool,
         T_prev_curr: Transform | None = None,
-    ) -> Moment:
+    ) -> BufferedObservation:
         """Return the observation with its pose: the module's, or a bridged one.
 
         Odometry bridges; else constant velocity, if `by_velocity` or while the module's sensors
@@ -59,7 +59,7 @@ class Session:
         is_silent = self.hold.status is not TrackingStatus.LOST
         return self._bridged(observation, by_velocity or is_silent, T_prev_curr)
 
-    def skip(self, observation: Observation, T_prev_curr: Transform | None) -> Moment:
+    def skip(self, observation: Observation, T_prev_curr: Transform | None) -> BufferedObservation:
         """Return an observation with a bridged pose; it is not given to the module."""
         self.hold.spare(observation)
         return self._bridged(observation, True, T_prev_curr)
@@ -87,7 +87,7 @@ class Session:
 
     def _bridged(
         self, observation: Observation, by_velocity: bool, T_prev_curr: Transform | None
-    ) -> Moment:
+    ) -> BufferedObservation:
         if self.hold.wheels_lie and self.is_running:
             observation = replace(observation, T_odom_base=None)
         turn = self.hold.turn if self.is_running else None
@@ -96,9 +96,11 @@ class Session:
             T_map_base = self.bridge.follow(observation, T_prev_curr)
         return self._moment(observation, T_map_base)
 
-    def _moment(self, observation: Observation, T_map_base: Transform | None) -> Moment:
+    def _moment(
+        self, observation: Observation, T_map_base: Transform | None
+    ) -> BufferedObservation:
         tracking = self.tracking
-        return Moment(
+        return BufferedObservation(
             observation=observation,
             T_map_base=T_map_base,
             module=BRIDGED if tracking is None else self.key,

@@ -17,7 +17,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Table:
+class ColumnTable:
     """Columns of equal length."""
 
     columns: Mapping[str, Sequence[Value]]
@@ -48,17 +48,17 @@ def write_rows(folder: Path, rows: Sequence[Row]) -> Path:
     return write_page(folder, rows, groups)
 
 
-def _table(rows: Sequence[Row], keys: Sequence[str], *, metrics: bool) -> Table:
+def _table(rows: Sequence[Row], keys: Sequence[str], *, metrics: bool) -> ColumnTable:
     numbers = [row.metrics if metrics else row.costs for row in rows]
     columns: dict[str, Sequence[Value]] = {"job": [row.name for row in rows]}
     columns |= {key: [row.keys.get(key) for row in rows] for key in keys}
     columns |= {"status": [row.status for row in rows], "error": [row.error for row in rows]}
     for name in dict.fromkeys(name for one in numbers for name in one):
         columns[name] = [one.get(name) for one in numbers]
-    return Table(columns=columns)
+    return ColumnTable(columns=columns)
 
 
-def _summary(groups: Sequence[Group]) -> Table:
+def _summary(groups: Sequence[Group]) -> ColumnTable:
     """Return one row per setting: how many runs, each metric's mean and its 95 % interval."""
     columns: dict[str, Sequence[Value]] = {
         key: [group.keys[key] for group in groups] for key in groups[0].keys
@@ -69,17 +69,17 @@ def _summary(groups: Sequence[Group]) -> Table:
         means = [group.mean(name) for group in groups]
         columns[name] = [one.mean if one else None for one in means]
         columns[f"{name} ±"] = [one.half_width if one else None for one in means]
-    return Table(columns=columns)
+    return ColumnTable(columns=columns)
 
 
-def _write_csv(path: Path, table: Table) -> None:
+def _write_csv(path: Path, table: ColumnTable) -> None:
     with replacing(path, newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(table.columns)
         writer.writerows(table.rows)
 
 
-def _write_parquet(path: Path, table: Table) -> None:
+def _write_parquet(path: Path, table: ColumnTable) -> None:
     try:
         import pyarrow
         from pyarrow import parquet

@@ -11,7 +11,7 @@ from typing import Any
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.bus.policy import Policy
 from sceneslam.config.check import NOTHING, check_keys
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.settings import DETECT_ONLY, LIVE, RunSettings
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.interfaces import Detector, Live, Sink, SlamModule, Source
@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Parts:
+class RunParts:
     """All that a run is made of."""
 
     source: Source
@@ -46,10 +46,10 @@ class Parts:
                 module.close()
 
 
-def build(config: Mapping[str, Any]) -> Parts:
+def build(config: Mapping[str, Any]) -> RunParts:
     """Return all parts; raises ConfigError or InputError naming what does not fit."""
     check_keys(config)
-    builder = Builder(config)
+    builder = ComponentBuilder(config)
     run = builder.make("run", RunSettings)
     if run.mode == DETECT_ONLY:
         raise ConfigError("run.mode", run.mode, "recording | live, where modules run")
@@ -70,7 +70,7 @@ def build(config: Mapping[str, Any]) -> Parts:
     check_detector(config, detector, rig)
     for key in modules:
         _check_sensors(f"slam.{key}", config["slam"][key], requires[key], rig)
-    return Parts(
+    return RunParts(
         source=source,
         rig=rig,
         detector=detector,
@@ -84,7 +84,7 @@ def build(config: Mapping[str, Any]) -> Parts:
     )
 
 
-def make_source(config: Mapping[str, Any], builder: Builder) -> Source:
+def make_source(config: Mapping[str, Any], builder: ComponentBuilder) -> Source:
     """Return the source with its effects."""
     source = builder.make("source", Source)
     if config.get("effects"):
@@ -104,7 +104,7 @@ def _check_mode(run: RunSettings, source: Source) -> None:
         raise ConfigError("run.mode", run.mode, f"{LIVE}, since this source measures now: run=live")
 
 
-def _module(builder: Builder, run: RunSettings, key: str) -> SlamModule:
+def _module(builder: ComponentBuilder, run: RunSettings, key: str) -> SlamModule:
     """Return a module, or the process that builds it meanwhile."""
     make = partial(builder.make, f"slam.{key}", SlamModule)
     if run.isolation == "inline":

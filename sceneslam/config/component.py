@@ -20,7 +20,7 @@ from sceneslam.types.errors import ConfigError, SceneSlamError
 Part = TypeVar("Part")
 
 
-class Builder:
+class ComponentBuilder:
     """Makes single components of one configuration."""
 
     def __init__(self, config: Mapping[str, Any]) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.scene_filter import ConfirmedScene, SceneFilter
-from sceneslam.detection.features import Features
+from sceneslam.detection.features import RecordingFeatures
 from sceneslam.interfaces import FeatureDetector
 from sceneslam.types.observation import SceneVote
 from sceneslam.types.rig import Rig
@@ -22,7 +22,7 @@ class Filtered:
     posterior: Mapping[str, float] | None
 
 
-def vote(detector: FeatureDetector, rig: Rig, features: Features) -> list[SceneVote]:
+def vote(detector: FeatureDetector, rig: Rig, features: RecordingFeatures) -> list[SceneVote]:
     """Return the detector's votes on every observation."""
     detector.activate(rig)
     told = zip(

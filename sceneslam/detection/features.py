@@ -17,7 +17,7 @@ from sceneslam.types.truth import GroundTruth, SceneChange
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Features:
+class RecordingFeatures:
     """A recording as a detector sees it."""
 
     stamps_ns: NDArray[np.int64]  # (N,) of all observations
@@ -46,7 +46,7 @@ class Features:
         part.replace(path)
 
     @classmethod
-    def read(cls, path: Path) -> Features:
+    def read(cls, path: Path) -> RecordingFeatures:
         """Return what a file holds, to the bit what was written."""
         with np.load(path, allow_pickle=False) as arrays:
             scenes = json.loads(str(arrays["scenes"]))

@@ -10,7 +10,7 @@ from itertools import product
 from typing import Any
 
 from sceneslam.bus.policy import Policy
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.detection.decide import confirm, vote
 from sceneslam.detection.run import Watched, score, watch
 from sceneslam.evaluation.metrics import Metrics
@@ -56,7 +56,7 @@ def try_all(config: Mapping[str, Any], axes: Sequence[Axis]) -> Iterator[Tried]:
     """
     detectors = list(_settings(axes, "detector."))
     policies = [_built(config, setting) for setting in _settings(axes, "policy.")]
-    evaluation = Builder(config).make("evaluation", EvaluationSettings)
+    evaluation = ComponentBuilder(config).make("evaluation", EvaluationSettings)
     watched: dict[str, Watched] = {}
     for setting in detectors:
         try:
@@ -78,7 +78,7 @@ def try_all(config: Mapping[str, Any], axes: Sequence[Axis]) -> Iterator[Tried]:
 
 
 def _votes(config: Mapping[str, Any], watched: dict[str, Watched]) -> _Ballot:
-    detector = Builder(config).make("detector", FeatureDetector)
+    detector = ComponentBuilder(config).make("detector", FeatureDetector)
     kind = json.dumps([config["detector"].get(name) for name in detector.feature_settings])
     if kind not in watched:
         watched[kind] = watch(config)
@@ -89,7 +89,7 @@ def _votes(config: Mapping[str, Any], watched: dict[str, Watched]) -> _Ballot:
 
 def _built(config: Mapping[str, Any], setting: Setting) -> tuple[Setting, Policy | SceneSlamError]:
     try:
-        return setting, Builder(_with(config, setting)).make("policy", Policy)
+        return setting, ComponentBuilder(_with(config, setting)).make("policy", Policy)
     except SceneSlamError as error:
         return setting, error
 

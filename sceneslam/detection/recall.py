@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from sceneslam.config.provenance import code_sha256, input_sha256
 from sceneslam.config.settings import RunSettings
-from sceneslam.detection.features import Features, measure
+from sceneslam.detection.features import RecordingFeatures, measure
 from sceneslam.interfaces import FeatureDetector, Source
 
 _CACHE = "~/.cache/sceneslam"
@@ -22,14 +22,14 @@ _CACHE = "~/.cache/sceneslam"
 
 def recall(
     config: Mapping[str, Any], detector: FeatureDetector, source: Source, run: RunSettings
-) -> Features:
+) -> RecordingFeatures:
     """Return the features that a configuration's detector takes from its source.
 
     Raises InputError where the source cannot be read.
     """
     path = _path(config, detector)
     if path.is_file():
-        return Features.read(path)
+        return RecordingFeatures.read(path)
     detector.activate(source.rig)
     observations = islice(source, run.max_observations)
     bar = tqdm(observations, desc="features", unit="obs", disable=not run.progress)
@@ -37,7 +37,7 @@ def recall(
     detector.shutdown()
     truth = source.ground_truth()
     scenes = truth.scenes if truth is not None and truth.scenes else None
-    found = Features(stamps_ns=stamps_ns, values=values, is_there=is_there, scenes=scenes)
+    found = RecordingFeatures(stamps_ns=stamps_ns, values=values, is_there=is_there, scenes=scenes)
     found.write(path)
     return found
 

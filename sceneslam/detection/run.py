@@ -14,11 +14,11 @@ from sceneslam.bus.scene_filter import ConfirmedScene
 from sceneslam.bus.watch import log_vote
 from sceneslam.config.build import check_detector, make_source
 from sceneslam.config.check import check_keys
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.provenance import save_config
 from sceneslam.config.settings import RunSettings
 from sceneslam.detection.decide import Filtered, filtered, vote
-from sceneslam.detection.features import Features
+from sceneslam.detection.features import RecordingFeatures
 from sceneslam.detection.recall import recall
 from sceneslam.evaluation.detection import score_detection
 from sceneslam.evaluation.metrics import Metrics, write_metrics
@@ -36,14 +36,14 @@ class Watched:
     """A recording as a detector saw it; other settings of the detector can be tried on it."""
 
     rig: Rig
-    features: Features
+    features: RecordingFeatures
     faults: Sequence[str]  # of the recording, where it was read just now
 
 
 def watch(config: Mapping[str, Any]) -> Watched:
     """Return what the configuration's detector sees; raises ConfigError or InputError."""
     check_keys(config)
-    builder = Builder(config)
+    builder = ComponentBuilder(config)
     run = builder.make("run", RunSettings)
     detector = builder.make("detector", FeatureDetector)
     source = make_source(config, builder)
@@ -56,7 +56,7 @@ def watch(config: Mapping[str, Any]) -> Watched:
 def detect(config: Mapping[str, Any], folder: Path) -> list[str]:
     """Write a folder with events, metrics and configuration; return a summary in short lines."""
     watched = watch(config)
-    builder = Builder(config)
+    builder = ComponentBuilder(config)
     detector = builder.make("detector", FeatureDetector)
     votes = vote(detector, watched.rig, watched.features)
     scene_filter = builder.make("policy", Policy).make_scene_filter(detector.scenes)
@@ -79,7 +79,7 @@ def detect(config: Mapping[str, Any], folder: Path) -> list[str]:
 
 
 def score(
-    features: Features, confirmed: Sequence[ConfirmedScene], settings: EvaluationSettings
+    features: RecordingFeatures, confirmed: Sequence[ConfirmedScene], settings: EvaluationSettings
 ) -> Metrics:
     """Return the metrics of confirmed scenes, named as those of a run with SLAM."""
     stamps_ns = features.stamps_ns

@@ -14,7 +14,7 @@ Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Matches:
+class PosePairs:
     """Pairs of poses of two trajectories: `first[k]` belongs to `second[k]`."""
 
     first: Indices
@@ -36,7 +36,7 @@ def nearest(stamps_ns: NDArray[np.int64], wanted_ns: NDArray[np.int64]) -> Indic
     return np.searchsorted(stamps_ns, stamps_ns[index])  # the first of equal stamps
 
 
-def associate(first: Trajectory, second: Trajectory, max_gap_s: float) -> Matches:
+def associate(first: Trajectory, second: Trajectory, max_gap_s: float) -> PosePairs:
     """Return, for each pose of the shorter trajectory, the nearest of the longer.
 
     Pairs farther apart than `max_gap_s` are left out, as in evo (`sync.associate_trajectories`), so
@@ -44,7 +44,7 @@ def associate(first: Trajectory, second: Trajectory, max_gap_s: float) -> Matche
     """
     if len(second) <= len(first):
         swapped = _nearest_within(second.stamps_ns, first.stamps_ns, max_gap_s)
-        return Matches(first=swapped.second, second=swapped.first)
+        return PosePairs(first=swapped.second, second=swapped.first)
     return _nearest_within(first.stamps_ns, second.stamps_ns, max_gap_s)
 
 
@@ -98,12 +98,12 @@ def interpolated(trajectory: Trajectory, stamps_ns: NDArray[np.int64]) -> Trajec
 
 def _nearest_within(
     short_ns: NDArray[np.int64], long_ns: NDArray[np.int64], max_gap_s: float
-) -> Matches:
+) -> PosePairs:
     if not len(short_ns) or not len(long_ns):
-        return Matches(first=np.zeros(0, np.int64), second=np.zeros(0, np.int64))
+        return PosePairs(first=np.zeros(0, np.int64), second=np.zeros(0, np.int64))
     partner = nearest(long_ns, short_ns)
     kept = np.flatnonzero(np.abs(long_ns[partner] - short_ns) <= round(max_gap_s * 1e9))
-    return Matches(first=kept, second=partner[kept])
+    return PosePairs(first=kept, second=partner[kept])
 
 
 def _slerp(

@@ -35,7 +35,7 @@ _PAGE_COLORS = {  # CSS variables of report.html
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
+class LabelledSpan:
     """A stretch of time [s] with one label."""
 
     start_s: float
@@ -143,7 +143,7 @@ def duration_s(result: RunResult) -> float:
     return float(elapsed_s(result, result.observed_ns[-1:]).sum())
 
 
-def spans(times_s: NDArray[np.float64], labels: Sequence[str], end_s: float) -> list[Span]:
+def spans(times_s: NDArray[np.float64], labels: Sequence[str], end_s: float) -> list[LabelledSpan]:
     """Return the stretches of equal labels; each lasts until the next begins."""
     if not len(labels):
         return []
@@ -151,18 +151,18 @@ def spans(times_s: NDArray[np.float64], labels: Sequence[str], end_s: float) -> 
     starts = np.flatnonzero(np.append(True, names[1:] != names[:-1]))
     ends_s = np.append(times_s[starts[1:]], max(end_s, times_s[-1]))
     return [
-        Span(float(times_s[start]), float(stop_s), str(names[start]))
+        LabelledSpan(float(times_s[start]), float(stop_s), str(names[start]))
         for start, stop_s in zip(starts, ends_s, strict=True)
     ]
 
 
-def module_spans(result: RunResult) -> list[Span]:
+def module_spans(result: RunResult) -> list[LabelledSpan]:
     """Return the spans of the modules that gave the poses; "" for bridged poses."""
     times_s = elapsed_s(result, result.trajectory.stamps_ns)
     return spans(times_s, result.modules, duration_s(result))
 
 
-def true_scene_spans(result: RunResult, truth: GroundTruth | None) -> list[Span]:
+def true_scene_spans(result: RunResult, truth: GroundTruth | None) -> list[LabelledSpan]:
     """Return the true scenes within the run."""
     changes = truth.scenes if truth else ()
     stamps_ns = np.array([change.stamp_ns for change in changes], np.int64)
@@ -172,13 +172,15 @@ def true_scene_spans(result: RunResult, truth: GroundTruth | None) -> list[Span]
     return within(found, duration_s(result))
 
 
-def within(found: Sequence[Span], end_s: float) -> list[Span]:
+def within(found: Sequence[LabelledSpan], end_s: float) -> list[LabelledSpan]:
     """Return the parts of the spans that lie between 0 and `end_s`."""
-    cut = [Span(max(s.start_s, 0.0), min(s.end_s, end_s), s.label) for s in found]
+    cut = [LabelledSpan(max(s.start_s, 0.0), min(s.end_s, end_s), s.label) for s in found]
     return [span for span in cut if span.end_s > span.start_s]
 
 
-def draw_bands(axes: Any, bands: Sequence[Span], colors: dict[str, str], alpha: float) -> None:
+def draw_bands(
+    axes: Any, bands: Sequence[LabelledSpan], colors: dict[str, str], alpha: float
+) -> None:
     """Shade stretches of time and name each at the top where there is room for it."""
     total_s = max((band.end_s for band in bands), default=0.0)
     for band in bands:

@@ -179,14 +179,14 @@ def _mark_confirmed(axes: Any, result: RunResult) -> None:
             )
 
 
-def _confirmed_spans(result: RunResult) -> list[look.Span]:
+def _confirmed_spans(result: RunResult) -> list[look.LabelledSpan]:
     changes = [e for e in result.events if e["event"] == "scene"]
     times_s = look.elapsed_s(result, np.array([e["stamp_ns"] for e in changes], np.int64))
     return look.spans(times_s, [e["scene"] for e in changes], look.duration_s(result))
 
 
 def _draw_bar(
-    axes: Any, bar: look.Span, row: int, color: str, *, name_it: bool, total_s: float
+    axes: Any, bar: look.LabelledSpan, row: int, color: str, *, name_it: bool, total_s: float
 ) -> None:
     width_s = max(bar.end_s - bar.start_s, 0.002 * total_s)
     axes.barh(row, width_s, left=bar.start_s, height=0.62, color=color, linewidth=0)
@@ -209,7 +209,7 @@ def _draw_trouble(axes: Any, result: RunResult, module: str, row: int) -> None:
         )
 
 
-def _trouble(result: RunResult, module: str) -> list[look.Span]:
+def _trouble(result: RunResult, module: str) -> list[look.LabelledSpan]:
     """Return the spans in which a module was not TRACKING, until it was replaced."""
     changes = [e for e in result.events if e["event"] == "tracking" and e["module"] == module]
     times_s = look.elapsed_s(result, np.array([e["stamp_ns"] for e in changes], np.int64))
@@ -217,7 +217,9 @@ def _trouble(result: RunResult, module: str) -> list[look.Span]:
     replaced = [e for e in result.events if is_switch(e) and e["from"] == module]
     replaced_s = [*(_at_s(result, e) for e in replaced), float("inf")]
     return [
-        look.Span(s.start_s, min(s.end_s, *(t for t in replaced_s if t >= s.start_s)), s.label)
+        look.LabelledSpan(
+            s.start_s, min(s.end_s, *(t for t in replaced_s if t >= s.start_s)), s.label
+        )
         for s in found
         if s.label != "tracking"
     ]

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import cv2
 
 from sceneslam.evaluation import markup
-from sceneslam.types.run import Event, Moment
+from sceneslam.types.run import Event, KeyMoment
 
 _QUALITY = 80  # of the images in the page (JPEG)
 
@@ -24,7 +24,7 @@ def change_of(event: Event) -> str:
     return ""
 
 
-def pictures(moments: Iterable[Moment], start_ns: int) -> str:
+def pictures(moments: Iterable[KeyMoment], start_ns: int) -> str:
     """Return the images as figures with the time since `start_ns` and what changed."""
     figures = []
     for moment in moments:

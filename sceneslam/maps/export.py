@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import grid_of
 from sceneslam.atlas.save import save_grid, save_pose_graph
-from sceneslam.atlas.submaps.graph import Kind
+from sceneslam.atlas.submaps.graph import EdgeKind
 from sceneslam.types import planar
 from sceneslam.types.maps import PoseGraphLayer
 
@@ -41,7 +41,7 @@ def _graph(saved: SavedMap) -> PoseGraphLayer:
         information=np.array([_information(edge.covariance) for edge in saved.edges]).reshape(
             -1, 6, 6
         ),
-        is_loop=np.array([edge.kind is Kind.LOOP for edge in saved.edges], bool),
+        is_loop=np.array([edge.kind is EdgeKind.LOOP for edge in saved.edges], bool),
     )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import CELL_M
-from sceneslam.atlas.submaps.graph import Kind
+from sceneslam.atlas.submaps.graph import EdgeKind
 from sceneslam.types import planar
 
 _CHI2_3 = 16.27  # of three degrees of freedom, exceeded by one in a thousand
@@ -14,7 +14,7 @@ _CHI2_3 = 16.27  # of three degrees of freedom, exceeded by one in a thousand
 
 def described(saved: SavedMap) -> list[str]:
     """Return what the map holds, a line per piece."""
-    loops = sum(edge.kind is Kind.LOOP for edge in saved.edges)
+    loops = sum(edge.kind is EdgeKind.LOOP for edge in saved.edges)
     lines = [
         f"{len(saved.submaps)} submaps of {saved.runs} runs, {len(saved.edges)} edges, "
         f"{loops} of them loops"

@@ -13,7 +13,7 @@ import yaml
 from numpy.typing import NDArray
 
 from sceneslam.config.build import make_source
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.evaluation.association import interpolated
 from sceneslam.interfaces import Live, Source
 from sceneslam.types import se3
@@ -30,7 +30,7 @@ _WEIGHT_MIN = 2.0  # images that have to agree on a surface
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class View:
+class ColouredDepthImage:
     """A depth image with its colours and pose."""
 
     depth_m: NDArray[np.float32]  # (H, W), 0 = missing
@@ -73,7 +73,7 @@ def write_mesh(folder: Path, voxel_m: float) -> Meshed:
 
 def views(
     observations: Iterable[Observation], trajectory: Trajectory, camera: Camera
-) -> Iterator[View]:
+) -> Iterator[ColouredDepthImage]:
     """Yield the depth images along a trajectory, one per 0.1 m or 9 degrees."""
     last: Transform | None = None
     first_ns, last_ns = trajectory.stamps_ns[[0, -1]]
@@ -108,7 +108,7 @@ class Volume:
             device=self._device,
         )
 
-    def add(self, view: View) -> None:
+    def add(self, view: ColouredDepthImage) -> None:
         """Fuse a depth image (Curless and Levoy, SIGGRAPH 1996)."""
         image = self._open3d.t.geometry.Image
         depth = image(np.ascontiguousarray(view.depth_m))
@@ -129,7 +129,7 @@ class Volume:
         return int(mesh.triangle.indices.shape[0])
 
 
-def _view(one: Observation, T_map_cam: Transform, camera: Camera) -> View:
+def _view(one: Observation, T_map_cam: Transform, camera: Camera) -> ColouredDepthImage:
     """Return the observation's images without the lens's distortion, depth out of range missing."""
     assert one.depth_m is not None
     depth_m = np.where(camera.measures(one.depth_m), one.depth_m, 0.0).astype(np.float32)
@@ -142,7 +142,7 @@ def _view(one: Observation, T_map_cam: Transform, camera: Camera) -> View:
         )
         depth_m = np.asarray(cv2.remap(depth_m, columns, rows, cv2.INTER_NEAREST), np.float32)
         image_bgr = np.asarray(cv2.remap(image_bgr, columns, rows, cv2.INTER_LINEAR), np.uint8)
-    return View(depth_m=depth_m, image_bgr=image_bgr, T_map_cam=T_map_cam)
+    return ColouredDepthImage(depth_m=depth_m, image_bgr=image_bgr, T_map_cam=T_map_cam)
 
 
 def _is_apart(T_map_first: Transform, T_map_second: Transform) -> bool:
@@ -157,7 +157,7 @@ def _source(folder: Path) -> Source:
         if not (folder / name).is_file():
             raise InputError(f"mesh: not the folder of a finished run, {name} is missing: {folder}")
     config: Mapping[str, Any] = yaml.safe_load((folder / "config.yaml").read_text())
-    source = make_source(config, Builder(config))
+    source = make_source(config, ComponentBuilder(config))
     if isinstance(source, Live) and source.live is not None:
         raise InputError(f"mesh: the run's source is live and cannot be read again: {folder}")
     return source

@@ -17,7 +17,7 @@ from yaml import YAMLError
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.config.build import make_source
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.provenance import provenance
 from sceneslam.evaluation.metrics import Metrics
 from sceneslam.evaluation.settings import EvaluationSettings
@@ -52,7 +52,7 @@ def recover(folder: Path) -> Recovered:
     # The code that a configuration names is run at the user's word alone, not at a file's.
     # Submaps are made of observations, which a journal does not hold.
     poses_alone = {**(config.get("atlas") or {}), "load": None, "save": None, "mode": "extend"}
-    builder = Builder(config | {"allow_targets": [], "atlas": poses_alone})
+    builder = ComponentBuilder(config | {"allow_targets": [], "atlas": poses_alone})
     atlas = builder.make("atlas", Atlas)
     kept = read_journal(folder / JOURNAL, _Retold(atlas))
     missing = list(_NEVER_KEPT)
@@ -146,7 +146,9 @@ def _events(folder: Path, missing: list[str]) -> list[Event]:
     return events
 
 
-def _truth(config: Mapping[str, Any], builder: Builder, missing: list[str]) -> GroundTruth | None:
+def _truth(
+    config: Mapping[str, Any], builder: ComponentBuilder, missing: list[str]
+) -> GroundTruth | None:
     try:
         return make_source(config, builder).ground_truth()
     except SceneSlamError as error:

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneslam.config.component import Builder
-from sceneslam.scenes.examples import FeatureSource, Seen, look
+from sceneslam.config.component import ComponentBuilder
+from sceneslam.scenes.examples import FeatureSource, MeasuredExample, look
 from sceneslam.scenes.label import Table, label
 from sceneslam.scenes.model import Model
 from sceneslam.scenes.runs import read_runs
@@ -27,7 +27,7 @@ from sceneslam.types.errors import InputError, SceneSlamError
 
 # The upper half of grey follows the light; the lower one, the shadows, whatever lies in them.
 _FEATURES = "q50,q75,q90,q98"
-_FEATURES_TARGET = "sceneslam.modules.detectors.image_features.Features"
+_FEATURES_TARGET = "sceneslam.modules.detectors.image_features.ImageFeatures"
 _CHANGE_M = 0.02  # what wheels lose over the half metre between two modules' poses
 _COMMAND = ("python", "-m", "sceneslam.scenes")
 
@@ -80,10 +80,10 @@ def _test(options: argparse.Namespace) -> None:
     print(f"wrong    {wrong} images" + (f": {options.sheet}" if wrong else ""))
 
 
-def _look(options: argparse.Namespace, names: Sequence[str]) -> list[Seen]:
+def _look(options: argparse.Namespace, names: Sequence[str]) -> list[MeasuredExample]:
     examples = read_words(options.examples)
     node = {"_target_": _FEATURES_TARGET, "names": list(names)}
-    features = Builder({"features": node}).make("features", FeatureSource)
+    features = ComponentBuilder({"features": node}).make("features", FeatureSource)
     return look(examples, features, options.images)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.config.build import make_source
-from sceneslam.config.component import Builder
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.types.errors import InputError
 from sceneslam.types.observation import Observation
 
@@ -55,7 +55,7 @@ class Example:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Seen:
+class MeasuredExample:
     """What was measured of an example."""
 
     example: Example
@@ -64,13 +64,15 @@ class Seen:
     thumbnails: Sequence[NDArray[np.uint8]]  # N, empty where the source has no images
 
 
-def look(examples: Sequence[Example], features: FeatureSource, images: int) -> list[Seen]:
+def look(
+    examples: Sequence[Example], features: FeatureSource, images: int
+) -> list[MeasuredExample]:
     """Return the features of up to so many observations of each recording, evenly over it.
 
     Examples of one recording, one after the other, are taken from it together. Raises ConfigError
     or InputError where a recording cannot be read, or an example has no observation.
     """
-    seen: list[Seen] = []
+    seen: list[MeasuredExample] = []
     for _, found in groupby(examples, key=lambda example: id(example.config)):
         seen += _look(list(found), features, images)
     return seen
@@ -95,11 +97,11 @@ class _Collected:
         if observation.image_bgr is not None:
             self.thumbnails.append(_thumbnail(observation.image_bgr))
 
-    def seen(self) -> Seen:
+    def seen(self) -> MeasuredExample:
         if not self.rows:
             scene, name = self.example.scene, self.example.name
             raise InputError(f"example: no observation of {scene} has all features: {name}")
-        return Seen(
+        return MeasuredExample(
             example=self.example,
             features=np.array(self.rows),
             weights=np.array(self.weights),
@@ -107,9 +109,11 @@ class _Collected:
         )
 
 
-def _look(examples: Sequence[Example], features: FeatureSource, images: int) -> list[Seen]:
+def _look(
+    examples: Sequence[Example], features: FeatureSource, images: int
+) -> list[MeasuredExample]:
     """Return what is seen of examples of one recording."""
-    source = make_source(examples[0].config, Builder(examples[0].config))
+    source = make_source(examples[0].config, ComponentBuilder(examples[0].config))
     step = max(1, (source.length or images) // images)
     end_s = max(part.end_s for example in examples for part in example.parts)
     collected = [_Collected(example) for example in examples]

@@ -19,7 +19,7 @@ Table = Mapping[str, Sequence[str]]  # scene -> modules, the best first
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Span:
+class BestModuleSpan:
     """A second of a recording or less, in which one module was best."""
 
     start_s: float  # after the first observation
@@ -35,7 +35,7 @@ class Labelled:
     name: str
     group: str  # what is held out together: one path, or one story of the simulator
     config: Mapping[str, Any]  # of its source and effects
-    spans: Sequence[Span]
+    spans: Sequence[BestModuleSpan]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -76,7 +76,7 @@ class Labels:
                     group=str(one["group"]),
                     config=dict(one["config"]),
                     spans=[
-                        Span(
+                        BestModuleSpan(
                             start_s=float(start_s),
                             end_s=float(end_s),
                             scene=str(scene),
@@ -167,7 +167,7 @@ def _labelled(
     for (place, _), found in groupby(enumerate(best), key=lambda at: (at[1], at[0] // per_second)):
         inside = [at for at, _ in found]
         spans.append(
-            Span(
+            BestModuleSpan(
                 start_s=round(inside[0] * STEP_S, 3),
                 end_s=round((inside[-1] + 1) * STEP_S, 3),
                 scene=keys[place],

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.scenes.examples import Seen
+from sceneslam.scenes.examples import MeasuredExample
 from sceneslam.scenes.model import Model, fit, shares
 from sceneslam.types.errors import InputError
 
@@ -20,7 +20,7 @@ _TEMPERATURES = np.geomspace(1.0, 10.0, 65)
 class Judged:
     """An example with the probabilities that a model gave it that was not trained on it."""
 
-    seen: Seen
+    seen: MeasuredExample
     scenes: tuple[str, ...]
     scores: NDArray[np.float64]  # (N, S)
 
@@ -49,7 +49,7 @@ class Trained:
     temperature: float
 
 
-def train(all_seen: Sequence[Seen], names: Sequence[str]) -> Trained:
+def train(all_seen: Sequence[MeasuredExample], names: Sequence[str]) -> Trained:
     """Return the model of examples whose features have these names.
 
     Its probabilities are calibrated on groups of recordings that were held out in turn: those
@@ -73,22 +73,22 @@ def train(all_seen: Sequence[Seen], names: Sequence[str]) -> Trained:
     return Trained(model=model, held_out=cooled, temperature=temperature)
 
 
-def judge(model: Model, seen: Seen) -> Judged:
+def judge(model: Model, seen: MeasuredExample) -> Judged:
     """Return what a model says of an example."""
     return Judged(seen=seen, scenes=model.scenes, scores=model.scores(seen.features))
 
 
-def _scenes(all_seen: Sequence[Seen]) -> set[str]:
+def _scenes(all_seen: Sequence[MeasuredExample]) -> set[str]:
     return {seen.example.scene for seen in all_seen}
 
 
-def _fit(all_seen: Sequence[Seen], names: Sequence[str]) -> Model:
+def _fit(all_seen: Sequence[MeasuredExample], names: Sequence[str]) -> Model:
     labels = [seen.example.scene for seen in all_seen for _ in seen.features]
     features = np.concatenate([seen.features for seen in all_seen])
     return fit(features, labels, _weights(all_seen), names)
 
 
-def _weights(all_seen: Sequence[Seen]) -> NDArray[np.float64]:
+def _weights(all_seen: Sequence[MeasuredExample]) -> NDArray[np.float64]:
     """Return (N,) the weights of all images, which sum to that of the scenes.
 
     Every scene weighs the same, and in it every example, unless the examples have weights of

@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from sceneslam.config.check import check_keys
 from sceneslam.config.resolve import resolved
 from sceneslam.scenes.examples import Example, Stretch
-from sceneslam.scenes.label import Labels, Span
+from sceneslam.scenes.label import BestModuleSpan, Labels
 from sceneslam.types.errors import InputError
 from sceneslam.types.observation import UNSURE
 
@@ -54,7 +54,7 @@ def _labelled(labels: Labels) -> Iterator[Example]:
             )
 
 
-def _stretch(span: Span) -> Stretch:
+def _stretch(span: BestModuleSpan) -> Stretch:
     weight_per_s = span.gain_m / (span.end_s - span.start_s)
     return Stretch(start_s=span.start_s, end_s=span.end_s, weight_per_s=weight_per_s)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sceneslam.ros import decode
 from sceneslam.ros.clouds import Cloud, cloud
 from sceneslam.ros.pixels import DepthUnits, locked
-from sceneslam.sources.synchronise import Bundle, Sample
+from sceneslam.sources.synchronise import Sample, SynchronisedSamples
 from sceneslam.types.errors import InputError
 from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Sensor
@@ -46,7 +46,7 @@ class BundleDecoder:
         self._units = units
         self._has_depth = False  # of the image's size
 
-    def observe(self, bundle: Bundle) -> Decoded:
+    def observe(self, bundle: SynchronisedSamples) -> Decoded:
         """Return the bundle's observation; an image of another size is as good as damaged.
 
         Raises InputError where the first depth image has another size than the image.
@@ -74,7 +74,7 @@ class BundleDecoder:
             stamp_ns=stamp_ns,
         )
 
-    def _sample(self, sensor: Sensor, bundle: Bundle) -> Sample | None:
+    def _sample(self, sensor: Sensor, bundle: SynchronisedSamples) -> Sample | None:
         others = {
             Sensor.DEPTH: bundle.depth,
             Sensor.SCAN: bundle.scan,
@@ -82,7 +82,7 @@ class BundleDecoder:
         }
         return bundle.primary if sensor is self._primary else others.get(sensor)
 
-    def _image(self, bundle: Bundle, problems: list[str]) -> NDArray[np.uint8] | None:
+    def _image(self, bundle: SynchronisedSamples, problems: list[str]) -> NDArray[np.uint8] | None:
         sample = self._sample(Sensor.IMAGE, bundle)
         if sample is None:
             return None
@@ -92,7 +92,9 @@ class BundleDecoder:
             return None
         return image if self._has_size("a colour image", image, problems) else None
 
-    def _depth(self, bundle: Bundle, problems: list[str]) -> NDArray[np.float32] | None:
+    def _depth(
+        self, bundle: SynchronisedSamples, problems: list[str]
+    ) -> NDArray[np.float32] | None:
         sample = self._sample(Sensor.DEPTH, bundle)
         if sample is None:
             return None
@@ -125,14 +127,14 @@ class BundleDecoder:
                 f"{self._size_wh[1]} pixels as in the first image, got {width}x{height}"
             )
 
-    def _scan(self, bundle: Bundle, problems: list[str]) -> LaserScan | None:
+    def _scan(self, bundle: SynchronisedSamples, problems: list[str]) -> LaserScan | None:
         sample = self._sample(Sensor.SCAN, bundle)
         scan = None if sample is None else decode.scan(sample.value)
         if sample is not None and scan is None:
             problems.append("a laser scan has no usable angles")
         return scan
 
-    def _points(self, bundle: Bundle, problems: list[str]) -> Cloud | None:
+    def _points(self, bundle: SynchronisedSamples, problems: list[str]) -> Cloud | None:
         sample = self._sample(Sensor.POINTS, bundle)
         if sample is None:
             return None
@@ -145,13 +147,13 @@ class BundleDecoder:
             times_s = locked(times_s)
         return Cloud(points_lidar=locked(found.points_lidar), point_times_s=times_s)
 
-    def _odometry(self, bundle: Bundle) -> NDArray[np.float64] | None:
+    def _odometry(self, bundle: SynchronisedSamples) -> NDArray[np.float64] | None:
         is_primary = self._primary is Sensor.ODOMETRY
         T_odom_base = bundle.primary.value if is_primary else bundle.T_odom_base
         return None if T_odom_base is None else locked(np.array(T_odom_base))
 
 
-def _samples(bundle: Bundle, sensor: Sensor) -> NDArray[np.float64] | None:
+def _samples(bundle: SynchronisedSamples, sensor: Sensor) -> NDArray[np.float64] | None:
     """Return (M, 4): seconds after the stamp, values in base."""
     if not bundle.samples[sensor]:
         return None

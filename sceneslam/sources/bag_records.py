@@ -24,7 +24,7 @@ Blob = bytes | mmap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Record:
+class BagRecord:
     """One record: its header fields, and where its data are."""
 
     opcode: int
@@ -64,7 +64,7 @@ def header_fields(header: bytes) -> dict[bytes, bytes] | None:
     return fields
 
 
-def record_at(data: Blob, position: int) -> Record | None:
+def record_at(data: Blob, position: int) -> BagRecord | None:
     """Return the record at a place, None when there is none; its data may reach beyond the end."""
     if position + _U32.size > len(data):
         return None
@@ -77,7 +77,7 @@ def record_at(data: Blob, position: int) -> Record | None:
     if fields is None or not _is_complete(fields):
         return None
     (size,) = _U32.unpack_from(data, end)
-    return Record(
+    return BagRecord(
         opcode=fields[b"op"][0],
         fields=fields,
         start=position,
@@ -86,7 +86,7 @@ def record_at(data: Blob, position: int) -> Record | None:
     )
 
 
-def records_in(data: bytes) -> Iterator[Record]:
+def records_in(data: bytes) -> Iterator[BagRecord]:
     """Yield a chunk's records, going on at the next message after damage."""
     position: int | None = 0
     while position is not None and position < len(data):

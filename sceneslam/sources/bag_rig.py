@@ -8,7 +8,7 @@ from typing import Any
 
 from sceneslam.ros import decode, names, pixels
 from sceneslam.sources.bag_frames import FrameTree
-from sceneslam.sources.bag_topics import Topics, first
+from sceneslam.sources.bag_topics import BagTopics, first
 from sceneslam.sources.intrinsics import Intrinsics
 from sceneslam.sources.recording import Recording
 from sceneslam.types import se3
@@ -38,7 +38,7 @@ class Given:
     wheels: Wheels
 
 
-def sensor_topics(recording: Recording, topics: Topics) -> dict[Sensor, str]:
+def sensor_topics(recording: Recording, topics: BagTopics) -> dict[Sensor, str]:
     """Return the topic of each sensor that the recording has; an Imu may be two of them."""
     chosen = {sensor: getattr(topics, need) for sensor, need in _NEEDS.items()}
     imu = first(recording, topics.imu) if topics.imu else None
@@ -50,7 +50,7 @@ def sensor_topics(recording: Recording, topics: Topics) -> dict[Sensor, str]:
     }
 
 
-def make_rig(recording: Recording, topics: Topics, frames: FrameTree, given: Given) -> Rig:
+def make_rig(recording: Recording, topics: BagTopics, frames: FrameTree, given: Given) -> Rig:
     """Return the rig; raises InputError for depth without intrinsics."""
     said = recording.metadata.get(names.RIG_METADATA, {})
     laser = lidar = None
@@ -76,7 +76,7 @@ def place(recording: Recording, topic: str, frames: FrameTree) -> Transform:
     return se3.identity() if T_base_sensor is None else T_base_sensor
 
 
-def picture_size_wh(recording: Recording, topics: Topics) -> tuple[int, int]:
+def picture_size_wh(recording: Recording, topics: BagTopics) -> tuple[int, int]:
     """Return the size of the first image (or depth, where there are no images) that is whole."""
     topic = topics.image or topics.depth or ""
     for message in recording.messages({topic}):
@@ -93,7 +93,7 @@ def picture_size_wh(recording: Recording, topics: Topics) -> tuple[int, int]:
 
 def _camera(
     recording: Recording,
-    topics: Topics,
+    topics: BagTopics,
     frames: FrameTree,
     given: Intrinsics | None,
     depth_range_m: tuple[float, float],

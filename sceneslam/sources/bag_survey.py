@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from mmap import mmap
 
 from sceneslam.sources import bag_records as records
-from sceneslam.sources.bag_records import Record
+from sceneslam.sources.bag_records import BagRecord
 
 _INDEX_RECORD_BYTES, _INDEX_ENTRY_BYTES = 55, 12
 _CONNECTION_BYTES = 8192  # of a connection record with its definition, about
@@ -15,7 +15,7 @@ _KNOWN = range(records.MESSAGE, records.CONNECTION + 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Span:
+class ChunkSpan:
     """What a chunk holds: when, and how many messages of each connection."""
 
     start_ns: int
@@ -28,8 +28,8 @@ class BagSurvey:
     """The contents of a bag; the place of a chunk is its record's first byte."""
 
     blob: mmap
-    chunks: dict[int, Record] = field(default_factory=dict)
-    spans: dict[int, Span] = field(default_factory=dict)
+    chunks: dict[int, BagRecord] = field(default_factory=dict)
+    spans: dict[int, ChunkSpan] = field(default_factory=dict)
     connections: dict[int, dict[bytes, bytes]] = field(default_factory=dict)  # topic, type, ...
     index_at: int | None = None  # [bytes], by the bag's header; 0: the bag was never closed
     is_sound: bool = True
@@ -59,7 +59,7 @@ class BagSurvey:
             return self.index_at > len(self.blob)
         return self.index_at == 0 or any(map(self.is_beyond, self.chunks.values()))
 
-    def is_beyond(self, record: Record) -> bool:
+    def is_beyond(self, record: BagRecord) -> bool:
         """Tell whether a record reaches beyond the bag's end."""
         return record.end > len(self.blob)
 
@@ -70,7 +70,7 @@ class BagSurvey:
             total.update(span.counts)
         return total
 
-    def content(self, record: Record) -> bytes | None:
+    def content(self, record: BagRecord) -> bytes | None:
         """Return a chunk's records, as many as there are; None when they cannot be unpacked."""
         data = self.blob[record.data_at : record.end]
         return records.unpack(record.fields.get(b"compression", b""), data)
@@ -97,7 +97,7 @@ class BagSurvey:
         self.is_sound &= position == len(self.blob)
         return gaps
 
-    def _take(self, place: int, record: Record) -> bool:
+    def _take(self, place: int, record: BagRecord) -> bool:
         """Tell whether this is a record (a chunk may be cut off), and remember what it says."""
         if record.opcode not in _KNOWN:
             return False
@@ -113,20 +113,20 @@ class BagSurvey:
             data = self.blob[record.data_at : record.end]
             numbers = [int.from_bytes(data[at : at + 4], "little") for at in range(0, len(data), 4)]
             counts = dict(zip(numbers[::2], numbers[1::2], strict=False))
-            self.spans[int.from_bytes(record.fields[b"chunk_pos"], "little")] = Span(
+            self.spans[int.from_bytes(record.fields[b"chunk_pos"], "little")] = ChunkSpan(
                 start_ns=record.time_ns(b"start_time"),
                 end_ns=record.time_ns(b"end_time"),
                 counts=counts,
             )
         return True
 
-    def _take_connection(self, record: Record, data: bytes) -> None:
+    def _take_connection(self, record: BagRecord, data: bytes) -> None:
         definition = records.header_fields(data)
         if definition and b"type" in definition and b"topic" in record.fields:
             topic = {b"topic": record.fields[b"topic"]}
             self.connections[record.number(b"conn")] = {**definition, **topic}
 
-    def _look_into(self, place: int, record: Record) -> None:
+    def _look_into(self, place: int, record: BagRecord) -> None:
         """Take a chunk's connections, times and counts from its content."""
         data = self.content(record) or b""
         counts: Counter[int] = Counter()
@@ -138,6 +138,6 @@ class BagSurvey:
                 counts[inner.number(b"conn")] += 1
                 times_ns.append(inner.time_ns(b"time"))
         if times_ns:
-            self.spans[place] = Span(
+            self.spans[place] = ChunkSpan(
                 start_ns=min(times_ns), end_ns=max(times_ns), counts=dict(counts)
             )

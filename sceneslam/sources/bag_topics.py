@@ -34,7 +34,7 @@ TYPES = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Topics:
+class BagTopics:
     """One topic per need, None where there is none."""
 
     image: str | None
@@ -48,7 +48,7 @@ class Topics:
     scene: str | None
 
 
-def choose_topics(recording: Recording, given: Mapping[str, str | None]) -> Topics:
+def choose_topics(recording: Recording, given: Mapping[str, str | None]) -> BagTopics:
     """Return the topics that are named and, for the rest, those found by type and encoding.
 
     Raises ConfigError for a name that is not there, InputError when several topics could serve.
@@ -80,7 +80,7 @@ def choose_topics(recording: Recording, given: Mapping[str, str | None]) -> Topi
     picture = chosen["image"] if chosen["image"] != NONE else chosen["depth"]
     infos = _of_type(recording, TYPES["camera_info"])
     chosen.setdefault("camera_info", _only("camera_info", _beside(picture, infos)))
-    return Topics(**{need: None if name == NONE else name for need, name in chosen.items()})
+    return BagTopics(**{need: None if name == NONE else name for need, name in chosen.items()})
 
 
 def first(recording: Recording, topic: str) -> Any:

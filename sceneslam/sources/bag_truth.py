@@ -8,7 +8,7 @@ import numpy as np
 
 from sceneslam.ros import decode
 from sceneslam.sources.bag_frames import FrameTree
-from sceneslam.sources.bag_topics import Topics, first
+from sceneslam.sources.bag_topics import BagTopics, first
 from sceneslam.sources.recording import Recording
 from sceneslam.types import se3
 from sceneslam.types.rig import Rig
@@ -20,7 +20,7 @@ CAMERA, BASE = "camera", "base"
 
 
 def read_truth(
-    recording: Recording, topics: Topics, frames: FrameTree, rig: Rig, truth_frame: str | None
+    recording: Recording, topics: BagTopics, frames: FrameTree, rig: Rig, truth_frame: str | None
 ) -> GroundTruth | None:
     """Return the true poses of `base` and the true scenes, None when there is neither.
 

@@ -14,7 +14,7 @@ from sceneslam.sources.carmen_lines import FLASER, ROBOTLASER, ScanLine, parse_s
 from sceneslam.sources.faults import FaultLog
 from sceneslam.sources.intrinsics import checked_above_zero
 from sceneslam.sources.rising import rising_order, rising_stamps
-from sceneslam.sources.spanned import Span
+from sceneslam.sources.spanned import TimeSpan
 from sceneslam.sources.survey.survey import Stream, Survey, spread
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
@@ -76,9 +76,9 @@ class Carmen:
         return self._faults.sentences()
 
     @property
-    def span(self) -> Span | None:
+    def span(self) -> TimeSpan | None:
         """Return the first and last stamp."""
-        return Span(start_ns=int(self._stamps_ns[0]), end_ns=int(self._stamps_ns[-1]))
+        return TimeSpan(start_ns=int(self._stamps_ns[0]), end_ns=int(self._stamps_ns[-1]))
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the scans by rising stamp."""

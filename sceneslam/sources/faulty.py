@@ -22,7 +22,7 @@ SENSORS = tuple(sensor.field for sensor in Sensor)
 FAULTS = ("dropout", "blackout", "nan", "clock", "duplicate", "disorder", "reset")
 
 
-class Faulty(Wrapped):
+class FaultySource(Wrapped):
     """Passes a source's observations on, but strikes at random ones.
 
     `dropout`: one sensor says nothing for `lasting_s`; `blackout`: none but odometry does. `nan`:

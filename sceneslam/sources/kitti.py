@@ -14,7 +14,7 @@ from sceneslam.sources.faults import FaultLog
 from sceneslam.sources.intrinsics import checked_range_m
 from sceneslam.sources.kitti_times import read_times_ns
 from sceneslam.sources.prefetch import prefetched
-from sceneslam.sources.spanned import Span
+from sceneslam.sources.spanned import TimeSpan
 from sceneslam.sources.survey.survey import Stream, Survey, spread
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
@@ -61,9 +61,9 @@ class Kitti:
         return self._faults.sentences()
 
     @property
-    def span(self) -> Span | None:
+    def span(self) -> TimeSpan | None:
         """Return the first and last stamp."""
-        return Span(start_ns=int(self._stamps_ns[0]), end_ns=int(self._stamps_ns[-1]))
+        return TimeSpan(start_ns=int(self._stamps_ns[0]), end_ns=int(self._stamps_ns[-1]))
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the scans; reads files ahead in threads."""

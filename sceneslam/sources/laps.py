@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sceneslam.interfaces import Source
-from sceneslam.sources.spanned import Span
+from sceneslam.sources.spanned import TimeSpan
 from sceneslam.sources.wrapped import Wrapped
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
@@ -39,7 +39,7 @@ class Laps(Wrapped):
         return None if one is None else one * self._laps
 
     @property
-    def span(self) -> Span | None:
+    def span(self) -> TimeSpan | None:
         """Return None: the span is that of a lap."""
         return None
 

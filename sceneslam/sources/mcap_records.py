@@ -19,7 +19,7 @@ _FOOTER_BODY = struct.Struct("<QQI")  # summary start, summary offset start, sum
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Record:
+class McapRecord:
     """One record outside of any chunk."""
 
     opcode: int
@@ -35,7 +35,7 @@ class Content:
     counts: Counter[int] = field(default_factory=Counter)  # by channel
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
 
-    def take(self, records: Sequence[Record]) -> dict[int, tuple[int, int]]:
+    def take(self, records: Sequence[McapRecord]) -> dict[int, tuple[int, int]]:
         """Add records; return each channel's first and last log time [ns] among them."""
         from mcap import records as mcap
         from mcap.data_stream import ReadDataStream
@@ -61,7 +61,7 @@ class Content:
         return span
 
 
-def read_records(data: bytes) -> Sequence[Record] | None:
+def read_records(data: bytes) -> Sequence[McapRecord] | None:
     """Return the records in the bytes of one record (a chunk's own), None when it is damaged.
 
     Of a chunk that is cut off they are those that are whole.
@@ -76,7 +76,7 @@ def read_records(data: bytes) -> Sequence[Record] | None:
     if len(body) != length:
         return None
     if opcode != CHUNK:
-        return [Record(opcode=opcode, body=body)]
+        return [McapRecord(opcode=opcode, body=body)]
     unpacked = _unpack_chunk(body)
     return None if unpacked is None else _split(memoryview(unpacked))
 
@@ -145,8 +145,8 @@ def _unpack_cut_chunk(body: memoryview) -> bytes:
     return packed if not compression else b""
 
 
-def _split(view: memoryview, *, is_cut: bool = False) -> Sequence[Record] | None:
-    records: list[Record] = []
+def _split(view: memoryview, *, is_cut: bool = False) -> Sequence[McapRecord] | None:
+    records: list[McapRecord] = []
     position = 0
     while position + RECORD_HEAD.size <= len(view):
         opcode, length = RECORD_HEAD.unpack_from(view, position)
@@ -154,5 +154,5 @@ def _split(view: memoryview, *, is_cut: bool = False) -> Sequence[Record] | None
         position = start + length
         if position > len(view) or (opcode == MESSAGE and length < MESSAGE_HEAD.size):
             return records if is_cut else None
-        records.append(Record(opcode=opcode, body=view[start:position]))
+        records.append(McapRecord(opcode=opcode, body=view[start:position]))
     return records

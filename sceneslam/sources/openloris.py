@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from sceneslam.ros.pixels import locked
-from sceneslam.sources.spanned import Span
+from sceneslam.sources.spanned import TimeSpan
 from sceneslam.sources.survey.survey import Stream, Survey
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.input_files import given_folder
@@ -55,10 +55,10 @@ class OpenLoris:
         return ()
 
     @property
-    def span(self) -> Span | None:
+    def span(self) -> TimeSpan | None:
         """Return the first and last stamp."""
         first_ns, last_ns = self._odometry.stamps_ns[[0, -1]].tolist()
-        return Span(start_ns=first_ns, end_ns=last_ns)
+        return TimeSpan(start_ns=first_ns, end_ns=last_ns)
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the odometry's poses."""

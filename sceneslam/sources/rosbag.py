@@ -20,10 +20,10 @@ from sceneslam.sources.intrinsics import checked_above_zero, given_intrinsics, g
 from sceneslam.sources.open_recording import open_recording
 from sceneslam.sources.prefetch import prefetched
 from sceneslam.sources.recording import Message
-from sceneslam.sources.spanned import Span
+from sceneslam.sources.spanned import TimeSpan
 from sceneslam.sources.survey.bag_sample import survey_recording
 from sceneslam.sources.survey.survey import Survey
-from sceneslam.sources.synchronise import Bundle, Sample, Synchroniser
+from sceneslam.sources.synchronise import Sample, SynchronisedSamples, Synchroniser
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.input_files import given_path
 from sceneslam.types.observation import Observation
@@ -93,14 +93,14 @@ class RosBag:
         ]
 
     @property
-    def span(self) -> Span | None:
+    def span(self) -> TimeSpan | None:
         """Return the first and last stamp of the primary topic."""
         topic = self._by_sensor[self._primary]
         first = next(self._recording.messages({topic}), None)
         last = self._recording.last(topic)
         if first is None or last is None:
             return None
-        return Span(start_ns=self._stamp_ns(first), end_ns=self._stamp_ns(last))
+        return TimeSpan(start_ns=self._stamp_ns(first), end_ns=self._stamp_ns(last))
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield observations; decodes pixels ahead in threads."""
@@ -137,7 +137,7 @@ class RosBag:
         for bundle in self._bundles():
             yield partial(decoder.observe, bundle)
 
-    def _bundles(self) -> Iterator[Bundle]:
+    def _bundles(self) -> Iterator[SynchronisedSamples]:
         topics = frozenset(self._by_sensor.values())
         synchroniser = Synchroniser(
             self._primary, frozenset(self._by_sensor), self._sync_tolerance_s

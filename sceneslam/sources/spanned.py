@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Span:
+class TimeSpan:
     """The first and last stamp of a recording."""
 
     start_ns: int
@@ -19,6 +19,6 @@ class Spanned(Protocol):
     """A source that knows its span before it is read."""
 
     @property
-    def span(self) -> Span | None:
+    def span(self) -> TimeSpan | None:
         """Return the stamps of the first and last observation, None when unknown."""
         ...

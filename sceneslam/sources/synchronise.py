@@ -29,7 +29,7 @@ class Sample:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Bundle:
+class SynchronisedSamples:
     """What belongs to one message of the primary sensor."""
 
     primary: Sample
@@ -70,7 +70,7 @@ class Synchroniser:
         self._taken_ns: dict[Sensor, int] = {}  # the newest that a bundle was given
         self._passed: Sample | None = None  # the odometry before the oldest that is held
 
-    def add(self, sensor: Sensor, sample: Sample) -> Iterator[Bundle]:
+    def add(self, sensor: Sensor, sample: Sample) -> Iterator[SynchronisedSamples]:
         """Take one sample; yield the bundles that are complete by it."""
         (self._waiting if sensor is self._primary else self._held[sensor]).append(sample)
         self._seen_ns[sensor] = max(self._seen_ns.get(sensor, 0), sample.stamp_ns)
@@ -87,7 +87,7 @@ class Synchroniser:
             self._primary = primary
             self._waiting.clear()
 
-    def flush(self) -> Iterator[Bundle]:
+    def flush(self) -> Iterator[SynchronisedSamples]:
         """Yield what still waits, at the end of the recording."""
         while self._waiting:
             yield self._bundle(self._waiting.popleft())
@@ -106,9 +106,9 @@ class Synchroniser:
                 return False
         return True
 
-    def _bundle(self, primary: Sample) -> Bundle:
+    def _bundle(self, primary: Sample) -> SynchronisedSamples:
         stamp_ns = primary.stamp_ns
-        return Bundle(
+        return SynchronisedSamples(
             primary=primary,
             depth=self._nearest(Sensor.DEPTH, stamp_ns),
             scan=self._last_since(Sensor.SCAN, stamp_ns),

@@ -19,7 +19,7 @@ from sceneslam.sources.intrinsics import (
     given_intrinsics,
 )
 from sceneslam.sources.prefetch import prefetched
-from sceneslam.sources.spanned import Span
+from sceneslam.sources.spanned import TimeSpan
 from sceneslam.sources.stamped_files import StampedFile, nearest_once, read_list
 from sceneslam.sources.survey.survey import Stream, Survey, spread
 from sceneslam.types import se3
@@ -116,10 +116,10 @@ class TumRgbd:
         return self._faults.sentences()
 
     @property
-    def span(self) -> Span | None:
+    def span(self) -> TimeSpan | None:
         """Return the first and last stamp of rgb.txt."""
         stamps_ns = [frame.stamp_ns for frame in self._frames]
-        return Span(start_ns=min(stamps_ns), end_ns=max(stamps_ns))
+        return TimeSpan(start_ns=min(stamps_ns), end_ns=max(stamps_ns))
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield observations; reads and decodes images ahead in threads."""

@@ -17,7 +17,7 @@ from sceneslam.ros.pixels import decode_bgr, locked
 from sceneslam.sources.faults import FaultLog
 from sceneslam.sources.intrinsics import checked_above_zero, given_intrinsics
 from sceneslam.sources.prefetch import prefetched
-from sceneslam.sources.spanned import Span
+from sceneslam.sources.spanned import TimeSpan
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
@@ -85,11 +85,11 @@ class Video:
         return self._faults.sentences()
 
     @property
-    def span(self) -> Span | None:
+    def span(self) -> TimeSpan | None:
         """Return the stamps of the first and last frame, as far as the film announces them."""
         if not self._footage.count:
             return None
-        return Span(start_ns=0, end_ns=round((self._footage.count - 1) * self._period_s * 1e9))
+        return TimeSpan(start_ns=0, end_ns=round((self._footage.count - 1) * self._period_s * 1e9))
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield observations; decodes ahead in a thread.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sceneslam.interfaces import Live, LiveFeed, Source
-from sceneslam.sources.spanned import Span, Spanned
+from sceneslam.sources.spanned import Spanned, TimeSpan
 from sceneslam.sources.survey.survey import Survey, Surveyed
 from sceneslam.types.rig import Rig
 
@@ -37,7 +37,7 @@ class Wrapped:
         return self._source.live if isinstance(self._source, Live) else None
 
     @property
-    def span(self) -> Span | None:
+    def span(self) -> TimeSpan | None:
         """Return the source's span where it knows one."""
         return self._source.span if isinstance(self._source, Spanned) else None
 

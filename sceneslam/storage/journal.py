@@ -5,7 +5,7 @@
 
 | kind | body |
 |---|---|
-| `H` | JSON: what the results need beside the configuration (`Head`) |
+| `H` | JSON: what the results need beside the configuration (`JournalHeader`) |
 | `O` | stamp [ns] of an observation |
 | `S` | T_map_local of a new session, key of its module |
 | `L` | stamp, T_local_base of the session |
@@ -43,7 +43,7 @@ _POSE_BYTES = 12 * 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Head:
+class JournalHeader:
     """What the results of a run need beside its configuration."""
 
     title: str
@@ -59,7 +59,7 @@ class Journal:
     """
 
     def __init__(
-        self, path: Path, head: Head, make_room: Callable[[], bool] = lambda: False
+        self, path: Path, head: JournalHeader, make_room: Callable[[], bool] = lambda: False
     ) -> None:
         self._path = path
         self._waiting = bytearray(MAGIC)
@@ -132,7 +132,7 @@ class Journal:
 class Kept:
     """What a journal holds beside the calls of the atlas."""
 
-    head: Head
+    head: JournalHeader
     observed_ns: NDArray[np.int64]
     torn_bytes: int  # after the last whole record
 
@@ -149,7 +149,7 @@ def read_journal(path: Path, log: TrajectoryLog) -> Kept:
     for kind, body in _records(data):
         read += _HEAD.size + len(body)
         if kind == b"H":
-            head = Head(**json.loads(body))
+            head = JournalHeader(**json.loads(body))
         elif kind == b"O":
             observed_ns.append(_number(body))
         else:

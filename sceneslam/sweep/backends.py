@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from sceneslam.collect.status import State, Status
 from sceneslam.config.check import first_line
-from sceneslam.sweep.supervise import Order, run_job, settle
+from sceneslam.sweep.supervise import JobOrder, run_job, settle
 from sceneslam.types.errors import ConfigError
 
 _LOOK_S = 0.2
@@ -21,7 +21,7 @@ _LOOK_S = 0.2
 class Backend(Protocol):
     """Runs jobs; the death of one, or of what runs it, is noted in its folder."""
 
-    def run(self, orders: Sequence[Order]) -> None:
+    def run(self, orders: Sequence[JobOrder]) -> None:
         """Run all orders; return when each is settled."""
         ...
 
@@ -29,7 +29,7 @@ class Backend(Protocol):
 class Basic:
     """One job after the other, here."""
 
-    def run(self, orders: Sequence[Order]) -> None:
+    def run(self, orders: Sequence[JobOrder]) -> None:
         """Run them in order."""
         for order in orders:
             run_job(order)
@@ -44,7 +44,7 @@ class Joblib:
         _check_count("cpus_per_job", cpus_per_job)
         self._n_jobs, self._cpus_per_job = n_jobs, cpus_per_job
 
-    def run(self, orders: Sequence[Order]) -> None:
+    def run(self, orders: Sequence[JobOrder]) -> None:
         """Run them from threads; each thread waits for the process of its job."""
         try:
             from joblib import Parallel, delayed
@@ -76,7 +76,7 @@ class Submitit:
         self._at_once = array_parallelism or _cores()
         self._parameters = dict(parameters)
 
-    def run(self, orders: Sequence[Order]) -> None:
+    def run(self, orders: Sequence[JobOrder]) -> None:
         """Submit them: to SLURM as one array, else as there is room."""
         try:
             from submitit import AutoExecutor
@@ -95,7 +95,7 @@ class Submitit:
             key = "hydra.launcher.parameters"
             raise ConfigError(key, self._parameters, f"submitit's ({error})") from error
         told = _with_cores(orders, self._parameters.get("cpus_per_task") or 1)
-        waiting, running = deque(told), dict[Order, Any]()
+        waiting, running = deque(told), dict[JobOrder, Any]()
         if self._cluster == "slurm":
             executor.update_parameters(slurm_array_parallelism=self._at_once)
             running = dict(zip(told, executor.map_array(run_job, told), strict=True))
@@ -124,7 +124,7 @@ class Ray:
         self._address, self._num_cpus = address, num_cpus
         self._cpus_per_job = cpus_per_job
 
-    def run(self, orders: Sequence[Order]) -> None:
+    def run(self, orders: Sequence[JobOrder]) -> None:
         """Run them as there are cores; a worker that dies takes its own job along, no other."""
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         try:
@@ -162,16 +162,16 @@ def _cores() -> int:
     return os.cpu_count() or 1
 
 
-def _with_cores(orders: Sequence[Order], cores: int) -> Sequence[Order]:
+def _with_cores(orders: Sequence[JobOrder], cores: int) -> Sequence[JobOrder]:
     return [replace(order, cores=max(1, cores)) for order in orders]
 
 
-def _is_waiting(order: Order) -> bool:
+def _is_waiting(order: JobOrder) -> bool:
     status = Status.read(order.folder)
     return status is None or status.state is State.WAITING
 
 
-def _note(order: Order, result: Callable[[], object]) -> None:
+def _note(order: JobOrder, result: Callable[[], object]) -> None:
     """Note in the job's folder when what ran it died."""
     try:
         result()

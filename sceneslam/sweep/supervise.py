@@ -19,7 +19,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Order:
+class JobOrder:
     """A job and what it is run with, by any process of any machine that sees the folders."""
 
     folder: Path
@@ -29,7 +29,7 @@ class Order:
     cores: int | None = None  # that the job may take; None: as many as there are
 
 
-def run_job(order: Order) -> None:
+def run_job(order: JobOrder) -> None:
     """Run a job to its end; how it ended is in its folder, whatever happens."""
     if order.stop.exists():
         settle(order.folder, State.STOPPED, "stopped before it began")
@@ -50,7 +50,7 @@ def settle(folder: Path, state: State, error: str) -> None:
         status.now(state, error).write(folder)
 
 
-def _start(order: Order, log: BinaryIO) -> subprocess.Popen[bytes]:
+def _start(order: JobOrder, log: BinaryIO) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
         [sys.executable, "-P", "-m", "sceneslam.sweep.job", str(order.folder)],
         stdin=subprocess.PIPE,  # closes with this process: the job does not outlive it
@@ -79,7 +79,7 @@ def _wait(process: subprocess.Popen[bytes], stop: Path) -> None:
                 process.terminate()
 
 
-def _environment(order: Order) -> dict[str, str]:
+def _environment(order: JobOrder) -> dict[str, str]:
     """Return a job's environment: that code first, and one thread per library.
 
     Jobs side by side are faster than threads side by side, and with more threads BLAS adds in

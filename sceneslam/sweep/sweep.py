@@ -17,7 +17,7 @@ from sceneslam.interrupts import termination_noted
 from sceneslam.sweep.backends import BACKENDS, Backend
 from sceneslam.sweep.progress import Progress
 from sceneslam.sweep.snapshot import keep_code
-from sceneslam.sweep.supervise import Order, settle
+from sceneslam.sweep.supervise import JobOrder, settle
 from sceneslam.types.errors import ConfigError, InputError
 
 _OWN = ".sweep"  # in a sweep's folder: the launcher, the code, and whether to stop
@@ -46,7 +46,7 @@ def run_sweep(
     if missing:
         code = keep_code(own / "code")
         orders = [
-            Order(folder=folder, code=code, began_in=began_in, stop=stop) for folder in missing
+            JobOrder(folder=folder, code=code, began_in=began_in, stop=stop) for folder in missing
         ]
         with termination_noted(stop.touch), Progress(missing):
             backend.run(orders)

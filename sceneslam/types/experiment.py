@@ -22,7 +22,7 @@ class Trial:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Outcome:
+class TrialResult:
     """What a trial gave; its folder holds the rest."""
 
     trial: Trial
@@ -33,7 +33,7 @@ class Outcome:
     faults: Sequence[str]
 
 
-RunTrials = Callable[[Iterable[Trial]], Iterator[Outcome]]
+RunTrials = Callable[[Iterable[Trial]], Iterator[TrialResult]]
 
 
 class Relation(Enum):

@@ -41,7 +41,7 @@ class Session:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Moment:
+class KeyMoment:
     """The camera image at a change of scene or module."""
 
     stamp_ns: int
@@ -78,4 +78,4 @@ class RunResult:
     missing: Mapping[int, str] = field(default_factory=dict)  # stamp -> what the module lacked
     dropped: int = 0  # observations that live mode skipped
     dropped_images: int = 0  # those of them with an image
-    moments: Sequence[Moment] = ()  # ordered by stamp
+    moments: Sequence[KeyMoment] = ()  # ordered by stamp

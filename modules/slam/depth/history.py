@@ -10,7 +10,7 @@ from sceneslam.types.trajectory import Trajectory
 from .keyframe_map import KeyframeMap
 
 
-class History:
+class PoseHistory:
     """One entry per observation that held a pose; 150 bytes each."""
 
     def __init__(self, keyframes: KeyframeMap) -> None:

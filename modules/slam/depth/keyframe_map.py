@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 
-from ..surfaces.keyframe import Keyframe
+from ..surfaces.keyframe import SurfaceKeyframe
 from ..surfaces.registration import Samples, compare
 from ..surfaces.surface import Floats, Grid, Surface
 
@@ -33,17 +33,17 @@ class KeyframeMap:
 
     def __init__(self, grid: Grid) -> None:
         self.grid = grid
-        self.keyframes: list[Keyframe] = []
+        self.keyframes: list[SurfaceKeyframe] = []
 
     def __len__(self) -> int:
         return len(self.keyframes)
 
-    def __getitem__(self, index: int) -> Keyframe:
+    def __getitem__(self, index: int) -> SurfaceKeyframe:
         return self.keyframes[index]
 
     def add(self, surface: Surface, T_local_cam: se3.Transform, *, stamp_ns: int) -> int:
         """Keep a view; return its number."""
-        self.keyframes.append(Keyframe(surface, T_local_cam, stamp_ns=stamp_ns))
+        self.keyframes.append(SurfaceKeyframe(surface, T_local_cam, stamp_ns=stamp_ns))
         return len(self.keyframes) - 1
 
     def overlaps(self, samples: Samples, T_local_cam: se3.Transform) -> Sequence[Overlap]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from sceneslam.types import se3
 
-from ..surfaces.registration import Prior, Registration, Samples, register
+from ..surfaces.registration import CameraPrior, Samples, SurfaceRegistration, register
 from ..surfaces.surface import Surface
 from .keyframe_map import KeyframeMap
 
@@ -18,7 +18,7 @@ _SURE_RATIO = 0.6  # of the points that agree, for a place that motion did not l
 _FAR = 100.0  # squared deviations from where motion led to, ten in one direction
 
 
-class Localizer:
+class DepthLocalizer:
     """Registers images with the keyframes of a map."""
 
     def __init__(
@@ -28,8 +28,8 @@ class Localizer:
         self._matched_min_ratio, self._weak_ratio = matched_min_ratio, weak_ratio
 
     def near(
-        self, samples: Samples, prior: Prior, T_local_cam_before: se3.Transform | None
-    ) -> Registration | None:
+        self, samples: Samples, prior: CameraPrior, T_local_cam_before: se3.Transform | None
+    ) -> SurfaceRegistration | None:
         """Return the camera's pose around the prior; where that fits badly, around the last pose.
 
         A hand that stopped, or turned back, is nearer to where it was than to where it went.
@@ -38,15 +38,17 @@ class Localizer:
         is_good = found is not None and found.matched_ratio >= _GOOD_RATIO
         again = None
         if not is_good and T_local_cam_before is not None:
-            again = self._register(samples, Prior(T_local_cam_before, prior.information))
+            again = self._register(samples, CameraPrior(T_local_cam_before, prior.information))
         both = [one for one in (found, again) if one is not None]
         best = max(both, key=lambda one: one.matched_ratio, default=None)
         return best if best and best.matched_ratio >= self._matched_min_ratio else None
 
-    def alike(self, samples: Samples, surface: Surface, expected: Prior) -> Registration | None:
+    def alike(
+        self, samples: Samples, surface: Surface, expected: CameraPrior
+    ) -> SurfaceRegistration | None:
         """Return the camera's pose by a keyframe that looks alike, where motion can lead to it."""
         for index in self._map.alike(surface, _ALIKE):
-            there = self._register(samples, Prior(self._map[index].T_local_cam, np.eye(6)))
+            there = self._register(samples, CameraPrior(self._map[index].T_local_cam, np.eye(6)))
             if there is None or there.localizability.ratios[0] < self._weak_ratio:
                 continue
             off = se3.log(se3.inverse(expected.T_local_cam) @ there.T_local_cam)
@@ -58,7 +60,7 @@ class Localizer:
                 return there
         return None
 
-    def _register(self, samples: Samples, prior: Prior) -> Registration | None:
+    def _register(self, samples: Samples, prior: CameraPrior) -> SurfaceRegistration | None:
         overlaps = self._map.overlaps(samples, prior.T_local_cam)
         near = [o.index for o in overlaps[:_TOGETHER] if o.ratio > _USEFUL_OVERLAP]
         keyframes = [self._map[index] for index in near or [overlaps[0].index]]

@@ -14,12 +14,12 @@ from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
-from ..surfaces.registration import Prior, Registration, Samples, samples_of
-from ..surfaces.surface import Surface, SurfaceReader
-from .history import History
+from ..surfaces.registration import CameraPrior, Samples, SurfaceRegistration, samples_of
+from ..surfaces.surface import DepthSurfaceReader, Surface
+from .history import PoseHistory
 from .keyframe_map import KeyframeMap
-from .localizer import Localizer
-from .pose_graph import PoseGraph
+from .localizer import DepthLocalizer
+from .pose_graph import DepthPoseGraph
 
 _SAMPLES_MIN = 100
 
@@ -59,13 +59,13 @@ class DepthSlam:
         if rig.camera is None:
             raise InputError("rig: depth needs the camera's intrinsics, got none")
         self._camera = rig.camera
-        self._reader = SurfaceReader(rig.camera)
+        self._reader = DepthSurfaceReader(rig.camera)
         self._map = KeyframeMap(self._reader.grid)
-        self._graph = PoseGraph(self._map, weak_ratio=self.weak_ratio)
-        self._localizer = Localizer(
+        self._graph = DepthPoseGraph(self._map, weak_ratio=self.weak_ratio)
+        self._localizer = DepthLocalizer(
             self._map, matched_min_ratio=self.matched_min_ratio, weak_ratio=self.weak_ratio
         )
-        self._history = History(self._map)
+        self._history = PoseHistory(self._map)
         self._predictor = Predictor(rig)
         self._T_local_base = se3.identity()
         self._reference, self._revision = 0, 0
@@ -123,7 +123,7 @@ class DepthSlam:
 
     def _locate(
         self, samples: Samples, surface: Surface, prediction: Prediction
-    ) -> Registration | None:
+    ) -> SurfaceRegistration | None:
         prior = self._prior(prediction)
         before = None
         if not prediction.is_measured:
@@ -131,12 +131,12 @@ class DepthSlam:
         found = self._localizer.near(samples, prior, before)
         return found or self._localizer.alike(samples, surface, prior)
 
-    def _prior(self, prediction: Prediction) -> Prior:
+    def _prior(self, prediction: Prediction) -> CameraPrior:
         T_cam_base = se3.inverse(self._camera.T_base_cam)
         turned = se3.adjoint(T_cam_base)
         information = np.linalg.inv(turned @ prediction.covariance @ turned.T)
         T_local_cam = prediction.T_local_base @ self._camera.T_base_cam
-        return Prior(T_local_cam, np.asarray(information, np.float64))
+        return CameraPrior(T_local_cam, np.asarray(information, np.float64))
 
     def _hold(
         self,
@@ -144,7 +144,7 @@ class DepthSlam:
         surface: Surface,
         samples: Samples,
         prediction: Prediction,
-        found: Registration,
+        found: SurfaceRegistration,
     ) -> Tracking:
         T_base_cam = self._camera.T_base_cam
         turned, back = se3.adjoint(T_base_cam), se3.adjoint(se3.inverse(T_base_cam))

@@ -13,7 +13,7 @@ import numpy as np
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
-from ..surfaces.registration import Prior, register, samples_of
+from ..surfaces.registration import CameraPrior, register, samples_of
 from ..surfaces.surface import Doubles
 from .keyframe_map import KeyframeMap
 
@@ -26,7 +26,7 @@ _GTSAM_ORDER = [3, 4, 5, 0, 1, 2]  # rotation first
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Edge:
+class RegistrationEdge:
     """A keyframe seen from another."""
 
     first: int
@@ -35,12 +35,12 @@ class Edge:
     information: Doubles  # (6, 6) of se3.log order, second's cam
 
 
-class PoseGraph:
+class DepthPoseGraph:
     """Registrations among keyframes, done one per call, so that no frame waits for many."""
 
     def __init__(self, keyframes: KeyframeMap, *, weak_ratio: float) -> None:
         self._map, self._weak_ratio = keyframes, weak_ratio
-        self._edges: list[Edge] = []
+        self._edges: list[RegistrationEdge] = []
         self._waiting: list[tuple[int, int]] = []
         self.is_fresh = False  # there are edges that the poses do not know yet
 
@@ -96,18 +96,20 @@ class PoseGraph:
             keyframe.move(np.array(solved.atPose3(index).matrix()))
         self.is_fresh = False
 
-    def _chain(self, index: int) -> Edge:
+    def _chain(self, index: int) -> RegistrationEdge:
         """Return what tracking told of a keyframe, which holds it where nothing else does."""
         before, this = self._map[index - 1], self._map[index]
-        return Edge(index - 1, index, before.T_cam_local @ this.T_local_cam, np.zeros((6, 6)))
+        return RegistrationEdge(
+            index - 1, index, before.T_cam_local @ this.T_local_cam, np.zeros((6, 6))
+        )
 
-    def _register(self, first: int, second: int) -> Edge | None:
+    def _register(self, first: int, second: int) -> RegistrationEdge | None:
         known, other = self._map[first], self._map[second]
         grid = self._map.grid
-        guess = Prior(other.T_local_cam, _LOOSE * np.eye(6))
+        guess = CameraPrior(other.T_local_cam, _LOOSE * np.eye(6))
         samples = samples_of(other.surface(), grid)
         found = register(samples, guess, [known], grid, weak_ratio=self._weak_ratio)
         if found is None or found.matched_ratio < _MATCHED_MIN_RATIO:
             return None
         T_first_second = se3.inverse(known.T_local_cam) @ found.T_local_cam
-        return Edge(first, second, T_first_second, found.information)
+        return RegistrationEdge(first, second, T_first_second, found.information)

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from sceneslam.types import se3
 from sceneslam.types.maps import PointLayer, PoseGraphLayer
 
-from .view import Tracker, View
+from .view import DirectView, Tracker
 
 _CLOUD_STEP_M, _CLOUD_TURN_RAD = 0.2, 0.2  # between two keyframes that give points
 _CLOUD_STRIDE_PX = 2
 
 
-class Keyframes:
+class DirectKeyframes:
     """Keeps poses of all keyframes, and points of those that show something new."""
 
     def __init__(self, tracker: Tracker, voxel_m: float) -> None:
@@ -28,7 +28,7 @@ class Keyframes:
     def add(
         self,
         stamp_ns: int,
-        view: View,
+        view: DirectView,
         T_local_cam: se3.Transform,
         information: NDArray[np.float64] | None,
     ) -> None:

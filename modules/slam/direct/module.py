@@ -20,8 +20,8 @@ from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
-from .keyframes import Keyframes
-from .view import Comparison, Tracker, View
+from .keyframes import DirectKeyframes
+from .view import Comparison, DirectView, Tracker
 
 _POSITIVE = (
     "width_px keyframe_step_m keyframe_turn_rad step_max_m turn_max_rad weak_m weak_rad "
@@ -73,9 +73,9 @@ class DirectSlam:
         self._camera = rig.camera
         self._tracker = Tracker(rig.camera, self.width_px, self.step_max_m, self.turn_max_rad)
         self._predictor = Predictor(rig)
-        self._keyframes = Keyframes(self._tracker, self.cloud_voxel_m)
-        self._key: View | None = None
-        self._last: View | None = None
+        self._keyframes = DirectKeyframes(self._tracker, self.cloud_voxel_m)
+        self._key: DirectView | None = None
+        self._last: DirectView | None = None
         self._T_local_key = self._T_local_last = se3.identity()  # of cam
         self._T_local_base = se3.identity()
 
@@ -123,7 +123,7 @@ class DirectSlam:
     def shutdown(self) -> None:
         """Do nothing: only memory is held, and the map stays readable."""
 
-    def _locate(self, view: View) -> _Located | None:
+    def _locate(self, view: DirectView) -> _Located | None:
         """Return the view's place beside the keyframe, or else beside the view before."""
         candidates = ((self._key, self._T_local_key), (self._last, self._T_local_last))
         for other, T_local_other in candidates:
@@ -136,7 +136,9 @@ class DirectSlam:
                 return _Located(T_local_other @ T_other_cam, found)
         return None
 
-    def _begin(self, observation: Observation, prediction: Prediction, view: View) -> Tracking:
+    def _begin(
+        self, observation: Observation, prediction: Prediction, view: DirectView
+    ) -> Tracking:
         """Make the first keyframe, or the first of a place that odometry alone leads to."""
         is_first = self._key is None
         self._predictor.coast(prediction)
@@ -151,7 +153,7 @@ class DirectSlam:
         self,
         observation: Observation,
         prediction: Prediction,
-        view: View,
+        view: DirectView,
         located: _Located,
     ) -> Tracking:
         """Go on from an answer, weighed against the prediction by the covariance of each."""
@@ -181,7 +183,7 @@ class DirectSlam:
         return self._answer(observation, status, found.matched_ratio, found.matched)
 
     def _add_keyframe(
-        self, observation: Observation, view: View, information: NDArray[np.float64] | None
+        self, observation: Observation, view: DirectView, information: NDArray[np.float64] | None
     ) -> None:
         """Make the view the keyframe; without information it is not connected with the last."""
         self._key = self._last = view

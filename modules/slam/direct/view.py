@@ -23,7 +23,7 @@ _CORRELATION = 100.0  # neighbouring pixels share errors: so many know as much a
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class View:
+class DirectView:
     """One image with its depth."""
 
     grey: NDArray[np.uint8]  # (h, w)
@@ -73,7 +73,7 @@ class Tracker:
         self._odometry = cv2.Odometry(kind, settings, method)
         self._camera = camera
 
-    def view(self, image_bgr: NDArray[np.uint8], depth_m: Floats) -> View:
+    def view(self, image_bgr: NDArray[np.uint8], depth_m: Floats) -> DirectView:
         """Return the view of an image (H, W, 3) and its depth (H, W) [m]."""
         grey = cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY)
         grey = cv2.resize(grey, self._size_wh, interpolation=cv2.INTER_AREA)
@@ -82,25 +82,27 @@ class Tracker:
         small_m = cv2.remap(measured, *self._maps_depth, cv2.INTER_NEAREST)
         frame = cv2.OdometryFrame(small_m, grey)
         self._odometry.prepareFrame(frame)
-        return View(
+        return DirectView(
             grey=np.asarray(grey, np.uint8), depth_m=np.asarray(small_m, np.float32), frame=frame
         )
 
-    def points(self, view: View, stride_px: int) -> Floats:
+    def points(self, view: DirectView, stride_px: int) -> Floats:
         """Return every stride-th pixel's point (N, 3) [m], cam; z is 0 where depth is missing."""
         z = view.depth_m[::stride_px, ::stride_px]
         v, u = np.mgrid[: z.shape[0], : z.shape[1]] * stride_px
         x, y = (u - self.K[0, 2]) / self.K[0, 0], (v - self.K[1, 2]) / self.K[1, 1]
         return np.stack([x * z, y * z, z], axis=-1).reshape(-1, 3).astype(np.float32)
 
-    def register(self, view: View, other: View) -> se3.Transform | None:
+    def register(self, view: DirectView, other: DirectView) -> se3.Transform | None:
         """Return T_other_view, None where the two do not fit together."""
         found, T_other_view = self._odometry.compute(view.frame, other.frame)
         if not found or not np.isfinite(T_other_view).all():
             return None
         return se3.orthonormal(np.asarray(T_other_view, np.float64))
 
-    def compare(self, view: View, other: View, T_other_view: se3.Transform) -> Comparison:
+    def compare(
+        self, view: DirectView, other: DirectView, T_other_view: se3.Transform
+    ) -> Comparison:
         """Return what the pixels of a view, laid on another, know of T_other_view."""
         points_view = self.points(view, _STEP_PX).astype(np.float64)
         greys = view.grey[::_STEP_PX, ::_STEP_PX].reshape(-1).astype(np.float64)
@@ -158,7 +160,7 @@ def _jacobians(
     return np.asarray(projection @ (T_other_view[:3, :3] @ moved))
 
 
-def _slopes(view: View, row: NDArray[np.int64], column: NDArray[np.int64]) -> Doubles:
+def _slopes(view: DirectView, row: NDArray[np.int64], column: NDArray[np.int64]) -> Doubles:
     """Return (N, 2, 2): slope of grey and of depth [m] along x and y [1/px], at pixels."""
     found = []
     for picture in (view.grey.astype(np.float64), view.depth_m.astype(np.float64)):

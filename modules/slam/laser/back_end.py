@@ -8,20 +8,20 @@ import numpy as np
 
 from sceneslam.types.planar import between
 
-from .keyframes import Keyframes
-from .loop_closure import LoopCloser
-from .pose_graph import Edge, PoseGraph, optimise
+from .keyframes import ScanKeyframes
+from .loop_closure import ScanLoopCloser
+from .pose_graph import ScanEdge, ScanPoseGraph, optimise
 
 _FELT = np.array([5e-3, 5e-3, 2e-3])  # m, m, rad: smaller corrections are within the pose's noise
 
 
 @dataclass(slots=True)
-class BackEnd:
+class LaserBackEnd:
     """Takes keyframes one by one, and corrects all of them when a loop closes."""
 
-    keyframes: Keyframes
-    closer: LoopCloser | None  # None: laser odometry without loop closure
-    graph: PoseGraph = field(default_factory=PoseGraph)
+    keyframes: ScanKeyframes
+    closer: ScanLoopCloser | None  # None: laser odometry without loop closure
+    graph: ScanPoseGraph = field(default_factory=ScanPoseGraph)
     revision: int = field(default=0, init=False)
 
     def take(self) -> bool:
@@ -30,7 +30,7 @@ class BackEnd:
         frames = self.keyframes.frames
         if number > 0:
             self.graph.add(
-                Edge(
+                ScanEdge(
                     first=number - 1,
                     second=number,
                     T_first_second=frames[number].T_prev_curr,

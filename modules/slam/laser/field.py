@@ -18,7 +18,7 @@ _END_RATIO = 0.4  # of a cell: a point this far from the centre of its neighbour
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Nearest:
+class NearestSurfaces:
     """The nearest surface to each of N points."""
 
     points: NDArray[np.float64]  # (N, 2) [m], local
@@ -52,11 +52,11 @@ class LikelihoodField:
             np.float32(1.0) - distance_px * np.float32(resolution_m / _REACH_M), np.float32(0.0)
         )
 
-    def nearest(self, points_local: NDArray[np.float64]) -> Nearest:
+    def nearest(self, points_local: NDArray[np.float64]) -> NearestSurfaces:
         """Return the nearest surfaces of points (N, 2) [m]."""
         column, row = self._cells(points_local)
         surface = self._surface_of_label[self._labels[row, column]]
-        return Nearest(
+        return NearestSurfaces(
             points=self._points[surface],
             shape=self._shape[surface],
             outward=self._outward[surface],

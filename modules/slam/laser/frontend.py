@@ -21,12 +21,12 @@ from sceneslam.types.planar import (
     turn,
 )
 
-from .back_end import BackEnd
+from .back_end import LaserBackEnd
 from .field import LikelihoodField
-from .history import History
-from .keyframes import Keyframe, Keyframes
+from .history import RelativePoseHistory
+from .keyframes import ScanKeyframe, ScanKeyframes
 from .loop_search import LoopSearch
-from .matcher import Match, Matcher, Prior, novelty
+from .matcher import Match, Matcher, MotionPrior, novelty
 from .surface import SurfacePoints
 
 _OVERLAP_MIN_RATIO = 0.5  # with less, the map does not cover this place yet
@@ -65,9 +65,9 @@ class FrontEnd:
     settings: ScanSettings
     matcher: Matcher
     motion: MotionModel
-    keyframes: Keyframes
-    back_end: BackEnd
-    history: History
+    keyframes: ScanKeyframes
+    back_end: LaserBackEnd
+    history: RelativePoseHistory
     _pose: Planar = field(default_factory=lambda: np.zeros(3), init=False)
     _covariance: Matrix = field(default_factory=lambda: np.diag(_DEVIATION_MIN**2), init=False)
     _step: Matrix = field(default_factory=lambda: np.zeros((3, 3)), init=False)  # since a keyframe
@@ -105,7 +105,7 @@ class FrontEnd:
         if self._field is None:
             self._extend(predicted_then, None, scan, surfaces)
             return self._hold(observation, predicted, None)
-        priors = [Prior.of(predicted_then, self._covariance, motion.probability)]
+        priors = [MotionPrior.of(predicted_then, self._covariance, motion.probability)]
         if motion.rival is not None:
             T_rival, noise = (
                 from_transform(motion.rival.T_prev_curr),
@@ -113,7 +113,7 @@ class FrontEnd:
             )
             there = propagate(known, before, T_rival, noise)
             priors.append(
-                Prior.of(compose(before, ratio * T_rival), there, motion.rival.probability)
+                MotionPrior.of(compose(before, ratio * T_rival), there, motion.rival.probability)
             )
         is_known = motion.is_measured and not motion.is_doubted
         new = novelty(between(self._seen_pose, predicted_then)) if is_known else 1.0
@@ -251,7 +251,7 @@ class FrontEnd:
         T_local_prev = frames[-1].T_local_base if frames else T_local_base
         T_prev_curr = between(T_local_prev, T_local_base)
         self.keyframes.add(
-            Keyframe(
+            ScanKeyframe(
                 stamp_ns=scan.stamp_ns,
                 T_local_base=T_local_base,
                 T_prev_curr=T_prev_curr,

@@ -11,16 +11,16 @@ from sceneslam.types import se3
 from sceneslam.types.planar import Planar, between, betweens, composed
 from sceneslam.types.trajectory import Trajectory
 
-from .keyframes import Keyframes
+from .keyframes import ScanKeyframes
 
 _NONE = -1  # before the first keyframe: the pose as it was reported
 
 
 @dataclass(slots=True)
-class History:
+class RelativePoseHistory:
     """Poses relative to keyframes; 40 bytes per stamp."""
 
-    keyframes: Keyframes
+    keyframes: ScanKeyframes
     _stamps_ns: array[int] = field(default_factory=lambda: array("q"))
     _owners: array[int] = field(default_factory=lambda: array("q"))
     _motions: array[float] = field(default_factory=lambda: array("d"))  # T_keyframe_base

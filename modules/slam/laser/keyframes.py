@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from sceneslam.types.observation import LaserScan
 from sceneslam.types.planar import Matrix, Planar, wrap
 
-from .surface import SurfacePoints, SurfaceReader, joined
+from .surface import ScanSurfaceReader, SurfacePoints, joined
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
-class Keyframe:
+class ScanKeyframe:
     """A scan that is part of the map; its pose may be corrected."""
 
     stamp_ns: int
@@ -27,7 +27,7 @@ class Keyframe:
 
 
 @dataclass(slots=True)
-class Keyframes:
+class ScanKeyframes:
     """All keyframes of one activation, in the order they were taken.
 
     A submap is `submap_keyframes` consecutive keyframes. Scans are matched with the latest two
@@ -36,11 +36,11 @@ class Keyframes:
     scan on demand: a scan has a tenth of their size.
     """
 
-    reader: SurfaceReader
+    reader: ScanSurfaceReader
     keyframe_distance_m: float
     keyframe_angle_rad: float
     submap_keyframes: int
-    frames: list[Keyframe] = field(default_factory=list)
+    frames: list[ScanKeyframe] = field(default_factory=list)
     _surfaces: dict[int, SurfacePoints] = field(default_factory=dict, init=False)  # of the latest
 
     def __len__(self) -> int:
@@ -55,7 +55,7 @@ class Keyframes:
         turned_rad = abs(wrap(T_local_base[2] - last[2]))
         return moved_m > self.keyframe_distance_m or turned_rad > self.keyframe_angle_rad
 
-    def add(self, frame: Keyframe, surfaces_base: SurfacePoints) -> None:
+    def add(self, frame: ScanKeyframe, surfaces_base: SurfacePoints) -> None:
         """Append a keyframe with its scan's surfaces, in its base."""
         self._surfaces[len(self.frames)] = surfaces_base
         self.frames.append(frame)

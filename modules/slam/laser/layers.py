@@ -14,14 +14,16 @@ from sceneslam.types.observation import LaserScan
 from sceneslam.types.planar import Matrix, apply, to_transform
 
 from ..grid import OccupancyGrid
-from .keyframes import Keyframes
-from .pose_graph import Edge
+from .keyframes import ScanKeyframes
+from .pose_graph import ScanEdge
 
 _PLANAR = [0, 1, 5]  # x, y, yaw in se3.log's order
 _LEVEL_DEVIATION = 0.01  # m and rad: standard deviation of z, roll and pitch on a floor
 
 
-def map_layers(keyframes: Keyframes, edges: Sequence[Edge], *, resolution_m: float) -> MapLayers:
+def map_layers(
+    keyframes: ScanKeyframes, edges: Sequence[ScanEdge], *, resolution_m: float
+) -> MapLayers:
     """Return the grid, points and pose graph of the keyframes, in `local`."""
     reader = keyframes.reader
     grid = OccupancyGrid(resolution_m)
@@ -47,7 +49,7 @@ def covariance_6(covariance: Matrix) -> NDArray[np.float64]:
     return full
 
 
-def _graph(keyframes: Keyframes, edges: Sequence[Edge]) -> PoseGraphLayer:
+def _graph(keyframes: ScanKeyframes, edges: Sequence[ScanEdge]) -> PoseGraphLayer:
     information = [np.linalg.inv(covariance_6(edge.covariance)) for edge in edges]
     return PoseGraphLayer(
         stamps_ns=np.array([frame.stamp_ns for frame in keyframes.frames], np.int64),

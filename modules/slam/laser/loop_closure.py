@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from sceneslam.types.planar import Planar, apply, between, compose, from_transform, turn
 
-from .keyframes import Keyframes
+from .keyframes import ScanKeyframes
 from .matcher import Match, Matcher
-from .places import Place, Places
-from .pose_graph import Edge
+from .places import Places, ScanSubmap
+from .pose_graph import ScanEdge
 from .surface import SurfacePoints
 
 _NEAR_M = 3.0  # a submap is visible within this distance of its keyframes
@@ -34,28 +34,28 @@ _FLOOR = np.diag(np.array([0.02, 0.02, 0.005]) ** 2)  # m, m, rad: least covaria
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Witness:
     keyframe: int
-    edge: Edge
+    edge: ScanEdge
 
 
 @dataclass(slots=True)
-class LoopCloser:
+class ScanLoopCloser:
     """Loop edges for one keyframe after the other."""
 
-    keyframes: Keyframes
+    keyframes: ScanKeyframes
     places: Places
     matcher: Matcher
     _links: list[dict[int, float]] = field(default_factory=list)  # submap: {other: distance [m]}
     _tried: dict[int, int] = field(default_factory=dict)  # submap: keyframe of the last trial
     _witnesses: list[_Witness] = field(default_factory=list)
 
-    def close(self, number: int) -> list[Edge]:
+    def close(self, number: int) -> list[ScanEdge]:
         """Return the loop edges of a new keyframe, mostly none."""
         self._link(number)
         finished = self.keyframes.finished_submaps
         if finished == 0:
             return []
         far_m = self._drives(number)[:finished]
-        accepted: list[Edge] = []
+        accepted: list[ScanEdge] = []
         for submap in self._candidates(number, far_m):
             self._tried[submap] = number
             window_m = min(_WINDOW_M + _DRIFT_M * far_m[submap], _WINDOW_MAX_M)
@@ -84,7 +84,9 @@ class LoopCloser:
         order = np.argsort((window_m + nearest_m)[near], kind="stable")
         return [int(submap) for submap in near[order[:_SUBMAPS_MAX]]]
 
-    def _match(self, number: int, submap: int, window_m: float, window_rad: float) -> Edge | None:
+    def _match(
+        self, number: int, submap: int, window_m: float, window_rad: float
+    ) -> ScanEdge | None:
         place = self.places.of(submap)
         surfaces = self.keyframes.surfaces_base(number)
         frames = self.keyframes.frames
@@ -106,7 +108,7 @@ class LoopCloser:
         if not self._believes(match, place, surfaces):
             return None
         G = turn(-float(match.T_local_base[2]))
-        return Edge(
+        return ScanEdge(
             first=place.anchor,
             second=number,
             T_first_second=match.T_local_base,
@@ -114,7 +116,7 @@ class LoopCloser:
             is_loop=True,
         )
 
-    def _believes(self, match: Match, place: Place, surfaces: SurfacePoints) -> bool:
+    def _believes(self, match: Match, place: ScanSubmap, surfaces: SurfacePoints) -> bool:
         return (
             match.inlier_ratio >= _INLIER_MIN_RATIO
             and match.weak_directions == 0
@@ -122,7 +124,7 @@ class LoopCloser:
             <= _THROUGH_MAX_RATIO
         )
 
-    def _confirm(self, number: int, edge: Edge) -> list[Edge]:
+    def _confirm(self, number: int, edge: ScanEdge) -> list[ScanEdge]:
         """Return this edge and the earlier one that agrees with it, or nothing without one."""
         size = self.keyframes.submap_keyframes
         self._witnesses = [w for w in self._witnesses if number - w.keyframe <= size]
@@ -150,7 +152,7 @@ class LoopCloser:
             metres = sum(frame.distance_m for frame in driven)
             self._connect(before, submap, metres)
 
-    def _join(self, edge: Edge) -> None:
+    def _join(self, edge: ScanEdge) -> None:
         size = self.keyframes.submap_keyframes
         self._connect(edge.first // size, edge.second // size, 0.5)
 

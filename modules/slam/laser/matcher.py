@@ -63,7 +63,7 @@ class Match:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Prior:
+class MotionPrior:
     """The predicted pose of a scan by one source of motion.
 
     The wheels' prior has heavy tails (Student's distribution), so that a contradicting scan
@@ -77,7 +77,7 @@ class Prior:
     freedom: float  # degrees of freedom of Student's distribution
 
     @classmethod
-    def of(cls, pose: Planar, covariance: Matrix, probability: float = 1.0) -> Prior:
+    def of(cls, pose: Planar, covariance: Matrix, probability: float = 1.0) -> MotionPrior:
         """Return the prior of a pose (3,) with covariance (3, 3); normal if it is the only one."""
         information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         spread = 0.5 * float(np.linalg.slogdet(covariance)[1])
@@ -133,7 +133,7 @@ class Matcher:
         self,
         scan_base: SurfacePoints,
         field: LikelihoodField,
-        priors: Sequence[Prior],
+        priors: Sequence[MotionPrior],
         *,
         novelty: float = 1.0,
     ) -> Match:
@@ -155,9 +155,11 @@ class Matcher:
         self, scan_base: SurfacePoints, field: LikelihoodField, start: Planar, prior: Matrix
     ) -> Match:
         """Return the pose of a scan, without a search, from `start` with covariance `prior`."""
-        return self._refine(scan_base, field, start, [Prior.of(start, prior)], self.shift_m)
+        return self._refine(scan_base, field, start, [MotionPrior.of(start, prior)], self.shift_m)
 
-    def _search(self, scan_base: SurfacePoints, field: LikelihoodField, prior: Prior) -> Planar:
+    def _search(
+        self, scan_base: SurfacePoints, field: LikelihoodField, prior: MotionPrior
+    ) -> Planar:
         """Return the most likely pose on a grid around the prediction."""
         predicted, sigma = prior.pose, np.sqrt(np.diag(prior.covariance))
         stride = max(1, len(scan_base) // _SEARCH_POINTS)
@@ -187,7 +189,7 @@ class Matcher:
         scan_base: SurfacePoints,
         field: LikelihoodField,
         start: Planar,
-        priors: Sequence[Prior],
+        priors: Sequence[MotionPrior],
         shift_m: float,
     ) -> Match:
         """Return the pose by Gauss-Newton from a start, with its most likely prior."""

@@ -18,15 +18,15 @@ from sceneslam.types.planar import to_transform, turn
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
-from .back_end import BackEnd
+from .back_end import LaserBackEnd
 from .frontend import Estimate, FrontEnd, ScanSettings
-from .history import History
-from .keyframes import Keyframes
+from .history import RelativePoseHistory
+from .keyframes import ScanKeyframes
 from .layers import covariance_6, map_layers
-from .loop_closure import LoopCloser
+from .loop_closure import ScanLoopCloser
 from .matcher import Matcher
 from .places import Places
-from .surface import SurfaceReader
+from .surface import ScanSurfaceReader
 
 _ABOVE_0 = (
     "resolution_m range_max_m laser_noise_m depth_noise_m window_m window_rad "
@@ -174,8 +174,8 @@ class LaserSlam:
 
     def _make_front_end(self, rig: Rig) -> FrontEnd:
         from_depth = isinstance(self._scanner, DepthScanner)
-        keyframes = Keyframes(
-            reader=SurfaceReader(
+        keyframes = ScanKeyframes(
+            reader=ScanSurfaceReader(
                 T_base_laser=self._T_base_laser,
                 range_max_m=self.range_max_m,
                 noise_m=self.depth_noise_m if from_depth else self.laser_noise_m,
@@ -191,7 +191,7 @@ class LaserSlam:
             degeneracy_ratio=self.degeneracy_ratio,
             shift_m=self.depth_shift_m if from_depth else 0.0,
         )
-        closer = LoopCloser(keyframes, Places(keyframes, self.resolution_m), matcher)
+        closer = ScanLoopCloser(keyframes, Places(keyframes, self.resolution_m), matcher)
         return FrontEnd(
             settings=ScanSettings(
                 resolution_m=self.resolution_m,
@@ -202,8 +202,8 @@ class LaserSlam:
             matcher=matcher,
             motion=MotionModel(rig),
             keyframes=keyframes,
-            history=History(keyframes),
-            back_end=BackEnd(keyframes, closer if self.close_loops else None),
+            history=RelativePoseHistory(keyframes),
+            back_end=LaserBackEnd(keyframes, closer if self.close_loops else None),
         )
 
 

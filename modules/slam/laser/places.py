@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from sceneslam.types.planar import between
 
 from .field import LikelihoodField
-from .keyframes import Keyframes
+from .keyframes import ScanKeyframes
 from .loop_search import LoopSearch
 from .surface import joined
 
@@ -16,7 +16,7 @@ _KEPT = 24  # places in memory, about 2 MB each
 
 
 @dataclass(slots=True)
-class Place:
+class ScanSubmap:
     """One submap in the frame of its middle keyframe."""
 
     anchor: int
@@ -35,11 +35,11 @@ class Place:
 class Places:
     """The places of all finished submaps; the latest used are kept."""
 
-    keyframes: Keyframes
+    keyframes: ScanKeyframes
     resolution_m: float
-    _places: OrderedDict[int, Place] = field(default_factory=OrderedDict)
+    _places: OrderedDict[int, ScanSubmap] = field(default_factory=OrderedDict)
 
-    def of(self, submap: int) -> Place:
+    def of(self, submap: int) -> ScanSubmap:
         """Return a submap's place."""
         if submap not in self._places:
             self._places[submap] = self._make(self.keyframes.of_submap(submap))
@@ -48,7 +48,7 @@ class Places:
         self._places.move_to_end(submap)
         return self._places[submap]
 
-    def _make(self, numbers: range) -> Place:
+    def _make(self, numbers: range) -> ScanSubmap:
         anchor = numbers[len(numbers) // 2]
         frames = self.keyframes.frames
         T_local_anchor = frames[anchor].T_local_base
@@ -56,4 +56,4 @@ class Places:
             self.keyframes.surfaces_base(i).moved(between(T_local_anchor, frames[i].T_local_base))
             for i in self.keyframes.around(anchor, numbers)
         ]
-        return Place(anchor=anchor, field=LikelihoodField(joined(parts), self.resolution_m))
+        return ScanSubmap(anchor=anchor, field=LikelihoodField(joined(parts), self.resolution_m))

@@ -17,7 +17,7 @@ _ORIGIN_DEVIATION = 1e-4  # m and rad
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Edge:
+class ScanEdge:
     """A measured motion between two keyframes."""
 
     first: int
@@ -28,14 +28,14 @@ class Edge:
 
 
 @dataclass(slots=True)
-class PoseGraph:
+class ScanPoseGraph:
     """Smooths incrementally (iSAM2): the cost of a loop grows with the poses it changes."""
 
-    edges: list[Edge] = field(default_factory=list)
+    edges: list[ScanEdge] = field(default_factory=list)
     _smoother: Any = field(default=None, init=False)
     _told: int = field(default=0, init=False)  # number of edges already in the smoother
 
-    def add(self, edge: Edge) -> None:
+    def add(self, edge: ScanEdge) -> None:
         """Add an edge; a new keyframe is added with the edge from the previous one."""
         self.edges.append(edge)
 
@@ -59,7 +59,7 @@ class PoseGraph:
         return _poses(self._smoother.calculateEstimate(), len(poses))
 
 
-def optimise(edges: list[Edge], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def optimise(edges: list[ScanEdge], poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the optimised poses (N, 3) (Levenberg-Marquardt), from the initial `poses`."""
     import gtsam
 
@@ -84,7 +84,7 @@ def _origin(gtsam: Any, poses: NDArray[np.float64]) -> Any:
     return gtsam.PriorFactorPose2(0, gtsam.Pose2(*poses[0]), noise)
 
 
-def _factor(gtsam: Any, edge: Edge) -> Any:
+def _factor(gtsam: Any, edge: ScanEdge) -> Any:
     noise = gtsam.noiseModel.Gaussian.Covariance(edge.covariance)
     if edge.is_loop:
         huber = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER)

@@ -62,7 +62,7 @@ def joined(parts: Sequence[SurfacePoints]) -> SurfacePoints:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SurfaceReader:
+class ScanSurfaceReader:
     """Reads the scans of one laser.
 
     A range's standard deviation is noise_m + noise_per_m * range^2; noise_per_m is 0 for a laser,

@@ -27,7 +27,7 @@ _POINTS_EVERY = 10  # images
 _POINT_M = 0.02  # of several points within a cube of this edge one is kept
 
 
-class OrbSlam3:
+class OrbSlam3Worker:
     """Tracks with ORB-SLAM3; `pyorbslam3` and a folder for its files are given."""
 
     requires = "image depth\nimage odometry"
@@ -191,6 +191,6 @@ def main(settings: dict[str, Any]) -> None:
     import pyorbslam3
 
     with tempfile.TemporaryDirectory(prefix="orb_slam3_") as folder:
-        serve(OrbSlam3(pyorbslam3, Path(folder), settings))
+        serve(OrbSlam3Worker(pyorbslam3, Path(folder), settings))
     sys.stderr.flush()
     os._exit(0)  # its threads would go on

@@ -21,7 +21,16 @@ from sceneslam.supervision.ending import MARK, how_it_ended, kill_all
 from sceneslam.supervision.limits import Limits
 from sceneslam.types.errors import ModuleError
 
-from .protocol import HEAD_BYTES, Fields, Head, ProtocolError, as_text, pack, read_fields, read_head
+from .protocol import (
+    HEAD_BYTES,
+    Fields,
+    MessageHeader,
+    ProtocolError,
+    as_text,
+    pack,
+    read_fields,
+    read_head,
+)
 
 _log = logging.getLogger(__name__)
 _CHUNK_BYTES = 1 << 20
@@ -123,7 +132,7 @@ class Program:
                 self._popen.wait(_PATIENCE_S)
         self._end()
 
-    def _head(self, deadline_s: float) -> Head:
+    def _head(self, deadline_s: float) -> MessageHeader:
         self._fill(HEAD_BYTES, deadline_s)
         head = read_head(bytes(self._inbox[:HEAD_BYTES]))
         if head.length > self._limits.memory_limit_mb << 20:

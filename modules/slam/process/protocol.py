@@ -30,7 +30,7 @@ class ProtocolError(Exception):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Head:
+class MessageHeader:
     """What a message is, before its fields."""
 
     kind: str
@@ -54,17 +54,17 @@ def pack(kind: str, number: int, fields: Fields) -> list[memoryview]:
     return [memoryview(head), *[part for part in parts if part.nbytes]]
 
 
-def read_head(data: bytes) -> Head:
+def read_head(data: bytes) -> MessageHeader:
     """Return the head in the first 40 bytes; raises ProtocolError where they are not one."""
     magic, kind, number, count, length = _HEAD.unpack(data)
     if magic[:-1] != MAGIC[:-1]:
         raise ProtocolError(f"wrote what is no message: {data[:24]!r}")
     if magic != MAGIC:
         raise ProtocolError(f"speaks version {magic[-1:].decode('latin1')}, expected {VERSION}")
-    return Head(kind=_text(kind), number=number, count=count, length=length)
+    return MessageHeader(kind=_text(kind), number=number, count=count, length=length)
 
 
-def read_fields(head: Head, data: bytes | bytearray) -> dict[str, NDArray[Any]]:
+def read_fields(head: MessageHeader, data: bytes | bytearray) -> dict[str, NDArray[Any]]:
     """Return the arrays of a message, read-only; raises ProtocolError where they do not fit it."""
     fields: dict[str, NDArray[Any]] = {}
     start = 0

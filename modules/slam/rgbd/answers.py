@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.se3 import Transform
 
-from .localizer import Fix
+from .localizer import VisualFix
 from .segments import Segments
 from .view import View
 
@@ -34,7 +34,7 @@ def started(view: View, T_local_base: Transform, *, is_first: bool, revision: in
 
 def held(
     view: View,
-    fix: Fix,
+    fix: VisualFix,
     T_local_base: Transform,
     *,
     status: TrackingStatus,

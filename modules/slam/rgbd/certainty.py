@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sceneslam.types.se3 import Transform
 
 from .landmarks import LandmarkTable
-from .localizer import Fix
+from .localizer import VisualFix
 from .pose_graph import motion_covariance
 from .pose_solver import Linearised
 from .view import View
@@ -37,7 +37,11 @@ class Certainty:
         self.by_wheels = np.zeros((6, 6))  # share of the last covariance due to wheels
 
     def covariance(
-        self, view: View, fix: Fix, T_local_base: Transform, T_keyframe_base: Sequence[Transform]
+        self,
+        view: View,
+        fix: VisualFix,
+        T_local_base: Transform,
+        T_keyframe_base: Sequence[Transform],
     ) -> NDArray[np.float64]:
         """Return the covariance (6, 6) of a pose, of se3.log order [m, rad], in base.
 
@@ -63,7 +67,9 @@ class Certainty:
         self._common = _KEPT * before + (1.0 - _KEPT) * ratio
         return max(1.0, self._common)
 
-    def scale_variance(self, view: View, fix: Fix, T_local_base: Transform) -> NDArray[np.float64]:
+    def scale_variance(
+        self, view: View, fix: VisualFix, T_local_base: Transform
+    ) -> NDArray[np.float64]:
         """Return (3, 3) [m^2]: variance by the scale's error over the motion since it was known."""
         sigmas = self._landmarks.scale_sigma[fix.landmark_ids]
         if not view.is_monocular or not sigmas.any():
@@ -76,7 +82,7 @@ class Certainty:
         return np.asarray(np.mean(sigmas**2) * np.outer(way_base, way_base))
 
 
-def common_ratio(view: View, fix: Fix) -> float:
+def common_ratio(view: View, fix: VisualFix) -> float:
     """Return how much stronger the residuals' gradient is than that of independent residuals.
 
     The squared sum of the gradients of a cell's pixels over the sum of their squares: 1 if they are

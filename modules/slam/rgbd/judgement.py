@@ -12,7 +12,7 @@ from sceneslam.types.observation import TrackingStatus
 from sceneslam.types.se3 import Transform
 
 from .keyframes import KeyframeStore
-from .localizer import Fix
+from .localizer import VisualFix
 from .pose_solver import PoseEstimate
 from .view import View
 
@@ -62,7 +62,7 @@ class KeyframeRule:
     def wants(
         self,
         T_local_base: Transform,
-        fix: Fix,
+        fix: VisualFix,
         keyframes: KeyframeStore,
         segment: Collection[int] | None,
     ) -> bool:

@@ -11,8 +11,8 @@ from .fusion import join_duplicates
 from .keyframes import NO_LANDMARK, Keyframe
 from .layers import LayerBuilder
 from .local_mapping import LocalMapping
-from .localizer import Fix
-from .memory import Memory
+from .localizer import VisualFix
+from .map_history import MapHistory
 from .triangulation import triangulate
 from .view import View
 from .visual_map import VisualMap
@@ -22,7 +22,7 @@ class KeyframeMaker:
     """Extends the map by a view."""
 
     def __init__(
-        self, visual_map: VisualMap, layers: LayerBuilder, memory: Memory, mapping: LocalMapping
+        self, visual_map: VisualMap, layers: LayerBuilder, memory: MapHistory, mapping: LocalMapping
     ) -> None:
         self._map, self._layers = visual_map, layers
         self._memory, self._mapping = memory, mapping
@@ -33,7 +33,7 @@ class KeyframeMaker:
         T_local_base: Transform,
         segment: set[int] | None,
         *,
-        fix: Fix | None,
+        fix: VisualFix | None,
         guessed_s: float | None,
     ) -> NDArray[np.int64]:
         """Insert a keyframe at a pose (4, 4) and return the ids (N,) of its landmarks.

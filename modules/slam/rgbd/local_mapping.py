@@ -11,13 +11,13 @@ from sceneslam.types.se3 import Transform
 from .alignment import Alignment
 from .alignment_search import Shown
 from .cores import Here, worker_beside
-from .mapping_work import MappingWork, Outcome, Task
+from .mapping_work import MappingResult, MappingWork, Task
 from .side_process import SideProcess
 from .view import View
 from .visual_map import VisualMap
-from .window import Window, merge_window, take_window
+from .window import MapWindow, merge_window, take_window
 
-_Worker = SideProcess[Task, Outcome] | Here[Task, Outcome]
+_Worker = SideProcess[Task, MappingResult] | Here[Task, MappingResult]
 _TIED_IMAGES = 10  # between merges with depth, whose registration takes 100 to 200 ms
 _FREE_IMAGES = 5  # without depth: triangulated landmarks need it early, as they drift in scale
 _BEGINNING = 16  # first views, kept to rebuild the map: 2.4 MB each
@@ -39,8 +39,8 @@ class LocalMapping:
     ) -> None:
         self._map, self._depth_camera, self._known = visual_map, depth_camera, alignment
         self._worker: _Worker | None = None
-        self._window: Window | None = None
-        self._result: Future[Outcome] | None = None
+        self._window: MapWindow | None = None
+        self._result: Future[MappingResult] | None = None
         self._images_left, self._newest = _FREE_IMAGES, -1
         self._fresh: dict[int, Shown] = {}  # keyframes that the worker has not received yet
         self._is_aligned = alignment is not None

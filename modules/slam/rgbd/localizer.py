@@ -23,7 +23,7 @@ _MIN_FOUND_RATIO = 0.1  # found, of the expected landmarks: 0.05 by chance, 0.2 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Fix:
+class VisualFix:
     """A pose and the landmarks that support it."""
 
     estimate: PoseEstimate
@@ -51,7 +51,7 @@ class _Found:
         return len(self.feature_rows)
 
 
-class Localizer:
+class VisualLocalizer:
     """Matches features to the map and solves for the pose."""
 
     def __init__(
@@ -62,7 +62,7 @@ class Localizer:
 
     def near(
         self, features: Features, T_predicted: Transform, held_ids: NDArray[np.int64]
-    ) -> Fix | None:
+    ) -> VisualFix | None:
         """Return the pose found by matching landmarks near their pixels at a predicted pose.
 
         First the landmarks tracked last (`held_ids`), then all around them, then with a larger
@@ -81,7 +81,7 @@ class Localizer:
                 return fix
         return None
 
-    def beside(self, features: Features, fix: Fix) -> Fix | None:
+    def beside(self, features: Features, fix: VisualFix) -> VisualFix | None:
         """Return the pose found by matching again from a pose of the same image."""
         found = self._look(
             features, fix.estimate.T_local_base, fix.expected_ids, _RADIUS_REFINED_PX
@@ -90,18 +90,18 @@ class Localizer:
             features, found, self._solver.approach(found.measured, fix.estimate.T_local_base)
         )
 
-    def around(self, features: Features, held_ids: NDArray[np.int64]) -> Fix | None:
+    def around(self, features: Features, held_ids: NDArray[np.int64]) -> VisualFix | None:
         """Return the pose found by descriptors alone, among all landmarks around `held_ids`."""
         return self.anywhere(features, self._map.around(held_ids))
 
-    def anywhere(self, features: Features, landmark_ids: NDArray[np.int64]) -> Fix | None:
+    def anywhere(self, features: Features, landmark_ids: NDArray[np.int64]) -> VisualFix | None:
         """Return the pose found by descriptors alone, among `landmark_ids`."""
         matches = match_anywhere(
             self._map.landmarks.descriptors.take(landmark_ids, axis=0), features
         )
         return self._search(features, self._found(features, landmark_ids, matches, se3.identity()))
 
-    def _search(self, features: Features, found: _Found) -> Fix | None:
+    def _search(self, features: Features, found: _Found) -> VisualFix | None:
         """Return the pose that most of the pairs agree on, confirmed by the landmarks around it."""
         if len(found) < self._min_inliers:
             return None
@@ -109,7 +109,7 @@ class Localizer:
 
     def _confirm(
         self, features: Features, rough: _Found, consensus: Consensus | None
-    ) -> Fix | None:
+    ) -> VisualFix | None:
         """Return the final pose, from all landmarks that are found with a nearly correct pose."""
         if consensus is None or len(consensus.inlier_rows) < self._min_inliers:
             return None
@@ -125,7 +125,7 @@ class Localizer:
         least = max(_MIN_INLIER_RATIO * len(found), _MIN_FOUND_RATIO * possible)
         if count < max(self._min_inliers, least):
             return None
-        return Fix(
+        return VisualFix(
             estimate=estimate,
             landmark_ids=found.landmark_ids[estimate.inliers],
             feature_rows=found.feature_rows[estimate.inliers],

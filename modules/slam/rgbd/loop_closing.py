@@ -10,7 +10,7 @@ from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
 from .cores import thread_beside
-from .loop_detection import Loop, LoopDetector, Query
+from .loop_detection import LoopClosure, LoopDetector, Query
 from .loop_fusion import fuse_duplicates
 from .pose_graph import PoseGraph, solve
 from .visual_map import VisualMap
@@ -21,7 +21,7 @@ _QUEUE = 3  # keyframes waiting for a query; older ones are dropped
 Poses = Mapping[int, Transform]
 
 
-class LoopCloser:
+class VisualLoopCloser:
     """Queries new keyframes, and corrects the map when two of them agree on a loop."""
 
     def __init__(self, visual_map: VisualMap, detector: LoopDetector, graph: PoseGraph) -> None:
@@ -31,7 +31,7 @@ class LoopCloser:
         self._candidate: int | None = None  # candidate of the first query, once it was found
         self._solution: Future[dict[int, Transform]] | None = None
         self._before: Poses = {}  # the poses that the worker began with
-        self._loops: list[Loop] = []
+        self._loops: list[LoopClosure] = []
         self._images_left = 0
 
     @property
@@ -88,7 +88,7 @@ class LoopCloser:
         else:
             self._fuse(loops)
 
-    def _met(self, loop: Loop) -> Poses:
+    def _met(self, loop: LoopClosure) -> Poses:
         """Return the new poses of a whole segment that a loop connects for the first time."""
         segment = self._graph.connected(loop.keyframe_id)
         poses = self._poses()
@@ -100,7 +100,7 @@ class LoopCloser:
             segment, T_new_old = other, se3.inverse(T_new_old)
         return {k: T_new_old @ poses[k] for k in segment}
 
-    def _begin(self, loops: list[Loop], met: Poses) -> None:
+    def _begin(self, loops: list[LoopClosure], met: Poses) -> None:
         """Start solving the part of the graph with the loops; `met`: poses of a moved segment."""
         part = self._graph.connected(loops[0].keyframe_id)
         self._before = {k: T for k, T in self._poses().items() if k in part}
@@ -127,7 +127,7 @@ class LoopCloser:
         self._solution, self._loops = None, []
         return T_new_old
 
-    def _fuse(self, loops: list[Loop]) -> None:
+    def _fuse(self, loops: list[LoopClosure]) -> None:
         for loop in loops:
             if loop.edge.start in self._graph and loop.edge.end in self._graph:
                 fuse_duplicates(self._map, old=loop.edge.start, new=loop.edge.end)

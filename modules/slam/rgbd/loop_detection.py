@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
-from .pose_graph import Edge, PoseGraph, Way, motion_covariance
+from .pose_graph import KeyframeEdge, PoseGraph, Way, motion_covariance
 from .recognition import PlaceRecognizer, Recognition
 from .visual_map import VisualMap
 
@@ -31,10 +31,10 @@ class Query:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Loop:
+class LoopClosure:
     """A loop: the edge from an old to a new keyframe, and the new one's pose by it."""
 
-    edge: Edge
+    edge: KeyframeEdge
     T_local_base: Transform  # of the new keyframe, by the old part of the map
 
     @property
@@ -50,7 +50,7 @@ class LoopDetector:
         self, visual_map: VisualMap, recognizer: PlaceRecognizer, graph: PoseGraph
     ) -> None:
         self._map, self._recognizer, self._graph = visual_map, recognizer, graph
-        self._hypothesis: Loop | None = None
+        self._hypothesis: LoopClosure | None = None
 
     def candidate(self, query: Query) -> int | None:
         """Return the unconnected keyframe that is exceptionally similar to the new one."""
@@ -69,7 +69,7 @@ class LoopDetector:
             return None
         return alike[0].place_id
 
-    def check(self, query: Query, candidate: int) -> list[Loop]:
+    def check(self, query: Query, candidate: int) -> list[LoopClosure]:
         """Return the loops that two keyframes agree on: this one's and an earlier one's."""
         new = self._map.keyframes[query.keyframe_id]
         seen = self._recognizer.recognize(candidate, new.features, query.depth_m)
@@ -87,26 +87,26 @@ class LoopDetector:
         self._hypothesis = None
         return [earlier, loop]
 
-    def is_news(self, loop: Loop) -> bool:
+    def is_news(self, loop: LoopClosure) -> bool:
         """Tell whether a loop moves its keyframe by more than its uncertainty."""
         T_local_base = self._map.keyframes[loop.keyframe_id].T_local_base
         xi = se3.log(se3.inverse(T_local_base) @ loop.T_local_base)
         return float(xi @ np.linalg.solve(loop.edge.covariance, xi)) > _CHI2
 
-    def _loop(self, keyframe_id: int, seen: Recognition) -> Loop:
+    def _loop(self, keyframe_id: int, seen: Recognition) -> LoopClosure:
         T_old = self._map.keyframes[seen.keyframe_id].T_local_base
         T_local_base = seen.fix.estimate.T_local_base
         T_start_end = se3.inverse(T_old) @ T_local_base
-        edge = Edge(
+        edge = KeyframeEdge(
             start=seen.keyframe_id,
             end=keyframe_id,
             T_start_end=T_start_end,
             covariance=motion_covariance(T_start_end, seen.fix.estimate.covariance),
             is_loop=True,
         )
-        return Loop(edge=edge, T_local_base=T_local_base)
+        return LoopClosure(edge=edge, T_local_base=T_local_base)
 
-    def _agree(self, earlier: Loop, later: Loop) -> bool:
+    def _agree(self, earlier: LoopClosure, later: LoopClosure) -> bool:
         """Tell whether both loops imply the same motion between the two new keyframes."""
         T_first, T_second = (
             self._map.keyframes[loop.keyframe_id].T_local_base for loop in (earlier, later)
@@ -118,7 +118,7 @@ class LoopDetector:
         return float(xi @ np.linalg.solve(covariance, xi)) <= _CHI2
 
 
-def _believable(loop: Loop, T_local_base: Transform, way: Way) -> bool:
+def _believable(loop: LoopClosure, T_local_base: Transform, way: Way) -> bool:
     """Tell whether the drift that the loop implies is plausible for the path."""
     T_error = se3.inverse(T_local_base) @ loop.T_local_base
     sigmas = np.sqrt(np.diag(loop.edge.covariance))

@@ -26,7 +26,7 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Outcome:
+class MappingResult:
     """The adjusted part, and the cameras' alignment if it differs from the assumed one."""
 
     adjusted: Adjusted
@@ -45,7 +45,7 @@ class MappingWork:
         self._found: Alignment | None = None
         self._ties: dict[tuple[int, int], Tie] = {}  # by keyframe ids
 
-    def __call__(self, task: Task) -> Outcome:
+    def __call__(self, task: Task) -> MappingResult:
         """Return the task's bundle adjusted with its relative-pose constraints."""
         self._tie(task)
         rows = {keyframe_id: row for row, keyframe_id in enumerate(task.keyframe_ids)}
@@ -55,7 +55,7 @@ class MappingWork:
             if one in rows and other in rows
         }
         bundle = replace(task.bundle, ties=Ties.of(ties))
-        return Outcome(
+        return MappingResult(
             adjusted=adjust(self._camera, bundle),
             alignment=self._found,
             is_aligned=self._search.is_over,

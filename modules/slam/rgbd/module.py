@@ -19,10 +19,10 @@ from sceneslam.types.trajectory import Trajectory
 from .alignment import Alignment
 from .answers import held, lost, placed, repeated, started
 from .limits import check_limits, check_sizes
-from .localizer import Fix
-from .parts import Parts
+from .localizer import VisualFix
+from .parts import RgbdParts
 from .reckoning import Reckoner, led
-from .renewal import NEWEST, Seen, renew, seen_by
+from .renewal import NEWEST, LocatedView, renew, seen_by
 from .reunion import Reunion
 from .turn_rate import expected_rate
 from .view import View
@@ -144,8 +144,8 @@ class RgbdSlam:
         self._memory.shutdown()
         self._reunion.end(self._map, self._memory.recognizer)
 
-    def _build(self, alignment: Alignment | None) -> Parts:
-        parts = Parts(self._arguments, self._camera, alignment, self._reunion)
+    def _build(self, alignment: Alignment | None) -> RgbdParts:
+        parts = RgbdParts(self._arguments, self._camera, alignment, self._reunion)
         self._eye, self._health, self._search = parts.eye, parts.health, parts.search
         self._map, self._mapping, self._memory = parts.map, parts.mapping, parts.memory
         self._layers, self._place_rule = parts.layers, parts.place_rule
@@ -155,7 +155,7 @@ class RgbdSlam:
 
     def _build_anew(self, view: View, alignment: Alignment) -> None:
         """Rebuild the map from its views, as the old one assigned depths to wrong corners."""
-        before, newest = self._memory, Seen(view=view, T_local_base=self._T_local_base)
+        before, newest = self._memory, LocatedView(view=view, T_local_base=self._T_local_base)
         segment = before.segment(self._held_ids)
         seen = seen_by(self._map.keyframes, self._mapping.beginning, segment, newest)
         self._mapping.shutdown()
@@ -191,7 +191,7 @@ class RgbdSlam:
         is_first, revision = self._observations == 1, self._memory.revision
         return started(view, self._T_local_base, is_first=is_first, revision=revision)
 
-    def _hold(self, view: View, fix: Fix, prediction: Prediction) -> Tracking:
+    def _hold(self, view: View, fix: VisualFix, prediction: Prediction) -> Tracking:
         """Accept a pose, and extend the map if a keyframe is due."""
         if view.is_monocular and prediction.is_measured:
             scale = self._certainty.scale_variance(view, fix, fix.estimate.T_local_base)
@@ -263,7 +263,7 @@ class RgbdSlam:
         view: View,
         segment: set[int] | None,
         *,
-        fix: Fix | None = None,
+        fix: VisualFix | None = None,
         guessed_s: float | None = None,
     ) -> None:
         self._held_ids = self._maker.insert(

@@ -9,22 +9,22 @@ from sceneslam.types.rig import Camera
 
 from .alignment import Alignment
 from .certainty import Certainty
-from .eye import Eye
 from .features import FeatureExtractor
 from .judgement import HealthRule, KeyframeRule, PlaceRule
 from .keyframe_maker import KeyframeMaker
 from .layers import LayerBuilder
 from .local_mapping import LocalMapping
-from .localizer import Localizer
-from .memory import Memory
+from .localizer import VisualLocalizer
+from .map_history import MapHistory
 from .pose_solver import PoseSolver
+from .rectifying_extractor import RectifyingExtractor
 from .relocalizer import Relocalizer
 from .reunion import Reunion
 from .search import Search
 from .visual_map import VisualMap
 
 
-class Parts:
+class RgbdParts:
     """An empty map with the parts for extraction, localization, mapping, rules and history."""
 
     def __init__(
@@ -55,13 +55,13 @@ class Parts:
             depth_camera,
             **same("sigma_px", "inverse_depth_sigma_per_m", "keyframe_limit", "landmark_limit"),
         )
-        localizer = Localizer(
+        localizer = VisualLocalizer(
             self.map,
             PoseSolver(camera, **same("seed")),
             **chosen(radius_px="search_radius_px", min_inliers="min_inliers"),
         )
-        self.eye = Eye(self.map, localizer, extractor)
-        self.memory = Memory(
+        self.eye = RectifyingExtractor(self.map, localizer, extractor)
+        self.memory = MapHistory(
             self.map, localizer, self.eye, reunion, **chosen(min_inliers="degraded_inliers")
         )
         relocalizer = Relocalizer(self.map.keyframes, self.memory.recognizer)

@@ -20,7 +20,7 @@ _RADIAN_M = 1.0  # metres that a radian counts in the length of a path
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Edge:
+class KeyframeEdge:
     """A measured motion from one keyframe to another."""
 
     start: int
@@ -29,10 +29,10 @@ class Edge:
     covariance: NDArray[np.float64]  # (6, 6), of se3.log order, in the frame of the end
     is_loop: bool = False
 
-    def turned(self) -> Edge:
+    def turned(self) -> KeyframeEdge:
         """Return the measurement inverted, from the end to the start."""
         adjoint = se3.adjoint(self.T_start_end)
-        return Edge(
+        return KeyframeEdge(
             start=self.end,
             end=self.start,
             T_start_end=se3.inverse(self.T_start_end),
@@ -40,10 +40,10 @@ class Edge:
             is_loop=self.is_loop,
         )
 
-    def then(self, after: Edge) -> Edge:
+    def then(self, after: KeyframeEdge) -> KeyframeEdge:
         """Return the composition of this edge and one that begins at its end."""
         adjoint = se3.adjoint(se3.inverse(after.T_start_end))
-        return Edge(
+        return KeyframeEdge(
             start=self.start,
             end=after.end,
             T_start_end=self.T_start_end @ after.T_start_end,
@@ -67,7 +67,7 @@ class PoseGraph:
     """Keyframes by id, and the edges between them."""
 
     def __init__(self) -> None:
-        self._edges: dict[int, dict[int, Edge]] = {}  # stored at both ends, beginning there
+        self._edges: dict[int, dict[int, KeyframeEdge]] = {}  # stored at both ends, beginning there
 
     def __contains__(self, keyframe_id: int) -> bool:
         return keyframe_id in self._edges
@@ -78,7 +78,7 @@ class PoseGraph:
         return list(self._edges)
 
     @property
-    def edges(self) -> list[Edge]:
+    def edges(self) -> list[KeyframeEdge]:
         """Return every edge once, from the lower to the higher id."""
         return [e for near in self._edges.values() for e in near.values() if e.start < e.end]
 
@@ -86,7 +86,7 @@ class PoseGraph:
         """Add a keyframe without edges."""
         self._edges[keyframe_id] = {}
 
-    def connect(self, edge: Edge) -> None:
+    def connect(self, edge: KeyframeEdge) -> None:
         """Add an edge between two keyframes; it replaces an existing one."""
         self._edges[edge.start][edge.end] = edge
         self._edges[edge.end][edge.start] = edge.turned()
@@ -95,7 +95,7 @@ class PoseGraph:
         """Return the ids of the keyframes connected by an edge."""
         return list(self._edges[keyframe_id])
 
-    def remove(self, keyframe_id: int) -> Edge | None:
+    def remove(self, keyframe_id: int) -> KeyframeEdge | None:
         """Remove a keyframe; its most certain neighbour takes over the other edges.
 
         Returns the edge from that neighbour to the keyframe, None without neighbours.
@@ -167,7 +167,7 @@ class PoseGraph:
 
 
 def solve(
-    T_local_base: Mapping[int, Transform], edges: Iterable[Edge], *, held: int
+    T_local_base: Mapping[int, Transform], edges: Iterable[KeyframeEdge], *, held: int
 ) -> dict[int, Transform]:
     """Return the poses that best fit the edges (Levenberg-Marquardt, Huber's kernel on loops).
 
@@ -203,10 +203,12 @@ def motion_covariance(T_start_end: Transform, measured: NDArray[np.float64]) -> 
     return np.asarray(measured + variances.repeat(3, axis=-1)[..., None] * np.eye(6))
 
 
-def _moved(edge: Edge, T_start_end: Transform) -> Edge:
-    return Edge(start=edge.start, end=edge.end, T_start_end=T_start_end, covariance=edge.covariance)
+def _moved(edge: KeyframeEdge, T_start_end: Transform) -> KeyframeEdge:
+    return KeyframeEdge(
+        start=edge.start, end=edge.end, T_start_end=T_start_end, covariance=edge.covariance
+    )
 
 
-def _length(edge: Edge) -> float:
+def _length(edge: KeyframeEdge) -> float:
     T = edge.T_start_end
     return float(np.linalg.norm(T[:3, 3]) + _RADIAN_M * se3.rotation_angle_rad(T))

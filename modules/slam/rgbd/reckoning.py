@@ -17,7 +17,7 @@ from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
 from .keyframes import Keyframe, Reckoned
-from .localizer import Fix
+from .localizer import VisualFix
 from .ties import Tie
 
 _SIGMA_M, _SIGMA_PER_M = 0.003, 0.02  # of the wheels' distance; a slip is an outlier
@@ -41,7 +41,7 @@ class Reckoner:
         return None if is_broken else self._now
 
 
-def led(fix: Fix, prediction: Prediction, scale_variance: Matrix) -> Fix:
+def led(fix: VisualFix, prediction: Prediction, scale_variance: Matrix) -> VisualFix:
     """Return a pose that was found without depth, fused with odometry.
 
     `scale_variance` (3, 3) [m^2], in base, is the pose's variance by the map's scale error. If

@@ -12,7 +12,7 @@ from sceneslam.types.se3 import Transform
 
 from .features import Features
 from .keyframes import Keyframe
-from .localizer import Fix, Localizer
+from .localizer import VisualFix, VisualLocalizer
 from .places import PlaceIndex
 from .visual_map import VisualMap
 
@@ -28,7 +28,7 @@ class Recognition:
     """A pose in the map, and the keyframe by which it was found."""
 
     keyframe_id: int
-    fix: Fix
+    fix: VisualFix
 
 
 class PlaceRecognizer:
@@ -38,7 +38,9 @@ class PlaceRecognizer:
     and the depths around it differ.
     """
 
-    def __init__(self, visual_map: VisualMap, localizer: Localizer, *, min_inliers: int) -> None:
+    def __init__(
+        self, visual_map: VisualMap, localizer: VisualLocalizer, *, min_inliers: int
+    ) -> None:
         self._map, self._localizer = visual_map, localizer
         self._min_inliers = min_inliers
         self.places = PlaceIndex()

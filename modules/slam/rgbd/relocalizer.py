@@ -10,7 +10,7 @@ from sceneslam.types.se3 import Transform
 
 from .features import Features
 from .keyframes import KeyframeStore
-from .localizer import Fix
+from .localizer import VisualFix
 from .recognition import PlaceRecognizer, Recognition
 
 _ALIKE = 3  # keyframes tried per image
@@ -28,7 +28,7 @@ class Relocalizer:
     def __init__(self, keyframes: KeyframeStore, recognizer: PlaceRecognizer) -> None:
         self._keyframes, self._recognizer = keyframes, recognizer
 
-    def find(self, features: Features, depth_m: NDArray[np.float32] | None) -> Fix | None:
+    def find(self, features: Features, depth_m: NDArray[np.float32] | None) -> VisualFix | None:
         """Return the pose in the map, None if no place or more than one is confirmed."""
         if not len(features):
             return None

@@ -11,14 +11,14 @@ from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
 from .keyframes import KeyframeStore
-from .parts import Parts
+from .parts import RgbdParts
 from .view import View
 
 NEWEST = -1  # id of the newest view, which may not be a keyframe
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Seen:
+class LocatedView:
     """A view with its pose in the old map."""
 
     view: View
@@ -29,22 +29,22 @@ def seen_by(
     keyframes: KeyframeStore,
     views: Mapping[int, View],
     segment: Collection[int] | None,
-    newest: Seen,
-) -> dict[int, Seen]:
+    newest: LocatedView,
+) -> dict[int, LocatedView]:
     """Return the views of a segment's keyframes (None: all) by id, and the newest view last.
 
     Only keyframes with a stored view that are older than the newest view.
     """
     now_ns = newest.view.observation.stamp_ns
     seen = {
-        k: Seen(view=views[k], T_local_base=keyframes[k].T_local_base)
+        k: LocatedView(view=views[k], T_local_base=keyframes[k].T_local_base)
         for k in keyframes.ids
         if k in views and keyframes[k].stamp_ns < now_ns and (segment is None or k in segment)
     }
     return seen | {NEWEST: newest}
 
 
-def renew(parts: Parts, seen: Mapping[int, Seen]) -> dict[int, Transform]:
+def renew(parts: RgbdParts, seen: Mapping[int, LocatedView]) -> dict[int, Transform]:
     """Insert a keyframe for each view in this order; return their new poses by the same ids.
 
     The first keeps its pose; the others are localized relative to those before them. If that fails,

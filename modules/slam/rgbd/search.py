@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .localizer import Fix, Localizer
+from .localizer import VisualFix, VisualLocalizer
 from .relocalizer import Relocalizer
 from .view import View
 
@@ -15,10 +15,10 @@ _CLEAR_RATIO = 0.2  # of the expected landmarks; up to 0.12 were observed by cha
 class Search:
     """Finds the camera in the map by the cheapest method that succeeds clearly."""
 
-    def __init__(self, localizer: Localizer, relocalizer: Relocalizer) -> None:
+    def __init__(self, localizer: VisualLocalizer, relocalizer: Relocalizer) -> None:
         self._localizer, self._relocalizer = localizer, relocalizer
 
-    def find(self, view: View, held_ids: NDArray[np.int64], *, is_lost: bool) -> Fix | None:
+    def find(self, view: View, held_ids: NDArray[np.int64], *, is_lost: bool) -> VisualFix | None:
         """Return the pose of a view; `held_ids` are the landmarks tracked last.
 
         If the prediction is far off, similar landmarks around it may agree by chance: then the
@@ -32,7 +32,7 @@ class Search:
         return fix or self._relocalizer.find(view.features, view.depth_m)
 
 
-def _better(one: Fix | None, other: Fix | None) -> Fix | None:
+def _better(one: VisualFix | None, other: VisualFix | None) -> VisualFix | None:
     """Return the pose with more inliers."""
     if one is None or other is None:
         return one or other

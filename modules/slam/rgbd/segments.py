@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
-from .pose_graph import Edge, PoseGraph
+from .pose_graph import KeyframeEdge, PoseGraph
 
 _WALK_M_PER_S, _TURN_RAD_PER_S = 1.0, 1.0  # standard deviations of a lost camera's motion
 
@@ -66,6 +66,8 @@ class Segments:
         if guess is None:
             return None
         T_start_base = se3.inverse(guess.T_local_base) @ T_local_base
-        begun = Edge(start=0, end=1, T_start_end=se3.identity(), covariance=guess.covariance)
-        way = Edge(start=1, end=2, T_start_end=T_start_base, covariance=measured)
+        begun = KeyframeEdge(
+            start=0, end=1, T_start_end=se3.identity(), covariance=guess.covariance
+        )
+        way = KeyframeEdge(start=1, end=2, T_start_end=T_start_base, covariance=measured)
         return begun.then(way).covariance

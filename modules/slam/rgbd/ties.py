@@ -16,9 +16,9 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
-from ..surfaces.keyframe import Keyframe as DepthKeyframe
-from ..surfaces.registration import Prior, Samples, register, samples_of
-from ..surfaces.surface import SurfaceReader
+from ..surfaces.keyframe import SurfaceKeyframe
+from ..surfaces.registration import CameraPrior, Samples, register, samples_of
+from ..surfaces.surface import DepthSurfaceReader
 
 _MIN_MATCHED_RATIO = 0.5  # of the common area, on the same surface
 _WEAK_RATIO = 0.005  # localizability below which surfaces do not constrain a direction
@@ -110,14 +110,14 @@ class DepthTies:
     """Registers keyframes' depth images with each other; for use in one thread."""
 
     def __init__(self, depth_camera: Camera, T_depth_cam: Transform) -> None:
-        self._reader, self._T_depth_cam = SurfaceReader(depth_camera), T_depth_cam
-        self._views: dict[int, DepthKeyframe] = {}
+        self._reader, self._T_depth_cam = DepthSurfaceReader(depth_camera), T_depth_cam
+        self._views: dict[int, SurfaceKeyframe] = {}
         self._samples: dict[int, Samples] = {}
 
     def look(self, keyframe_id: int, depth_m: NDArray[np.float32]) -> None:
         """Add a keyframe's depth image (H, W) [m]."""
         surface = self._reader.read(depth_m)
-        self._views[keyframe_id] = DepthKeyframe(surface, se3.identity(), stamp_ns=0)
+        self._views[keyframe_id] = SurfaceKeyframe(surface, se3.identity(), stamp_ns=0)
         self._samples[keyframe_id] = samples_of(surface, self._reader.grid)
         for oldest in list(self._views)[:-_KEPT]:
             del self._views[oldest], self._samples[oldest]
@@ -130,7 +130,9 @@ class DepthTies:
         if one not in self._views or other not in self._views:
             return None
         to_cam = se3.inverse(self._T_depth_cam)
-        prior = Prior(self._T_depth_cam @ T_one_other @ to_cam, _PRIOR_INFORMATION * np.eye(6))
+        prior = CameraPrior(
+            self._T_depth_cam @ T_one_other @ to_cam, _PRIOR_INFORMATION * np.eye(6)
+        )
         found = register(
             self._samples[other],
             prior,

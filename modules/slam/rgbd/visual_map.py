@@ -29,7 +29,7 @@ _SHIFT_PX = 2.0  # of the depth image relative to the colours, by calibration an
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Prediction:
+class ExpectedLandmarks:
     """Landmarks that the image should contain, with their predicted pixels."""
 
     ids: NDArray[np.int64]  # (N,)
@@ -101,7 +101,9 @@ class VisualMap:
         """Return the local map: all landmarks of the keyframes that saw these landmarks."""
         return self.keyframes.landmarks_of(self.keyframes.covisible(landmark_ids, limit=_COVISIBLE))
 
-    def predict(self, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> Prediction:
+    def predict(
+        self, T_local_base: Transform, landmark_ids: NDArray[np.int64]
+    ) -> ExpectedLandmarks:
         """Return which of these landmarks the image should contain at a pose, and their pixels."""
         camera, table = self.camera, self.landmarks
         T_local_cam = T_local_base @ camera.T_base_cam
@@ -124,7 +126,7 @@ class VisualMap:
             & (levels > -1.5)
             & (levels < LEVELS + 0.5)
         )
-        return Prediction(
+        return ExpectedLandmarks(
             ids=landmark_ids.take(visible),
             uv_px=np.stack([u.take(visible), v.take(visible)], axis=1),
             levels=np.clip(np.rint(levels.take(visible)), 0, LEVELS - 1).astype(np.int64),

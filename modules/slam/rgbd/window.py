@@ -23,7 +23,7 @@ _MAX_SIGMA_M, _MAX_SIGMA_RATIO = 1.0, 0.3  # limits of a landmark; the second of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Window:
+class MapWindow:
     """A copied part of the map, with its origin in the map."""
 
     bundle: Bundle
@@ -36,7 +36,7 @@ class Window:
     corrections: int  # of the map, when it was copied
 
 
-def take_window(visual_map: VisualMap, keyframe_id: int) -> Window | None:
+def take_window(visual_map: VisualMap, keyframe_id: int) -> MapWindow | None:
     """Return a copy of a keyframe's surroundings: landmarks that two or more keyframes saw.
 
     None if it shares no landmark with another keyframe.
@@ -76,7 +76,7 @@ def take_window(visual_map: VisualMap, keyframe_id: int) -> Window | None:
         ),
         ties=Ties.of({}),
     )
-    return Window(
+    return MapWindow(
         bundle=bundle,
         keyframe_ids=keyframe_ids,
         free_ids=free,
@@ -90,7 +90,7 @@ def take_window(visual_map: VisualMap, keyframe_id: int) -> Window | None:
     )
 
 
-def merge_window(visual_map: VisualMap, window: Window, adjusted: Adjusted) -> Transform:
+def merge_window(visual_map: VisualMap, window: MapWindow, adjusted: Adjusted) -> Transform:
     """Apply the adjusted keyframes and landmarks to the map; remove wrong sightings.
 
     Returns T_new_old (4, 4) of the window's newest keyframe, with which all newer ones move. A map
@@ -120,7 +120,7 @@ def merge_window(visual_map: VisualMap, window: Window, adjusted: Adjusted) -> T
     return np.asarray(T_new_old)
 
 
-def _forget(visual_map: VisualMap, window: Window, adjusted: Adjusted) -> None:
+def _forget(visual_map: VisualMap, window: MapWindow, adjusted: Adjusted) -> None:
     """Remove disagreeing sightings from their keyframes."""
     store = visual_map.keyframes
     for row, keyframe_id in enumerate(window.keyframe_ids):

@@ -29,13 +29,13 @@ MAPS = ("grid", "points")
 _MAIN = """
 import json, sys
 settings, *sys.path = sys.argv[1:]
-from sceneslam.modules.slam.ros2_node.bridge import main
+from sceneslam.modules.slam.ros2_node.client import main
 main(json.loads(settings))
 """
 
 
 @dataclass(slots=True, kw_only=True)
-class Topics:
+class NodeTopics:
     """Names of topics; null: not sent, or not listened to."""
 
     image: str | None
@@ -66,7 +66,7 @@ class Ros2Node(ProcessSlam):
         *,
         command: Command | None,
         needs: Sequence[str],
-        topics: Topics,
+        topics: NodeTopics,
         pose_kind: str,
         map_kind: str,
         pose_frame: str,

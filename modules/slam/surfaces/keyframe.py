@@ -14,7 +14,7 @@ _FUSE_SIGMAS = 4.0
 _COUNT_MAX = 50.0  # images that a plane is the mean of; then the oldest fade
 
 
-class Keyframe:
+class SurfaceKeyframe:
     """A surface at a pose in `local`, which the pose graph may move."""
 
     def __init__(self, surface: Surface, T_local_cam: se3.Transform, *, stamp_ns: int) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sceneslam.types import se3
 
 from ..degeneracy import Localizability, localizability
-from .keyframe import FACING_COS, Keyframe
+from .keyframe import FACING_COS, SurfaceKeyframe
 from .surface import Doubles, Floats, Grid, Surface
 
 _ITERATIONS_MAX = 12
@@ -69,7 +69,7 @@ def samples_of(surface: Surface, grid: Grid, stride: int = 2) -> Samples:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Prior:
+class CameraPrior:
     """Where the camera should be by its motion."""
 
     T_local_cam: se3.Transform
@@ -77,7 +77,7 @@ class Prior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Registration:
+class SurfaceRegistration:
     """A pose and what holds it."""
 
     T_local_cam: se3.Transform
@@ -93,8 +93,13 @@ class Registration:
 
 
 def register(
-    samples: Samples, prior: Prior, keyframes: Sequence[Keyframe], grid: Grid, *, weak_ratio: float
-) -> Registration | None:
+    samples: Samples,
+    prior: CameraPrior,
+    keyframes: Sequence[SurfaceKeyframe],
+    grid: Grid,
+    *,
+    weak_ratio: float,
+) -> SurfaceRegistration | None:
     """Return the pose of the samples beside the keyframes; None where too few match."""
     held = samples.localizability().held(weak_ratio)
     T_local_cam, gate_m = prior.T_local_cam, _GATE_M[0]
@@ -113,7 +118,7 @@ def register(
     matched = samples.localizability(system.is_matched)
     held = matched.held(weak_ratio)
     information = held.T @ system.information @ held
-    return Registration(T_local_cam, information, matched, system.seen, system.matched)
+    return SurfaceRegistration(T_local_cam, information, matched, system.seen, system.matched)
 
 
 class _System:
@@ -122,7 +127,7 @@ class _System:
     def __init__(
         self,
         samples: Samples,
-        keyframes: Sequence[Keyframe],
+        keyframes: Sequence[SurfaceKeyframe],
         T_local_cam: se3.Transform,
         *,
         gate_m: float,
@@ -139,7 +144,7 @@ class _System:
     def _add(
         self,
         samples: Samples,
-        keyframe: Keyframe,
+        keyframe: SurfaceKeyframe,
         T_key_cam: se3.Transform,
         gate_m: float,
         grid: Grid,
@@ -159,7 +164,7 @@ class _System:
 
 
 def compare(
-    samples: Samples, keyframe: Keyframe, T_key_cam: se3.Transform, gate_m: float, grid: Grid
+    samples: Samples, keyframe: SurfaceKeyframe, T_key_cam: se3.Transform, gate_m: float, grid: Grid
 ) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
     """Return residuals [m], the keyframe's normals, who is seen, and who is on its surface."""
     T = T_key_cam.astype(np.float32)

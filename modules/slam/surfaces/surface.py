@@ -70,7 +70,7 @@ class Surface:
         return np.asarray(total / np.maximum(length, 1e-6), np.float32)
 
 
-class SurfaceReader:
+class DepthSurfaceReader:
     """Makes surfaces of one camera's depth images."""
 
     def __init__(self, camera: Camera) -> None:

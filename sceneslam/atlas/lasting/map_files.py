@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan
-from sceneslam.atlas.submaps.graph import Edge, Kind
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.types.errors import InputError, told
 from sceneslam.types.files import PART, replacing
@@ -158,8 +158,8 @@ def _check(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
     nodes, kinds = arrays["edge_nodes"], arrays["edge_kind"]
     if len(nodes) and not (nodes.min() >= 0 and nodes.max() < counts["submaps"]):
         raise InputError(f"edge_nodes: expected 0 to {counts['submaps'] - 1}: {path}")
-    if not np.isin(kinds, [kind.value for kind in Kind]).all():
-        raise InputError(f"edge_kind: expected 0 to {max(Kind)}: {path}")
+    if not np.isin(kinds, [kind.value for kind in EdgeKind]).all():
+        raise InputError(f"edge_kind: expected 0 to {max(EdgeKind)}: {path}")
 
 
 def _arrays(saved: SavedMap, modules: list[str]) -> dict[str, NDArray[Any]]:
@@ -243,7 +243,7 @@ def _unpacked(arrays: Mapping[str, NDArray[Any]], modules: list[str]) -> SavedMa
             second=int(nodes[1]),
             T_first_second=motion,
             covariance=covariance,
-            kind=Kind(int(kind)),
+            kind=EdgeKind(int(kind)),
         )
         for nodes, motion, covariance, kind in zip(
             arrays["edge_nodes"],

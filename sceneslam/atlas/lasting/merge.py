@@ -12,7 +12,7 @@ from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
-from sceneslam.atlas.submaps.graph import Edge, Kind, consistent, solve
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind, consistent, solve
 from sceneslam.types import planar
 
 _AROUND = 1  # neighbouring submaps on either side that are searched together with one
@@ -95,7 +95,7 @@ def _loops(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
                 second=node,
                 T_first_second=planar.between(saved.T_map_node[first], match.T_target_query),
                 covariance=match.covariance,
-                kind=Kind.LOOP,
+                kind=EdgeKind.LOOP,
             )
         )
     return found

@@ -7,7 +7,7 @@ import numpy as np
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
-from sceneslam.atlas.submaps.graph import Edge, Kind
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind
 from sceneslam.types import planar
 
 _COVERED_RATIO = 0.95  # of a submap's walls, covered by later submaps
@@ -56,7 +56,7 @@ def _is_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
 
 def _bridges(saved: SavedMap, kept: set[int]) -> list[Edge]:
     """Return the composed motions across removed submaps."""
-    onward = {edge.first: edge for edge in saved.edges if edge.kind is not Kind.LOOP}
+    onward = {edge.first: edge for edge in saved.edges if edge.kind is not EdgeKind.LOOP}
     found = []
     for start in sorted(kept):
         edge, passed = onward.get(start), False

@@ -10,9 +10,9 @@ import numpy as np
 
 from sceneslam.atlas.places.floor_plan import FloorPlan, draw
 from sceneslam.atlas.places.plan_field import PlanField
-from sceneslam.atlas.places.plan_search import Window
+from sceneslam.atlas.places.plan_search import SearchWindow
 from sceneslam.atlas.places.recognition import Recognizer
-from sceneslam.atlas.places.registration import Registration, register
+from sceneslam.atlas.places.registration import PlanRegistration, register
 from sceneslam.atlas.uncertainty import WHEELS
 from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar
@@ -28,7 +28,7 @@ _DOUBTS = 3  # consecutive comparisons that contradict the map: the place was wr
 _KNOWN_MIN = 0.6
 
 
-class Outcome(Enum):
+class LocalizationEvent(Enum):
     """Result of a comparison with the map."""
 
     NOTHING = "nothing"
@@ -38,7 +38,7 @@ class Outcome(Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Placed:
+class PlacedScan:
     """A scan with its pose in the frame of the run."""
 
     scan: KeyScan
@@ -50,7 +50,7 @@ class Fix:
     """The robot's pose in the map by its newest scans."""
 
     stamp_ns: int
-    match: Registration  # of `base` at the stamp, in the map
+    match: PlanRegistration  # of `base` at the stamp, in the map
 
     @property
     def T_map_base(self) -> Planar:
@@ -58,7 +58,7 @@ class Fix:
         return self.match.T_target_query
 
 
-class Localizer:
+class MapLocalizer:
     """Compares the last metres of a run with a map."""
 
     def __init__(self, plan: FloorPlan) -> None:
@@ -66,11 +66,11 @@ class Localizer:
         self.fixes: list[Fix] = []
         self._map = Recognizer(PlanField(plan))
         self._next_ns = 0
-        self._fixed_at: Placed | None = None
+        self._fixed_at: PlacedScan | None = None
         self._guess: Planar | None = None  # T_map_run of the last search
         self._vain = self._doubts = 0
 
-    def is_due(self, placed: Placed) -> bool:
+    def is_due(self, placed: PlacedScan) -> bool:
         """Tell whether it is time to compare at the newest scan."""
         if placed.scan.stamp_ns < self._next_ns:
             return False
@@ -79,11 +79,11 @@ class Localizer:
         away = planar.between(self._fixed_at.T_run_base, placed.T_run_base)
         return bool(np.hypot(away[0], away[1]) >= _FIX_M or abs(away[2]) >= 1.0)
 
-    def compare(self, latest: Sequence[Placed]) -> Outcome:
+    def compare(self, latest: Sequence[PlacedScan]) -> LocalizationEvent:
         """Compare the latest scans, oldest first, with the map."""
         newest, query = latest[-1], _query(latest)
         if not len(query):
-            return Outcome.NOTHING
+            return LocalizationEvent.NOTHING
         field = PlanField(query)
         if self.T_map_run is not None:
             return self._check(newest, field)
@@ -91,16 +91,16 @@ class Localizer:
         if match is None or match.weak_directions:
             self._guess, self._vain = None, self._vain + 1
             self._wait(newest, _PERIOD_S * 2.0 ** min(self._vain // _PATIENCE, 4))
-            return Outcome.NOTHING
+            return LocalizationEvent.NOTHING
         self._wait(newest, _PERIOD_S)
         T_map_run = _run_in_map(match, newest)
         before, self._guess = self._guess, T_map_run
         if before is None or not _agree(before, T_map_run, newest.T_run_base):
-            return Outcome.NOTHING
+            return LocalizationEvent.NOTHING
         self._take(newest, match)
-        return Outcome.FOUND
+        return LocalizationEvent.FOUND
 
-    def _check(self, newest: Placed, query: PlanField) -> Outcome:
+    def _check(self, newest: PlacedScan, query: PlanField) -> LocalizationEvent:
         """Compare near the predicted pose; repeated contradictions withdraw the localization."""
         assert self.T_map_run is not None and self._fixed_at is not None
         self._wait(newest, _FIX_S)
@@ -108,7 +108,7 @@ class Localizer:
         away = planar.between(self._fixed_at.T_run_base, newest.T_run_base)
         moved_m, turned_rad = float(np.hypot(away[0], away[1])), abs(float(away[2]))
         turn = WHEELS.rad_per_m * moved_m + WHEELS.rad_per_rad * turned_rad
-        window = Window(
+        window = SearchWindow(
             around=expected,
             half_m=_REACH_M + _SIGMAS * WHEELS.per_m * moved_m,
             half_rad=_REACH_RAD + _SIGMAS * turn,
@@ -116,27 +116,27 @@ class Localizer:
         match = self._map.recognize(query, window)
         if match is not None and _is_within(match, window):
             self._take(newest, match)
-            return Outcome.FIXED
+            return LocalizationEvent.FIXED
         there = register(query, self._map.field, expected)
         is_contradicted = there.known_ratio >= _KNOWN_MIN and not there.is_verified
         self._doubts = self._doubts + 1 if is_contradicted else 0
         if self._doubts < _DOUBTS:
-            return Outcome.NOTHING
+            return LocalizationEvent.NOTHING
         self.T_map_run, self._guess, self._fixed_at = None, None, None
         self._doubts, self._vain, self.fixes = 0, 0, []
-        return Outcome.WITHDRAWN
+        return LocalizationEvent.WITHDRAWN
 
-    def _take(self, newest: Placed, match: Registration) -> None:
+    def _take(self, newest: PlacedScan, match: PlanRegistration) -> None:
         self.T_map_run, self._fixed_at = _run_in_map(match, newest), newest
         self.fixes.append(Fix(stamp_ns=newest.scan.stamp_ns, match=match))
         self._doubts = self._vain = 0
         self._wait(newest, _FIX_S)
 
-    def _wait(self, newest: Placed, period_s: float) -> None:
+    def _wait(self, newest: PlacedScan, period_s: float) -> None:
         self._next_ns = newest.scan.stamp_ns + round(min(period_s, _PERIOD_MAX_S) * 1e9)
 
 
-def _query(latest: Sequence[Placed]) -> FloorPlan:
+def _query(latest: Sequence[PlacedScan]) -> FloorPlan:
     """Return the plan of the last metres in the frame of base at the newest scan."""
     newest, length_m = latest[-1], 0.0
     scans: list[tuple[Planar, KeyScan]] = []
@@ -151,7 +151,7 @@ def _query(latest: Sequence[Placed]) -> FloorPlan:
     return draw(scans)
 
 
-def _run_in_map(match: Registration, newest: Placed) -> Planar:
+def _run_in_map(match: PlanRegistration, newest: PlacedScan) -> Planar:
     T_base_run = planar.between(newest.T_run_base, np.zeros(3))
     return planar.compose(match.T_target_query, T_base_run)
 
@@ -162,6 +162,6 @@ def _agree(first: Planar, second: Planar, T_run_base: Planar) -> bool:
     return bool(np.hypot(off[0], off[1]) <= _AGREE_M and abs(off[2]) <= _AGREE_RAD)
 
 
-def _is_within(match: Registration, window: Window) -> bool:
+def _is_within(match: PlanRegistration, window: SearchWindow) -> bool:
     off = planar.between(window.around, match.T_target_query)
     return bool(np.hypot(off[0], off[1]) <= window.half_m and abs(off[2]) <= window.half_rad)

@@ -17,7 +17,7 @@ _LIKELIHOOD_M = 0.1  # standard deviation of a wall in the coarse search
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Nearest:
+class NearestWalls:
     """The walls and free space of a plan around N points."""
 
     error: NDArray[np.float64]  # (N, 2) [m]: from the nearest wall point to the point
@@ -46,7 +46,7 @@ class PlanField:
         self._points = plan.points.astype(np.float64)
         self._normals = plan.normals.astype(np.float64)
 
-    def nearest(self, points: NDArray[np.float64]) -> Nearest:
+    def nearest(self, points: NDArray[np.float64]) -> NearestWalls:
         """Return walls and free space around points (N, 2) [m] of the plan's frame."""
         rows, columns = self._free.shape
         cells = self._cells(points)
@@ -56,7 +56,7 @@ class PlanField:
         error = points - self._points[index]
         distance_m = np.linalg.norm(error, axis=1)
         is_free = self._free[row, column] & inside
-        return Nearest(
+        return NearestWalls(
             error=error,
             normals=self._normals[index],
             distance_m=distance_m,

@@ -33,7 +33,7 @@ class Peak:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Window:
+class SearchWindow:
     """The poses to search."""
 
     around: Planar  # T_target_query
@@ -55,7 +55,12 @@ class PlanSearch:
         self._spectra: dict[tuple[int, int], NDArray[np.complex128]] = {}
 
     def find(
-        self, points: NDArray[np.float64], window: Window | None, *, score_min: float, most: int
+        self,
+        points: NDArray[np.float64],
+        window: SearchWindow | None,
+        *,
+        score_min: float,
+        most: int,
     ) -> list[Peak]:
         """Return up to `most` peaks, best first, of wall points (N, 2) of the query's frame."""
         centre = points.mean(axis=0)
@@ -99,7 +104,7 @@ class PlanSearch:
         scores: NDArray[np.float64],
         yaw_rad: float,
         centre: NDArray[np.float64],
-        window: Window | None,
+        window: SearchWindow | None,
         score_min: float,
     ) -> list[Peak]:
         highest = cv2.dilate(scores, np.ones((5, 5), np.uint8))
@@ -120,7 +125,7 @@ class PlanSearch:
         ]
 
 
-def _headings(window: Window | None, step_rad: float) -> NDArray[np.float64]:
+def _headings(window: SearchWindow | None, step_rad: float) -> NDArray[np.float64]:
     if window is None or window.half_rad >= np.pi:
         count = int(np.ceil(2 * np.pi / step_rad))
         return np.asarray(np.arange(count) * (2 * np.pi / count))

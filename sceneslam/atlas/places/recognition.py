@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from sceneslam.atlas.places.plan_field import PlanField
-from sceneslam.atlas.places.plan_search import PlanSearch, Window, is_apart
-from sceneslam.atlas.places.registration import Registration, register
+from sceneslam.atlas.places.plan_search import PlanSearch, SearchWindow, is_apart
+from sceneslam.atlas.places.registration import PlanRegistration, register
 
 _SCORE_MIN = 0.3  # of the coarse search, whose cells are 3 x 3 of the plan's
 _CANDIDATES = 24  # that are refined, at most,
@@ -26,8 +26,8 @@ class Recognizer:
         self.field, self._search = target, PlanSearch(target)
 
     def recognize(
-        self, query: PlanField, window: Window | None, *, known_min: float = _KNOWN_MIN
-    ) -> Registration | None:
+        self, query: PlanField, window: SearchWindow | None, *, known_min: float = _KNOWN_MIN
+    ) -> PlanRegistration | None:
         """Return the pose of the query in the target, None if no pose or more than one fits.
 
         A pose is refuted if walls of one plan lie in free space of the other, or away from its
@@ -53,7 +53,7 @@ class Recognizer:
         ]
         return None if rivals else best
 
-    def _candidates(self, query: PlanField, window: Window | None) -> list[Registration]:
+    def _candidates(self, query: PlanField, window: SearchWindow | None) -> list[PlanRegistration]:
         if window is not None and window.half_m <= _NEAR_M and window.half_rad <= _NEAR_RAD:
             return [register(query, self.field, window.around)]
         points = query.plan.points.astype(np.float64)
@@ -62,5 +62,5 @@ class Recognizer:
         return [register(query, self.field, peak.T_target_query) for peak in likely]
 
 
-def _worth(one: Registration) -> float:
+def _worth(one: PlanRegistration) -> float:
     return one.inlier_ratio * one.known_ratio

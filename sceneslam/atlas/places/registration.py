@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import CELL_M
-from sceneslam.atlas.places.plan_field import Nearest, PlanField
+from sceneslam.atlas.places.plan_field import NearestWalls, PlanField
 from sceneslam.types import planar
 from sceneslam.types.planar import Matrix, Planar
 
@@ -26,7 +26,7 @@ _OPEN = 25.0  # m^2, rad^2: variance in unconstrained directions, twice a submap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Registration:
+class PlanRegistration:
     """The pose of a query plan in a target plan, with its quality."""
 
     T_target_query: Planar
@@ -48,7 +48,7 @@ class Registration:
         return is_off or self.conflict_ratio > 2.0 * _OTHER_MAX
 
 
-def register(query: PlanField, target: PlanField, start: Planar) -> Registration:
+def register(query: PlanField, target: PlanField, start: Planar) -> PlanRegistration:
     """Return the query's pose in the target, from a start within about 0.5 m and 0.2 rad."""
     walls = _Walls.of(query)
     few, pose = walls.thinned(), planar.compose(start, walls.T_query_centre)
@@ -131,7 +131,7 @@ def _held(H: Matrix, spread_m: float) -> tuple[Matrix, int]:
     return np.asarray(total * np.outer(inverse, inverse) * kept), 3 - keep.shape[1]
 
 
-def _judged(query: PlanField, walls: _Walls, target: PlanField, pose: Planar) -> Registration:
+def _judged(query: PlanField, walls: _Walls, target: PlanField, pose: Planar) -> PlanRegistration:
     H, _, total, squared = _equations(walls, target, pose, _KERNELS_M[-1])
     H, weak = _held(H, walls.spread_m)
     noise_m2 = max(squared / max(total, 1e-9), _NOISE_MIN_M**2)
@@ -144,7 +144,7 @@ def _judged(query: PlanField, walls: _Walls, target: PlanField, pose: Planar) ->
     known = int(here.is_known.sum())
     inliers = int((here.distance_m <= _INLIER_M).sum())
     T_target_query = planar.compose(pose, T_centre_query)
-    return Registration(
+    return PlanRegistration(
         T_target_query=T_target_query,
         covariance=np.asarray(covariance),
         weak_directions=weak,
@@ -154,13 +154,13 @@ def _judged(query: PlanField, walls: _Walls, target: PlanField, pose: Planar) ->
     )
 
 
-def _back(query: PlanField, target: PlanField, pose: Planar) -> Nearest:
+def _back(query: PlanField, target: PlanField, pose: Planar) -> NearestWalls:
     """Return the query's walls and free space at the target's walls."""
     T_query_target = planar.between(pose, np.zeros(3))
     return query.nearest(planar.apply(T_query_target, target.plan.points.astype(np.float64)))
 
 
-def _conflicts(nearest: Nearest) -> float:
+def _conflicts(nearest: NearestWalls) -> float:
     """Return the share of walls in known space of the other plan that lie in its free space."""
     known = int(nearest.is_known.sum())
     return int((nearest.is_known & nearest.is_clear).sum()) / max(known, 1)

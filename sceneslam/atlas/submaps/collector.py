@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.atlas.submaps.graph import Edge, Kind
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind
 from sceneslam.atlas.submaps.submap import (
     STEP_M,
     STEP_RAD,
@@ -147,9 +147,9 @@ class Collector:
         self.T_run_node.append(part[0].T_map_base)
         self._part = part
 
-    def _kind(self, pose: KeyPose) -> Kind:
+    def _kind(self, pose: KeyPose) -> EdgeKind:
         """Return which source measured the motion from the newest submap to a pose."""
         if self._part[0].session != pose.session:
-            return Kind.HANDOVER
+            return EdgeKind.HANDOVER
         bridged = sum(each.module == BRIDGED for each in [*self._part, pose])
-        return Kind.BRIDGE if 2 * bridged > len(self._part) else Kind.MOTION
+        return EdgeKind.BRIDGE if 2 * bridged > len(self._part) else EdgeKind.MOTION

@@ -23,7 +23,7 @@ _FIXED = np.array([1e-4, 1e-4, 1e-5])  # m, m, rad
 _LOOSE = np.array([10.0, 10.0, 3.0])  # m, m, rad: any loop moves it
 
 
-class Kind(IntEnum):
+class EdgeKind(IntEnum):
     """The source of an edge."""
 
     MOTION = 0  # by one module
@@ -40,7 +40,7 @@ class Edge:
     second: int
     T_first_second: Planar
     covariance: Matrix  # (3, 3), axes of second
-    kind: Kind
+    kind: EdgeKind
 
     def shifted(self, by: int) -> Edge:
         """Return the edge with its node numbers increased by `by`."""

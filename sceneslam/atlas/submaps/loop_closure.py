@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import FloorPlan, join
 from sceneslam.atlas.places.plan_field import PlanField
-from sceneslam.atlas.places.plan_search import Window
+from sceneslam.atlas.places.plan_search import SearchWindow
 from sceneslam.atlas.places.recognition import Recognizer
-from sceneslam.atlas.submaps.graph import Edge, Kind
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.types import planar
 from sceneslam.types.planar import Planar
@@ -59,7 +59,7 @@ class LoopFinder:
                     second=second,
                     T_first_second=match.T_target_query,
                     covariance=match.covariance,
-                    kind=Kind.LOOP,
+                    kind=EdgeKind.LOOP,
                 )
             )
         return found
@@ -111,11 +111,11 @@ class LoopFinder:
 
 def _window(
     first: int, second: int, T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
-) -> Window:
+) -> SearchWindow:
     around = planar.between(T_map_node[first], T_map_node[second])
     sigma = np.abs(drift[second] - drift[first])
     half_m = _SIGMAS * float(max(sigma[0], sigma[1]) + 0.5 * sigma[2] * np.hypot(*around[:2]))
-    return Window(around=around, half_m=half_m, half_rad=_SIGMAS * float(sigma[2]))
+    return SearchWindow(around=around, half_m=half_m, half_rad=_SIGMAS * float(sigma[2]))
 
 
 def _gap_m(first: FloorPlan, second: FloorPlan, T_first_second: Planar) -> float:

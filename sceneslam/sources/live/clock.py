@@ -14,7 +14,7 @@ _DRIFT_RATIO = 5e-4  # by which two clocks may run apart: crystals are ten times
 _SAME_CLOCK_NS = 1_000_000_000  # a robot's clock so near to this machine's is this machine's
 
 
-class Order(Enum):
+class StampOrder(Enum):
     """How a message's stamp goes with those before it."""
 
     RISING = "rising"
@@ -35,7 +35,7 @@ class Lined:
     """A stamp on the time line."""
 
     stamp_ns: int
-    order: Order
+    order: StampOrder
     shift_ns: int  # what was added to it
 
 
@@ -56,20 +56,20 @@ class StampClock:
     def line_up(self, topic: str, stamp_ns: int, arrived_ns: int) -> Lined:
         """Return the stamp of a topic's newest message on the time line."""
         stream = self._streams.get(topic)
-        order = Order.RISING
+        order = StampOrder.RISING
         if stream is None:
             stream = self._begin(stamp_ns, arrived_ns)
             self._streams[topic] = stream
         elif self._has_jumped(stream, stamp_ns, arrived_ns):
-            order = Order.JUMPED
+            order = StampOrder.JUMPED
             stream.shift_ns = self._shift(stream, stamp_ns, arrived_ns - stream.arrived_ns)
         elif stamp_ns <= stream.stamp_ns:
-            order = Order.UNORDERED
+            order = StampOrder.UNORDERED
         lined_ns = stamp_ns + stream.shift_ns
         is_late = self._note_delay(arrived_ns - lined_ns, arrived_ns)
-        if order is Order.RISING and is_late:
-            order = Order.LATE
-        if order is not Order.UNORDERED:
+        if order is StampOrder.RISING and is_late:
+            order = StampOrder.LATE
+        if order is not StampOrder.UNORDERED:
             stream.stamp_ns, stream.arrived_ns = stamp_ns, arrived_ns
         return Lined(stamp_ns=lined_ns, order=order, shift_ns=stream.shift_ns)
 

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from sceneslam.sources.bag_observation import PRIMARY
-from sceneslam.sources.live.clock import Lined, Order
+from sceneslam.sources.live.clock import Lined, StampOrder
 from sceneslam.types.rig import Sensor
 from sceneslam.types.run import Event
 
@@ -68,7 +68,7 @@ class Streams:
         if topic in self._silent:
             self._silent.discard(topic)
             self._tell("stream_returned", lined.stamp_ns, topic=topic)
-        if lined.order is Order.JUMPED:
+        if lined.order is StampOrder.JUMPED:
             before_ns = self._shifts_ns.get(topic, 0)
             jumped_s = (before_ns - lined.shift_ns) / 1e9
             self._tell(
@@ -79,7 +79,7 @@ class Streams:
                 shift_ns=lined.shift_ns,
                 paces=topic == self._topics[self.pace],
             )
-        elif lined.order is not Order.RISING:
+        elif lined.order is not StampOrder.RISING:
             self._tell_once(lined.order.name.lower(), lined.stamp_ns, topic, arrived_ns)
         self._shifts_ns[topic] = lined.shift_ns
 

@@ -9,7 +9,7 @@ import pyrealsense2 as rs
 from numpy.typing import NDArray
 
 
-class Alignment:
+class DepthAligner:
     """Registers depth frames to colour frames."""
 
     def __init__(self) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 import pyrealsense2 as rs
 from numpy.typing import NDArray
 
-from sceneslam.sources.realsense.alignment import Alignment
+from sceneslam.sources.realsense.alignment import DepthAligner
 from sceneslam.sources.realsense.distortion import to_opencv
-from sceneslam.sources.realsense.frames import Frame, Take, Wanted
+from sceneslam.sources.realsense.frames import DeviceFrame, Take, Wanted
 from sceneslam.types.errors import InputError
 from sceneslam.types.rig import Camera, Sensor
 
@@ -56,7 +56,7 @@ class Device:
         self._depth_scale_m = float(depth.get_option(rs.option.depth_units))
         if depth.supports(rs.option.emitter_enabled):
             depth.set_option(rs.option.emitter_enabled, float(wanted.is_emitting))
-        self._alignment = Alignment()
+        self._alignment = DepthAligner()
 
     @property
     def sensors(self) -> frozenset[Sensor]:
@@ -93,7 +93,7 @@ class Device:
             part.open([self._profiles[sensor] for sensor in sensors])
             part.start(_taker(take))
 
-    def depth_m(self, depth: Frame, image: Frame) -> NDArray[np.float32]:
+    def depth_m(self, depth: DeviceFrame, image: DeviceFrame) -> NDArray[np.float32]:
         """Return the depth (H, W) [m] of an image's pixels, 0 where nothing was measured."""
         units = self._alignment.registered(depth.frame, image.frame)
         return units.astype(np.float32) * np.float32(self._depth_scale_m)
@@ -117,7 +117,7 @@ def _taker(take: Take) -> Callable[[Any], None]:
         if sensor is not None:
             frame.keep()
             stamp_ns = round(frame.get_timestamp() * 1e6)
-            take(Frame(sensor=sensor, frame=frame, stamp_ns=stamp_ns, arrived_ns=arrived_ns))
+            take(DeviceFrame(sensor=sensor, frame=frame, stamp_ns=stamp_ns, arrived_ns=arrived_ns))
 
     return taken
 

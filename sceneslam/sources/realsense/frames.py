@@ -22,7 +22,7 @@ class Wanted:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Frame:
+class DeviceFrame:
     """One measurement as it came."""
 
     sensor: Sensor
@@ -41,7 +41,7 @@ class Frame:
         return int(self.frame.get_data_size())
 
 
-Take = Callable[[Frame], None]
+Take = Callable[[DeviceFrame], None]
 
 
 class OpenCamera(Protocol):
@@ -64,7 +64,7 @@ class OpenCamera(Protocol):
         """Begin to measure; `take` is called in threads of the camera's own."""
         ...
 
-    def depth_m(self, depth: Frame, image: Frame) -> NDArray[np.float32]:
+    def depth_m(self, depth: DeviceFrame, image: DeviceFrame) -> NDArray[np.float32]:
         """Return the depth (H, W) [m] of an image's pixels, 0 where nothing was measured."""
         ...
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.sources.realsense.frames import Frame
+from sceneslam.sources.realsense.frames import DeviceFrame
 from sceneslam.types.rig import Sensor
 
 _PATIENCE_NS = 50_000_000  # an image waits so long for its depth
@@ -21,9 +21,9 @@ class Paired:
     """What belongs to one image."""
 
     stamp_ns: int
-    image: Frame
-    depth: Frame | None
-    samples: tuple[tuple[int, Frame], ...]  # stamp and frame, since the image before
+    image: DeviceFrame
+    depth: DeviceFrame | None
+    samples: tuple[tuple[int, DeviceFrame], ...]  # stamp and frame, since the image before
 
 
 class Pairing:
@@ -31,11 +31,11 @@ class Pairing:
 
     def __init__(self, tolerance_ns: int) -> None:
         self._tolerance_ns = tolerance_ns
-        self._images: deque[tuple[int, Frame]] = deque(maxlen=_MOST)
-        self._depths: deque[tuple[int, Frame]] = deque(maxlen=_MOST)
-        self._samples: deque[tuple[int, Frame]] = deque(maxlen=_MOST_SAMPLES)
+        self._images: deque[tuple[int, DeviceFrame]] = deque(maxlen=_MOST)
+        self._depths: deque[tuple[int, DeviceFrame]] = deque(maxlen=_MOST)
+        self._samples: deque[tuple[int, DeviceFrame]] = deque(maxlen=_MOST_SAMPLES)
 
-    def add(self, frame: Frame, stamp_ns: int) -> None:
+    def add(self, frame: DeviceFrame, stamp_ns: int) -> None:
         """Take a frame."""
         held = {Sensor.IMAGE: self._images, Sensor.DEPTH: self._depths}
         held.get(frame.sensor, self._samples).append((stamp_ns, frame))

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from sceneslam.ros.pixels import locked
 from sceneslam.sources.intrinsics import checked_above_zero, checked_range_m
-from sceneslam.sources.live.clock import Order
+from sceneslam.sources.live.clock import StampOrder
 from sceneslam.sources.live.inbox import Inbox
 from sceneslam.sources.live.measuring import Measuring
 from sceneslam.sources.live.streams import Streams
-from sceneslam.sources.realsense.frames import Frame, OpenCamera, Wanted
+from sceneslam.sources.realsense.frames import DeviceFrame, OpenCamera, Wanted
 from sceneslam.sources.realsense.pairing import Paired, Pairing, samples_of
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError, told
@@ -56,7 +56,7 @@ class RealSense(Measuring):
         )
         self._silent_after_s = silent_after_s
         self._tolerance_ns = round(0.5e9 / rate_hz)
-        self._waiting: Inbox[Frame] = Inbox()
+        self._waiting: Inbox[DeviceFrame] = Inbox()
         self._device: OpenCamera | None = None
         self._faults: list[str] = []
 
@@ -99,7 +99,7 @@ class RealSense(Measuring):
                 heard_ns = frame.arrived_ns
                 lined = self._clock.line_up(frame.sensor.value, frame.stamp_ns, heard_ns)
                 streams.hear(frame.sensor.value, lined, heard_ns)
-                if lined.order is not Order.UNORDERED:
+                if lined.order is not StampOrder.UNORDERED:
                     stamp_ns = lined.stamp_ns
                     pairing.add(frame, stamp_ns)
             now_ns = monotonic_ns()

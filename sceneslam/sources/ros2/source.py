@@ -17,14 +17,14 @@ from sceneslam.sources.bag_rig import Given, make_rig, picture_size_wh, place, s
 from sceneslam.sources.bag_topics import NONE, TYPES, choose_topics, first
 from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.sources.intrinsics import checked_above_zero, given_intrinsics, given_range_m
-from sceneslam.sources.live.clock import Order
+from sceneslam.sources.live.clock import StampOrder
 from sceneslam.sources.live.inbox import Inbox
 from sceneslam.sources.live.measuring import Measuring
 from sceneslam.sources.live.streams import Streams
-from sceneslam.sources.ros2.heard import Heard
+from sceneslam.sources.ros2.live_recording import LiveRecording
 from sceneslam.sources.survey.bag_sample import survey_recording
 from sceneslam.sources.survey.survey import Survey
-from sceneslam.sources.synchronise import Bundle, Sample, Synchroniser
+from sceneslam.sources.synchronise import Sample, SynchronisedSamples, Synchroniser
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor, Wheels
@@ -96,7 +96,7 @@ class Ros2(Measuring):
         self._faults = FaultLog()
         self._transport: Transport | None = None
         self._inbox: Inbox[Arrival] = Inbox()
-        self.heard = Heard()
+        self.heard = LiveRecording()
 
     @property
     def rig(self) -> Rig:
@@ -197,7 +197,7 @@ class Ros2(Measuring):
         for topic in sorted(used):
             transport.subscribe(topic, types[topic], self._inbox.put)
 
-    def _bundles(self) -> Iterator[tuple[Bundle, Sensor]]:
+    def _bundles(self) -> Iterator[tuple[SynchronisedSamples, Sensor]]:
         """Yield bundles with the sensor that each is made for."""
         assert self._streams is not None, "rig is asked first"
         streams, primary = self._streams, self._streams.pace
@@ -236,7 +236,7 @@ class Ros2(Measuring):
             return
         lined = self._clock.line_up(topic, decode.stamp_ns(message), arrival.arrived_ns)
         self._streams.hear(topic, lined, arrival.arrived_ns)
-        if lined.order is Order.UNORDERED:
+        if lined.order is StampOrder.UNORDERED:
             return
         if lined.shift_ns:
             message = _restamped(message, lined.stamp_ns)

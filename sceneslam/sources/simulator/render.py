@@ -11,11 +11,11 @@ from typing import IO
 
 import cv2
 
-from sceneslam.sources.simulator.shot import Frame, Photographer, Shot
+from sceneslam.sources.simulator.shot import Photographer, Shot, SimulatedFrame
 from sceneslam.types.errors import InputError
 
 
-def render(shot: Shot, count: int, workers: int) -> Generator[Frame]:
+def render(shot: Shot, count: int, workers: int) -> Generator[SimulatedFrame]:
     """Yield frames 0 to count - 1; their bytes do not depend on the number of workers.
 
     Raises InputError when a worker dies.
@@ -74,12 +74,12 @@ def _brief(worker: subprocess.Popen[bytes], shot: Shot, share: range) -> None:
         raise InputError("the simulator: a rendering process could not start") from None
 
 
-def _receive(worker: subprocess.Popen[bytes], index: int) -> Frame:
+def _receive(worker: subprocess.Popen[bytes], index: int) -> SimulatedFrame:
     output: IO[bytes] | None = worker.stdout
     assert output is not None
     try:
         frame = pickle.load(output)
     except (EOFError, pickle.UnpicklingError):
         raise InputError(f"the simulator: a rendering process ended at frame {index}") from None
-    assert isinstance(frame, Frame)
+    assert isinstance(frame, SimulatedFrame)
     return frame

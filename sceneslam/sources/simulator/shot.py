@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.sources.simulator.optics.camera import Eye, View
+from sceneslam.sources.simulator.optics.camera import CameraRenderer, RenderedView
 from sceneslam.sources.simulator.optics.exposure import Shutter, split
 from sceneslam.sources.simulator.optics.lighting import LightMap, bake
 from sceneslam.sources.simulator.optics.noise_table import NoiseTable
@@ -15,8 +15,8 @@ from sceneslam.sources.simulator.optics.people import add_people, reach_people
 from sceneslam.sources.simulator.optics.rays import RayCaster
 from sceneslam.sources.simulator.optics.sensor_noise import expose, measure_depth
 from sceneslam.sources.simulator.places import building, rooms
-from sceneslam.sources.simulator.places.floor import FloorPlan
-from sceneslam.sources.simulator.places.place import Place
+from sceneslam.sources.simulator.places.floor import BuildingLayout
+from sceneslam.sources.simulator.places.place import SimulatedPlace
 from sceneslam.sources.simulator.robot.motion import Path
 from sceneslam.sources.simulator.settings import ExposureSettings, LaserSettings
 from sceneslam.sources.simulator.story import Story
@@ -38,7 +38,7 @@ class Shot:
     rate_hz: float
     camera: Camera
     scanner: LaserSettings | None  # None: switched off
-    place: Place
+    place: SimulatedPlace
     light: LightMap
     exposure: ExposureSettings
     exposures: NDArray[np.float64]  # (frames,), time ratio x gain
@@ -62,7 +62,7 @@ class Shot:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Frame:
+class SimulatedFrame:
     """What camera and laser measured."""
 
     image_bgr: NDArray[np.uint8]  # (H, W, 3)
@@ -77,22 +77,22 @@ class Photographer:
         self._shot = shot
         self._caster = RayCaster(shot.place.panels)
         self._noise = NoiseTable(np.random.default_rng([shot.seed, _FRAME_STREAM]))
-        self._eye = Eye(shot.place, shot.light, self._caster, shot.camera)
+        self._eye = CameraRenderer(shot.place, shot.light, self._caster, shot.camera)
 
-    def take(self, index: int) -> Frame:
+    def take(self, index: int) -> SimulatedFrame:
         """Return frame `index`."""
         shot, time_s = self._shot, self._shot.time_s(index)
         T_gt_cam = shot.path.pose(time_s) @ shot.camera.T_base_cam
         view = self._eye.look(T_gt_cam, shot.levels(time_s))
         self._add_people(view, time_s, T_gt_cam)
         rng = np.random.default_rng([shot.seed, _FRAME_STREAM, index])
-        return Frame(
+        return SimulatedFrame(
             image_bgr=expose(view, self._noise, rng, self._shutter(index)),
             depth_mm=measure_depth(view, shot.camera, self._noise, rng),
             ranges_m=self._sweep(index),
         )
 
-    def _add_people(self, view: View, time_s: float, T_gt_cam: Transform) -> None:
+    def _add_people(self, view: RenderedView, time_s: float, T_gt_cam: Transform) -> None:
         shot, rays = self._shot, self._eye.directions
         add_people(view, shot.place.people, time_s, T_gt_cam, rays, shot.levels(time_s))
 
@@ -129,7 +129,7 @@ class Photographer:
 
 def meter(shot: Shot, count: int) -> list[NDArray[np.float32]]:
     """Return the grey of a coarse grid of each frame, before exposure."""
-    eye = Eye(shot.place, shot.light, RayCaster(shot.place.panels), shot.camera)
+    eye = CameraRenderer(shot.place, shot.light, RayCaster(shot.place.panels), shot.camera)
     greys: list[NDArray[np.float32]] = []
     for first in range(0, count, _METERED):
         times_s = [shot.time_s(index) for index in range(first, min(first + _METERED, count))]
@@ -139,7 +139,7 @@ def meter(shot: Shot, count: int) -> list[NDArray[np.float32]]:
     return greys
 
 
-def build_place(kind: str, seed: int, order: int | None) -> Place:
+def build_place(kind: str, seed: int, order: int | None) -> SimulatedPlace:
     """Return a story's place: `two_rooms`, `sunny_rooms`, `bare_rooms`, `corridor`, `building`."""
     rng = np.random.default_rng([seed, _PLACE_STREAM, 0])
     if kind == "building":
@@ -149,12 +149,12 @@ def build_place(kind: str, seed: int, order: int | None) -> Place:
     return rooms.two_rooms(rng, sunny=kind == "sunny_rooms", bare=kind == "bare_rooms")
 
 
-def floor_plan(kind: str, order: int | None) -> FloorPlan:
+def floor_plan(kind: str, order: int | None) -> BuildingLayout:
     """Return a story's place from above."""
     return building.floor_plan(order) if kind == "building" else rooms.floor_plan()
 
 
-def light_place(place: Place, seed: int) -> LightMap:
+def light_place(place: SimulatedPlace, seed: int) -> LightMap:
     """Return the light of a place."""
     rng = np.random.default_rng([seed, _PLACE_STREAM, 1])
     return bake(place, RayCaster(place.panels), rng)

@@ -17,13 +17,13 @@ from sceneslam.sources.rosbag import RosBag
 from sceneslam.sources.simulator import settings, stories
 from sceneslam.sources.simulator.cache import Cache, code_digest
 from sceneslam.sources.simulator.optics.exposure import follow
-from sceneslam.sources.simulator.places.floor import FloorPlan
+from sceneslam.sources.simulator.places.floor import BuildingLayout
 from sceneslam.sources.simulator.render import render
 from sceneslam.sources.simulator.robot import motion
-from sceneslam.sources.simulator.robot.wheels import Gyro, WheelOdometry
+from sceneslam.sources.simulator.robot.wheels import SimulatedGyro, WheelOdometry
 from sceneslam.sources.simulator.shot import (
-    Frame,
     Shot,
+    SimulatedFrame,
     build_place,
     floor_plan,
     light_place,
@@ -125,7 +125,7 @@ class Simulator:
         return motion.plan(self._story.start_x_y_deg, self._story.moves, self._floor_plan.floor)
 
     @cached_property
-    def _floor_plan(self) -> FloorPlan:
+    def _floor_plan(self) -> BuildingLayout:
         return floor_plan(self._story.place, self._order)
 
     def _read(self) -> RosBag:
@@ -198,10 +198,10 @@ class Simulator:
             writer.close()
 
     def _write(
-        self, writer: ros_writer.ObservationWriter, shot: Shot, frames: Iterator[Frame]
+        self, writer: ros_writer.ObservationWriter, shot: Shot, frames: Iterator[SimulatedFrame]
     ) -> None:
         odometry = WheelOdometry(self._path, self._odometry, self._generator(4))
-        gyro = Gyro(self._path, self._gyro, self._generator(5))
+        gyro = SimulatedGyro(self._path, self._gyro, self._generator(5))
         for index, frame in enumerate(frames):
             time_s, before_s = shot.time_s(index), shot.time_s(index - 1)
             writer.write(

@@ -12,7 +12,7 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.sources.simulator.places.floor import FloorPlan
+from sceneslam.sources.simulator.places.floor import BuildingLayout
 from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import SceneChange
 
@@ -22,7 +22,7 @@ _LIT_LEVEL = 0.5  # of a zone's lamps; a lamp that goes on or off passes it in t
 _SHORTEST_S = 1.0  # what is over sooner is a flicker, not a scene
 
 
-def scene_at(plan: FloorPlan, T_gt_base: Transform, levels: Mapping[str, float]) -> str | None:
+def scene_at(plan: BuildingLayout, T_gt_base: Transform, levels: Mapping[str, float]) -> str | None:
     """Return the scene of the robot's zone, or of the one behind the door before it.
 
     None outside all zones.

@@ -17,7 +17,7 @@ from sceneslam.sources.simulator.optics.lighting import LightMap
 from sceneslam.sources.simulator.optics.planes import Planes, Sight
 from sceneslam.sources.simulator.optics.rays import RayCaster
 from sceneslam.sources.simulator.optics.sheet import pack
-from sceneslam.sources.simulator.places.place import SUN, Place
+from sceneslam.sources.simulator.places.place import SUN, SimulatedPlace
 from sceneslam.sources.simulator.places.surfaces import TEXEL_M
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
@@ -34,7 +34,7 @@ Panels = NDArray[np.int32]  # a panel's number per pixel; one beyond the last: t
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class View:
+class RenderedView:
     """A noise-free frame."""
 
     image_bgr: Image  # (H, W, 3), 255 for white in unit light; the square root of radiance
@@ -43,10 +43,12 @@ class View:
     blinded: NDArray[np.bool_]  # (H, W), to the depth camera's pattern: by sun or polish
 
 
-class Eye:
+class CameraRenderer:
     """Renders views of one place with one camera."""
 
-    def __init__(self, place: Place, light: LightMap, caster: RayCaster, camera: Camera) -> None:
+    def __init__(
+        self, place: SimulatedPlace, light: LightMap, caster: RayCaster, camera: Camera
+    ) -> None:
         self._caster, self._light, self._camera = caster, light, camera
         self._planes = Planes(place.panels)
         self._skin, self._skin_lookup = _paint_skin(place)
@@ -65,7 +67,7 @@ class Eye:
         """Return the rays' directions (H, W, 3) in `cam`, with z = 1."""
         return self._directions
 
-    def look(self, T_gt_cam: Transform, levels: Mapping[str, float]) -> View:
+    def look(self, T_gt_cam: Transform, levels: Mapping[str, float]) -> RenderedView:
         """Return the view from a pose, each group of lamps at its level (0 off, 1 full)."""
         panels = self._find_panels(T_gt_cam)
         sight = self._planes.seen_from(T_gt_cam)
@@ -74,7 +76,7 @@ class Eye:
         blinded = np.take(self._polished, panels)
         if shaded.sunlight is not None and self._sun is not None:
             blinded |= shaded.sunlight >= self._sun.blinding
-        return View(
+        return RenderedView(
             image_bgr=shaded.image_bgr,
             depth_m=shaded.depth_m,
             cosine=shaded.cosine,
@@ -250,7 +252,7 @@ def _with_sky(lookup: Image) -> Image:
     return np.ascontiguousarray(np.concatenate([lookup, lookup[:1]]).T)
 
 
-def _paint_skin(place: Place) -> tuple[NDArray[np.uint8], Image]:
+def _paint_skin(place: SimulatedPlace) -> tuple[NDArray[np.uint8], Image]:
     """Return all textures, at all levels, on one sheet, and its lookup (4, levels * panels)."""
     blocks, current = [], [panel.texture for panel in place.panels]
     for _ in range(_LEVELS):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sceneslam.sources.simulator.optics.rays import RayCaster
 from sceneslam.sources.simulator.optics.sheet import Sheet, pack
-from sceneslam.sources.simulator.places.place import SUN, Lamp, Panel, Place, Sun
+from sceneslam.sources.simulator.places.place import SUN, Lamp, Panel, SimulatedPlace, Sun
 
 _LIFT_M = 0.002  # rays start this far off their panel
 _BOUNCE_RAYS = 64
@@ -42,7 +42,7 @@ class _Cells:
     first: NDArray[np.int64]  # (panels,), where a block starts
 
 
-def bake(place: Place, caster: RayCaster, rng: np.random.Generator) -> LightMap:
+def bake(place: SimulatedPlace, caster: RayCaster, rng: np.random.Generator) -> LightMap:
     """Return the light of every switch of a place at full power."""
     sheet = pack(_block_sizes(place), _SHEET_COLUMNS)
     cells = _cells(place, sheet)
@@ -61,13 +61,13 @@ def bake(place: Place, caster: RayCaster, rng: np.random.Generator) -> LightMap:
     return LightMap(groups=place.groups, irradiance=canvas, lookup=sheet.lookup())
 
 
-def _block_sizes(place: Place) -> NDArray[np.int64]:
+def _block_sizes(place: SimulatedPlace) -> NDArray[np.int64]:
     edges = np.array([(panel.edge_u_m, panel.edge_v_m) for panel in place.panels])
     cells = np.rint(np.linalg.norm(edges, axis=2) / place.cell_m)
     return np.asarray(np.maximum(2, cells), dtype=np.int64)
 
 
-def _cells(place: Place, sheet: Sheet) -> _Cells:
+def _cells(place: SimulatedPlace, sheet: Sheet) -> _Cells:
     counts = sheet.size_wh.prod(axis=1)
     parts = [
         _block_cells(panel, int(wide), int(high))
@@ -93,7 +93,7 @@ def _block_cells(panel: Panel, wide: int, high: int) -> tuple[NDArray[np.float64
     return panel.corner_m + across + down + _LIFT_M * panel.normal, np.asarray(albedo, np.float32)
 
 
-def _direct(group: str, place: Place, cells: _Cells, caster: RayCaster) -> Values:
+def _direct(group: str, place: SimulatedPlace, cells: _Cells, caster: RayCaster) -> Values:
     """Return the irradiance (N,) straight from the lamps of a group, or from the sun."""
     total = np.zeros(len(cells.points), np.float32)
     if group == SUN and place.sun:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.sources.simulator.optics.camera import View
+from sceneslam.sources.simulator.optics.camera import RenderedView
 from sceneslam.sources.simulator.places.walker import Walker
 from sceneslam.types.se3 import Transform
 
@@ -21,7 +21,7 @@ Values = NDArray[np.float32]
 
 
 def add_people(
-    view: View,
+    view: RenderedView,
     people: Sequence[Walker],
     time_s: float,
     T_gt_cam: Transform,

@@ -15,7 +15,7 @@ Values = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Seen:
+class PanelPoints:
     """The points of panels that pixels show, all arrays of the pixels' shape."""
 
     depth_m: Values
@@ -30,7 +30,7 @@ class Sight:
 
     table: Values  # (12, panels + 1)
 
-    def at(self, panels: NDArray[np.int32], directions_cam: Values) -> Seen:
+    def at(self, panels: NDArray[np.int32], directions_cam: Values) -> PanelPoints:
         """Return the points that pixels show: their panels (...), directions (..., 3) with z = 1.
 
         With X = corner + u e_u + v e_v = z d and the dual basis g of (e_u, e_v, n):
@@ -47,7 +47,7 @@ class Sight:
         v += np.take(self.table[10], panels)
         slope = np.abs(inverse)
         slope *= np.take(self.table[11], panels)
-        return Seen(depth_m=depth_m, u=u, v=v, slope=slope)
+        return PanelPoints(depth_m=depth_m, u=u, v=v, slope=slope)
 
     def _dot(self, row: int, panels: NDArray[np.int32], x: Values, y: Values) -> Values:
         total = np.take(self.table[row], panels)

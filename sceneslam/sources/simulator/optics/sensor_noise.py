@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.sources.simulator.optics.camera import View
+from sceneslam.sources.simulator.optics.camera import RenderedView
 from sceneslam.sources.simulator.optics.exposure import NOMINAL, Shutter
 from sceneslam.sources.simulator.optics.noise_table import NoiseTable
 from sceneslam.types.rig import Camera
@@ -27,7 +27,7 @@ _EDGE_STEP_RATIO = 0.03  # of the depth, across one pixel
 
 
 def expose(
-    view: View, noise: NoiseTable, rng: np.random.Generator, shutter: Shutter = NOMINAL
+    view: RenderedView, noise: NoiseTable, rng: np.random.Generator, shutter: Shutter = NOMINAL
 ) -> NDArray[np.uint8]:
     """Return the image (H, W, 3) BGR of a view with photon and read noise, in 8 bits.
 
@@ -50,7 +50,7 @@ def expose(
 
 
 def measure_depth(
-    view: View, camera: Camera, noise: NoiseTable, rng: np.random.Generator
+    view: RenderedView, camera: Camera, noise: NoiseTable, rng: np.random.Generator
 ) -> NDArray[np.uint16]:
     """Return the depth (H, W) [mm] that a Kinect reports of a view, 0 where it sees none."""
     near_m, far_m = camera.depth_range_m

@@ -12,10 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneslam.sources.simulator.places import zones
-from sceneslam.sources.simulator.places.floor import Door, Floor, FloorPlan, Profile, Slippery, Zone
-from sceneslam.sources.simulator.places.place import NIGHT, Builder, Lamp, Place, Sun
+from sceneslam.sources.simulator.places.floor import (
+    BuildingLayout,
+    Door,
+    Floor,
+    Profile,
+    Slippery,
+    Zone,
+)
+from sceneslam.sources.simulator.places.place import NIGHT, Lamp, PanelBuilder, SimulatedPlace, Sun
 from sceneslam.sources.simulator.places.walker import Walker
-from sceneslam.sources.simulator.places.zone_kind import DOOR_WIDTH_M, WALL_M, Kind, line_door
+from sceneslam.sources.simulator.places.zone_kind import DOOR_WIDTH_M, WALL_M, ZoneKind, line_door
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
@@ -32,10 +39,10 @@ Point = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Placed:
+class PlacedZone:
     """A zone where it stands."""
 
-    kind: Kind
+    kind: ZoneKind
     T_gt_local: Transform
 
     def gt(self, point_m: Point) -> Point:
@@ -49,7 +56,7 @@ class Placed:
         return (min(ax, bx), max(ax, bx)), (min(ay, by), max(ay, by))
 
 
-def layout(order_seed: int | None) -> tuple[Placed, ...]:
+def layout(order_seed: int | None) -> tuple[PlacedZone, ...]:
     """Return the zones along the ring from the office on; a seed shuffles all but the corridors."""
     twins = (zones.twin("twin_a"), zones.twin("twin_b"))
     drawn = (*twins, zones.hall(), zones.atrium(), zones.ramp(), zones.store())
@@ -65,7 +72,7 @@ def layout(order_seed: int | None) -> tuple[Placed, ...]:
     placed, x_m = [], 0.0
     for index, kind in enumerate(ring):
         is_back = index > len(there)
-        placed.append(Placed(kind=kind, T_gt_local=_stand(x_m, is_back=is_back)))
+        placed.append(PlacedZone(kind=kind, T_gt_local=_stand(x_m, is_back=is_back)))
         if kind.exit_xy_m[0] > 0:
             x_m += (-1 if is_back else 1) * (kind.exit_xy_m[0] + WALL_M)
         else:
@@ -73,9 +80,9 @@ def layout(order_seed: int | None) -> tuple[Placed, ...]:
     return tuple(placed)
 
 
-def build(rng: np.random.Generator, order_seed: int | None) -> Place:
+def build(rng: np.random.Generator, order_seed: int | None) -> SimulatedPlace:
     """Return the building."""
-    builder, placed = Builder(rng), layout(order_seed)
+    builder, placed = PanelBuilder(rng), layout(order_seed)
     twin_seed = int(rng.integers(2**32))
     lamps: list[Lamp] = []
     for one in placed:
@@ -93,7 +100,7 @@ def build(rng: np.random.Generator, order_seed: int | None) -> Place:
         sky=_SKY,
         blinding=_BLINDING,
     )
-    return Place(
+    return SimulatedPlace(
         panels=tuple(builder.panels),
         lamps=tuple(lamps),
         sun=sun,
@@ -102,10 +109,10 @@ def build(rng: np.random.Generator, order_seed: int | None) -> Place:
     )
 
 
-def floor_plan(order_seed: int | None) -> FloorPlan:
+def floor_plan(order_seed: int | None) -> BuildingLayout:
     """Return the building from above."""
     placed = layout(order_seed)
-    return FloorPlan(
+    return BuildingLayout(
         zones=tuple(_zone(one) for one in placed),
         doors=tuple(_door(one) for one in placed),
         floor=_floor(placed),
@@ -126,7 +133,7 @@ def tour(order_seed: int | None) -> tuple[Point, ...]:
     return (*around[1:], *again, *home)
 
 
-def _length_m(row: list[Kind]) -> float:
+def _length_m(row: list[ZoneKind]) -> float:
     return sum(kind.size_m[0] for kind in row) + WALL_M * (len(row) - 1)
 
 
@@ -139,7 +146,7 @@ def _stand(x_m: float, *, is_back: bool) -> Transform:
     return T_gt_local
 
 
-def _zone(one: Placed) -> Zone:
+def _zone(one: PlacedZone) -> Zone:
     """Return a zone's rectangle; the walls between zones are shared by halves."""
     length_m, width_m, _ = one.kind.size_m
     half = WALL_M / 2
@@ -147,14 +154,14 @@ def _zone(one: Placed) -> Zone:
     return Zone(name=one.kind.name, x_m=x_m, y_m=y_m, group=one.kind.group)
 
 
-def _door(one: Placed) -> Door:
+def _door(one: PlacedZone) -> Door:
     """Return the door by which a zone is left."""
     exit_x, exit_y = one.kind.exit_xy_m
     x_m, y_m = one.gt((exit_x + (WALL_M if exit_x > 0 else -WALL_M) / 2, exit_y))
     return Door(x_m=x_m, y_m=(y_m - DOOR_WIDTH_M / 2, y_m + DOOR_WIDTH_M / 2))
 
 
-def _night(one: Placed) -> Lamp:
+def _night(one: PlacedZone) -> Lamp:
     x_m, y_m = one.gt((one.kind.size_m[0] / 2, one.kind.south_m + one.kind.size_m[1] / 2))
     return Lamp(
         group=NIGHT,
@@ -166,14 +173,14 @@ def _night(one: Placed) -> Lamp:
     )
 
 
-def _people(one: Placed) -> Iterator[Walker]:
+def _people(one: PlacedZone) -> Iterator[Walker]:
     for start_m, end_m in one.kind.walks:
         yield Walker(
             start_m=one.gt(start_m), end_m=one.gt(end_m), group=one.kind.group, light=_ON_PEOPLE
         )
 
 
-def _floor(placed: tuple[Placed, ...]) -> Floor:
+def _floor(placed: tuple[PlacedZone, ...]) -> Floor:
     profiles, slippery = [], []
     for one in placed:
         for x_m, y_m, ratio in one.kind.slippery:

@@ -94,7 +94,7 @@ class Door:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FloorPlan:
+class BuildingLayout:
     """What the robot's path and the true scenes depend on."""
 
     zones: tuple[Zone, ...]

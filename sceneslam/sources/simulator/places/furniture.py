@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneslam.sources.simulator.places.pictures import decorated, poster, spines
-from sceneslam.sources.simulator.places.place import Builder
+from sceneslam.sources.simulator.places.place import PanelBuilder
 from sceneslam.sources.simulator.places.surfaces import (
     OAK,
     WALNUT,
@@ -39,7 +39,9 @@ class Spot:
         )
 
 
-def bookshelf(builder: Builder, spot: Spot, size_m: tuple[float, float], colour: Colour) -> None:
+def bookshelf(
+    builder: PanelBuilder, spot: Spot, size_m: tuple[float, float], colour: Colour
+) -> None:
     """Put up a shelf, 30 cm deep, its boards filled with books of all sizes."""
     case, rng, depth_m, (width_m, height_m) = wood(colour), builder.rng, 0.3, size_m
     for side in (-1, 1):
@@ -62,7 +64,9 @@ def bookshelf(builder: Builder, spot: Spot, size_m: tuple[float, float], colour:
             left_m += block_m + float(rng.choice([0.0, 0.0, 0.08]))
 
 
-def table(builder: Builder, spot: Spot, size_m: tuple[float, float, float], look: Material) -> None:
+def table(
+    builder: PanelBuilder, spot: Spot, size_m: tuple[float, float, float], look: Material
+) -> None:
     """Put up a table on four legs."""
     width_m, depth_m, height_m = size_m
     top_m = height_m - 0.03
@@ -76,7 +80,7 @@ def table(builder: Builder, spot: Spot, size_m: tuple[float, float, float], look
             builder.box(leg, (0.05, 0.05, top_m), look, yaw_deg=yaw_deg)
 
 
-def chair(builder: Builder, spot: Spot, look: Material, seat: Material) -> None:
+def chair(builder: PanelBuilder, spot: Spot, look: Material, seat: Material) -> None:
     """Put up a chair; who sits on it looks to its front."""
     table(builder, spot, (0.42, 0.42, 0.45), look)
     cushion, yaw_deg = (spot.x_m, spot.y_m), spot.yaw_deg
@@ -87,7 +91,7 @@ def chair(builder: Builder, spot: Spot, look: Material, seat: Material) -> None:
     builder.box(spot.at(0, 0.19), (0.4, 0.03, 0.2), look, bottom_m=0.74, yaw_deg=yaw_deg)
 
 
-def sofa(builder: Builder, spot: Spot, width_m: float, colour: Colour) -> None:
+def sofa(builder: PanelBuilder, spot: Spot, width_m: float, colour: Colour) -> None:
     """Put up a sofa, 85 cm deep, with loose cushions."""
     cloth, rng, yaw_deg = fabric(colour), builder.rng, spot.yaw_deg
     builder.box(spot.at(0, -0.08), (width_m - 0.3, 0.68, 0.4), cloth, yaw_deg=yaw_deg)
@@ -103,7 +107,7 @@ def sofa(builder: Builder, spot: Spot, width_m: float, colour: Colour) -> None:
 
 
 def cabinet(
-    builder: Builder, spot: Spot, size_m: tuple[float, float, float], look: Material
+    builder: PanelBuilder, spot: Spot, size_m: tuple[float, float, float], look: Material
 ) -> None:
     """Put up a cabinet with drawers, and things on top of it."""
     width_m, depth_m, height_m = size_m
@@ -123,7 +127,7 @@ def cabinet(
     builder.box(thing, (0.18, 0.16, 0.14), cardboard, bottom_m=height_m, yaw_deg=turned)
 
 
-def sideboard(builder: Builder, spot: Spot, width_m: float) -> None:
+def sideboard(builder: PanelBuilder, spot: Spot, width_m: float) -> None:
     """Put up a low board: bays with books or behind doors, and more books on top of it."""
     rng, yaw_deg, look = builder.rng, spot.yaw_deg, wood((186, 200, 206), 0.8)
     for bottom_m in (0.05, 0.53):
@@ -147,7 +151,7 @@ def sideboard(builder: Builder, spot: Spot, width_m: float) -> None:
         _books(builder, spot.at(right_m - 0.05, -0.02), top, 0.56, yaw_deg)
 
 
-def wall_shelf(builder: Builder, spot: Spot, width_m: float) -> None:
+def wall_shelf(builder: PanelBuilder, spot: Spot, width_m: float) -> None:
     """Hang two small boards on a wall, one above the other, with things on them."""
     yaw_deg = spot.yaw_deg
     for bottom_m in (0.25, 0.6):
@@ -159,7 +163,7 @@ def wall_shelf(builder: Builder, spot: Spot, width_m: float) -> None:
         builder.box(thing, (0.1, 0.1, 0.14), cardboard, bottom_m=bottom_m + 0.02, yaw_deg=yaw_deg)
 
 
-def door_leaf(builder: Builder, spot: Spot) -> None:
+def door_leaf(builder: PanelBuilder, spot: Spot) -> None:
     """Hang a white door, 90 cm wide, with panels and a handle; it stands along its x axis."""
     panel = paint((176, 186, 190))
     white = decorated(paint(WHITE), (0.15, 0.2, 0.6, 0.7, panel), (0.15, 1.1, 0.6, 0.7, panel))
@@ -169,7 +173,7 @@ def door_leaf(builder: Builder, spot: Spot) -> None:
     builder.box(at, handle, paint((70, 72, 74)), bottom_m=1.02, yaw_deg=spot.yaw_deg)
 
 
-def parcels(builder: Builder, spot: Spot) -> None:
+def parcels(builder: PanelBuilder, spot: Spot) -> None:
     """Pile up cardboard boxes."""
     rng = builder.rng
     builder.box(spot.at(0, 0), (0.52, 0.42, 0.38), cardboard, yaw_deg=spot.yaw_deg)
@@ -178,7 +182,7 @@ def parcels(builder: Builder, spot: Spot) -> None:
     builder.box(spot.at(-0.5, 0.05), (0.34, 0.3, 0.27), cardboard, yaw_deg=-turned)
 
 
-def plant(builder: Builder, spot: Spot, height_m: float) -> None:
+def plant(builder: PanelBuilder, spot: Spot, height_m: float) -> None:
     """Put up a potted plant of some sixty two-sided leaves."""
     rng, pot_m = builder.rng, 0.32
     builder.box((spot.x_m, spot.y_m), (0.3, 0.3, pot_m), fabric((70, 96, 150), 5.0), yaw_deg=20)
@@ -197,7 +201,7 @@ def plant(builder: Builder, spot: Spot, height_m: float) -> None:
         builder.panel(root + side * wide_m - behind, -side * wide_m, out * long_m, leaf)
 
 
-def bed(builder: Builder, spot: Spot) -> None:
+def bed(builder: PanelBuilder, spot: Spot) -> None:
     """Put up a bed, 2 m long, its head at its back."""
     yaw_deg = spot.yaw_deg
     builder.box(spot.at(0, 0), (0.95, 2.0, 0.28), wood(OAK), yaw_deg=yaw_deg)
@@ -209,7 +213,7 @@ def bed(builder: Builder, spot: Spot) -> None:
 
 
 def _books(
-    builder: Builder,
+    builder: PanelBuilder,
     centre_xy_m: tuple[float, float],
     size_m: tuple[float, float, float],
     bottom_m: float,

@@ -61,7 +61,7 @@ NIGHT = "night"  # the group of stand-by lights and the street, which no switch 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Place:
+class SimulatedPlace:
     """Everything that light and camera meet."""
 
     panels: tuple[Panel, ...]
@@ -78,7 +78,7 @@ class Place:
 
 
 @dataclass(slots=True)
-class Builder:
+class PanelBuilder:
     """Puts panels together; textures are drawn from one generator, in order."""
 
     rng: np.random.Generator

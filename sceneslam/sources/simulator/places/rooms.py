@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sceneslam.sources.simulator.places.floor import Door, FloorPlan, Zone
+from sceneslam.sources.simulator.places.floor import BuildingLayout, Door, Zone
 from sceneslam.sources.simulator.places.furniture import (
     Spot,
     bed,
@@ -23,7 +23,7 @@ from sceneslam.sources.simulator.places.furniture import (
     wall_shelf,
 )
 from sceneslam.sources.simulator.places.pictures import decorated, painting, pin_board, poster
-from sceneslam.sources.simulator.places.place import NIGHT, Builder, Lamp, Place, Sun
+from sceneslam.sources.simulator.places.place import NIGHT, Lamp, PanelBuilder, SimulatedPlace, Sun
 from sceneslam.sources.simulator.places.surfaces import (
     BIRCH,
     OAK,
@@ -53,30 +53,34 @@ _NIGHT_POWER = 0.03  # stand-by lights and the street: never quite dark
 _SUN = Sun(direction=(0.42, -0.62, -0.66), power=4.4, sky=3.0)
 
 
-def floor_plan() -> FloorPlan:
+def floor_plan() -> BuildingLayout:
     """Return room A and what lies behind its door; the border is in the middle of the wall."""
     border_m = (_A_X_M[1] + _B_X_M[0]) / 2
     room_a = Zone(name="a", x_m=(_A_X_M[0], border_m), y_m=_A_Y_M, group="a")
     behind = Zone(name="b", x_m=(border_m, _CORRIDOR_X_M[1]), y_m=_B_Y_M, group="b")
-    return FloorPlan(zones=(room_a, behind), doors=(Door(x_m=border_m, y_m=DOOR_Y_M),))
+    return BuildingLayout(zones=(room_a, behind), doors=(Door(x_m=border_m, y_m=DOOR_Y_M),))
 
 
-def two_rooms(rng: np.random.Generator, *, sunny: bool = False, bare: bool = False) -> Place:
+def two_rooms(
+    rng: np.random.Generator, *, sunny: bool = False, bare: bool = False
+) -> SimulatedPlace:
     """Return rooms A and B.
 
     Sunny: the window of A stands open to the sun. Bare: nothing stands at its south wall.
     """
-    builder = Builder(rng)
+    builder = PanelBuilder(rng)
     _room_a(builder, sunny=sunny, bare=bare)
     _room_b(builder)
     lamps = [*_lamps_a(), _night((2.6, 3.0)), _night((7.9, 3.4))]
     lamps += [_lamp("b", (x_m, 2.1), (0.6, 0.6), _POWER_B) for x_m in (6.5, 8.9)]
-    return Place(panels=tuple(builder.panels), lamps=tuple(lamps), sun=_SUN if sunny else None)
+    return SimulatedPlace(
+        panels=tuple(builder.panels), lamps=tuple(lamps), sun=_SUN if sunny else None
+    )
 
 
-def corridor(rng: np.random.Generator) -> Place:
+def corridor(rng: np.random.Generator) -> SimulatedPlace:
     """Return room A and, behind its door, a bare corridor 14 m long."""
-    builder = Builder(rng)
+    builder = PanelBuilder(rng)
     _room_a(builder)
     (x0, x1), (y0, y1) = _CORRIDOR_X_M, _CORRIDOR_Y_M
     wall = paint((166, 174, 178))
@@ -91,10 +95,10 @@ def corridor(rng: np.random.Generator) -> Place:
         _lamp("b", (float(at), 1.98), (0.9, 0.25), _POWER_CORRIDOR)
         for at in np.arange(6.6, x1, 2.4)
     ]
-    return Place(panels=tuple(builder.panels), lamps=tuple(lamps))
+    return SimulatedPlace(panels=tuple(builder.panels), lamps=tuple(lamps))
 
 
-def _room_a(builder: Builder, *, sunny: bool = False, bare: bool = False) -> None:
+def _room_a(builder: PanelBuilder, *, sunny: bool = False, bare: bool = False) -> None:
     """Build the living room."""
     white = paint(WHITE)
     (x0, x1), (y0, y1) = _A_X_M, _A_Y_M
@@ -123,7 +127,7 @@ def _room_a(builder: Builder, *, sunny: bool = False, bare: bool = False) -> Non
     door_leaf(builder, Spot(4.54, 1.47, 180))
 
 
-def _room_b(builder: Builder) -> None:
+def _room_b(builder: PanelBuilder) -> None:
     """Build the bedroom, in darker colours."""
     wall = paint(_BLUE_GREY)
     (x0, x1), (y0, y1) = _B_X_M, _B_Y_M
@@ -151,7 +155,7 @@ def _room_b(builder: Builder) -> None:
 
 
 def _wall_with_door(
-    builder: Builder, x_m: float, y_m: tuple[float, float], look: Material, *, faces_east: bool
+    builder: PanelBuilder, x_m: float, y_m: tuple[float, float], look: Material, *, faces_east: bool
 ) -> None:
     """Build one side of the wall at x with its door frame; the west side adds the passage."""
     (south, north), (y0, y1) = y_m, DOOR_Y_M
@@ -169,7 +173,7 @@ def _wall_with_door(
         _line_hole(builder, (x_m, _B_X_M[0]), DOOR_Y_M)
 
 
-def _line_hole(builder: Builder, x_m: tuple[float, float], y_m: tuple[float, float]) -> None:
+def _line_hole(builder: PanelBuilder, x_m: tuple[float, float], y_m: tuple[float, float]) -> None:
     """Line the passage of the door with wood."""
     (x0, x1), (y0, y1) = x_m, y_m
     builder.wall((x1, y0), (x0, y0), (0, DOOR_TOP_M), wood(OAK))
@@ -178,7 +182,7 @@ def _line_hole(builder: Builder, x_m: tuple[float, float], y_m: tuple[float, flo
     builder.level(x_m, y_m, 0.0, wood(WALNUT))
 
 
-def _wall_with_window(builder: Builder, y_m: float, *, sunny: bool) -> None:
+def _wall_with_window(builder: PanelBuilder, y_m: float, *, sunny: bool) -> None:
     """Build the north wall of A: its window has a lowered blind, or stands open to the sun."""
     (left, right), (sill, top) = _WINDOW_X_M, _WINDOW_Z_M
     white, wide = paint(WHITE), right - left

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from sceneslam.sources.simulator.places.pictures import decorated
-from sceneslam.sources.simulator.places.place import SUN, Builder, Lamp
+from sceneslam.sources.simulator.places.place import SUN, Lamp, PanelBuilder
 from sceneslam.sources.simulator.places.surfaces import OAK, WALNUT, Material, wood
 
 WALL_M = 0.12  # between two zones
@@ -22,7 +22,7 @@ Doors = tuple[float, ...]  # where along their wall, y of the local frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Kind:
+class ZoneKind:
     """A zone in its own frame: it is entered at (0, 0) along +x.
 
     It is left at `exit_xy_m`: through its east wall along +x, or through its west wall along -x.
@@ -33,7 +33,7 @@ class Kind:
     south_m: float  # y of its south wall
     exit_xy_m: Point
     route: tuple[Point, ...]  # between the doors
-    furnish: Callable[[Builder, int], None]  # with what; the number is the same for twins
+    furnish: Callable[[PanelBuilder, int], None]  # with what; the number is the same for twins
     floor: Material
     wall: Material
     ceiling: Material | None  # None: open to the sky
@@ -54,7 +54,7 @@ class Kind:
         """Return what lights the zone: lamps of its name, or the sun."""
         return self.name if self.ceiling else SUN
 
-    def build(self, builder: Builder, twin_seed: int) -> None:
+    def build(self, builder: PanelBuilder, twin_seed: int) -> None:
         """Add the zone's panels in its own frame."""
         builder.is_polished = self.has_polished_floor
         self._floor(builder)
@@ -71,7 +71,7 @@ class Kind:
         self._wall_with_doors(builder, "east", length_m, () if has_two_west else (0.0,))
         self.furnish(builder, twin_seed)
 
-    def lamps_at(self, builder: Builder) -> list[Lamp]:
+    def lamps_at(self, builder: PanelBuilder) -> list[Lamp]:
         """Return the zone's lamps in gt."""
         height_m = self.size_m[2] - 0.01
         turn = builder.T_gt_local
@@ -87,7 +87,7 @@ class Kind:
             for x_m, y_m, wide_m, deep_m in self.lamps
         ]
 
-    def _floor(self, builder: Builder) -> None:
+    def _floor(self, builder: PanelBuilder) -> None:
         length_m, width_m, _ = self.size_m
         knots = [(0.0, 0.0), *self.heights, (length_m, 0.0)]
         for (x0, z0), (x1, z1) in pairwise(knots):
@@ -96,12 +96,12 @@ class Kind:
                 across, down = np.array([x1 - x0, 0, z1 - z0]), np.array([0, -width_m, 0])
                 builder.panel(corner, across, down, self.floor)
 
-    def _wall(self, builder: Builder, side: str, ends: tuple[Point, Point]) -> None:
+    def _wall(self, builder: PanelBuilder, side: str, ends: tuple[Point, Point]) -> None:
         look = decorated(self.wall, *self.pictures.get(side, ()))
         height_m = (0.0, self.size_m[2])
         builder.wall(*ends, height_m, look, hole_m=self.windows.get(side))
 
-    def _wall_with_doors(self, builder: Builder, side: str, x_m: float, doors: Doors) -> None:
+    def _wall_with_doors(self, builder: PanelBuilder, side: str, x_m: float, doors: Doors) -> None:
         """Add a wall across the zone, one piece per door."""
         south, north = self.south_m, self.south_m + self.size_m[1]
         edges = [south, *np.add(doors[:-1], doors[1:]) / 2, north]
@@ -117,7 +117,7 @@ class Kind:
             builder.wall(*ends, (0.0, self.size_m[2]), look, hole_m=hole)
 
 
-def line_door(builder: Builder, x_m: tuple[float, float], y_m: float) -> None:
+def line_door(builder: PanelBuilder, x_m: tuple[float, float], y_m: float) -> None:
     """Line the passage of a door with wood."""
     (x0, x1), y0, y1 = x_m, y_m - DOOR_WIDTH_M / 2, y_m + DOOR_WIDTH_M / 2
     builder.wall((x1, y0), (x0, y0), (0, DOOR_TOP_M), wood(OAK))

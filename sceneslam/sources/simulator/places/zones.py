@@ -18,7 +18,7 @@ from sceneslam.sources.simulator.places.furniture import (
     table,
 )
 from sceneslam.sources.simulator.places.pictures import painting, pin_board, poster
-from sceneslam.sources.simulator.places.place import Builder
+from sceneslam.sources.simulator.places.place import PanelBuilder
 from sceneslam.sources.simulator.places.surfaces import (
     BIRCH,
     OAK,
@@ -34,7 +34,7 @@ from sceneslam.sources.simulator.places.surfaces import (
     stone_tiles,
     wood,
 )
-from sceneslam.sources.simulator.places.zone_kind import Kind, Pictures
+from sceneslam.sources.simulator.places.zone_kind import Pictures, ZoneKind
 
 # Wheels turn in vain where a robot crosses what is wet or lies loose: a metre or so each time. A
 # dry floor, polished or not, takes a few per cent at most (rolling resistance is a fiftieth of the
@@ -50,9 +50,9 @@ _HALL_ROUTE = (
 )
 
 
-def office() -> Kind:
+def office() -> ZoneKind:
     """Return the furnished office, where the tour begins: every sensor works."""
-    return Kind(
+    return ZoneKind(
         name="office",
         size_m=(8.0, 6.0, 2.6),
         south_m=-3.0,
@@ -79,9 +79,9 @@ def office() -> Kind:
     )
 
 
-def twin(name: str) -> Kind:
+def twin(name: str) -> ZoneKind:
     """Return one of two rooms that look alike; only what lies on the table differs."""
-    return Kind(
+    return ZoneKind(
         name=name,
         size_m=(5.0, 4.4, 2.5),
         south_m=-2.2,
@@ -96,13 +96,13 @@ def twin(name: str) -> Kind:
     )
 
 
-def hall() -> Kind:
+def hall() -> ZoneKind:
     """Return a hall whose walls are beyond the depth camera's range, its floor polished stone."""
     tall = tuple((left, 1.6, 1.5, 2.0, poster) for left in (1.0, 4.6, 8.2, 11.8, 15.4))
     wide = tuple((left, 1.7, 1.8, 1.4, painting) for left in (2.0, 6.0, 10.0, 14.0, 17.2))
     ends: Pictures = ((1.0, 1.6, 1.4, 2.0, poster), (4.2, 1.8, 2.0, 1.5, painting))
     ends += ((10.2, 1.8, 2.0, 1.5, painting), (13.4, 1.6, 1.4, 2.0, poster))
-    return Kind(
+    return ZoneKind(
         name="hall",
         size_m=(20.0, 16.0, 4.5),
         south_m=-8.0,
@@ -120,7 +120,7 @@ def hall() -> Kind:
     )
 
 
-def poster_corridor() -> Kind:
+def poster_corridor() -> ZoneKind:
     """Return the long lit corridor between the rows: bare walls, but posters to see."""
     length_m = ROWS_APART_M + _CORRIDOR_M
     spots = np.arange(1.6, length_m - 1.5, 2.3)
@@ -138,17 +138,17 @@ def poster_corridor() -> Kind:
     )
 
 
-def bare_corridor() -> Kind:
+def bare_corridor() -> ZoneKind:
     """Return the dark corridor without anything in it: only wheels and gyro measure its length."""
     return _corridor("bare", wall=paint((176, 180, 184)), pictures={}, power=1.8, is_lit=False)
 
 
 def _corridor(
     name: str, *, wall: Material, pictures: Mapping[str, Pictures], power: float, is_lit: bool
-) -> Kind:
+) -> ZoneKind:
     length_m, middle_m = ROWS_APART_M + _CORRIDOR_M, _CORRIDOR_M / 2
     lamps = tuple((middle_m, float(y), 0.25, 0.9) for y in np.arange(0.0, ROWS_APART_M + 1, 2.5))
-    return Kind(
+    return ZoneKind(
         name=name,
         size_m=(_CORRIDOR_M, length_m, 2.5),
         south_m=-middle_m,
@@ -165,12 +165,12 @@ def _corridor(
     )
 
 
-def atrium() -> Kind:
+def atrium() -> ZoneKind:
     """Return the atrium: no roof, a window front to the south, sun on everything in it."""
     bricks: Pictures = ((0.6, 1.6, 1.2, 1.6, poster), (3.0, 1.8, 1.6, 1.2, painting))
     bricks += ((5.6, 1.5, 1.2, 1.7, poster), (8.6, 1.7, 1.6, 1.3, painting))
     ends = ((0.8, 1.7, 1.5, 1.5, painting), (7.6, 1.6, 1.3, 1.8, poster))
-    return Kind(
+    return ZoneKind(
         name="atrium",
         size_m=(12.0, 11.0, 4.4),
         south_m=-5.5,
@@ -186,9 +186,9 @@ def atrium() -> Kind:
     )
 
 
-def store() -> Kind:
+def store() -> ZoneKind:
     """Return the store room, its lights off: black but for noise; sheets of foil on its floor."""
-    return Kind(
+    return ZoneKind(
         name="store",
         size_m=(12.0, 6.0, 2.5),
         south_m=-3.0,
@@ -205,13 +205,13 @@ def store() -> Kind:
     )
 
 
-def ramp() -> Kind:
+def ramp() -> ZoneKind:
     """Return the way over a ramp of 8 degrees, up and down, and over a door sill."""
     top_m, foot = _RAMP_M * float(np.tan(np.deg2rad(_RAMP_DEG))), 1.8
     up, down, end = foot + _RAMP_M, foot + _RAMP_M + 2.4, foot + 2 * _RAMP_M + 2.4
     pictures = tuple((0.8 + 2.1 * k, 0.7, 0.8, 1.0, poster) for k in range(6))
     sill = ((13.3, 0.0), (13.36, 0.012), (13.44, 0.012), (13.5, 0.0))
-    return Kind(
+    return ZoneKind(
         name="ramp",
         size_m=(14.0, 2.6, 3.1),
         south_m=-1.3,
@@ -229,11 +229,11 @@ def ramp() -> Kind:
     )
 
 
-def lobby(name: str, length_m: float) -> Kind:
+def lobby(name: str, length_m: float) -> ZoneKind:
     """Return a lit passage of any length, which makes both rows equally long."""
     count = max(1, int(length_m / 2.0))
     pictures = tuple((0.4 + 2.0 * k, 0.6, 0.8, 1.0, poster) for k in range(count))
-    return Kind(
+    return ZoneKind(
         name=name,
         size_m=(length_m, 3.0, 2.5),
         south_m=-1.5,
@@ -249,11 +249,11 @@ def lobby(name: str, length_m: float) -> Kind:
     )
 
 
-def _leave_empty(builder: Builder, twin_seed: int) -> None:
+def _leave_empty(builder: PanelBuilder, twin_seed: int) -> None:
     """Put up nothing."""
 
 
-def _furnish_office(builder: Builder, twin_seed: int) -> None:
+def _furnish_office(builder: PanelBuilder, twin_seed: int) -> None:
     for x_m, y_m, yaw_deg in ((2.2, 2.0, 0), (4.6, 2.1, 5), (3.0, -2.1, 180), (5.4, -2.0, 175)):
         table(builder, Spot(x_m, y_m, yaw_deg), (1.4, 0.7, 0.74), wood(BIRCH, 1.5))
         side = -0.75 if y_m > 0 else 0.75
@@ -269,7 +269,7 @@ def _furnish_office(builder: Builder, twin_seed: int) -> None:
     parcels(builder, Spot(6.9, -2.5, 178))
 
 
-def _furnish_twin(builder: Builder, twin_seed: int) -> None:
+def _furnish_twin(builder: PanelBuilder, twin_seed: int) -> None:
     own_rng, builder.rng = builder.rng, np.random.default_rng(twin_seed)
     sofa(builder, Spot(2.5, 1.72), 1.9, (128, 158, 172))
     sideboard(builder, Spot(2.6, -2.0, 180), 1.5)
@@ -283,14 +283,14 @@ def _furnish_twin(builder: Builder, twin_seed: int) -> None:
     builder.box((0.9, -1.5), (0.3, 0.2, 0.2), painting, bottom_m=0.6, yaw_deg=25)
 
 
-def _furnish_hall(builder: Builder, twin_seed: int) -> None:
+def _furnish_hall(builder: PanelBuilder, twin_seed: int) -> None:
     for x_m in (2.0, 10.0, 18.0):
         sofa(builder, Spot(x_m, 7.4), 2.2, (90, 110, 150))
         plant(builder, Spot(x_m - 1.6, -7.4), 1.4)
         plant(builder, Spot(x_m + 1.4, 7.3), 1.5)
 
 
-def _furnish_atrium(builder: Builder, twin_seed: int) -> None:
+def _furnish_atrium(builder: PanelBuilder, twin_seed: int) -> None:
     for x_m in np.arange(0.6, 12.0, 2.1):  # the roof: boards, and glass between them
         builder.level((x_m - 0.6, x_m + 0.8), (-5.5, 5.5), 4.4, plain(WHITE), faces_up=False)
     for x_m, y_m in ((1.2, 4.6), (4.2, 4.7), (7.4, 4.6), (10.6, 4.6), (1.0, -2.4), (10.8, -3.0)):
@@ -300,7 +300,7 @@ def _furnish_atrium(builder: Builder, twin_seed: int) -> None:
     chair(builder, Spot(6.4, 3.2, 200), wood(OAK), fabric((110, 70, 40)))
 
 
-def _furnish_store(builder: Builder, twin_seed: int) -> None:
+def _furnish_store(builder: PanelBuilder, twin_seed: int) -> None:
     for x_m in (1.7, 4.0, 6.3, 8.6):
         bookshelf(builder, Spot(x_m, 2.8, 0), (1.6, 1.9), OAK)
         bookshelf(builder, Spot(x_m + 1.2, -2.8, 180), (1.4, 2.0), BIRCH)

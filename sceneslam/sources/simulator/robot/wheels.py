@@ -40,7 +40,7 @@ class WheelOdometry:
         return se3.from_xy_yaw(x, y, yaw)
 
 
-class Gyro:
+class SimulatedGyro:
     """Turn rates in `base` with white noise and a bias that walks."""
 
     def __init__(self, path: Path, settings: GyroSettings, rng: np.random.Generator) -> None:

@@ -21,7 +21,7 @@ from sceneslam.types.se3 import Transform
 
 from ..process.client import LOST, TRACKING, poses, serve
 from ..process.protocol import Fields, ProtocolError
-from .heard import Heard, moved
+from .listener import NodeListener, moved
 
 _TYPES = {
     "image": "sensor_msgs/msg/Image",
@@ -35,7 +35,7 @@ _TYPES = {
 _KEPT = 1000  # observations whose poses may still come
 
 
-class Bridge:
+class NodeClient:
     """Sends what is observed, and answers with what the node says."""
 
     def __init__(self, settings: dict[str, Any]) -> None:
@@ -51,7 +51,7 @@ class Bridge:
     def activate(self, rig: Fields) -> None:
         """Join the domain and start the node; what it says on standard output is its log."""
         self._transport = open_transport(Network(**self._settings["network"]))
-        self._heard = Heard(self._transport, self._settings)
+        self._heard = NodeListener(self._transport, self._settings)
         self._camera = _camera(rig)
         places = {
             frame: rig[name]
@@ -187,6 +187,6 @@ def _inertial(stamp_ns: int, observation: Fields) -> dict[int, dict[Sensor, NDAr
 
 def main(settings: dict[str, Any]) -> None:
     """Serve until the input is closed; the node ends with this program's group."""
-    serve(Bridge(settings))
+    serve(NodeClient(settings))
     sys.stderr.flush()
     os._exit(0)  # the transport's threads would go on

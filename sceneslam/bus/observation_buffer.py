@@ -17,7 +17,7 @@ _BULKY = ("image_bgr", "depth_m", "points_lidar", "point_times_s")
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
-class Moment:
+class BufferedObservation:
     """An observation with its pose, and the state from which later poses can be bridged."""
 
     observation: Observation
@@ -33,7 +33,7 @@ class Moment:
         """Return the observation's stamp."""
         return self.observation.stamp_ns
 
-    def bridged(self, T_map_base: Transform | None, bridge: Bridge) -> Moment:
+    def bridged(self, T_map_base: Transform | None, bridge: Bridge) -> BufferedObservation:
         """Return the moment with a bridged pose."""
         return replace(
             self,
@@ -45,7 +45,7 @@ class Moment:
         )
 
 
-class Memory:
+class ObservationBuffer:
     """The moments of the last while, bounded in time and in bytes.
 
     When the bytes do not suffice, older moments lose their sensor data, so that the spacing of
@@ -56,17 +56,17 @@ class Memory:
     def __init__(self, *, span_s: float, limit_mb: float, keeps_sensors: bool) -> None:
         self._span_ns, self._limit_bytes = round(span_s * 1e9), round(limit_mb * 1e6)
         self._keeps_sensors = keeps_sensors
-        self._moments: list[Moment] = []  # by rising stamp
+        self._moments: list[BufferedObservation] = []  # by rising stamp
         self._full_ns: list[int] = []  # stamps of the moments that still have their sensor data
         self._sizes: list[int] = []  # bytes of that sensor data, in the same order
         self._bytes = 0  # in all
 
     @property
-    def newest(self) -> Moment:
+    def newest(self) -> BufferedObservation:
         """Return the moment that was added last."""
         return self._moments[-1]
 
-    def add(self, moment: Moment) -> None:
+    def add(self, moment: BufferedObservation) -> None:
         """Add a moment; remove those that are too old."""
         self._append(moment)
         old = self._count(moment.stamp_ns - self._span_ns - 1)
@@ -78,7 +78,7 @@ class Memory:
         while self._bytes > self._limit_bytes and len(self._full_ns) > 2:
             self._strip(self._least_missed())
 
-    def anchor(self, until_ns: int | None) -> Moment:
+    def anchor(self, until_ns: int | None) -> BufferedObservation:
         """Return the newest trusted moment, not after `until_ns` if that is given.
 
         Without a trusted moment, the oldest that has a pose; without a pose, the oldest.
@@ -89,16 +89,16 @@ class Memory:
                 return moment
         return posed[0] if posed else self._moments[0]
 
-    def after(self, stamp_ns: int) -> list[Moment]:
+    def after(self, stamp_ns: int) -> list[BufferedObservation]:
         """Return all moments after an instant."""
         return self._moments[self._count(stamp_ns) :]
 
-    def last_until(self, stamp_ns: int) -> Moment | None:
+    def last_until(self, stamp_ns: int) -> BufferedObservation | None:
         """Return the newest moment up to an instant, None if it was removed."""
         count = self._count(stamp_ns)
         return self._moments[count - 1] if count else None
 
-    def rewrite(self, moments: list[Moment]) -> None:
+    def rewrite(self, moments: list[BufferedObservation]) -> None:
         """Replace all moments from the first of `moments` on by these, with corrected poses."""
         from_ns = moments[0].stamp_ns
         del self._moments[self._count(from_ns - 1) :]
@@ -115,7 +115,7 @@ class Memory:
         """Return how many moments there are up to an instant."""
         return bisect_right(self._moments, stamp_ns, key=_stamp_ns)
 
-    def _append(self, moment: Moment) -> None:
+    def _append(self, moment: BufferedObservation) -> None:
         self._moments.append(moment)
         size = _size(moment.observation)
         if size:
@@ -142,7 +142,7 @@ class Memory:
         self._moments[index].observation = _stripped(self._moments[index].observation)
 
 
-def _stamp_ns(moment: Moment) -> int:
+def _stamp_ns(moment: BufferedObservation) -> int:
     return moment.observation.stamp_ns
 
 

@@ -12,14 +12,14 @@ from sceneslam.types.maps import LandmarkLayer, PoseGraphLayer
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
-from .eye import Eye
 from .frame_log import FrameLog, joined, moved
 from .keyframes import Keyframe
-from .localizer import Fix, Localizer
-from .loop_closing import LoopCloser
+from .localizer import VisualFix, VisualLocalizer
+from .loop_closing import VisualLoopCloser
 from .loop_detection import LoopDetector, Query
-from .pose_graph import Edge, PoseGraph, motion_covariance
+from .pose_graph import KeyframeEdge, PoseGraph, motion_covariance
 from .recognition import PlaceRecognizer
+from .rectifying_extractor import RectifyingExtractor
 from .reunion import Reunion
 from .segments import Segments
 from .visual_map import VisualMap
@@ -29,14 +29,14 @@ _RECKONED_VARIANCE = 0.05**2  # [m^2] and [rad^2], of a keyframe placed by odome
 _NEVER_SAW = -1
 
 
-class Memory:
+class MapHistory:
     """Records the map's growth and pruning, and corrects the map when a place is recognized."""
 
     def __init__(
         self,
         visual_map: VisualMap,
-        localizer: Localizer,
-        eye: Eye,
+        localizer: VisualLocalizer,
+        eye: RectifyingExtractor,
         reunion: Reunion,
         *,
         min_inliers: int,
@@ -46,13 +46,13 @@ class Memory:
         self._keyframes: dict[int, Keyframe] = {}  # including those just removed from the map
         self.recognizer = PlaceRecognizer(visual_map, localizer, min_inliers=min_inliers)
         detector = LoopDetector(visual_map, self.recognizer, self._graph)
-        self._closer = LoopCloser(visual_map, detector, self._graph)
+        self._closer = VisualLoopCloser(visual_map, detector, self._graph)
         self.segments = Segments(self._graph)
         self.reference = _NEVER_SAW  # the keyframe that the newest frame refers to
         self.revision = 0  # increases with every correction
         self._before = Trajectory.empty()  # poses of the map that this one replaced
 
-    def follow(self, before: Memory, T_local_keyframe: Mapping[int, Transform]) -> None:
+    def follow(self, before: MapHistory, T_local_keyframe: Mapping[int, Transform]) -> None:
         """Continue from a map that is replaced; `T_local_keyframe` are its corrected keyframes."""
         before._closer.finish()
         before.shutdown()
@@ -79,7 +79,7 @@ class Memory:
         return [se3.inverse(self._map.keyframes[k].T_local_base) @ T_local_base for k in near]
 
     def insert(
-        self, fix: Fix | None, depth_m: NDArray[np.float32] | None, *, guessed_s: float | None
+        self, fix: VisualFix | None, depth_m: NDArray[np.float32] | None, *, guessed_s: float | None
     ) -> None:
         """Add the map's newest keyframe; `fix` is its pose in the map, None for odometry.
 
@@ -179,7 +179,7 @@ class Memory:
         keyframe_id, T_keyframe_base = self._frames.newest
         return np.asarray(self._keyframes[keyframe_id].T_local_base @ T_keyframe_base)
 
-    def _edges(self, keyframe_id: int, fix: Fix | None) -> list[Edge]:
+    def _edges(self, keyframe_id: int, fix: VisualFix | None) -> list[KeyframeEdge]:
         """Return the edges to the keyframes against which a new keyframe's pose was measured.
 
         A landmark belongs to the keyframe that saw it first; the edge to each such keyframe gets
@@ -229,6 +229,8 @@ class Memory:
             self.recognizer.places.remove(keyframe_id)
 
 
-def _edge(start: int, end: int, T_start_end: Transform, covariance: NDArray[np.float64]) -> Edge:
+def _edge(
+    start: int, end: int, T_start_end: Transform, covariance: NDArray[np.float64]
+) -> KeyframeEdge:
     covariance = motion_covariance(T_start_end, covariance)
-    return Edge(start=start, end=end, T_start_end=T_start_end, covariance=covariance)
+    return KeyframeEdge(start=start, end=end, T_start_end=T_start_end, covariance=covariance)

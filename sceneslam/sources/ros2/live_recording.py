@@ -22,7 +22,7 @@ _TF = {names.TF: Qos.RELIABLE, names.TF_STATIC: Qos.HISTORY}
 _TF_TYPE = "tf2_msgs/msg/TFMessage"
 
 
-class Heard:
+class LiveRecording:
     """A recording in memory that grows while a transport is listened to.
 
     `topics` holds what was heard, `announced` also what others only say that they publish.

@@ -20,7 +20,7 @@ _POSE_TYPES = {"odometry": "nav_msgs/msg/Odometry", "pose": "geometry_msgs/msg/P
 _LOG_ODDS = 4.0  # of a cell that is said to be occupied for sure
 
 
-class Heard:
+class NodeListener:
     """Listens; what is said comes in a thread of the transport's."""
 
     def __init__(self, transport: Transport, settings: dict[str, Any]) -> None:

@@ -14,7 +14,7 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
 from .features import FeatureExtractor
-from .localizer import Fix, Localizer
+from .localizer import VisualFix, VisualLocalizer
 from .shifts import shifts_px_per_s
 from .shutter import RollingShutter, Turning, moves_px_per_s
 from .turn_rate import TurnRate, measured_rate
@@ -25,11 +25,11 @@ _ROW_STEP = 32  # rows that are compared first
 _ROUNDS = 2  # of correcting and matching again if the turn rate was unknown
 
 
-class Eye:
+class RectifyingExtractor:
     """Finds features and corrects the rolling shutter, which it calibrates by the poses found."""
 
     def __init__(
-        self, visual_map: VisualMap, localizer: Localizer, extractor: FeatureExtractor
+        self, visual_map: VisualMap, localizer: VisualLocalizer, extractor: FeatureExtractor
     ) -> None:
         self._landmarks, self._camera = visual_map.landmarks, visual_map.camera
         self._localizer = localizer
@@ -70,7 +70,7 @@ class Eye:
             turning=turning,
         )
 
-    def settle(self, view: View, fix: Fix, predictor: Predictor) -> tuple[View, Fix]:
+    def settle(self, view: View, fix: VisualFix, predictor: Predictor) -> tuple[View, VisualFix]:
         """Return the view and its pose, corrected by the turn rate that the pose gives."""
         turn = measured_rate(view.observation, predictor, fix.estimate.T_local_base)
         if self._shutter.readout_s and turn.is_unknown:
@@ -84,7 +84,7 @@ class Eye:
         """Apply the new readout time, if it changed enough; return the change [s]."""
         return self._shutter.step_s()
 
-    def _turn(self, view: View, fix: Fix, turn: TurnRate) -> tuple[View, Fix]:
+    def _turn(self, view: View, fix: VisualFix, turn: TurnRate) -> tuple[View, VisualFix]:
         """Estimate the turn rate from the rows' residuals and the prior rate."""
         camera, seen = self._camera, fix.estimate.linearised
         rotation_cam_base = camera.T_base_cam[:3, :3].T
@@ -103,7 +103,7 @@ class Eye:
         turning = replace(view.turning, rate_cam=view.turning.rate_cam + change)
         return replace(view, features=features, turning=turning), replace(fix, estimate=estimate)
 
-    def _learn(self, view: View, fix: Fix) -> View:
+    def _learn(self, view: View, fix: VisualFix) -> View:
         """Update the readout time; return the view with its pose's derivative by it."""
         uv_px = view.features.uv_px[fix.feature_rows]
         slope_px = moves_px_per_s(self._camera, uv_px, view.turning.rate_cam)
