@@ -22,7 +22,7 @@ from sceneslam.types.errors import InputError
 
 
 def open_bag(path: Path) -> ChunkedRecording:
-    """Return the recording; raises InputError when the file is no ROS 1 bag."""
+    """Return the recording of a file; raises InputError unless it is a ROS 1 bag."""
     bag = BagFile(path)
     return ChunkedRecording([bag.layout()], bag.read, is_slow=bag.is_slow)
 
@@ -75,10 +75,10 @@ class BagFile:
         )
 
     def read(self, chunk: Chunk) -> ChunkContent:
-        """Return a chunk's messages that are whole."""
+        """Return the undamaged messages of a chunk."""
         survey = self._survey
         outer = survey.chunks[chunk.offset]
-        is_last = survey.is_cut_off and survey.is_beyond(outer)  # its rest is missing, not damaged
+        is_last = survey.is_cut_off and survey.is_beyond(outer)  # the rest is missing
         data = survey.content(outer)
         if data is None:
             return ChunkContent(messages=(), lost_bytes=0 if is_last else chunk.length)
@@ -96,7 +96,7 @@ class BagFile:
         return ChunkContent(messages=messages, lost_bytes=lost)
 
     def _note(self, chunks: Sequence[Chunk], topics: Mapping[str, TopicType]) -> str:
-        """Return what is wrong with the bag as a whole."""
+        """Return a sentence on damage of the bag as a whole, "" without."""
         survey = self._survey
         if survey.is_sound:
             return ""
@@ -109,7 +109,7 @@ class BagFile:
         return cut_off(chunks, topics, f"{share} of the recording")
 
     def _topics(self) -> dict[str, TopicType]:
-        """Return the topics that hold messages; remember which connection is which."""
+        """Return the topics that hold messages; store the topic of each connection."""
         topics: dict[str, TopicType] = {}
         counts = self._survey.counts()
         for number, fields in self._survey.connections.items():

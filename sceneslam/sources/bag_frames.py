@@ -1,4 +1,4 @@
-"""Where the sensors of a recording sit on its robot."""
+"""Sensor poses on the robot, from a recording's transforms."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.se3 import Transform
 
 _BASES = ("base_link", "base_footprint", "base")
-_FIRST_MOVING = 200  # messages of /tf that are looked through for mounts
+_FIRST_MOVING = 200  # messages of /tf that are searched for sensor mounts
 
 
 class FrameTree:
-    """The transforms of /tf_static and, where those say nothing, the first of /tf."""
+    """The transforms of /tf_static; for frames that are missing there, the first ones of /tf."""
 
     def __init__(self, recording: Recording, base_frame: str | None) -> None:
         self._up: dict[str, tuple[str, Transform]] = {}  # child -> parent, T_parent_child
@@ -32,7 +32,7 @@ class FrameTree:
         self.base = base_frame or next((name for name in _BASES if name in frames), None)
 
     def T_base(self, frame: str) -> Transform | None:
-        """Return T_base_frame, None when the recording does not connect the two."""
+        """Return T_base_frame (4, 4) [m]; None if no chain of transforms connects both."""
         if self.base is None:
             return None
         base_root, T_root_base = self._to_root(self.base)

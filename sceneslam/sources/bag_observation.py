@@ -1,4 +1,4 @@
-"""Bundles of ROS messages as observations."""
+"""Decoding of synchronised ROS messages into observations."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Sensor
 from sceneslam.types.se3 import Transform
 
-# One observation per message of the first of these that there is.
+# There is one observation per message of the first available sensor of this list.
 PRIMARY = (Sensor.IMAGE, Sensor.DEPTH, Sensor.POINTS, Sensor.SCAN, Sensor.ODOMETRY)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Decoded:
-    """An observation, None when nothing of it could be decoded, and what was wrong."""
+    """An observation (None if no part of it could be decoded) and its decoding problems."""
 
     observation: Observation | None
     problems: tuple[str, ...]
@@ -31,7 +31,7 @@ class Decoded:
 
 
 class BundleDecoder:
-    """Decodes bundles; safe to call from several threads."""
+    """Decodes synchronised samples; thread-safe."""
 
     def __init__(
         self,
@@ -44,10 +44,10 @@ class BundleDecoder:
         self._sensors = sensors
         self._size_wh = size_wh
         self._units = units
-        self._has_depth = False  # of the image's size
+        self._has_depth = False  # True after the first depth image of the colour image's size
 
     def observe(self, bundle: SynchronisedSamples) -> Decoded:
-        """Return the bundle's observation; an image of another size is as good as damaged.
+        """Return the observation of the samples; an image of another size is treated as damaged.
 
         Raises InputError where the first depth image has another size than the image.
         """
@@ -119,7 +119,7 @@ class BundleDecoder:
         return False
 
     def _refuse_first(self, stamp_ns: int, depth_m: NDArray[np.float32]) -> None:
-        """Raise InputError where no depth so far had the image's size: no other will."""
+        """Raise InputError if no depth image so far had the colour image's size."""
         if not self._has_depth and self._size_wh is not None:
             height, width = depth_m.shape
             raise InputError(
@@ -154,7 +154,7 @@ class BundleDecoder:
 
 
 def _samples(bundle: SynchronisedSamples, sensor: Sensor) -> NDArray[np.float64] | None:
-    """Return (M, 4): seconds after the stamp, values in base."""
+    """Return IMU samples (M, 4): time relative to the stamp [s], then x, y, z in base."""
     if not bundle.samples[sensor]:
         return None
     rows = [
@@ -165,9 +165,10 @@ def _samples(bundle: SynchronisedSamples, sensor: Sensor) -> NDArray[np.float64]
 
 
 def measured(message: Any, sensor: Sensor, T_base_imu: Transform) -> Any:
-    """Return what a decoded message holds of a sensor, None where it makes no sense.
+    """Return a sensor's measurement in a decoded message, None if it is invalid.
 
-    The pose (4, 4) of an Odometry, the vector (3,) of an Imu in base, else the message itself.
+    Odometry gives T_odom_base (4, 4) [m], an Imu the vector (3,) [rad/s or m/s^2] in base, any
+    other type the message itself.
     """
     if sensor is Sensor.ODOMETRY:
         return decode.transform(message.pose.pose.position, message.pose.pose.orientation)

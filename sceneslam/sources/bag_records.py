@@ -11,7 +11,7 @@ from mmap import mmap
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG_HEADER, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 5, 6, 7
 _U32, _TIME = struct.Struct("<I"), struct.Struct("<II")
-_FIELDS = {  # what each record must say, and in how many bytes (0: any number)
+_FIELDS = {  # required header fields of each record and their lengths [bytes], 0: any
     MESSAGE: {b"conn": 4, b"time": 8},
     BAG_HEADER: {b"index_pos": 8},
     CHUNK: {b"compression": 0},
@@ -25,7 +25,7 @@ Blob = bytes | mmap
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BagRecord:
-    """One record: its header fields, and where its data are."""
+    """One record: its header fields and the position of its data."""
 
     opcode: int
     fields: dict[bytes, bytes]
@@ -49,7 +49,7 @@ class BagRecord:
 
 
 def header_fields(header: bytes) -> dict[bytes, bytes] | None:
-    """Return the fields of a record's header, None when they do not add up."""
+    """Return the fields of a record's header, None if their lengths contradict the header's."""
     fields, position = {}, 0
     while position < len(header):
         if position + _U32.size > len(header):
@@ -65,7 +65,7 @@ def header_fields(header: bytes) -> dict[bytes, bytes] | None:
 
 
 def record_at(data: Blob, position: int) -> BagRecord | None:
-    """Return the record at a place, None when there is none; its data may reach beyond the end."""
+    """Return the record at a position [bytes], None if there is none; its data may be cut off."""
     if position + _U32.size > len(data):
         return None
     (length,) = _U32.unpack_from(data, position)
@@ -87,7 +87,7 @@ def record_at(data: Blob, position: int) -> BagRecord | None:
 
 
 def records_in(data: bytes) -> Iterator[BagRecord]:
-    """Yield a chunk's records, going on at the next message after damage."""
+    """Yield a chunk's records; after damage, continue at the next message."""
     position: int | None = 0
     while position is not None and position < len(data):
         record = record_at(data, position)
@@ -99,12 +99,12 @@ def records_in(data: bytes) -> Iterator[BagRecord]:
 
 
 def find_chunk(data: Blob, start: int) -> int | None:
-    """Return the next place at or after `start` where a chunk record begins, None if none does."""
+    """Return the position [bytes] of the first chunk record at or after `start`, None without."""
     return _find(data, start, b"compression=", CHUNK)
 
 
 def find_message(data: bytes, start: int) -> int | None:
-    """Return the next place at or after `start` where a message begins, None if none does."""
+    """Return the position [bytes] of the first message at or after `start`, None without."""
     return _find(data, start, b"op=\x02", MESSAGE)
 
 
@@ -121,7 +121,7 @@ def _find(data: Blob, start: int, mark: bytes, opcode: int) -> int | None:
 
 
 def _is_complete(fields: dict[bytes, bytes]) -> bool:
-    """Tell whether a record says what its kind has to say."""
+    """Tell whether a record has all required fields of its type."""
     if len(fields.get(b"op", b"")) != 1:
         return False
     needed = _FIELDS.get(fields[b"op"][0], {})

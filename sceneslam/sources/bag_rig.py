@@ -1,4 +1,4 @@
-"""The sensors of a recording: kinds, intrinsics and places."""
+"""The sensors of a recording: types, intrinsics and poses on the robot."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sceneslam.types.errors import InputError
 from sceneslam.types.rig import Camera, Laser, Lidar, Rig, Sensor, Wheels, optical_to_rep103
 from sceneslam.types.se3 import Transform
 
-_NEEDS = {  # sensor -> whose topic it comes from
+_NEEDS = {  # sensor -> field of BagTopics that names its topic
     Sensor.IMAGE: "image",
     Sensor.DEPTH: "depth",
     Sensor.SCAN: "scan",
@@ -30,7 +30,7 @@ _DEPTH_RANGE_M, _LIDAR_RANGE_M = (0.3, 8.0), (1.0, 100.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Given:
-    """What the configuration says in place of the recording; None: as recorded."""
+    """Values of the configuration that replace recorded ones; None: as recorded."""
 
     intrinsics: Intrinsics | None
     depth_range_m: tuple[float, float] | None
@@ -39,7 +39,7 @@ class Given:
 
 
 def sensor_topics(recording: Recording, topics: BagTopics) -> dict[Sensor, str]:
-    """Return the topic of each sensor that the recording has; an Imu may be two of them."""
+    """Return the topic of each recorded sensor; one Imu topic can be gyro and accelerometer."""
     chosen = {sensor: getattr(topics, need) for sensor, need in _NEEDS.items()}
     imu = first(recording, topics.imu) if topics.imu else None
     measured = {} if imu is None else decode.inertial(imu)
@@ -70,14 +70,14 @@ def make_rig(recording: Recording, topics: BagTopics, frames: FrameTree, given: 
 
 
 def place(recording: Recording, topic: str, frames: FrameTree) -> Transform:
-    """Return T_base_sensor of a topic's sensor, the identity where the recording is silent."""
+    """Return T_base_sensor (4, 4) [m] of a topic's sensor; identity if it is not recorded."""
     message = first(recording, topic)
     T_base_sensor = None if message is None else frames.T_base(decode.frame_id(message))
     return se3.identity() if T_base_sensor is None else T_base_sensor
 
 
 def picture_size_wh(recording: Recording, topics: BagTopics) -> tuple[int, int]:
-    """Return the size of the first image (or depth, where there are no images) that is whole."""
+    """Return width and height [px] of the first undamaged image, or depth image without images."""
     topic = topics.image or topics.depth or ""
     for message in recording.messages({topic}):
         decoded = recording.decode(message)
@@ -98,7 +98,7 @@ def _camera(
     given: Intrinsics | None,
     depth_range_m: tuple[float, float],
 ) -> Camera | None:
-    """Return the camera of the image, or of the depth where there is no image."""
+    """Return the camera of the colour images; without these, that of the depth images."""
     message = first(recording, topics.image or topics.depth or "")
     size_wh = picture_size_wh(recording, topics)
     info = first(recording, topics.camera_info) if topics.camera_info else None
@@ -130,7 +130,7 @@ def _camera(
 
 
 def _said(said: Any, key: str) -> tuple[float, float] | None:
-    """Return a range that our own recordings carry, None when it is missing or damaged."""
+    """Return a range [m] from the metadata of a SceneSLAM recording; None if missing or damaged."""
     try:
         low, high = json.loads(said[key])
         return float(low), float(high)

@@ -1,4 +1,4 @@
-"""What a ROS 1 bag holds and where: from its index, or from its content where that is damaged."""
+"""Contents of a ROS 1 bag: from its index or, if that is damaged, from a full read."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from sceneslam.sources import bag_records as records
 from sceneslam.sources.bag_records import BagRecord
 
 _INDEX_RECORD_BYTES, _INDEX_ENTRY_BYTES = 55, 12
-_CONNECTION_BYTES = 8192  # of a connection record with its definition, about
+_CONNECTION_BYTES = 8192  # approximate size of a connection record with its message definition
 _KNOWN = range(records.MESSAGE, records.CONNECTION + 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChunkSpan:
-    """What a chunk holds: when, and how many messages of each connection."""
+    """The time range of a chunk and its number of messages per connection."""
 
     start_ns: int
     end_ns: int
@@ -25,7 +25,7 @@ class ChunkSpan:
 
 @dataclass(slots=True, eq=False)
 class BagSurvey:
-    """The contents of a bag; the place of a chunk is its record's first byte."""
+    """The contents of a bag; a chunk's position is the first byte of its record."""
 
     blob: mmap
     chunks: dict[int, BagRecord] = field(default_factory=dict)
@@ -36,7 +36,7 @@ class BagSurvey:
     lost_bytes: int = 0
 
     def run(self) -> None:
-        """Go through the records; look into the chunks as well when the index is not sound."""
+        """Read the records; unpack the chunks as well if the index is damaged."""
         gaps = self._walk()
         named = {number for span in self.spans.values() for number in span.counts}
         is_whole = set(self.spans) == set(self.chunks) and named <= set(self.connections)
@@ -60,7 +60,7 @@ class BagSurvey:
         return self.index_at == 0 or any(map(self.is_beyond, self.chunks.values()))
 
     def is_beyond(self, record: BagRecord) -> bool:
-        """Tell whether a record reaches beyond the bag's end."""
+        """Tell whether a record extends beyond the end of the file."""
         return record.end > len(self.blob)
 
     def counts(self) -> Counter[int]:
@@ -71,15 +71,15 @@ class BagSurvey:
         return total
 
     def content(self, record: BagRecord) -> bytes | None:
-        """Return a chunk's records, as many as there are; None when they cannot be unpacked."""
+        """Return a chunk's bytes, possibly cut off; None if they cannot be unpacked."""
         data = self.blob[record.data_at : record.end]
         return records.unpack(record.fields.get(b"compression", b""), data)
 
     def _walk(self) -> dict[int, int]:
-        """Take the records; return how many bytes after which chunk made no sense."""
+        """Read all records; return the unreadable bytes after each chunk, by its position."""
         gaps: dict[int, int] = {}
         position = chunk_end = len(records.MAGIC)
-        last = -1  # place of the last chunk
+        last = -1  # position of the last chunk
         while position < len(self.blob):
             record = records.record_at(self.blob, position)
             if record is not None and self._take(position, record):
@@ -98,7 +98,7 @@ class BagSurvey:
         return gaps
 
     def _take(self, place: int, record: BagRecord) -> bool:
-        """Tell whether this is a record (a chunk may be cut off), and remember what it says."""
+        """Store a record's content; return whether it is valid (a chunk may be cut off)."""
         if record.opcode not in _KNOWN:
             return False
         if record.opcode != records.CHUNK and self.is_beyond(record):
@@ -127,7 +127,7 @@ class BagSurvey:
             self.connections[record.number(b"conn")] = {**definition, **topic}
 
     def _look_into(self, place: int, record: BagRecord) -> None:
-        """Take a chunk's connections, times and counts from its content."""
+        """Read connections, times and message counts from a chunk's content."""
         data = self.content(record) or b""
         counts: Counter[int] = Counter()
         times_ns = []

@@ -1,4 +1,4 @@
-"""Which topic of a recording serves which need."""
+"""Choice of a recording's topics: one per sensor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sceneslam.sources.recording import Recording
 from sceneslam.types.errors import ConfigError, InputError
 
 _log = logging.getLogger(__name__)
-NONE = "none"  # as a topic's name: do without
+NONE = "none"  # as a topic's name: the sensor is not used
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _POSES = (
     "nav_msgs/msg/Odometry",
@@ -35,7 +35,7 @@ TYPES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BagTopics:
-    """One topic per need, None where there is none."""
+    """One topic per sensor or reference; None: not available."""
 
     image: str | None
     depth: str | None
@@ -49,9 +49,9 @@ class BagTopics:
 
 
 def choose_topics(recording: Recording, given: Mapping[str, str | None]) -> BagTopics:
-    """Return the topics that are named and, for the rest, those found by type and encoding.
+    """Return the configured topics; the others are found by message type and encoding.
 
-    Raises ConfigError for a name that is not there, InputError when several topics could serve.
+    Raises ConfigError for an unknown topic, InputError if several topics fit.
     """
     for need, name in given.items():
         _check_given(recording, need, name)
@@ -84,7 +84,7 @@ def choose_topics(recording: Recording, given: Mapping[str, str | None]) -> BagT
 
 
 def first(recording: Recording, topic: str) -> Any:
-    """Return a topic's first message that makes sense, None when there is none."""
+    """Return a topic's first message that can be decoded, None without."""
     for message in recording.messages({topic}):
         decoded = recording.decode(message)
         if decoded is not None:
@@ -93,7 +93,7 @@ def first(recording: Recording, topic: str) -> Any:
 
 
 def describe(recording: Recording) -> str:
-    """Return the topics and their types, to show."""
+    """Return the topics and their types as text."""
     return ", ".join(f"{name} ({kind.msgtype})" for name, kind in sorted(recording.topics.items()))
 
 
@@ -123,13 +123,13 @@ def _is_truth(name: str) -> bool:
 
 
 def _is_8_bit_depth(name: str, message: Any) -> bool:
-    """Tell whether this is a picture of depth for people: its unit is lost."""
+    """Tell whether the image is an 8-bit visualisation of depth, without its unit."""
     is_colour = "color" in name or "rgb" in name
     return "depth" in name and not is_colour and decode.is_grey(message)
 
 
 def _one_transport(topics: Sequence[str]) -> list[str]:
-    """Return the topics without the compressed ones whose raw images are there as well."""
+    """Return the topics without compressed ones whose raw images are recorded as well."""
     return [name for name in topics if name.rsplit("/", 1)[0] not in topics]
 
 
@@ -138,12 +138,12 @@ def _without_grey(topics: Sequence[str], firsts: Mapping[str, Any]) -> list[str]
 
 
 def _prefer(topics: Sequence[str], is_better: Callable[[str], bool]) -> list[str]:
-    """Return the better topics where there are some, else all."""
+    """Return the topics for which `is_better` holds; if there are none, all."""
     return [name for name in topics if is_better(name)] or list(topics)
 
 
 def _beside(picture: str | None, infos: Sequence[str]) -> list[str]:
-    """Return the CameraInfo topic nearest above the image's own name, else all."""
+    """Return the CameraInfo topic in the image topic's nearest namespace, else all."""
     parts = (picture or "").split("/")
     for length in range(len(parts) - 1, 0, -1):
         candidate = "/".join([*parts[:length], "camera_info"])

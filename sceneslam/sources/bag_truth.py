@@ -22,10 +22,10 @@ CAMERA, BASE = "camera", "base"
 def read_truth(
     recording: Recording, topics: BagTopics, frames: FrameTree, rig: Rig, truth_frame: str | None
 ) -> GroundTruth | None:
-    """Return the true poses of `base` and the true scenes, None when there is neither.
+    """Return the true poses of `base` and the true scenes; None if neither is recorded.
 
-    `truth_frame` says whose poses they are, `camera` (optical) or `base`; None: what the messages
-    say, else the base where the recording knows one and the camera where it does not.
+    `truth_frame` is the frame of the recorded poses, `camera` (optical) or `base`. None: the frame
+    that the messages name; without a name, `base` if the recording has that frame, else `camera`.
     """
     trajectory = Trajectory.empty()
     scenes: tuple[SceneChange, ...] = ()
@@ -42,7 +42,7 @@ def read_truth(
 def _tracked(
     recording: Recording, topic: str, frames: FrameTree, rig: Rig, truth_frame: str | None
 ) -> Transform:
-    """Return T_base_tracked of the frame whose poses the topic holds."""
+    """Return T_base_tracked (4, 4) [m], where `tracked` is the frame of the recorded poses."""
     child = str(getattr(first(recording, topic), "child_frame_id", "")).lstrip("/")
     T_base_child = frames.T_base(child) if child else None
     if truth_frame is None and T_base_child is not None:
@@ -54,7 +54,7 @@ def _tracked(
 
 
 def _is_pose(recording: Recording, topic: str) -> bool:
-    """Tell whether the topic's type has no place for the frame that is tracked."""
+    """Tell whether the topic's message type does not name the tracked frame."""
     return "Pose" in recording.topics[topic].msgtype
 
 
@@ -82,7 +82,7 @@ def _pose(message: Any) -> Transform | None:
 
 
 def _scenes(recording: Recording, topic: str) -> tuple[SceneChange, ...]:
-    """Return the changes, without repetitions of the same scene."""
+    """Return the scene changes; repetitions of the same scene are left out."""
     changes: list[SceneChange] = []
     for message in recording.messages({topic}):
         decoded = recording.decode(message)

@@ -24,8 +24,8 @@ from sceneslam.types.rig import Laser, Rig, Sensor, Wheels
 from sceneslam.types.truth import GroundTruth
 
 _LOG = logging.getLogger(__name__)
-_LATE_MAX_S = 2.0  # messages overtake each other by less; a clock that is set jumps farther
-_SAMPLES = 20  # scans of a survey
+_LATE_MAX_S = 2.0  # messages are out of order by less; a clock that is set jumps farther
+_SAMPLES = 20  # scans that are read for a survey
 _OFFSET = b"robot_frontlaser_offset"
 
 
@@ -33,9 +33,9 @@ class Carmen:
     """Gives one observation per FLASER or ROBOTLASER1 line, stamped by its `ipc_timestamp`.
 
     Odometry is that of the line; ODOM and RLASER lines are not used. Scans come in the order of
-    their stamps, which need not be the order of their lines: relations name a scan by its stamp.
-    Where the clock was set back or says nothing, the log's order is kept and the stamps are made
-    to rise. Ranges of `range_max_m` and beyond are no return.
+    their stamps, which can differ from the order of the lines: relations refer to scans by stamp.
+    Where the clock was set back or a stamp is missing, the log's order is kept and the stamps are
+    made to rise. Ranges of `range_max_m` [m] and beyond count as no return.
     """
 
     def __init__(self, path: str, range_max_m: float, wheels: Mapping[str, float] | None) -> None:
@@ -62,7 +62,7 @@ class Carmen:
 
     @property
     def rig(self) -> Rig:
-        """Return the one laser and the wheel odometry."""
+        """Return the rig: one laser and wheel odometry."""
         return self._rig
 
     @property
@@ -87,13 +87,13 @@ class Carmen:
             scan = parse_scan(line)
             if scan is None:
                 self._faults.add(
-                    "scan line makes no sense", f"{stamp_ns * 1e-9:.3f} s: {self._path}"
+                    "scan line is invalid", f"{stamp_ns * 1e-9:.3f} s: {self._path}"
                 )
             else:
                 yield self._observation(scan, stamp_ns)
 
     def survey(self) -> Survey:
-        """Return the scans, some of them and their odometry parsed."""
+        """Return the stamps of the scans and some parsed scans with their odometry."""
         places = spread(len(self._lines), _SAMPLES)
         pairs = sorted({place for at in places for place in (at, min(at + 1, places[-1]))})
         parsed = [(int(self._stamps_ns[at]), parse_scan(self._lines[at])) for at in pairs]
@@ -114,7 +114,7 @@ class Carmen:
         )
 
     def ground_truth(self) -> GroundTruth | None:
-        """Return None: a log has no truth of its own (relations are for the evaluation)."""
+        """Return None: a log holds no ground truth (relations are files of the evaluation)."""
         return None
 
     def _observation(self, scan: ScanLine, stamp_ns: int) -> Observation:
@@ -136,7 +136,7 @@ class Carmen:
         )
 
     def _warn_of_changed(self, changed: NDArray[np.int64]) -> None:
-        """Tell of stamps that were set right: nothing is lost, so it is no fault."""
+        """Log stamps that were corrected; no data are lost, so this is not a fault."""
         if len(changed):
             _LOG.warning(
                 "%d of %d scans, first at %.3f s, have stamps that do not rise; they were given "
@@ -148,13 +148,13 @@ class Carmen:
             )
 
     def _scan_lines(self) -> Sequence[bytes]:
-        """Return the lines of the kind there is more of: some logs tell each scan in both ways."""
+        """Return the scan lines of the more frequent type: some logs use both for each scan."""
         lines = self._path.read_bytes().splitlines()
         new, old = ([one for one in lines if one.startswith(kind)] for kind in (ROBOTLASER, FLASER))
         return new if len(new) >= len(old) else old
 
     def _offset_m(self) -> float:
-        """Return how far the laser sits before the robot's centre, 0 where the log is silent."""
+        """Return the laser's distance [m] in front of the robot's centre, 0 if not logged."""
         with self._path.open("rb") as file:
             for line in file:
                 words = line.split()

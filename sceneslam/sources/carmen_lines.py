@@ -1,4 +1,4 @@
-"""Lines of a CARMEN log."""
+"""Parsing of the lines of a CARMEN log."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class ScanLine:
     ranges_m: NDArray[np.float32]  # (N,) as logged
     angle_min_rad: float
     angle_step_rad: float
-    range_max_m: float | None  # None: the line does not say
+    range_max_m: float | None  # None: not in the line
     T_odom_base: Transform
-    T_base_laser: Transform | None  # None: the line does not say
+    T_base_laser: Transform | None  # None: not in the line
 
 
 def parse_scan(line: bytes) -> ScanLine | None:
-    """Return the scan of a FLASER or ROBOTLASER1 line, None when the line makes no sense."""
+    """Return the scan of a FLASER or ROBOTLASER1 line, None if the line is invalid."""
     try:
         scan = _flaser(line) if line.startswith(FLASER) else _robotlaser(line)
     except (ValueError, IndexError, OverflowError):
@@ -36,7 +36,7 @@ def parse_scan(line: bytes) -> ScanLine | None:
 
 
 def stamp_of(line: bytes) -> int:
-    """Return the ns of a line's `ipc_timestamp`, the third word from its end; 0 if it is none."""
+    """Return the `ipc_timestamp` [ns] of a line, the third word from its end; 0 if invalid."""
     words = line.rsplit(maxsplit=3)
     whole, _, fraction = (words[1] if len(words) == 4 else b"").partition(b".")
     try:
@@ -46,14 +46,14 @@ def stamp_of(line: bytes) -> int:
 
 
 def _is_finite(scan: ScanLine) -> bool:
-    """Tell whether all that is not a range is a number (a range that is none is no return)."""
+    """Tell whether all values but the ranges are finite (a range that is not: no return)."""
     T_base_laser = scan.T_odom_base if scan.T_base_laser is None else scan.T_base_laser
     angles_rad = (scan.angle_min_rad, scan.angle_step_rad)
     return all(np.isfinite(values).all() for values in (scan.T_odom_base, T_base_laser, angles_rad))
 
 
 def _flaser(line: bytes) -> ScanLine:
-    """FLASER count [ranges] x y theta odom_x odom_y odom_theta ipc_time host logger_time."""
+    """Parse FLASER count [ranges] x y theta odom_x odom_y odom_theta ipc_time host logger_time."""
     words = line.split()
     count = int(words[1])
     ranges_m = _numbers(words, 2, count)
@@ -70,9 +70,10 @@ def _flaser(line: bytes) -> ScanLine:
 
 
 def _robotlaser(line: bytes) -> ScanLine:
-    """ROBOTLASER1 type start fov step range_max accuracy mode count [ranges] count [remissions] ...
+    """Parse ROBOTLASER1 type start fov step range_max accuracy mode count [ranges] ...
 
-    ... laser x y theta, robot x y theta, tv rv forward side turn, ipc_time host logger_time.
+    ... count [remissions] laser x y theta, robot x y theta, tv rv forward side turn, ipc_time host
+    logger_time.
     """
     words = line.split()
     start_rad, _, step_rad, range_max_m = map(float, words[2:6])

@@ -1,4 +1,4 @@
-"""Observations whose arrays hold numbers."""
+"""Removal of values that are not finite, and of invalid odometry, from observations."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from sceneslam.types.rig import Sensor
 from sceneslam.types.se3 import Transform, orthonormal
 
 _FAR_M = 1e8  # more than twice around the Earth
-_ROUNDED = 1e-12  # more adds up over a million steps
+_ROUNDED = 1e-12  # rounding error per step; more would accumulate over a million steps
 _SKEW_MAX = 1e-3  # of R^T R off the identity; the rounding of float32 is a thousandth of that
 
 
 def cleaned(observation: Observation, log: FaultLog) -> Observation:
-    """Return the observation with finite arrays; the same object when there is nothing to mend.
+    """Return the observation with finite arrays; the same object if nothing had to be removed.
 
-    Depth that is not finite is missing (REP-118), which is a value. Empty images, points and gyro
-    samples that are not finite, and odometry that is no pose, are left out and told to `log`.
+    Depth that is not finite becomes 0, missing (REP-118). Empty images, points and gyro samples
+    that are not finite, and odometry that is not a valid pose, are left out and counted in `log`.
     """
     changes = {
         **_pictures(observation, log),
@@ -71,7 +71,7 @@ def _motion(observation: Observation, log: FaultLog) -> Mapping[str, object]:
     elif T_odom_base is not None:
         skew = _skew(T_odom_base)
         if not skew <= _SKEW_MAX:
-            log.add("odometry that is no pose", at_stamp(observation.stamp_ns))
+            log.add("odometry is not a valid pose", at_stamp(observation.stamp_ns))
             changes["T_odom_base"] = None
         elif skew > _ROUNDED:
             changes["T_odom_base"] = locked(orthonormal(T_odom_base))
@@ -88,7 +88,7 @@ def _motion(observation: Observation, log: FaultLog) -> Mapping[str, object]:
 
 
 def _skew(T_odom_base: Transform) -> float:
-    """Return how far the rotation is from being one; inf where this is no place on Earth."""
+    """Return the largest entry of |R^T R - I|; inf for an impossible position."""
     if T_odom_base.shape != (4, 4) or np.abs(T_odom_base[:3, 3]).max() > _FAR_M:
         return np.inf
     rotation = T_odom_base[:3, :3]

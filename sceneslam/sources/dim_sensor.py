@@ -1,9 +1,9 @@
-"""What a camera would have recorded in less light: an 8-bit image, dimmed with its noise.
+"""Simulation of less light on a recorded 8-bit image, with the sensor noise of that light.
 
-A recorded value stands for light by the sRGB curve and so for `full_well_electrons` at most. In
-less light the sensor counts fewer electrons, whose number is Poisson distributed, and adds read
-noise; automatic exposure makes up for the light as far as its gain goes; eight bits are kept.
-Only noise is added that the recording does not hold already: none at full light.
+The sRGB curve gives the light of a recorded value; white is `full_well_electrons` electrons. In
+less light, the sensor counts fewer electrons, with Poisson distributed shot noise, and adds read
+noise. Automatic exposure amplifies the signal up to its largest gain; the result has eight bits.
+Only noise that the recording does not contain already is added: none at full light.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from sceneslam.types.errors import ConfigError
 
 _LEVELS = 256
-_QUANTILES = 4096  # of the noise, per recorded value: what 12 random bits choose from
-_GAUSS_FROM = 25.0  # electrons from which a Poisson distribution is taken for a Gaussian
+_QUANTILES = 4096  # of the noise, per recorded value; 12 random bits select one
+_GAUSS_FROM = 25.0  # electrons; above, the Poisson distribution is approximated by a Gaussian
 _SMALLEST_SIGMA = 1e-3  # electrons
-_RARE = 1e-6  # far below a quantile
+_RARE = 1e-6  # probability that is neglected: far less than one quantile
 
 
 class DimSensor:
-    """A camera's sensor, by look-up: each value has a table of what it may become."""
+    """A camera's sensor as a look-up table: for each recorded value, the possible new values."""
 
     def __init__(
         self, *, full_well_electrons: float, read_noise_electrons: float, gain_max: float
@@ -41,7 +41,7 @@ class DimSensor:
     def dim(
         self, image_bgr: NDArray[np.uint8], light: float, rng: np.random.Generator
     ) -> NDArray[np.uint8]:
-        """Return the image (H, W, 3) as it would be with `light` (0 to 1) of its light."""
+        """Return the BGR image (H, W, 3) with the fraction `light` (0 to 1) of its light."""
         if light != self._light:
             self._light, self._table = light, self._make_table(light)
         noise = np.frombuffer(rng.bytes(2 * image_bgr.size), dtype="<u2")
@@ -51,7 +51,7 @@ class DimSensor:
         return np.take(self._table, index).reshape(image_bgr.shape)
 
     def gain(self, light: float) -> float:
-        """Return by how much automatic exposure makes up for `light` (0 to 1)."""
+        """Return the gain of automatic exposure at the fraction `light` (0 to 1) of the light."""
         return min(self._gain_max, 1.0 / light) if light > 0 else self._gain_max
 
     def _make_table(self, light: float) -> NDArray[np.uint8]:
@@ -59,9 +59,9 @@ class DimSensor:
         gain = self.gain(light)
         values = np.arange(_LEVELS)
         electrons = srgb_to_linear(values / 255.0) * self._full_well * light
-        # What reaches the next value up: the new value is at most k below limits[k].
+        # limits[k]: number of electrons below which the new value is at most k.
         limits = srgb_to_linear((values[:-1] + 0.5) / 255.0) * self._full_well / gain
-        added = electrons * (1.0 - light)  # shot noise that the recording does not hold
+        added = electrons * (1.0 - light)  # missing variance of shot noise
         sigma = max(self._read_noise * np.sqrt(1.0 - light**2), _SMALLEST_SIGMA)
         below = np.empty((_LEVELS, _LEVELS))
         below[:, -1] = 1.0
@@ -85,9 +85,9 @@ def srgb_to_linear(srgb: NDArray[np.floating]) -> NDArray[np.float64]:
 def _poisson_cdf(
     limits: NDArray[np.float64], mean: NDArray[np.float64], sigma: float
 ) -> NDArray[np.float64]:
-    """Return P(N + G < limit) (V, L) of Poisson counts N (V means) with Gaussian noise G.
+    """Return P(N + G < limit), (V, L), for Poisson counts N with V means and Gaussian noise G.
 
-    `limits` (V, L) rise along L; those that are never reached are not worked out.
+    `limits` (V, L) rise along L; those with negligible probability are not computed.
     """
     below = np.ones_like(limits)
     if not len(mean):

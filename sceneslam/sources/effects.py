@@ -1,4 +1,4 @@
-"""Effects on any source with images."""
+"""Changes of lighting, applied to the images of any source."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth, SceneChange
 
 BRIGHT, DARK = "Bright", "Dark"
-_DARK_BELOW = 0.5  # of the recorded light: a mean grey of 130 becomes 95
+_DARK_BELOW = 0.5  # of the recorded light: a mean grey value of 130 becomes 95
 
 
 class LightsOut(Wrapped):
-    """Dims the colour images of a source by a schedule; depth, which brings its light, stays.
+    """Dims a source's colour images by a schedule; depth, actively lit, is not changed.
 
     `schedule` is a list of [time, level], the time in seconds from the first observation or, with
     `schedule_unit: ratio`, as share of the recording. Level 1 is the image as recorded, bit for
@@ -78,7 +78,7 @@ class LightsOut(Wrapped):
             yield self._dimmed(observation, (observation.stamp_ns - start_ns) * 1e-9)
 
     def ground_truth(self) -> GroundTruth | None:
-        """Return the source's truth with the scenes that the schedule makes of it."""
+        """Return the source's ground truth with the scenes that follow from the schedule."""
         truth = self._source.ground_truth()
         start_ns = self.start_ns()
         if start_ns is None:
@@ -115,7 +115,7 @@ class LightsOut(Wrapped):
 def _merge(
     scenes: Sequence[SceneChange], dark: Sequence[tuple[int, bool]]
 ) -> tuple[SceneChange, ...]:
-    """Return the scenes, Dark where the light is off and Bright where nothing else is known."""
+    """Return the scenes: Dark while the light is off, else the source's, else Bright."""
     stamps_ns = sorted({change.stamp_ns for change in scenes} | {stamp for stamp, _ in dark})
     merged: list[SceneChange] = []
     for stamp_ns in stamps_ns:

@@ -1,4 +1,4 @@
-"""Any source with a file of its images' exposures beside it."""
+"""Exposures of a source's images, read from a file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _COLUMNS = "`stamp_s exposure_s` or `stamp_s exposure_s gain`, the stamps rising
 
 
 class ExposureTimes(Wrapped):
-    """Gives every image the exposure that the file lists for the nearest stamp.
+    """Assigns to every image the exposure that the file lists for the nearest stamp.
 
     A line of the file is `stamp_s exposure_s` or `stamp_s exposure_s gain`; `#` begins a comment.
     `reference_s` is the product of time and gain that counts as 1 (null: the median of the file).

@@ -1,4 +1,4 @@
-"""Any source, one of whose sensors fails for a while."""
+"""Temporary failure of one sensor of any source."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from sceneslam.types.truth import GroundTruth, SceneChange
 
 
 class FailingSensor(Wrapped):
-    """Passes a source's observations on; in some spans of time one sensor fails.
+    """Passes on a source's observations; during given time spans, one sensor fails.
 
     `failure` is a name of FAILURES, `spans_s` a list of [from, to] in seconds after the first
-    observation; how bad it is (blur, share of pixels) is drawn from the seed. With `names_scene`
-    the true scene is then that of the failure (camera_frozen: CameraFrozen), and outside it the
-    source's, or `otherwise` where the source knows none.
+    observation; its severity (blur, share of pixels) is drawn from the seed. With `names_scene`
+    the true scene during a failure is named after it (camera_frozen: CameraFrozen); else it is the
+    source's, or `otherwise` if the source has no true scenes.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class FailingSensor(Wrapped):
         self._names_scene, self._otherwise = names_scene, otherwise
 
     def __iter__(self) -> Iterator[Observation]:
-        """Yield the source's observations, in the spans with a sensor that fails."""
+        """Yield the source's observations; within the spans, one sensor fails."""
         failure = FAILURES[self._failure](np.random.default_rng([self._seed, 3]))
         start_ns: int | None = None
         for observation in self._source:
@@ -59,7 +59,7 @@ class FailingSensor(Wrapped):
             yield failure.pass_on(observation, is_failing=is_failing)
 
     def ground_truth(self) -> GroundTruth | None:
-        """Return the source's truth, with the scenes of the failure where it names them."""
+        """Return the source's ground truth, with the failures' scenes if `names_scene`."""
         truth = self._source.ground_truth()
         start_ns = self.start_ns() if self._names_scene else None
         if start_ns is None:

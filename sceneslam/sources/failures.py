@@ -1,4 +1,4 @@
-"""How sensors fail: each failure changes what one sensor says, and nothing else."""
+"""Models of sensor failures; each changes the measurements of one sensor only."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ Random = np.random.Generator
 
 
 class Failure(Protocol):
-    """One sensor that fails at times. It sees all observations, by rising stamp."""
+    """A failure of one sensor; it is given all observations, by rising stamp."""
 
     def pass_on(self, observation: Observation, *, is_failing: bool) -> Observation:
-        """Return the observation as it is with a sensor that fails, or does not."""
+        """Return the observation, with the sensor's measurement changed if it is failing."""
         ...
 
 
 @dataclass(slots=True)
 class _Spoilt:
-    """A measurement that is changed, each by itself: value, stamp [ns] -> value or None."""
+    """A failure that changes each measurement by itself: (value, stamp [ns]) -> value or None."""
 
     name: str  # of the field of Observation
     change: Callable[[Any, int], Any]
@@ -48,7 +48,7 @@ class _Spoilt:
 
 @dataclass(slots=True)
 class _Frozen:
-    """A sensor that repeats its first measurement of a failure."""
+    """A sensor that repeats its first measurement of the failure."""
 
     name: str
     _first: Any = None
@@ -67,11 +67,11 @@ class _Frozen:
 
 @dataclass(slots=True)
 class _Wheels:
-    """Encoders that count so many times the distance; their pose is their sum."""
+    """Wheel encoders that measure `ratio` times the motion; odometry integrates it."""
 
-    ratio: float  # 0: they count no turn either
-    _T_true: Transform | None = None  # the last odometry as it came ...
-    _T_counted: Transform | None = None  # ... and as it was passed on since the first failure
+    ratio: float  # 0: rotation is not measured either
+    _T_true: Transform | None = None  # last odometry of the source ...
+    _T_counted: Transform | None = None  # ... and as passed on, from the first failure on
 
     def pass_on(self, observation: Observation, *, is_failing: bool) -> Observation:
         T_odom_base = observation.T_odom_base
@@ -91,7 +91,7 @@ class _Wheels:
 
 @dataclass(slots=True)
 class _Dirt:
-    """Three to eight dark spots on the lens, out of focus and so with soft edges."""
+    """Three to eight dark spots on the lens, with soft edges because they are out of focus."""
 
     rng: Random
     _cover: NDArray[np.float32] | None = None  # (H, W, 1) 0 (clean) to 1
@@ -118,7 +118,7 @@ def _silent(value: object, stamp_ns: int) -> None:
 
 
 def _black(rng: Random, image_bgr: Image, stamp_ns: int) -> Image:
-    """Return what a sensor reads behind a lens cap: its noise."""
+    """Return the image of a covered lens: sensor noise."""
     return rng.integers(0, 3, image_bgr.shape, np.uint8)
 
 
@@ -127,7 +127,7 @@ def _overexposed(gain: float, image_bgr: Image, stamp_ns: int) -> Image:
 
 
 def _blurred(rng: Random, sigma_ratio: float, image_bgr: Image, stamp_ns: int) -> Image:
-    """Return an image out of focus; the noise is the sensor's, and stays sharp."""
+    """Return a defocused image; the sensor's noise is added after the blur."""
     soft = cv2.GaussianBlur(image_bgr, (0, 0), sigma_ratio * image_bgr.shape[1])
     noisy = soft.astype(np.int16) + rng.integers(-2, 3, image_bgr.shape, np.int16)
     return np.asarray(np.clip(noisy, 0, 255), np.uint8)
@@ -139,7 +139,7 @@ def _flickering(rate_hz: float, low: float, image_bgr: Image, stamp_ns: int) -> 
 
 
 def _torn(rng: Random, image_bgr: Image, stamp_ns: int) -> Image:
-    """Return an image that lost packets: from some rows on it is shifted sideways."""
+    """Return an image with lost packets: below some rows it is shifted sideways."""
     torn = image_bgr.copy()
     height, width = image_bgr.shape[:2]
     for row in np.sort(rng.integers(0, height, int(rng.integers(3, 7)))).tolist():
@@ -152,13 +152,13 @@ def _empty(depth_m: Depth, stamp_ns: int) -> Depth:
 
 
 def _noisy(rng: Random, share: float, depth_m: Depth, stamp_ns: int) -> Depth:
-    """Return depth with a share of pixels at random, as where two projectors interfere."""
+    """Return depth with a share of random pixels, as when two projectors interfere."""
     wild_m = rng.uniform(0.3, 8.0, depth_m.shape).astype(np.float32)
     return np.where(rng.random(depth_m.shape) < share, wild_m, depth_m)
 
 
 def _covered(rng: Random, share: float, scan: LaserScan, stamp_ns: int) -> LaserScan:
-    """Return a scan whose beams, all or most of them, end on what lies over the window."""
+    """Return a scan most of whose beams, or all, end on an object on the scanner's window."""
     ranges_m = scan.ranges_m.copy()
     count = round(share * len(ranges_m))
     ranges_m[:count] = scan.range_min_m + rng.uniform(0.0, 0.03, count)
@@ -200,5 +200,5 @@ FAILURES: Mapping[str, Callable[[Random], Failure]] = {
 
 
 def scene_of(failure: str) -> str:
-    """Return the name of a failure's scene: camera_frozen, CameraFrozen."""
+    """Return the name of a failure's scene: CameraFrozen for camera_frozen."""
     return "".join(word.title() for word in failure.split("_"))

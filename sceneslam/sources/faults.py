@@ -1,4 +1,4 @@
-"""Damage that a source met, counted by kind."""
+"""Counts of damaged data that a source has found, by type."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 
 class FaultLog:
-    """Counts faults; remembers where each kind came first."""
+    """Counts faults; stores where each type occurred first."""
 
     def __init__(self) -> None:
         self._counts: dict[str, int] = {}
@@ -18,7 +18,7 @@ class FaultLog:
         self._first.setdefault(kind, where)
 
     def clear(self) -> None:
-        """Forget everything, for a new reading."""
+        """Delete all counts, before the source is read again."""
         self._counts.clear()
         self._first.clear()
 
@@ -31,5 +31,5 @@ class FaultLog:
 
 
 def at_stamp(stamp_ns: int) -> str:
-    """Return the words for a place in time."""
+    """Return "at stamp ... s"."""
     return f"stamp {stamp_ns * 1e-9:.6f} s"

@@ -1,4 +1,4 @@
-"""Any source, made to fail on purpose: for experiments on what the bus survives."""
+"""Fault injection into any source, for experiments on robustness."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ FAULTS = ("dropout", "blackout", "nan", "clock", "duplicate", "disorder", "reset
 
 
 class FaultySource(Wrapped):
-    """Passes a source's observations on, but strikes at random ones.
+    """Passes on a source's observations and injects faults into random ones.
 
-    `dropout`: one sensor says nothing for `lasting_s`; `blackout`: none but odometry does. `nan`:
-    one sensor's numbers are none. `clock`: one stamp is off by up to `clock_jump_s`. `duplicate`:
-    the observation comes twice. `disorder`: it comes after the next one. `reset`: odometry begins
-    anew, at the identity.
+    `dropout`: one sensor is missing for `lasting_s`; `blackout`: all but odometry are. `nan`: the
+    values of one sensor are NaN. `clock`: one stamp is off by up to `clock_jump_s`. `duplicate`:
+    the observation is repeated. `disorder`: it comes after the next one. `reset`: odometry restarts
+    at the identity.
     """
 
     def __init__(
@@ -55,10 +55,10 @@ class FaultySource(Wrapped):
         )
 
     def __iter__(self) -> Iterator[Observation]:
-        """Yield the source's observations, struck."""
+        """Yield the source's observations with the injected faults."""
         late: Observation | None = None
-        silent: dict[str, int] = {}  # sensor -> until when
-        self._T_new_odom: Transform | None = None  # of odometry that began anew
+        silent: dict[str, int] = {}  # sensor -> end of its silence [ns]
+        self._T_new_odom: Transform | None = None  # new odometry frame after a reset
         for observation in self._source:
             stamp_ns = observation.stamp_ns
             rng = np.random.default_rng([self._seed, 1, stamp_ns % 2**64])
@@ -88,13 +88,13 @@ class FaultySource(Wrapped):
     def _silenced(
         self, fault: str | None, observation: Observation, rng: np.random.Generator
     ) -> list[str]:
-        """Return the sensors that a fault silences."""
+        """Return the sensors whose measurements a fault removes."""
         if fault == "blackout":
             return [name for name in SENSORS if name != "T_odom_base"]
         return [_any_sensor(observation, rng)] if fault == "dropout" else []
 
     def _reset(self, fault: str | None, observation: Observation) -> Observation:
-        """Return the observation with the odometry that began anew, if it did."""
+        """Return the observation; after a reset, with odometry from the new origin."""
         T_odom_base = observation.T_odom_base
         if fault == "reset" and T_odom_base is not None:
             self._T_new_odom = se3.inverse(T_odom_base)
@@ -114,13 +114,13 @@ class FaultySource(Wrapped):
 
 
 def _any_sensor(observation: Observation, rng: np.random.Generator) -> str:
-    """Return one of the sensors that the observation has, at random."""
+    """Return a random sensor of the observation."""
     present = [name for name in SENSORS if getattr(observation, name) is not None]
     return present[int(rng.integers(len(present)))] if present else SENSORS[0]
 
 
 def _without_numbers(observation: Observation, name: str) -> Observation:
-    """Return the observation with NaN in one sensor; an image, which has none, is black."""
+    """Return the observation with NaN for one sensor; an image (8 bit) becomes black."""
     value = getattr(observation, name)
     if name == "scan":
         blind = replace(value, ranges_m=np.full_like(value.ranges_m, np.nan))

@@ -17,7 +17,7 @@ from sceneslam.types.observation import Observation
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameFiles:
-    """Where the images of one stamp are."""
+    """Paths of the images of one stamp."""
 
     stamp_ns: int
     color: Path
@@ -26,24 +26,24 @@ class FrameFiles:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ReadFrame:
-    """An observation, None when no image of it could be read, and what was wrong where."""
+    """An observation (None if no image could be read) and its problems with their files."""
 
     observation: Observation | None
     problems: Mapping[str, Path]
 
 
 class FrameReader:
-    """Reads images; safe to call from several threads."""
+    """Reads images; thread-safe."""
 
     def __init__(self, size_wh: tuple[int, int], units: pixels.DepthUnits) -> None:
         self._size_wh = size_wh
         self._units = units
-        self._has_depth = False  # of the first image's size
+        self._has_depth = False  # True after the first depth image of the first colour image's size
 
     def read(self, frame: FrameFiles) -> ReadFrame:
-        """Return the frame's observation; an image of another size is as good as damaged.
+        """Return the frame's observation; an image of another size is treated as damaged.
 
-        Raises InputError for depth that is not 16 bit, and where the first is of another size.
+        Raises InputError for depth that is not 16 bit, or if the first one has another size.
         """
         problems: dict[str, Path] = {}
         image_bgr = self._image(frame.color, problems)
@@ -54,7 +54,7 @@ class FrameReader:
         return ReadFrame(observation=observation, problems=problems)
 
     def depth_m(self, path: Path) -> NDArray[np.float32] | None:
-        """Return a depth image [m], None when it cannot be read; raises InputError as `read`."""
+        """Return a depth image (H, W) [m], None if unreadable; raises InputError as `read`."""
         return self._depth(path, {})
 
     def _image(self, path: Path, problems: dict[str, Path]) -> NDArray[np.uint8] | None:
@@ -80,7 +80,7 @@ class FrameReader:
                 f"in {channels}: {path}"
             )
         if not self._has_size(path, stored, problems):
-            if not self._has_depth:  # no other will
+            if not self._has_depth:  # then all depth images have another size
                 raise InputError(f"depth: {next(reversed(problems))}: {path}")
             return None
         self._has_depth = True
@@ -97,7 +97,7 @@ class FrameReader:
 
 
 def first_size_wh(frames: Iterable[FrameFiles]) -> tuple[int, int]:
-    """Return the size of the first colour image that can be read; raises InputError if none."""
+    """Return width and height [px] of the first readable colour image, else raise InputError."""
     last = Path()
     for frame in frames:
         data = _bytes(frame.color, "", {})
@@ -110,7 +110,7 @@ def first_size_wh(frames: Iterable[FrameFiles]) -> tuple[int, int]:
 
 def _bytes(path: Path, problem: str, problems: dict[str, Path]) -> bytes | None:
     try:
-        if path.is_file():  # no pipe: reading one may never end
+        if path.is_file():  # not a pipe: reading one may block forever
             return path.read_bytes()
         problems[problem] = path
         return None

@@ -1,4 +1,4 @@
-"""A camera's parameters as they are given in a configuration."""
+"""Camera intrinsics from a configuration."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NUMBERS = ("fx", "fy", "cx", "cy")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Intrinsics:
-    """A pinhole camera and, where it was given, its distortion (OpenCV's order)."""
+    """A pinhole camera and, if given, its distortion coefficients (OpenCV's order)."""
 
     fx: float  # [px]
     fy: float  # [px]
@@ -26,7 +26,7 @@ class Intrinsics:
 
 
 def given_intrinsics(camera: Mapping[str, Any]) -> Intrinsics | None:
-    """Return what `camera` says: {fx, fy, cx, cy, distortion}; None when all four are null.
+    """Return the intrinsics of `camera`: {fx, fy, cx, cy, distortion}; None if the four are null.
 
     Raises ConfigError for `camera.<key>` when a key is unknown, missing or out of range.
     """
@@ -39,7 +39,7 @@ def given_intrinsics(camera: Mapping[str, Any]) -> Intrinsics | None:
         if distortion is not None:
             raise ConfigError("camera.fx", None, "a number [px], as camera.distortion is given")
         return None
-    for key in sorted(values, key=lambda key: values[key] is None):  # what is given comes first
+    for key in sorted(values, key=lambda key: values[key] is None):  # keys with a value first
         value, least = values[key], 0 if key in ("fx", "fy") else -np.inf
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if value is None or not is_number or not least < value < np.inf:

@@ -1,4 +1,4 @@
-"""KITTI drives: a folder of lidar scans, with times and poses where it has them."""
+"""KITTI drives: a folder of lidar scans, with times and poses if available."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from sceneslam.types.truth import GroundTruth
 
 _FOLDERS = ("velodyne", "velodyne_points/data", ".")
 _POINT_BYTES = 16  # float32 x y z reflectance
-_SAMPLES = 3  # scans of a survey
+_SAMPLES = 3  # scans that are read for a survey
 
 
 class Kitti:
     """Gives one observation per scan; base is the lidar.
 
-    `velodyne/*.bin` (odometry benchmark) or `velodyne_points/data/*.bin` (raw data). Times come
-    from times.txt or timestamps.txt, else 10 Hz. Truth: groundtruth_tum.txt or poses*.txt, taken
-    for poses of the lidar.
+    `velodyne/*.bin` (odometry benchmark) or `velodyne_points/data/*.bin` (raw data). Times are
+    read from times.txt or timestamps.txt, else 10 Hz. Ground truth is read from groundtruth_tum.txt
+    or poses*.txt, as poses of the lidar.
     """
 
     def __init__(self, path: str, range_m: list[float]) -> None:
@@ -47,7 +47,7 @@ class Kitti:
 
     @property
     def rig(self) -> Rig:
-        """Return the one lidar."""
+        """Return the rig: one lidar."""
         return self._rig
 
     @property
@@ -78,7 +78,7 @@ class Kitti:
                 yield Observation(stamp_ns=stamp_ns, points_lidar=points)
 
     def survey(self) -> Survey:
-        """Return the scans, some of them read."""
+        """Return the stamps of the scans and some of the scans."""
         lidar = Stream(
             sensor=Sensor.POINTS,
             place=str(self._files[0].parent),
@@ -89,7 +89,7 @@ class Kitti:
         return Survey(streams=[lidar], clouds=[points for points in scans if points is not None])
 
     def ground_truth(self) -> GroundTruth | None:
-        """Return the drive's poses, None when it has none."""
+        """Return the drive's true poses, None without a file of poses."""
         tum = self._folder / "groundtruth_tum.txt"
         if tum.is_file():
             return GroundTruth(trajectory=Trajectory.read_tum(tum))
@@ -98,7 +98,7 @@ class Kitti:
         return None
 
     def _read_poses(self, path: Path) -> Trajectory:
-        """Return KITTI's twelve numbers per line (the upper rows of T_gt_lidar)."""
+        """Return the poses of a file: per line, twelve numbers, rows 1 to 3 of T_gt_lidar [m]."""
         try:
             rows = np.loadtxt(path, ndmin=2, dtype=np.float64)
         except ValueError as err:
@@ -126,7 +126,7 @@ def _scan_files(folder: Path) -> Sequence[Path]:
 
 
 def _read_scan(path: Path) -> NDArray[np.float32] | None:
-    """Return the finite points (N, 3) [m] of a file, None when it is empty or cut off."""
+    """Return the finite points (N, 3) [m], lidar, of a file; None if it is empty or cut off."""
     try:
         data = path.read_bytes() if path.is_file() else b""
     except OSError:

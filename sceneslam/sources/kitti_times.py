@@ -16,9 +16,9 @@ _NAMES = ("times.txt", "velodyne_points/timestamps.txt", "timestamps.txt")
 
 
 def read_times_ns(folder: Path, count: int) -> NDArray[np.int64]:
-    """Return the stamps (N,) [ns] of `count` scans; 10 Hz from zero where no file has them.
+    """Return the stamps (N,) [ns] of `count` scans; without a file of times, 10 Hz from zero.
 
-    Raises InputError when a file of times has another count or a line that is no time.
+    Raises InputError if the file has another number of lines or an invalid time.
     """
     for name in _NAMES:
         path = folder / name
@@ -34,7 +34,7 @@ def read_times_ns(folder: Path, count: int) -> NDArray[np.int64]:
 
 
 def _stamp_ns(line: str, path: Path) -> int:
-    """Return the ns of seconds, or of a date and time as in the raw drives (taken for UTC)."""
+    """Return the stamp [ns] of a line: seconds, or date and time as in the raw drives (as UTC)."""
     try:
         if ":" not in line:
             return int(Decimal(line).scaleb(9))

@@ -1,4 +1,4 @@
-"""A round trip that is driven again and again: for runs of hours from a recording of seconds."""
+"""Repetition of a recorded round trip, for runs of hours from a recording of seconds."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _PAUSE_NS = 33_000_000  # between the last observation of a lap and the first of
 
 
 class Laps(Wrapped):
-    """Passes a recording on `laps` times, one after the other: stamps and odometry go on.
+    """Repeats a recording `laps` times; stamps and odometry continue from lap to lap.
 
-    The recording should end where it began: else the robot is moved at the end of every lap, which
-    its wheels do not notice.
+    The recording should end where it began; else the robot jumps at the end of every lap, which its
+    wheels do not measure.
     """
 
     def __init__(self, source: Source, laps: int) -> None:
@@ -34,17 +34,17 @@ class Laps(Wrapped):
 
     @property
     def length(self) -> int | None:
-        """Return how many observations there are at most."""
+        """Return the largest possible number of observations, None if unknown."""
         one = self._source.length
         return None if one is None else one * self._laps
 
     @property
     def span(self) -> TimeSpan | None:
-        """Return None: the span is that of a lap."""
+        """Return None: the source's span is that of one lap."""
         return None
 
     def __iter__(self) -> Iterator[Observation]:
-        """Yield every lap's observations."""
+        """Yield the observations of all laps."""
         shift_ns, T_odom_start = 0, se3.identity()
         for _ in range(self._laps):
             first: Observation | None = None
@@ -61,7 +61,7 @@ class Laps(Wrapped):
                 T_odom_start = last.T_odom_base
 
     def ground_truth(self) -> GroundTruth | None:
-        """Return the truth of all laps."""
+        """Return the ground truth of all laps."""
         truth = self._source.ground_truth()
         stamps_ns = [observation.stamp_ns for observation in self._source]
         if truth is None or not stamps_ns:
@@ -85,7 +85,7 @@ def _moved(
     T_odom_first: Transform | None,
     T_odom_start: Transform,
 ) -> Observation:
-    """Return an observation of a later lap, which began at `T_odom_start`."""
+    """Return an observation of a later lap, whose odometry starts at `T_odom_start`."""
     T_odom_base = observation.T_odom_base
     if T_odom_base is not None and T_odom_first is not None and shift_ns:
         T_odom_base = T_odom_start @ se3.inverse(T_odom_first) @ T_odom_base
@@ -97,7 +97,7 @@ def _moved(
 
 
 def _repeated(scenes: Sequence[SceneChange], shifts_ns: Sequence[int]) -> tuple[SceneChange, ...]:
-    """Return the scenes of all laps; one that goes on into the next lap is no change."""
+    """Return the scene changes of all laps; a scene that continues into the next lap is none."""
     every = [replace(one, stamp_ns=one.stamp_ns + by) for by in shifts_ns for one in scenes]
     return tuple(
         one

@@ -1,4 +1,4 @@
-"""How bright the light is, by time."""
+"""The level of the light over time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sceneslam.types.errors import ConfigError
 
 @dataclass(frozen=True, slots=True)
 class LightSchedule:
-    """The level (0 to 1) over seconds: straight lines between the given instants."""
+    """The level (0 to 1) over time [s], linear between the given instants."""
 
     times_s: tuple[float, ...]
     levels: tuple[float, ...]
@@ -23,8 +23,8 @@ class LightSchedule:
     ) -> LightSchedule:
         """Return the schedule of `[time, level]` steps: from each time on, fade to the level.
 
-        Before the first step the light is on. A fade that the next step interrupts goes on from
-        the level it has reached.
+        Before the first step the light is on. If a step interrupts a fade, the new fade starts at
+        the level that was reached.
         """
         times, levels = [0.0], [1.0]
         for number, (time, level) in enumerate(steps):
@@ -41,11 +41,11 @@ class LightSchedule:
         return cls(tuple(times), tuple(levels))
 
     def level(self, time_s: float) -> float:
-        """Return the level at a time."""
+        """Return the level (0 to 1) at a time."""
         return float(np.interp(time_s, self.times_s, self.levels))
 
     def crossings(self, threshold: float) -> Sequence[tuple[float, bool]]:
-        """Return (time [s], is dark from then on), beginning at 0: dark is below `threshold`."""
+        """Return pairs (time [s], is dark from then on) from 0 on; dark: below `threshold`."""
         is_dark = self.levels[0] < threshold
         found = [(0.0, is_dark)]
         for place in range(1, len(self.times_s)):
@@ -60,7 +60,7 @@ class LightSchedule:
 
 
 def check_steps(steps: object, *, is_ratio: bool) -> Sequence[Sequence[float]]:
-    """Return the steps; raises ConfigError for `schedule` unless times rise and levels fit."""
+    """Return the steps; raises ConfigError unless times rise and levels are in 0 to 1."""
     allowed = "a list of [time, level]: times from 0 on, rising; levels 0 (off) to 1 (as recorded)"
     if not isinstance(steps, list | tuple) or not steps:
         raise ConfigError("schedule", steps, allowed)

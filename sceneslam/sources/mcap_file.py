@@ -1,4 +1,4 @@
-"""MCAP files as chunks: by their index where it is sound, by reading through where it is not."""
+"""MCAP files as chunks: by their index or, if it is damaged, by a full read."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _KEPT = (records.SCHEMA, records.CHANNEL, records.MESSAGE, records.CHUNK, record
 
 
 def open_mcap(paths: Sequence[Path]) -> ChunkedRecording:
-    """Return one recording of all files; raises InputError when one is no MCAP file."""
+    """Return one recording of all files; raises InputError unless all are MCAP files."""
     files = {path: McapFile(path) for path in paths}
     layouts = [file.layout() for file in files.values()]
     return ChunkedRecording(layouts, lambda chunk: files[chunk.file].read(chunk))
@@ -40,7 +40,7 @@ class McapFile:
         self._names: dict[int, str] = {}  # channel -> topic
 
     def layout(self) -> Layout:
-        """Return the chunks and topics, from the index or, failing that, from the content."""
+        """Return the chunks and topics, from the index or, if it is damaged, from the content."""
         from mcap.exceptions import McapError
 
         size = self._path.stat().st_size
@@ -56,7 +56,7 @@ class McapFile:
             return layout or self._from_content(file, size, note)
 
     def read(self, chunk: Chunk) -> ChunkContent:
-        """Return a chunk's messages; a damaged one is lost as a whole."""
+        """Return a chunk's messages; a damaged chunk is left out as a whole."""
         with self._path.open("rb") as file:
             file.seek(chunk.offset)
             found = records.read_records(file.read(chunk.length))
@@ -73,9 +73,9 @@ class McapFile:
         return ChunkContent(messages=messages)
 
     def _from_index(self, file: IO[bytes]) -> Layout | None:
-        """Return the layout by the file's summary, None when it was written without.
+        """Return the layout by the file's summary, None if it has no summary.
 
-        Raises whatever the reader runs into when the summary is damaged.
+        Raises any exception of the reader if the summary is damaged.
         """
         from mcap.reader import SeekingReader
 
@@ -108,9 +108,9 @@ class McapFile:
         return Layout(chunks=chunks, topics=topics, metadata=metadata)
 
     def _from_content(self, file: IO[bytes], size: int, note: str) -> Layout:
-        """Return the layout by reading the file through, as far as it goes.
+        """Return the layout by reading the whole file, up to its last readable record.
 
-        `note` says what is wrong with the index.
+        `note` describes the damage of the index.
         """
         content, spans, lost = records.Content(), [], 0
         position, is_complete, is_cut = len(records.MAGIC), False, not records.has_end(file)
@@ -142,7 +142,7 @@ class McapFile:
             if span
         ]
         if not is_complete and not is_cut:
-            lost += size - position  # the damage is inside
+            lost += size - position  # damage within the file, not at its end
         elif not is_complete:
             note = cut_off(chunks, topics)
         return Layout(
@@ -153,7 +153,7 @@ class McapFile:
         return frozenset(self._names[number] for number in channels if number in self._names)
 
     def _topics(self, content: records.Content) -> dict[str, TopicType]:
-        """Return the topics that hold ROS messages; remember which channel is which."""
+        """Return the topics that hold ROS messages; store the topic of each channel."""
         topics: dict[str, TopicType] = {}
         for number, channel in content.channels.items():
             schema = content.schemas.get(channel.schema_id)

@@ -1,4 +1,4 @@
-"""Records of an MCAP file, checked by their checksums."""
+"""Records of an MCAP file, verified by their checksums."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class McapRecord:
 
 @dataclass(slots=True)
 class Content:
-    """What was met on the way through a file."""
+    """Records collected while reading a file."""
 
     schemas: dict[int, Any] = field(default_factory=dict)
     channels: dict[int, Any] = field(default_factory=dict)
@@ -62,9 +62,9 @@ class Content:
 
 
 def read_records(data: bytes) -> Sequence[McapRecord] | None:
-    """Return the records in the bytes of one record (a chunk's own), None when it is damaged.
+    """Return the records in one record's bytes (of a chunk, those inside), None if damaged.
 
-    Of a chunk that is cut off they are those that are whole.
+    Of a chunk that is cut off, the complete records are returned.
     """
     view = memoryview(data)
     if len(view) < RECORD_HEAD.size:
@@ -82,14 +82,14 @@ def read_records(data: bytes) -> Sequence[McapRecord] | None:
 
 
 def has_end(file: IO[bytes]) -> bool:
-    """Tell whether the file ends as a finished one does."""
+    """Tell whether the file ends with a footer and the MCAP signature."""
     size = file.seek(0, 2)
     file.seek(max(size - len(MAGIC), len(MAGIC)))
     return file.read() == MAGIC
 
 
 def has_summary(file: IO[bytes]) -> bool:
-    """Tell whether the file was written with a summary; raises ValueError when it is damaged."""
+    """Tell whether the file has a summary; raises ValueError if the summary is damaged."""
     tail = RECORD_HEAD.size + _FOOTER_BODY.size + len(MAGIC)
     size = file.seek(0, 2)
     if size < tail + len(MAGIC) or not has_end(file):
@@ -120,16 +120,16 @@ def _unpack_chunk(body: memoryview) -> bytes | None:
         chunk = mcap.Chunk.read(ReadDataStream(BytesIO(body)))
         stream, length = get_chunk_data_stream(chunk, validate_crc=True)
         return bytes(stream.read(length))
-    except Exception:  # three libraries of compression, each with errors of its own
+    except Exception:  # three compression libraries, each with its own exceptions
         return None
 
 
 def _unpack_cut_chunk(body: memoryview) -> bytes:
-    """Return what can be unpacked of the beginning of a chunk."""
+    """Return the bytes that can be decompressed from the beginning of a chunk."""
     import lz4.frame  # type: ignore[import-untyped]
     import zstandard
 
-    # Its head: first and last time, size, checksum, compression, length of what is packed.
+    # Header: first and last time, size, checksum, compression, length of the compressed data.
     if len(body) < _CHUNK_HEAD.size:
         return b""
     *_, length = _CHUNK_HEAD.unpack_from(body)

@@ -1,4 +1,4 @@
-"""Odometry that stays smooth where it was reset, or one reading of it was wrong."""
+"""Removal of jumps from odometry: resets, and single wrong poses."""
 
 from __future__ import annotations
 
@@ -12,36 +12,36 @@ from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
-# What wheels may tell beyond twice the step before: what was held up (the Intel log has 0.87 m and
-# 51 degrees within 20 ms, and no jump), and full throttle. Who comes to where odometry begins has
-# most likely been reset.
+# Largest plausible excess over twice the previous step: delayed messages (the Intel log has 0.87 m
+# and 51 degrees within 20 ms, and no jump) and full acceleration. A pose at the odometry's origin
+# is most likely a reset.
 _SLACK_M, _SLACK_RAD = 1.0, 1.2
 _SLACK_AT_ORIGIN = 0.1  # of both
-_ORIGIN_M, _ORIGIN_RAD = 0.05, 0.05  # so near is where it begins
+_ORIGIN_M, _ORIGIN_RAD = 0.05, 0.05  # closer poses count as the origin
 _BOOST_M_S2, _BOOST_RAD_S2 = 10.0, 20.0
-_COAST_S = 0.5  # a motion of so long ago says nothing any more
+_COAST_S = 0.5  # longer ago, the last velocity is no prediction any more
 
 
 class Odometer:
-    """Takes jumps out of the odometry of one observation after the other.
+    """Removes jumps from the odometry of successive observations.
 
-    A jump is a motion that no vehicle makes from one step to the next. The motion before it goes
-    on in its place, for half a second at most.
+    A jump is a motion that exceeds any vehicle's acceleration. It is replaced by the previous
+    velocity, for half a second at most.
     """
 
     def __init__(self) -> None:
-        self._before: Observation | None = None  # the last with odometry, as it came
+        self._before: Observation | None = None  # the last with odometry, unchanged
         self._T_smooth_odom: Transform | None = None  # None until the first jump
         self._rates = np.zeros(2)  # of the last step [m/s, rad/s] ...
         self._twist = np.zeros(6)  # ... and its motion per second
 
     @property
     def T_smooth_odom(self) -> Transform:
-        """Return what odometry is moved by since the last jump, the identity before the first."""
+        """Return T_smooth_odom (4, 4) [m], the correction since the last jump; identity before."""
         return se3.identity() if self._T_smooth_odom is None else self._T_smooth_odom
 
     def smooth(self, observation: Observation, log: FaultLog) -> Observation:
-        """Return the observation with odometry that goes on from that of the one before."""
+        """Return the observation with odometry that continues the previous one's without a jump."""
         before, T_odom_base = self._before, observation.T_odom_base
         if T_odom_base is None:
             return observation
@@ -66,7 +66,7 @@ class Odometer:
         return T_odom_base if offset is None else offset @ T_odom_base
 
     def _take(self, T_prev_curr: Transform, duration_s: float, slack: NDArray[np.float64]) -> bool:
-        """Tell whether a vehicle moves so, after the step before; if so, note this one."""
+        """Tell whether a motion is plausible after the previous step; if so, store its velocity."""
         moved = _moved(T_prev_curr)
         boost = np.array([_BOOST_M_S2, _BOOST_RAD_S2]) * duration_s**2
         if (moved > slack + 2.0 * self._rates * duration_s + boost).any():
@@ -76,6 +76,6 @@ class Odometer:
 
 
 def _moved(T_prev_curr: Transform) -> NDArray[np.float64]:
-    """Return way [m] and turn [rad]."""
+    """Return (2,): distance [m] and angle of rotation [rad]."""
     way_m = np.linalg.norm(T_prev_curr[:3, 3])
     return np.array([way_m, float(se3.rotation_angle_rad(T_prev_curr))])

@@ -20,7 +20,7 @@ _FIRST_LOOK_BACK_NS = 2_000_000_000
 
 
 def open_recording(path: Path) -> Recording:
-    """Return the recording at `path`; raises InputError when there is none that can be read."""
+    """Return the recording at `path`; raises InputError if there is no readable one."""
     if not path.exists():
         raise InputError(f"recording not found: {path}")
     if path.is_dir():
@@ -80,7 +80,7 @@ class FolderRecording:
                 yield Message(topic=entry.topic, log_ns=log_ns, data=bytes(data))
 
     def last(self, topic: str) -> Message | None:
-        """Return the topic's last message: looks at ever longer stretches before the end."""
+        """Return the topic's last message; searches increasing time spans before the end."""
         from rosbags.rosbag2 import Reader
 
         with self._guarded(), Reader(self._path) as reader:
@@ -97,7 +97,7 @@ class FolderRecording:
                 back_ns *= 8
 
     def decode(self, message: Message) -> Any:
-        """Return the decoded message, None when its bytes make no sense."""
+        """Return the decoded message, None if its bytes are invalid."""
         return self._decoder.decode(message.topic, message.data)
 
     def _read_topics(self) -> dict[str, TopicType]:
@@ -121,9 +121,9 @@ class FolderRecording:
 
     @contextmanager
     def _guarded(self) -> Iterator[None]:
-        """Raise InputError for whatever the storage runs into."""
+        """Raise InputError for any exception of the storage."""
         try:
             yield
-        except Exception as err:  # sqlite3, yaml, zstd and rosbags each have errors of their own
+        except Exception as err:  # sqlite3, yaml, zstd and rosbags have their own exceptions
             reason = " ".join(str(err).split()) or type(err).__name__
             raise InputError(f"recording cannot be read ({reason}): {self._path}") from err

@@ -25,7 +25,7 @@ class OpenLoris:
     """Gives one observation per pose of the wheel odometry, at its own stamp.
 
     `sequence` is named as in the data set: scene, package and number, as in `home-1-3`. Files are
-    told apart by their headers, not by their names. Shi et al., ICRA 2020.
+    distinguished by their headers, not by their names. Shi et al., ICRA 2020.
     """
 
     def __init__(self, path: str, sequence: str, wheels: Mapping[str, float] | None) -> None:
@@ -41,7 +41,7 @@ class OpenLoris:
 
     @property
     def rig(self) -> Rig:
-        """Return the wheel odometry alone."""
+        """Return the rig: wheel odometry only."""
         return Rig(sensors=frozenset({Sensor.ODOMETRY}), wheels=self._wheels)
 
     @property
@@ -51,7 +51,7 @@ class OpenLoris:
 
     @property
     def faults(self) -> Sequence[str]:
-        """Return nothing: poses that are none were left out."""
+        """Return no faults: invalid poses are left out."""
         return ()
 
     @property
@@ -61,7 +61,7 @@ class OpenLoris:
         return TimeSpan(start_ns=first_ns, end_ns=last_ns)
 
     def __iter__(self) -> Iterator[Observation]:
-        """Yield the odometry's poses."""
+        """Yield one observation per pose of the odometry."""
         poses = zip(
             self._odometry.stamps_ns.tolist(), self._odometry.T_world_base.copy(), strict=True
         )
@@ -69,7 +69,7 @@ class OpenLoris:
             yield Observation(stamp_ns=stamp_ns, T_odom_base=locked(T_odom_base))
 
     def survey(self) -> Survey:
-        """Return the odometry's poses."""
+        """Return the stamps and poses of the odometry."""
         wheels = Stream(
             sensor=Sensor.ODOMETRY,
             place=f"{self._scene} {_ODOMETRY}",
@@ -83,12 +83,12 @@ class OpenLoris:
         )
 
     def ground_truth(self) -> GroundTruth | None:
-        """Return the sequence's true poses of base, None when the folder has none."""
+        """Return the sequence's true poses of `base`, None if the folder has none."""
         truth = self._find(_TRUTH)
         return GroundTruth(trajectory=truth) if len(truth) else None
 
     def _find(self, pattern: str) -> Trajectory:
-        """Return the sequence's poses in the files of a pattern, empty when there are none."""
+        """Return the sequence's poses in all files that match a pattern; may be empty."""
         for path in sorted(self._folder.glob(pattern)):
             for one in read_recorded(path):
                 if (one.scene, one.sequence) == (self._scene, self._number):

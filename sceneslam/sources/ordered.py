@@ -1,4 +1,4 @@
-"""Any source, with its promises kept: stamps rise, arrays hold numbers, odometry is smooth."""
+"""A wrapper that ensures a source's contract: rising stamps, finite arrays, smooth odometry."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _PERIODS = 4  # one or two frames lost in a row are common
 class Ordered(Wrapped):
     """Leaves out observations whose stamps repeat or run backwards, and values that are NaN.
 
-    Odometry that was reset goes on from where it was.
+    Odometry that was reset continues from its last pose.
 
-    A single stamp ahead of its neighbours, by more than a few of the source's own periods, is left
-    out too, rather than all that follow it. A gap longer than `max_gap_s` is a fault, but for a
-    rest: over it odometry moved no farther than it did between two observations before.
+    A single stamp that is ahead of its neighbours by more than a few periods is left out too,
+    rather than all that follow it. A gap longer than `max_gap_s` is a fault, unless the robot
+    rested: over the gap, odometry moved no farther than between earlier observations.
     """
 
     def __init__(self, source: Source, max_gap_s: float = 5.0) -> None:
@@ -41,7 +41,7 @@ class Ordered(Wrapped):
 
     @property
     def faults(self) -> Sequence[str]:
-        """Return the source's faults and what was left out here."""
+        """Return the source's faults and counts of what was left out here."""
         return [*self._source.faults, *self._log.sentences()]
 
     def __iter__(self) -> Iterator[Observation]:
@@ -50,8 +50,8 @@ class Ordered(Wrapped):
         self._rested_s: list[float] = []
         self._odometer, self._rests = Odometer(), Rests(self._max_gap_ns)
         last_ns: int | None = None
-        period_ns = self._max_gap_ns // _PERIODS  # the longest of late
-        held: Observation | None = None  # after a jump: it may be the jump that is wrong
+        period_ns = self._max_gap_ns // _PERIODS  # the longest recent period
+        held: Observation | None = None  # after a jump ahead, until the next stamp confirms it
         for observation in filter(self._is_stamped, self._source):
             stamp_ns = observation.stamp_ns
             if held is not None:
@@ -88,7 +88,7 @@ class Ordered(Wrapped):
         return mended
 
     def _is_stamped(self, observation: object) -> bool:
-        """Tell whether this is an observation with a stamp that a recording can hold."""
+        """Tell whether this is an observation with a valid stamp."""
         stamp_ns: Any = observation.stamp_ns if isinstance(observation, Observation) else None
         if isinstance(stamp_ns, Integral) and abs(int(stamp_ns)) <= _STAMP_MAX_NS:
             return True
@@ -100,7 +100,7 @@ class Ordered(Wrapped):
         self._log.add(kind, at_stamp(observation.stamp_ns))
 
     def _note_gap(self, last_ns: int | None, observation: Observation) -> None:
-        """Note a gap before an observation that was taken."""
+        """Count a gap before an accepted observation."""
         if last_ns is None or observation.stamp_ns - last_ns <= self._max_gap_ns:
             return
         gap_s = (observation.stamp_ns - last_ns) * 1e-9
@@ -110,7 +110,7 @@ class Ordered(Wrapped):
             self._log.add(f"no observation for {gap_s:.1f} s", at_stamp(last_ns))
 
     def _tell_of_rests(self) -> None:
-        """Tell of gaps in which the robot stood: nothing is lost, so they are no fault."""
+        """Log gaps in which the robot stood still; no data are lost, so they are no faults."""
         if self._rested_s:
             _LOG.warning(
                 "the robot rested and nothing was recorded, %d times, at most for %.1f s",

@@ -1,4 +1,4 @@
-"""Decoding ahead of use, in threads, in order."""
+"""Decoding ahead in threads, with results in order."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ Item = TypeVar("Item")
 def prefetched(
     jobs: Iterable[Callable[[], Item]], *, workers: int = 1, ahead: int = 4
 ) -> Iterator[Item]:
-    """Yield each job's result in the jobs' order while up to `ahead` more are being worked on.
+    """Yield the jobs' results in order; up to `ahead` further jobs are in progress.
 
-    One worker beside the caller is what two cores carry: more only take turns with the tracking.
-    The jobs themselves are drawn in the caller's thread. A job's exception is raised where its
-    result would have come. When the caller stops, work that has not begun is dropped.
+    On two cores, more than one worker beside the caller only slows down tracking.
+    The iterator of jobs is advanced in the caller's thread. A job's exception is raised in place of
+    its result. When the caller stops, jobs that have not started are dropped.
     """
     pool = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="decode")
     running: deque[Future[Item]] = deque()

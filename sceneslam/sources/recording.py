@@ -1,4 +1,4 @@
-"""A recording of ROS messages, whatever file holds it."""
+"""The interface of recordings of ROS messages, for all file formats."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class Message:
     """One recorded message, not yet decoded."""
 
     topic: str
-    log_ns: int  # when it was recorded
+    log_ns: int  # time of recording
     data: bytes
 
 
 class Recording(Protocol):
-    """Messages by time."""
+    """Recorded messages, ordered by time."""
 
     @property
     def topics(self) -> Mapping[str, TopicType]:
@@ -32,40 +32,40 @@ class Recording(Protocol):
 
     @property
     def faults(self) -> Sequence[str]:
-        """Return one sentence per kind of damage met so far."""
+        """Return one sentence per type of damage found so far."""
         ...
 
     @property
     def is_slow(self) -> bool:
-        """Tell whether it is packed so that a second of it takes seconds to read."""
+        """Tell whether decompression is slower than real time."""
         ...
 
     @property
     def metadata(self) -> Mapping[str, Mapping[str, str]]:
-        """Return named texts that were recorded beside the messages."""
+        """Return the metadata that was recorded beside the messages."""
         ...
 
     @property
     def span_ns(self) -> tuple[int, int]:
-        """Return when the first and the last message were recorded."""
+        """Return the recording times [ns] of the first and the last message."""
         ...
 
     def messages(self, topics: Collection[str], from_ns: int | None = None) -> Iterator[Message]:
-        """Yield the messages of `topics` by log time, from the beginning or an instant."""
+        """Yield the messages of `topics` by recording time, from `from_ns` or the beginning on."""
         ...
 
     def last(self, topic: str) -> Message | None:
-        """Return a topic's last message, None when finding it takes reading everything."""
+        """Return a topic's last message, None if that would require a full read."""
         ...
 
     def decode(self, message: Message) -> Any:
-        """Return the message as an object, None when its bytes make no sense."""
+        """Return the decoded message, None if its bytes are invalid."""
         ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chunk:
-    """A stretch of a file that holds messages; unit of reading and of loss."""
+    """A part of a file that is read as a whole, and is left out as a whole if damaged."""
 
     file: Path
     offset: int  # [bytes]
@@ -77,18 +77,18 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Layout:
-    """Where everything is in a file."""
+    """The positions of a file's chunks, and its topics."""
 
     chunks: Sequence[Chunk]
     topics: Mapping[str, TopicType]
     metadata: Mapping[str, Mapping[str, str]]
-    lost_bytes: int = 0  # that belong to no chunk
-    note: str = ""  # what is wrong with the file, "" when nothing is
+    lost_bytes: int = 0  # bytes outside of all readable chunks
+    note: str = ""  # sentence on the file's damage, "" without
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ChunkContent:
-    """What could be read of a chunk."""
+    """The readable messages of a chunk."""
 
     messages: Sequence[Message]
     lost_bytes: int = 0
@@ -102,7 +102,7 @@ def cut_off(
     topics: Mapping[str, TopicType],
     missing: str = "the rest of the recording",
 ) -> str:
-    """Return the note on a file whose end is missing: what there is, and what is missing."""
+    """Return the sentence on a file whose end is missing: what is readable and what is not."""
     if not chunks:
         return "cut off before its first chunk was complete"
     span_s = (max(one.end_ns for one in chunks) - min(one.start_ns for one in chunks)) * 1e-9
@@ -117,12 +117,12 @@ ChunkReader = Callable[[Chunk], ChunkContent]
 
 
 class ChunkedRecording:
-    """Files of chunks, read one chunk at a time; a damaged chunk is left out and reported."""
+    """Files of chunks, read chunk by chunk; damaged chunks are left out and reported."""
 
     def __init__(
         self, layouts: Sequence[Layout], read_chunk: ChunkReader, *, is_slow: bool = False
     ) -> None:
-        self.is_slow = is_slow  # to unpack: worth threads
+        self.is_slow = is_slow  # to decompress; chunks are then read ahead in threads
         self._chunks = sorted(
             (chunk for layout in layouts for chunk in layout.chunks),
             key=lambda chunk: (chunk.start_ns, chunk.file, chunk.offset),
@@ -137,7 +137,7 @@ class ChunkedRecording:
 
     @property
     def faults(self) -> Sequence[str]:
-        """Return what is wrong with the files and how much was lost."""
+        """Return the files' damage and the amount of lost data."""
         notes = [layout.note for layout in self._layouts if layout.note]
         lost = sum(layout.lost_bytes for layout in self._layouts) + sum(self._damaged.values())
         if lost:
@@ -149,12 +149,12 @@ class ChunkedRecording:
 
     @property
     def span_ns(self) -> tuple[int, int]:
-        """Return the first and last log time, by the index."""
+        """Return the first and last recording time [ns] of the index."""
         starts = (chunk.start_ns for chunk in self._chunks)
         return min(starts, default=0), max((chunk.end_ns for chunk in self._chunks), default=0)
 
     def messages(self, topics: Collection[str], from_ns: int | None = None) -> Iterator[Message]:
-        """Yield by log time, holding only chunks that overlap."""
+        """Yield the messages by recording time; only overlapping chunks are in memory."""
         waiting: list[tuple[int, int, int, Message]] = []
         least_ns = -(2**63) if from_ns is None else from_ns
         chunks = [
@@ -173,7 +173,7 @@ class ChunkedRecording:
             yield heapq.heappop(waiting)[3]
 
     def last(self, topic: str) -> Message | None:
-        """Return the topic's last message by log time."""
+        """Return the topic's last message by recording time."""
         best: Message | None = None
         for chunk in sorted(self._chunks, key=lambda chunk: chunk.end_ns, reverse=True):
             if best is not None and chunk.end_ns < best.log_ns:
@@ -188,12 +188,12 @@ class ChunkedRecording:
         return best
 
     def decode(self, message: Message) -> Any:
-        """Return the decoded message, None when its bytes make no sense."""
+        """Return the decoded message, None if its bytes are invalid."""
         return self._decoder.decode(message.topic, message.data)
 
     def _contents(self, chunks: Sequence[Chunk]) -> Iterator[ChunkContent]:
-        """Yield what is in the chunks; slow ones are read ahead."""
-        begin = 1 if self.is_slow else len(chunks)  # who looks at the first message only stops here
+        """Yield the chunks' contents; slow chunks are read ahead."""
+        begin = 1 if self.is_slow else len(chunks)  # a caller may need the first message only
         yield from map(self._read, chunks[:begin])
         jobs = (partial(self._read_chunk, chunk) for chunk in chunks[begin:])
         if begin < len(chunks):
@@ -212,12 +212,12 @@ class ChunkedRecording:
 
 
 def _amount(count: int) -> str:
-    """Return a number of bytes in words."""
+    """Return a number of bytes as text."""
     return f"{count / 1e6:.1f} MB" if count >= 100_000 else f"{count} bytes"
 
 
 def _merge_topics(layouts: Sequence[Layout]) -> dict[str, TopicType]:
-    """Return the topics of all files, their counts added up."""
+    """Return the topics of all files with the sums of their counts."""
     merged: dict[str, TopicType] = {}
     for layout in layouts:
         for name, topic in layout.topics.items():

@@ -1,4 +1,4 @@
-"""Stamps of a sequence whose order is known but whose clock now and then ran late."""
+"""Correction of stamps that do not rise, in a sequence of known order."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 
 def longest_rising(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the places of the longest strictly rising subsequence."""
+    """Return the indices of the longest strictly rising subsequence."""
     tails: list[int] = []  # the smallest stamp that ends a rising run of each length
-    ends: list[int] = []  # and its place
+    ends: list[int] = []  # and its index
     before = np.full(len(stamps_ns), -1)
     for place, stamp in enumerate(stamps_ns.tolist()):
         length = bisect_left(tails, stamp)
@@ -27,7 +27,7 @@ def longest_rising(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def rising_order(stamps_ns: NDArray[np.int64], *, late_max_ns: int) -> NDArray[np.int64]:
-    """Return the order by stamp; the order as it is where a stamp is behind by more than that."""
+    """Return the indices sorted by stamp; unsorted if one is late by more than `late_max_ns`."""
     behind_ns = np.maximum.accumulate(stamps_ns) - stamps_ns
     if behind_ns.max(initial=0) > late_max_ns:
         return np.arange(len(stamps_ns))
@@ -35,9 +35,9 @@ def rising_order(stamps_ns: NDArray[np.int64], *, late_max_ns: int) -> NDArray[n
 
 
 def rising_stamps(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return stamps that rise: those out of order are set evenly between their neighbours'.
+    """Return rising stamps: those out of order are interpolated between their neighbours.
 
-    At the ends, where there is a neighbour on one side only, they are set 1 ms apart.
+    At the ends, with one neighbour only, they are set 1 ms apart.
     """
     kept = longest_rising(stamps_ns)
     if not len(kept):

@@ -1,4 +1,4 @@
-"""A live source with its promises kept: stamps rise, arrays hold numbers, odometry is smooth."""
+"""A wrapper for live sources: ensures rising stamps, finite arrays and smooth odometry."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sceneslam.types.truth import GroundTruth
 
 
 class RisingLive(Wrapped):
-    """Leaves out at once what comes behind, and holds nothing back to see what follows."""
+    """Leaves out observations whose stamps do not rise; adds no delay."""
 
     def __init__(self, source: Source, feed: LiveFeed) -> None:
         super().__init__(source)
@@ -29,12 +29,12 @@ class RisingLive(Wrapped):
 
     @property
     def live(self) -> LiveFeed | None:
-        """Return itself: it tells what it does to odometry, too."""
+        """Return self: its notices include corrections of odometry."""
         return self
 
     @property
     def faults(self) -> Sequence[str]:
-        """Return the source's faults and what was left out here."""
+        """Return the source's faults and counts of what was left out here."""
         return [*self._source.faults, *self._log.sentences()]
 
     def __iter__(self) -> Iterator[Observation]:
@@ -57,13 +57,13 @@ class RisingLive(Wrapped):
         return self._source.ground_truth()
 
     def measured_ns(self, observation: Observation) -> int:
-        """Return when the source measured an observation."""
+        """Return the time [ns] at which an observation was measured, on the monotonic clock."""
         return self._feed.measured_ns(observation)
 
     def notices(self) -> Sequence[Event]:
-        """Return what the source tells, and where odometry jumped.
+        """Return the source's events, and jumps of odometry.
 
-        `odometry_jump` has what the observations' odometry is from there on, of what was measured:
+        The event `odometry_jump` holds the correction of the measured odometry from then on:
         `T_smooth_odom`, 16 numbers row by row.
         """
         with self._lock:

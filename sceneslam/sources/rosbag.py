@@ -34,7 +34,7 @@ from sceneslam.types.truth import GroundTruth
 class RosBag:
     """Gives one observation per message of the first of image, depth, points, scan, odometry.
 
-    `topics` names the topic per need (null: found by type and encoding; `none`: do without).
+    `topics` names the topic per sensor (null: found by type and encoding; `none`: not used).
     """
 
     def __init__(
@@ -82,12 +82,12 @@ class RosBag:
 
     @property
     def length(self) -> int | None:
-        """Return how many messages the primary topic has."""
+        """Return the number of messages of the primary topic."""
         return self._recording.topics[self._by_sensor[self._primary]].count
 
     @property
     def faults(self) -> Sequence[str]:
-        """Return the damage of the file and of single messages."""
+        """Return the faults of the file and of single messages."""
         return [f"{fault}: {self._path}" for fault in self._recording.faults] + [
             f"{fault}: {self._path}" for fault in self._faults.sentences()
         ]
@@ -115,7 +115,7 @@ class RosBag:
             raise InputError(f"{err}: {self._path}") from err
 
     def survey(self) -> Survey:
-        """Return the topics, and samples of some stretches."""
+        """Return the topics, and samples of some time spans."""
         return survey_recording(
             self._recording,
             {sensor: self._by_sensor[sensor] for sensor in Sensor if sensor in self._by_sensor},
@@ -124,11 +124,11 @@ class RosBag:
         )
 
     def ground_truth(self) -> GroundTruth | None:
-        """Return the poses and scenes of the ground-truth topics."""
+        """Return the poses and scenes of the ground truth topics, None without."""
         return read_truth(self._recording, self._topics, self._frames, self._rig, self._truth_frame)
 
     def _jobs(self) -> Iterator[Callable[[], Decoded]]:
-        """Yield what is to be decoded for each observation."""
+        """Yield one decoding job per observation."""
         depth_range_m = self._rig.camera.depth_range_m if self._rig.camera else (0.0, 100.0)
         units = DepthUnits(self._depth_scale, depth_range_m)
         is_seeing = bool(self._topics.image or self._topics.depth)
@@ -151,7 +151,7 @@ class RosBag:
         yield from synchroniser.flush()
 
     def _samples(self, message: Message, T_base_imu: Any) -> Iterator[tuple[Sensor, Sample]]:
-        """Yield what a message holds, nothing (and a fault) when it makes no sense."""
+        """Yield a message's samples; for an invalid message, none, and count a fault."""
         value = self._recording.decode(message)
         if value is None:
             self._faults.add(

@@ -1,1 +1,1 @@
-"""What sources that measure now share: their clocks, their silences, and what waits."""
+"""Shared parts of live sources: clocks, monitoring of streams, and queues."""

@@ -1,4 +1,4 @@
-"""Measurements between a driver's threads and the source's: bounded, the newest win."""
+"""Bounded queue between a driver's threads and the source's; the oldest entries are dropped."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ import threading
 from collections import Counter, deque
 from typing import Generic, Protocol, TypeVar
 
-_MOST_BYTES = 4_000_000  # of a topic that wait: four colour images of 640x480
-_MOST = 500  # messages of a topic that wait
+_MOST_BYTES = 4_000_000  # queued per topic: four colour images of 640x480
+_MOST = 500  # messages queued per topic
 
 
 class Item(Protocol):
-    """What is put into an inbox."""
+    """An entry of an inbox."""
 
     @property
     def topic(self) -> str:
-        """Return the stream that it belongs to."""
+        """Return the name of its stream."""
         ...
 
     @property
     def size(self) -> int:
-        """Return its bytes."""
+        """Return its size [bytes]."""
         ...
 
 
@@ -28,7 +28,7 @@ T = TypeVar("T", bound=Item)
 
 
 class Inbox(Generic[T]):
-    """Takes measurements from any thread and gives them in order."""
+    """A queue of measurements from any thread, read in order of arrival."""
 
     def __init__(self) -> None:
         self._dropped: Counter[str] = Counter()
@@ -39,7 +39,7 @@ class Inbox(Generic[T]):
         self._changed = threading.Condition()
 
     def put(self, item: T) -> None:
-        """Leave a message; the oldest of its topic goes where too much of it waits."""
+        """Add a message; drop the oldest of its topic if the topic's limit is exceeded."""
         topic, size = item.topic, item.size
         with self._changed:
             while self._counts[topic] and (
@@ -54,7 +54,7 @@ class Inbox(Generic[T]):
             self._changed.notify()
 
     def take(self, timeout_s: float) -> T | None:
-        """Return the oldest message, None when none came in time or the inbox is closed."""
+        """Return the oldest message, None after the timeout or if the inbox is closed."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._is_closed, timeout_s)
             if not self._waiting or self._is_closed:
@@ -65,7 +65,7 @@ class Inbox(Generic[T]):
 
     @property
     def is_closed(self) -> bool:
-        """Tell whether nothing more is given."""
+        """Tell whether the inbox was closed."""
         return self._is_closed
 
     def take_dropped(self) -> Counter[str]:
@@ -75,7 +75,7 @@ class Inbox(Generic[T]):
             return dropped
 
     def close(self) -> None:
-        """Give nothing more."""
+        """Close the inbox; `take` returns None from then on."""
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()

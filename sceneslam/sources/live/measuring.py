@@ -1,4 +1,4 @@
-"""A source that measures now, but for where its measurements come from."""
+"""Common part of the live sources."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from sceneslam.types.truth import GroundTruth
 
 
 class Measuring:
-    """Answers what is the same for a robot and a camera: each is its own feed."""
+    """The methods that are the same for all live sources; a source is its own feed."""
 
     def __init__(self) -> None:
         self._clock = StampClock()
-        self._streams: Streams | None = None  # None until it is iterated
+        self._streams: Streams | None = None  # None before iteration
 
     @property
     def length(self) -> int | None:
-        """Return None: nobody knows how long it will last."""
+        """Return None: the length of a live source is unknown."""
         return None
 
     @property
     def live(self) -> LiveFeed | None:
-        """Return itself."""
+        """Return self."""
         return self
 
     def ground_truth(self) -> GroundTruth | None:
-        """Return None: nobody knows."""
+        """Return None: a live source has no ground truth."""
         return None
 
     def measured_ns(self, observation: Observation) -> int:
-        """Return when an observation was measured, by the monotonic clock."""
+        """Return the time [ns] at which an observation was measured, on the monotonic clock."""
         return self._clock.measured_ns(observation.stamp_ns)
 
     def notices(self) -> Sequence[Event]:
-        """Return what happened to the streams since the last call."""
+        """Return the events of the streams since the last call."""
         return self._streams.notices() if self._streams is not None else ()
 
     def close(self) -> None:
-        """End the iteration, and free what it took."""
+        """End the iteration and release all resources."""
         raise NotImplementedError

@@ -1,4 +1,4 @@
-"""Which of a robot's streams are alive, and what is worth a word about each."""
+"""Monitoring of a robot's streams: which are alive, and events of each."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from sceneslam.types.rig import Sensor
 from sceneslam.types.run import Event
 
 _WAITED_FOR = frozenset({Sensor.DEPTH, Sensor.ODOMETRY, Sensor.GYRO, Sensor.ACCELEROMETER})
-_STREAK_NS = 5_000_000_000  # what goes on for so long is told once
+_STREAK_NS = 5_000_000_000  # a condition that lasts is reported once per so long
 
 
 class Streams:
-    """Watches topics fall silent, come back, come late; `notices` is safe from any thread."""
+    """Detects topics that fall silent, return or are late; `notices` is thread-safe."""
 
     def __init__(self, topics: Mapping[Sensor, str], silent_after_s: float, now_ns: int) -> None:
         self._topics = topics
@@ -33,14 +33,14 @@ class Streams:
 
     @property
     def pace(self) -> Sensor:
-        """Return the sensor whose messages observations are made of: the first that is alive."""
+        """Return the sensor that sets the pace of observations: the first that is alive."""
         ranked = [sensor for sensor in PRIMARY if sensor in self._topics]
         alive = [sensor for sensor in ranked if self._topics[sensor] not in self._silent]
         return (alive or ranked)[0]
 
     @property
     def waits_for(self) -> frozenset[Sensor]:
-        """Return the streams that are alive and whose measurement at that instant is needed."""
+        """Return the live streams whose measurement of the same instant is needed."""
         return frozenset(
             sensor
             for sensor, topic in self._topics.items()
@@ -48,9 +48,9 @@ class Streams:
         )
 
     def has_begun(self, stamp_ns: int) -> bool:
-        """Tell whether all streams that are alive had spoken by then: what came before is partial.
+        """Tell whether all live streams had a message by then; earlier observations are partial.
 
-        Streams of their own pace, such as a laser's, need only have been heard.
+        Streams with their own rate, such as a laser's, need to have had one message at any time.
         """
         for sensor, topic in self._topics.items():
             first_ns = self._first_ns.get(topic)
@@ -62,7 +62,7 @@ class Streams:
         return True
 
     def hear(self, topic: str, lined: Lined, arrived_ns: int) -> None:
-        """Take that a message came."""
+        """Record the arrival of a message."""
         self._heard_ns[topic] = arrived_ns
         self._first_ns.setdefault(topic, lined.stamp_ns)
         if topic in self._silent:
@@ -84,7 +84,7 @@ class Streams:
         self._shifts_ns[topic] = lined.shift_ns
 
     def look(self, now_ns: int, stamp_ns: int) -> bool:
-        """Notice who fell silent; return whether anybody did."""
+        """Detect silent streams; return whether there is a new one."""
         fallen = [
             topic
             for topic, heard_ns in self._heard_ns.items()
@@ -96,7 +96,7 @@ class Streams:
         return bool(fallen)
 
     def drop(self, counts: Mapping[str, int], now_ns: int, stamp_ns: int) -> None:
-        """Take how many messages had to go before anybody decoded them; told in sums."""
+        """Record numbers of dropped messages; events report their sums."""
         self._dropped.update(counts)
         if self._dropped and now_ns - self._dropped_ns > _STREAK_NS:
             self._dropped_ns = now_ns
@@ -105,7 +105,7 @@ class Streams:
             self._dropped.clear()
 
     def notices(self) -> Sequence[Event]:
-        """Return what there was to tell since the last call."""
+        """Return the events since the last call."""
         with self._lock:
             told, self._notices = self._notices, []
             return told

@@ -1,4 +1,4 @@
-"""Depth as the colour camera would see it, by the SDK."""
+"""Registration of depth images to the colour camera by the SDK."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class DepthAligner:
         self._joining.start(self._keep)
 
     def registered(self, depth: Any, colour: Any) -> NDArray[np.uint16]:
-        """Return the depth (H, W) in the depth frame's units, of the colour frame's pixels."""
+        """Return depth (H, W) at the colour frame's pixels, in the depth frame's units."""
         self._pair, self._joined = [depth, colour], []
         self._joining.invoke(depth)
         aligned = self._align.process(self._joined[0].as_frameset()).as_frameset()

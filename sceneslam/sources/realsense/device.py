@@ -1,4 +1,4 @@
-"""Opens a RealSense camera: which one, which of its streams, and what the factory calibrated."""
+"""Access to a RealSense camera: device, streams and factory calibration."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sceneslam.sources.realsense.frames import DeviceFrame, Take, Wanted
 from sceneslam.types.errors import InputError
 from sceneslam.types.rig import Camera, Sensor
 
-_STREAMS = {  # what it is called, and in which format it is asked for
+_STREAMS = {  # name in the SDK and requested format
     Sensor.IMAGE: (rs.stream.color, rs.format.bgr8),
     Sensor.DEPTH: (rs.stream.depth, rs.format.z16),
     Sensor.GYRO: (rs.stream.gyro, rs.format.motion_xyz32f),
@@ -39,10 +39,10 @@ def find_device(serial: str | None) -> Any:
 
 
 class Device:
-    """A camera that is open; `start` has every measurement taken, from the SDK's threads."""
+    """An open camera; after `start`, the SDK's threads deliver every measurement."""
 
     def __init__(self, device: Any, wanted: Wanted) -> None:
-        self._sensors: dict[Sensor, Any] = {}  # the part of the camera that measures it
+        self._sensors: dict[Sensor, Any] = {}  # the SDK's sensor of each
         self._profiles: dict[Sensor, Any] = {}
         for part in device.query_sensors():
             for sensor in _STREAMS:
@@ -60,11 +60,11 @@ class Device:
 
     @property
     def sensors(self) -> frozenset[Sensor]:
-        """Return what it measures."""
+        """Return the available sensors."""
         return frozenset(self._profiles)
 
     def camera(self) -> Camera:
-        """Return the colour camera as the factory calibrated it; its place is the optical frame."""
+        """Return the colour camera by its factory calibration, at the origin of `base`."""
         found = self._profiles[Sensor.IMAGE].as_video_stream_profile().get_intrinsics()
         return Camera(
             size_wh=(found.width, found.height),
@@ -76,7 +76,7 @@ class Device:
         )
 
     def rotations(self) -> Mapping[Sensor, NDArray[np.float64]]:
-        """Return, for gyro and accelerometer, R_cam_sensor (3, 3)."""
+        """Return the rotations R_cam_sensor (3, 3) of gyro and accelerometer."""
         colour = self._profiles[Sensor.IMAGE]
         return {
             sensor: np.array(profile.get_extrinsics_to(colour).rotation).reshape(3, 3).T
@@ -85,7 +85,7 @@ class Device:
         }
 
     def start(self, take: Take) -> None:
-        """Begin to measure."""
+        """Start all streams."""
         parts: dict[int, tuple[Any, list[Sensor]]] = {}
         for sensor, part in self._sensors.items():
             parts.setdefault(id(part), (part, []))[1].append(sensor)
@@ -94,12 +94,12 @@ class Device:
             part.start(_taker(take))
 
     def depth_m(self, depth: DeviceFrame, image: DeviceFrame) -> NDArray[np.float32]:
-        """Return the depth (H, W) [m] of an image's pixels, 0 where nothing was measured."""
+        """Return the depth (H, W) [m] at a colour image's pixels, 0 = missing."""
         units = self._alignment.registered(depth.frame, image.frame)
         return units.astype(np.float32) * np.float32(self._depth_scale_m)
 
     def stop(self) -> None:
-        """Stop measuring; a camera that was unplugged cannot be asked any more."""
+        """Stop all streams; errors of an unplugged camera are ignored."""
         for part in {id(part): part for part in self._sensors.values()}.values():
             try:
                 part.stop()
@@ -123,7 +123,7 @@ def _taker(take: Take) -> Callable[[Any], None]:
 
 
 def _profile(part: Any, sensor: Sensor, wanted: Wanted) -> Any:
-    """Return the wanted stream, of a motion sensor the fastest; None if the camera lacks it."""
+    """Return the requested stream (of an IMU the fastest), None if the camera lacks it."""
     stream, form = _STREAMS[sensor]
     found = [
         one for one in part.get_stream_profiles()
@@ -139,7 +139,7 @@ def _profile(part: Any, sensor: Sensor, wanted: Wanted) -> Any:
 
 
 def _missing(device: Any, sensor: Sensor, wanted: Wanted) -> str:
-    """Return what the camera has in place of a stream that was asked for."""
+    """Return the error for a missing stream, with the camera's alternatives."""
     stream = _STREAMS[sensor][0]
     found = {
         (one.as_video_stream_profile().width(), one.as_video_stream_profile().height(), one.fps())

@@ -1,4 +1,4 @@
-"""Lens distortion of RealSense cameras as OpenCV has it."""
+"""Conversion of RealSense lens distortion to OpenCV's model."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import pyrealsense2 as rs
 
 from sceneslam.types.errors import InputError
 
-_GRID = 21  # points along each axis that a distortion is fitted to
-_LEFT_PX = 0.5  # that a fit may be off: as little as corners are
+_GRID = 21  # grid points per axis for the fit
+_LEFT_PX = 0.5  # largest residual of the fit: as accurate as image corners
 
 
 def to_opencv(intrinsics: Any) -> tuple[float, ...]:
-    """Return k1 k2 p1 p2 k3; raises InputError for a lens that they do not describe.
+    """Return k1 k2 p1 p2 k3; raises InputError for a lens that this model does not fit.
 
-    The SDK has several models, some from the image to the ray. Whichever it is, the coefficients
+    The SDK has several models, some of which map pixels to rays. For any of them, the coefficients
     are fitted by least squares to the rays of a grid of pixels: OpenCV's model is linear in them.
     """
     if intrinsics.model == rs.distortion.none or not any(intrinsics.coeffs):

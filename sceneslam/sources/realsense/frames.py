@@ -1,4 +1,4 @@
-"""What is asked of a RealSense camera, and what it gives."""
+"""Interface of a RealSense camera: requested streams and measured frames."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from sceneslam.types.rig import Camera, Sensor
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wanted:
-    """Which streams are asked for."""
+    """The requested streams."""
 
     size_wh: tuple[int, int]  # [px], of colour and depth
     rate_hz: int
-    is_emitting: bool  # the laser pattern that makes bare walls measurable, also in the dark
+    is_emitting: bool  # projects the infrared pattern: depth on bare walls and in the dark
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DeviceFrame:
-    """One measurement as it came."""
+    """One raw measurement."""
 
     sensor: Sensor
-    frame: Any  # of pyrealsense2, kept
-    stamp_ns: int  # the camera's, or this machine's where the SDK translates it
+    frame: Any  # of pyrealsense2, kept alive
+    stamp_ns: int  # camera's clock, or this machine's if the SDK converts it
     arrived_ns: int  # CLOCK_MONOTONIC
 
     @property
@@ -37,7 +37,7 @@ class DeviceFrame:
 
     @property
     def size(self) -> int:
-        """Return its bytes."""
+        """Return its size [bytes]."""
         return int(self.frame.get_data_size())
 
 
@@ -45,29 +45,29 @@ Take = Callable[[DeviceFrame], None]
 
 
 class OpenCamera(Protocol):
-    """A camera that is open."""
+    """An open camera."""
 
     @property
     def sensors(self) -> frozenset[Sensor]:
-        """Return what it measures."""
+        """Return the available sensors."""
         ...
 
     def camera(self) -> Camera:
-        """Return the colour camera as the factory calibrated it; its place is the optical frame."""
+        """Return the colour camera by its factory calibration, at the origin of `base`."""
         ...
 
     def rotations(self) -> Mapping[Sensor, NDArray[np.float64]]:
-        """Return, for gyro and accelerometer, R_cam_sensor (3, 3)."""
+        """Return the rotations R_cam_sensor (3, 3) of gyro and accelerometer."""
         ...
 
     def start(self, take: Take) -> None:
-        """Begin to measure; `take` is called in threads of the camera's own."""
+        """Start all streams; `take` is called in the SDK's threads."""
         ...
 
     def depth_m(self, depth: DeviceFrame, image: DeviceFrame) -> NDArray[np.float32]:
-        """Return the depth (H, W) [m] of an image's pixels, 0 where nothing was measured."""
+        """Return the depth (H, W) [m] at a colour image's pixels, 0 = missing."""
         ...
 
     def stop(self) -> None:
-        """Stop measuring."""
+        """Stop all streams."""
         ...

@@ -1,4 +1,4 @@
-"""Which depth belongs to an image, and which motion samples."""
+"""Association of colour images with depth images and IMU samples."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from numpy.typing import NDArray
 from sceneslam.sources.realsense.frames import DeviceFrame
 from sceneslam.types.rig import Sensor
 
-_PATIENCE_NS = 50_000_000  # an image waits so long for its depth
-_MOST = 3  # images and depths that wait
-_MOST_SAMPLES = 1000  # that wait for an image
+_PATIENCE_NS = 50_000_000  # longest time that an image waits for its depth
+_MOST = 3  # images, and depth images, that wait
+_MOST_SAMPLES = 1000  # IMU samples that wait for an image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Paired:
-    """What belongs to one image."""
+    """A colour image with its depth and IMU samples."""
 
     stamp_ns: int
     image: DeviceFrame
     depth: DeviceFrame | None
-    samples: tuple[tuple[int, DeviceFrame], ...]  # stamp and frame, since the image before
+    samples: tuple[tuple[int, DeviceFrame], ...]  # stamp [ns] and frame, since the previous image
 
 
 class Pairing:
-    """Takes frames with their stamps on the run's time line."""
+    """Pairs frames by their stamps on the run's time line."""
 
     def __init__(self, tolerance_ns: int) -> None:
         self._tolerance_ns = tolerance_ns
@@ -36,12 +36,12 @@ class Pairing:
         self._samples: deque[tuple[int, DeviceFrame]] = deque(maxlen=_MOST_SAMPLES)
 
     def add(self, frame: DeviceFrame, stamp_ns: int) -> None:
-        """Take a frame."""
+        """Add a frame."""
         held = {Sensor.IMAGE: self._images, Sensor.DEPTH: self._depths}
         held.get(frame.sensor, self._samples).append((stamp_ns, frame))
 
     def next(self, now_ns: int) -> Paired | None:
-        """Return the oldest image once its depth is there, or will not come; None until then."""
+        """Return the oldest image when its depth has arrived or is overdue, else None."""
         if not self._images:
             return None
         stamp_ns, image = self._images[0]
@@ -59,7 +59,7 @@ class Pairing:
 
 
 def samples_of(paired: Paired, sensor: Sensor) -> NDArray[np.float64]:
-    """Return a sensor's samples (M, 4): seconds after the image, values along its own axes."""
+    """Return samples (M, 4): time after the image [s], then x, y, z in the sensor's frame."""
     rows = []
     for stamp_ns, frame in paired.samples:
         if frame.sensor is sensor:

@@ -22,14 +22,14 @@ from sceneslam.types.errors import ConfigError, InputError, told
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor, optical_to_rep103
 
-_TICK_S = 0.1  # how late a silence may be noticed
+_TICK_S = 0.1  # interval of checks for silent streams
 
 
 class RealSense(Measuring):
     """Gives one observation per colour image, with the depth of the same instant.
 
-    A camera that falls silent, or is unplugged, is opened again as soon as it is there. `mount` is
-    where it sits in base: `xyz_m`, and `rpy_rad` of a camera that looks along base's x at zero.
+    A camera that falls silent or is unplugged is reopened as soon as it is available. `mount` is
+    its pose in `base`: `xyz_m`, and `rpy_rad`, zero for a camera that looks along x of `base`.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class RealSense(Measuring):
 
     @property
     def rig(self) -> Rig:
-        """Return the camera's sensors; opens it the first time. Raises InputError."""
+        """Return the camera's sensors; opens the camera at the first call. Raises InputError."""
         if self._device is None:
             self._device = self._opener(self._serial, self._wanted)
             camera = replace(
@@ -75,7 +75,7 @@ class RealSense(Measuring):
 
     @property
     def faults(self) -> Sequence[str]:
-        """Return why the camera could not be opened again, if so."""
+        """Return the reason if the camera could not be reopened."""
         return tuple(self._faults)
 
     def close(self) -> None:
@@ -85,7 +85,7 @@ class RealSense(Measuring):
             self._device.stop()
 
     def __iter__(self) -> Iterator[Observation]:
-        """Yield observations as they come, until `close`."""
+        """Yield observations as they arrive, until `close`."""
         topics = {sensor: sensor.value for sensor in self.rig.sensors}
         streams = self._streams = Streams(topics, self._silent_after_s, monotonic_ns())
         device = self._device
@@ -113,7 +113,7 @@ class RealSense(Measuring):
                 device = self._device = self._reopened(device)
 
     def _reopened(self, device: OpenCamera) -> OpenCamera:
-        """Return the camera opened again, as it was where it is not there."""
+        """Return the reopened camera; the old one if it is not available."""
         device.stop()
         try:
             found = self._opener(self._serial, self._wanted)
@@ -125,7 +125,7 @@ class RealSense(Measuring):
         return found
 
     def _observation(self, paired: Paired, device: OpenCamera) -> Observation:
-        """Return what belongs together, in base where it has directions."""
+        """Return the observation of paired frames; vectors are in `base`."""
         camera, depth_m, image = self._rig.camera, None, paired.image
         if paired.depth is not None and camera is not None:
             depth_m = device.depth_m(paired.depth, image)
@@ -142,7 +142,7 @@ class RealSense(Measuring):
     def _in_base(
         self, paired: Paired, sensor: Sensor, device: OpenCamera
     ) -> NDArray[np.float64] | None:
-        """Return a motion sensor's samples (N, 4) along base's axes, None without samples."""
+        """Return IMU samples (N, 4): time [s], then x, y, z in `base`; None without samples."""
         rows = samples_of(paired, sensor)
         if not len(rows):
             return None
@@ -152,7 +152,7 @@ class RealSense(Measuring):
 
 
 def _opener() -> Callable[[str | None, Wanted], OpenCamera]:
-    """Return what opens a camera; raises ConfigError where its library is missing."""
+    """Return the function that opens a camera; raises ConfigError without pyrealsense2."""
     try:
         from sceneslam.sources.realsense.device import Device, find_device
     except ImportError as error:
@@ -162,7 +162,7 @@ def _opener() -> Callable[[str | None, Wanted], OpenCamera]:
 
 
 def _mounted(mount: Mapping[str, Sequence[float]]) -> NDArray[np.float64]:
-    """Return T_base_camera of a mount."""
+    """Return T_base_camera (4, 4) [m] of a mount."""
     for key, value in mount.items():
         is_triple = isinstance(value, list | tuple) and len(value) == 3
         if key not in ("xyz_m", "rpy_rad") or not is_triple or not np.isfinite(value).all():

@@ -1,1 +1,1 @@
-"""A robot's topics as a source: heard first, as a short recording, then followed."""
+"""The topics of a ROS 2 robot as a source: recorded briefly, chosen from, then subscribed to."""

@@ -1,4 +1,4 @@
-"""What was heard of a robot in a few seconds, as a recording: chosen from and surveyed as one."""
+"""Messages received from a robot in the first seconds, as a recording in memory."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from sceneslam.ros.transport.transport import Arrival, Qos, Transport
 from sceneslam.sources.bag_topics import TYPES
 from sceneslam.sources.recording import Message
 
-_LOOK_S = 0.1  # between two looks at what is announced
-_MOST_HELD = 400  # messages of a topic ...
-_MOST_PICTURES = 40  # ... and of those that hold a megabyte each
+_LOOK_S = 0.1  # interval of topic discovery
+_MOST_HELD = 400  # messages kept per topic ...
+_MOST_PICTURES = 40  # ... and per topic with messages of about a megabyte
 _PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")
 _TF = {names.TF: Qos.RELIABLE, names.TF_STATIC: Qos.HISTORY}
 _TF_TYPE = "tf2_msgs/msg/TFMessage"
 
 
 class LiveRecording:
-    """A recording in memory that grows while a transport is listened to.
+    """A recording in memory of the messages that a transport receives.
 
-    `topics` holds what was heard, `announced` also what others only say that they publish.
+    `topics` holds the received topics, `announced` also those without a message.
     """
 
     is_slow = False
@@ -41,14 +41,14 @@ class LiveRecording:
 
     @property
     def span_ns(self) -> tuple[int, int]:
-        """Return when the first and the last message came (monotonic clock)."""
+        """Return the arrival times [ns] of the first and last message (monotonic clock)."""
         times = [one.log_ns for held in self._copies() for one in (held[0], held[-1])]
         return min(times, default=0), max(times, default=0)
 
     def listen(
         self, transport: Transport, *, wanted: Collection[str], listen_s: float, wait_s: float
     ) -> None:
-        """Listen until `listen_s` after the first measurement, and to all that is `wanted`.
+        """Receive until `listen_s` after the first measurement and until all `wanted` topics came.
 
         Gives up after `wait_s`.
         """
@@ -70,7 +70,7 @@ class LiveRecording:
             transport.unsubscribe(topic)
 
     def take(self, arrival: Arrival) -> None:
-        """Take a message; of many, the newest are kept."""
+        """Add a message; beyond the limits, the oldest are dropped."""
         topic = arrival.topic
         with self._changed:
             msgtype = self.announced[topic]
@@ -82,7 +82,7 @@ class LiveRecording:
             self.topics[topic] = TopicType.of_network(msgtype, count)
 
     def messages(self, topics: Collection[str], from_ns: int | None = None) -> Iterator[Message]:
-        """Yield by arrival."""
+        """Yield the messages by arrival."""
         found = [one for held in self._copies() for one in held if one.topic in topics]
         for message in sorted(found, key=lambda one: one.log_ns):
             if from_ns is None or message.log_ns >= from_ns:
@@ -94,7 +94,7 @@ class LiveRecording:
         return held[-1] if held else None
 
     def decode(self, message: Message) -> Any:
-        """Return the decoded message, None when its bytes make no sense."""
+        """Return the decoded message, None if its bytes are invalid."""
         return self._decoder.decode(message.topic, message.data)
 
     def _copies(self) -> list[list[Message]]:

@@ -29,9 +29,9 @@ from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor, Wheels
 
-_TICK_S = 0.1  # how late a silence may be noticed
-_PATIENCE_S = 0.05  # an image waits so long for odometry of its instant: 20 Hz, as robots send it
-_USUAL = {  # a RealSense camera's and a robot's names; other topics are found by their type
+_TICK_S = 0.1  # interval of checks for silent streams
+_PATIENCE_S = 0.05  # an image waits so long for odometry: the period of 20 Hz
+_USUAL = {  # usual topic names; other topics are found by their type
     "image": ("/camera/color/image_raw", "/camera/camera/color/image_raw"),
     "depth": (
         "/camera/aligned_depth_to_color/image_raw",
@@ -47,9 +47,9 @@ _USUAL = {  # a RealSense camera's and a robot's names; other topics are found b
 class Ros2(Measuring):
     """Gives one observation per message of the first of image, depth, points, scan, odometry.
 
-    Where that falls silent, the next one takes its place until it is back. `topics` as for a bag.
-    The robot is listened to for `listen_s` before it is chosen what is used, and until every topic
-    that is named was heard; after `wait_s` that is an InputError.
+    If that falls silent, the next one replaces it until it is back. `topics` is as for a bag.
+    Topics are received for `listen_s` before the used ones are chosen, and until every configured
+    topic has had a message; after `wait_s` without, an InputError is raised.
     """
 
     def __init__(
@@ -100,9 +100,9 @@ class Ros2(Measuring):
 
     @property
     def rig(self) -> Rig:
-        """Return the sensors that are heard; waits for them the first time.
+        """Return the rig of the received sensors; waits for them at the first call.
 
-        Raises InputError where nothing is heard, or not what is named.
+        Raises InputError if nothing is received, or not all configured topics.
         """
         if self._transport is None:
             self._listen()
@@ -110,11 +110,11 @@ class Ros2(Measuring):
 
     @property
     def faults(self) -> Sequence[str]:
-        """Return what was wrong with single messages."""
+        """Return the faults of single messages."""
         return self._faults.sentences()
 
     def survey(self) -> Survey:
-        """Return what was heard at the beginning."""
+        """Return the survey of the messages received at the beginning."""
         _ = self.rig
         return survey_recording(
             self.heard,
@@ -132,7 +132,7 @@ class Ros2(Measuring):
             self._transport.close()
 
     def __iter__(self) -> Iterator[Observation]:
-        """Yield observations as they come, until `close`."""
+        """Yield observations as they arrive, until `close`."""
         for bundle, primary in self._bundles():
             if self._streams is None or not self._streams.has_begun(bundle.primary.stamp_ns):
                 continue
@@ -143,7 +143,7 @@ class Ros2(Measuring):
                 yield decoded.observation
 
     def _listen(self) -> None:
-        """Hear what there is, choose what is used, and follow that alone."""
+        """Receive all topics, choose the used ones, and subscribe to these only."""
         wanted = [name for name in self._named.values() if name not in (None, NONE)]
         self._transport = open_transport(self._network)
         try:
@@ -175,7 +175,7 @@ class Ros2(Measuring):
             raise InputError(f"{error}: {self._where()}, {self._there()}") from error
 
     def _name(self, need: str, name: str | None) -> str | None:
-        """Return the name that is given, or the usual one where it was heard."""
+        """Return the configured name of a topic, or the usual one if it was received."""
         usual = (one for one in _USUAL.get(need, ()) if one in self.heard.topics)
         return name if name is not None else next(usual, None)
 
@@ -198,8 +198,8 @@ class Ros2(Measuring):
             transport.subscribe(topic, types[topic], self._inbox.put)
 
     def _bundles(self) -> Iterator[tuple[SynchronisedSamples, Sensor]]:
-        """Yield bundles with the sensor that each is made for."""
-        assert self._streams is not None, "rig is asked first"
+        """Yield synchronised samples, each with its primary sensor."""
+        assert self._streams is not None, "`rig` has to be read before iteration"
         streams, primary = self._streams, self._streams.pace
         synchroniser = Synchroniser(
             primary,
@@ -217,7 +217,7 @@ class Ros2(Measuring):
                     stamp_ns = sample.stamp_ns
                     if sensor is not streams.pace or primary is streams.pace:
                         yield from ((one, primary) for one in synchroniser.add(sensor, sample))
-            # While messages wait here, the time is theirs: who is read late was heard in time.
+            # While messages are queued, the time is the arrival time of the oldest.
             now_ns = monotonic_ns() if arrival is None else arrival.arrived_ns
             if now_ns - looked_ns > _TICK_S * 1e9:
                 looked_ns = now_ns
@@ -227,7 +227,7 @@ class Ros2(Measuring):
             synchroniser.follow(primary, streams.waits_for)
 
     def _samples(self, arrival: Arrival) -> Iterator[tuple[Sensor, Sample]]:
-        """Yield what a message holds, on one time line."""
+        """Yield a message's samples, with aligned stamps."""
         assert self._streams is not None
         topic = arrival.topic
         message = self._decoder.decode(topic, arrival.cdr)
@@ -246,7 +246,7 @@ class Ros2(Measuring):
                 yield sensor, Sample(stamp_ns=lined.stamp_ns, value=held)
 
     def _unplaced(self) -> list[str]:
-        """Return the frames of sensors that no transform connects with the base."""
+        """Return the sensor frames that no transform connects with the base."""
         topics = (self.topics.image or self.topics.depth, self.topics.scan, self.topics.points)
         messages = [first(self.heard, topic) for topic in topics if topic]
         frames = dict.fromkeys(decode.frame_id(one) for one in messages if one is not None)
@@ -257,7 +257,7 @@ class Ros2(Measuring):
         return f"domain {self._network.domain()} ({reach}; ROS_DOMAIN_ID, source.discovery)"
 
     def _there(self) -> str:
-        """Return what is announced, and what of it was heard, to show."""
+        """Return the announced and the received topics as text."""
         announced: Mapping[str, str] = self.heard.announced
         parts = [
             f"{topic} ({msgtype}{'' if topic in self.heard.topics else ', silent'})"

@@ -1,4 +1,4 @@
-"""A folder of rendered stories: whole, checked files only, each made by one process at a time."""
+"""A cache folder of rendered stories: complete files with checksums, each made by one process."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 class Cache:
-    """Keeps files under names that hold everything that they depend on."""
+    """Keeps files under names with a hash of everything that they depend on."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = given_path(str(folder))
@@ -29,11 +29,11 @@ class Cache:
     def fetch(
         self, name: str, depends_on: Mapping[str, object], make: Callable[[Path], None]
     ) -> Path:
-        """Return the file of a configuration; make it when it is missing or damaged.
+        """Return the path of a cached file; make it if it is missing or damaged.
 
-        `make` writes to the path that it is given; the file counts once that has returned. Other
-        processes that want the same file wait for it, those that want another do not. Raises
-        InputError where the folder cannot be written, before `make` where that can be known.
+        `make` writes to the given path; the file is valid once `make` has returned. Other processes
+        wait only if they need the same file. Raises InputError if the folder cannot be written, if
+        possible before `make` is called.
         """
         path = self._folder / f"{name}_{fingerprint(depends_on)}.mcap"
         seal = path.with_suffix(".crc32")
@@ -49,8 +49,8 @@ class Cache:
 
 def _make(path: Path, seal: Path, make: Callable[[Path], None]) -> None:
     if path.is_file():
-        log.warning("the cached file is damaged and is made anew: %s", path)
-    for old in (path, seal):  # a folder in a file's place cannot be replaced
+        log.warning("the cached file is damaged and is rendered again: %s", path)
+    for old in (path, seal):  # a folder at the file's path cannot be replaced
         old.unlink(missing_ok=True)
     part = path.with_suffix(f".{os.getpid()}.part")
     part.touch()
@@ -65,10 +65,10 @@ def _make(path: Path, seal: Path, make: Callable[[Path], None]) -> None:
 
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    """Wait for a lock file; the lock goes with the process that holds it, however that ends."""
+    """Hold a file lock; it is released when its process ends in any way."""
     try:
         import fcntl
-    except ImportError:  # Windows: everyone makes its own, and the last one stays
+    except ImportError:  # Windows: each process makes the file, the last one stays
         yield
         return
     with path.open("w") as file:
@@ -77,14 +77,14 @@ def _locked(path: Path) -> Iterator[None]:
         except BlockingIOError:
             log.warning("another process makes this recording: waiting for %s", path)
             fcntl.flock(file, fcntl.LOCK_EX)
-        except OSError:  # a file system without locks: everyone makes its own
+        except OSError:  # a file system without locks: each process makes the file
             log.info("%s cannot be locked", path)
         yield
 
 
 @contextmanager
 def _writable(cache: Path) -> Iterator[None]:
-    """Raise InputError with what to set where a cache cannot be written."""
+    """Raise InputError, with the variable to set, if the cache cannot be written."""
     try:
         yield
     except OSError as error:
@@ -95,7 +95,7 @@ def _writable(cache: Path) -> Iterator[None]:
 
 
 def _is_sealed(path: Path, seal: Path) -> bool:
-    """Tell whether a file is the one that its checksum was written for."""
+    """Tell whether a file agrees with its stored checksum."""
     try:
         return seal.read_bytes() == _checksum(path).encode()
     except OSError:
@@ -103,13 +103,13 @@ def _is_sealed(path: Path, seal: Path) -> bool:
 
 
 def fingerprint(depends_on: Mapping[str, object]) -> str:
-    """Return twelve digits that change with any value."""
+    """Return a hash of twelve digits of the values."""
     text = json.dumps(depends_on, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def code_digest(*files: Path) -> str:
-    """Return a digest of what Python files do; comments, docstrings and layout are not in it."""
+    """Return a hash of the code of Python files, without comments, docstrings and layout."""
     digest = hashlib.sha256()
     for file in sorted(files):
         tree = ast.parse(file.read_bytes())
@@ -126,7 +126,7 @@ def _is_text(node: ast.AST) -> bool:
 
 
 def _checksum(path: Path) -> str:
-    """Return size and CRC-32 of a file as text."""
+    """Return the size and CRC-32 of a file as text."""
     value = 0
     with path.open("rb") as file:
         while block := file.read(_BLOCK_BYTES):

@@ -1,7 +1,7 @@
-"""What a noise-free camera sees of a place: colour, depth and the angle of view of surfaces.
+"""Noise-free camera images of a place: colour, depth and the surfaces' angles of incidence.
 
-Rays tell which panel a pixel shows, and only where neighbours on a coarse grid disagree; depth
-and texture coordinates then follow from the panel's plane, exactly.
+Ray casting finds the panel that a pixel shows: on a coarse grid, and between grid nodes that
+show different panels. Depth and texture coordinates then follow exactly from the panel's plane.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from sceneslam.sources.simulator.places.surfaces import TEXEL_M
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
-_LEVELS = 6  # of each texture, every one half as fine as the one before
+_LEVELS = 6  # mipmap levels of each texture, each half the resolution of the previous
 _SHEET_COLUMNS = 4096
-_ROW = 256  # samples at edges are looked up in rows of this many
-_STEP_PX = 2  # of the coarse grid: what is thinner may be missed
+_ROW = 256  # samples at edges are processed in rows of this length
+_STEP_PX = 2  # of the coarse grid; thinner objects may be missed
 _EDGE_OFFSETS_PX = ((-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375))
-_EDGE_CONTRAST = 6.0  # grey values between panels that noise hides, at nominal exposure
+_EDGE_CONTRAST = 6.0  # grey values at nominal exposure; lower contrast is below noise
 
 Image = NDArray[np.float32]
-Panels = NDArray[np.int32]  # a panel's number per pixel; one beyond the last: the sky
+Panels = NDArray[np.int32]  # panel index per pixel; the number of panels: sky
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RenderedView:
-    """A noise-free frame."""
+    """A noise-free image with depth."""
 
     image_bgr: Image  # (H, W, 3), 255 for white in unit light; the square root of radiance
     depth_m: Image  # (H, W), along the optical axis; inf where nothing is
-    cosine: Image  # (H, W), between the ray and the surface's normal
-    blinded: NDArray[np.bool_]  # (H, W), to the depth camera's pattern: by sun or polish
+    cosine: Image  # (H, W), of the angle between ray and surface normal
+    blinded: NDArray[np.bool_]  # (H, W), no depth because of sunlight or a polished surface
 
 
 class CameraRenderer:
@@ -64,11 +64,11 @@ class CameraRenderer:
 
     @property
     def directions(self) -> Image:
-        """Return the rays' directions (H, W, 3) in `cam`, with z = 1."""
+        """Return the directions (H, W, 3) of the pixels' rays in `cam`, with z = 1."""
         return self._directions
 
     def look(self, T_gt_cam: Transform, levels: Mapping[str, float]) -> RenderedView:
-        """Return the view from a pose, each group of lamps at its level (0 off, 1 full)."""
+        """Return the view from the pose T_gt_cam (4, 4) [m], with lamp groups at levels 0 to 1."""
         panels = self._find_panels(T_gt_cam)
         sight = self._planes.seen_from(T_gt_cam)
         shaded = self._shade(sight, panels, self._directions, self._lengths, levels)
@@ -86,7 +86,7 @@ class CameraRenderer:
     def meter(
         self, poses: Sequence[Transform], levels: Mapping[str, float], step_px: int
     ) -> list[Image]:
-        """Return the grey of every `step_px`-th pixel (N,) from each pose, 255 as in a view."""
+        """Return the grey values (N,), 0 to 255, of every `step_px`-th pixel from each T_gt_cam."""
         directions = np.ascontiguousarray(self._directions[::step_px, ::step_px])
         lengths = np.ascontiguousarray(self._lengths[::step_px, ::step_px])
         weights = np.array([0.114, 0.587, 0.299], np.float32)
@@ -103,7 +103,7 @@ class CameraRenderer:
         return self._caster.first_panels(rays.reshape(-1, 6)).reshape(rays.shape[:-1])
 
     def _find_panels(self, T_gt_cam: Transform) -> Panels:
-        """Return which panel each pixel shows: between equal neighbours on the grid, that one."""
+        """Return each pixel's panel; between equal grid nodes, it is that of the nodes."""
         step, (width, height) = _STEP_PX, self._camera.size_wh
         nodes = self._cast(T_gt_cam, np.ascontiguousarray(self._directions[::step, ::step]))
         corners = [nodes, _moved(nodes, 0, 1), _moved(nodes, 1, 0), _moved(nodes, 1, 1)]
@@ -116,7 +116,7 @@ class CameraRenderer:
         return panels
 
     def _lit(self, levels: Mapping[str, float]) -> Image:
-        """Return the sheet of the light map: the root of the light (BGR), and the sun's."""
+        """Return the light map's sheet: square root of the light (BGR), and the sun's share."""
         wanted = tuple(levels[group] for group in self._light.groups)
         if wanted != self._lit_at:
             total = np.zeros_like(self._light.irradiance[0])
@@ -137,7 +137,7 @@ class CameraRenderer:
         lengths: Image,
         levels: Mapping[str, float],
     ) -> _Shaded:
-        """Return what pixels (rows, columns) show."""
+        """Return colour and depth of pixels (rows, columns)."""
         seen = sight.at(panels, directions)
         cosine = seen.slope / lengths
         detail = self._detail(seen.depth_m, cosine) * (self._planes.count + 1) + panels
@@ -156,7 +156,7 @@ class CameraRenderer:
         )
 
     def _detail(self, depth_m: Image, cosine: Image) -> NDArray[np.int32]:
-        """Return the level of the textures whose texels are about as large as the pixels."""
+        """Return the mipmap level whose texels are about as large as the pixels."""
         texels = np.minimum(depth_m, np.float32(100.0)) / np.float32(self._camera.fx * TEXEL_M)
         square = texels * texels / np.maximum(cosine, np.float32(0.02))
         level = 0.5 * np.log2(np.maximum(square, np.float32(1.0)))
@@ -170,7 +170,7 @@ class CameraRenderer:
         sight: Sight,
         levels: Mapping[str, float],
     ) -> None:
-        """Average four samples per pixel, in place, where panels of different colour meet."""
+        """Average four samples per pixel, in place, at edges between panels of different colour."""
         pixels = np.flatnonzero(_edges(panels, image))
         if len(pixels) == 0:
             return
@@ -194,7 +194,7 @@ class _Shaded:
 
 
 def _directions(camera: Camera, offset_px: tuple[float, float]) -> Image:
-    """Return the rays' directions (H, W, 3) in `cam`, with z = 1: reach is depth."""
+    """Return ray directions (H, W, 3) in `cam`, with z = 1: then the ray length is the depth."""
     width, height = camera.size_wh
     x = (np.arange(width) + offset_px[0] - camera.cx) / camera.fx
     y = (np.arange(height) + offset_px[1] - camera.cy) / camera.fy
@@ -204,19 +204,19 @@ def _directions(camera: Camera, offset_px: tuple[float, float]) -> Image:
 
 
 def _rays(T_gt_cam: Transform, directions_cam: Image) -> Image:
-    """Return rays (..., 6) in gt."""
+    """Return rays (..., 6), origin [m] and direction, in `gt`."""
     rays = np.empty((*directions_cam.shape[:-1], 6), np.float32)
     rays[..., :3] = T_gt_cam[:3, 3]
     x, y = directions_cam[..., 0], directions_cam[..., 1]
     for axis, (a, b, c) in enumerate(T_gt_cam[:3, :3].astype(np.float32)):
-        rays[..., 3 + axis] = a * x + b * y + c  # by hand: the same bits for any number of threads
+        rays[..., 3 + axis] = a * x + b * y + c  # same result for any number of threads
     return rays
 
 
 def _sample(
     sheet: Image | NDArray[np.uint8], lookup: Image, index: NDArray[np.int32], u: Image, v: Image
 ) -> Image:
-    """Return the sheet's values (rows, columns, C) at texture coordinates of blocks."""
+    """Return the sheet's values (rows, columns, C) at texture coordinates in blocks."""
     left, across, top, down = (np.take(column, index) for column in lookup)
     across *= u
     across += left
@@ -226,14 +226,14 @@ def _sample(
 
 
 def _moved(nodes: Panels, down: int, right: int) -> Panels:
-    """Return each node's neighbour; at the border, a panel that is none, so that rays are cast."""
+    """Return each node's neighbour; at the border an invalid index, so that rays are cast there."""
     moved = np.full_like(nodes, -1)
     moved[: len(nodes) - down, : nodes.shape[1] - right] = nodes[down:, right:]
     return moved
 
 
 def _edges(panels: Panels, image: Image) -> NDArray[np.bool_]:
-    """Tell of each pixel whether a neighbour shows another panel, of another tone."""
+    """Return (H, W) whether a neighbouring pixel shows another panel of another colour."""
     edges = np.zeros(panels.shape, np.bool_)
     green = np.ascontiguousarray(image[..., 1])
     for here, there in (
@@ -248,12 +248,12 @@ def _edges(panels: Panels, image: Image) -> NDArray[np.bool_]:
 
 
 def _with_sky(lookup: Image) -> Image:
-    """Return (4, N + 1) of a look-up (N, 4): the sky's block is the first one."""
+    """Return (4, N + 1) of a look-up (N, 4); the sky uses the first block."""
     return np.ascontiguousarray(np.concatenate([lookup, lookup[:1]]).T)
 
 
 def _paint_skin(place: SimulatedPlace) -> tuple[NDArray[np.uint8], Image]:
-    """Return all textures, at all levels, on one sheet, and its lookup (4, levels * panels)."""
+    """Return one sheet of all textures at all levels and its look-up (4, levels * panels)."""
     blocks, current = [], [panel.texture for panel in place.panels]
     for _ in range(_LEVELS):
         blocks += current

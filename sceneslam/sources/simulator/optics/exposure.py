@@ -1,4 +1,4 @@
-"""Automatic exposure: how long the shutter is open, and how much its signal is amplified."""
+"""Automatic exposure: exposure time and gain of each frame."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 
 from sceneslam.sources.simulator.settings import ExposureSettings
 
-_SETTLED = 200  # frames on the first view before the story begins
+_SETTLED = 200  # frames for convergence on the first view before the story begins
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shutter:
-    """How one frame is exposed."""
+    """The exposure of one frame."""
 
-    time_ratio: float = 1.0  # of the nominal time, which shows white in unit light as white
+    time_ratio: float = 1.0  # of the nominal time, at which white in unit light is white
     gain: float = 1.0
-    motion_px: tuple[float, float] = (0.0, 0.0)  # of the picture while the shutter is open
+    motion_px: tuple[float, float] = (0.0, 0.0)  # of the image during the exposure
 
 
 NOMINAL = Shutter()
@@ -28,10 +28,10 @@ NOMINAL = Shutter()
 def follow(
     greys: Sequence[NDArray[np.float32]], settings: ExposureSettings, rate_hz: float
 ) -> NDArray[np.float64]:
-    """Return (N,) the exposure (time ratio x gain) of each frame.
+    """Return the exposure (N,), time ratio x gain, of each frame.
 
-    `greys` are what the frames would show at nominal exposure, before anything is white. Each
-    frame corrects the next one's exposure towards the target mean, at the pace of the lag.
+    `greys` are the frames' grey values at nominal exposure, without saturation. Each
+    frame corrects the next one's exposure towards the target mean with the time constant `lag_s`.
     """
     if not settings.is_automatic:
         return np.ones(len(greys))
@@ -48,7 +48,7 @@ def follow(
 
 
 def split(exposure: float, settings: ExposureSettings) -> tuple[float, float]:
-    """Return (time ratio, gain): the shutter first, the amplifier when it can no longer."""
+    """Return (time ratio, gain): gain is used only beyond the longest exposure time."""
     longest = settings.range_s[1] / settings.nominal_s if settings.is_automatic else 1.0
     time_ratio = min(exposure, longest)
     return time_ratio, exposure / time_ratio

@@ -1,6 +1,6 @@
-"""How light falls on a place: each switch's light by ray casting, with shadows and bounces.
+"""Illumination of a place: each lamp group's light by ray casting, with shadows and reflections.
 
-Irradiance is in units of what the camera shows as white on a perfect reflector.
+The unit of irradiance is that at which a perfect reflector is white in the image.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from sceneslam.sources.simulator.optics.rays import RayCaster
 from sceneslam.sources.simulator.optics.sheet import Sheet, pack
 from sceneslam.sources.simulator.places.place import SUN, Lamp, Panel, SimulatedPlace, Sun
 
-_LIFT_M = 0.002  # rays start this far off their panel
+_LIFT_M = 0.002  # offset of a ray's origin from its panel
 _BOUNCE_RAYS = 64
 _BOUNCES = 4
 _SHEET_COLUMNS = 1024
@@ -25,7 +25,7 @@ Values = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LightMap:
-    """The irradiance that each switch gives, on a sheet with one block per panel."""
+    """The irradiance by each lamp group, on a sheet with one block per panel."""
 
     groups: tuple[str, ...]
     irradiance: Values  # (groups, rows, columns, 3), BGR
@@ -34,16 +34,16 @@ class LightMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Cells:
-    """The light map's cells, all blocks in a row, row by row."""
+    """The light map's cells, block by block, row by row."""
 
     points: Values  # (N, 3) [m], just above the panel
     normals: Values  # (N, 3)
     albedo: Values  # (N, 3), linear
-    first: NDArray[np.int64]  # (panels,), where a block starts
+    first: NDArray[np.int64]  # (panels,), index of each block's first cell
 
 
 def bake(place: SimulatedPlace, caster: RayCaster, rng: np.random.Generator) -> LightMap:
-    """Return the light of every switch of a place at full power."""
+    """Return the light of every lamp group of a place at full power."""
     sheet = pack(_block_sizes(place), _SHEET_COLUMNS)
     cells = _cells(place, sheet)
     direct = np.stack([_direct(group, place, cells, caster) for group in place.groups], axis=1)
@@ -83,7 +83,7 @@ def _cells(place: SimulatedPlace, sheet: Sheet) -> _Cells:
 
 
 def _block_cells(panel: Panel, wide: int, high: int) -> tuple[NDArray[np.float64], Values]:
-    """Return the centres (N, 3) and linear reflectances (N, 3) of a panel's cells."""
+    """Return the centres (N, 3) [m], gt, and linear reflectances (N, 3) of a panel's cells."""
     t, s = np.meshgrid(
         (np.arange(high) + 0.5) / high, (np.arange(wide) + 0.5) / wide, indexing="ij"
     )
@@ -94,7 +94,7 @@ def _block_cells(panel: Panel, wide: int, high: int) -> tuple[NDArray[np.float64
 
 
 def _direct(group: str, place: SimulatedPlace, cells: _Cells, caster: RayCaster) -> Values:
-    """Return the irradiance (N,) straight from the lamps of a group, or from the sun."""
+    """Return the direct irradiance (N,) by the lamps of a group, or by the sun."""
     total = np.zeros(len(cells.points), np.float32)
     if group == SUN and place.sun:
         _shine(total, cells, caster, *_sun_rays(place.sun, cells))
@@ -108,7 +108,7 @@ def _direct(group: str, place: SimulatedPlace, cells: _Cells, caster: RayCaster)
 def _shine(
     total: Values, cells: _Cells, caster: RayCaster, towards: Values, irradiance: Values
 ) -> None:
-    """Add, in place, the irradiance that comes along rays whose way is free."""
+    """Add, in place, the irradiance along rays that are not blocked."""
     lit = np.flatnonzero(irradiance > 0)
     rays = np.concatenate([cells.points[lit], towards[lit]], axis=1)
     total[lit] += np.where(caster.is_blocked(rays, reach=0.999), 0.0, irradiance[lit])
@@ -122,10 +122,10 @@ def _sun_rays(sun: Sun, cells: _Cells) -> tuple[Values, Values]:
 
 
 def _lamp_rays(lamp: Lamp, point_m: NDArray[np.float64], cells: _Cells) -> tuple[Values, Values]:
-    """Return the ways to a point of a lamp and the irradiance from there: Lambert, 1 / r^2."""
+    """Return the vectors to a point of a lamp and its irradiance: Lambert's law, 1 / r^2."""
     towards = (point_m - cells.points).astype(np.float32)
     square_m2 = np.maximum((towards**2).sum(axis=1), 1e-4)
-    down = np.maximum(towards[:, 2], 0.0)  # of the ray, times r, at the lamp
+    down = np.maximum(towards[:, 2], 0.0)  # cosine at the lamp, times r
     cosine = np.maximum((towards * cells.normals).sum(axis=1), 0.0)
     power = lamp.power / lamp.points_per_side**2
     share = np.where(square_m2 > lamp.reach_m**2, np.float32(0.0), np.float32(power))
@@ -141,9 +141,9 @@ def _lamp_points(lamp: Lamp) -> NDArray[np.float64]:
 def _gather(
     cells: _Cells, sheet: Sheet, caster: RayCaster, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Return (rays, N): the cells that each cell sees, cosine-weighted.
+    """Return (rays, N): the cells that each cell's cosine-weighted rays hit.
 
-    N stands for the back of a panel (black), N + 1 for the sky.
+    Index N is the back of a panel (black), N + 1 the sky.
     """
     count, lookup = len(cells.points), sheet.lookup()
     spin = rng.uniform(0, 2 * np.pi, count).astype(np.float32)
@@ -152,7 +152,7 @@ def _gather(
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     other = np.cross(cells.normals, side)
     seen = np.empty((_BOUNCE_RAYS, count), np.int64)
-    for k in range(_BOUNCE_RAYS):  # a sunflower's seeds on the unit disc, lifted to the sphere
+    for k in range(_BOUNCE_RAYS):  # Fibonacci lattice on the unit disc, projected to the sphere
         radius = np.sqrt((k + 0.5) / _BOUNCE_RAYS)
         x, y = radius * np.cos(spin + 2.399963 * k), radius * np.sin(spin + 2.399963 * k)
         way = side * x[:, None] + other * y[:, None] + cells.normals * np.sqrt(1 - radius**2)
@@ -172,7 +172,7 @@ def _gather(
 
 
 def _bounce(direct: Values, sky: Values, albedo: Values, seen: NDArray[np.int64]) -> Values:
-    """Return the irradiance (N, groups, 3) that other cells reflect, by repeated gathering."""
+    """Return the irradiance (N, groups, 3) reflected by other cells, by iterated gathering."""
     count, groups = direct.shape
     source = np.zeros((count + 2, groups, 3), np.float32)
     source[count + 1] = sky[:, None]
@@ -187,7 +187,7 @@ def _bounce(direct: Values, sky: Values, albedo: Values, seen: NDArray[np.int64]
 
 
 def _smooth(block: Values) -> Values:
-    """Return a block without the speckle of few rays."""
+    """Return a block smoothed against the noise of few rays."""
     for _ in range(3):
         block = np.asarray(cv2.blur(block, (3, 3), borderType=cv2.BORDER_REPLICATE))
     return block

@@ -1,4 +1,4 @@
-"""Normal noise for frames, cut from one long table: to draw it anew is what takes time."""
+"""Normal noise for frames, taken from one long table, as drawing it for each frame is slow."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ _ENTRIES = 1 << 22  # more than four frames' pixels in colour
 
 
 class NoiseTable:
-    """Standard normal numbers, drawn once; a frame takes them from places of its own."""
+    """Standard normal numbers, drawn once; each frame takes a random part of them."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._normals = rng.standard_normal(_ENTRIES, dtype=np.float32)
         self._normals.flags.writeable = False
 
     def normals(self, rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:
-        """Return an array of the table, read-only, which begins where `rng` says."""
+        """Return a read-only array of the table from a random position on."""
         count = prod(shape)
         start = int(rng.integers(0, max(_ENTRIES - count, 1)))
         part = self._normals[start : start + count]

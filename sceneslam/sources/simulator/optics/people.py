@@ -1,4 +1,4 @@
-"""People before a rendered view: each an upright cylinder in trousers, a striped shirt, a head."""
+"""People in a rendered view: upright cylinders with trousers, striped shirt and head."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sceneslam.sources.simulator.optics.camera import RenderedView
 from sceneslam.sources.simulator.places.walker import Walker
 from sceneslam.types.se3 import Transform
 
-_SHIRT_RATIO, _HEAD_RATIO = 0.5, 0.86  # of the height, where they begin
+_SHIRT_RATIO, _HEAD_RATIO = 0.5, 0.86  # lower end, as share of the height
 _TROUSERS, _SHIRT, _STRIPE, _HEAD = np.array(  # BGR
     [(60, 48, 40), (70, 90, 170), (190, 200, 205), (130, 160, 205)], np.float32
 )
@@ -28,7 +28,7 @@ def add_people(
     directions_cam: Values,
     levels: Mapping[str, float],
 ) -> None:
-    """Put people into a view, in place; `directions_cam` (H, W, 3) are its rays, with z = 1."""
+    """Draw people into a view, in place; `directions_cam` (H, W, 3) are its rays, with z = 1."""
     for person in people:
         ways = directions_cam.reshape(-1, 3) @ T_gt_cam[:3, :3].T.astype(np.float32)
         start = T_gt_cam[:3, 3].astype(np.float32)
@@ -45,7 +45,7 @@ def add_people(
 
 
 def reach_people(people: Sequence[Walker], time_s: float, rays: Values) -> Values:
-    """Return how far rays (N, 6) in gt go to the first person, in lengths of their directions."""
+    """Return the distance (N,) of rays (N, 6), gt, to the first person, in direction lengths."""
     reach = np.full(len(rays), np.inf, np.float32)
     for person in people:
         reach = np.minimum(reach, _reach(person, time_s, rays[0, :3], rays[:, 3:]))
@@ -53,9 +53,9 @@ def reach_people(people: Sequence[Walker], time_s: float, rays: Values) -> Value
 
 
 def _reach(person: Walker, time_s: float, start: Values, ways: Values) -> Values:
-    """Return where rays (N, 3) from one point enter a person's cylinder, else infinity.
+    """Return the distance (N,) at which rays from one point enter a person's cylinder, else inf.
 
-    |o + t d|^2 = r^2 in the plane, with o from the axis to the start.
+    Solves |o + t d|^2 = r^2 for t, horizontally, with o from the cylinder's axis to the start.
     """
     offset = start[:2] - person.position_m(time_s).astype(np.float32)
     a = np.maximum((ways[:, :2] ** 2).sum(axis=1), np.float32(1e-12))
@@ -69,7 +69,7 @@ def _reach(person: Walker, time_s: float, start: Values, ways: Values) -> Values
 
 
 def _colours(person: Walker, height_m: Values) -> Values:
-    """Return the colours (N, 3) BGR of a person at heights (N,)."""
+    """Return the colours (N, 3) BGR of a person at heights (N,) [m]."""
     ratio = height_m / person.height_m
     is_stripe = (height_m // _STRIPE_M) % 2 == 0
     shirt = np.where(is_stripe[:, None], _STRIPE, _SHIRT)

@@ -1,4 +1,4 @@
-"""Where pixels lie on the planes of panels, without a ray: 1 / depth is affine in a picture."""
+"""Intersection of pixels with panels' planes in closed form: 1 / depth is affine in the image."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ Values = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PanelPoints:
-    """The points of panels that pixels show, all arrays of the pixels' shape."""
+    """The points on panels that pixels show; all arrays have the pixels' shape."""
 
     depth_m: Values
     u: Values  # along the panel's edges, 0 to 1
     v: Values
-    slope: Values  # cosine of the angle of view, times the length of the ray's direction
+    slope: Values  # cosine of the angle of incidence, times the length of the ray's direction
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sight:
-    """The planes of all panels from one pose."""
+    """The planes of all panels in the frame of one camera pose."""
 
     table: Values  # (12, panels + 1)
 
     def at(self, panels: NDArray[np.int32], directions_cam: Values) -> PanelPoints:
-        """Return the points that pixels show: their panels (...), directions (..., 3) with z = 1.
+        """Return the points that pixels show, by their panels (...) and directions (..., 3), z = 1.
 
-        With X = corner + u e_u + v e_v = z d and the dual basis g of (e_u, e_v, n):
+        The point is X = corner + u e_u + v e_v = z d. With the dual basis g of (e_u, e_v, n):
         1 / z = g_n d / g_n corner, u = z g_u d - g_u corner.
         """
         x, y = directions_cam[..., 0], directions_cam[..., 1]
@@ -60,7 +60,7 @@ class Sight:
 
 
 class Planes:
-    """The planes of all panels, and the sky: a panel beyond the last, far away."""
+    """The planes of all panels, and of the sky: a distant panel after the last index."""
 
     def __init__(self, panels: Sequence[Panel]) -> None:
         self.count = len(panels)
@@ -71,7 +71,7 @@ class Planes:
         self._duals = np.linalg.inv(basis)  # (panels, 3, 3), rows g_u, g_v, g_n
 
     def seen_from(self, T_gt_cam: Transform) -> Sight:
-        """Return the planes as a camera sees them."""
+        """Return the planes in the frame of a camera at T_gt_cam (4, 4) [m]."""
         corners_m = (self._corners_m - T_gt_cam[:3, 3]) @ T_gt_cam[:3, :3]
         duals = self._duals @ T_gt_cam[:3, :3]
         offsets = np.einsum("pij,pj->pi", duals, corners_m)

@@ -17,10 +17,10 @@ Rays = NDArray[np.float32]  # (N, 6): origin [m], direction
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Hits:
-    """Where rays first meet a panel; a ray that leaves the place has an infinite reach."""
+    """The first intersections of rays with panels; without one, the reach is infinite."""
 
-    reach: NDArray[np.float32]  # (N,), in lengths of the ray's direction
-    triangle: NDArray[np.int64]  # (N,), two per panel; 0 for a ray that leaves
+    reach: NDArray[np.float32]  # (N,), distance in lengths of the ray's direction
+    triangle: NDArray[np.int64]  # (N,), two per panel; 0 without an intersection
     uv: NDArray[np.float32]  # (N, 2), barycentric
 
 
@@ -36,7 +36,7 @@ class RayCaster:
         self._scene.add_triangles(self._tensor(vertices), self._tensor(triangles))
 
     def first_hits(self, rays: Rays) -> Hits:
-        """Return where each ray (N, 6) first meets a panel."""
+        """Return the first intersections of rays (N, 6), gt: origin [m], direction."""
         answer = self._scene.cast_rays(self._tensor.from_numpy(rays), nthreads=1)
         triangle = answer["primitive_ids"].numpy().astype(np.int64)
         reach = answer["t_hit"].numpy()
@@ -44,13 +44,13 @@ class RayCaster:
         return Hits(reach=reach, triangle=triangle, uv=answer["primitive_uvs"].numpy())
 
     def first_panels(self, rays: Rays) -> NDArray[np.int32]:
-        """Return the panel that each ray (N, 6) first meets; their count where it leaves."""
+        """Return the index (N,) of the first panel of rays (N, 6), gt; number of panels without one."""
         answer = self._scene.cast_rays(self._tensor.from_numpy(rays), nthreads=1)
         panel = answer["primitive_ids"].numpy() >> 1
         return np.asarray(np.minimum(panel, np.uint32(self._count)), np.int32)
 
     def is_blocked(self, rays: Rays, reach: float) -> NDArray[np.bool_]:
-        """Tell of each ray (N, 6) whether a panel lies within `reach` lengths of it."""
+        """Return (N,) whether a panel lies within `reach` direction lengths on rays (N, 6), gt."""
         blocked = self._scene.test_occlusions(
             self._tensor.from_numpy(rays), tnear=0.0, tfar=reach, nthreads=1
         )

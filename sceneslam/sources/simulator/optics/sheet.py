@@ -1,4 +1,4 @@
-"""Many small images on one large one, so that one look-up serves all panels."""
+"""Texture atlas: many small images on one large one, for one look-up over all panels."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from numpy.typing import NDArray
 
 Pixels = NDArray[np.uint8] | NDArray[np.float32]
 
-_BORDER = 1  # repeats a block's edge, so that interpolation never sees a neighbour
+_BORDER = 1  # repeats a block's edge, so that interpolation does not reach the next block
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sheet:
-    """Where each block lies on the sheet, its border left out."""
+    """The position of each block on the sheet, without its border."""
 
     shape: tuple[int, int]  # rows, columns
     left_top: NDArray[np.int64]  # (N, 2)
     size_wh: NDArray[np.int64]  # (N, 2)
 
     def window(self, index: int) -> tuple[slice, slice]:
-        """Return the (rows, columns) of a block."""
+        """Return the slices (rows, columns) of a block."""
         (left, top), (wide, high) = self.left_top[index], self.size_wh[index]
         return slice(top, top + high), slice(left, left + wide)
 
     def paste(self, canvas: Pixels, index: int, block: Pixels) -> None:
-        """Put a block and its border onto a canvas of the sheet's shape."""
+        """Copy a block with its border to a canvas of the sheet's shape."""
         rows, columns = self.window(index)
         area = canvas[
             rows.start - _BORDER : rows.stop + _BORDER,
@@ -36,10 +36,10 @@ class Sheet:
         area[:] = cv2.copyMakeBorder(block, *(_BORDER,) * 4, cv2.BORDER_REPLICATE)
 
     def lookup(self) -> NDArray[np.float32]:
-        """Return (2 N, 4): x = a + b u, y = c + d v of a block's two triangles.
+        """Return (2 N, 4), coefficients a, b, c, d of each triangle: x = a + b u, y = c + d v.
 
-        Coordinates are OpenCV's (pixel centres at whole numbers) for barycentric (u, v); the
-        second triangle is the first turned by half a circle.
+        x and y are OpenCV's pixel coordinates (centres at integers), u and v are barycentric; the
+        second triangle of a block is the first one rotated by 180 degrees.
         """
         start, size = self.left_top - 0.5, self.size_wh
         upper = np.stack([start[:, 0], size[:, 0], start[:, 1], size[:, 1]], axis=1)
@@ -49,7 +49,7 @@ class Sheet:
 
 
 def pack(size_wh: NDArray[np.int64], columns: int) -> Sheet:
-    """Return places for blocks (N, 2) on a sheet `columns` wide: in rows, highest first."""
+    """Return positions of blocks (N, 2) [px] on a sheet `columns` wide: in rows, highest first."""
     left_top = np.zeros_like(size_wh)
     left, top, row_height = 0, 0, 0
     columns = max(columns, int(size_wh[:, 0].max()) + 2 * _BORDER)

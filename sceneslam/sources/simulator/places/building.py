@@ -1,7 +1,7 @@
-"""A building of zones in two rows, which two long corridors join to a ring.
+"""A building: two rows of zones, connected by two long corridors to a ring.
 
 Frame gt: the office's west door is the origin; the first row runs east along y = 0, the second
-one back west along y = 20. Any order of the zones closes: a lobby fills up the shorter row.
+one back west along y = 20. For any order of the zones, a lobby makes the shorter row as long.
 """
 
 from __future__ import annotations
@@ -28,36 +28,36 @@ from sceneslam.types.se3 import Transform
 
 START_XY_M = (2.0, 0.0)  # in the office
 _IN_FIRST_ROW = 3
-_LOBBY_M = 4.0  # the shortest
-_NIGHT_POWER = 0.002  # exit signs: a camera at its longest exposure sees noise
+_LOBBY_M = 4.0  # shortest length
+_NIGHT_POWER = 0.002  # exit signs: only noise at the camera's longest exposure
 _CELL_M = 0.12
-_ON_PEOPLE = 0.5  # light, as on the lit walls
+_ON_PEOPLE = 0.5  # irradiance on people, as on the lit walls
 _SUN_POWER, _SKY = 8.0, 6.0
-_BLINDING = 0.03 * _SUN_POWER  # some 3000 of the sun's 100,000 lux
+_BLINDING = 0.03 * _SUN_POWER  # about 3000 of the sun's 100,000 lux
 
 Point = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PlacedZone:
-    """A zone where it stands."""
+    """A zone with its pose in `gt`."""
 
     kind: ZoneKind
     T_gt_local: Transform
 
     def gt(self, point_m: Point) -> Point:
-        """Return a point of the zone's own frame in gt."""
+        """Return a point (x, y) [m] of the zone's frame in `gt`."""
         x, y, _, _ = self.T_gt_local @ [*point_m, 0.0, 1.0]
         return float(x), float(y)
 
     def box(self, x_m: Point, y_m: Point) -> tuple[Point, Point]:
-        """Return a rectangle of the zone's own frame in gt: its x and y from low to high."""
+        """Return a rectangle of the zone's frame in `gt`: its ranges of x and y [m]."""
         (ax, ay), (bx, by) = self.gt((x_m[0], y_m[0])), self.gt((x_m[1], y_m[1]))
         return (min(ax, bx), max(ax, bx)), (min(ay, by), max(ay, by))
 
 
 def layout(order_seed: int | None) -> tuple[PlacedZone, ...]:
-    """Return the zones along the ring from the office on; a seed shuffles all but the corridors."""
+    """Return the zones along the ring from the office on; a seed shuffles all but corridors."""
     twins = (zones.twin("twin_a"), zones.twin("twin_b"))
     drawn = (*twins, zones.hall(), zones.atrium(), zones.ramp(), zones.store())
     order = np.arange(len(drawn))
@@ -110,7 +110,7 @@ def build(rng: np.random.Generator, order_seed: int | None) -> SimulatedPlace:
 
 
 def floor_plan(order_seed: int | None) -> BuildingLayout:
-    """Return the building from above."""
+    """Return the building's layout: zones, doors and floor."""
     placed = layout(order_seed)
     return BuildingLayout(
         zones=tuple(_zone(one) for one in placed),
@@ -120,12 +120,12 @@ def floor_plan(order_seed: int | None) -> BuildingLayout:
 
 
 def dark_groups() -> tuple[str, ...]:
-    """Return the lamps that are off."""
+    """Return the lamp groups that are off."""
     return tuple(one.kind.group for one in layout(None) if not one.kind.is_lit)
 
 
 def tour(order_seed: int | None) -> tuple[Point, ...]:
-    """Return the way around the ring, and again into the first zone and back."""
+    """Return the route (x, y) [m], gt: around the ring, into the first zone again, and back."""
     placed = layout(order_seed)
     start, around = placed[0], [one.gt(point) for one in placed for point in one.kind.route]
     again = [one.gt(point) for one in placed[:3] for point in one.kind.route]
@@ -147,7 +147,7 @@ def _stand(x_m: float, *, is_back: bool) -> Transform:
 
 
 def _zone(one: PlacedZone) -> Zone:
-    """Return a zone's rectangle; the walls between zones are shared by halves."""
+    """Return a zone's rectangle; its border is the middle of the walls."""
     length_m, width_m, _ = one.kind.size_m
     half = WALL_M / 2
     x_m, y_m = one.box((-half, length_m + half), (one.kind.south_m, one.kind.south_m + width_m))
@@ -155,7 +155,7 @@ def _zone(one: PlacedZone) -> Zone:
 
 
 def _door(one: PlacedZone) -> Door:
-    """Return the door by which a zone is left."""
+    """Return the exit door of a zone."""
     exit_x, exit_y = one.kind.exit_xy_m
     x_m, y_m = one.gt((exit_x + (WALL_M if exit_x > 0 else -WALL_M) / 2, exit_y))
     return Door(x_m=x_m, y_m=(y_m - DOOR_WIDTH_M / 2, y_m + DOOR_WIDTH_M / 2))

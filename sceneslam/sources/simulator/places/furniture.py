@@ -1,4 +1,4 @@
-"""Furniture, made of boxes and leaves."""
+"""Furniture, built from boxes and flat panels."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from sceneslam.sources.simulator.places.surfaces import (
 
 @dataclass(frozen=True, slots=True)
 class Spot:
-    """Where a piece stands: its centre, and the heading of its own x axis (front is -y)."""
+    """The position of a piece and the heading of its x axis; its front is -y."""
 
     x_m: float
     y_m: float
     yaw_deg: float = 0.0
 
     def at(self, right_m: float, back_m: float) -> tuple[float, float]:
-        """Return a point of the piece (its right, its back) in gt."""
+        """Return a point of the piece, given by its distance to the right and back, in `gt` [m]."""
         c, s = np.cos(np.deg2rad(self.yaw_deg)), np.sin(np.deg2rad(self.yaw_deg))
         return (
             float(self.x_m + c * right_m - s * back_m),
@@ -42,7 +42,7 @@ class Spot:
 def bookshelf(
     builder: PanelBuilder, spot: Spot, size_m: tuple[float, float], colour: Colour
 ) -> None:
-    """Put up a shelf, 30 cm deep, its boards filled with books of all sizes."""
+    """Add a bookshelf, 30 cm deep, filled with books."""
     case, rng, depth_m, (width_m, height_m) = wood(colour), builder.rng, 0.3, size_m
     for side in (-1, 1):
         place = spot.at(side * (width_m - 0.02) / 2, 0)
@@ -67,7 +67,7 @@ def bookshelf(
 def table(
     builder: PanelBuilder, spot: Spot, size_m: tuple[float, float, float], look: Material
 ) -> None:
-    """Put up a table on four legs."""
+    """Add a table on four legs."""
     width_m, depth_m, height_m = size_m
     top_m = height_m - 0.03
     yaw_deg = spot.yaw_deg
@@ -81,7 +81,7 @@ def table(
 
 
 def chair(builder: PanelBuilder, spot: Spot, look: Material, seat: Material) -> None:
-    """Put up a chair; who sits on it looks to its front."""
+    """Add a chair."""
     table(builder, spot, (0.42, 0.42, 0.45), look)
     cushion, yaw_deg = (spot.x_m, spot.y_m), spot.yaw_deg
     builder.box(cushion, (0.4, 0.4, 0.04), seat, bottom_m=0.45, yaw_deg=yaw_deg)
@@ -92,7 +92,7 @@ def chair(builder: PanelBuilder, spot: Spot, look: Material, seat: Material) -> 
 
 
 def sofa(builder: PanelBuilder, spot: Spot, width_m: float, colour: Colour) -> None:
-    """Put up a sofa, 85 cm deep, with loose cushions."""
+    """Add a sofa, 85 cm deep, with loose cushions."""
     cloth, rng, yaw_deg = fabric(colour), builder.rng, spot.yaw_deg
     builder.box(spot.at(0, -0.08), (width_m - 0.3, 0.68, 0.4), cloth, yaw_deg=yaw_deg)
     builder.box(spot.at(0, 0.33), (width_m, 0.2, 0.8), cloth, yaw_deg=yaw_deg)
@@ -109,7 +109,7 @@ def sofa(builder: PanelBuilder, spot: Spot, width_m: float, colour: Colour) -> N
 def cabinet(
     builder: PanelBuilder, spot: Spot, size_m: tuple[float, float, float], look: Material
 ) -> None:
-    """Put up a cabinet with drawers, and things on top of it."""
+    """Add a cabinet with drawers, and objects on top."""
     width_m, depth_m, height_m = size_m
     centre, yaw_deg, rng = (spot.x_m, spot.y_m), spot.yaw_deg, builder.rng
     builder.box(centre, size_m, look, yaw_deg=yaw_deg)
@@ -128,7 +128,7 @@ def cabinet(
 
 
 def sideboard(builder: PanelBuilder, spot: Spot, width_m: float) -> None:
-    """Put up a low board: bays with books or behind doors, and more books on top of it."""
+    """Add a sideboard: bays with books or doors, and books on top."""
     rng, yaw_deg, look = builder.rng, spot.yaw_deg, wood((186, 200, 206), 0.8)
     for bottom_m in (0.05, 0.53):
         builder.box(spot.at(0, 0), (width_m, 0.36, 0.03), look, bottom_m=bottom_m, yaw_deg=yaw_deg)
@@ -152,7 +152,7 @@ def sideboard(builder: PanelBuilder, spot: Spot, width_m: float) -> None:
 
 
 def wall_shelf(builder: PanelBuilder, spot: Spot, width_m: float) -> None:
-    """Hang two small boards on a wall, one above the other, with things on them."""
+    """Add two small wall shelves, one above the other, with objects."""
     yaw_deg = spot.yaw_deg
     for bottom_m in (0.25, 0.6):
         centre = spot.at(0, 0)
@@ -164,7 +164,7 @@ def wall_shelf(builder: PanelBuilder, spot: Spot, width_m: float) -> None:
 
 
 def door_leaf(builder: PanelBuilder, spot: Spot) -> None:
-    """Hang a white door, 90 cm wide, with panels and a handle; it stands along its x axis."""
+    """Add a white door leaf, 90 cm wide along x, with panels and a handle."""
     panel = paint((176, 186, 190))
     white = decorated(paint(WHITE), (0.15, 0.2, 0.6, 0.7, panel), (0.15, 1.1, 0.6, 0.7, panel))
     builder.box(spot.at(0, 0), (0.9, 0.04, 2.0), white, bottom_m=0.01, yaw_deg=spot.yaw_deg)
@@ -174,7 +174,7 @@ def door_leaf(builder: PanelBuilder, spot: Spot) -> None:
 
 
 def parcels(builder: PanelBuilder, spot: Spot) -> None:
-    """Pile up cardboard boxes."""
+    """Add a pile of cardboard boxes."""
     rng = builder.rng
     builder.box(spot.at(0, 0), (0.52, 0.42, 0.38), cardboard, yaw_deg=spot.yaw_deg)
     turned = spot.yaw_deg + float(rng.uniform(-25, 25))
@@ -183,7 +183,7 @@ def parcels(builder: PanelBuilder, spot: Spot) -> None:
 
 
 def plant(builder: PanelBuilder, spot: Spot, height_m: float) -> None:
-    """Put up a potted plant of some sixty two-sided leaves."""
+    """Add a potted plant of about sixty two-sided leaves."""
     rng, pot_m = builder.rng, 0.32
     builder.box((spot.x_m, spot.y_m), (0.3, 0.3, pot_m), fabric((70, 96, 150), 5.0), yaw_deg=20)
     builder.box((spot.x_m, spot.y_m), (0.03, 0.03, height_m * 0.6), wood(WALNUT), bottom_m=pot_m)
@@ -202,7 +202,7 @@ def plant(builder: PanelBuilder, spot: Spot, height_m: float) -> None:
 
 
 def bed(builder: PanelBuilder, spot: Spot) -> None:
-    """Put up a bed, 2 m long, its head at its back."""
+    """Add a bed, 2 m long, with the headboard at the back."""
     yaw_deg = spot.yaw_deg
     builder.box(spot.at(0, 0), (0.95, 2.0, 0.28), wood(OAK), yaw_deg=yaw_deg)
     quilt = fabric((120, 96, 84), 20.0)

@@ -1,4 +1,4 @@
-"""Things to look at: paintings, posters, book spines and pin boards."""
+"""Textures with visual features: paintings, posters, book spines and pin boards."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _BINDINGS = (
 
 
 def painting(rng: np.random.Generator, width_m: float, height_m: float) -> Texture:
-    """Return a framed abstract painting: a sky of brush strokes with shapes over it."""
+    """Return a framed abstract painting: brush strokes and shapes."""
     rows, columns = shape = texels(width_m, height_m)
     low, high = rng.uniform(40, 150, 3), rng.uniform(110, 235, 3)
     blend = 1.0 / (1.0 + np.exp(-2.0 * clouds(rng, shape, 40.0)))
@@ -106,7 +106,7 @@ def pin_board(rng: np.random.Generator, width_m: float, height_m: float) -> Text
 
 
 def decorated(base: Material, *pieces: tuple[float, float, float, float, Material]) -> Material:
-    """Return a surface with pieces on it, each (left, top, width, height) [m] and its material."""
+    """Return a surface with pieces, each (left, top, width, height) [m] and its material."""
 
     def material(rng: np.random.Generator, width_m: float, height_m: float) -> Texture:
         image = base(rng, width_m, height_m)

@@ -1,4 +1,4 @@
-"""A place to drive through: flat textured panels, lamps and the sun."""
+"""A simulated place: flat textured panels, lamps and the sun."""
 
 from __future__ import annotations
 
@@ -19,50 +19,50 @@ Rectangle = tuple[float, float, float, float]  # left, top, width, height [m]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Panel:
-    """A parallelogram, seen from the side on which u points right and v points down."""
+    """A parallelogram; on its visible side, u points right and v down."""
 
     corner_m: Vector  # (3,), top left, frame gt
     edge_u_m: Vector  # (3,), along the texture's columns
     edge_v_m: Vector  # (3,), along the texture's rows
     texture: Texture
-    is_polished: bool = False  # a mirror to the depth camera's pattern: nothing comes back
+    is_polished: bool = False  # reflects the depth camera's pattern away: no depth
 
     @property
     def normal(self) -> Vector:
-        """Return the unit normal (3,), towards the viewer."""
+        """Return the unit normal (3,), gt, towards the visible side."""
         normal = np.cross(self.edge_v_m, self.edge_u_m)
         return np.asarray(normal / np.linalg.norm(normal))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lamp:
-    """A flat ceiling light, shining down by Lambert's law."""
+    """A flat ceiling light that emits downwards by Lambert's law."""
 
     group: str  # lamps of one group share a switch
     centre_m: tuple[float, float, float]
     size_xy_m: tuple[float, float]
-    power: float  # in front of it, at 1 m, in units of what the camera shows as white
-    points_per_side: int = 4  # it is lit from a square grid of points
-    reach_m: float = np.inf  # farther away it gives no direct light
+    power: float  # irradiance at 1 m in front of it; at 1, white is white in the image
+    points_per_side: int = 4  # point lights per side of a square grid
+    reach_m: float = np.inf  # no direct light beyond
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sun:
-    """Light from far away; it also is the sky that is seen where a ray leaves the place."""
+    """Parallel light, and the sky that is visible where a ray leaves the place."""
 
     direction: tuple[float, float, float]  # from the sun
-    power: float  # on a surface that faces it
+    power: float  # irradiance on a surface that faces it
     sky: float  # radiance of the sky
-    blinding: float = 0.02  # irradiance in which a depth camera's pattern is lost
+    blinding: float = 0.02  # irradiance above which there is no depth
 
 
 SUN = "sun"  # the group of the sun
-NIGHT = "night"  # the group of stand-by lights and the street, which no switch turns off
+NIGHT = "night"  # the group of stand-by lights and street lamps, always on
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SimulatedPlace:
-    """Everything that light and camera meet."""
+    """All surfaces, lights and people of a place."""
 
     panels: tuple[Panel, ...]
     lamps: tuple[Lamp, ...]
@@ -72,19 +72,19 @@ class SimulatedPlace:
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """Return the switches: lamp groups in order of appearance, the sun last."""
+        """Return the lamp groups in order of appearance, the sun last."""
         names = dict.fromkeys(lamp.group for lamp in self.lamps)
         return (*names, SUN) if self.sun else tuple(names)
 
 
 @dataclass(slots=True)
 class PanelBuilder:
-    """Puts panels together; textures are drawn from one generator, in order."""
+    """Collects panels; their textures are drawn from one generator, in order."""
 
     rng: np.random.Generator
     panels: list[Panel] = field(default_factory=list)
-    T_gt_local: Transform = field(default_factory=se3.identity)  # where what follows is put
-    is_polished: bool = False  # what follows
+    T_gt_local: Transform = field(default_factory=se3.identity)  # pose of the frame of the next panels
+    is_polished: bool = False# of the next panels
 
     def panel(self, corner_m: Vector, edge_u_m: Vector, edge_v_m: Vector, look: Material) -> None:
         """Add one panel."""
@@ -100,7 +100,7 @@ class PanelBuilder:
         *,
         hole_m: Rectangle | None = None,
     ) -> None:
-        """Add an upright panel; left and right are the viewer's, heights (bottom, top).
+        """Add a vertical panel; left and right as seen from its visible side, heights (bottom, top).
 
         A hole (left, top, width, height) is measured from the panel's top left corner.
         """
@@ -132,7 +132,7 @@ class PanelBuilder:
         *,
         faces_up: bool = True,
     ) -> None:
-        """Add a floor, or a ceiling when it does not face up."""
+        """Add a horizontal panel: a floor, or a ceiling if it does not face up."""
         across, along = np.array([x_m[1] - x_m[0], 0, 0]), np.array([0, y_m[1] - y_m[0], 0])
         if faces_up:
             self.panel(np.array([x_m[0], y_m[1], height_m]), across, -along, look)
@@ -185,7 +185,7 @@ def _axes(yaw_deg: float) -> tuple[Vector, Vector]:
 
 
 def _around(hole_m: Rectangle, width_m: float, height_m: float) -> list[Rectangle]:
-    """Return the rectangles that are left of a panel: beside, above and below its hole."""
+    """Return the rectangles that remain of a panel around its hole."""
     left, top, wide, high = hole_m
     right, bottom = left + wide, top + high
     parts = [

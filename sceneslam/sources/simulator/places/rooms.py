@@ -1,6 +1,6 @@
-"""The places: two furnished rooms joined by a door, and a room that opens on a bare corridor.
+"""The places of the short stories: two furnished rooms, or a room and a bare corridor.
 
-Frame gt: room A spans x 0..5, y 0..4.2; the wall to the next place is 5..5.12; z is up.
+In frame gt, room A spans x 0..5, y 0..4.2; the wall to the next room x 5..5.12; z is up.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ _CORRIDOR_X_M, _CORRIDOR_Y_M = (5.12, 19.5), (1.15, 2.8)
 _WINDOW_X_M, _WINDOW_Z_M = (1.3, 2.9), (0.95, 2.1)
 _BLUE_GREY: Colour = (162, 150, 138)
 _POWER_A, _POWER_B, _POWER_CORRIDOR = 5.4, 13.0, 2.0
-_NIGHT_POWER = 0.03  # stand-by lights and the street: never quite dark
+_NIGHT_POWER = 0.03  # stand-by lights and street lamps: never completely dark
 _SUN = Sun(direction=(0.42, -0.62, -0.66), power=4.4, sky=3.0)
 
 
 def floor_plan() -> BuildingLayout:
-    """Return room A and what lies behind its door; the border is in the middle of the wall."""
+    """Return the layout: room A and the zone behind its door; the border is the wall's middle."""
     border_m = (_A_X_M[1] + _B_X_M[0]) / 2
     room_a = Zone(name="a", x_m=(_A_X_M[0], border_m), y_m=_A_Y_M, group="a")
     behind = Zone(name="b", x_m=(border_m, _CORRIDOR_X_M[1]), y_m=_B_Y_M, group="b")
@@ -66,7 +66,7 @@ def two_rooms(
 ) -> SimulatedPlace:
     """Return rooms A and B.
 
-    Sunny: the window of A stands open to the sun. Bare: nothing stands at its south wall.
+    `sunny`: sunlight enters by the window of A. `bare`: the south wall of A has no furniture.
     """
     builder = PanelBuilder(rng)
     _room_a(builder, sunny=sunny, bare=bare)
@@ -157,7 +157,7 @@ def _room_b(builder: PanelBuilder) -> None:
 def _wall_with_door(
     builder: PanelBuilder, x_m: float, y_m: tuple[float, float], look: Material, *, faces_east: bool
 ) -> None:
-    """Build one side of the wall at x with its door frame; the west side adds the passage."""
+    """Build one side of the wall at x with its door frame; the west side adds the door's lining."""
     (south, north), (y0, y1) = y_m, DOOR_Y_M
     left_m = y0 - south if faces_east else north - y1
     wide_m, top_m = y1 - y0, HEIGHT_M - DOOR_TOP_M
@@ -174,7 +174,7 @@ def _wall_with_door(
 
 
 def _line_hole(builder: PanelBuilder, x_m: tuple[float, float], y_m: tuple[float, float]) -> None:
-    """Line the passage of the door with wood."""
+    """Add the wooden lining of the door."""
     (x0, x1), (y0, y1) = x_m, y_m
     builder.wall((x1, y0), (x0, y0), (0, DOOR_TOP_M), wood(OAK))
     builder.wall((x0, y1), (x1, y1), (0, DOOR_TOP_M), wood(OAK))
@@ -183,7 +183,7 @@ def _line_hole(builder: PanelBuilder, x_m: tuple[float, float], y_m: tuple[float
 
 
 def _wall_with_window(builder: PanelBuilder, y_m: float, *, sunny: bool) -> None:
-    """Build the north wall of A: its window has a lowered blind, or stands open to the sun."""
+    """Build the north wall of A: its window has a lowered blind, or lets the sun in."""
     (left, right), (sill, top) = _WINDOW_X_M, _WINDOW_Z_M
     white, wide = paint(WHITE), right - left
     window = (left, HEIGHT_M - top, wide, top - sill)

@@ -1,7 +1,7 @@
-"""What walls, floors and furniture look like: seeded textures with their colour irregularities.
+"""Textures of walls, floors and furniture, with random irregularities of colour.
 
-A texture is (rows, columns, 3) uint8 BGR, row 0 at the top, `TEXEL_M` wide texels. Its values are
-255 * sqrt(reflectance): the camera's own response, so that a picture of it in unit light is it.
+A texture is (rows, columns, 3) uint8 BGR, row 0 at the top, with texels `TEXEL_M` wide. Values are
+255 * sqrt(reflectance), the camera's response: its image in unit light equals the texture.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def texels(width_m: float, height_m: float) -> tuple[int, int]:
 
 
 def noise(rng: np.random.Generator, shape: tuple[int, int], cell_wh: tuple[float, float]) -> Field:
-    """Return smooth noise of about unit deviation whose features measure `cell_wh` texels."""
+    """Return smooth noise of unit standard deviation and correlation length `cell_wh` [texels]."""
     rows, columns = shape
     coarse = (max(2, round(rows / cell_wh[1]) + 1), max(2, round(columns / cell_wh[0]) + 1))
     values = rng.standard_normal(coarse, dtype=np.float32)
@@ -39,19 +39,19 @@ def noise(rng: np.random.Generator, shape: tuple[int, int], cell_wh: tuple[float
 
 
 def clouds(rng: np.random.Generator, shape: tuple[int, int], cell_px: float) -> Field:
-    """Return noise with detail at four scales, the coarsest `cell_px` texels."""
+    """Return noise at four scales, the coarsest of `cell_px` texels."""
     octaves = [0.5**k * noise(rng, shape, (cell_px / 2**k,) * 2) for k in range(4)]
     return _field(sum(octaves[1:], octaves[0]))
 
 
 def finish(colour: NDArray[np.floating] | Colour, shade: Field, gain: float = 1.0) -> Texture:
-    """Return a colour (one or per texel) made lighter and darker by `gain` * shade levels."""
+    """Return a colour (one, or per texel) plus `gain` * `shade` grey levels."""
     base = np.asarray(colour, dtype=np.float32)
     return np.clip(base + gain * shade[..., None] + 0.5, 4, 250).astype(np.uint8)
 
 
 def paint(colour: Colour) -> Material:
-    """Return painted plaster: plain but for a grain of half a level."""
+    """Return painted plaster: uniform, with a grain of half a grey level."""
 
     def material(rng: np.random.Generator, width_m: float, height_m: float) -> Texture:
         shape = texels(width_m, height_m)
@@ -61,7 +61,7 @@ def paint(colour: Colour) -> Material:
 
 
 def plain(colour: Colour) -> Material:
-    """Return a ceiling's paint: one tone, in few texels."""
+    """Return a ceiling's paint: one colour, in few texels."""
 
     def material(rng: np.random.Generator, width_m: float, height_m: float) -> Texture:
         return np.full((4, 4, 3), colour, np.uint8)
@@ -70,7 +70,7 @@ def plain(colour: Colour) -> Material:
 
 
 def brick(rng: np.random.Generator, width_m: float, height_m: float) -> Texture:
-    """Return a wall of bricks, each of its own tone, with light joints."""
+    """Return a wall of bricks of different colour with light joints."""
     rows, columns = shape = texels(width_m, height_m)
     high, wide = round(0.08 / TEXEL_M), round(0.25 / TEXEL_M)
     y, x = np.arange(rows) // high, np.arange(columns)
@@ -97,7 +97,7 @@ def stone_tiles(rng: np.random.Generator, width_m: float, height_m: float) -> Te
 
 
 def wood(colour: Colour, contrast: float = 1.0) -> Material:
-    """Return planed wood, its grain along the longer side."""
+    """Return planed wood with grain along the longer side."""
 
     def material(rng: np.random.Generator, width_m: float, height_m: float) -> Texture:
         if height_m > width_m:
@@ -108,7 +108,7 @@ def wood(colour: Colour, contrast: float = 1.0) -> Material:
 
 
 def floorboards(colour: Colour) -> Material:
-    """Return a floor of boards 12 cm wide, each of its own tone, with dark joints and knots."""
+    """Return a floor of boards 12 cm wide, of different colour, with dark joints and knots."""
 
     def material(rng: np.random.Generator, width_m: float, height_m: float) -> Texture:
         rows, columns = texels(width_m, height_m)
@@ -124,7 +124,7 @@ def floorboards(colour: Colour) -> Material:
 
 
 def fabric(colour: Colour, contrast: float = 9.0) -> Material:
-    """Return woven cloth with folds and worn places."""
+    """Return woven cloth with folds and worn areas."""
 
     def material(rng: np.random.Generator, width_m: float, height_m: float) -> Texture:
         shape = texels(width_m, height_m)

@@ -1,4 +1,4 @@
-"""A zone of the building as its author draws it: a box with two doors, its way, its light."""
+"""The description of a zone of the building: a box with two doors, its route and light."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ DOOR_WIDTH_M, DOOR_TOP_M = 0.95, 2.05
 Point = tuple[float, float]
 # Each picture on a wall: left, top, width, height [m] and its material.
 Pictures = tuple[tuple[float, float, float, float, Material], ...]
-Doors = tuple[float, ...]  # where along their wall, y of the local frame
+Doors = tuple[float, ...]  # y along their wall, in the zone's frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ZoneKind:
-    """A zone in its own frame: it is entered at (0, 0) along +x.
+    """A zone in its own frame; it is entered at (0, 0) along +x.
 
     It is left at `exit_xy_m`: through its east wall along +x, or through its west wall along -x.
     """
@@ -32,8 +32,8 @@ class ZoneKind:
     size_m: tuple[float, float, float]  # along x, from south to north, height
     south_m: float  # y of its south wall
     exit_xy_m: Point
-    route: tuple[Point, ...]  # between the doors
-    furnish: Callable[[PanelBuilder, int], None]  # with what; the number is the same for twins
+    route: tuple[Point, ...]  # way points between the doors
+    furnish: Callable[[PanelBuilder, int], None]  # adds furniture; twins have the same seed
     floor: Material
     wall: Material
     ceiling: Material | None  # None: open to the sky
@@ -41,17 +41,17 @@ class ZoneKind:
         default_factory=dict
     )  # of the walls south, north, west, east: left, top, width, height [m], material
     windows: Mapping[str, tuple[float, float, float, float]] = field(default_factory=dict)
-    lamps: tuple[tuple[float, float, float, float], ...] = ()  # x, y, width, depth
+    lamps: tuple[tuple[float, float, float, float], ...] = ()  # x, y, width, depth [m]
     power: float = 0.0  # of each lamp
     is_lit: bool = True
     has_polished_floor: bool = False
     slippery: tuple[tuple[Point, Point, float], ...] = ()  # x and y of a rectangle, slip ratio
     heights: tuple[Point, ...] = ()  # of the floor: (x, height) knots
-    walks: tuple[tuple[Point, Point], ...] = ()  # of people, to and fro
+    walks: tuple[tuple[Point, Point], ...] = ()  # of people, start and end
 
     @property
     def group(self) -> str:
-        """Return what lights the zone: lamps of its name, or the sun."""
+        """Return the zone's lamp group: its name, or the sun."""
         return self.name if self.ceiling else SUN
 
     def build(self, builder: PanelBuilder, twin_seed: int) -> None:
@@ -118,7 +118,7 @@ class ZoneKind:
 
 
 def line_door(builder: PanelBuilder, x_m: tuple[float, float], y_m: float) -> None:
-    """Line the passage of a door with wood."""
+    """Add the wooden lining of a door."""
     (x0, x1), y0, y1 = x_m, y_m - DOOR_WIDTH_M / 2, y_m + DOOR_WIDTH_M / 2
     builder.wall((x1, y0), (x0, y0), (0, DOOR_TOP_M), wood(OAK))
     builder.wall((x0, y1), (x1, y1), (0, DOOR_TOP_M), wood(OAK))
@@ -129,7 +129,7 @@ def line_door(builder: PanelBuilder, x_m: tuple[float, float], y_m: float) -> No
 def _frame(
     hole_m: tuple[float, float, float, float],
 ) -> list[tuple[float, float, float, float, Material]]:
-    """Return the strips of wood around a door."""
+    """Return the strips of a door frame."""
     left, top, wide, high = hole_m
     return [
         (left - 0.07, top - 0.07, 0.07, high + 0.07, wood(OAK)),

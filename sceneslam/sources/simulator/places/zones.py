@@ -1,4 +1,4 @@
-"""The building's zones: in each another sensor fails, for the reason it fails in the world."""
+"""The building's zones: in each, another sensor fails for a realistic reason."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ from sceneslam.sources.simulator.places.surfaces import (
 )
 from sceneslam.sources.simulator.places.zone_kind import Pictures, ZoneKind
 
-# Wheels turn in vain where a robot crosses what is wet or lies loose: a metre or so each time. A
-# dry floor, polished or not, takes a few per cent at most (rolling resistance is a fiftieth of the
-# weight, and rubber slips by as little below a third of what it holds).
+# Wheels slip where the floor is wet or covered: about a metre each time. A
+# dry floor, polished or not, causes a slip of a few per cent (rolling resistance is a fiftieth of the
+# weight, and the slip of rubber is that small below a third of its largest traction).
 ROWS_APART_M = 20.0  # the two rows of zones, from door to door
 _RAMP_DEG = 8.0
-_RAMP_M = 4.0  # from the foot to the landing, level
+_RAMP_M = 4.0  # from the foot to the level landing
 _CORRIDOR_M = 2.2  # wide
 
 _HALL_ROUTE = (
@@ -51,7 +51,7 @@ _HALL_ROUTE = (
 
 
 def office() -> ZoneKind:
-    """Return the furnished office, where the tour begins: every sensor works."""
+    """Return the furnished office, where the tour begins and every sensor works."""
     return ZoneKind(
         name="office",
         size_m=(8.0, 6.0, 2.6),
@@ -80,7 +80,7 @@ def office() -> ZoneKind:
 
 
 def twin(name: str) -> ZoneKind:
-    """Return one of two rooms that look alike; only what lies on the table differs."""
+    """Return one of two rooms that look alike, but for the objects on the table."""
     return ZoneKind(
         name=name,
         size_m=(5.0, 4.4, 2.5),
@@ -121,7 +121,7 @@ def hall() -> ZoneKind:
 
 
 def poster_corridor() -> ZoneKind:
-    """Return the long lit corridor between the rows: bare walls, but posters to see."""
+    """Return the long lit corridor between the rows: flat walls with posters."""
     length_m = ROWS_APART_M + _CORRIDOR_M
     spots = np.arange(1.6, length_m - 1.5, 2.3)
     return _corridor(
@@ -139,7 +139,7 @@ def poster_corridor() -> ZoneKind:
 
 
 def bare_corridor() -> ZoneKind:
-    """Return the dark corridor without anything in it: only wheels and gyro measure its length."""
+    """Return the dark, empty corridor: only wheels and gyro measure its length."""
     return _corridor("bare", wall=paint((176, 180, 184)), pictures={}, power=1.8, is_lit=False)
 
 
@@ -166,7 +166,7 @@ def _corridor(
 
 
 def atrium() -> ZoneKind:
-    """Return the atrium: no roof, a window front to the south, sun on everything in it."""
+    """Return the atrium: no roof, windows to the south, sunlight everywhere."""
     bricks: Pictures = ((0.6, 1.6, 1.2, 1.6, poster), (3.0, 1.8, 1.6, 1.2, painting))
     bricks += ((5.6, 1.5, 1.2, 1.7, poster), (8.6, 1.7, 1.6, 1.3, painting))
     ends = ((0.8, 1.7, 1.5, 1.5, painting), (7.6, 1.6, 1.3, 1.8, poster))
@@ -187,7 +187,7 @@ def atrium() -> ZoneKind:
 
 
 def store() -> ZoneKind:
-    """Return the store room, its lights off: black but for noise; sheets of foil on its floor."""
+    """Return the store room: lights off, images of noise only, sheets of foil on the floor."""
     return ZoneKind(
         name="store",
         size_m=(12.0, 6.0, 2.5),
@@ -206,7 +206,7 @@ def store() -> ZoneKind:
 
 
 def ramp() -> ZoneKind:
-    """Return the way over a ramp of 8 degrees, up and down, and over a door sill."""
+    """Return the zone with a ramp of 8 degrees, up and down, and a door sill."""
     top_m, foot = _RAMP_M * float(np.tan(np.deg2rad(_RAMP_DEG))), 1.8
     up, down, end = foot + _RAMP_M, foot + _RAMP_M + 2.4, foot + 2 * _RAMP_M + 2.4
     pictures = tuple((0.8 + 2.1 * k, 0.7, 0.8, 1.0, poster) for k in range(6))
