@@ -86,9 +86,7 @@ class Carmen:
         for line, stamp_ns in zip(self._lines, self._stamps_ns.tolist(), strict=True):
             scan = parse_scan(line)
             if scan is None:
-                self._faults.add(
-                    "scan line is invalid", f"{stamp_ns * 1e-9:.3f} s: {self._path}"
-                )
+                self._faults.add("scan line is invalid", f"{stamp_ns * 1e-9:.3f} s: {self._path}")
             else:
                 yield self._observation(scan, stamp_ns)
 

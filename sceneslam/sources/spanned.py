@@ -1,4 +1,4 @@
-"""Sources that know when they begin and end."""
+"""Sources whose first and last stamps are known in advance."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class TimeSpan:
 
 @runtime_checkable
 class Spanned(Protocol):
-    """A source that knows its span before it is read."""
+    """A source whose time span is known before it is read."""
 
     @property
     def span(self) -> TimeSpan | None:

@@ -1,4 +1,4 @@
-"""Any source with its wheel odometry spoilt on purpose: for experiments on who trusts it."""
+"""Errors added to the wheel odometry of any source, for experiments on robustness."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import GroundTruth
 
-LASTING = ("reversed", "frozen", "slipping")  # for some seconds, again and again
+LASTING = ("reversed", "frozen", "slipping")  # for some seconds, repeatedly
 ALWAYS = ("scaled", "turning", "late", "absent")
 LIES = ("none", *LASTING, *ALWAYS, "spikes")
-_DRIVING_M_S = 0.05  # wheels of a robot that stands have nothing to lie about
+_DRIVING_M_S = 0.05  # below this speed, no error is added
 
 
 class SpoiltOdometry(Wrapped):
-    """Passes a source's observations on with odometry that lies.
+    """Passes on a source's observations with wrong odometry.
 
-    For `lasting_s` at a time, about every `every_s` while the wheels turn: `reversed` (translation
-    with the other sign), `frozen` (no motion), `slipping` (translation times `ratio`). Throughout:
-    `scaled` (translation times `ratio`), `turning` (`turn_rad_per_m` more yaw for every metre),
-    `late` (the pose of `late_s` before), `absent`. `spikes`: single poses off by up to `spike_m`
-    and `spike_rad`, about every `every_s`.
+    For `lasting_s`, about every `every_s` of driving: `reversed` (translation
+    with the wrong sign), `frozen` (no motion), `slipping` (translation times `ratio`). Always:
+    `scaled` (translation times `ratio`), `turning` (`turn_rad_per_m` more yaw per metre),
+    `late` (the pose of `late_s` before), `absent` (no odometry). `spikes`: single poses off by up to
+    `spike_m` and `spike_rad`, about every `every_s`.
     """
 
     def __init__(
@@ -61,19 +61,19 @@ class SpoiltOdometry(Wrapped):
 
     @property
     def rig(self) -> Rig:
-        """Return the source's rig, without wheels where their odometry is absent."""
+        """Return the source's rig; without wheel odometry for `absent`."""
         rig = self._source.rig
         if self._lie != "absent":
             return rig
         return replace(rig, sensors=rig.sensors - {Sensor.ODOMETRY})
 
     def __iter__(self) -> Iterator[Observation]:
-        """Yield the source's observations with spoilt odometry."""
+        """Yield the source's observations with wrong odometry."""
         rng = np.random.default_rng([self._seed, 2])
         spans = _Spans(self._every_s, self._lasting_s, rng)
         late = _Late(round(self._late_s * 1e9))
-        T_true: Transform | None = None  # the last odometry as it came ...
-        T_spoilt = se3.identity()  # ... and as it was passed on
+        T_true: Transform | None = None  # last odometry of the source ...
+        T_spoilt = se3.identity()  # ... and as passed on
         stamp_ns = 0
         for observation in self._source:
             T_odom_base = observation.T_odom_base
@@ -104,7 +104,7 @@ class SpoiltOdometry(Wrapped):
         return self._source.ground_truth()
 
     def _motion(self, T_prev_curr: Transform, *, is_lying: bool) -> Transform:
-        """Return a motion as the wheels report it."""
+        """Return the reported motion for a true one T_prev_curr (4, 4) [m]."""
         ratio, turn_rad = 1.0, 0.0
         if self._lie == "scaled":
             ratio = self._ratio
@@ -121,7 +121,7 @@ class SpoiltOdometry(Wrapped):
 
 @dataclass(slots=True)
 class _Spans:
-    """Draws when to lie; a lie begins only while the robot drives."""
+    """Draws the time spans of errors; a span begins only while the robot drives."""
 
     every_s: float
     lasting_s: list[float]
@@ -130,7 +130,7 @@ class _Spans:
     _until_ns: int = field(default=0, init=False)
 
     def covers(self, stamp_ns: int, *, is_driving: bool) -> bool:
-        """Tell whether a lie lasts at a stamp; stamps rise."""
+        """Tell whether a stamp is within a span; stamps must rise."""
         if self._next_ns is None:
             self._plan(stamp_ns)
         elif is_driving and stamp_ns >= self._next_ns:
@@ -141,7 +141,7 @@ class _Spans:
         return stamp_ns < self._until_ns
 
     def begins(self, stamp_ns: int) -> bool:
-        """Tell whether it is time for a lie of one observation."""
+        """Tell whether a single wrong pose is due."""
         if self._until_ns <= stamp_ns:
             return False
         self._until_ns = stamp_ns
@@ -153,13 +153,13 @@ class _Spans:
 
 @dataclass(slots=True)
 class _Late:
-    """Odometry of some time ago."""
+    """Odometry with a delay."""
 
     late_ns: int
     _known: deque[tuple[int, Transform]] = field(default_factory=deque)
 
     def shift(self, stamp_ns: int, T_odom_base: Transform) -> Transform:
-        """Return the odometry of `late_ns` before; the first for as long as there is none."""
+        """Return T_odom_base of `late_ns` before; the first one if there is none."""
         self._known.append((stamp_ns, T_odom_base))
         wanted_ns = stamp_ns - self.late_ns
         while len(self._known) > 1 and self._known[1][0] <= wanted_ns:

@@ -22,9 +22,9 @@ class StampedFile:
 
 
 def read_list(path: Path) -> Sequence[StampedFile]:
-    """Return the files of a list, in its order; `#` begins a comment.
+    """Return the files of a list in its order; `#` begins a comment.
 
-    Raises InputError when the list is missing or a line is not a stamp and a name.
+    Raises InputError if the list is missing or a line is not a stamp and a name.
     """
     if not path.is_file():
         raise InputError(f"{path.name} is missing: {path.parent}")
@@ -49,7 +49,7 @@ def nearest_once(
 ) -> Sequence[StampedFile | None]:
     """Return for each stamp the file nearest in time within the tolerance; each is used once.
 
-    The closest pairs are served first.
+    The closest pairs are matched first.
     """
     chosen: list[StampedFile | None] = [None] * len(wanted_ns)
     if not files or not len(wanted_ns):

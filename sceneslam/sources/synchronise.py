@@ -1,4 +1,4 @@
-"""One bundle of measurements per message of the primary sensor, from streams with own stamps."""
+"""Synchronisation of streams: one set of samples per message of the primary sensor."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Sensor
 from sceneslam.types.se3 import Transform
 
-_PATIENCE_S = 1.0  # how long a message waits for a stream that is behind
-_REACH_NS = 1_000_000_000  # what is this much older than the first message belongs to none
-_ODOMETRY_GAP_NS = 1_000_000_000  # beyond, odometry is not interpolated
-_ODOMETRY_HOLD_NS = 100_000_000  # how far the first and last odometry reach beyond themselves
-_MOST_HELD = 4096  # samples of one stream
+_PATIENCE_S = 1.0  # longest wait of a message for a stream that is behind
+_REACH_NS = 1_000_000_000  # older samples are not used
+_ODOMETRY_GAP_NS = 1_000_000_000  # longest gap for interpolation of odometry
+_ODOMETRY_HOLD_NS = 100_000_000  # validity before the first and after the last odometry
+_MOST_HELD = 4096  # queued samples per stream
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sample:
-    """One message's stamp and what it holds."""
+    """A message's stamp and value."""
 
     stamp_ns: int
     value: Any
@@ -30,20 +30,22 @@ class Sample:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SynchronisedSamples:
-    """What belongs to one message of the primary sensor."""
+    """A message of the primary sensor with the measurements of all other sensors."""
 
     primary: Sample
     depth: Sample | None = None  # nearest in time
-    scan: Sample | None = None  # the last since the bundle before
-    points: Sample | None = None  # the last since the bundle before
+    scan: Sample | None = None  # the last since the previous set
+    points: Sample | None = None  # the last since the previous set
     T_odom_base: Transform | None = None  # interpolated
-    samples: Mapping[Sensor, Sequence[Sample]] = field(default_factory=dict)  # since the one before
+    samples: Mapping[Sensor, Sequence[Sample]] = field(
+        default_factory=dict
+    )  # since the previous set
 
 
 class Synchroniser:
-    """Takes samples in the order of recording, gives bundles in the order of the primary's.
+    """Takes samples in the order of recording; gives sets in the order of the primary's.
 
-    A bundle waits for the streams in `waits_for` (None: all) until something is `patience_s` newer.
+    A set waits for the streams in `waits_for` (None: all) until any sample is `patience_s` newer.
     """
 
     def __init__(
@@ -54,7 +56,7 @@ class Synchroniser:
         *,
         waits_for: frozenset[Sensor] | None = None,
         patience_s: float = _PATIENCE_S,
-        extrapolates: bool = False,  # odometry that is not there in time
+        extrapolates: bool = False,  # odometry that is late
     ) -> None:
         self._primary = primary
         self._extrapolates = extrapolates
@@ -67,11 +69,11 @@ class Synchroniser:
         }
         self._seen_ns: dict[Sensor, int] = {}  # the latest stamp of each stream
         self._newest_ns = 0
-        self._taken_ns: dict[Sensor, int] = {}  # the newest that a bundle was given
-        self._passed: Sample | None = None  # the odometry before the oldest that is held
+        self._taken_ns: dict[Sensor, int] = {}  # the newest sample used in a set
+        self._passed: Sample | None = None  # the odometry before the oldest queued one
 
     def add(self, sensor: Sensor, sample: Sample) -> Iterator[SynchronisedSamples]:
-        """Take one sample; yield the bundles that are complete by it."""
+        """Add a sample; yield the sets that are complete now."""
         (self._waiting if sensor is self._primary else self._held[sensor]).append(sample)
         self._seen_ns[sensor] = max(self._seen_ns.get(sensor, 0), sample.stamp_ns)
         self._newest_ns = max(self._newest_ns, sample.stamp_ns)
@@ -79,7 +81,7 @@ class Synchroniser:
             yield self._bundle(self._waiting.popleft())
 
     def follow(self, primary: Sensor, waits_for: frozenset[Sensor]) -> None:
-        """Give a bundle per message of another sensor from now on; what it held is its own."""
+        """Use another primary sensor from now on; its queued samples become primary."""
         self._waits_for = waits_for
         if primary is not self._primary:
             self._held[self._primary] = deque(maxlen=_MOST_HELD)
@@ -88,12 +90,12 @@ class Synchroniser:
             self._waiting.clear()
 
     def flush(self) -> Iterator[SynchronisedSamples]:
-        """Yield what still waits, at the end of the recording."""
+        """Yield the remaining sets at the end of the recording."""
         while self._waiting:
             yield self._bundle(self._waiting.popleft())
 
     def _is_complete(self, stamp_ns: int) -> bool:
-        """Tell whether no stream can still bring something that belongs to the stamp."""
+        """Tell whether no stream can still have a sample for the stamp."""
         if self._newest_ns - stamp_ns > self._patience_ns:
             return True
         for sensor, held in self._held.items():
@@ -139,7 +141,7 @@ class Synchroniser:
         return found[-1] if found else None
 
     def _take_until(self, sensor: Sensor, stamp_ns: int) -> Sequence[Sample]:
-        """Return the samples since the last that was taken up to the stamp, by stamp."""
+        """Return the unused samples up to the stamp, by stamp."""
         held = self._held.get(sensor)
         if not held:
             return ()
@@ -173,7 +175,7 @@ class Synchroniser:
         return se3.interpolate(before.value, after.value, ratio)
 
     def _extrapolated(self, last: Sample, stamp_ns: int) -> Transform:
-        """Return odometry a little after its last message, at the velocity before it."""
+        """Return T_odom_base (4, 4) [m] shortly after the last message, at constant velocity."""
         passed = self._passed
         gap_ns = 0 if passed is None else last.stamp_ns - passed.stamp_ns
         if passed is None or not 0 < gap_ns <= _ODOMETRY_GAP_NS:

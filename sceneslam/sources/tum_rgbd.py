@@ -30,9 +30,9 @@ from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
-_SAMPLES = 8  # depth images of a survey
+_SAMPLES = 8  # depth images that are read for a survey
 _NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
-_KNOWN = {  # the calibrations that the benchmark publishes
+_KNOWN = {  # published calibrations of the benchmark
     ("freiburg1", "fr1"): Intrinsics(
         fx=517.3,
         fy=516.5,
@@ -57,7 +57,7 @@ class TumRgbd:
     """Gives one observation per line of rgb.txt, with the depth nearest to it in time.
 
     `camera` (fx, fy, cx, cy, distortion) may be null for the benchmark's own recordings, which
-    are known by their folder's name. Base is the camera's place, with REP-103 axes.
+    are known by their folder's name. `base` is at the camera's origin, with REP-103 axes.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class TumRgbd:
 
     @property
     def rig(self) -> Rig:
-        """Return the one camera."""
+        """Return the rig: one camera."""
         return Rig(sensors=self._sensors, camera=self._camera)
 
     @property
@@ -131,7 +131,7 @@ class TumRgbd:
                 yield frame.observation
 
     def survey(self) -> Survey:
-        """Return both lists, with some depth images read."""
+        """Return the stamps of both lists and some depth images."""
         units = DepthUnits.unlimited(self._depth_scale)
         reader = FrameReader(self._camera.size_wh, units)
         depths = [reader.depth_m(self._depths[at].path) for at in self._sampled()]
@@ -158,7 +158,7 @@ class TumRgbd:
         return spread(len(self._depths), _SAMPLES) if self._depths else ()
 
     def ground_truth(self) -> GroundTruth | None:
-        """Return groundtruth.txt (poses of the camera's optical frame) as poses of base."""
+        """Return groundtruth.txt (poses of the camera's optical frame) as poses of `base`."""
         path = self._folder / "groundtruth.txt"
         if not path.is_file():
             return None
@@ -179,7 +179,7 @@ def _path(file: StampedFile | None) -> Path | None:
 
 
 def _known_intrinsics(folder: Path) -> Intrinsics:
-    """Return the calibration of a benchmark's recording; raises ConfigError for another folder."""
+    """Return the calibration of a recording of the benchmark; raises ConfigError for others."""
     name = folder.resolve().name.lower()
     for tags, intrinsics in _KNOWN.items():
         if any(tag in name for tag in tags):

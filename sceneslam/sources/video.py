@@ -1,4 +1,4 @@
-"""Films, and folders of images: footage of one camera, in any format that OpenCV reads."""
+"""Videos and folders of images: one camera, in any format that OpenCV reads."""
 
 from __future__ import annotations
 
@@ -24,35 +24,37 @@ from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.truth import GroundTruth, SceneChange
 
 _IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".ppm", ".pgm", ".tif", ".tiff", ".webp"})
-_FOLDER_RATE_HZ = 30.0  # images alone do not say how fast they were taken
-_HEADER_RATIO = 0.98  # encoders announce some frames more than they write
+_FOLDER_RATE_HZ = 30.0  # assumed rate of images without stamps
+_HEADER_RATIO = (
+    0.98  # share of announced frames that must exist
+)
 _NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Frame:
     image_bgr: NDArray[np.uint8] | None  # (H, W, 3), None where it is damaged
-    time_s: float  # as the film says, NaN where it does not
+    time_s: float  # time in the video, NaN if unknown
     name: str
 
 
 class _Footage(Protocol):
-    """Frames in their order."""
+    """A sequence of frames."""
 
     rate_hz: float
-    count: int  # as announced
+    count: int  # announced number
 
     def jobs(self) -> Iterator[Callable[[], _Frame | None]]:
-        """Yield one call per frame, to be made in turn; None after the last."""
+        """Yield one function per frame, to be called in order; None is returned after the last."""
         ...
 
 
 class Video:
-    """Gives one observation per frame of a film, or per image of a folder by name.
+    """Gives one observation per frame of a video, or per image of a folder by name.
 
-    Stamps begin at 0 and are the film's own, or even ones where `rate_hz` is given. `camera` (fx,
-    fy, cx, cy, distortion) may be null, as a detector needs none; with it all images have one size.
-    `scenes` are the true ones, [seconds, scene] by rising seconds, the first at 0; null: unknown.
+    Stamps begin at 0; they are the video's own, or equidistant if `rate_hz` is given. `camera` (fx,
+    fy, cx, cy, distortion) may be null for detectors; with it, all images must have one size.
+    `scenes` are the true scenes, [seconds, scene] by rising time, the first at 0; null: unknown.
     """
 
     def __init__(
@@ -71,12 +73,12 @@ class Video:
 
     @property
     def rig(self) -> Rig:
-        """Return the one camera, whose parameters may be unknown."""
+        """Return the rig: one camera, possibly with unknown intrinsics."""
         return Rig(sensors=frozenset({Sensor.IMAGE}), camera=self._camera)
 
     @property
     def length(self) -> int | None:
-        """Return how many frames the film announces, or the folder has."""
+        """Return the announced number of frames of the video, or that of the folder."""
         return self._footage.count or None
 
     @property
@@ -86,7 +88,7 @@ class Video:
 
     @property
     def span(self) -> TimeSpan | None:
-        """Return the stamps of the first and last frame, as far as the film announces them."""
+        """Return the stamps of the first and last announced frame."""
         if not self._footage.count:
             return None
         return TimeSpan(start_ns=0, end_ns=round((self._footage.count - 1) * self._period_s * 1e9))
@@ -94,7 +96,7 @@ class Video:
     def __iter__(self) -> Iterator[Observation]:
         """Yield observations; decodes ahead in a thread.
 
-        Raises InputError for an image of another size where the camera is known.
+        Raises InputError for an image of another size if intrinsics are given.
         """
         self._faults.clear()
         stamp_ns, count = -1, 0
@@ -113,18 +115,18 @@ class Video:
             self._faults.add(missing, self._path)
 
     def ground_truth(self) -> GroundTruth | None:
-        """Return the scenes that were given."""
+        """Return the configured scenes, None without."""
         return GroundTruth(scenes=self._scenes) if self._scenes else None
 
     def _stamp_ns(self, frame: _Frame, last_ns: int, count: int) -> int:
-        """Return the film's stamp; one period after the last where it has none that rises."""
+        """Return a frame's stamp [ns]; if it does not rise, one period after the last."""
         if self._rate_hz is not None or np.isnan(frame.time_s):
             return round(count * self._period_s * 1e9)
         stamp_ns = round(frame.time_s * 1e9)
         return stamp_ns if stamp_ns > last_ns else last_ns + round(self._period_s * 1e9)
 
     def _with_size(self, camera: dict[str, Any], path: str) -> Camera | None:
-        """Return the given camera; raises InputError where no frame can be read."""
+        """Return the configured camera with the image size; raises InputError without a frame."""
         given = given_intrinsics(camera)
         frames = chain((job() for job in self._footage.jobs()), [None])
         first = next(f for f in frames if f is None or f.image_bgr is not None)
@@ -155,7 +157,7 @@ class Video:
 
 
 class _Folder:
-    """Images by the order of their names."""
+    """Images in the order of their names."""
 
     rate_hz = _FOLDER_RATE_HZ
 
@@ -164,7 +166,7 @@ class _Folder:
         self.count = len(files)
 
     def jobs(self) -> Iterator[Callable[[], _Frame | None]]:
-        """Yield one call per image."""
+        """Yield one function per image."""
         return (partial(self._read, file) for file in self._files)
 
     @staticmethod
@@ -177,7 +179,7 @@ class _Folder:
 
 
 class _Film:
-    """A file of moving images."""
+    """A video file."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -187,7 +189,7 @@ class _Film:
         self.count = max(int(film.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
 
     def jobs(self) -> Iterator[Callable[[], _Frame | None]]:
-        """Yield calls without an end, the last of which return None."""
+        """Yield functions without end; after the last frame they return None."""
         film = self._open()
         while True:
             yield partial(self._read, film)
@@ -195,7 +197,7 @@ class _Film:
     def _open(self) -> cv2.VideoCapture:
         level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         film = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
-        cv2.utils.logging.setLogLevel(level)  # what it cannot open is told once, below
+        cv2.utils.logging.setLogLevel(level)  # failures are reported below
         if not film.isOpened():
             raise InputError(f"film: expected a file that FFmpeg can read, or images: {self._path}")
         return film
@@ -210,7 +212,7 @@ class _Film:
 
 
 def _footage(path: Path) -> _Footage:
-    """Return what a path holds; raises InputError for anything else."""
+    """Return the footage of a path; raises InputError for anything else."""
     if not path.exists():
         raise InputError(f"film not found, expected a file or a folder of images: {path}")
     if path.is_file() and path.suffix.lower() not in _IMAGES:
@@ -223,7 +225,7 @@ def _footage(path: Path) -> _Footage:
 
 
 def _checked(scenes: Sequence[Sequence[float | str]]) -> tuple[SceneChange, ...]:
-    """Return the true scenes; raises ConfigError unless they are by rising seconds from 0."""
+    """Return the true scenes; raises ConfigError unless their times rise from 0."""
     allowed = "a list of [seconds, scene] by rising seconds, the first at 0"
     changes: list[SceneChange] = []
     for entry in scenes:

@@ -1,4 +1,4 @@
-"""A source around another: what it does not change is the inner one's."""
+"""Base class of sources that wrap another source."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sceneslam.types.rig import Rig
 
 
 class Wrapped:
-    """Passes on the rig, length, faults, feed and span of its source."""
+    """Passes on rig, length, faults, live feed and time span of its source."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
@@ -23,7 +23,7 @@ class Wrapped:
 
     @property
     def length(self) -> int | None:
-        """Return how many observations the source will give at most."""
+        """Return the largest possible number of observations, None if unknown."""
         return self._source.length
 
     @property
@@ -33,16 +33,16 @@ class Wrapped:
 
     @property
     def live(self) -> LiveFeed | None:
-        """Return the source's feed where it measures now."""
+        """Return the source's live feed, None for recordings."""
         return self._source.live if isinstance(self._source, Live) else None
 
     @property
     def span(self) -> TimeSpan | None:
-        """Return the source's span where it knows one."""
+        """Return the source's time span, None if unknown."""
         return self._source.span if isinstance(self._source, Spanned) else None
 
     def survey(self) -> Survey | None:
-        """Return what the source holds where it can be looked at; effects are not in it."""
+        """Return the source's survey, None if unknown; effects are not included."""
         return self._source.survey() if isinstance(self._source, Surveyed) else None
 
     def start_ns(self) -> int | None:

@@ -1,4 +1,4 @@
-"""Rendering all frames of a shot, in order, by as many processes as wanted."""
+"""Rendering of all frames of a shot, in order, by several processes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sceneslam.types.errors import InputError
 
 
 def render(shot: Shot, count: int, workers: int) -> Generator[SimulatedFrame]:
-    """Yield frames 0 to count - 1; their bytes do not depend on the number of workers.
+    """Yield frames 0 to count - 1; they do not depend on the number of workers.
 
     Raises InputError when a worker dies.
     """
@@ -38,10 +38,12 @@ def render(shot: Shot, count: int, workers: int) -> Generator[SimulatedFrame]:
 
 
 def work() -> None:
-    """Render a share of a shot's frames: both from standard input, the frames to its output."""
+    """Render the frames that standard input lists, and write them to standard output."""
     cv2.setNumThreads(1)
     with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as output:
-        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever a library prints
+        os.dup2(
+            sys.stderr.fileno(), sys.stdout.fileno()
+        )  # for output of libraries
         shot, share = pickle.load(sys.stdin.buffer)
         photographer = Photographer(shot)
         for index in share:
@@ -52,8 +54,8 @@ def work() -> None:
 def _hire() -> subprocess.Popen[bytes]:
     """Start a worker.
 
-    Processes, since ray casting holds the interpreter's lock. Not by multiprocessing, which runs
-    the caller's main module anew in each; in a session of their own, which Ctrl-C does not reach.
+    Workers are processes, since ray casting holds the GIL. `multiprocessing` is not used: it runs
+    the caller's main module in each. They have their own session, which Ctrl-C does not reach.
     """
     command = f"from {__name__} import work; work()"
     return subprocess.Popen(

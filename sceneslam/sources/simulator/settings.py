@@ -1,4 +1,4 @@
-"""The settings of the simulated sensors, checked."""
+"""Settings of the simulated sensors, with checks."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class CameraSettings:
         _require("tilt_deg", self.tilt_deg, "-45 to 45", abs(self.tilt_deg) <= 45)
 
     def camera(self) -> Camera:
-        """Return the camera model with its place on the robot."""
+        """Return the camera model with its pose on the robot."""
         width, height = self.size_wh
         focal_px = 0.5 * width / np.tan(0.5 * np.deg2rad(self.fov_deg))
         tilt = se3.so3_exp(np.array([0.0, np.deg2rad(self.tilt_deg), 0.0]))
@@ -81,29 +81,29 @@ class LaserSettings:
         _require("height_m", self.height_m, "0.02 to 1.5", 0.02 <= self.height_m <= 1.5)
 
     def laser(self) -> Laser:
-        """Return the laser with its place on the robot."""
+        """Return the laser model with its pose on the robot."""
         position_m = np.array([0.0, 0.0, self.height_m])
         return Laser(T_base_laser=se3.from_parts(np.eye(3), position_m))
 
     def angles_rad(self) -> NDArray[np.float64]:
-        """Return the beams' angles [rad], counter-clockwise, evenly about straight ahead."""
+        """Return the beams' angles (beams,) [rad], counter-clockwise, symmetric to x of `laser`."""
         half = int(0.5 * self.fov_deg / self.step_deg + 1e-6)
         return np.asarray(np.deg2rad(self.step_deg) * np.arange(-half, half + 1))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometrySettings:
-    """Wheel encoders: two wheels, each with its error, and a floor that is slippery."""
+    """Wheel encoders: two wheels with their errors, and slip."""
 
     wheel_base_m: float
     scale_error_ratio: float  # of both wheels
-    unequal_ratio: float  # of the wheels against each other
-    noise_ratio: float  # deviation per wheel, per square root of a metre
+    unequal_ratio: float  # scale difference between the wheels
+    noise_ratio: float  # standard deviation per wheel, per square root of a metre
     slips_per_minute: float
-    slip_m: float  # of one wheel or both, at most
-    lie: str  # what the encoders do from time to time
-    lies_per_minute: float  # but once at least
-    lie_s: float  # each time
+    slip_m: float  # largest slip of one or both wheels
+    lie: str  # kind of temporary encoder failure
+    lies_per_minute: float  # at least one
+    lie_s: float  # duration of each
 
     def __post_init__(self) -> None:
         _require("wheel_base_m", self.wheel_base_m, "0.05 to 1", 0.05 <= self.wheel_base_m <= 1)
@@ -127,9 +127,9 @@ class GyroSettings:
     """A rate gyro."""
 
     rate_hz: float
-    bias_radps: float  # deviation from one seed to the next, per axis
+    bias_radps: float  # standard deviation between seeds, per axis
     noise_radps: float  # per sample
-    bias_walk_radps_per_sqrt_s: float  # how fast the bias walks
+    bias_walk_radps_per_sqrt_s: float  # random walk of the bias
 
     def __post_init__(self) -> None:
         _require("rate_hz", self.rate_hz, "10 to 1000", 10 <= self.rate_hz <= 1000)
@@ -141,14 +141,14 @@ class GyroSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExposureSettings:
-    """How long the camera exposes: automatically, or as long as `nominal_s` without gain."""
+    """Exposure of the camera: automatic, or `nominal_s` without gain."""
 
     is_automatic: bool
-    target_grey: float  # mean of the image that it seeks
+    target_grey: float  # target mean of the image
     lag_s: float  # time constant
-    nominal_s: float  # shows a white surface in unit light as white
+    nominal_s: float  # time at which white in unit light is white in the image
     range_s: tuple[float, float]
-    gain_max: float  # after the longest exposure
+    gain_max: float  # used beyond the longest exposure time
 
     def __post_init__(self) -> None:
         _require("target_grey", self.target_grey, "20 to 235", 20 <= self.target_grey <= 235)
@@ -160,7 +160,7 @@ class ExposureSettings:
 
 
 def read(kind: type[_T], key: str, values: Mapping[str, Any]) -> _T:
-    """Return the settings of a mapping; raise ConfigError naming the key that is wrong."""
+    """Return the settings of a mapping; raises ConfigError that names the wrong key."""
     names = [entry.name for entry in fields(kind)]  # type: ignore[arg-type]
     for name in values:
         if name not in names:

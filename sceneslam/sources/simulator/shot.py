@@ -1,4 +1,4 @@
-"""One frame of a story: what camera and laser measure, from nothing but the frame's number."""
+"""The frames of a story: camera and laser measurements of any frame by its index."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from sceneslam.sources.simulator.story import Story
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
-_METERED = 64  # frames that are metered at a time, in the light of the first of them
-_PLACE_STREAM, _FRAME_STREAM, _SWEEP_STREAM = 1, 2, 3  # of random numbers, below the seed
+_METERED = 64  # frames metered together, in the light of the first
+_PLACE_STREAM, _FRAME_STREAM, _SWEEP_STREAM = 1, 2, 3  # streams of random numbers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Shot:
-    """All that the frames of a story have in common; passed to every worker."""
+    """The data that all frames of a story share; passed to every worker."""
 
     story: Story
     lights: str
@@ -37,14 +37,14 @@ class Shot:
     path: Path
     rate_hz: float
     camera: Camera
-    scanner: LaserSettings | None  # None: switched off
+    scanner: LaserSettings | None  # None: no laser
     place: SimulatedPlace
     light: LightMap
     exposure: ExposureSettings
     exposures: NDArray[np.float64]  # (frames,), time ratio x gain
 
     def time_s(self, index: int) -> float:
-        """Return when a frame is taken, since the story's start."""
+        """Return the time [s] of a frame since the story's start."""
         return index / self.rate_hz
 
     def levels(self, time_s: float) -> dict[str, float]:
@@ -52,7 +52,7 @@ class Shot:
         return self.story.levels(self.place.groups, time_s, self.lights)
 
     def sweep_time_s(self, index: int) -> float | None:
-        """Return the time of a laser sweep that ended since the frame before, None without."""
+        """Return the time [s] of a laser scan since the previous frame, None without."""
         if self.scanner is None:
             return None
         sweep = int(self.time_s(index) * self.scanner.rate_hz + 1e-6)
@@ -63,7 +63,7 @@ class Shot:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SimulatedFrame:
-    """What camera and laser measured."""
+    """Measurements of camera and laser at one frame."""
 
     image_bgr: NDArray[np.uint8]  # (H, W, 3)
     depth_mm: NDArray[np.uint16]  # (H, W), 0 = missing
@@ -71,7 +71,7 @@ class SimulatedFrame:
 
 
 class Photographer:
-    """Renders any frame of a shot; the same frame is the same bytes, whoever renders it."""
+    """Renders any frame of a shot, with the same result in every process."""
 
     def __init__(self, shot: Shot) -> None:
         self._shot = shot
@@ -97,7 +97,7 @@ class Photographer:
         add_people(view, shot.place.people, time_s, T_gt_cam, rays, shot.levels(time_s))
 
     def _shutter(self, index: int) -> Shutter:
-        """Return how a frame is exposed; only turning blurs, since driving moves little."""
+        """Return a frame's exposure; motion blur is due to rotation only, as driving is slow."""
         shot, settings = self._shot, self._shot.exposure
         if not settings.is_automatic:
             return Shutter()
@@ -109,7 +109,7 @@ class Photographer:
         return Shutter(time_ratio=time_ratio, gain=gain, motion_px=motion_px)
 
     def _sweep(self, index: int) -> NDArray[np.float32] | None:
-        """Return the ranges of the sweep that belongs to a frame; its beams leave at once."""
+        """Return the ranges (beams,) [m] of a frame's scan, all beams at once; None without."""
         time_s, scanner = self._shot.sweep_time_s(index), self._shot.scanner
         if time_s is None or scanner is None:
             return None
@@ -128,7 +128,7 @@ class Photographer:
 
 
 def meter(shot: Shot, count: int) -> list[NDArray[np.float32]]:
-    """Return the grey of a coarse grid of each frame, before exposure."""
+    """Return the grey values of a coarse pixel grid (N,) of each frame, before exposure."""
     eye = CameraRenderer(shot.place, shot.light, RayCaster(shot.place.panels), shot.camera)
     greys: list[NDArray[np.float32]] = []
     for first in range(0, count, _METERED):
@@ -140,7 +140,7 @@ def meter(shot: Shot, count: int) -> list[NDArray[np.float32]]:
 
 
 def build_place(kind: str, seed: int, order: int | None) -> SimulatedPlace:
-    """Return a story's place: `two_rooms`, `sunny_rooms`, `bare_rooms`, `corridor`, `building`."""
+    """Return a place: `two_rooms`, `sunny_rooms`, `bare_rooms`, `corridor` or `building`."""
     rng = np.random.default_rng([seed, _PLACE_STREAM, 0])
     if kind == "building":
         return building.build(rng, order)
@@ -150,11 +150,11 @@ def build_place(kind: str, seed: int, order: int | None) -> SimulatedPlace:
 
 
 def floor_plan(kind: str, order: int | None) -> BuildingLayout:
-    """Return a story's place from above."""
+    """Return the layout of a story's place."""
     return building.floor_plan(order) if kind == "building" else rooms.floor_plan()
 
 
 def light_place(place: SimulatedPlace, seed: int) -> LightMap:
-    """Return the light of a place."""
+    """Return the light map of a place."""
     rng = np.random.default_rng([seed, _PLACE_STREAM, 1])
     return bake(place, RayCaster(place.panels), rng)

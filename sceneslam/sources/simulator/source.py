@@ -1,4 +1,4 @@
-"""A simulated robot that drives through two rooms or a building, in one of nine stories."""
+"""A simulated robot that drives through rooms or a building, in one of nine stories."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
-_START_NS = 1_000 * 10**9  # stamps count from here: zero means "unset" to many readers
+_START_NS = 1_000 * 10**9  # first stamp; zero means "unset" in many formats
 _OF_ROOMS, _OF_BUILDING = {"rooms.py"}, {"building.py", "zones.py", "zone_kind.py"}
 _LIGHTS = ("story", "on", "off")
 
 
 class Simulator:
-    """Renders a story once, keeps it as MCAP, and gives the observations of that file.
+    """Renders a story once to a cached MCAP file, and gives the observations of that file.
 
-    `lights` keeps the rooms' lamps on or off, whatever the story says; `laser` switches the
+    `lights` keeps the rooms' lamps on or off, against the story; `laser` switches the
     scanner on, `wheels` the encoders; `order` is a seed for the order of the building's rooms;
     `duration_s` ends the story early. The same arguments give the same bytes, with
     any number of `workers` (processes; null: one per core).
@@ -89,7 +89,7 @@ class Simulator:
 
     @property
     def rig(self) -> Rig:
-        """Return the simulated sensors; nothing is rendered for it."""
+        """Return the simulated sensors, without rendering."""
         sensors = {Sensor.IMAGE, Sensor.DEPTH, Sensor.GYRO}
         sensors |= {Sensor.SCAN} if self._laser else set()
         sensors |= {Sensor.ODOMETRY} if self._wheels else set()
@@ -109,15 +109,15 @@ class Simulator:
 
     @property
     def faults(self) -> Sequence[str]:
-        """Return the faults of the cached file: none, since damaged files are made anew."""
+        """Return the faults of the cached file: none, as damaged files are rendered again."""
         return self._reader.faults if self._reader else ()
 
     def __iter__(self) -> Iterator[Observation]:
-        """Yield the observations of the cached file; renders it when there is none."""
+        """Yield the observations of the cached file; renders it if it is missing."""
         yield from self._read()
 
     def ground_truth(self) -> GroundTruth:
-        """Return the exact poses and the scenes that the light makes; renders when needed."""
+        """Return the exact poses and the true scenes; renders the story if needed."""
         return self._read().ground_truth() or GroundTruth()
 
     @cached_property
@@ -147,7 +147,7 @@ class Simulator:
         return self._reader
 
     def _dependencies(self) -> Mapping[str, object]:
-        """Return all that the cached file depends on, the code that draws its place with it."""
+        """Return everything that the cached file depends on, with a hash of its place's code."""
         return {
             "story": self._story,
             "seed": self._seed,
@@ -217,7 +217,7 @@ class Simulator:
         writer.write_truth(self._truth(shot))
 
     def _truth(self, shot: Shot) -> GroundTruth:
-        """Return the pose and the scene of every frame."""
+        """Return the ground truth: pose and scene of every frame."""
         times_s = [shot.time_s(index) for index in range(self.length)]
         stamps_ns = np.array([_stamp_ns(time_s) for time_s in times_s])
         T_gt_base = np.stack([self._path.pose(time_s) for time_s in times_s])
@@ -246,7 +246,7 @@ class Simulator:
 
 
 def _code_of(place: str) -> Iterator[Path]:
-    """Yield the code that a recording depends on; its story counts by value."""
+    """Yield the files of code that a recording depends on; its story is compared by value."""
     of_others = _OF_ROOMS if place == "building" else _OF_BUILDING
     for file in Path(__file__).parent.rglob("*.py"):
         if file.name not in {"cache.py", "stories.py", *of_others}:

@@ -1,4 +1,4 @@
-"""The stories by name."""
+"""The definitions of all stories."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def find(name: str, order: int | None) -> Story:
 
 
 def _drop_outs(*drops: tuple[float, float]) -> Knots:
-    """Return the knots of a lamp that fails at each (time, duration) [s]."""
+    """Return the level's knots of a lamp that fails at each (time, duration) [s]."""
     knots: list[tuple[float, float]] = []
     for start, duration in drops:
         end = start + duration
@@ -36,9 +36,9 @@ def _drop_outs(*drops: tuple[float, float]) -> Knots:
     return tuple(knots)
 
 
-# Through room A from the start view to the door, turning into it at the end.
+# Route through room A from the start to the door, turning into it at the end.
 _TO_DOOR = ((2.75, 2.2), (2.7, 1.3), (3.1, 0.8), (3.6, 0.95), (3.8, 1.5), (4.0, 1.95), (5.06, 1.98))
-# Along room B's side of the dividing wall, turning into the door at the end.
+# Route along the dividing wall in room B, turning into the door at the end.
 _BACK_TO_DOOR = ((6.3, 3.3), (5.6, 3.3), (5.55, 2.3), (5.4, 2.02), (5.06, 1.98))
 _ROUND_A = ((2.75, 2.2), (2.7, 1.3), (3.1, 0.8), (3.6, 0.95), (3.8, 1.6), (3.8, 2.3), (3.3, 2.75))
 

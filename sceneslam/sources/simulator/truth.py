@@ -1,7 +1,7 @@
-"""The true scenes: the zone that the robot enters or is in, and whether its lamps shine.
+"""True scenes: by the light in the zone that the robot is in or enters.
 
-Before a door it is the zone behind it as soon as the nearest floor that a camera sees, a metre
-ahead, lies there: a robot that looks through a door into the dark is about to be in the dark.
+In front of a door, the zone behind it counts as soon as the nearest floor that a camera sees, a
+metre ahead, lies there: a robot that looks through a door into the dark is about to be in it.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import SceneChange
 
 BRIGHT, DARK = "Bright", "Dark"
-_AHEAD_M = 1.0  # where a camera 0.45 m high that looks 25 degrees down at most meets the floor
-_LIT_LEVEL = 0.5  # of a zone's lamps; a lamp that goes on or off passes it in the middle
-_SHORTEST_S = 1.0  # what is over sooner is a flicker, not a scene
+_AHEAD_M = 1.0  # nearest visible floor of a camera at 0.45 m whose image reaches 25 degrees down
+_LIT_LEVEL = 0.5  # threshold on the level of a zone's lamps
+_SHORTEST_S = 1.0  # shorter changes are flicker, not a scene
 
 
 def scene_at(plan: BuildingLayout, T_gt_base: Transform, levels: Mapping[str, float]) -> str | None:
-    """Return the scene of the robot's zone, or of the one behind the door before it.
+    """Return the scene of the robot's zone, or of the zone behind the door in front of it.
 
     None outside all zones.
     """
@@ -38,9 +38,9 @@ def scene_at(plan: BuildingLayout, T_gt_base: Transform, levels: Mapping[str, fl
 
 
 def changes_of(stamps_ns: NDArray[np.int64], scenes: Sequence[str]) -> tuple[SceneChange, ...]:
-    """Return the changes of a story whose scene is known at every stamp.
+    """Return the scene changes of a story, from the scene at each stamp (N,) [ns].
 
-    A stretch shorter than a second belongs to the scene before it.
+    A scene shorter than a second is replaced by the one before it.
     """
     names = np.asarray(scenes)
     starts = np.flatnonzero(np.append(True, names[1:] != names[:-1]))

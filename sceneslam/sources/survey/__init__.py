@@ -1,1 +1,1 @@
-"""What a recording holds, before and while it is run."""
+"""Survey of a recording's contents, before and during a run."""

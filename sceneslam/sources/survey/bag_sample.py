@@ -1,4 +1,4 @@
-"""A few seconds of a ROS recording, from its beginning to its end."""
+"""Samples of a ROS recording, from its beginning to its end."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from sceneslam.types.rig import Sensor
 
 _STRETCHES, _STRETCH_NS = 5, 1_000_000_000
 _SLOW_STRETCHES, _SLOW_STRETCH_NS = 1, 200_000_000  # bzip2 unpacks some megabytes per second
-_MOST_MESSAGES = 400  # of a stretch
-_MOST_SAMPLES = 2  # depth images, scans and clouds of a stretch that are decoded
+_MOST_MESSAGES = 400  # per time span
+_MOST_SAMPLES = 2  # decoded depth images, scans and clouds per time span
 
 
 def survey_recording(
@@ -29,7 +29,7 @@ def survey_recording(
     unplaced: Sequence[str] = (),
     silent: Sequence[str] = (),
 ) -> Survey:
-    """Return the streams of a recording, sampled in stretches of a second."""
+    """Return the streams of a recording, sampled in time spans of a second."""
     taken: dict[Sensor, list[int]] = {sensor: [] for sensor in topics}
     samples = _Samples(DepthUnits.unlimited(depth_scale))
     for stretch in _stretches(recording, topics):
@@ -87,12 +87,12 @@ def _stretch(
 
 
 class _Samples:
-    """What some messages hold."""
+    """The contents of the sampled messages."""
 
     def __init__(self, units: DepthUnits) -> None:
         self._units = units
         self._counts: dict[Sensor, int] = {}
-        self.is_scaled = False  # depth is in whole units
+        self.is_scaled = False  # depth is stored as integers
         self.depths_m: list[Any] = []
         self.scans: list[Any] = []
         self.clouds: list[Any] = []
@@ -101,11 +101,11 @@ class _Samples:
         self.gyro_radps: list[Any] = []
 
     def begin(self) -> None:
-        """Begin a stretch."""
+        """Begin a time span."""
         self._counts = {}
 
     def take(self, sensor: Sensor, stamp_ns: int, value: Any) -> None:
-        """Keep what a message holds, where it is one of the first of its stretch."""
+        """Add a message's contents if it is one of the first of its time span."""
         if sensor is Sensor.ODOMETRY:
             T_odom_base = decode.transform(value.pose.pose.position, value.pose.pose.orientation)
             if T_odom_base is not None:

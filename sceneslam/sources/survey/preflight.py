@@ -1,7 +1,7 @@
-"""A recording before it is run: a line per sensor, and a warning where a value is implausible.
+"""Checks before a run: one line per sensor, and warnings of implausible values.
 
-The limits are those of the sensors' physics. A wrong unit is off by a factor of five and more, so
-that none of them has to be sharp.
+The limits follow from the sensors' physics. They need not be exact, as a wrong unit causes an
+error of a factor of five or more.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from numpy.typing import NDArray
 from sceneslam.sources.survey.survey import Stream, Survey
 from sceneslam.types.rig import Camera, Rig, Sensor
 
-_IN_RANGE_MIN = 0.9  # a depth camera measures within its range; by a wrong unit 0.74 at most did
+_IN_RANGE_MIN = 0.9  # share of depths in range; with wrong units, at most 0.74 in our recordings
 _SCALES = (1000.0, 5000.0)  # units per metre in use: millimetres, and those of TUM
-_FITS = 0.98  # of the measured depths in range: this scale explains them
+_FITS = 0.98  # share of depths in range that confirms a scale
 _FIELD_OF_VIEW_DEG = (15.0, 150.0)  # of a pinhole camera, horizontal
-_OFF_CENTRE = 0.25  # of the image's size; a lens sits within some percent of the centre
+_OFF_CENTRE = 0.25  # of the image's size; a principal point is within some per cent of the centre
 _SPEED_MAX_MPS = 70.0  # 250 km/h
 _TURN_MAX_RADPS = 35.0  # gyros measure up to 2000 degrees per second
-_RETURNS_MIN = 0.02  # share of beams that hit anything; less is an open field
-_IMAGE_RATE_HZ = (0.5, 2000.0)  # slower, no two images overlap; faster, the stamps' unit is wrong
+_RETURNS_MIN = 0.02  # share of beams with a return; less in open fields only
+_IMAGE_RATE_HZ = (0.5, 2000.0)  # below, images do not overlap; above, the stamps' unit is wrong
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Preflight:
-    """What is worth saying of a recording before it is run."""
+    """The report on a recording before its run."""
 
     lines: tuple[str, ...]  # one per sensor
-    warnings: tuple[str, ...]  # sentences, each with the key to look at
+    warnings: tuple[str, ...]  # sentences that name the key to check
 
 
 def preflight(survey: Survey, rig: Rig) -> Preflight:
-    """Return what a survey shows, held against the rig that the source declares."""
+    """Return the report: a survey compared with the rig that the source declares."""
     camera = rig.camera
     warnings = [*_of_time(survey), *_of_pairs(survey)]
     if camera is not None:
@@ -71,7 +71,7 @@ def _line(stream: Stream, survey: Survey, camera: Camera | None) -> str:
 
 
 def _of_time(survey: Survey) -> Iterator[str]:
-    """Yield what is wrong with the stamps: a unit, or clocks that have nothing in common."""
+    """Yield warnings of stamps: wrong units, or clocks without a common time."""
     low_hz, high_hz = _IMAGE_RATE_HZ
     for stream in survey.streams:
         rate_hz = stream.rate_hz
@@ -99,7 +99,7 @@ def _spans(survey: Survey) -> str:
 
 
 def _of_pairs(survey: Survey) -> Iterator[str]:
-    """Yield that images lack depth, though there are enough depth images for them."""
+    """Yield a warning if images have no depth though there are enough depth images."""
     image, depth = survey.stream(Sensor.IMAGE), survey.stream(Sensor.DEPTH)
     paired = survey.paired_ratio()
     if image is None or depth is None or paired is None:
@@ -113,7 +113,7 @@ def _of_pairs(survey: Survey) -> Iterator[str]:
 
 
 def apart(survey: Survey) -> str:
-    """Return how far images are from their depth, in words; "" where there are not both."""
+    """Return the time between images and their depth as text, "" if one of them is missing."""
     apart_s = survey.apart_s()
     if not len(apart_s):
         return ""
@@ -121,11 +121,11 @@ def apart(survey: Survey) -> str:
 
 
 def _of_lens(camera: Camera) -> Iterator[str]:
-    """Yield intrinsics that belong to another image."""
+    """Yield warnings of intrinsics that do not fit the image size."""
     width, height = camera.size_wh
     fov_deg = degrees(2 * atan(0.5 * width / camera.fx)) if camera.fx > 0 else 0.0
     low_deg, high_deg = _FIELD_OF_VIEW_DEG
-    if camera.fx != 1.0 and not low_deg <= fov_deg <= high_deg:  # 1.0: not known
+    if camera.fx != 1.0 and not low_deg <= fov_deg <= high_deg:  # 1.0: unknown
         yield (
             f"source.camera.fx {camera.fx:g} makes a field of view of {fov_deg:.0f} degrees in "
             f"images of {width}x{height}: is it of another resolution?"
@@ -139,7 +139,7 @@ def _of_lens(camera: Camera) -> Iterator[str]:
 
 
 def _of_depth(survey: Survey, camera: Camera) -> Iterator[str]:
-    """Yield that depth lies outside the camera's range, where its unit is most likely wrong."""
+    """Yield a warning if depth is outside the camera's range: its unit is probably wrong."""
     if not survey.depths_m:
         return
     depths_m = _measured(survey.depths_m)
@@ -169,7 +169,7 @@ def _better_scale(survey: Survey, camera: Camera, depths_m: NDArray[np.float32])
 
 
 def _of_ranges(survey: Survey, rig: Rig) -> Iterator[str]:
-    """Yield that a laser or lidar measures next to nothing within its range."""
+    """Yield a warning if a laser or lidar has almost no returns within its range."""
     beams = sum(len(scan.ranges_m) for scan in survey.scans)
     returns = len(_returns(survey))
     if survey.scans and returns < _RETURNS_MIN * max(beams, 1):
@@ -196,7 +196,7 @@ def _of_ranges(survey: Survey, rig: Rig) -> Iterator[str]:
 
 
 def _of_motion(survey: Survey) -> Iterator[str]:
-    """Yield odometry and gyros that are faster than any robot."""
+    """Yield warnings of odometry and gyros that are faster than any robot."""
     if survey.odometry_ns is not None and len(survey.T_odom_base) > 1:
         positions_m = np.stack([T[:3, 3] for T in survey.T_odom_base])
         steps_s = np.diff(survey.odometry_ns) * 1e-9
@@ -214,7 +214,7 @@ def _of_motion(survey: Survey) -> Iterator[str]:
 
 
 def _of_places(survey: Survey) -> Iterator[str]:
-    """Yield sensors that nobody says where they sit, and topics that nobody fills."""
+    """Yield warnings of sensors without a pose on the robot, and of topics without messages."""
     for frame in survey.unplaced:
         yield (
             f"no transform connects frame {frame!r} with the robot's base (source.base_frame): its "
@@ -225,7 +225,7 @@ def _of_places(survey: Survey) -> Iterator[str]:
 
 
 def _measured(depths_m: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Return every fourth row and column of what was measured, as one array (N,) [m]."""
+    """Return the valid depths (N,) [m] of every fourth row and column."""
     values = [depth_m[::4, ::4].ravel() for depth_m in depths_m]
     every = np.concatenate(values) if values else np.zeros(0, np.float32)
     return every[np.isfinite(every) & (every > 0)]

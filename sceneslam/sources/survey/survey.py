@@ -1,4 +1,4 @@
-"""What a recording holds, by a few samples: taken before it is run, in about a second."""
+"""Contents of a recording by a few samples, taken before a run in about a second."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class Stream:
     """The measurements of one sensor."""
 
     sensor: Sensor
-    place: str  # the topic or file
+    place: str  # topic or file
     count: int  # in the whole recording
-    stamps_ns: Stamps  # (N,) rising; all of them, or those in the stretches that were read
+    stamps_ns: Stamps  # (N,) rising; all, or those in the sampled time spans
 
     @property
     def rate_hz(self) -> float | None:
@@ -35,7 +35,7 @@ class Stream:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Survey:
-    """Streams and samples of what they hold; a source leaves out what it does not have."""
+    """Streams and samples of their contents; fields a source does not have are empty."""
 
     streams: Sequence[Stream]
     sync_tolerance_s: float | None = None  # between an image and its depth
@@ -43,18 +43,18 @@ class Survey:
     depths_m: Sequence[NDArray[np.float32]] = ()  # (H, W), also out of range; 0 = missing
     scans: Sequence[LaserScan] = ()
     clouds: Sequence[NDArray[np.float32]] = ()  # (N, 3) [m]
-    odometry_ns: Stamps | None = None  # (N,) of ...
+    odometry_ns: Stamps | None = None  # (N,) stamps of ...
     T_odom_base: Sequence[Transform] = ()  # ... these N poses
     gyro_radps: Sequence[NDArray[np.float64]] = ()  # (3,) each
     unplaced: Sequence[str] = ()  # frames of sensors that no transform connects with the base
-    silent: Sequence[str] = ()  # topics that are announced, though nothing came
+    silent: Sequence[str] = ()  # announced topics without a message
 
     def stream(self, sensor: Sensor) -> Stream | None:
         """Return a sensor's stream, None where the recording has none."""
         return next((one for one in self.streams if one.sensor is sensor), None)
 
     def apart_s(self) -> NDArray[np.float64]:
-        """Return how far each image is from the depth image nearest in time (N,) [s]."""
+        """Return the time (N,) [s] between each image and the depth image nearest in time."""
         image, depth = self.stream(Sensor.IMAGE), self.stream(Sensor.DEPTH)
         if image is None or depth is None or not len(depth.stamps_ns):
             return np.zeros(0)
@@ -74,13 +74,13 @@ class Survey:
 
 @runtime_checkable
 class Surveyed(Protocol):
-    """A source that can be looked at before it is run."""
+    """A source that can be surveyed before a run."""
 
     def survey(self) -> Survey | None:
-        """Return what it holds, None when unknown; reads a few stretches of it."""
+        """Return the survey, None if unknown; reads a few time spans only."""
         ...
 
 
 def spread(count: int, samples: int) -> list[int]:
-    """Return at most `samples` places of `count`, evenly from the first to the last."""
+    """Return at most `samples` indices below `count`, evenly from the first to the last."""
     return sorted({round(at) for at in np.linspace(0, count - 1, min(count, samples))})

@@ -1,4 +1,4 @@
-"""What the observations of a run held, counted as they come."""
+"""Statistics of the observations of a run."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Sensor
 
-_EVERY = 30  # depth image or scan is looked into
+_EVERY = 30  # every 30th depth image and scan is examined
 
 
 class Tally:
-    """Counts the sensors; remembers where the active module lacked one of its own."""
+    """Counts observations per sensor; records where a sensor of the active module was missing."""
 
     def __init__(self, sensors: frozenset[Sensor]) -> None:
-        self.missing: dict[int, str] = {}  # stamp [ns] -> what the module needs and did not get
+        self.missing: dict[int, str] = {}  # stamp [ns] -> missing sensors of the module
         self._order = [sensor for sensor in Sensor if sensor in sensors]
         self._observations = 0
         self._counts: Counter[Sensor] = Counter()
@@ -25,7 +25,7 @@ class Tally:
         self._returns: list[float] = []  # share of beams
 
     def add(self, observation: Observation, requires: Sequence[frozenset[Sensor]]) -> None:
-        """Take an observation, and the sets of sensors of which its module needs one."""
+        """Add an observation; the active module requires one of the given sets of sensors."""
         self._observations += 1
         held = [sensor for sensor in self._order if observation.has(sensor)]
         self._counts.update(held)
@@ -35,7 +35,7 @@ class Tally:
         self._look_into(observation)
 
     def words(self) -> str:
-        """Return the counts as the end of a sentence."""
+        """Return the statistics as the end of a sentence."""
         parts = [f"{self._counts[sensor]} with {self._named(sensor)}" for sensor in self._order]
         return f"of {self._observations} observations, {', '.join(parts) or 'none with a sensor'}"
 

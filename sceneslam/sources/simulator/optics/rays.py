@@ -44,7 +44,7 @@ class RayCaster:
         return Hits(reach=reach, triangle=triangle, uv=answer["primitive_uvs"].numpy())
 
     def first_panels(self, rays: Rays) -> NDArray[np.int32]:
-        """Return the index (N,) of the first panel of rays (N, 6), gt; number of panels without one."""
+        """Return the index (N,) of the first panel of rays (N, 6), gt; else the panel count."""
         answer = self._scene.cast_rays(self._tensor.from_numpy(rays), nthreads=1)
         panel = answer["primitive_ids"].numpy() >> 1
         return np.asarray(np.minimum(panel, np.uint32(self._count)), np.int32)

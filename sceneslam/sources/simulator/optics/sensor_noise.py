@@ -109,7 +109,7 @@ def _is_edge(depth_m: NDArray[np.float32], normals: NDArray[np.float32]) -> NDAr
     kernel = np.ones((3, 3), np.uint8)
     step = cv2.dilate(depth_m, kernel) - cv2.erode(depth_m, kernel)
     inverse = 1.0 / depth_m
-    curvature = np.abs(cv2.Laplacian(inverse, cv2.CV_32F)) * depth_m  # inverse depth of a plane is linear
+    curvature = np.abs(cv2.Laplacian(inverse, cv2.CV_32F)) * depth_m  # 0 on a plane
     edge = (step > _EDGE_STEP_RATIO * depth_m) & (curvature > 0.5 * _EDGE_STEP_RATIO)
     ragged = cv2.dilate(edge.astype(np.uint8), kernel).astype(np.bool_)
     return np.asarray(edge | (ragged & (normals < _SPARED)), np.bool_)

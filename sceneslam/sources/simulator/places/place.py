@@ -83,8 +83,8 @@ class PanelBuilder:
 
     rng: np.random.Generator
     panels: list[Panel] = field(default_factory=list)
-    T_gt_local: Transform = field(default_factory=se3.identity)  # pose of the frame of the next panels
-    is_polished: bool = False# of the next panels
+    T_gt_local: Transform = field(default_factory=se3.identity)  # frame of the next panels
+    is_polished: bool = False  # of the next panels
 
     def panel(self, corner_m: Vector, edge_u_m: Vector, edge_v_m: Vector, look: Material) -> None:
         """Add one panel."""
@@ -100,7 +100,7 @@ class PanelBuilder:
         *,
         hole_m: Rectangle | None = None,
     ) -> None:
-        """Add a vertical panel; left and right as seen from its visible side, heights (bottom, top).
+        """Add a vertical panel; left and right are seen from its front, heights (bottom, top).
 
         A hole (left, top, width, height) is measured from the panel's top left corner.
         """

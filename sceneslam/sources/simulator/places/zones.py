@@ -37,7 +37,7 @@ from sceneslam.sources.simulator.places.surfaces import (
 from sceneslam.sources.simulator.places.zone_kind import Pictures, ZoneKind
 
 # Wheels slip where the floor is wet or covered: about a metre each time. A
-# dry floor, polished or not, causes a slip of a few per cent (rolling resistance is a fiftieth of the
+# dry floor, polished or not, causes a few per cent of slip (rolling resistance is a fiftieth of the
 # weight, and the slip of rubber is that small below a third of its largest traction).
 ROWS_APART_M = 20.0  # the two rows of zones, from door to door
 _RAMP_DEG = 8.0
@@ -291,7 +291,7 @@ def _furnish_hall(builder: PanelBuilder, twin_seed: int) -> None:
 
 
 def _furnish_atrium(builder: PanelBuilder, twin_seed: int) -> None:
-    for x_m in np.arange(0.6, 12.0, 2.1):  # the roof: boards, and glass between them
+    for x_m in np.arange(0.6, 12.0, 2.1):  # the roof: boards with glass between them
         builder.level((x_m - 0.6, x_m + 0.8), (-5.5, 5.5), 4.4, plain(WHITE), faces_up=False)
     for x_m, y_m in ((1.2, 4.6), (4.2, 4.7), (7.4, 4.6), (10.6, 4.6), (1.0, -2.4), (10.8, -3.0)):
         plant(builder, Spot(x_m, y_m), 1.5)

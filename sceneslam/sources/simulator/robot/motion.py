@@ -1,4 +1,4 @@
-"""How the robot drives: moves become a differential drive's exact path."""
+"""Motion of the robot: moves are converted to the exact path of a differential drive."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _TURN_LIMIT_RADPS = np.deg2rad(58.0)
 _ACCELERATION_MPS2 = 0.5
 _TURN_ACCELERATION_RADPS2 = 2.5
 _LOOKAHEAD_M = 0.32
-_AXLE_M = 0.12  # wheels touch the floor so far before, behind and beside the robot's centre
-_HALF_S = 0.5e-3  # of the span over which a turn rate is taken
-_SPIN_BEYOND_RAD = np.deg2rad(60.0)  # turns on the spot before it drives
+_AXLE_M = 0.12  # distance from the robot's centre to the wheels' contact points
+_HALF_S = 0.5e-3  # half the interval of numerical differentiation
+_SPIN_BEYOND_RAD = np.deg2rad(60.0)  # larger heading errors are corrected on the spot first
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Wait:
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """Follow a polyline from where the robot is, and stop at its end."""
+    """Follow a polyline from the current position, and stop at its end."""
 
     points_xy_m: tuple[tuple[float, float], ...]
     speed_mps: float = 0.42
@@ -40,7 +40,7 @@ class Drive:
 
 @dataclass(frozen=True, slots=True)
 class Face:
-    """Turn on the spot to a heading, by the shorter way."""
+    """Turn on the spot to a heading, by the smaller angle."""
 
     heading_deg: float
     rate_degps: float = 45.0
@@ -48,7 +48,7 @@ class Face:
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """Drive straight ahead, or back when negative, and stop."""
+    """Drive straight ahead, or back if negative, and stop."""
 
     distance_m: float
     speed_mps: float = 0.2
@@ -59,19 +59,19 @@ Move = Wait | Drive | Face | Shift
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Path:
-    """A drive, step by step: the pose at each step's start and the speeds held in it."""
+    """A drive in steps: the pose at the start of each step and its constant speeds."""
 
     x_y_yaw: NDArray[np.float64]  # (N, 3) [m, m, rad], frame gt
-    speed_turn: NDArray[np.float64]  # (N, 2) [m/s, rad/s], along the level
+    speed_turn: NDArray[np.float64]  # (N, 2) [m/s, rad/s], horizontal
     floor: Floor = field(default_factory=Floor)
 
     @property
     def duration_s(self) -> float:
-        """Return how long the drive takes."""
+        """Return the duration of the drive."""
         return len(self.x_y_yaw) / STEP_HZ
 
     def pose(self, time_s: float) -> Transform:
-        """Return T_gt_base at a time, exactly: steps are circular arcs, and stand on the floor."""
+        """Return T_gt_base (4, 4) [m] at a time, on the floor; steps are exact circular arcs."""
         index = min(int(time_s * STEP_HZ + 1e-6), len(self.x_y_yaw) - 1)
         speed, turn = self.speed_turn[index]
         x, y, yaw = advance(self.x_y_yaw[index], speed, turn, time_s - index / STEP_HZ)
@@ -80,7 +80,7 @@ class Path:
         return _stand(T_gt_base, self.floor) if is_raised else T_gt_base
 
     def turn_rates_radps(self, time_s: float) -> NDArray[np.float64]:
-        """Return the rates of turn (3,) in `base` at a time."""
+        """Return the angular velocity (3,) [rad/s] in `base` at a time."""
         index = min(int(time_s * STEP_HZ + 1e-6), len(self.x_y_yaw) - 1)
         x, y, _ = self.x_y_yaw[index].tolist()
         if not self.floor.is_raised_near(x, y):
@@ -89,9 +89,9 @@ class Path:
         return se3.so3_log(before[:3, :3].T @ after[:3, :3]) / (2.0 * _HALF_S)
 
     def stretch(self) -> NDArray[np.float64]:
-        """Return (N,) how much longer a wheel's way is in each step than the robot's on a plan.
+        """Return (N,) the ratio of the wheels' distance to the robot's horizontal one in each step.
 
-        Wheels follow the slope, and turn in vain where the floor is slippery.
+        It is above 1 on slopes, and where wheels slip.
         """
         x, y, yaw = self.x_y_yaw.T
         ahead = _AXLE_M * np.cos(yaw), _AXLE_M * np.sin(yaw)
@@ -103,7 +103,7 @@ class Path:
 def advance(
     x_y_yaw: NDArray[np.float64], speed_mps: float, turn_radps: float, duration_s: float
 ) -> NDArray[np.float64]:
-    """Return (x, y, yaw) after driving at constant speeds: a circular arc."""
+    """Return (..., 3), x, y [m] and yaw [rad], after a circular arc at constant speeds."""
     x, y, yaw = x_y_yaw
     half = 0.5 * turn_radps * duration_s
     chord_m = speed_mps * duration_s * np.sinc(half / np.pi)
@@ -117,7 +117,7 @@ def plan(
     moves: tuple[Move, ...],
     floor: Floor | None = None,
 ) -> Path:
-    """Return the path that the moves make from a start pose (x [m], y [m], heading [deg])."""
+    """Return the path of moves from a start pose (x [m], y [m], heading [deg])."""
     driver = _Driver(start_x_y_deg)
     for move in moves:
         match move:
@@ -134,7 +134,7 @@ def plan(
 
 
 def _stand(T_gt_base: Transform, floor: Floor) -> Transform:
-    """Return a pose on the plan, raised and tilted by the floor under front, back and sides."""
+    """Return a planar pose raised and tilted by the floor's height at the four contact points."""
     offsets = _AXLE_M * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float)
     points = np.asarray(se3.apply(T_gt_base, offsets), np.float64)
     points[:, 2] = floor.height_m(points[:, 0], points[:, 1])
@@ -148,7 +148,7 @@ def _stand(T_gt_base: Transform, floor: Floor) -> Transform:
 
 
 class _Driver:
-    """Drives with limited speeds and accelerations, and writes down every step."""
+    """Drives with limited speeds and accelerations; records every step."""
 
     def __init__(self, start_x_y_deg: tuple[float, float, float]) -> None:
         x, y, heading_deg = start_x_y_deg
@@ -163,7 +163,7 @@ class _Driver:
             self._step(0.0, 0.0)
 
     def face(self, heading_rad: float, rate_radps: float) -> None:
-        """Turn to a heading, braking so as to arrive without overshoot."""
+        """Turn to a heading without overshoot."""
         limit = min(rate_radps, _TURN_LIMIT_RADPS)
         while abs(error := _wrap(heading_rad - self.pose[2])) > 2e-4 or abs(self.turn) > 0.02:
             self._step(0.0, float(np.sign(error)) * min(limit, _brake(abs(error), 0.8)))
@@ -178,7 +178,7 @@ class _Driver:
         self._stop()
 
     def follow(self, points_xy_m: NDArray[np.float64], speed_mps: float) -> None:
-        """Follow a polyline by pure pursuit of a point ahead on it."""
+        """Follow a polyline by pure pursuit."""
         line = _sample(np.vstack([self.pose[:2], points_xy_m]))
         at, limit = 0, min(speed_mps, _SPEED_LIMIT_MPS)
         ahead = round(_LOOKAHEAD_M / 0.01)
@@ -201,7 +201,7 @@ class _Driver:
             self._step(0.0, 0.0)
 
     def _step(self, speed_mps: float, turn_radps: float) -> None:
-        """Approach the wished speeds as fast as the limits allow, for one step."""
+        """Approach the target speeds within the acceleration limits, for one step."""
         most = _ACCELERATION_MPS2 / STEP_HZ
         self.speed += max(-most, min(speed_mps - self.speed, most))
         most = _TURN_ACCELERATION_RADPS2 / STEP_HZ
@@ -213,7 +213,7 @@ class _Driver:
 
 
 def _brake(left: float, deceleration: float) -> float:
-    """Return the highest speed from which one can still stop within what is left."""
+    """Return the highest speed that allows stopping within the remaining distance."""
     return sqrt(2.0 * deceleration * left) + 1e-3
 
 
@@ -222,12 +222,12 @@ def _wrap(angle_rad: float) -> float:
 
 
 def _sample(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return points every centimetre along a polyline, its corners rounded off."""
+    """Return points (N, 2) [m], one per centimetre, of a polyline with rounded corners."""
     lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     at = np.arange(0.0, lengths[-1], 0.01)
     line = np.stack([np.interp(at, lengths, corners[:, axis]) for axis in (0, 1)], axis=1)
     ramp = np.minimum(np.arange(len(line)), np.arange(len(line))[::-1])
-    reach = np.minimum(25, ramp)[:, None]  # half the rounding window, shrinking to the ends
+    reach = np.minimum(25, ramp)[:, None]  # half the smoothing window, smaller towards the ends
     sums = np.vstack([np.zeros((1, 2)), np.cumsum(line, axis=0)])
     index = np.arange(len(line))[:, None]
     return np.asarray(

@@ -1,4 +1,4 @@
-"""What wheel encoders and a gyro report of a drive."""
+"""Simulated wheel odometry and gyro of a drive."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from sceneslam.sources.simulator.settings import LIES, GyroSettings, OdometrySet
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
-_SLIP_S = 0.4  # how long a slip lasts
-_LIES = dict(zip(LIES, (1.0, -1.0, 0.0, 3.0), strict=True))  # what encoders report of a step's way
+_SLIP_S = 0.4  # duration of a slip
+_LIES = dict(zip(LIES, (1.0, -1.0, 0.0, 3.0), strict=True))  # ratio of reported to true distance
 
 
 class WheelOdometry:
-    """Dead reckoning from two wheels with scale errors, noise and slips."""
+    """Dead reckoning from two wheels with scale errors, noise and slip."""
 
     def __init__(self, path: Path, settings: OdometrySettings, rng: np.random.Generator) -> None:
         speed, turn = path.speed_turn.T
@@ -32,7 +32,7 @@ class WheelOdometry:
         self._x_y_yaw = _integrate(measured_m, settings.wheel_base_m)
 
     def pose(self, time_s: float) -> Transform:
-        """Return T_odom_base at a time."""
+        """Return T_odom_base (4, 4) [m] at a time."""
         at = min(time_s * STEP_HZ, len(self._x_y_yaw) - 1.0)
         before = min(int(at), len(self._x_y_yaw) - 2)
         start, end = self._x_y_yaw[before : before + 2]
@@ -41,7 +41,7 @@ class WheelOdometry:
 
 
 class SimulatedGyro:
-    """Turn rates in `base` with white noise and a bias that walks."""
+    """Angular velocity in `base` with white noise and a random walk of the bias."""
 
     def __init__(self, path: Path, settings: GyroSettings, rng: np.random.Generator) -> None:
         self._times_s = np.arange(int(path.duration_s * settings.rate_hz) + 1) / settings.rate_hz
@@ -52,7 +52,7 @@ class SimulatedGyro:
         self._rates += [path.turn_rates_radps(float(time_s)) for time_s in self._times_s]
 
     def samples(self, after_s: float, until_s: float) -> NDArray[np.float64]:
-        """Return (M, 4): time - until [s] and rate [rad/s] of the samples in (after, until]."""
+        """Return samples (M, 4) in (after, until]: time - until [s], rates [rad/s], base."""
         first, last = np.searchsorted(self._times_s, [after_s + 1e-9, until_s + 1e-9])
         since_s = self._times_s[first:last, None] - until_s
         return np.hstack([since_s, self._rates[first:last]])
@@ -61,7 +61,7 @@ class SimulatedGyro:
 def _slips(
     count: int, speed: NDArray[np.float64], settings: OdometrySettings, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Return (2, N) [m]: what each wheel turned without moving the robot."""
+    """Return (2, N) [m]: distance that each wheel reports in each step because of slip."""
     extra_m = np.zeros((2, count))
     expected = settings.slips_per_minute * count / STEP_HZ / 60.0
     length = round(_SLIP_S * STEP_HZ)
@@ -79,7 +79,7 @@ def _slips(
 def _lying_steps(
     count: int, settings: OdometrySettings, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
-    """Return (N,) whether the encoders lie in a step."""
+    """Return (N,) whether the encoders are wrong in each step."""
     lying = np.zeros(count, np.bool_)
     if settings.lie == "none":
         return lying
@@ -91,7 +91,7 @@ def _lying_steps(
 
 
 def _integrate(wheels_m: NDArray[np.float64], wheel_base_m: float) -> NDArray[np.float64]:
-    """Return poses (N + 1, 3) from the steps (2, N) of the left and the right wheel."""
+    """Return poses (N + 1, 3), x, y [m], yaw [rad], from the wheels' steps (2, N) [m]."""
     left_m, right_m = wheels_m
     yaw = np.concatenate([[0.0], np.cumsum((right_m - left_m) / wheel_base_m)])
     ahead_m, middle = 0.5 * (left_m + right_m), 0.5 * (yaw[:-1] + yaw[1:])
