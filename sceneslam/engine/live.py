@@ -1,4 +1,4 @@
-"""A run at the pace of the clock: the source and the bus in a thread each, a mailbox between."""
+"""Real-time runs: source and bus in two threads, with a mailbox between them."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
 from sceneslam.types.run import Event
 
-_LOOK_S = 0.2  # how late Ctrl-C may be noticed
-_BEHIND_S = 1.0  # a recording that cannot be read in time is played so much later
-_LEAVE_S = 2.0  # a source that does not end by then is left to itself
+_LOOK_S = 0.2  # interval of checks for Ctrl-C
+_BEHIND_S = 1.0  # if a recording is read too slowly, its playback is delayed in steps of this
+_LEAVE_S = 2.0  # wait for the source's thread to end; then it is abandoned
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveSettings:
-    """How time passes in a live run; seconds of the wall clock."""
+    """Timing of a live run, in seconds of the wall clock."""
 
-    rate: float = 1.0  # of a recording: twice as fast by 2
-    silent_after_s: float = 1.0  # without an observation, the events say that the source is silent
-    end_after_s: float | None = None  # of silence the run ends; None: never
+    rate: float = 1.0  # playback rate of a recording; 2: twice as fast
+    silent_after_s: float = 1.0  # time without an observation until the event `silent`
+    end_after_s: float | None = None  # silence after which the run ends; None: never
 
     def __post_init__(self) -> None:
         if not 0.01 <= self.rate <= 100:
@@ -38,11 +38,11 @@ class LiveSettings:
 
 @dataclass(slots=True, kw_only=True)
 class LiveTally:
-    """What a live run cost its input."""
+    """Statistics of a live run's input."""
 
-    dropped: int = 0  # observations, for newer ones had come
-    dropped_images: int = 0  # those of them that held an image
-    latencies_ms: list[float] = field(default_factory=list)  # stamp to pose, of each that was taken
+    dropped: int = 0  # observations that were replaced by newer ones
+    dropped_images: int = 0  # of these, those with an image
+    latencies_ms: list[float] = field(default_factory=list)  # from stamp to pose
 
 
 def run_live(
@@ -54,14 +54,14 @@ def run_live(
     feed: LiveFeed | None = None,
     tally: LiveTally | None = None,
 ) -> LiveTally:
-    """Run `step` on the observations as they come until it returns False; return what it cost.
+    """Run `step` on the observations in real time until it returns False; return statistics.
 
-    A `tally` that is given holds that also where the run is interrupted.
+    A given `tally` is updated in place, and is valid also if the run is interrupted.
 
-    Without a `feed` they are a recording's and paced by their stamps. `note` takes what happens to
-    the input: `silent`, `returned`, `behind` (a recording that cannot be read in time is played
-    so much later), and what the feed tells. Both run in the thread `bus`, the
-    source in another. What they raise is raised here; Ctrl-C ends both.
+    Without a `feed` they are those of a recording, and paced by their stamps. `note` receives
+    events of the input: `silent`, `returned`, `behind` (a recording is read too slowly and its
+    playback delayed), and the feed's. Both functions run in the thread `bus`, the source in another
+    one. Their exceptions are raised here; Ctrl-C ends both.
     """
     run = _LiveRun(observations, step, note, settings=settings, feed=feed)
     run.tally = tally if tally is not None else run.tally
@@ -84,12 +84,12 @@ class _LiveRun:
         self.tally, self._errors = LiveTally(), list[BaseException]()
         self._lag_ns: int | None = None  # clock - stamp / rate, of the first observation
         self._last_ns = 0
-        self._due_at_ns: dict[int, int] = {}  # stamp -> when it was due, of what waits
-        self._behind_s = self._told_behind_s = 0.0  # by which a recording is played later
+        self._due_at_ns: dict[int, int] = {}  # stamp -> due time of queued observations
+        self._behind_s = self._told_behind_s = 0.0  # delay of playback
 
     def carry_out(self) -> LiveTally:
         source = threading.Thread(target=self._guard, args=(self._read,), name="source")
-        source.daemon = True  # a driver that hangs does not hold the program
+        source.daemon = True  # a driver that hangs does not keep the program running
         bus = threading.Thread(target=self._guard, args=(self._work,), name="bus")
         source.start()
         bus.start()
@@ -118,7 +118,7 @@ class _LiveRun:
             self._mailbox.close()
 
     def _read(self) -> None:
-        """Put every observation into the mailbox when its time has come."""
+        """Put every observation into the mailbox when it is due."""
         for observation in self._observations:
             if not self._feed and not self._await(observation):
                 return
@@ -127,10 +127,10 @@ class _LiveRun:
                 return
 
     def _await(self, observation: Observation) -> bool:
-        """Wait until a recorded observation is due; return whether the run goes on.
+        """Wait until a recorded observation is due; return whether the run continues.
 
-        A recording that is read too slowly is played later from then on: what it loses is not the
-        time that poses take.
+        If the recording is read too slowly, its playback is delayed from then on: reading time is
+        not part of the latency.
         """
         elapsed_ns, now_ns = round(observation.stamp_ns / self._settings.rate), monotonic_ns()
         if self._lag_ns is None:
@@ -143,7 +143,7 @@ class _LiveRun:
         return not self._is_over.wait(max(-behind_s, 0.0))
 
     def _work(self) -> None:
-        """Lead what comes through the bus."""
+        """Pass the observations of the mailbox to the bus."""
         silent_s, settings = 0.0, self._settings
         while True:
             taken = self._mailbox.take(settings.silent_after_s)
@@ -173,7 +173,7 @@ class _LiveRun:
         self._is_over.set()
 
     def _was_due_ns(self, stamp_ns: int) -> int:
-        """Return when a recorded observation was due; forget those before, which were dropped."""
+        """Return the due time of a recorded observation; remove earlier, dropped ones."""
         due_ns = self._due_at_ns[stamp_ns]
         for earlier_ns in [one for one in list(self._due_at_ns) if one <= stamp_ns]:
             del self._due_at_ns[earlier_ns]

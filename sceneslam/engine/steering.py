@@ -1,4 +1,4 @@
-"""What an operator asks of a run while it goes, carried out between two observations."""
+"""Commands of an operator during a run, executed between two observations."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from sceneslam.types.maps import HybridMap
 from sceneslam.types.observation import Observation, SceneVote
 from sceneslam.types.rig import Rig, Sensor
 
-_UNLIKELY = 0.01  # of a scene that was not chosen, for a filter of probabilities
+_UNLIKELY = 0.01  # probability of the scenes that were not selected, for Bayes filters
 
 
 class SteeredDetector:
-    """A detector whose votes an operator may replace; they are confirmed like any other."""
+    """A detector whose votes an operator can override; the policy confirms them as usual."""
 
     def __init__(self, detector: Detector) -> None:
         self._detector = detector
-        self.selected = ""  # the scene that is voted for; "": the detector's own
+        self.selected = ""  # the selected scene; "": the detector's own votes
 
     @property
     def quantity(self) -> str:
@@ -44,7 +44,7 @@ class SteeredDetector:
         self._detector.activate(rig)
 
     def get_scene(self, observation: Observation) -> SceneVote:
-        """Return a vote for the selected scene, with what the detector measured."""
+        """Return a vote for the selected scene, with the detector's measured value."""
         vote = self._detector.get_scene(observation)
         if not self.selected:
             return vote
@@ -60,16 +60,16 @@ class SteeredDetector:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Saving:
-    """A map that is being written."""
+    """A map that is being saved."""
 
     command: SaveMap
     saved: Future[None]
 
 
 class Operator:
-    """Carries commands out; `note` takes what came of each as an event.
+    """Executes commands; `note` receives the result of each as an event.
 
-    Maps are written by `executor`, which may take its time.
+    Maps are saved asynchronously by `executor`.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Operator:
         self.is_paused = False
 
     def obey(self, command: Command, stamp_ns: int) -> None:
-        """Carry a command out, or say in an event why not."""
+        """Execute a command, or report in an event why that is not possible."""
         if isinstance(command, SaveMap) and _is_name(command.name):
             folder = self._folder / "maps" / command.name
             saved = self._executor.submit(self._save, command.hybrid, folder)
@@ -98,14 +98,14 @@ class Operator:
             self._tell(command, stamp_ns, self._carry_out(command))
 
     def report(self, stamp_ns: int) -> None:
-        """Say of the maps that are written by now what came of it."""
+        """Report the maps that have been saved since the last call."""
         while self._saving and self._saving[0].saved.done():
             saving = self._saving.pop(0)
             error = saving.saved.exception()
             self._tell(saving.command, stamp_ns, "" if error is None else told(error))
 
     def close(self, stamp_ns: int) -> None:
-        """Wait for the maps that are being written."""
+        """Wait for the maps that are being saved."""
         self._executor.shutdown()
         self.report(stamp_ns)
 
@@ -117,7 +117,7 @@ class Operator:
             self._note("command", stamp_ns, command=asked, what=what)
 
     def _carry_out(self, command: Command) -> str:
-        """Carry out; return why that is not possible, "" where it was."""
+        """Execute a command; return the reason if that is not possible, else ""."""
         match command:
             case Pause(is_paused=is_paused):
                 self.is_paused = is_paused

@@ -1,1 +1,1 @@
-"""ROS messages as SceneSLAM reads and writes them."""
+"""Reading and writing of ROS messages."""

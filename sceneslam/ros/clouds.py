@@ -1,4 +1,4 @@
-"""PointCloud2 messages as arrays."""
+"""Conversion of PointCloud2 messages to arrays."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sceneslam.types.errors import InputError
 
 _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _TIME_NAMES = ("time", "t", "timestamp", "time_stamp", "offset_time")
-_ABSOLUTE_S = 1e6  # a `time` beyond is no offset but an instant
+_ABSOLUTE_S = 1e6  # larger values of `time` are absolute
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -24,9 +24,9 @@ class Cloud:
 
 
 def cloud(message: Any, stamp_ns: int) -> Cloud | None:
-    """Return the points of a PointCloud2, None when its data are cut off.
+    """Return the points of a PointCloud2, None if its data are cut off.
 
-    Raises InputError when it has no x, y and z.
+    Raises InputError if it has no fields x, y and z.
     """
     fields = {field.name: field for field in message.fields}
     if not {"x", "y", "z"} <= fields.keys():
@@ -44,7 +44,7 @@ def cloud(message: Any, stamp_ns: int) -> Cloud | None:
 
 
 def _rows(message: Any, fields: dict[str, Any]) -> NDArray[Any] | None:
-    """Return the points as a structured array (N,), None when there are too few bytes."""
+    """Return the points as a structured array (N,), None if bytes are missing."""
     order = ">" if message.is_bigendian else "<"
     kept = [field for field in fields.values() if field.datatype in _DTYPES]
     ends = [field.offset + np.dtype(_DTYPES[field.datatype]).itemsize for field in kept]
@@ -69,7 +69,7 @@ def _rows(message: Any, fields: dict[str, Any]) -> NDArray[Any] | None:
 
 
 def _offsets_s(values: NDArray[Any], stamp_ns: int) -> NDArray[np.float64]:
-    """Return seconds after the stamp: whole numbers are ns, large ones instants."""
+    """Return times (N,) [s] after the stamp: integers are in ns, large values absolute."""
     if values.dtype.kind in "iu":
         if values.dtype.itemsize < 8 or not len(values) or int(values.max()) < 10**15:
             return values.astype(np.float64) * 1e-9

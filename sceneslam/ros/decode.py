@@ -1,4 +1,4 @@
-"""Pixels, scans, points and poses of decoded ROS messages (either generation)."""
+"""Conversion of decoded ROS 1 and ROS 2 messages to images, scans, cameras and poses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sceneslam.types.observation import LaserScan
 from sceneslam.types.rig import Camera, Sensor
 from sceneslam.types.se3 import Transform
 
-# Encoding -> (dtype, channels, OpenCV conversion to BGR, None where it is BGR already).
+# Encoding -> (dtype, channels, OpenCV conversion to BGR; None: already BGR).
 _COLOR: dict[str, tuple[str, int, int | None]] = {
     "bgr8": ("u1", 3, None),
     "8UC3": ("u1", 3, None),
@@ -47,7 +47,7 @@ def stamp_ns(message: Any) -> int:
 
 
 def frame_id(message: Any) -> str:
-    """Return a message's frame without the leading slash of old."""
+    """Return a message's frame without a leading slash (of old ROS versions)."""
     return str(message.header.frame_id).lstrip("/")
 
 
@@ -68,14 +68,14 @@ def is_depth(message: Any, topic: str) -> bool:
 
 
 def is_grey(message: Any) -> bool:
-    """Tell whether an image message says that it has no colour."""
+    """Tell whether an image message has a grey encoding."""
     return _encoding(message)[0].split(";")[0].strip() in ("mono8", "mono16", "8UC1")
 
 
 def image_bgr(message: Any) -> NDArray[np.uint8] | None:
-    """Return the image (H, W, 3) uint8 BGR of an Image or CompressedImage, None when damaged.
+    """Return the image (H, W, 3) uint8 BGR of an Image or CompressedImage, None if damaged.
 
-    Raises InputError for an encoding that is not known.
+    Raises InputError for an unknown encoding.
     """
     encoding, is_compressed = _encoding(message)
     if is_compressed:
@@ -94,9 +94,9 @@ def image_bgr(message: Any) -> NDArray[np.uint8] | None:
 
 
 def depth_m(message: Any, units: pixels.DepthUnits) -> NDArray[np.float32] | None:
-    """Return the depth (H, W) float32 [m] of an image message, None when it is damaged.
+    """Return the depth (H, W) float32 [m] of an image message, None if it is damaged.
 
-    Raises InputError when it holds something else than 16-bit or float depth.
+    Raises InputError unless its encoding is 16-bit or float depth.
     """
     encoding, is_compressed = _encoding(message)
     if not is_compressed:
@@ -120,19 +120,19 @@ def depth_m(message: Any, units: pixels.DepthUnits) -> NDArray[np.float32] | Non
 
 
 def is_metric_depth(message: Any) -> bool:
-    """Tell whether an image of depth holds metres, not whole units."""
+    """Tell whether a depth image is in metres (float), not in integer units."""
     return _encoding(message)[0].startswith("32FC1")
 
 
 def is_blank_depth(message: Any) -> bool:
-    """Tell whether an image of float depth, not compressed, holds not one finite value."""
+    """Tell whether an uncompressed float depth image has no finite value."""
     encoding, is_compressed = _encoding(message)
     raw = None if is_compressed or encoding != "32FC1" else _raw(message, "f4", 1)
     return raw is not None and not np.isfinite(raw).any()
 
 
 def inertial(imu: Any) -> dict[Sensor, NDArray[np.float64]]:
-    """Return what an Imu measures, in its frame: rate (3,) [rad/s], acceleration (3,) [m/s^2]."""
+    """Return an Imu's angular velocity (3,) [rad/s] and acceleration (3,) [m/s^2], own frame."""
     measured = {
         Sensor.GYRO: (imu.angular_velocity, imu.angular_velocity_covariance),
         Sensor.ACCELEROMETER: (imu.linear_acceleration, imu.linear_acceleration_covariance),
@@ -140,15 +140,15 @@ def inertial(imu: Any) -> dict[Sensor, NDArray[np.float64]]:
     return {
         sensor: np.array([vector.x, vector.y, vector.z])
         for sensor, (vector, covariance) in measured.items()
-        if covariance[0] != -1  # as the message marks what it does not hold
+        if covariance[0] != -1  # -1: not measured
     }
 
 
 def scan(message: Any) -> LaserScan | None:
-    """Return a LaserScan by our conventions, None when its angles make no sense.
+    """Return the scan of a LaserScan message, None if its angles are invalid.
 
-    Out of range above (REP-117: also +inf) is inf; NaN, zero and too close are NaN. A laser that
-    turns clockwise is turned round.
+    Ranges above the maximum (REP-117: also +inf) become inf; NaN, zero and below the minimum become
+    NaN. The beams of a clockwise laser are reversed.
     """
     low_m, high_m = float(message.range_min), float(message.range_max)
     step_rad, start_rad = float(message.angle_increment), float(message.angle_min)
@@ -172,7 +172,7 @@ def scan(message: Any) -> LaserScan | None:
 
 
 def camera(message: Any) -> Camera | None:
-    """Return the camera of a CameraInfo, None when it was never calibrated (K is zero)."""
+    """Return the camera of a CameraInfo, None if it is not calibrated (K is zero)."""
     k, d = (_coefficients(message, letter) for letter in "kd")
     if k[0] <= 0 or k[4] <= 0:
         return None
@@ -191,7 +191,7 @@ def camera(message: Any) -> Camera | None:
 
 
 def transform(at: Any, turn: Any) -> Transform | None:
-    """Return T of a Point or Vector3 and a Quaternion, None when it is no rigid motion."""
+    """Return T (4, 4) [m] of a Point or Vector3 and a Quaternion, None if it is not rigid."""
     quat_xyzw = np.array([turn.x, turn.y, turn.z, turn.w], dtype=np.float64)
     position = np.array([at.x, at.y, at.z], dtype=np.float64)
     norm = float(np.linalg.norm(quat_xyzw))
@@ -236,7 +236,7 @@ def _integers(stored: NDArray[Any] | None, units: pixels.DepthUnits) -> NDArray[
 
 
 def _inverse_depth_m(stored: NDArray[Any], header: bytes) -> NDArray[np.float32]:
-    """Return metres of compressedDepth's quantised inverse depth (0 stays missing)."""
+    """Return the depth [m] of compressedDepth's quantised inverse depth (0 stays missing)."""
     scale, offset = np.frombuffer(header, dtype="<f4", count=2, offset=4)
     with np.errstate(divide="ignore", invalid="ignore"):
         metres = scale / (stored.astype(np.float32) - offset)

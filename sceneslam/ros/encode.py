@@ -1,4 +1,4 @@
-"""Our values as ROS 2 messages, serialised to CDR."""
+"""Encoding of observations as ROS 2 messages, serialised to CDR."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Encoder:
         self._store = get_typestore(Stores.ROS2_HUMBLE)
 
     def definition(self, msgtype: str) -> bytes:
-        """Return the type's `ros2msg` definition, its dependencies included."""
+        """Return the type's `ros2msg` definition with its dependencies."""
         return self._store.generate_msgdef(msgtype, ros_version=2)[0].encode()
 
     def camera_info(self, stamp_ns: int, camera: Camera) -> bytes:
@@ -65,7 +65,7 @@ class Encoder:
         )
 
     def image(self, stamp_ns: int, pixels: NDArray[Any], encoding: str) -> bytes:
-        """Return an Image of pixels (H, W, C), as they are."""
+        """Return an Image of pixels (H, W, C) in the given encoding."""
         height, width = pixels.shape[:2]
         data = np.ascontiguousarray(pixels).reshape(height, -1).view(np.uint8)
         return self._cdr(
@@ -80,7 +80,7 @@ class Encoder:
         )
 
     def scan(self, scan: LaserScan) -> bytes:
-        """Return a LaserScan; its angles and ranges are float32 by the type."""
+        """Return a LaserScan message; its angles and ranges are float32."""
         last = max(len(scan.ranges_m) - 1, 0)
         return self._cdr(
             names.TYPES[names.SCAN],
@@ -102,7 +102,7 @@ class Encoder:
         points_lidar: NDArray[np.float32],
         point_times_s: NDArray[np.float64] | None,
     ) -> bytes:
-        """Return a PointCloud2 with x y z, and `time` [s after the stamp] where it is known."""
+        """Return a PointCloud2 of points (N, 3) [m], lidar, with times (N,) [s] if known."""
         layout = [(axis, "<f4") for axis in "xyz"]
         if point_times_s is not None:
             layout.append(("time", "<f8"))
@@ -122,7 +122,7 @@ class Encoder:
     ) -> bytes:
         """Return an Odometry of base_link in `frame`, without covariance.
 
-        `twist_base` (6,) is the velocity [m/s, rad/s] in base; None: zero.
+        `T_frame_base` is (4, 4) [m], `twist_base` (6,) the velocity [m/s, rad/s]; None: zero.
         """
         moves = np.zeros(6) if twist_base is None else twist_base
         linear, angular = (
@@ -146,7 +146,7 @@ class Encoder:
         )
 
     def imu(self, stamp_ns: int, measured: Mapping[Sensor, NDArray[np.float64]]) -> bytes:
-        """Return an Imu with what its gyro and accelerometer measured (3,); the rest is marked."""
+        """Return an Imu of gyro (3,) [rad/s] and accelerometer (3,) [m/s^2]; missing: marked."""
         unknown = np.zeros(9)
         unknown[0] = -1.0
         vectors, covariances = {}, {}
@@ -166,7 +166,7 @@ class Encoder:
         )
 
     def transforms(self, stamp_ns: int, parent: str, children: dict[str, Transform]) -> bytes:
-        """Return a TFMessage of `T_parent_child` for each child."""
+        """Return a TFMessage of T_parent_child (4, 4) [m] for each child."""
         stamped = []
         for child, T_parent_child in children.items():
             pose = self._pose(T_parent_child)
@@ -199,7 +199,7 @@ class Encoder:
         )
 
     def _cloud(self, stamp_ns: int, rows: NDArray[np.void], frame: str) -> bytes:
-        """Return a PointCloud2 of rows whose dtype names the fields."""
+        """Return a PointCloud2 of a structured array (N,), whose dtype defines the fields."""
         fields = [
             self._new(
                 "sensor_msgs/msg/PointField",

@@ -1,4 +1,4 @@
-"""What a run finds out as ROS 2 messages: path, grid, cloud, diagnostics."""
+"""Encoding of results as ROS 2 messages: path, grid, cloud, diagnostics."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"  # diagnostic_msgs/DiagnosticStatus
 
 
 class ResultEncoder(Encoder):
-    """Builds and serialises results."""
+    """Builds and serialises messages of results."""
 
     def pose_odometry(
         self,
@@ -27,10 +27,10 @@ class ResultEncoder(Encoder):
         frame: str,
         base: str,
     ) -> bytes:
-        """Return an Odometry whose pose has a covariance (6, 6) [m, rad] in base, or none.
+        """Return an Odometry of T_frame_base (4, 4) [m]; its covariance (6, 6) [m, rad] is in base.
 
-        The message wants it along the axes of `frame`: it is turned. Velocity is not estimated, as
-        the first entry of its covariance says (-1).
+        The covariance is rotated to the axes of `frame`, as the message defines. Velocity is not
+        estimated: the first entry of its covariance is -1.
         """
         zero = self._new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
         unknown = np.zeros(36)
@@ -55,7 +55,7 @@ class ResultEncoder(Encoder):
     def path(
         self, stamps_ns: Sequence[int], T_frame_base: Sequence[Transform], frame: str
     ) -> bytes:
-        """Return a Path; stamped as its last pose."""
+        """Return a Path of poses (4, 4) [m]; its stamp is that of the last pose."""
         poses = [
             self._new(
                 "geometry_msgs/msg/PoseStamped",
@@ -125,7 +125,7 @@ class ResultEncoder(Encoder):
 
 
 def _turned(covariance: NDArray[np.float64], T_frame_base: Transform) -> NDArray[np.float64]:
-    """Return a covariance in base, translation first, along the axes of the frame."""
+    """Return a covariance (6, 6) in base, translation first, along the axes of the frame."""
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = T_frame_base[:3, :3]
     return np.asarray(turn @ covariance @ turn.T)

@@ -1,4 +1,4 @@
-"""Decoding of messages by the definitions that a recording carries."""
+"""Decoding of messages by the definitions in the recording."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TopicType:
-    """What a topic's messages are."""
+    """Type, encoding and number of a topic's messages."""
 
     msgtype: str  # `sensor_msgs/msg/Image`, for ROS 1 too
     encoding: str  # of messages: `cdr` or `ros1`
-    definition: str  # as `definition_format` says; "" when the recording has none
+    definition: str  # in `definition_format`; "" if not recorded
     definition_format: str  # `ros2msg`, `ros1msg` or `ros2idl`
     count: int  # messages
 
     @classmethod
     def of_network(cls, msgtype: str, count: int = 0) -> TopicType:
-        """Return a topic of a standard type, as it comes over the network."""
+        """Return a live topic of a standard type."""
         kind = {"msgtype": msgtype, "encoding": "cdr", "definition": ""}
         return cls(**kind, definition_format="ros2msg", count=count)
 
     def with_count(self, count: int) -> TopicType:
-        """Return the same with another count."""
+        """Return a copy with another count."""
         return replace(self, count=count)
 
 
 class MessageDecoder:
-    """Turns messages into objects; reads a type's definition when it is first met."""
+    """Decodes messages; reads a type's definition at its first message."""
 
     def __init__(self, topics: Mapping[str, TopicType]) -> None:
         self._topics = topics
-        self._stores: dict[str, Any] = {}  # by topic: files may define one type in two ways
+        self._stores: dict[str, Any] = {}  # by topic, as files may hold two definitions of one type
 
     def decode(self, topic: str, data: bytes) -> Any:
-        """Return the message, None when its bytes or its definition make no sense."""
+        """Return the message, None if its bytes or its definition are invalid."""
         kind = self._topics[topic]
         if topic not in self._stores:
             self._stores[topic] = _typestore(kind)
@@ -47,12 +47,12 @@ class MessageDecoder:
             if kind.encoding == "ros1":
                 return store.deserialize_ros1(data, kind.msgtype)
             return store.deserialize_cdr(data, kind.msgtype)
-        except Exception:  # generated code: broken bytes raise whatever they run into
+        except Exception:  # generated code raises any exception for invalid bytes
             return None
 
 
 def _typestore(kind: TopicType) -> Any:
-    """Return a typestore that knows the type, None when its definition cannot be read."""
+    """Return a typestore with the type, None if its definition cannot be read."""
     from rosbags.typesys import (
         Stores,
         TypesysError,
@@ -69,7 +69,7 @@ def _typestore(kind: TopicType) -> Any:
         if kind.definition_format == "ros2idl":
             store.register(get_types_from_idl(kind.definition))
         else:
-            # Bags of before 2011 keep the header in a package that is gone.
+            # Bags from before 2011 have the header in a package that no longer exists.
             text = kind.definition.replace("roslib/Header", "std_msgs/Header")
             store.register(get_types_from_msg(text, kind.msgtype))
     except (TypesysError, ValueError, KeyError):
@@ -79,7 +79,7 @@ def _typestore(kind: TopicType) -> Any:
 
 
 def _has_standard_fields(store: Any, standard: Any) -> bool:
-    """Tell whether no standard type lacks a field: a definition may be damaged like the rest."""
+    """Tell whether the standard types have all fields: a definition may be damaged."""
     for name, (_, fields) in store.fielddefs.items():
         expected = standard.fielddefs.get(name, ((), ()))[1]
         if not {field for field, _ in expected} <= {field for field, _ in fields}:

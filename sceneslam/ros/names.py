@@ -1,4 +1,4 @@
-"""Topic and frame names of our own recordings (REP-103, REP-105)."""
+"""Topic and frame names of SceneSLAM's recordings (REP-103, REP-105)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RESULT_MAP = "/map"
 RESULT_MODULE = OWN_PREFIX + "module"
 RESULT_EVENTS = OWN_PREFIX + "events"  # JSON
 
-RIG_METADATA = "sceneslam.rig"  # MCAP metadata: what no ROS message says of a rig
+RIG_METADATA = "sceneslam.rig"  # MCAP metadata: properties of a rig that no ROS message has
 
 TYPES = {
     IMAGE: "sensor_msgs/msg/CompressedImage",

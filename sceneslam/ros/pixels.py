@@ -1,4 +1,4 @@
-"""Encoded and raw pixels as arrays."""
+"""Decoding of images and depth images."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _PNG, _JPEG = b"\x89PNG", b"\xff\xd8"
 
 
 def decode(data: bytes, flags: int) -> NDArray[Any] | None:
-    """Return the pixels of a JPEG, PNG (or other) file, None when it is damaged or cut off.
+    """Return the pixels of an image file (JPEG, PNG, ...), None if it is damaged or cut off.
 
-    `flags` are OpenCV's: IMREAD_COLOR for BGR, IMREAD_UNCHANGED for what is stored.
+    `flags` are OpenCV's: IMREAD_COLOR for BGR, IMREAD_UNCHANGED for the stored format.
     """
     is_cut = (data[:4] == _PNG and b"IEND" not in data[-64:]) or (
         data[:2] == _JPEG and b"\xff\xd9" not in data[-64:]
@@ -31,19 +31,19 @@ def decode(data: bytes, flags: int) -> NDArray[Any] | None:
 
 
 def decode_bgr(data: bytes) -> NDArray[np.uint8] | None:
-    """Return the image (H, W, 3) uint8 BGR of a file's bytes, None when it is damaged."""
+    """Return the image (H, W, 3) uint8 BGR of a file's bytes, None if it is damaged."""
     pixels = decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return None if pixels is None else locked(pixels)
 
 
 def locked(array: NDArray[Scalar]) -> NDArray[Scalar]:
-    """Return the array, read-only from now on."""
+    """Make the array read-only and return it."""
     array.flags.writeable = False
     return array
 
 
 class DepthUnits:
-    """Turns stored depths into metres; what is not finite or out of range is missing (0)."""
+    """Converts stored depth to metres; values that are out of range or not finite become 0."""
 
     def __init__(self, units_per_m: float, range_m: tuple[float, float]) -> None:
         self._low_m, self._high_m = np.float32(range_m[0]), np.float32(range_m[1])
@@ -52,17 +52,17 @@ class DepthUnits:
 
     @classmethod
     def unlimited(cls, units_per_m: float) -> DepthUnits:
-        """Return units that keep every depth but the largest number, which means "missing"."""
+        """Return units without a range limit; only the largest integer means "missing"."""
         units = cls(units_per_m, (0.0, float("inf")))
         units._table_m[-1] = 0.0
         return units
 
     def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
-        """Return metres (H, W) of whole units."""
+        """Return the depth (H, W) [m] of integer units."""
         return locked(np.take(self._table_m, stored))
 
     def of_metres(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return metres (H, W) of metres, NaN and infinite ones missing (REP-118)."""
+        """Return the depth (H, W) [m] with NaN and infinity as missing (REP-118)."""
         return locked(self._cut(depth_m))
 
     def _cut(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""Observations and ground truth as an MCAP file of ROS 2 messages."""
+"""Writing of observations, ground truth and results to an MCAP file of ROS 2 messages."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
-_CHUNK_BYTES = 256 * 1024  # what a file that was cut off loses at most
+_CHUNK_BYTES = 256 * 1024  # largest loss if the file is cut off
 _DEPTH_UNITS_PER_M = 1000.0
 
 
 class ObservationWriter:
-    """Records observations so that `sources.rosbag` gives them back.
+    """Records observations so that `sources.rosbag` reads the same ones.
 
-    Colour as JPEG or PNG, depth as 16-bit PNG in mm, everything else as it is (angles and ranges
-    of a LaserScan are float32 by its type). Opens in Foxglove.
+    Colour is stored as JPEG or PNG, depth as 16-bit PNG in mm, other values exactly (angles and
+    ranges of a LaserScan are float32). The file opens in Foxglove.
     """
 
     def __init__(self, path: Path, *, rig: Rig, image_format: str, jpeg_quality: int = 95) -> None:
@@ -61,7 +61,7 @@ class ObservationWriter:
         self._mcap.add_metadata(names.RIG_METADATA, _rig_metadata(rig))
 
     def write(self, observation: Observation) -> None:
-        """Add all that the observation holds, at its stamp."""
+        """Add all measurements of the observation."""
         stamp_ns, encoder = observation.stamp_ns, self._encoder
         self._write_frames(stamp_ns)
         for at_ns, measured in _inertial(observation).items():
@@ -87,7 +87,7 @@ class ObservationWriter:
             self._write_image(stamp_ns, observation.image_bgr)
 
     def write_pose(self, stamp_ns: int, T_map_base: Transform) -> None:
-        """Add a result: the pose in `map`, as Odometry with its velocity and as transform."""
+        """Add a result: T_map_base (4, 4) [m], as Odometry with velocity and as transform."""
         self._write_frames(stamp_ns)
         before, self._posed = self._posed, (stamp_ns, T_map_base)
         self._first_pose = self._first_pose or self._posed
@@ -98,7 +98,7 @@ class ObservationWriter:
         self._add(names.TF, stamp_ns, data)
 
     def write_result(self, result: RunResult) -> None:
-        """Add what is known at the end: the revised path, the grid and the coloured points."""
+        """Add the final results: the revised path, the grid and the coloured points."""
         trajectory, at_ns = result.trajectory, self._last_ns
         poses = list(trajectory.T_world_base)
         path = self._encoder.path(trajectory.stamps_ns.tolist(), poses, names.MAP)
@@ -116,13 +116,13 @@ class ObservationWriter:
         self._add(names.RESULT_MODULE, stamp_ns, self._encoder.text(module))
 
     def write_event(self, stamp_ns: int, text: str) -> None:
-        """Add a result: what was decided."""
+        """Add a result: an event."""
         self._add(names.RESULT_EVENTS, stamp_ns, self._encoder.text(text))
 
     def write_truth(self, truth: GroundTruth) -> None:
-        """Add all true poses (float64) and scene changes; any time before `close`.
+        """Add all true poses (float64) and scene changes; at any time before `close`.
 
-        Where there are results, frame `gt` is laid on `map` at the first of their poses.
+        With results, frame `gt` is aligned with `map` at the first pose of both.
         """
         self._write_truth_frame(truth.trajectory)
         for stamp_ns, T_gt_base in zip(
@@ -144,7 +144,7 @@ class ObservationWriter:
         )
 
     def close(self) -> None:
-        """Finish the file; a second call does nothing."""
+        """Close the file; a second call does nothing."""
         if not self._is_open:
             return
         self._is_open = False
@@ -163,7 +163,7 @@ class ObservationWriter:
         self._add(names.IMAGE, stamp_ns, message)
 
     def _write_frames(self, stamp_ns: int) -> None:
-        """Add the sensors' places on the robot, once, at the first stamp."""
+        """Add the sensors' poses on the robot, once, at the first stamp."""
         if self._has_frames:
             return
         self._has_frames = True
@@ -207,7 +207,7 @@ class ObservationWriter:
 def _twist(
     before_ns: int, T_map_before: Transform, stamp_ns: int, T_map_base: Transform
 ) -> NDArray[np.float64] | None:
-    """Return the velocity (6,) [m/s, rad/s] in base between two poses, None at one instant."""
+    """Return the velocity (6,) [m/s, rad/s] in base between two poses, None at equal stamps."""
     if stamp_ns <= before_ns:
         return None
     motion = se3.log(se3.inverse(T_map_before) @ T_map_base)
@@ -215,7 +215,7 @@ def _twist(
 
 
 def depth_png(depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return a 16-bit PNG [mm] of a depth image; what does not fit is missing (0)."""
+    """Return a 16-bit PNG [mm] of a depth image (H, W) [m]; values that do not fit become 0."""
     depth_mm = np.rint(depth_m * np.float32(_DEPTH_UNITS_PER_M))
     fits = (depth_mm > 0) & (depth_mm <= np.iinfo(np.uint16).max)
     done, data = cv2.imencode(".png", np.where(fits, depth_mm, 0).astype(np.uint16))
@@ -225,7 +225,7 @@ def depth_png(depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def _inertial(observation: Observation) -> dict[int, dict[Sensor, NDArray[np.float64]]]:
-    """Return what gyro and accelerometer measured, by stamp [ns]."""
+    """Return gyro and accelerometer samples (3,), by stamp [ns]."""
     found: dict[int, dict[Sensor, NDArray[np.float64]]] = {}
     for sensor in (sensor for sensor in Sensor if sensor.is_sampled and observation.has(sensor)):
         for row in getattr(observation, sensor.field):
@@ -235,7 +235,7 @@ def _inertial(observation: Observation) -> dict[int, dict[Sensor, NDArray[np.flo
 
 
 def _rig_metadata(rig: Rig) -> dict[str, str]:
-    """Return what no ROS message says of a rig."""
+    """Return the properties of a rig that no ROS message has."""
     said: dict[str, object] = {"sensors": sorted(sensor.value for sensor in rig.sensors)}
     if rig.camera:
         said["depth_range_m"] = list(rig.camera.depth_range_m)

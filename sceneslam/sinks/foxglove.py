@@ -1,4 +1,4 @@
-"""The run in Foxglove while it runs: what the robot sees, where it is, who works, and why."""
+"""Live view of a run in Foxglove: observations, pose, active module and decisions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sceneslam.types.run import Event
 from sceneslam.types.se3 import Transform
 
 EVENTS = "/sceneslam/events"
-PARAMETERS = {  # of Foxglove's panel of that name -> the topic that a value is a message on
+PARAMETERS = {  # parameter in Foxglove's panel -> topic on which its value is published
     "scene": requests.SELECT_SCENE,
     "module": requests.SELECT_MODULE,
     "paused": requests.PAUSE,
@@ -40,10 +40,10 @@ _log = logging.getLogger(__name__)
 
 
 class FoxgloveSink(TopicSink):
-    """Serves the run on this machine; Foxglove connects, and steers by its panels.
+    """A WebSocket server on this machine for Foxglove, whose panels can also send commands.
 
-    Beside what a robot hears: every `image_every`-th image, scans, the whole tree of frames, and
-    the events that people look for. The layout lies in the run's folder.
+    Publishes the topics of `TopicSink`, and every `image_every`-th image, scans, all frames and
+    important events. A layout for Foxglove is written to the run's folder.
     """
 
     def __init__(
@@ -72,14 +72,14 @@ class FoxgloveSink(TopicSink):
         )
 
     def open(self, rig: Rig, folder: Path) -> None:
-        """Begin to serve."""
+        """Start the server."""
         self._rig, self._images = rig, 0
         super().open(rig, folder)
         layout = files("sceneslam.sinks").joinpath(LAYOUT).read_text()
         (folder / LAYOUT).write_text(layout)
 
     def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
-        """Show what was seen, and where."""
+        """Publish an observation and its pose."""
         stamp_ns = observation.stamp_ns
         if T_map_base is not None and observation.T_odom_base is not None:
             children = {names.BASE: observation.T_odom_base}
@@ -91,7 +91,7 @@ class FoxgloveSink(TopicSink):
         super().write(observation, T_map_base, module)
 
     def write_event(self, event: Event) -> None:
-        """Show what was decided."""
+        """Publish an event."""
         super().write_event(event)
         if event["event"] in _TOLD:
             text = json.dumps(dict(event), default=str)

@@ -1,4 +1,4 @@
-"""The map while the robot drives, drawn beside the run: the pose never waits for it."""
+"""The map during a run, built in a thread of its own, so that poses are not delayed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
 
 _log = logging.getLogger(__name__)
-_STEP_M, _STEP_RAD = 0.1, 0.1  # what is seen from nearer places than that is seen already
+_STEP_M, _STEP_RAD = 0.1, 0.1  # smallest motion between two observations in the map
 NOTHING = HybridMap(
     points=PointLayer(points=np.zeros((0, 3), np.float32)),
     point_modules=np.zeros(0, np.uint8),
@@ -27,7 +27,7 @@ NOTHING = HybridMap(
 
 
 class LiveMap:
-    """Draws what is seen from new places in a thread of its own; the newest waits, no more."""
+    """Adds observations from new poses to the map in a thread; only the newest one is queued."""
 
     def __init__(
         self, mapper: LiveMapper, *, every_s: float, publish: Callable[[HybridMap], None]
@@ -41,14 +41,14 @@ class LiveMap:
         self._thread: threading.Thread | None = None
 
     def open(self, rig: Rig) -> None:
-        """Begin an empty map."""
+        """Start with an empty map."""
         self._mapper.open(rig)
         self._is_closed, self._newest, self._T_map_drawn = False, NOTHING, None
         self._thread = threading.Thread(target=self._draw, name="map", daemon=True)
         self._thread.start()
 
     def add(self, observation: Observation, T_map_base: Transform) -> None:
-        """Leave an observation where it was made from a new place."""
+        """Queue an observation if its pose T_map_base (4, 4) [m] is new."""
         if not self._is_new(T_map_base):
             return
         with self._changed:
@@ -56,11 +56,11 @@ class LiveMap:
             self._changed.notify()
 
     def newest(self) -> HybridMap:
-        """Return the map as it was published last."""
+        """Return the latest map."""
         return self._newest
 
     def close(self) -> None:
-        """End the thread. May be called twice."""
+        """Stop the thread. May be called twice."""
         with self._changed:
             self._is_closed = True
             self._changed.notify()
@@ -92,5 +92,5 @@ class LiveMap:
                     self._newest = self._mapper.map()
                     self._publish(self._newest)
         except Exception as error:
-            _log.warning("the live map is drawn no further: %s", told(error))
+            _log.warning("the live map is no longer updated: %s", told(error))
             _log.debug("the whole error", exc_info=error)

@@ -1,4 +1,4 @@
-"""The run as an MCAP file: what the robot saw and where it was, for Foxglove and for re-runs."""
+"""Recording of a run as an MCAP file: observations and poses, for Foxglove and as a source."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _log = logging.getLogger(__name__)
 class McapSink:
     """Writes observations, poses in `map`, active modules and, at the end, the map.
 
-    With `image_format` png and every image and depth image, `source=mcap` reads back what the run
-    was given; else it is for looking at.
+    With `image_format` png and every image and depth image, `source=mcap` reads the same
+    observations from it; else it is for viewing only.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class McapSink:
         self._module = ""
 
     def open(self, rig: Rig, folder: Path) -> None:
-        """Begin the file, which gets its name by `close`; a relative path is one in `folder`."""
+        """Open the file, which gets its final name in `close`; a relative path is in `folder`."""
         self._file = folder / self._path
         self._file.parent.mkdir(parents=True, exist_ok=True)
         part = part_of(self._file)
@@ -55,7 +55,7 @@ class McapSink:
         self._module = ""
 
     def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
-        """Add one observation, its pose where there is one, and the module when it changes."""
+        """Add an observation, its pose if there is one, and the module if it changed."""
         if self._writer is None:
             return
         self._writer.write(self._thinned(observation))
@@ -72,17 +72,17 @@ class McapSink:
             self._writer.write_event(int(event["stamp_ns"]), text)
 
     def write_truth(self, truth: GroundTruth) -> None:
-        """Add what is known to be true, so that a re-run can be measured as well."""
+        """Add the ground truth, for the evaluation of later runs."""
         if self._writer is not None:
             self._writer.write_truth(truth)
 
     def write_result(self, result: RunResult) -> None:
-        """Add the path as revised, the grid and the points."""
+        """Add the revised path, the grid and the points."""
         if self._writer is not None:
             self._writer.write_result(result)
 
     def close(self) -> None:
-        """Finish the file, and say how large it is."""
+        """Close the file, and log its size."""
         if self._writer is not None:
             writer, self._writer = self._writer, None
             writer.close()
@@ -90,7 +90,7 @@ class McapSink:
             _log.info("%s: %.1f MB", self._file.name, self._file.stat().st_size / 1e6)
 
     def _thinned(self, observation: Observation) -> Observation:
-        """Return the observation with the pictures that are due."""
+        """Return the observation without the images that are not due."""
         if observation.image_bgr is not None:
             self._images += 1
             if self._images % self._image_every != 1 % self._image_every:

@@ -36,7 +36,7 @@ _MAP_COLORS = {"modules": at.BY_MODULE, "true": at.AS_SEEN}
 
 
 class RerunSink:
-    """Logs a run. Only increments of the trajectory are logged, so that cost does not grow."""
+    """Logs a run. The trajectory is logged in increments, so that the cost per pose is constant."""
 
     def __init__(
         self,
@@ -50,12 +50,12 @@ class RerunSink:
         jpeg_quality: int,
         map_colors: str,
     ) -> None:
-        """Get ready to write to the file `path`, or to a viewer.
+        """Prepare to write to the file `path`, or to a viewer.
 
-        `map_colors`: modules (each its own) or true (as the camera saw them), to begin with.
+        `map_colors`: initial colours of the map, modules (one per module) or true (the camera's).
 
-        Where the extra `rerun` is not installed nothing is written, or, when it is `required`,
-        ConfigError says what to install.
+        Without the extra `rerun` nothing is written, or, if it is `required`, ConfigError names the
+        extra to install.
         """
         if (path is None) == (viewer is None):
             raise ConfigError("path", path, "a file, or null with a viewer")
@@ -78,7 +78,7 @@ class RerunSink:
         """Start the file or the viewer, with a layout for the sensors that the rig has."""
         if self._rr is None:
             return
-        # A fixed identity: two runs of one command differ in nothing but the viewer's own stamps.
+        # A fixed id: two runs of one command differ only in the stamps that the viewer adds.
         name = "sceneslam" if self._path is not None else folder.name
         self._recording = self._rr.RecordingStream("sceneslam", recording_id=name)
         layout = at.layout(rig, shown=self._shown)
@@ -93,7 +93,7 @@ class RerunSink:
         self._sensors.place(self._recording, rig)
 
     def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
-        """Log one observation; what it lacks, and what is not due, is left out."""
+        """Log the measurements of an observation that are due."""
         recording = self._recording
         if recording is None:
             return
@@ -104,7 +104,7 @@ class RerunSink:
         self._sensors.write(recording, observation)
 
     def write_event(self, event: Event) -> None:
-        """Log a vote as curves, and every decision as a line of text."""
+        """Log a vote as curves, other events as lines of text."""
         recording = self._recording
         if recording is None:
             return
@@ -121,7 +121,7 @@ class RerunSink:
             recording.log(panel, self._rr.TextLog(_sentence(event), level=level))
 
     def write_truth(self, truth: GroundTruth) -> None:
-        """Keep what is true for the end."""
+        """Keep the ground truth for the end of the run."""
         self._truth = truth
 
     def write_result(self, result: RunResult) -> None:
@@ -134,7 +134,7 @@ class RerunSink:
         write_end(self._recording, result, self._truth, self._first, self._start_ns, self._colors)
 
     def close(self) -> None:
-        """Write out what is pending and finish the file."""
+        """Flush and close the file."""
         if self._recording is not None:
             self._recording.flush()
             self._recording.disconnect()
@@ -169,7 +169,7 @@ class RerunSink:
     def _write_level(
         self, recording: rr.RecordingStream, path: str, scene: str, previous: str | None
     ) -> None:
-        """Log 1 for the scene that is said, and 0 for the one that was before."""
+        """Log 1 for the current scene and 0 for the previous one."""
         recording.log(f"{path}/{scene}", self._rr.Scalars([1.0]))
         if previous is not None:
             recording.log(f"{path}/{previous}", self._rr.Scalars([0.0]))

@@ -1,4 +1,4 @@
-"""What is known at a run's end, for the Rerun viewer: map, revised trajectory, truth, errors."""
+"""Final results of a run for the Rerun viewer: map, revised trajectory, ground truth, errors."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def write_end(
     start_ns: int,
     colors: Colors,
 ) -> None:
-    """Log all of it at the recording's present time; `first` is the first pose with its stamp.
+    """Log all results at the recording's current time; `first` is the first pose with its stamp.
 
-    The truth is laid on the estimate at that pose, so that errors are what grew since.
+    The ground truth is aligned with the estimate at that pose, so errors are relative to it.
     """
     _write_map(recording, result, colors)
     _write_revised(recording, result, colors)
@@ -79,14 +79,14 @@ def _write_revised(recording: rr.RecordingStream, result: RunResult, colors: Col
     path, strips, shades, begin = result.trajectory.positions_m, [], [], 0
     for key, run in groupby(result.modules):
         end = begin + len(list(run))
-        strips.append(path[max(begin - 1, 0) : end])  # a step belongs to the pose it leads to
+        strips.append(path[max(begin - 1, 0) : end])  # a segment belongs to the pose at its end
         shades.append(colors.get(key, at.BRIDGED_RGB))
         begin = end
     recording.log(at.REVISED, rr.LineStrips3D(strips, colors=shades, radii=[0.02]))
 
 
 def _placed(true: Trajectory, stamp_ns: int, T_map_base: Transform) -> Trajectory | None:
-    """Return the true trajectory in `map`, None where it says nothing of that instant."""
+    """Return the true trajectory in `map`, None if it has no pose at the stamp."""
     at_first = int(np.argmin(np.abs(true.stamps_ns - stamp_ns)))
     if abs(int(true.stamps_ns[at_first]) - stamp_ns) > _TRUTH_GAP_NS:
         return None
@@ -104,7 +104,7 @@ def _write_truth(recording: rr.RecordingStream, true: Trajectory) -> None:
 def _write_errors(
     recording: rr.RecordingStream, path: str, told: Trajectory, true: Trajectory, start_ns: int
 ) -> None:
-    """Log the distance of every pose from the true one at its stamp [m]."""
+    """Log the position error [m] of every pose."""
     import rerun as rr
 
     after = np.clip(np.searchsorted(true.stamps_ns, told.stamps_ns), 1, len(true) - 1)

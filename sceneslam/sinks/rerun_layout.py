@@ -1,4 +1,4 @@
-"""What the Rerun viewer shows where: entity paths, colours, and the blueprint."""
+"""Layout of the Rerun viewer: entity paths, colours and the blueprint."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ VALUE, VOTES, CONFIRMED, ERRORS = "plots/value", "plots/votes", "plots/confirmed
 POSTERIOR = "plots/posterior"
 DECISIONS, TRACKING = "decisions", "tracking"
 LEGEND = "legend"
-BY_MODULE, AS_SEEN = f"{MAP}/modules", f"{MAP}/true"  # the map's points, in either colours
+BY_MODULE, AS_SEEN = f"{MAP}/modules", f"{MAP}/true"  # the map's points in two colourings
 TIMELINE = "time"
 
-# Okabe and Ito's palette, as in the figures; grey for poses that no module gave.
+# The palette of Okabe and Ito, as in the figures; grey: poses without a module.
 PALETTE_RGB = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0))
 BRIDGED_RGB, TRUTH_RGB = (119, 119, 119), (160, 160, 160)
 
 
 def layout(rig: Rig, *, shown: str) -> Any:
-    """Return the blueprint: the map beside camera, votes, errors and decisions.
+    """Return the blueprint with views of map, camera, votes, errors and decisions.
 
-    `shown`: BY_MODULE or AS_SEEN; the other one is hidden, until its eye is clicked.
+    `shown`: BY_MODULE or AS_SEEN; the other one is hidden, and can be made visible.
     """
     import rerun.blueprint as rrb
 
@@ -45,18 +45,18 @@ def layout(rig: Rig, *, shown: str) -> Any:
             rrb.Spatial2DView(origin=f"/{LEGEND}", name="colours"),
         )
     )
-    # The trajectory is logged in steps: show all of them up to the time cursor.
+    # The trajectory is logged in increments: show all of them up to the time cursor.
     past = rrb.VisibleTimeRanges(
         timeline=TIMELINE,
         start=rrb.TimeRangeBoundary.infinite(),
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
-    seen = ["$origin/**", f"- /{CAMERA}/depth"]  # its cloud would hide the map's colours
+    seen = ["$origin/**", f"- /{CAMERA}/depth"]  # its points would hide the map's colours
     hidden = AS_SEEN if shown == BY_MODULE else BY_MODULE
     overrides = {ONLINE: past, hidden: rrb.EntityBehavior(visible=False)}
     space = rrb.Spatial3DView(origin="/world", contents=seen, name="map", overrides=overrides)
     views = rrb.Horizontal(space, rrb.Vertical(*side), column_shares=[3, 2])
-    # Opens at the end, with the whole path in sight.
+    # Opens at the end, with the whole path visible.
     at_end = rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following")
     return rrb.Blueprint(views, at_end, collapse_panels=True)
 

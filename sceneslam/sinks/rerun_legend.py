@@ -1,4 +1,4 @@
-"""Which colour stands for which module, as a picture: the Rerun viewer has no legend of its own."""
+"""A legend of the modules' colours as an image, since the Rerun viewer has no legend."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _TEXT_RGB = (230, 230, 230)
 
 
 def legend(colors: Mapping[str, tuple[int, int, int]]) -> NDArray[np.uint8]:
-    """Return a picture (H, W, 3) RGB with a line for each name, in the order of the table."""
+    """Return an image (H, W, 3) RGB with one line per name, in the order of the table."""
     picture = np.zeros((_ROW_PX * max(len(colors), 1), _WIDTH_PX, 3), np.uint8)
     for row, (name, color) in enumerate(colors.items()):
         top, bottom = row * _ROW_PX + 8, (row + 1) * _ROW_PX - 8

@@ -1,4 +1,4 @@
-"""What a robot's sensors saw, for the Rerun viewer."""
+"""Sensor data for the Rerun viewer."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class SensorLog:
         self._every, self._jpeg_quality, self._count = every, jpeg_quality, 0
 
     def place(self, recording: rr.RecordingStream, rig: Rig) -> None:
-        """Log where the sensors sit on the robot."""
+        """Log the poses of the sensors on the robot."""
         import rerun as rr
 
         if rig.camera is not None:
@@ -45,7 +45,7 @@ class SensorLog:
             recording.log(at.LASER, _pose(rig.laser.T_base_laser), static=True)
 
     def write(self, recording: rr.RecordingStream, observation: Observation) -> None:
-        """Log what is due of an observation."""
+        """Log the measurements of an observation that are due."""
         import rerun as rr
 
         if observation.image_bgr is not None and self._is_due("image"):

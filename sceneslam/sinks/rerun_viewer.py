@@ -1,4 +1,4 @@
-"""A Rerun viewer on this machine: one that runs already, or a new one."""
+"""The Rerun viewer on this machine: a running one, or a new one."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ from time import monotonic, sleep
 
 from sceneslam.types.errors import ConfigError
 
-HOST = "127.0.0.1"  # nothing of the run leaves this machine
+HOST = "127.0.0.1"  # only this machine can connect
 _STARTS_WITHIN_S = 30.0
 _log = logging.getLogger(__name__)
 
 
 class Viewer:
-    """Listens on 127.0.0.1; it outlives the run, and the next one is shown in it as well."""
+    """A viewer on 127.0.0.1; it stays open after the run and also shows later runs."""
 
     def __init__(self, *, port: int, web_port: int | None) -> None:
-        """Take the ports; with a `web_port` it is a page for a browser, else a window."""
+        """Set the ports; with a `web_port`, the viewer is a web page, else a window."""
         for name, value in (("port", port), ("web_port", web_port)):
             if value is not None and not 1024 <= value <= 65535:
                 raise ConfigError(name, value, "1024 to 65535")
         self._port, self._web_port = port, web_port
-        self.process: subprocess.Popen[bytes] | None = None  # that this run started
+        self.process: subprocess.Popen[bytes] | None = None  # started by this run
 
     @property
     def url(self) -> str:
-        """Return where recordings are sent."""
+        """Return the address to which recordings are sent."""
         return f"rerun+http://{HOST}:{self._port}/proxy"
 
     def open(self) -> str:
-        """Start the viewer where none listens; return in a sentence where to look.
+        """Start the viewer if none is running; return a sentence with its address.
 
-        Raises ConfigError when it does not come up.
+        Raises ConfigError if it does not start.
         """
         if not _listens(self._port):
             if self._web_port is not None and _listens(self._web_port):
-                raise ConfigError("web_port", self._web_port, "a port that nothing else listens on")
+                raise ConfigError("web_port", self._web_port, "a port that is not in use")
             self._check_display()
             self.process = subprocess.Popen(
                 self._command(),
@@ -57,7 +57,7 @@ class Viewer:
         return f"Rerun: {where}{stays}"
 
     def _check_display(self) -> None:
-        """Raise ConfigError where a window has nowhere to open."""
+        """Raise ConfigError if there is no display for a window."""
         is_linux = sys.platform.startswith("linux")
         has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
         if self._web_port is None and is_linux and not has_display:
@@ -74,7 +74,7 @@ class Viewer:
         until_s = monotonic() + _STARTS_WITHIN_S
         while not _listens(self._port):
             if self.process.poll() is not None or monotonic() > until_s:
-                allowed = "a port on which the viewer comes up; without a display: web_port=9090"
+                allowed = "a port on which the viewer can start; without a display: web_port=9090"
                 raise ConfigError("port", self._port, allowed)
             sleep(0.05)
 

@@ -27,9 +27,9 @@ class LightsOut(Wrapped):
 
     `schedule` is a list of [time, level], the time in seconds from the first observation or, with
     `schedule_unit: ratio`, as share of the recording. Level 1 is the image as recorded, bit for
-    bit; at level 0 the share `ambient_ratio` of the light is left. The true scene is Dark while
-    the level is below a half. `lights` on or off holds the level at 1 or 0 throughout. Dimmed
-    images carry their exposure, with the recording's as the reference.
+    bit; at level 0 the share `ambient_ratio` of the light is left. The true scene is Dark while the
+    level is below a half. `lights` on or off holds the level at 1 or 0 throughout. Dimmed images
+    carry their exposure, with the recording's as the reference.
     """
 
     def __init__(

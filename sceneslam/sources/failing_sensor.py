@@ -21,8 +21,8 @@ class FailingSensor(Wrapped):
     """Passes on a source's observations; during given time spans, one sensor fails.
 
     `failure` is a name of FAILURES, `spans_s` a list of [from, to] in seconds after the first
-    observation; its severity (blur, share of pixels) is drawn from the seed. With `names_scene`
-    the true scene during a failure is named after it (camera_frozen: CameraFrozen); else it is the
+    observation; its severity (blur, share of pixels) is drawn from the seed. With `names_scene` the
+    true scene during a failure is named after it (camera_frozen: CameraFrozen); else it is the
     source's, or `otherwise` if the source has no true scenes.
     """
 

@@ -32,9 +32,9 @@ _SAMPLES = 3  # scans that are read for a survey
 class Kitti:
     """Gives one observation per scan; base is the lidar.
 
-    `velodyne/*.bin` (odometry benchmark) or `velodyne_points/data/*.bin` (raw data). Times are
-    read from times.txt or timestamps.txt, else 10 Hz. Ground truth is read from groundtruth_tum.txt
-    or poses*.txt, as poses of the lidar.
+    `velodyne/*.bin` (odometry benchmark) or `velodyne_points/data/*.bin` (raw data). Times are read
+    from times.txt or timestamps.txt, else 10 Hz. Ground truth is read from groundtruth_tum.txt or
+    poses*.txt, as poses of the lidar.
     """
 
     def __init__(self, path: str, range_m: list[float]) -> None:

@@ -15,9 +15,9 @@ def prefetched(
 ) -> Iterator[Item]:
     """Yield the jobs' results in order; up to `ahead` further jobs are in progress.
 
-    On two cores, more than one worker beside the caller only slows down tracking.
-    The iterator of jobs is advanced in the caller's thread. A job's exception is raised in place of
-    its result. When the caller stops, jobs that have not started are dropped.
+    On two cores, more than one worker beside the caller only slows down tracking. The iterator of
+    jobs is advanced in the caller's thread. A job's exception is raised in place of its result.
+    When the caller stops, jobs that have not started are dropped.
     """
     pool = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="decode")
     running: deque[Future[Item]] = deque()

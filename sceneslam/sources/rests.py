@@ -15,8 +15,8 @@ _LEAST_M, _LEAST_RAD = 0.05, 0.05  # less is odometry noise, or the robot settli
 class Rests:
     """Compares each step of odometry with the largest one so far.
 
-    Many loggers write a record only after some centimetres of motion: the step after
-    a rest is then as long as any other.
+    Many loggers write a record only after some centimetres of motion: the step after a rest is then
+    as long as any other.
     """
 
     def __init__(self, max_gap_ns: int) -> None:

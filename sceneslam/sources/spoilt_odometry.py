@@ -31,8 +31,8 @@ class SpoiltOdometry(Wrapped):
     For `lasting_s`, about every `every_s` of driving: `reversed` (translation
     with the wrong sign), `frozen` (no motion), `slipping` (translation times `ratio`). Always:
     `scaled` (translation times `ratio`), `turning` (`turn_rad_per_m` more yaw per metre),
-    `late` (the pose of `late_s` before), `absent` (no odometry). `spikes`: single poses off by up to
-    `spike_m` and `spike_rad`, about every `every_s`.
+    `late` (the pose of `late_s` before), `absent` (no odometry). `spikes`: single poses off by up
+    to `spike_m` and `spike_rad`, about every `every_s`.
     """
 
     def __init__(

@@ -56,8 +56,8 @@ _KNOWN = {  # published calibrations of the benchmark
 class TumRgbd:
     """Gives one observation per line of rgb.txt, with the depth nearest to it in time.
 
-    `camera` (fx, fy, cx, cy, distortion) may be null for the benchmark's own recordings, which
-    are known by their folder's name. `base` is at the camera's origin, with REP-103 axes.
+    `camera` (fx, fy, cx, cy, distortion) may be null for the benchmark's own recordings, which are
+    known by their folder's name. `base` is at the camera's origin, with REP-103 axes.
     """
 
     def __init__(

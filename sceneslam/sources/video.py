@@ -25,9 +25,7 @@ from sceneslam.types.truth import GroundTruth, SceneChange
 
 _IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".ppm", ".pgm", ".tif", ".tiff", ".webp"})
 _FOLDER_RATE_HZ = 30.0  # assumed rate of images without stamps
-_HEADER_RATIO = (
-    0.98  # share of announced frames that must exist
-)
+_HEADER_RATIO = 0.98  # share of announced frames that must exist
 _NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 

@@ -1,4 +1,4 @@
-"""How a process ended, and how one is ended together with all that it started."""
+"""Exit codes of processes as text, and killing of a process with all its children."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import subprocess
 from contextlib import suppress
 from pathlib import Path
 
-MARK = "SCENESLAM_PROCESS"  # in the environment of all that a module starts
+MARK = "SCENESLAM_PROCESS"  # in the environment of all processes that a module starts
 
 
 def how_it_ended(code: int) -> str:
-    """Return what an exit code says, after `it`."""
+    """Return an exit code as text that follows `it`."""
     if code < 0:
         names = {one.value: one.name for one in signal.Signals}  # without the real-time signals
         return f"was killed by signal {-code} ({names.get(-code, 'real-time')})"
@@ -20,7 +20,7 @@ def how_it_ended(code: int) -> str:
 
 
 def kill_all(popen: subprocess.Popen[bytes], mark: str) -> None:
-    """Kill a process, its group, and what left the group but bears its mark; leave no zombie."""
+    """Kill a process, its group and all processes with its mark; leave no zombie."""
     with suppress(ProcessLookupError):
         os.killpg(popen.pid, signal.SIGKILL)
     popen.wait()

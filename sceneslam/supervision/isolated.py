@@ -1,4 +1,4 @@
-"""A SLAM module that lives in a process of its own, and looks to the bus like any other."""
+"""A SLAM module in a process of its own, with the interface of any module."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
-_DYING_S = 0.5  # a death so soon after the first request came before it
+_DYING_S = 0.5  # if it dies within this time after a request, it was probably dead before
 
 
 class IsolatedModule(Restarted):
-    """Fulfils `SlamModule`, `Restartable`, `Concurrent` by a process that `make` builds it in.
+    """Implements `SlamModule`, `Restartable` and `Concurrent`; `make` builds the module.
 
-    Whatever ends the process ends the session: the call raises ModuleError with the reason, a new
-    process is started as soon as its budget allows, and `activate` begins anew in it. Exceptions
-    of the module itself are raised here as they were there. Who stops a session because it failed
-    says so by `note_failure`.
+    The end of the process ends the session: the call raises ModuleError with the reason, a new
+    process is started as soon as `Limits` allow, and `activate` starts a session in it. Exceptions
+    of the module itself are raised here unchanged. A caller that stops a failed session must call
+    `note_failure`.
     """
 
     def __init__(self, name: str, make: Callable[[], SlamModule], limits: Limits) -> None:
-        """Start the process; whether the module can be built there, `requires` says."""
+        """Start the process; reading `requires` waits until the module is built."""
         if not hasattr(os, "memfd_create"):
             raise ConfigError("isolation", "process", "inline (processes need Linux)")
         super().__init__(limits)
@@ -44,48 +44,48 @@ class IsolatedModule(Restarted):
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return the module's; raises what its constructor raised, ConfigError among others."""
+        """Return the module's requirements; raises the exception of its constructor, if any."""
         if self._requires is None:
             self._await_built()
         assert self._requires is not None
         return self._requires
 
     def activate(self, rig: Rig) -> None:
-        """Start anew, in a new process where the last one died; waits until it may be started."""
+        """Start a session, in a new process if the last one died; may wait for a restart."""
         self._bury()
         was_idle, asked_s = self._process is not None and self._is_greeted, monotonic()
         try:
             self._begin(rig)
         except ProcessDeathError:
-            # A process with threads may still look alive when it was killed while it was idle.
+            # A process with threads may still seem alive after it was killed while idle.
             if not was_idle or monotonic() - asked_s > _DYING_S:
                 raise
             self.note_failure()
             self._begin(rig)
 
     def set_pose(self, T_map_local: Transform) -> None:
-        """Place `local` in the map."""
+        """Set T_map_local (4, 4) [m]."""
         self._call(self._limits.step_deadline_s, "set_pose", T_map_local)
 
     def set_scene(self, scene: str) -> None:
-        """Tell the confirmed scene."""
+        """Set the confirmed scene."""
         self._call(self._limits.step_deadline_s, "set_scene", scene)
 
     def track(self, observation: Observation) -> Tracking:
-        """Return T_local_base at the observation."""
+        """Return T_local_base (4, 4) [m] at the observation."""
         self.submit(observation)
         return self.collect()
 
     def submit(self, observation: Observation) -> None:
-        """Let the module begin to track; others may be given work before `collect`."""
+        """Start tracking without waiting; `collect` returns the result."""
         self._ask("track", observation)
 
     def collect(self) -> Tracking:
-        """Return the answer to `submit`."""
+        """Return the result of `submit`."""
         return cast(Tracking, self._answer(self._limits.step_deadline_s))
 
     def get_trajectory(self) -> Trajectory:
-        """Return T_local_base at every stamp."""
+        """Return T_local_base (4, 4) [m] at every stamp."""
         return cast(Trajectory, self._call(self._limits.start_deadline_s, "get_trajectory"))
 
     def get_map(self) -> MapLayers:
@@ -93,12 +93,12 @@ class IsolatedModule(Restarted):
         return cast(MapLayers, self._call(self._limits.start_deadline_s, "get_map"))
 
     def shutdown(self) -> None:
-        """Shut the module down; its process stays, with the map, for the next `activate`."""
+        """Shut the module down; its process keeps the map until the next `activate`."""
         if self._is_active:
             self._call(self._limits.start_deadline_s, "shutdown")
 
     def close(self) -> None:
-        """End the process for good. May be called twice."""
+        """End the process. May be called twice."""
         if self._process is not None:
             self._process.end()
         self._process, self._is_active = None, False
@@ -116,7 +116,7 @@ class IsolatedModule(Restarted):
         return self._process
 
     def _start(self) -> None:
-        """Start a process and let it build the module, without waiting."""
+        """Start a process that builds the module, without waiting."""
         self._is_greeted = self._is_active = False
         self._process = Process(self._limits)
         level = logging.getLogger().getEffectiveLevel()
@@ -150,7 +150,7 @@ class IsolatedModule(Restarted):
             raise
 
     def _bury(self) -> None:
-        """Notice a process that died while nobody asked it for anything."""
+        """Detect a process that died while it was idle."""
         if self._process is not None and not self._process.is_alive:
             _log.warning("%s: its process died while it was idle", self._name)
             self._process.end()
@@ -158,7 +158,7 @@ class IsolatedModule(Restarted):
             self._replace()
 
     def _replace(self) -> None:
-        """Start the next process at once where that is allowed: it can be built meanwhile."""
+        """Start the next process if a restart is allowed; it builds the module in parallel."""
         self._process, self._is_active, self._is_greeted = None, False, False
         if self._restarts.wait_s(monotonic()) == 0 and self._requires is not None:
             self._start()

@@ -1,4 +1,4 @@
-"""How long a module's process may take, what it may use, and how often it is started again."""
+"""Limits of a module's process: deadlines, memory, and number of restarts."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from time import monotonic, sleep
 
 from sceneslam.types.errors import ConfigError, ModuleError
 
-_DOUBLINGS = 30  # more are years
+_DOUBLINGS = 30  # more would be years
 
 
 @dataclass(slots=True, kw_only=True)
 class Limits:
-    """Of one module's process; durations are of the wall clock."""
+    """Limits of one module's process; durations are wall clock time."""
 
     step_deadline_s: float  # to track one observation
-    start_deadline_s: float  # to be built, to be activated, to hand over its map
+    start_deadline_s: float  # to be built, to be activated, to return its map
     memory_limit_mb: int  # of its private memory
     restarts_max: int  # within the window
     restart_window_s: float
-    # Before the second start in the window; then twice as long each time, up to the pace that the
-    # window allows on average.
+    # Delay of the second start in the window; it doubles with each start, up to the mean interval
+    # of starts that the window allows.
     restart_backoff_s: float
     threads: int  # of OpenCV
 
@@ -34,24 +34,24 @@ class Limits:
 
 
 class Restarts:
-    """Says when a module that failed may be started again; all but `await_start` pure."""
+    """Decides when a failed module may be restarted, with exponential backoff."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
         self._failures_s: list[float] = []
 
     def note_failure(self, now_s: float) -> None:
-        """Take one failure."""
+        """Record a failure."""
         self._forget(now_s)
         self._failures_s.append(now_s)
 
     def is_spent(self, now_s: float) -> bool:
-        """Tell whether it failed more often in the window than it may be started again."""
+        """Tell whether the failures in the window exceed the allowed restarts."""
         self._forget(now_s)
         return len(self._failures_s) > self._limits.restarts_max
 
     def wait_s(self, now_s: float) -> float:
-        """Return how long to wait for the next start, 0 where it may be at once."""
+        """Return the remaining delay [s] before the next start."""
         self._forget(now_s)
         failures = len(self._failures_s)
         if self.is_spent(now_s):
@@ -65,7 +65,7 @@ class Restarts:
         return max(due_s - now_s, 0.0)
 
     def await_start(self) -> None:
-        """Sleep until it may be started; raises ModuleError where it failed too often."""
+        """Sleep until the next start is allowed; raises ModuleError after too many failures."""
         wait_s = self.wait_s(monotonic())
         if self.is_spent(monotonic()):
             raise ModuleError(
@@ -75,6 +75,6 @@ class Restarts:
         sleep(wait_s)
 
     def _forget(self, now_s: float) -> None:
-        """Drop the failures that left the window."""
+        """Remove the failures that are older than the window."""
         begin_s = now_s - self._limits.restart_window_s
         self._failures_s = [time_s for time_s in self._failures_s if time_s > begin_s]

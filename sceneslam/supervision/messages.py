@@ -1,4 +1,4 @@
-"""What the bus's process and a module's process say to each other."""
+"""Messages between the main process and a module's process."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Request:
-    """A call of one of the module's methods; the first is the word to build it."""
+    """A call of one of the module's methods; the first request builds the module."""
 
     number: int
     method: str
@@ -17,7 +17,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogLine:
-    """What a module said in the log during a call."""
+    """A log record of the module during a call."""
 
     logger: str
     level: int
@@ -26,7 +26,7 @@ class LogLine:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reply:
-    """What came of a request."""
+    """The result of a request."""
 
     number: int
     value: Any = None

@@ -1,8 +1,8 @@
-"""Messages as plain tuples beside large arrays, which stay where they are.
+"""Serialisation of messages: plain tuples, and large arrays that are not copied.
 
-A processor that has just changed the process runs unknown code several times more slowly: the
-values of every step are taken apart by hand, which is a fraction of pickle's way through them.
-All other values are pickled.
+After a switch of processes, code that is not in the caches runs several times more slowly. The
+types of every tracking step are therefore converted directly, with much less code than pickle. All
+other values are pickled.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from sceneslam.supervision.messages import Reply, Request
 from sceneslam.types.observation import LaserScan, Observation, Tracking, TrackingStatus
 
-_SMALL_BYTES = 1 << 12  # an array up to a page is copied more cheaply than it is referred to
+_SMALL_BYTES = 1 << 12  # copying an array up to a page is cheaper than a reference
 _PLAIN = (int, float, str, bool, type(None))
 _KINDS: tuple[Any, ...] = (
     Request,
@@ -30,7 +30,7 @@ _PICKLE, _TUPLE, _STATUS, _SMALL, _LARGE = range(-5, 0)
 
 
 def take_apart(value: Any, large: list[memoryview]) -> Any:
-    """Return a value as numbers, text, bytes and tuples; large arrays are put into `large`."""
+    """Return a value as numbers, text, bytes and tuples; large arrays are appended to `large`."""
     kind = type(value)
     if kind in _PLAIN:
         return value
@@ -47,7 +47,7 @@ def take_apart(value: Any, large: list[memoryview]) -> Any:
 
 
 def put_together(item: Any, large: Sequence[Any]) -> Any:
-    """Return the value that was taken apart; `large` are buffers of bytes."""
+    """Return the original value; `large` are the arrays' buffers."""
     if type(item) is not tuple:
         return item
     kind = item[0]
@@ -88,7 +88,7 @@ def _pickled(value: object, large: list[memoryview]) -> Any:
 
 
 def _restored(kind: type, values: Sequence[object]) -> object:
-    """Return a frozen dataclass with these fields, without its constructor's checks."""
+    """Return a frozen dataclass with these field values, without calling its constructor."""
     restored: object = object.__new__(kind)
     for name, value in zip(kind.__slots__, values, strict=True):  # type: ignore[attr-defined]
         object.__setattr__(restored, name, value)

@@ -1,4 +1,4 @@
-"""A module's process as its parent sees it: started, asked with a deadline, and ended."""
+"""A module's process on the parent's side: start, requests with deadlines, and end."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from sceneslam.supervision.messages import Reply, Request
 from sceneslam.supervision.transport import Channel
 from sceneslam.types.errors import ModuleError, told
 
-_END_PATIENCE_S = 1.0  # for a process that hung up, or was hung up on, to be gone
-# The path is set when the interpreter is up: what lies in a user's folder must not shadow its own.
+_END_PATIENCE_S = 1.0  # for a process to end after its channel was closed
+# The path is set after start-up: files in the user's folder must not shadow standard modules.
 _MAIN = """
 import sys
 line, lifeline, *sys.path = sys.argv[1:]
@@ -30,14 +30,14 @@ main(int(line), int(lifeline))
 
 
 class ProcessDeathError(ModuleError):
-    """The process is no more; the message says how it ended."""
+    """The process has ended; the message says how."""
 
 
 class Process:
-    """Sends requests to one process and takes its replies, in order.
+    """Sends requests to one process and receives its replies, in order.
 
-    Every failure of the process itself (gone, too slow, out of memory) ends it and raises
-    ProcessDeathError. It ends with this object, and with the parent, however that ends.
+    Any failure of the process itself (ended, too slow, out of memory) ends it and raises
+    ProcessDeathError. It ends with this object and with the parent, however the parent ends.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -47,11 +47,11 @@ class Process:
         mark = uuid4().hex
         self._popen = subprocess.Popen(
             [sys.executable, "-P", "-c", _MAIN, str(far.fileno()), str(lifeline), *sys.path],
-            # All else about threads is the parent's: with more of BLAS's, sums differ in a bit.
+            # Other thread settings are the parent's: BLAS sums depend on the number of threads.
             env={**os.environ, "OPENCV_FOR_THREADS_NUM": str(limits.threads), MARK: mark},
             stdin=subprocess.DEVNULL,
             pass_fds=(far.fileno(), lifeline),
-            process_group=0,  # a terminal's Ctrl-C is the parent's to handle
+            process_group=0,  # Ctrl-C is handled by the parent
         )
         far.close()
         os.close(lifeline)
@@ -66,7 +66,7 @@ class Process:
         return self._end.alive and self._popen.poll() is None
 
     def submit(self, method: str, *arguments: object) -> None:
-        """Send a request, whose reply `collect` returns."""
+        """Send a request; `collect` returns its reply."""
         self._number += 1
         self._asked_s = monotonic()
         request = Request(number=self._number, method=method, arguments=arguments)
@@ -76,14 +76,14 @@ class Process:
             raise self._died() from error
 
     def has_answer(self) -> bool:
-        """Tell whether `collect` would return, or raise, at once."""
+        """Tell whether `collect` would return or raise without waiting."""
         return self._channel.has_message()
 
     def collect(self, deadline_s: float) -> Any:
-        """Return what the last request's method returned, or raise what it raised.
+        """Return the last request's result, or raise its exception.
 
-        The deadline counts from the request on. What earlier requests brought, which an interrupt
-        kept from being collected, is passed over.
+        The deadline starts at the request. Replies to earlier requests that were not collected
+        because of an interrupt are skipped.
         """
         while True:
             left_s = max(self._asked_s + deadline_s - monotonic(), 1e-3)
@@ -96,7 +96,7 @@ class Process:
                 raise self._died() from error
             except Exception as error:
                 self._end()
-                raise ProcessDeathError(f"answered what is no answer ({told(error)})") from error
+                raise ProcessDeathError(f"sent an invalid reply ({told(error)})") from error
             for line in reply.log:
                 logging.getLogger(line.logger).log(line.level, "%s", line.text)
             if reply.number == self._number:
@@ -105,7 +105,7 @@ class Process:
     def end(self) -> None:
         """End the process; may be called twice."""
         if self._end.alive:
-            self._channel.close()  # it ends by itself when it has nothing more to do
+            self._channel.close()  # the process ends when its channel is closed
             with suppress(subprocess.TimeoutExpired):
                 self._popen.wait(_END_PATIENCE_S)
         self._end()
@@ -121,7 +121,7 @@ class Process:
         return reply.value
 
     def _died(self) -> ProcessDeathError:
-        """Return how the process, which hung up, ended."""
+        """Return the error with the exit code of the process that closed its channel."""
         with suppress(subprocess.TimeoutExpired):
             self._popen.wait(_END_PATIENCE_S)
         self._end()
@@ -136,7 +136,7 @@ class _Elsewhere(Exception):  # noqa: N818 - not an error, but where one came fr
 
 
 def _end(popen: subprocess.Popen[bytes], channel: Channel, lifeline: int, mark: str) -> None:
-    """Kill a process with all that it started, and close what led to it."""
+    """Kill a process with all its children, and close the connections to it."""
     kill_all(popen, mark)
     channel.close()
     os.close(lifeline)

@@ -1,4 +1,4 @@
-"""What a SLAM module with a process of its own answers as `Restartable`."""
+"""The `Restartable` part of SLAM modules with a process of their own."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from sceneslam.supervision.limits import Limits, Restarts
 
 
 class Running(Protocol):
-    """A process that may be answering its first request."""
+    """A process that may still be working on its first request."""
 
     @property
     def is_alive(self) -> bool:
-        """Tell whether it still runs."""
+        """Tell whether it is running."""
         ...
 
     def has_answer(self) -> bool:
-        """Tell whether an answer can be read without a wait."""
+        """Tell whether a reply can be read without waiting."""
         ...
 
 
 class Restarted(ABC):
-    """Starts its process again, at once or after a while, up to so many times."""
+    """Restarts its process, with delays and up to a limit."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits, self._restarts = limits, Restarts(limits)
-        self._is_active = False  # a session goes on in the process
-        self._is_greeted = False  # it answered its first request
+        self._is_active = False  # a session is running in the process
+        self._is_greeted = False  # the first request has been answered
 
     @property
     def is_ready(self) -> bool:
-        """Tell whether `activate` would not have to wait, and start a process where it may be."""
+        """Tell whether `activate` would not wait; start a process if that is allowed."""
         self._bury()
         if self._restarts.wait_s(monotonic()) > 0:
             return False
@@ -42,12 +42,12 @@ class Restarted(ABC):
 
     @property
     def is_spent(self) -> bool:
-        """Tell whether it failed too often to be started again, for now."""
+        """Tell whether there were too many failures for another restart now."""
         return self._restarts.is_spent(monotonic())
 
     def note_failure(self) -> None:
-        """Take that a session failed: the next may begin after a while, longer each time."""
-        if not self.is_spent:  # else it was refused for that, which is no failure
+        """Record that a session failed; the delay before the next one grows."""
+        if not self.is_spent:  # else the session was refused, which is not a failure
             self._restarts.note_failure(monotonic())
 
     @property
@@ -61,4 +61,4 @@ class Restarted(ABC):
 
     @abstractmethod
     def _bury(self) -> None:
-        """Notice a process that ended while nobody asked it for anything."""
+        """Detect a process that ended while it was idle."""

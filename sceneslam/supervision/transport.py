@@ -1,4 +1,4 @@
-"""Messages between two processes: whole packets on a socket, arrays in lent shared memory."""
+"""Messages between two processes: packets on a socket, large arrays in shared memory."""
 
 from __future__ import annotations
 
@@ -19,48 +19,49 @@ from numpy.typing import NDArray
 
 from sceneslam.supervision.packing import put_together, take_apart
 
-_PACKET_BYTES = 1 << 15  # what travels in the packet itself: a socket's buffer holds several
+_PACKET_BYTES = 1 << 15  # largest data within a packet; a socket's buffer holds several
 _PACKET_MAX_BYTES = 1 << 16
 _FD_BYTES = socket.CMSG_SPACE(4)
-_WRITTEN, _VOID = b"w", b"v"  # what follows an announced message
-_AWAKE_NS = 200_000  # several times what falling asleep and being woken takes
-_LINE_BYTES = 64  # of a cache line: where each array begins
-_Place = tuple[int, int, list[tuple[int, int]]]  # a block, its capacity, where its parts are
+_WRITTEN, _VOID = b"w", b"v"  # states of an announced message
+_AWAKE_NS = 200_000  # several times the latency of sleep and wake-up
+_LINE_BYTES = 64  # a cache line; alignment of arrays
+_Place = tuple[int, int, list[tuple[int, int]]]  # block, capacity, begin and end of its parts
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class _Block:
-    """Shared memory that this end writes; it has no name, so that none is ever left behind."""
+    """Anonymous shared memory that this end writes, so that no file is left behind."""
 
     memory: mmap.mmap
-    fd: int | None  # until the other end has it
+    fd: int | None  # until it was sent to the other end
 
 
 class Channel:
-    """One end of a line of messages, each anything that can be pickled.
+    """One end of a bidirectional channel of messages, each any value that can be pickled.
 
-    Arrays are written once, to a block of shared memory, and read there in place: the block is
-    lent, and used anew when nothing at the other end looks at it any more. So an array may be kept
-    for as long as one likes. Arrays arrive read-only.
+    Arrays are copied once, to a block of shared memory, and read there in place: the block is
+    reused only when nothing at the other end refers to it any more. So an array may be kept for any
+    time. Received arrays are read-only.
     """
 
     def __init__(self, line: socket.socket, pidfd: int | None = None) -> None:
-        """Talk over `line`; `pidfd` is readable once the other process has ended."""
+        """Use the socket `line`; `pidfd` becomes readable when the other process has ended."""
         self._line, self._pidfd = line, pidfd
         self._arrivals = select.poll()
         self._arrivals.register(line, select.POLLIN)
         if pidfd is not None:
             self._arrivals.register(pidfd, select.POLLIN)
         self._blocks: list[_Block] = []
-        self._free: list[int] = []  # of the blocks
+        self._free: list[int] = []  # indices of free blocks
         self._borrowed: dict[int, mmap.mmap] = {}  # the other end's blocks
-        self._looked_at: dict[int, ref[NDArray[np.uint8]]] = {}  # those of them in use here
-        self._returned: list[int] = []  # those that nothing here looks at any more
+        self._looked_at: dict[int, ref[NDArray[np.uint8]]] = {}  # borrowed blocks in use here
+        self._returned: list[int] = []  # borrowed blocks that are no longer in use
 
     def send(self, message: object) -> None:
-        """Send a message; raises OSError where the other end is gone or its line is full.
+        """Send a message; raises OSError if the other end has ended or its buffer is full.
 
-        Arrays are announced before they are written: the other end wakes up meanwhile.
+        Messages are announced before arrays are written, so that the other end wakes up in
+        parallel.
         """
         large: list[memoryview] = []
         head = marshal.dumps(take_apart(message, large))
@@ -85,21 +86,21 @@ class Channel:
         self._forget_fd(block)
 
     def receive(self, timeout_s: float | None = None) -> Any:
-        """Return the next message; raises TimeoutError, or EOFError where the other end is gone.
+        """Return the next message; raises TimeoutError, or EOFError if the other end has ended.
 
-        Who waits for so long at most stays awake at first: an answer may be near.
+        With a timeout, it first polls for a short time, since a reply may be near.
         """
         awake_ns = 0 if timeout_s is None else _AWAKE_NS
         while True:
             packet, extra = self._arrival(timeout_s, awake_ns)
             if packet in (_WRITTEN, _VOID):
-                continue  # its message was given up before it was announced
+                continue  # the message was cancelled
             returned, head, place = marshal.loads(packet)
             self._free += returned
             if place is None:
                 return put_together(marshal.loads(head), [])
             parts: list[Any] = self._look_at(place, extra)
-            # All but what the arrays hold can be put together while they are written.
+            # The message is built while the arrays are still being written.
             message = None if head is None else put_together(marshal.loads(head), parts)
             if self._arrival(timeout_s, _AWAKE_NS)[0] == _WRITTEN:
                 if head is None:
@@ -108,7 +109,7 @@ class Channel:
                 return message
 
     def _arrival(self, timeout_s: float | None, awake_ns: int) -> tuple[bytes, Sequence[Any]]:
-        """Return the next packet and what came along with it; sleep only after `awake_ns`."""
+        """Return the next packet and its ancillary data; poll for `awake_ns` before sleeping."""
         asleep_ns = monotonic_ns() + awake_ns
         while True:
             try:
@@ -136,11 +137,11 @@ class Channel:
             raise EOFError
 
     def has_message(self) -> bool:
-        """Tell whether `receive` would return, or raise, at once."""
+        """Tell whether `receive` would return or raise without waiting."""
         return bool(self._arrivals.poll(0))
 
     def close(self) -> None:
-        """Hang up; what was received stays readable."""
+        """Close the channel; received arrays stay readable."""
         self._line.close()
         pidfd, self._pidfd = self._pidfd, None
         if pidfd is not None:
@@ -149,7 +150,7 @@ class Channel:
             self._forget_fd(block)
 
     def _packet(self, head: bytes | None, place: _Place | None) -> bytes:
-        """Return what goes over the socket, with the blocks that the other end has back."""
+        """Return the bytes of a packet, with the blocks that are returned to the other end."""
         returned, self._returned = self._returned, []
         return marshal.dumps((returned, head, place))
 
@@ -161,13 +162,13 @@ class Channel:
             self._free.remove(index)
             return index
         fd = os.memfd_create("sceneslam")
-        capacity = 1 << (size - 1).bit_length()  # so that messages of about one size share
+        capacity = 1 << (size - 1).bit_length()  # messages of similar size share blocks
         os.ftruncate(fd, capacity)
         self._blocks.append(_Block(memory=mmap.mmap(fd, capacity), fd=fd))
         return len(self._blocks) - 1
 
     def _look_at(self, place: _Place, extra: Sequence[Any]) -> list[NDArray[np.uint8]]:
-        """Return the parts in a block of the other end, which has it back when they are gone."""
+        """Return the arrays in a block of the other end; it is returned when they are deleted."""
         index, capacity, spans = place
         if extra:
             fd = int.from_bytes(extra[0][2], "little")
@@ -192,7 +193,7 @@ def _as_message(fd: int) -> tuple[int, int, array.array[int]]:
 
 
 def _layout(parts: Sequence[memoryview]) -> list[tuple[int, int]]:
-    """Return where each part begins and ends in a block."""
+    """Return begin and end of each part in a block [bytes]."""
     spans, start = [], 0
     for part in parts:
         spans.append((start, start + part.nbytes))

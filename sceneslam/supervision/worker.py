@@ -1,4 +1,4 @@
-"""A module's own process: builds the module, then does what it is asked until the line closes."""
+"""Main function of a module's process: builds the module and serves requests."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sceneslam.types.errors import ModuleError
 
 
 class Worker:
-    """Owns the module and answers requests."""
+    """Owns the module and serves requests."""
 
     def __init__(self) -> None:
         self._module: Any = None
@@ -27,7 +27,7 @@ class Worker:
         logging.getLogger().addHandler(self._log)
 
     def answer(self, request: Request) -> Reply:
-        """Return what the module answers, or what it raised."""
+        """Return the result or exception of the requested method."""
         try:
             value = self._call(request)
         except BaseException as error:
@@ -53,7 +53,7 @@ class Worker:
 
 
 def serve(channel: Channel) -> None:
-    """Answer until the other end hangs up."""
+    """Serve requests until the channel is closed."""
     worker = Worker()
     while True:
         try:
@@ -66,11 +66,11 @@ def serve(channel: Channel) -> None:
             return
         except Exception as error:
             channel.send(Reply(number=reply.number, error=ModuleError(f"its answer: {error}")))
-        del reply  # it may hold what was lent
+        del reply  # it may refer to shared memory
 
 
 class _Collector(logging.Handler):
-    """Keeps what is logged until it is taken along with a reply."""
+    """Collects log records, which are sent with the next reply."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -86,20 +86,20 @@ class _Collector(logging.Handler):
 
 
 def _portable(error: BaseException) -> Exception:
-    """Return the error where it survives the journey, else a ModuleError that says the same."""
+    """Return the error if it can be pickled, else a ModuleError with its message."""
     try:
         if isinstance(error, Exception) and type(pickle.loads(pickle.dumps(error))) is type(error):
             return error
     except Exception:
-        pass  # its constructor asks for more than it passes on
+        pass  # cannot be unpickled: its constructor needs other arguments
     return ModuleError(f"{type(error).__name__}: {error}")
 
 
 def _die_with_parent(lifeline: int) -> None:
-    """Let the kernel end this process when the lifeline's other end closes, whatever it is doing.
+    """Let the kernel end this process when the other end of `lifeline` is closed.
 
-    A pipe's end raises SIGIO, whose default is to terminate: it needs no thread, no GIL, and does
-    not depend on which thread of the parent started this process (as PR_SET_PDEATHSIG does).
+    The closed pipe raises SIGIO, which terminates by default: it needs no thread and no GIL, and
+    does not depend on which thread of the parent started this process (as PR_SET_PDEATHSIG does).
     """
     fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
     flags = fcntl.fcntl(lifeline, fcntl.F_GETFL)
@@ -107,7 +107,7 @@ def _die_with_parent(lifeline: int) -> None:
 
 
 def main(line: int, lifeline: int) -> None:
-    """Serve on the inherited descriptors; Ctrl-C is the parent's to handle."""
+    """Serve on the inherited descriptors; Ctrl-C is handled by the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _die_with_parent(lifeline)
     serve(Channel(socket.socket(fileno=line)))

@@ -1,1 +1,1 @@
-"""ROS 2 topics of this machine or network, as bytes: over DDS without ROS, or through rclpy."""
+"""Publishing and subscribing to ROS 2 topics as bytes: by DDS without ROS, or by rclpy."""

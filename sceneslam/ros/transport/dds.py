@@ -1,9 +1,9 @@
-"""ROS 2 topics over Cyclone DDS: no ROS has to be installed.
+"""ROS 2 topics over Cyclone DDS, without a ROS installation.
 
 ROS 2 maps topic `/a` to DDS topic `rt/a`, and type `pkg/msg/Name` to `pkg::msg::dds_::Name_`.
-Messages stay the bytes that they are: every type is a placeholder of the right name. The other side
-matches by that name alone, and an image costs a copy. Fast DDS 3 (ROS 2 Kilted) compares what types
-hold as well; it matches where its profile says `fastdds.type_propagation` `disabled`.
+Messages are passed as bytes: every type is a placeholder with the right name. Participants match by
+that name only, and an image is copied once. Fast DDS 3 (ROS 2 Kilted) also compares the types'
+definitions; it matches if its profile sets `fastdds.type_propagation` to `disabled`.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ from sceneslam.ros.transport.transport import (
 from sceneslam.types.errors import ConfigError, told
 
 _log = logging.getLogger(__name__)
-_WAKE_S = 0.1  # how long `close` may take
-_BATCH = 64  # messages taken at once
-_ENDPOINTS = 1000  # announcements taken at once
+_WAKE_S = 0.1  # interval at which `close` is noticed
+_BATCH = 64  # messages read at once
+_ENDPOINTS = 1000  # announcements read at once
 _CONFIG = "CYCLONEDDS_URI"
-_environment = threading.Lock()  # a domain reads it when its first participant joins
-# This machine alone: by the loopback interface, with multicast for participants that know no more
-# than that (a robot's drivers as they are started), and by number for those that avoid it.
+_environment = threading.Lock()  # a domain reads the environment when its first participant joins
+# Discovery on this machine only: by the loopback interface, with multicast for participants with
+# default settings (a robot's drivers), and by participant index for those without multicast.
 _ON_LOOPBACK = (
     '<General><Interfaces><NetworkInterface name="lo" multicast="true"/></Interfaces>'
     "<AllowMulticast>spdp</AllowMulticast></General>"
@@ -67,7 +67,7 @@ _ON_LOOPBACK = (
 
 
 class DdsTransport:
-    """A participant of Cyclone DDS; a user's own CYCLONEDDS_URI comes before `discovery`."""
+    """A participant of Cyclone DDS; a user's CYCLONEDDS_URI has priority over `discovery`."""
 
     def __init__(self, network: Network) -> None:
         domain = network.domain()
@@ -88,10 +88,10 @@ class DdsTransport:
         self._thread: threading.Thread | None = None
 
     def topics(self) -> Mapping[str, str]:
-        """Return the ROS topics that others announced, and not yet withdrew."""
+        """Return the ROS topics that other participants currently announce."""
         with self._lock:
             for endpoint in self._announced.take(_ENDPOINTS):
-                name = endpoint.topic_name or ""  # a writer that left has none
+                name = endpoint.topic_name or ""  # a deleted writer has none
                 if not _is_alive(endpoint):
                     self._published.pop(endpoint.key, None)
                 elif name.startswith("rt/") and endpoint.key not in self._own_keys():
@@ -99,7 +99,7 @@ class DdsTransport:
             return dict(self._published.values())
 
     def subscribe(self, topic: str, msgtype: str, heard: Heard, qos: Qos = Qos.SENSOR) -> None:
-        """Deliver the topic's messages to `heard`, in the transport's thread."""
+        """Call `heard` for each message of the topic, in the transport's thread."""
         with self._lock:
             reader = DataReader(self._participant, self._topic(topic, msgtype), _qos(qos))
             mask = SampleState.NotRead | ViewState.Any | InstanceState.Any
@@ -137,7 +137,7 @@ class DdsTransport:
             for writer in self._writers.values():
                 writer.close()
             self._readers, self._writers, self._topics = {}, {}, {}
-            if self._participant is not None:  # with all that is in it, which no destructor does
+            if self._participant is not None:  # with its entities, which no destructor deletes
                 self._participant._delete(self._participant._ref)
                 self._participant = None
 
@@ -166,7 +166,7 @@ class DdsTransport:
 
 
 class _Bytes(IdlStruct):
-    """A message as the bytes that it is sent as."""
+    """A message as its serialised bytes."""
 
     def __init__(self, cdr: bytes) -> None:
         self.cdr = cdr
@@ -180,7 +180,7 @@ class _Bytes(IdlStruct):
 
     @classmethod
     def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Any:
-        return cls(b"")  # a writer that left
+        return cls(b"")  # a deleted writer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -193,20 +193,20 @@ class _Reader:
 
 
 class _Writer:
-    """Sends the bytes of one type."""
+    """Publishes serialised messages of one type."""
 
     def __init__(self, writer: Any, data_type: Any) -> None:
         self._writer, self._data_type = writer, data_type
         self.key = writer.guid
 
     def publish(self, cdr: bytes) -> None:
-        """Send; after `close`, to nobody."""
+        """Publish a message; no effect after `close`."""
         writer = self._writer
         if writer is not None:
             writer.write(self._data_type(cdr))
 
     def close(self) -> None:
-        """Leave the topic."""
+        """Delete the writer."""
         self._writer = None
 
 
@@ -214,13 +214,13 @@ def _deliver(heard: Heard, arrival: Arrival) -> None:
     try:
         heard(arrival)
     except Exception as error:
-        _log.warning("a message of %s could not be taken: %s", arrival.topic, told(error))
+        _log.warning("a message of %s could not be processed: %s", arrival.topic, told(error))
         _log.debug("the whole error", exc_info=error)
 
 
 @contextmanager
 def _configured(*, is_local: bool) -> Iterator[None]:
-    """Have a domain that is joined meanwhile stay on this machine, but for a user's own word."""
+    """Restrict a domain that is joined in this context to this machine, unless a URI is set."""
     with _environment:
         is_ours = is_local and not os.environ.get(_CONFIG)
         before = _sockets()
@@ -236,7 +236,7 @@ def _configured(*, is_local: bool) -> Iterator[None]:
 
 
 def _sockets() -> set[int]:
-    """Return this process's descriptors of datagram sockets; none where there is no /proc."""
+    """Return the descriptors of this process's datagram sockets; empty without /proc."""
     found = set()
     for entry in Path("/proc/self/fd").glob("*"):
         try:
@@ -244,7 +244,7 @@ def _sockets() -> set[int]:
                 with socket.socket(fileno=os.dup(int(entry.name))) as one:
                     if one.family == socket.AF_INET and one.type == socket.SOCK_DGRAM:
                         found.add(int(entry.name))
-        except OSError:  # closed meanwhile
+        except OSError:  # closed in the meantime
             continue
     return found
 
@@ -260,7 +260,7 @@ def _keep_local(descriptors: set[int]) -> None:
 
 
 def _named(typename: str) -> Any:
-    """Return a type of that name whose samples are bytes."""
+    """Return a type with that name whose samples are bytes."""
     return make_idl_struct(
         "Named", typename, {"placeholder": uint8}, bases=(_Bytes,), dataclassify=False
     )

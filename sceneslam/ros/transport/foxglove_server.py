@@ -1,4 +1,4 @@
-"""ROS 2 messages for Foxglove: a WebSocket server on this machine, and what its panels ask back."""
+"""A WebSocket server on this machine for Foxglove: ROS 2 messages, and messages of its panels."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from sceneslam.ros.encode import Encoder
 from sceneslam.ros.transport.transport import Arrival, Heard, Publisher, Qos
 from sceneslam.types.errors import ConfigError, told
 
-HOST = "127.0.0.1"  # nothing of the run leaves this machine
+HOST = "127.0.0.1"  # only this machine can connect
 _log = logging.getLogger(__name__)
 
 
 class FoxgloveTransport:
     """Serves topics over Foxglove's WebSocket protocol.
 
-    Panels may publish on the topics that are subscribed here (JSON or CDR), and set `parameters`:
-    name -> topic of a String or Bool that the value is published on.
+    Panels can publish on topics that are subscribed here (JSON or CDR), and set `parameters`:
+    name -> topic (String or Bool) on which the value is published.
     """
 
     def __init__(self, port: int, parameters: Mapping[str, str]) -> None:
@@ -49,19 +49,19 @@ class FoxgloveTransport:
 
     @property
     def url(self) -> str:
-        """Return where Foxglove connects to."""
+        """Return the address for Foxglove."""
         return f"ws://{HOST}:{self._server.port}"
 
     def topics(self) -> Mapping[str, str]:
-        """Return nothing: panels are no robots."""
+        """Return no topics: panels do not announce theirs."""
         return {}
 
     def subscribe(self, topic: str, msgtype: str, heard: Heard, qos: Qos = Qos.SENSOR) -> None:
-        """Call `heard` for what panels publish on the topic."""
+        """Call `heard` for each message that a panel publishes on the topic."""
         self._heard[topic] = (msgtype, heard)
 
     def unsubscribe(self, topic: str) -> None:
-        """Call nobody any more."""
+        """End the subscription."""
         self._heard.pop(topic, None)
 
     def publisher(self, topic: str, msgtype: str, qos: Qos = Qos.RELIABLE) -> Publisher:
@@ -79,7 +79,7 @@ class FoxgloveTransport:
             return self._publishers[topic]
 
     def close(self) -> None:
-        """Stop serving. May be called twice."""
+        """Stop the server. May be called twice."""
         server, self._server = self._server, None
         if server is not None:
             for channel in self._publishers.values():
@@ -87,16 +87,16 @@ class FoxgloveTransport:
             server.stop()
 
     def repeat(self, topic: str) -> None:
-        """Send the last message of a latched topic again, to who subscribed late."""
+        """Repeat the last message of a latched topic for a late subscriber."""
         channel = self._publishers.get(topic)
         if channel is not None:
             channel.repeat()
 
     def hear(self, topic: str, encoding: str, data: bytes) -> None:
-        """Deliver what a panel published."""
+        """Deliver a panel's message to its subscriber."""
         msgtype, heard = self._heard.get(topic, ("", None))
         if heard is None:
-            _log.warning("Foxglove published on %s, which nobody hears", topic)
+            _log.warning("Foxglove published on %s, which has no subscriber", topic)
             return
         try:
             cdr = data if encoding == "cdr" else self._cdr(msgtype, json.loads(data)["data"])
@@ -126,18 +126,18 @@ class FoxgloveTransport:
             return b"\x00\x01\x00\x00" + bytes([value])
         if msgtype == "std_msgs/msg/String" and isinstance(value, str):
             return self._encoder.text(value)
-        raise TypeError(f"{msgtype} is not to be made of {value!r}")
+        raise TypeError(f"{msgtype} cannot be made of {value!r}")
 
 
 class _Channel:
-    """Sends on one channel."""
+    """Publishes on one channel."""
 
     def __init__(self, channel: Any, *, is_latched: bool) -> None:
         self._channel, self._is_latched = channel, is_latched
         self._last: bytes | None = None
 
     def publish(self, cdr: bytes) -> None:
-        """Send to all panels that subscribed."""
+        """Send a message to all subscribed panels."""
         if self._is_latched:
             self._last = cdr
         channel = self._channel
@@ -145,19 +145,19 @@ class _Channel:
             channel.log(cdr)
 
     def repeat(self) -> None:
-        """Send what is latched once more."""
+        """Repeat the last message of a latched channel."""
         if self._last is not None and self._channel is not None:
             self._channel.log(self._last)
 
     def close(self) -> None:
-        """Send nothing any more."""
+        """Close the channel."""
         channel, self._channel = self._channel, None
         if channel is not None:
             channel.close()
 
 
 class _Listener:
-    """What the server's threads call."""
+    """Callbacks of the server's threads."""
 
     def __init__(self, transport: FoxgloveTransport) -> None:
         self._transport = transport

@@ -1,4 +1,4 @@
-"""ROS 2 topics through rclpy, where a ROS of this Python is installed: any vendor, any release."""
+"""ROS 2 topics through rclpy, for any DDS vendor, if a ROS for this Python is installed."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ _SPIN_S = 0.1
 
 
 class RclpyTransport:
-    """A node `sceneslam`; messages stay serialised (raw subscriptions)."""
+    """The node `sceneslam`; messages are not deserialised (raw subscriptions)."""
 
     def __init__(self, network: Network) -> None:
-        if network.reach() == LOCALHOST:  # rclpy takes it from nowhere else
+        if network.reach() == LOCALHOST:  # rclpy reads it from the environment only
             os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         self._context = Context()
         rclpy.init(context=self._context, domain_id=network.domain())
@@ -58,7 +58,7 @@ class RclpyTransport:
         return found
 
     def subscribe(self, topic: str, msgtype: str, heard: Heard, qos: Qos = Qos.SENSOR) -> None:
-        """Deliver the topic's messages to `heard`, in the node's thread."""
+        """Call `heard` for each message of the topic, in the node's thread."""
 
         def deliver(cdr: bytes) -> None:
             if self._is_closed:
@@ -66,7 +66,7 @@ class RclpyTransport:
             try:
                 heard(Arrival(topic=topic, cdr=bytes(cdr), arrived_ns=monotonic_ns()))
             except Exception as error:
-                _log.warning("a message of %s could not be taken: %s", topic, told(error))
+                _log.warning("a message of %s could not be processed: %s", topic, told(error))
 
         self.unsubscribe(topic)
         self._subscriptions[topic] = self._node.create_subscription(
@@ -108,7 +108,7 @@ class _Publisher:
         self._publisher = publisher
 
     def publish(self, cdr: bytes) -> None:
-        """Send bytes as they are."""
+        """Publish a serialised message."""
         self._publisher.publish(cdr)
 
 

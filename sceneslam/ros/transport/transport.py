@@ -1,4 +1,4 @@
-"""What a ROS 2 transport does, and how one is opened."""
+"""The interface of ROS 2 transports, and their factory."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from sceneslam.types.errors import ConfigError, told
 
 DDS, RCLPY = "dds", "rclpy"
 LOCALHOST, SUBNET = "localhost", "subnet"
-_DOMAIN_MAX = 232  # the DDS port numbers end there
+_DOMAIN_MAX = 232  # largest id for which DDS has port numbers
 
 
 class Qos(Enum):
-    """How messages are kept and sent, by ROS 2's names for it."""
+    """Quality of service profiles, named as in ROS 2."""
 
     SENSOR = "sensor data: best effort, the last few"
     RELIABLE = "reliable, the last ten"
@@ -29,15 +29,15 @@ DEPTHS = {Qos.SENSOR: 5, Qos.RELIABLE: 10, Qos.LATCHED: 1, Qos.HISTORY: 100}  # 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arrival:
-    """One message as it came."""
+    """A received message."""
 
     topic: str
-    cdr: bytes  # with its four bytes of header
+    cdr: bytes  # with its header of four bytes
     arrived_ns: int  # CLOCK_MONOTONIC
 
     @property
     def size(self) -> int:
-        """Return the message's bytes."""
+        """Return the message's size [bytes]."""
         return len(self.cdr)
 
 
@@ -55,34 +55,34 @@ class Publisher(Protocol):
 class Transport(Protocol):
     """A participant of a ROS 2 domain. All methods may be called from any thread.
 
-    Topics are named as in ROS (`/scan`), types as `sensor_msgs/msg/LaserScan`. What a callback
-    raises ends nothing: it is logged, and the next message is delivered.
+    Topics are named as in ROS (`/scan`), types as `sensor_msgs/msg/LaserScan`. An exception of a
+    callback is logged, and the next message is delivered.
     """
 
     def topics(self) -> Mapping[str, str]:
-        """Return the type of every topic that another participant publishes, as known by now."""
+        """Return the type of every topic that another participant is known to publish."""
         ...
 
     def subscribe(self, topic: str, msgtype: str, heard: Heard, qos: Qos = Qos.SENSOR) -> None:
-        """Call `heard` for every message from now on, in a thread of the transport's own."""
+        """Call `heard` for every message from now on, in the transport's thread."""
         ...
 
     def unsubscribe(self, topic: str) -> None:
-        """Call nobody any more for a topic; also where nobody was called."""
+        """End the subscription of a topic, if there is one."""
         ...
 
     def publisher(self, topic: str, msgtype: str, qos: Qos = Qos.RELIABLE) -> Publisher:
-        """Return what sends on a topic; the same one for the same topic."""
+        """Return the publisher of a topic; the same one for the same topic."""
         ...
 
     def close(self) -> None:
-        """Leave the domain; no callback runs afterwards. May be called twice."""
+        """Leave the domain; no callback is called afterwards. May be called twice."""
         ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Network:
-    """Which participants are talked to."""
+    """Domain and discovery range."""
 
     transport: str = DDS
     domain_id: int | None = None  # None: ROS_DOMAIN_ID, else 0
@@ -97,7 +97,7 @@ class Network:
             raise ConfigError("discovery", self.discovery, f"null, {LOCALHOST} or {SUBNET}")
 
     def domain(self) -> int:
-        """Return the domain's number; raises ConfigError where ROS_DOMAIN_ID is none."""
+        """Return the domain id; raises ConfigError if ROS_DOMAIN_ID is invalid."""
         if self.domain_id is not None:
             return self.domain_id
         text = os.environ.get("ROS_DOMAIN_ID") or "0"
@@ -106,7 +106,7 @@ class Network:
         return int(text)
 
     def reach(self) -> str:
-        """Return `localhost` or `subnet`; this machine alone where nobody asks for more."""
+        """Return the discovery range, `localhost` (the default) or `subnet`."""
         if self.discovery is not None:
             return self.discovery
         text = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", LOCALHOST).lower()
@@ -116,7 +116,7 @@ class Network:
 def open_transport(network: Network) -> Transport:
     """Join the domain.
 
-    Raises ConfigError where the library is missing or the domain cannot be joined.
+    Raises ConfigError if the library is missing or the domain cannot be joined.
     """
     try:
         if network.transport == RCLPY:

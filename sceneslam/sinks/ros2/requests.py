@@ -1,4 +1,4 @@
-"""What operators ask for over ROS 2 topics, since services differ between DDS vendors."""
+"""Operators' requests over ROS 2 topics (services are not compatible between DDS vendors)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _TYPES = {
 
 
 class Requests:
-    """Collects requests from the network's thread for the run's."""
+    """Passes requests from the network's thread to the run's."""
 
     def __init__(self, transport: Transport, *, map_frame: str) -> None:
         self._map_frame = map_frame
@@ -52,19 +52,19 @@ class Requests:
             transport.subscribe(topic, kind, self._take, Qos.RELIABLE)
 
     def commands(self) -> Sequence[Command]:
-        """Return what was asked of the run since the last call."""
+        """Return the commands received since the last call."""
         with self._lock:
             asked, self._commands = self._commands, []
             return asked
 
     def maps(self) -> Sequence[str]:
-        """Return the names under which the map was asked for since the last call."""
+        """Return the requested names of saved maps since the last call."""
         with self._lock:
             asked, self._names = self._names, []
             return asked
 
     def placed(self) -> Transform | None:
-        """Return where the robot was said to be (T_frame_base) since the last call, else None."""
+        """Return T_frame_base (4, 4) [m] of a new `/initialpose`, None without."""
         with self._lock:
             asked, self._T_frame_base = self._T_frame_base, None
             return asked
@@ -72,14 +72,14 @@ class Requests:
     def _take(self, arrival: Arrival) -> None:
         message = self._decoder.decode(arrival.topic, arrival.cdr)
         if message is None:
-            _log.warning("a message of %s makes no sense", arrival.topic)
+            _log.warning("a message of %s is invalid", arrival.topic)
             return
         self._takers[arrival.topic](message)
 
     def _place(self, message: Any) -> None:
         frame = decode.frame_id(message)
         if frame != self._map_frame:
-            _log.warning("%s in %r: wanted in %r", INITIAL_POSE, frame, self._map_frame)
+            _log.warning("%s in frame %r: expected frame %r", INITIAL_POSE, frame, self._map_frame)
             return
         pose = message.pose.pose
         with self._lock:

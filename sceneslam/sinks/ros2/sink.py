@@ -1,4 +1,4 @@
-"""A run for the robot that it runs on, over the network that the robot's own topics use."""
+"""The sink that publishes a run to a robot's ROS 2 network."""
 
 from __future__ import annotations
 

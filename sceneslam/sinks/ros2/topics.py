@@ -1,4 +1,4 @@
-"""A run as ROS 2 topics: map -> odom, path, map, scene, module, health; whatever carries them."""
+"""A run as ROS 2 topics, for any transport: map -> odom, path, map, scene, module, health."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ TYPES = {
     MODULE: ("std_msgs/msg/String", Qos.LATCHED),
     DIAGNOSTICS: ("diagnostic_msgs/msg/DiagnosticArray", Qos.RELIABLE),
 }
-_SLOW_NS = 1_000_000_000  # between two paths, and two diagnostics
-_PATH_POSES = 2000  # at most; beyond, every second one is left out
+_SLOW_NS = 1_000_000_000  # period of path and diagnostics
+_PATH_POSES = 2000  # largest number; beyond, every second one is left out
 _LEVELS = {"tracking": OK, "degraded": WARN}
 
 
 class TopicSink:
     """Publishes poses as they are reported, and the map every `map_every_s`.
 
-    `map -> odom` as REP-105 wants it: the robot's own `odom -> base_link` is not touched. Where the
-    source has no odometry, `map -> base_link`. The transform is stamped `tf_ahead_s` ahead, so that
-    who looks it up in between need not wait. `/initialpose` moves `map` to where the robot was said
-    to be; it does not look for the robot in an older map.
+    `map -> odom` follows REP-105: the robot publishes `odom -> base_link`. If the source has no
+    odometry, `map -> base_link` is published. The stamp is `tf_ahead_s` ahead, so that look-ups
+    between two poses do not wait. `/initialpose` moves `map` so that the robot has the given pose;
+    it does not relocalize the robot in an older map.
     """
 
     def __init__(
@@ -78,25 +78,25 @@ class TopicSink:
         self._transport: Transport | None = None
 
     def open(self, rig: Rig, folder: Path) -> None:
-        """Begin to publish."""
+        """Start publishing."""
         self._transport = self._join()
         for topic, (msgtype, qos) in TYPES.items():
             self._transport.publisher(topic, msgtype, qos)
         self._requests = Requests(self._transport, map_frame=self._map_frame)
         self._T_frame_map = se3.identity()
         self._T_smooth_odom = se3.identity()
-        self._shift_ns = 0  # of the run's stamps against the robot's
+        self._shift_ns = 0  # offset of the run's stamps to the robot's
         self._covariance: NDArray[np.float64] | None = None
         self._stamps_ns: list[int] = []
         self._poses: list[Transform] = []  # T_map_base
-        self._path_step = 1  # of the poses, so many make one of the path
+        self._path_step = 1  # every so many poses, one is in the path
         self._count, self._slow_ns = 0, -_SLOW_NS
         self._said = dict.fromkeys((SCENE, MODULE), "")
         self._status, self._reason = "", ""
         self._live_map.open(rig)
 
     def commands(self) -> Sequence[Command]:
-        """Return what operators asked for."""
+        """Return the operators' commands since the last call."""
         if self._transport is None:
             return ()
         saves = [
@@ -105,11 +105,11 @@ class TopicSink:
         return [*self._requests.commands(), *saves]
 
     def write_covariance(self, stamp_ns: int, covariance: NDArray[np.float64]) -> None:
-        """Take the covariance of the next pose."""
+        """Set the covariance (6, 6) of the next pose, of se3.log order [m, rad], in base."""
         self._covariance = covariance
 
     def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
-        """Publish a pose and, now and then, path and health."""
+        """Publish a pose and, once per second, path and diagnostics."""
         stamp_ns = observation.stamp_ns - self._shift_ns
         covariance, self._covariance = self._covariance, None
         if T_map_base is not None:
@@ -129,7 +129,7 @@ class TopicSink:
             self._send_health(stamp_ns, module)
 
     def write_event(self, event: Event) -> None:
-        """Take what changes what is published."""
+        """Publish scene and module when they change."""
         kind = event["event"]
         if kind == "scene":
             self._say(SCENE, str(event["scene"]))
@@ -143,10 +143,10 @@ class TopicSink:
             self._T_smooth_odom = np.reshape(event["T_smooth_odom"], (4, 4))
 
     def write_truth(self, truth: GroundTruth) -> None:
-        """Take nothing: a robot has none."""
+        """Do nothing: a robot has no ground truth."""
 
     def write_result(self, result: RunResult) -> None:
-        """Publish path and map as they are known at the end."""
+        """Publish the revised path and the final map."""
         trajectory = result.trajectory
         self._stamps_ns = (trajectory.stamps_ns - self._shift_ns).tolist()
         self._poses = list(trajectory.T_world_base)
@@ -162,7 +162,7 @@ class TopicSink:
             self._transport = None
 
     def _place(self, T_map_base: Transform) -> None:
-        """Move the published map so that the robot is where it was said to be."""
+        """Move the published `map` so that the robot has the pose of `/initialpose`."""
         T_frame_base = self._requests.placed()
         if T_frame_base is not None:
             self._T_frame_map = T_frame_base @ se3.inverse(T_map_base)
@@ -211,7 +211,7 @@ class TopicSink:
             self.send(POINTS, self.encoder.cloud(stamp_ns, hybrid.points, T_frame_map, frame))
 
     def _say(self, topic: str, text: str) -> None:
-        """Publish a word where it is another than before."""
+        """Publish a text if it has changed."""
         if text != self._said[topic]:
             self._said[topic] = text
             self.send(topic, self.encoder.text(text))

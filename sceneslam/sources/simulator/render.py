@@ -41,9 +41,7 @@ def work() -> None:
     """Render the frames that standard input lists, and write them to standard output."""
     cv2.setNumThreads(1)
     with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as output:
-        os.dup2(
-            sys.stderr.fileno(), sys.stdout.fileno()
-        )  # for output of libraries
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # for output of libraries
         shot, share = pickle.load(sys.stdin.buffer)
         photographer = Photographer(shot)
         for index in share:

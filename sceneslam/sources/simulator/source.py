@@ -44,10 +44,10 @@ _LIGHTS = ("story", "on", "off")
 class Simulator:
     """Renders a story once to a cached MCAP file, and gives the observations of that file.
 
-    `lights` keeps the rooms' lamps on or off, against the story; `laser` switches the
-    scanner on, `wheels` the encoders; `order` is a seed for the order of the building's rooms;
-    `duration_s` ends the story early. The same arguments give the same bytes, with
-    any number of `workers` (processes; null: one per core).
+    `lights` keeps the rooms' lamps on or off, against the story; `laser` switches the scanner on,
+    `wheels` the encoders; `order` is a seed for the order of the building's rooms; `duration_s`
+    ends the story early. The same arguments give the same bytes, with any number of `workers`
+    (processes; null: one per core).
     """
 
     def __init__(

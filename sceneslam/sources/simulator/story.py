@@ -10,9 +10,7 @@ import numpy as np
 from sceneslam.sources.simulator.places.place import NIGHT, SUN
 from sceneslam.sources.simulator.robot.motion import Move
 
-Knots = tuple[
-    tuple[float, float], ...
-]  # (time [s], level 0..1), linear between
+Knots = tuple[tuple[float, float], ...]  # (time [s], level 0..1), linear between
 
 OFF: Knots = ((0.0, 0.0),)
 

@@ -1,7 +1,7 @@
 """Checks before a run: one line per sensor, and warnings of implausible values.
 
-The limits follow from the sensors' physics. They need not be exact, as a wrong unit causes an
-error of a factor of five or more.
+The limits follow from the sensors' physics. They need not be exact, as a wrong unit causes an error
+of a factor of five or more.
 """
 
 from __future__ import annotations

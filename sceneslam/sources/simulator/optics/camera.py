@@ -1,7 +1,7 @@
 """Noise-free camera images of a place: colour, depth and the surfaces' angles of incidence.
 
-Ray casting finds the panel that a pixel shows: on a coarse grid, and between grid nodes that
-show different panels. Depth and texture coordinates then follow exactly from the panel's plane.
+Ray casting finds the panel that a pixel shows: on a coarse grid, and between grid nodes that show
+different panels. Depth and texture coordinates then follow exactly from the panel's plane.
 """
 
 from __future__ import annotations

@@ -30,8 +30,8 @@ def follow(
 ) -> NDArray[np.float64]:
     """Return the exposure (N,), time ratio x gain, of each frame.
 
-    `greys` are the frames' grey values at nominal exposure, without saturation. Each
-    frame corrects the next one's exposure towards the target mean with the time constant `lag_s`.
+    `greys` are the frames' grey values at nominal exposure, without saturation. Each frame corrects
+    the next one's exposure towards the target mean with the time constant `lag_s`.
     """
     if not settings.is_automatic:
         return np.ones(len(greys))

@@ -1,7 +1,7 @@
 """Sensor noise of cameras: shot noise, read noise, and noise and missing pixels of Kinect depth.
 
-Axial depth noise: C. V. Nguyen, S. Izadi, D. Lovell, "Modeling Kinect Sensor Noise for Improved
-3D Reconstruction and Tracking", 3DIMPVT 2012.
+Axial depth noise: C. V. Nguyen, S. Izadi, D. Lovell, "Modeling Kinect Sensor Noise for Improved 3D
+Reconstruction and Tracking", 3DIMPVT 2012.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A building: two rows of zones, connected by two long corridors to a ring.
 
-Frame gt: the office's west door is the origin; the first row runs east along y = 0, the second
-one back west along y = 20. For any order of the zones, a lobby makes the shorter row as long.
+Frame gt: the office's west door is the origin; the first row runs east along y = 0, the second one
+back west along y = 20. For any order of the zones, a lobby makes the shorter row as long.
 """
 
 from __future__ import annotations
