@@ -137,7 +137,7 @@ def test_message_of_no_sense_is_left_out(sink, client, caplog):
     client.publish("/sceneslam/pause", "std_msgs/msg/Bool", {"data": "yes"})
     client.publish("/sceneslam/select_scene", "std_msgs/msg/String", {"data": "Bright"})
     assert until_asked(sink) == [SelectScene(scene="Bright")]
-    assert "is not to be made of 'yes'" in caplog.text
+    assert "cannot be made of 'yes'" in caplog.text
 
 
 def test_port_in_use_and_impossible_settings_are_refused(sink, tmp_path):

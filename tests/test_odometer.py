@@ -90,7 +90,7 @@ def test_odometry_that_is_no_pose_is_left_out():
     for T_odom_base in (np.zeros((4, 4)), np.eye(4)[:3], np.diag([1.0, 1.0, -1.0, 1.0])):
         ordered = Ordered(Listed([replace(good, T_odom_base=T_odom_base)]))
         assert [found.T_odom_base for found in ordered] == [None]
-        assert ordered.faults[0].startswith("odometry that is no pose")
+        assert ordered.faults[0].startswith("odometry is not a valid pose")
 
 
 def test_rotation_that_was_rounded_on_its_way_is_one_again():

@@ -106,7 +106,7 @@ def test_callback_that_fails_is_logged_and_the_next_message_comes(caplog):
         receiver.subscribe("/scan", STRING, heard, Qos.RELIABLE)
         publisher = sender.publisher("/scan", STRING)
         until(lambda: publisher.publish(CDR) or len(inbox.arrivals) > 1)
-        assert "a message of /scan could not be taken: ValueError: of no use" in caplog.text
+        assert "a message of /scan could not be processed: ValueError: of no use" in caplog.text
 
 
 def test_nothing_is_left_of_a_transport_that_was_closed():

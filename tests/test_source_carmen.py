@@ -105,7 +105,7 @@ def test_a_cut_off_line_is_passed_over_and_told(tmp_path: Path) -> None:
     path = write(tmp_path / "a.log", whole, whole[:200], flaser([2.0] * 180, "3.0"))
     source = make_source("carmen", path)
     assert [one.stamp_ns for one in source] == [10**9, 3 * 10**9]
-    assert any("makes no sense: 1 time" in fault for fault in source.faults)
+    assert any("is invalid: 1 time" in fault for fault in source.faults)
 
 
 def test_scans_come_in_the_order_of_their_stamps_and_keep_them(tmp_path: Path) -> None:
