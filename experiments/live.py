@@ -6,8 +6,9 @@
 
 Every 10 s a line: memory of the run and of the processes that it started (resident), threads and
 open files of the run. At the end the latency from an image's stamp to its pose (p50, p99), dropped
-images, switches, and by how much memory grew per hour over the second half. Other words are
-overrides of the run. Latency says something on an idle machine alone.
+images, switches, the ten slowest poses with what their time went to, and by how much memory grew
+per hour over the second half. Other words are overrides of the run. Latency says something on an
+idle machine alone.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -118,15 +120,15 @@ def children(pid: int) -> Iterator[int]:
             yield from children(int(child))
 
 
-def show(samples: list[Sample], metrics: dict[str, object]) -> None:
+def show(samples: list[Sample], metrics: dict[str, Any]) -> None:
     """Print what the whole run cost."""
     latency = metrics["latency_ms"]
-    assert isinstance(latency, dict)
     print(f"stamp to pose: p50 {latency['p50']:.0f} ms, p99 {latency['p99']:.0f} ms")
     taken, dropped = metrics["observations"], metrics["dropped_images"]
-    switches = metrics["switches"]
-    assert isinstance(switches, list)
-    print(f"{taken} observations, {dropped} images dropped, {len(switches)} switches")
+    switches = len(metrics["switches"])
+    print(f"{taken} observations, {dropped} images dropped, {switches} switches")
+    for slow in metrics["slowest"]:
+        print(f"  {_why(slow, metrics['start_ns'])}")
     late = samples[len(samples) // 2 :]
     if len(late) > 2:
         hours = np.array([one.at_s for one in late]) / 3600
@@ -134,6 +136,17 @@ def show(samples: list[Sample], metrics: dict[str, object]) -> None:
         print(f"memory over the second half: {np.polyfit(hours, total_mb, 1)[0]:+.0f} MB per hour")
         threads, files = {one.threads for one in late}, {one.files for one in late}
         print(f"threads {min(threads)} to {max(threads)}, files {min(files)} to {max(files)}")
+
+
+def _why(slow: dict[str, Any], start_ns: int) -> str:
+    """Return a slow pose's line: when, how long, and the parts above a tenth of that."""
+    parts = sorted(slow["parts_ms"].items(), key=lambda part: -part[1])
+    shown = [f"{name} {ms:.0f}" for name, ms in parts if ms > 0.1 * slow["latency_ms"]]
+    beside = f"; beside it: {', '.join(slow['beside'])}" if slow["beside"] else ""
+    return (
+        f"{(slow['stamp_ns'] - start_ns) / 1e9:7.2f} s  {slow['latency_ms']:4.0f} ms: "
+        f"{', '.join(shown)} ms (computing {slow['cpu_ms']:.0f} ms){beside}"
+    )
 
 
 if __name__ == "__main__":

@@ -77,7 +77,7 @@ def follow(
     **changes,
 ) -> Run:
     """Run the module over observations, of which one comes every period at most."""
-    settings = yaml.safe_load(CONF.read_text()) | {"seed": 0} | changes
+    settings = yaml.safe_load(CONF.read_text()) | {"seed": 0, "is_repeatable": True} | changes
     del settings["_target_"]
     module = RgbdSlam(**settings)
     module.activate(rig)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import sys
+from array import array
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
@@ -20,7 +21,8 @@ from sceneslam.bus.bus import Bus
 from sceneslam.bus.handover_log import log_uncertainty
 from sceneslam.config.build import RunParts
 from sceneslam.config.settings import LIVE
-from sceneslam.engine.live import LiveTally, run_live
+from sceneslam.engine.live import LiveTally, Spent, run_live
+from sceneslam.engine.slowest import Stopwatch
 from sceneslam.engine.steering import Operator, SteeredDetector
 from sceneslam.interfaces import CovarianceSink, Live, LiveFeed, ResultSink, Sink, Steering
 from sceneslam.keeping import Keeping
@@ -58,8 +60,8 @@ class RunLoop:
         self._log = self._keeping.events
         self._events_written = 0
         self._moments, self._events_seen = Moments(), 0
-        self._observed_ns: list[int] = []
-        self._live = LiveTally()
+        self._observed_ns = array("q")
+        self._live, self._watch = LiveTally(), Stopwatch()
         self._covariances = np.zeros((0, 6, 6))
         self._began_s, self._wall_s = perf_counter(), 0.0
         detector = SteeredDetector(parts.detector)
@@ -163,6 +165,7 @@ class RunLoop:
                 module_ms={key: np.array(runner.track_ms) for key, runner in bus.runners.items()},
                 wall_s=self._wall_s,
                 latency_ms=np.array(self._live.latencies_ms),
+                slowest=self._live.slowest.poses,
             ),
         )
 
@@ -221,6 +224,7 @@ class RunLoop:
                 settings=self._parts.run.live,
                 feed=feed,
                 tally=self._live,
+                spent=self._spent,
             )
         finally:
             images = self._live.dropped_images
@@ -246,11 +250,16 @@ class RunLoop:
 
     def _step(self, observation: Observation) -> bool:
         """Feed one observation; return whether the run goes on."""
+        watch = self._watch
+        watch.restart()
         self._steer(observation.stamp_ns)
+        watch.lap("operator")
         if self._operator.is_paused:
             return True
         self._bus.step(observation)
+        watch.lap("bus")
         self._parts.atlas.observe(observation)
+        watch.lap("atlas")
         self._observed_ns.append(observation.stamp_ns)
         events = self._log.since(self._events_seen)
         self._events_seen += len(events)
@@ -258,10 +267,22 @@ class RunLoop:
         module = self._parts.modules.get(self._bus.active)
         self._tally.add(observation, () if module is None else module.requires)
         self._keeping.keep(observation.stamp_ns)
+        watch.lap("files")
         if self._sinks:
             self._write(observation)
+        watch.lap("sinks")
         self._bar.update()
         return self._bus.state != "terminate"
+
+    def _spent(self) -> Spent:
+        """Return what the last step's time went to."""
+        parts_ms, bus = dict(self._watch.parts_ms), self._bus
+        if "bus" not in parts_ms:  # the run is paused
+            return Spent(parts_ms=parts_ms)
+        own_ms = {"detector": bus.detector_us[-1] / 1e3, "bus": bus.bus_us[-1] / 1e3}
+        modules = f"modules ({bus.active or 'none'}, {bus.state})"
+        parts_ms[modules] = parts_ms["bus"] - sum(own_ms.values())
+        return Spent(parts_ms={**parts_ms, **own_ms}, cpu_ms=self._watch.cpu_ms, beside=bus.beside)
 
     def _steer(self, stamp_ns: int) -> None:
         """Do what operators asked since the last observation."""

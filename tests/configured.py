@@ -63,6 +63,7 @@ CONFIG = {
         "rate": 1.0,
         "silent_after_s": 1.0,
         "end_after_s": None,
+        "is_repeatable": True,
         "catch_up_steps": None,
     },
     "allow_targets": ["fakes"],

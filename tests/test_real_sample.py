@@ -47,7 +47,7 @@ def tracked(module, source):
 
 @pytest.mark.parametrize(
     ("name", "changes", "limit_m", "limit_rad"),
-    [("rgbd", {"seed": 0}, 0.032, 0.047), ("depth", {}, 0.040, 0.066)],
+    [("rgbd", {"seed": 0, "is_repeatable": True}, 0.032, 0.047), ("depth", {}, 0.040, 0.066)],
 )
 def test_a_kinect_held_by_hand_is_tracked(name, changes, limit_m, limit_rad):
     source = make_source("tum_rgbd", TUM, camera=KINECT)

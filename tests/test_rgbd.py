@@ -33,7 +33,7 @@ RGBD = frozenset({Sensor.IMAGE, Sensor.DEPTH})
 def make(rig=RIG, **changes):
     settings = yaml.safe_load(CONFIG.read_text())
     del settings["_target_"]
-    module = RgbdSlam(**settings | {"seed": 0} | changes)
+    module = RgbdSlam(**settings | {"seed": 0, "is_repeatable": True} | changes)
     module.activate(rig)
     return module
 

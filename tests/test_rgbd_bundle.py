@@ -1,5 +1,6 @@
 """How the rgbd module adjusts keyframes and landmarks together, beside the tracking."""
 
+from concurrent.futures import Future
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,6 +13,7 @@ from sceneslam.modules.slam.rgbd.bundle import Bundle, adjust
 from sceneslam.modules.slam.rgbd.fusion import join_duplicates
 from sceneslam.modules.slam.rgbd.keyframes import NO_LANDMARK, DepthView, Keyframe
 from sceneslam.modules.slam.rgbd.local_mapping import LocalMapping
+from sceneslam.modules.slam.rgbd.mapping_work import MappingWork
 from sceneslam.modules.slam.rgbd.residuals import Sightings, errors
 from sceneslam.modules.slam.rgbd.ties import Tie, Ties
 from sceneslam.types import se3
@@ -161,7 +163,7 @@ def test_merge_comes_at_a_fixed_image_and_moves_what_is_newer_along():
     T_true = visual_map.keyframes[4].T_local_base
     slip = se3.exp(np.array([0.03, 0, 0, 0, 0, 0]))
     visual_map.keyframes[4].T_local_base = slip @ T_true
-    mapping = LocalMapping(CAMERA, visual_map, alignment=Alignment())
+    mapping = LocalMapping(CAMERA, visual_map, alignment=Alignment(), is_repeatable=True)
     moved = [mapping.step() for _ in range(9)]  # begins at the fifth
     assert (np.stack(moved) == np.eye(4)).all()
     newer = keyframe_at(
@@ -181,10 +183,25 @@ def test_merge_comes_at_a_fixed_image_and_moves_what_is_newer_along():
     assert np.abs(shared - points).max() < 0.02
 
 
+def test_live_merge_is_put_off_until_the_worker_is_done(monkeypatch):
+    visual_map, _ = mapped(np.random.default_rng(4), is_matched=True)
+    T_true = visual_map.keyframes[4].T_local_base
+    visual_map.keyframes[4].T_local_base = se3.exp(np.array([0.03, 0, 0, 0, 0, 0])) @ T_true
+    mapping = LocalMapping(CAMERA, visual_map, alignment=Alignment(), is_repeatable=False)
+    asked, outcome = [], Future()
+    worker = SimpleNamespace(submit=lambda task: asked.append(task) or outcome, end=lambda: None)
+    monkeypatch.setattr(mapping, "_process", lambda: worker)
+    moved = [mapping.step() for _ in range(40)]  # it begins at the fifth
+    assert (np.stack(moved) == np.eye(4)).all() and len(asked) == 1
+    outcome.set_result(MappingWork(CAMERA, CAMERA, Alignment())(asked[0]))
+    mapping.step()
+    assert visual_map.keyframes[4].T_local_base == pytest.approx(T_true, abs=2e-3)
+
+
 def test_keyframes_with_depth_give_the_worker_twice_the_images():
     visual_map, _ = mapped(np.random.default_rng(6), is_matched=True)
     visual_map.keyframes[4].T_local_base = se3.from_xy_yaw(0.03, 0.0, 0.0)
-    mapping = LocalMapping(CAMERA, visual_map, alignment=Alignment())
+    mapping = LocalMapping(CAMERA, visual_map, alignment=Alignment(), is_repeatable=True)
     frame = np.full(CAMERA.size_wh[::-1], np.nan, np.float32)
     mapping.insert(4, SimpleNamespace(features=visual_map.keyframes[4].features, depth_m=frame))
     moved = [not np.array_equal(mapping.step(), np.eye(4)) for _ in range(15)]
@@ -194,7 +211,7 @@ def test_keyframes_with_depth_give_the_worker_twice_the_images():
 
 def test_map_that_was_corrected_meanwhile_stays_as_it_is():
     visual_map, _ = mapped(np.random.default_rng(5), is_matched=True)
-    mapping = LocalMapping(CAMERA, visual_map, alignment=Alignment())
+    mapping = LocalMapping(CAMERA, visual_map, alignment=Alignment(), is_repeatable=True)
     for _ in range(5):
         mapping.step()
     corrected = se3.from_xy_yaw(1.0, 0.0, 0.1)

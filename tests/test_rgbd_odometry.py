@@ -16,7 +16,9 @@ YAML = Path(__file__).parents[1] / "conf" / "slam" / "rgbd.yaml"
 
 def drive_away_in_the_dark(*, has_odometry):
     """See one wall, turn round in the dark, and see another; return the answers."""
-    config = OmegaConf.merge({"seed": 0}, {"node": OmegaConf.load(YAML)}).node
+    config = OmegaConf.merge(
+        {"seed": 0, "run": {"is_repeatable": True}}, {"node": OmegaConf.load(YAML)}
+    ).node
     module = instantiate(config, _convert_="all")
     module.activate(RIG)
     observations = [room_observation(index) for index in range(6)]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from contextlib import contextmanager
-from time import monotonic_ns
+from dataclasses import replace
+from time import monotonic_ns, time_ns
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from omegaconf import OmegaConf
 
 from sceneslam.ros import names
 from sceneslam.ros.encode import Encoder
-from sceneslam.ros.transport.transport import Arrival
+from sceneslam.ros.transport.transport import Arrival, Publication
 from sceneslam.sources.live.clock import StampClock, StampOrder
 from sceneslam.sources.live.inbox import Inbox
 from sceneslam.sources.ros2 import source as under_test
@@ -45,12 +46,16 @@ class Robot:
 
     def __init__(self, *topics):
         self.encoder, self._heard, self.is_closed = Encoder(), {}, False
+        self.mounts = {names.LASER: T_BASE_LASER, names.CAMERA: se3.identity()}
         self._topics = {topic: TYPES[topic] for topic in topics}
         for topic in topics:  # what serialises a type is made at its first message
             self._message(self.encoder, topic, 0)
 
-    def topics(self):
-        return self._topics
+    def publications(self):
+        return [
+            Publication(topic=topic, msgtype=kind, is_latched=topic == names.TF_STATIC)
+            for topic, kind in self._topics.items()
+        ]
 
     def subscribe(self, topic, msgtype, heard, qos=None):
         assert TYPES[topic] == msgtype
@@ -65,14 +70,17 @@ class Robot:
     def close(self):
         self.is_closed = True
 
-    def send(self, topic, cdr):
-        if topic in self._heard:
-            self._heard[topic](Arrival(topic=topic, cdr=cdr, arrived_ns=monotonic_ns()))
+    def send(self, topic, cdr, *, to=object, publisher=0, arrived_ns=None):
+        """Deliver a message, to a listener of the class `to` alone."""
+        listener = self._heard.get(topic)
+        if listener is not None and isinstance(listener.__self__, to):
+            came_ns = monotonic_ns() if arrived_ns is None else arrived_ns
+            listener(Arrival(topic=topic, cdr=cdr, arrived_ns=came_ns, publisher=publisher))
 
-    def measure(self, stamp_ns, *, without=()):
+    def measure(self, stamp_ns, *, without=(), **how):
         """Send what every topic would at one instant."""
         for topic in [one for one in self._topics if one not in without]:
-            self.send(topic, self._message(self.encoder, topic, stamp_ns))
+            self.send(topic, self._message(self.encoder, topic, stamp_ns), **how)
 
     def _message(self, encoder, topic, stamp_ns):
         if topic == "/odom":
@@ -86,7 +94,7 @@ class Robot:
         if topic == INFO:
             return encoder.camera_info(stamp_ns, CAMERA)
         if topic == names.TF_STATIC:
-            return encoder.transforms(stamp_ns, names.BASE, {names.LASER: T_BASE_LASER})
+            return encoder.transforms(stamp_ns, names.BASE, self.mounts)
         if topic == IMAGE:
             return encoder.image(stamp_ns, np.full((6, 8, 3), 7, np.uint8), "bgr8")
         return encoder.image(stamp_ns, np.full((6, 8, 1), 2000, np.uint16), "16UC1")
@@ -103,11 +111,15 @@ def scan(stamp_ns):
     )
 
 
-@pytest.fixture
-def make(monkeypatch):
+@pytest.fixture(scope="module")
+def config():
     with initialize_config_module("sceneslam.conf", version_base="1.3"):
-        config = OmegaConf.to_container(compose("source/ros2").source)
-    config.pop("_target_")
+        return OmegaConf.to_container(compose("source/ros2").source)
+
+
+@pytest.fixture
+def make(monkeypatch, config):
+    config = {key: value for key, value in config.items() if key != "_target_"}
     quick = {"listen_s": 0.05, "wait_s": 0.5, "silent_after_s": 0.3}
 
     def made(robot, **words):
@@ -120,12 +132,12 @@ def make(monkeypatch):
 
 @contextmanager
 def talking(robot):
-    """Measure every 10 ms while a source listens."""
+    """Measure every 10 ms while a source listens to what there is, and nothing once it follows."""
     is_over = threading.Event()
 
     def talk():
         while not is_over.wait(0.01):
-            robot.measure(monotonic_ns())
+            robot.measure(monotonic_ns(), to=under_test.LiveRecording)
 
     thread = threading.Thread(target=talk)
     thread.start()
@@ -208,6 +220,142 @@ def test_scan_takes_the_place_of_images_that_fall_silent(make):
     assert silent >= {IMAGE, DEPTH}
 
 
+def taken(source, count):
+    """Return so many observations, and end the source."""
+    observations = iter(source)
+    found = [next(observations) for _ in range(count)]
+    source.close()
+    return found
+
+
+def drive(robot, count, *, begin_ns=None, **words):
+    now_ns = monotonic_ns() if begin_ns is None else begin_ns
+    for index in range(count):
+        robot.measure(now_ns + index * 33 * MS, **words)
+    return now_ns
+
+
+def told(source, event):
+    return [one for one in source.notices() if one["event"] == event]
+
+
+def test_topic_of_two_types_is_read_as_the_one_that_serves_and_named(make):
+    robot = Robot(*ALL)
+    text = Publication(topic="/scan", msgtype="std_msgs/msg/String")
+    right = robot.publications()
+    robot.publications = lambda: [text, *right]
+    source = make(robot)
+    assert Sensor.SCAN in heard(source, robot).sensors
+    (odd,) = source.survey().odd
+    assert "/scan is published as std_msgs/msg/String too" in odd
+    drive(robot, 3)
+    taken(source, 1)
+    (event,) = told(source, "wrong_type")
+    assert event["topic"] == "/scan" and event["type"] == "std_msgs/msg/String"
+
+
+def test_usual_topic_of_another_type_is_named(make):
+    robot = Robot(IMAGE, INFO)
+    text = Publication(topic="/scan", msgtype="std_msgs/msg/String")
+    right = robot.publications()
+    robot.publications = lambda: [text, *right]
+    source = make(robot)
+    assert Sensor.SCAN not in heard(source, robot).sensors
+    assert any("/scan is std_msgs/msg/String" in one for one in source.survey().odd)
+
+
+def test_second_publisher_of_a_topic_is_named_and_not_mixed_in(make):
+    robot = Robot(*ALL)
+    source = make(robot)
+    heard(source, robot)
+    now_ns = drive(robot, 2)
+    other = robot.encoder.image(now_ns + 50 * MS, np.full((6, 8, 3), 99, np.uint8), "bgr8")
+    robot.send(IMAGE, other, publisher=5)
+    drive(robot, 3, begin_ns=now_ns + 66 * MS)
+    found = taken(source, 4)
+    assert {one.image_bgr[0, 0, 0] for one in found} == {7}
+    (event,) = told(source, "second_publisher")
+    assert event["topic"] == IMAGE
+
+
+def test_calibration_that_comes_late_is_waited_for(make):
+    robot = Robot(*ALL)
+    source = make(robot, wait_s=5.0)
+    robot._topics = {topic: kind for topic, kind in robot._topics.items() if topic != INFO}
+    timer = threading.Timer(0.5, lambda: robot._topics.update({INFO: TYPES[INFO]}))
+    timer.start()
+    assert heard(source, robot).camera.fx == CAMERA.fx
+    timer.join()
+
+
+def test_calibration_that_changes_is_named_and_the_run_goes_on(make):
+    robot = Robot(*ALL)
+    source = make(robot)
+    heard(source, robot)
+    drive(robot, 2)
+    robot.send(INFO, robot.encoder.camera_info(1, replace(CAMERA, fx=9.0)))
+    drive(robot, 3)
+    taken(source, 3)
+    (event,) = told(source, "camera_info_changed")
+    assert event["fx"] == 9.0
+
+
+def test_transforms_that_move_or_come_late_are_named(make):
+    robot = Robot(*ALL)
+    robot.mounts = {names.LASER: T_BASE_LASER}  # nobody says where the camera sits
+    source = make(robot)
+    heard(source, robot)
+    moved = {names.LASER: se3.identity(), names.CAMERA: se3.identity()}
+    robot.send(names.TF_STATIC, robot.encoder.transforms(1, names.BASE, moved))
+    source.close()
+    events = [(one["event"], one["frames"]) for one in source.notices()]
+    assert events == [("tf_late", [names.CAMERA]), ("tf_changed", [names.LASER])]
+
+
+@pytest.mark.parametrize(
+    ("picture", "encoding", "says"),
+    [
+        (np.zeros((12, 16, 3), np.uint8), "bgr8", "has 16x12 pixels"),
+        (np.zeros((6, 8, 3), np.uint8), "cmyk8", "image encoding: got 'cmyk8'"),
+    ],
+)
+def test_image_that_cannot_be_used_is_named_and_the_run_goes_on(make, picture, encoding, says):
+    robot = Robot(*ALL)
+    source = make(robot)
+    heard(source, robot)
+    now_ns = drive(robot, 2)
+    robot.send(IMAGE, robot.encoder.image(now_ns + 66 * MS, picture, encoding))
+    robot.measure(now_ns + 66 * MS, without=(IMAGE,))
+    drive(robot, 3, begin_ns=now_ns + 99 * MS)
+    assert any(one.stamp_ns > now_ns + 66 * MS for one in taken(source, 4))
+    (event,) = told(source, "left_out")
+    assert says in event["topic"]
+
+
+def test_damaged_message_is_named_and_the_run_goes_on(make):
+    robot = Robot(*ALL)
+    source = make(robot)
+    heard(source, robot)
+    now_ns = drive(robot, 2)
+    robot.send("/scan", b"\x00\x01\x00\x00broken")
+    drive(robot, 3, begin_ns=now_ns + 66 * MS)
+    taken(source, 4)
+    (event,) = told(source, "left_out")
+    assert "/scan" in event["topic"]
+
+
+def test_robot_that_stamps_nothing_is_followed_by_when_messages_come(make):
+    robot = Robot(IMAGE, DEPTH, INFO, "/odom")
+    source = make(robot)
+    heard(source, robot)
+    now_ns = monotonic_ns()
+    for index in range(5):
+        robot.measure(0, arrived_ns=now_ns + index * 33 * MS)
+    stamps_ns = [one.stamp_ns for one in taken(source, 3)]
+    assert stamps_ns == sorted(set(stamps_ns))
+    assert {one["topic"] for one in told(source, "unstamped")}
+
+
 def test_topic_that_is_named_and_not_heard_is_named_with_what_is_there(make):
     robot = Robot(IMAGE)
     source = make(robot, topics={"image": "/front/image"})
@@ -252,8 +400,8 @@ class TestClock:
         return [clock.line_up(topic, stamp, arrived) for topic, stamp, arrived in messages]
 
     def test_steady_clock_is_left_alone(self):
-        lined = self.lines(*[("/a", index * 33 * MS, S + index * 33 * MS) for index in range(9)])
-        assert [one.stamp_ns for one in lined] == [index * 33 * MS for index in range(9)]
+        lined = self.lines(*[("/a", S + index * 33 * MS, index * 33 * MS) for index in range(9)])
+        assert [one.stamp_ns for one in lined] == [S + index * 33 * MS for index in range(9)]
         assert {one.order for one in lined} == {StampOrder.RISING}
 
     @pytest.mark.parametrize("jump_ns", [-100 * S, 3600 * S])
@@ -270,7 +418,7 @@ class TestClock:
 
     def test_burst_after_a_stall_is_late_and_no_jump(self):
         lined = self.lines(
-            ("/a", 0, 0), ("/a", 33 * MS, 5 * S), ("/a", 66 * MS, 5 * S), ("/a", 5 * S, 5 * S + 1)
+            ("/a", 1, 0), ("/a", 33 * MS, 5 * S), ("/a", 66 * MS, 5 * S), ("/a", 5 * S, 5 * S + 1)
         )
         assert [one.order for one in lined] == [
             StampOrder.RISING,
@@ -294,9 +442,28 @@ class TestClock:
 
     def test_clocks_that_drift_apart_are_not_late(self):
         clock = StampClock()
-        for second in range(20_000):  # the robot's is slow by 100 ppm: 2 s in the end
+        for second in range(1, 20_000):  # the robot's is slow by 100 ppm: 2 s in the end
             lined = clock.line_up("/a", round(second * S * 0.9999), second * S)
         assert lined.order is StampOrder.RISING
+
+    def test_message_without_a_stamp_counts_as_measured_when_it_came(self):
+        lined = self.lines(
+            ("/a", 100 * S, 0),
+            ("/b", 0, 5 * MS),
+            ("/a", 100 * S + 33 * MS, 33 * MS),
+            ("/b", 0, 40 * MS),
+            ("/b", 0, 40 * MS),
+        )
+        told = [one.stamp_ns - 100 * S for one in lined]
+        assert told == [0, 5 * MS, 33 * MS, 40 * MS, 40 * MS + 1]
+        assert [one.order is StampOrder.UNSTAMPED for one in lined] == [False, True, False, True, True]
+
+    def test_robot_without_any_stamp_is_measured_by_this_machines_clock(self):
+        clock = StampClock()
+        arrived_ns = monotonic_ns()
+        lined = clock.line_up("/a", 0, arrived_ns)
+        assert abs(lined.stamp_ns - time_ns()) < S
+        assert clock.measured_ns(lined.stamp_ns) == arrived_ns
 
 
 def test_inbox_keeps_the_newest_of_each_topic():

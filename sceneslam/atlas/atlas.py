@@ -9,11 +9,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.atlas.budget import Budget
 from sceneslam.atlas.fusion import fuse
 from sceneslam.atlas.lasting.lasting_map import EXTEND, LastingMap
 from sceneslam.atlas.mapper import Mapper, Note
 from sceneslam.atlas.places.floor_plan import grid_of
-from sceneslam.atlas.pose_path import OpenSession, PosePath, trajectory_of
+from sceneslam.atlas.pose_path import OpenSession, PoseLog, PosePath, trajectory_of
 from sceneslam.atlas.revision import Revised, revise
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.submaps.own_loops import own_loops
@@ -41,16 +42,20 @@ class Atlas:
         save: str | None = None,
         mode: str = EXTEND,
         save_every_s: float = 60.0,
+        point_limit: int | None = None,
     ) -> None:
         if not 0 < voxel_m < float("inf"):
             raise ConfigError("voxel_m", voxel_m, "metres above 0")
+        if point_limit is not None and not point_limit >= 1:
+            raise ConfigError("point_limit", point_limit, "null (no limit), or 1 or more")
+        self._budget = None if point_limit is None else Budget(limit=point_limit, voxel_m=voxel_m)
         self._lasting = LastingMap(load=load, save=save, mode=mode, save_every_s=save_every_s)
         self._mapper: Mapper | None = None  # None while only poses are given
         self._note: Note | None = None
         self._correction: Correction | None = None
         self._voxel_m = voxel_m
         self._sessions: list[OpenSession] = []
-        self._online = PosePath()  # as reported at the time
+        self._online = PoseLog()  # as reported at the time
         self._path = PosePath()  # after corrections
         self._journal: TrajectoryLog | None = None
 
@@ -63,6 +68,8 @@ class Atlas:
         self._note = note
         loaded = self._lasting.loaded
         self._lasting.open(is_live=is_live)
+        if self._budget is not None:
+            self._budget.open(is_live=is_live)
         self._mapper = Mapper(
             rig, known=self._path.known_at, note=note, loaded=loaded, is_live=is_live
         )
@@ -82,6 +89,8 @@ class Atlas:
 
         Call it after the last session was closed.
         """
+        if self._budget is not None:
+            self._budget.close()
         if self._mapper is None or not self._path.stamps_ns:
             return self._lasting.faults
         try:
@@ -140,7 +149,7 @@ class Atlas:
         if self._journal is not None:
             self._journal.add_pose(stamp_ns, T_map_base, module, covariance)
         session = len(self._sessions) - 1
-        self._online.add(stamp_ns, self._in_map(T_map_base), module, session, covariance)
+        self._online.add(stamp_ns, self._in_map(T_map_base))
         self._path.add(stamp_ns, T_map_base, module, session, covariance)
 
     def rewind(self, stamp_ns: int) -> None:
@@ -157,6 +166,8 @@ class Atlas:
         if self._journal is not None:
             self._journal.add_end(session, revised)
         self._sessions[session].layers, self._sessions[session].revised = layers, revised
+        if self._budget is not None:
+            self._budget.keep(self._sessions)
 
     def pose_at(self, stamp_ns: int) -> Transform | None:
         """Return T_map_base (4, 4) at the newest stamp, None if it has no pose.
@@ -170,7 +181,8 @@ class Atlas:
     @property
     def last_covariance(self) -> Covariance | None:
         """Return the newest pose's (6, 6) covariance as its module reported it, else None."""
-        return self._path.covariances[-1] if self._path.covariances else None
+        rows = len(self._path.stamps_ns)
+        return self._path.covariance_at(rows - 1) if rows else None
 
     @property
     def last_stamp_ns(self) -> int | None:

@@ -36,7 +36,7 @@ def fuse(placed: Sequence[Placed], *, voxel_m: float) -> HybridMap:
         owners.append(np.full(len(layer.points), modules.index(module), np.uint8))
     cloud, color = np.concatenate(points), np.concatenate(colors)
     owner = np.concatenate([np.zeros(0, np.uint8), *owners])
-    keep = _one_per_voxel(cloud, owner, voxel_m)
+    keep = one_per_voxel(cloud, owner, voxel_m)
     graphs = [(n, T, m.pose_graph) for n, T, m in placed if m.pose_graph is not None]
     landmarks = [(n, T, m.landmarks) for n, T, m in placed if m.landmarks is not None]
     return HybridMap(
@@ -61,7 +61,7 @@ def _owners(
     return np.repeat(numbers, [count for _, count in counts])
 
 
-def _one_per_voxel(
+def one_per_voxel(
     points: NDArray[np.float32], owner: NDArray[np.uint8], voxel_m: float
 ) -> NDArray[np.intp]:
     """Return the indices of the first point of every (voxel, owner), in their old order."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,12 +10,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sceneslam.atlas.revision import Told
+from sceneslam.atlas.rows import Rows
 from sceneslam.atlas.submaps.collector import Known
 from sceneslam.atlas.uncertainty import Covariance, SessionPose
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.run import BRIDGED, SessionStart
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
+
+_UPPER = np.triu_indices(6)
+_NONE = np.full(len(_UPPER[0]), np.nan)  # no covariance was reported
 
 
 @dataclass(slots=True)
@@ -23,8 +28,8 @@ class OpenSession:
 
     module: str
     T_map_local: Transform
-    stamps_ns: list[int] = field(default_factory=list)
-    poses: list[Transform] = field(default_factory=list)  # T_local_base
+    stamps_ns: array[int] = field(default_factory=lambda: array("q"))
+    poses: Rows = field(default_factory=lambda: Rows(4, 4))  # T_local_base
     layers: MapLayers = field(default_factory=MapLayers)
     revised: Trajectory = field(default_factory=Trajectory.empty)  # T_local_base
 
@@ -38,14 +43,32 @@ class OpenSession:
 
 
 @dataclass(slots=True)
-class PosePath:
-    """Poses ordered by stamp."""
+class PoseLog:
+    """Poses ordered by stamp, as they were reported."""
 
-    stamps_ns: list[int] = field(default_factory=list)
-    poses: list[Transform] = field(default_factory=list)  # T_map_base
+    stamps_ns: array[int] = field(default_factory=lambda: array("q"))
+    poses: Rows = field(default_factory=lambda: Rows(4, 4))
+
+    def add(self, stamp_ns: int, T_map_base: Transform) -> None:
+        """Add a pose unless its stamp, or a later one, already has one."""
+        if not self.stamps_ns or stamp_ns > self.stamps_ns[-1]:
+            self.stamps_ns.append(stamp_ns)
+            self.poses.append(T_map_base)
+
+
+@dataclass(slots=True)
+class PosePath:
+    """Poses ordered by stamp, with who gave them; they may be cut and replaced."""
+
+    stamps_ns: array[int] = field(default_factory=lambda: array("q"))
+    poses: Rows = field(default_factory=lambda: Rows(4, 4))  # T_map_base
     modules: list[str] = field(default_factory=list)
-    sessions: list[int] = field(default_factory=list)  # the open session, -1 before the first
-    covariances: list[Covariance | None] = field(default_factory=list)  # as reported
+    sessions: array[int] = field(
+        default_factory=lambda: array("q")
+    )  # the open session, -1 before the first
+    _covariances: Rows = field(
+        default_factory=lambda: Rows(len(_NONE))
+    )  # as reported; NaN: not reported
 
     def add(
         self,
@@ -58,7 +81,7 @@ class PosePath:
         """Add a pose unless its stamp already has one."""
         if self.stamps_ns and stamp_ns <= self.stamps_ns[-1]:
             return
-        self.covariances.append(covariance)
+        self._covariances.append(_NONE if covariance is None else covariance[_UPPER])
         self.stamps_ns.append(stamp_ns)
         self.poses.append(T_map_base)
         self.modules.append(module)
@@ -67,14 +90,20 @@ class PosePath:
     def cut(self, stamp_ns: int) -> None:
         """Remove the poses from an instant on."""
         keep = bisect_left(self.stamps_ns, stamp_ns)
-        for values in (
-            self.stamps_ns,
-            self.poses,
-            self.modules,
-            self.sessions,
-            self.covariances,
-        ):
+        for values in (self.stamps_ns, self.modules, self.sessions):
             del values[keep:]
+        for rows in (self.poses, self._covariances):
+            rows.cut(keep)
+
+    def covariance_at(self, row: int) -> Covariance | None:
+        """Return the covariance (6, 6) that was reported with a pose, None without one."""
+        triangle = self._covariances[row]
+        if np.isnan(triangle[0]):
+            return None
+        covariance = np.empty((6, 6))
+        covariance[_UPPER] = triangle
+        covariance[_UPPER[::-1]] = triangle
+        return covariance
 
     def row_at(self, stamp_ns: int) -> int | None:
         """Return the index of the pose at a stamp, None without one."""
@@ -90,7 +119,7 @@ class PosePath:
             T_map_base=self.poses[row],
             session=self.sessions[row],
             module=self.modules[row],
-            covariance=self.covariances[row],
+            covariance=self.covariance_at(row),
         )
 
     def session_starts(self) -> list[SessionStart]:
@@ -106,17 +135,18 @@ class PosePath:
 
     def steps(self) -> list[SessionPose]:
         """Return every pose with its module and the covariance that this reported."""
-        rows = zip(self.poses, self.sessions, self.modules, self.covariances, strict=True)
+        rows = enumerate(zip(self.poses, self.sessions, self.modules, strict=True))
         return [
             SessionPose(
-                T_map_base=T, session=session, is_bridged=module == BRIDGED, covariance=told
+                T_map_base=T,
+                session=session,
+                is_bridged=module == BRIDGED,
+                covariance=self.covariance_at(row),
             )
-            for T, session, module, told in rows
+            for row, (T, session, module) in rows
         ]
 
 
-def trajectory_of(stamps_ns: Sequence[int], poses: Sequence[Transform]) -> Trajectory:
+def trajectory_of(stamps_ns: Sequence[int], poses: Rows) -> Trajectory:
     """Return poses as a trajectory."""
-    if not stamps_ns:
-        return Trajectory.empty()
-    return Trajectory(stamps_ns=np.array(stamps_ns, np.int64), T_world_base=np.stack(poses))
+    return Trajectory(stamps_ns=np.array(stamps_ns, np.int64), T_world_base=np.asarray(poses))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from array import array
 from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter_ns
 from typing import Protocol
@@ -108,7 +109,7 @@ class Bus:
             key: Runner(key, module, executor(key, is_live=is_live))
             for key, module in modules.items()
         }
-        self.bus_us: list[float] = []
+        self.bus_us = array("d")
         self._policy, self._log = policy, log
         self._watch = Watch(
             detector,
@@ -137,7 +138,7 @@ class Bus:
         self._state = self._machine.state
 
     @property
-    def detector_us(self) -> list[float]:
+    def detector_us(self) -> array[float]:
         """Return the time [us] that each vote took."""
         return self._watch.spent_us
 
@@ -150,6 +151,11 @@ class Bus:
     def active(self) -> str:
         """Return the key of the active module, "" when no module is active."""
         return self._estimator.active.key if self._estimator.active else ""
+
+    @property
+    def beside(self) -> list[str]:
+        """Return which modules start or end in another thread now, in words."""
+        return [f"{key} {runner.beside}" for key, runner in self.runners.items() if runner.beside]
 
     @property
     def scene(self) -> str:

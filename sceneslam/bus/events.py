@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,18 +12,22 @@ from typing import Any
 from sceneslam.types.files import LogFile
 from sceneslam.types.run import Event
 
+_PACK = 512  # events that are compressed at a time: a vote takes 30 bytes then
+
 
 class EventLog:
     """Collects events in memory and writes them to `events.jsonl` as they occur.
 
-    All events but `cost` depend on the recording and the configuration alone.
+    The newest stay as they are, older ones are kept compressed. All events but `cost` depend on
+    the recording and the configuration alone.
     """
 
     def __init__(
         self, path: Path | None = None, make_room: Callable[[], bool] = lambda: False
     ) -> None:
-        self._events: list[Event] = []
-        self._written = 0  # how many of the events are in the file
+        self._packed: list[bytes] = []  # _PACK events each, the oldest first
+        self._newest: list[Event] = []  # those after them
+        self._written = 0  # how many of the newest are in the file
         self._file = LogFile(path, make_room) if path else None
 
     @property
@@ -33,29 +38,32 @@ class EventLog:
     @property
     def events(self) -> tuple[Event, ...]:
         """Return all events so far."""
-        return tuple(self._events)
+        packed = [event for pack in self._packed for event in _unpacked(pack)]
+        return (*packed, *self._newest)
 
     def since(self, count: int) -> list[Event]:
         """Return the events after the first `count`."""
-        return self._events[count:]
+        first = count - _PACK * len(self._packed)
+        return self._newest[first:] if first >= 0 else list(self.events[count:])
 
     def add(self, event: str, stamp_ns: int, **fields: Any) -> None:
         """Record an event; NaN becomes null. All but votes are written at once."""
         line: dict[str, Any] = {"event": event, "stamp_ns": stamp_ns}
         for key, value in fields.items():
             line[key] = None if isinstance(value, float) and not math.isfinite(value) else value
-        self._events.append(line)
+        self._newest.append(line)
         if event != "vote":
             self.flush()
 
     def flush(self) -> None:
         """Write pending events to disk; if that fails, they stay in memory."""
-        if self._file is None:
-            return
-        lines = [json.dumps(line) + "\n" for line in self._events[self._written :]]
-        self._written = len(self._events)
-        if lines:
-            self._file.append("".join(lines).encode())
+        if self._file is not None:
+            lines = [json.dumps(line) + "\n" for line in self._newest[self._written :]]
+            if lines:
+                self._file.append("".join(lines).encode())
+        self._written = len(self._newest)
+        if self._written >= 2 * _PACK:
+            self._pack()
 
     def sync(self) -> None:
         """Wait until written events would survive a loss of power; any thread may call it."""
@@ -67,3 +75,13 @@ class EventLog:
         self.flush()
         if self._file is not None:
             self._file.close()
+
+    def _pack(self) -> None:
+        oldest, self._newest = self._newest[:_PACK], self._newest[_PACK:]
+        self._written -= _PACK
+        self._packed.append(zlib.compress(json.dumps(oldest).encode()))
+
+
+def _unpacked(pack: bytes) -> list[Event]:
+    events: list[Event] = json.loads(zlib.decompress(pack))
+    return events

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from array import array
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
@@ -40,7 +41,7 @@ class Runner:
         self.key = key
         self.is_failed = False
         self.T_map_local: Transform | None = None  # None until it is placed
-        self.track_ms: list[float] = []
+        self.track_ms = array("d")
         self.spent_ns = 0  # total time that callers waited
         self.start_ns = 0  # time that the last start took
         self._executor = executor
@@ -66,6 +67,14 @@ class Runner:
         """Tell whether the module can be activated, at once or after a wait."""
         module = self._module
         return not self.is_failed or (isinstance(module, Restartable) and not module.is_spent)
+
+    @property
+    def beside(self) -> str:
+        """Return what the executor does for the module now: `starts`, `ends` or nothing."""
+        for what, future in (("ends", self._ending), ("starts", self._starting)):
+            if future is not None and not future.done():
+                return what
+        return ""
 
     def start(self, rig: Rig, scene: str) -> None:
         """Begin to activate the module anew; `has_started` gives the result."""

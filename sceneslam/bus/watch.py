@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from array import array
 from collections.abc import Mapping, Sequence
 from time import perf_counter_ns
 from typing import Any
@@ -46,7 +47,7 @@ class Watch:
     def __init__(
         self, detector: Detector, rig: Rig, log: EventLog, *, scene_filter: SceneFilter
     ) -> None:
-        self.spent_us: list[float] = []
+        self.spent_us = array("d")
         self.is_working = True
         self._detector, self._log = detector, log
         self._filter = scene_filter

@@ -36,6 +36,7 @@ class RunSettings:
     rate: float  # live, of a recording: so many times as fast as it was recorded
     silent_after_s: float  # live: the events name a source that gave nothing for so long ...
     end_after_s: float | None  # ... and the run ends after so long; null: never
+    is_repeatable: bool  # modules wait for what they compute beside the poses
     catch_up_steps: int | None  # remembered observations per new one, at a hand-over; null: all
 
     def __post_init__(self) -> None:

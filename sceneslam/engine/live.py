@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from array import array
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from time import monotonic_ns
 
 from sceneslam.engine.mailbox import Mailbox, Waited
+from sceneslam.engine.slowest import Slowest
 from sceneslam.interfaces import LiveFeed
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
-from sceneslam.types.run import Event
+from sceneslam.types.run import Event, SlowPose
 
 _LOOK_S = 0.2  # interval of checks for Ctrl-C
 _BEHIND_S = 1.0  # if a recording is read too slowly, its playback is delayed in steps of this
@@ -42,7 +44,18 @@ class LiveTally:
 
     dropped: int = 0  # observations that were replaced by newer ones
     dropped_images: int = 0  # of these, those with an image
-    latencies_ms: list[float] = field(default_factory=list)  # from stamp to pose
+    # from stamp to pose
+    latencies_ms: array[float] = field(default_factory=lambda: array("d"))
+    slowest: Slowest = field(default_factory=Slowest)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spent:
+    """What the last step's time went to; see SlowPose."""
+
+    parts_ms: Mapping[str, float] = field(default_factory=dict)
+    cpu_ms: float = 0.0
+    beside: Sequence[str] = ()
 
 
 def run_live(
@@ -53,17 +66,19 @@ def run_live(
     settings: LiveSettings,
     feed: LiveFeed | None = None,
     tally: LiveTally | None = None,
+    spent: Callable[[], Spent] = Spent,
 ) -> LiveTally:
     """Run `step` on the observations in real time until it returns False; return statistics.
 
-    A given `tally` is updated in place, and is valid also if the run is interrupted.
+    `spent` is called after a step that is one of the slowest. A given `tally` is updated in place,
+    and is valid also if the run is interrupted.
 
     Without a `feed` they are those of a recording, and paced by their stamps. `note` receives
     events of the input: `silent`, `returned`, `behind` (a recording is read too slowly and its
     playback delayed), and the feed's. Both functions run in the thread `bus`, the source in another
     one. Their exceptions are raised here; Ctrl-C ends both.
     """
-    run = _LiveRun(observations, step, note, settings=settings, feed=feed)
+    run = _LiveRun(observations, step, note, settings=settings, feed=feed, spent=spent)
     run.tally = tally if tally is not None else run.tally
     return run.carry_out()
 
@@ -77,7 +92,9 @@ class _LiveRun:
         *,
         settings: LiveSettings,
         feed: LiveFeed | None,
+        spent: Callable[[], Spent],
     ) -> None:
+        self._spent = spent
         self._observations, self._step, self._note = observations, step, note
         self._settings, self._feed = settings, feed
         self._mailbox, self._is_over = Mailbox(), threading.Event()
@@ -85,6 +102,7 @@ class _LiveRun:
         self._lag_ns: int | None = None  # clock - stamp / rate, of the first observation
         self._last_ns = 0
         self._due_at_ns: dict[int, int] = {}  # stamp -> due time of queued observations
+        self._came_at_ns: dict[int, int] = {}  # stamp -> when they were queued
         self._behind_s = self._told_behind_s = 0.0  # delay of playback
 
     def carry_out(self) -> LiveTally:
@@ -122,6 +140,7 @@ class _LiveRun:
         for observation in self._observations:
             if not self._feed and not self._await(observation):
                 return
+            self._came_at_ns[observation.stamp_ns] = monotonic_ns()
             self._mailbox.put(observation)
             if self._is_over.is_set():
                 return
@@ -163,21 +182,32 @@ class _LiveRun:
             if silent_s:
                 self._tell("returned")
                 silent_s = 0.0
+            began_ns = monotonic_ns()
             if not self._step(taken):
                 break
-            stamp_ns = taken.stamp_ns
-            measured_ns = (
-                self._feed.measured_ns(taken) if self._feed else self._was_due_ns(stamp_ns)
-            )
-            self.tally.latencies_ms.append((monotonic_ns() - measured_ns) / 1e6)
+            self._count(taken, began_ns)
         self._is_over.set()
 
-    def _was_due_ns(self, stamp_ns: int) -> int:
-        """Return the due time of a recorded observation; remove earlier, dropped ones."""
-        due_ns = self._due_at_ns[stamp_ns]
-        for earlier_ns in [one for one in list(self._due_at_ns) if one <= stamp_ns]:
-            del self._due_at_ns[earlier_ns]
-        return due_ns
+    def _count(self, taken: Observation, began_ns: int) -> None:
+        """Keep how long an observation's pose took, and why where that was long."""
+        now_ns, stamp_ns = monotonic_ns(), taken.stamp_ns
+        came_ns, due_ns = _taken(self._came_at_ns, stamp_ns), _taken(self._due_at_ns, stamp_ns)
+        measured_ns = self._feed.measured_ns(taken) if self._feed else due_ns
+        latency_ms = (now_ns - measured_ns) / 1e6
+        self.tally.latencies_ms.append(latency_ms)
+        if not self.tally.slowest.has_room(latency_ms):
+            return
+        spent = self._spent()
+        waits = {"arriving": (came_ns - measured_ns) / 1e6, "waiting": (began_ns - came_ns) / 1e6}
+        self.tally.slowest.add(
+            SlowPose(
+                stamp_ns=stamp_ns,
+                latency_ms=latency_ms,
+                parts_ms={**waits, **spent.parts_ms},
+                cpu_ms=spent.cpu_ms,
+                beside=spent.beside,
+            )
+        )
 
     def _tell_notices(self) -> None:
         for notice in self._feed.notices() if self._feed else ():
@@ -188,3 +218,11 @@ class _LiveRun:
 
     def _tell(self, event: str, **fields: object) -> None:
         self._note({"event": event, "stamp_ns": self._last_ns, **fields})
+
+
+def _taken(at_ns: dict[int, int], stamp_ns: int) -> int:
+    """Return when a stamp was; forget it, and those before it, which were dropped."""
+    found_ns = at_ns.get(stamp_ns, 0)
+    for earlier_ns in [one for one in list(at_ns) if one <= stamp_ns]:
+        del at_ns[earlier_ns]
+    return found_ns

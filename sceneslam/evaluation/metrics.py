@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +154,7 @@ def _costs(result: RunResult) -> Metrics:
         "bus_overhead_us": _median_p95(result.timings.bus_us),
         "detector_us": _median_p95(result.timings.detector_us),
         "latency_ms": _percentiles(result.timings.latency_ms, p50=50, p99=99),
+        "slowest": [asdict(pose) for pose in result.timings.slowest],
     }
 
 

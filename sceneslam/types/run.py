@@ -49,6 +49,19 @@ class KeyMoment:
     image_bgr: NDArray[np.uint8]  # (h, w, 3), small
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlowPose:
+    """A pose of a live run that came late, and what its time went to."""
+
+    stamp_ns: int
+    latency_ms: float  # from the stamp to the pose
+    # `arriving`: until the observation could be taken; `waiting`: for the one before; then each
+    # part of the work on it.
+    parts_ms: Mapping[str, float]
+    cpu_ms: float  # of the work, what its thread computed; the rest it waited
+    beside: Sequence[str]  # what other threads did for the modules meanwhile
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Timings:
     """Wall-clock times; not part of the deterministic output."""
@@ -60,6 +73,7 @@ class Timings:
     latency_ms: NDArray[np.float64] = field(
         default_factory=lambda: np.zeros(0)
     )  # live: stamp to pose
+    slowest: Sequence[SlowPose] = ()  # live, the slowest first
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

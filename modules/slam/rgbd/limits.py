@@ -27,6 +27,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "cloud_stride_px": (1, 100),
     "cloud_voxel_m": (0.001, 10),
     "grid_resolution_m": (0.001, 10),
+    "is_repeatable": (False, True),
     "seed": (0, 2**31 - 1),
 }
 

@@ -1,4 +1,4 @@
-"""Local bundle adjustment in a worker; results are merged at fixed image counts."""
+"""Local bundle adjustment in a worker; results are merged some images later."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ _BEGINNING = 16  # first views, kept to rebuild the map: 2.4 MB each
 class LocalMapping:
     """Adjusts the newest keyframes and their landmarks at fixed intervals of images.
 
-    A worker does it between two merges, and a merge waits for the worker, so that the map at an
-    image depends on the images alone.
+    A worker does it between two merges. If `is_repeatable`, a merge waits for the worker, so that
+    the map at an image depends on the images alone; else it is put off, as a robot cannot wait.
     """
 
     def __init__(
@@ -36,7 +36,9 @@ class LocalMapping:
         visual_map: VisualMap,
         *,
         alignment: Alignment | None,
+        is_repeatable: bool,
     ) -> None:
+        self._is_repeatable = is_repeatable
         self._map, self._depth_camera, self._known = visual_map, depth_camera, alignment
         self._worker: _Worker | None = None
         self._window: MapWindow | None = None
@@ -62,8 +64,8 @@ class LocalMapping:
 
         Returns T_new_old (4, 4), the correction of the newest keyframe and its surroundings.
         """
-        self._images_left -= 1
-        if self._images_left:
+        self._images_left = max(self._images_left - 1, 0)
+        if self._images_left or self._is_late():
             return se3.identity()
         self._images_left = _FREE_IMAGES
         T_new_old = self._merge()
@@ -89,6 +91,10 @@ class LocalMapping:
         """End the worker; its pending task is not merged."""
         if self._worker is not None:
             self._worker.end()
+
+    def _is_late(self) -> bool:
+        """Tell whether a merge is due, and put off because the worker is not done."""
+        return not (self._is_repeatable or self._result is None or self._result.done())
 
     def _merge(self) -> Transform:
         window, result = self._window, self._result

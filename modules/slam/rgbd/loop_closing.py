@@ -1,4 +1,4 @@
-"""Close loops: some work per image; the pose graph in a worker, merged at a fixed image."""
+"""Close loops: some work per image; the pose graph in a worker, merged some images later."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .loop_fusion import fuse_duplicates
 from .pose_graph import PoseGraph, solve
 from .visual_map import VisualMap
 
-_MERGE_IMAGES = 10  # after which the merge waits for the worker, so that runs are repeatable
+_MERGE_IMAGES = 10  # after which a merge is due; a repeatable one waits for the worker
 _QUEUE = 3  # keyframes waiting for a query; older ones are dropped
 
 Poses = Mapping[int, Transform]
@@ -24,7 +24,15 @@ Poses = Mapping[int, Transform]
 class VisualLoopCloser:
     """Queries new keyframes, and corrects the map when two of them agree on a loop."""
 
-    def __init__(self, visual_map: VisualMap, detector: LoopDetector, graph: PoseGraph) -> None:
+    def __init__(
+        self,
+        visual_map: VisualMap,
+        detector: LoopDetector,
+        graph: PoseGraph,
+        *,
+        is_repeatable: bool,
+    ) -> None:
+        self._is_repeatable = is_repeatable
         self._map, self._detector, self._graph = visual_map, detector, graph
         self._worker = thread_beside("pose_graph")
         self._queries: deque[Query] = deque(maxlen=_QUEUE)
@@ -48,8 +56,9 @@ class VisualLoopCloser:
     def step(self) -> dict[int, Transform]:
         """Do one image's share of the work; return T_new_old per keyframe that was moved."""
         if self._solution is not None:
-            self._images_left -= 1
-            return {} if self._images_left else self._merge(self._solution)
+            self._images_left = max(self._images_left - 1, 0)
+            is_late = not (self._is_repeatable or self._solution.done())
+            return {} if self._images_left or is_late else self._merge(self._solution)
         if self._candidate is not None:
             self._check(self._queries.popleft(), self._candidate)
             self._candidate = None

@@ -40,13 +40,14 @@ class MapHistory:
         reunion: Reunion,
         *,
         min_inliers: int,
+        is_repeatable: bool,
     ) -> None:
         self._map, self._eye, self._reunion = visual_map, eye, reunion
         self._graph, self._frames = PoseGraph(), FrameLog()
         self._keyframes: dict[int, Keyframe] = {}  # including those just removed from the map
         self.recognizer = PlaceRecognizer(visual_map, localizer, min_inliers=min_inliers)
         detector = LoopDetector(visual_map, self.recognizer, self._graph)
-        self._closer = VisualLoopCloser(visual_map, detector, self._graph)
+        self._closer = VisualLoopCloser(visual_map, detector, self._graph, is_repeatable=is_repeatable)
         self.segments = Segments(self._graph)
         self.reference = _NEVER_SAW  # the keyframe that the newest frame refers to
         self.revision = 0  # increases with every correction

@@ -57,6 +57,7 @@ class RgbdSlam:
         cloud_stride_px: int,
         cloud_voxel_m: float,
         grid_resolution_m: float,
+        is_repeatable: bool,
         seed: int,
     ) -> None:
         self._arguments = {name: value for name, value in locals().items() if name != "self"}

@@ -62,11 +62,18 @@ class RgbdParts:
         )
         self.eye = RectifyingExtractor(self.map, localizer, extractor)
         self.memory = MapHistory(
-            self.map, localizer, self.eye, reunion, **chosen(min_inliers="degraded_inliers")
+            self.map,
+            localizer,
+            self.eye,
+            reunion,
+            **chosen(min_inliers="degraded_inliers"),
+            **same("is_repeatable"),
         )
         relocalizer = Relocalizer(self.map.keyframes, self.memory.recognizer)
         self.search = Search(localizer, relocalizer)
-        self.mapping = LocalMapping(depth_camera, self.map, alignment=alignment)
+        self.mapping = LocalMapping(
+            depth_camera, self.map, alignment=alignment, **same("is_repeatable")
+        )
         self.layers = LayerBuilder(
             depth_camera, **same("cloud_stride_px", "cloud_voxel_m", "grid_resolution_m")
         )

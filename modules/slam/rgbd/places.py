@@ -37,8 +37,7 @@ class PlaceIndex:
             [rng.permutation(_DESCRIPTOR_BITS)[:_WORD_BITS] for _ in range(_TABLES)]
         )
         self._places: dict[int, NDArray[np.int32]] = {}  # words, ascending
-        self._holders = np.zeros(_WORDS, np.int32)  # how many places have the word
-        self._weights = np.zeros(_WORDS, np.float32)  # zero except during a query
+        self._holders = np.zeros(_WORDS, np.uint16)  # how many places have the word
 
     def __len__(self) -> int:
         return len(self._places)
@@ -59,14 +58,13 @@ class PlaceIndex:
         """Return the places (of `place_ids`, or all), the most similar first."""
         words = self._words(descriptors)
         rarity = np.log((1.0 + len(self._places)) / np.maximum(self._holders[words], 1))
-        self._weights[words] = rarity
+        weights = np.zeros(_WORDS, np.float32)
+        weights[words] = rarity
         asked = self._places if place_ids is None else place_ids
         total = max(float(rarity.sum()), 1e-9)
         found = [
-            Likeness(place_id=k, ratio=float(self._weights[self._places[k]].sum()) / total)
-            for k in asked
+            Likeness(place_id=k, ratio=float(weights[self._places[k]].sum()) / total) for k in asked
         ]
-        self._weights[words] = 0.0
         return sorted(found, key=lambda likeness: (-likeness.ratio, likeness.place_id))
 
     def _words(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:

@@ -12,7 +12,7 @@ import logging
 import os
 import socket
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,6 +44,7 @@ from sceneslam.ros.transport.transport import (
     Arrival,
     Heard,
     Network,
+    Publication,
     Publisher,
     Qos,
 )
@@ -53,6 +54,11 @@ _log = logging.getLogger(__name__)
 _WAKE_S = 0.1  # interval at which `close` is noticed
 _BATCH = 64  # messages read at once
 _ENDPOINTS = 1000  # announcements read at once
+_LATCHED = {
+    Policy.Durability.TransientLocal,
+    Policy.Durability.Transient,
+    Policy.Durability.Persistent,
+}
 _CONFIG = "CYCLONEDDS_URI"
 _environment = threading.Lock()  # a domain reads the environment when its first participant joins
 # Discovery on this machine only: by the loopback interface, with multicast for participants with
@@ -82,21 +88,21 @@ class DdsTransport:
         self._readers: dict[str, _Reader] = {}
         self._writers: dict[str, _Writer] = {}
         self._topics: dict[str, Any] = {}
-        self._published: dict[Any, tuple[str, str]] = {}  # by endpoint
+        self._published: dict[Any, Publication] = {}  # by endpoint
         self._is_closed = False
         self._waitset = WaitSet(self._participant)
         self._thread: threading.Thread | None = None
 
-    def topics(self) -> Mapping[str, str]:
-        """Return the ROS topics that other participants currently announce."""
+    def publications(self) -> Sequence[Publication]:
+        """Return the ROS publishers that other participants currently announce."""
         with self._lock:
             for endpoint in self._announced.take(_ENDPOINTS):
                 name = endpoint.topic_name or ""  # a deleted writer has none
                 if not _is_alive(endpoint):
                     self._published.pop(endpoint.key, None)
                 elif name.startswith("rt/") and endpoint.key not in self._own_keys():
-                    self._published[endpoint.key] = (name[2:], _ros_type(endpoint.type_name))
-            return dict(self._published.values())
+                    self._published[endpoint.key] = _publication(name[2:], endpoint)
+            return tuple(self._published.values())
 
     def subscribe(self, topic: str, msgtype: str, heard: Heard, qos: Qos = Qos.SENSOR) -> None:
         """Call `heard` for each message of the topic, in the transport's thread."""
@@ -146,7 +152,7 @@ class DdsTransport:
             self._waitset.wait(timeout=duration(seconds=_WAKE_S))
             with self._lock:
                 taken = [
-                    (one.heard, Arrival(topic=topic, cdr=sample.cdr, arrived_ns=monotonic_ns()))
+                    (one.heard, _arrival(topic, sample))
                     for topic, one in self._readers.items()
                     for sample in one.reader.take(_BATCH)
                     if isinstance(sample, _Bytes)
@@ -210,6 +216,15 @@ class _Writer:
         self._writer = None
 
 
+def _arrival(topic: str, sample: Any) -> Arrival:
+    return Arrival(
+        topic=topic,
+        cdr=sample.cdr,
+        arrived_ns=monotonic_ns(),
+        publisher=sample.sample_info.publication_handle,
+    )
+
+
 def _deliver(heard: Heard, arrival: Arrival) -> None:
     try:
         heard(arrival)
@@ -267,7 +282,6 @@ def _named(typename: str) -> Any:
 
 
 def _qos(qos: Qos) -> Any:
-
     policies = [
         Policy.Reliability.BestEffort
         if qos is Qos.SENSOR
@@ -289,6 +303,15 @@ def _ros_type(dds_type: str) -> str:
     return dds_type.replace("::dds_::", "::").removesuffix("_").replace("::", "/")
 
 
-def _is_alive(endpoint: Any) -> bool:
+def _publication(topic: str, endpoint: Any) -> Publication:
+    policies = set(endpoint.qos or ())
+    return Publication(
+        topic=topic,
+        msgtype=_ros_type(endpoint.type_name),
+        is_reliable=Policy.Reliability.BestEffort not in policies,
+        is_latched=bool(policies & _LATCHED),
+    )
 
+
+def _is_alive(endpoint: Any) -> bool:
     return bool(endpoint.sample_info.instance_state == InstanceState.Alive)

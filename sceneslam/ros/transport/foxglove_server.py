@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from time import monotonic_ns
 from typing import Any
 
@@ -13,7 +13,7 @@ import foxglove
 from foxglove.websocket import Capability, Parameter
 
 from sceneslam.ros.encode import Encoder
-from sceneslam.ros.transport.transport import Arrival, Heard, Publisher, Qos
+from sceneslam.ros.transport.transport import Arrival, Heard, Publication, Publisher, Qos
 from sceneslam.types.errors import ConfigError, told
 
 HOST = "127.0.0.1"  # only this machine can connect
@@ -52,9 +52,9 @@ class FoxgloveTransport:
         """Return the address for Foxglove."""
         return f"ws://{HOST}:{self._server.port}"
 
-    def topics(self) -> Mapping[str, str]:
-        """Return no topics: panels do not announce theirs."""
-        return {}
+    def publications(self) -> Sequence[Publication]:
+        """Return no publishers: panels do not announce theirs."""
+        return ()
 
     def subscribe(self, topic: str, msgtype: str, heard: Heard, qos: Qos = Qos.SENSOR) -> None:
         """Call `heard` for each message that a panel publishes on the topic."""

@@ -6,7 +6,7 @@ import importlib
 import logging
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Sequence
 from time import monotonic_ns
 from typing import Any
 
@@ -22,6 +22,7 @@ from sceneslam.ros.transport.transport import (
     Arrival,
     Heard,
     Network,
+    Publication,
     Publisher,
     Qos,
 )
@@ -48,14 +49,19 @@ class RclpyTransport:
         self._thread = threading.Thread(target=self._spin, name="rclpy", daemon=True)
         self._thread.start()
 
-    def topics(self) -> Mapping[str, str]:
-        """Return the topics that other nodes publish."""
-        found = {}
-        for name, types in self._node.get_topic_names_and_types():
-            others = self._node.get_publishers_info_by_topic(name)
-            if any(one.node_name != self._node.get_name() for one in others):
-                found[name] = types[0]
-        return found
+    def publications(self) -> Sequence[Publication]:
+        """Return the publishers of other nodes."""
+        return tuple(
+            Publication(
+                topic=name,
+                msgtype=one.topic_type,
+                is_reliable=one.qos_profile.reliability is not ReliabilityPolicy.BEST_EFFORT,
+                is_latched=one.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL,
+            )
+            for name, _ in self._node.get_topic_names_and_types()
+            for one in self._node.get_publishers_info_by_topic(name)
+            if one.node_name != self._node.get_name()
+        )
 
     def subscribe(self, topic: str, msgtype: str, heard: Heard, qos: Qos = Qos.SENSOR) -> None:
         """Call `heard` for each message of the topic, in the node's thread."""

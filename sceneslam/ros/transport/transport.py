@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
@@ -34,6 +34,7 @@ class Arrival:
     topic: str
     cdr: bytes  # with its header of four bytes
     arrived_ns: int  # CLOCK_MONOTONIC
+    publisher: int = 0  # who sent it, where the transport tells
 
     @property
     def size(self) -> int:
@@ -42,6 +43,16 @@ class Arrival:
 
 
 Heard = Callable[[Arrival], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Publication:
+    """A publisher of another participant, as announced."""
+
+    topic: str
+    msgtype: str
+    is_reliable: bool = True
+    is_latched: bool = False  # transient local
 
 
 class Publisher(Protocol):
@@ -59,8 +70,8 @@ class Transport(Protocol):
     callback is logged, and the next message is delivered.
     """
 
-    def topics(self) -> Mapping[str, str]:
-        """Return the type of every topic that another participant is known to publish."""
+    def publications(self) -> Sequence[Publication]:
+        """Return the known publishers of other participants."""
         ...
 
     def subscribe(self, topic: str, msgtype: str, heard: Heard, qos: Qos = Qos.SENSOR) -> None:

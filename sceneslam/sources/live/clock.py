@@ -21,6 +21,7 @@ class StampOrder(Enum):
     UNORDERED = "its stamp is before that of the message before"
     LATE = "it came late"
     JUMPED = "the clock jumped"
+    UNSTAMPED = "it has no stamp: it counts as measured when it came"
 
 
 @dataclass(slots=True, kw_only=True)
@@ -55,6 +56,8 @@ class StampClock:
 
     def line_up(self, topic: str, stamp_ns: int, arrived_ns: int) -> Lined:
         """Return the stamp of a topic's newest message on the time line."""
+        if stamp_ns == 0:
+            return self._stamped(topic, arrived_ns)
         stream = self._streams.get(topic)
         order = StampOrder.RISING
         if stream is None:
@@ -72,6 +75,16 @@ class StampClock:
         if order is not StampOrder.UNORDERED:
             stream.stamp_ns, stream.arrived_ns = stamp_ns, arrived_ns
         return Lined(stamp_ns=lined_ns, order=order, shift_ns=stream.shift_ns)
+
+    def _stamped(self, topic: str, arrived_ns: int) -> Lined:
+        """Return a message without a stamp as one of the fastest, sent when it came."""
+        if self._delay_ns is None:
+            self._delay_ns, self._noted_ns = self._real_ns, arrived_ns
+        stamp_ns, last = arrived_ns - self._delay_ns, self._streams.get(topic)
+        if last is not None:
+            stamp_ns = max(stamp_ns, last.stamp_ns + last.shift_ns + 1)
+        self._streams[topic] = _Stream(stamp_ns=stamp_ns, arrived_ns=arrived_ns, shift_ns=0)
+        return Lined(stamp_ns=stamp_ns, order=StampOrder.UNSTAMPED, shift_ns=0)
 
     def measured_ns(self, stamp_ns: int) -> int:
         """Return the time [ns] of an aligned stamp on this machine's monotonic clock.

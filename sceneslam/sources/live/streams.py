@@ -13,6 +13,7 @@ from sceneslam.types.run import Event
 
 _WAITED_FOR = frozenset({Sensor.DEPTH, Sensor.ODOMETRY, Sensor.GYRO, Sensor.ACCELEROMETER})
 _STREAK_NS = 5_000_000_000  # a condition that lasts is reported once per so long
+_FOLLOWED_NS = 300_000_000  # without a message, a topic's publisher has left: three at 10 Hz
 
 
 class Streams:
@@ -25,6 +26,7 @@ class Streams:
         self._silent: set[str] = set()
         self._first_ns: dict[str, int] = {}
         self._told_ns: dict[tuple[str, str], int] = {}
+        self._publishers: dict[str, tuple[int, int]] = {}  # topic -> who is followed, last heard
         self._shifts_ns: dict[str, int] = {}
         self._dropped: Counter[str] = Counter()
         self._dropped_ns = now_ns
@@ -61,17 +63,29 @@ class Streams:
                 return False
         return True
 
+    def follows(self, topic: str, publisher: int, arrived_ns: int, stamp_ns: int) -> bool:
+        """Tell whether a message is of the topic's one publisher.
+
+        Where there are two, the first is followed until it has been silent for a while.
+        """
+        followed, heard_ns = self._publishers.get(topic, (publisher, arrived_ns))
+        if publisher != followed and arrived_ns - heard_ns < _FOLLOWED_NS:
+            self.tell_once("second_publisher", stamp_ns, topic, arrived_ns)
+            return False
+        self._publishers[topic] = publisher, arrived_ns
+        return True
+
     def hear(self, topic: str, lined: Lined, arrived_ns: int) -> None:
         """Record the arrival of a message."""
         self._heard_ns[topic] = arrived_ns
         self._first_ns.setdefault(topic, lined.stamp_ns)
         if topic in self._silent:
             self._silent.discard(topic)
-            self._tell("stream_returned", lined.stamp_ns, topic=topic)
+            self.tell("stream_returned", lined.stamp_ns, topic=topic)
         if lined.order is StampOrder.JUMPED:
             before_ns = self._shifts_ns.get(topic, 0)
             jumped_s = (before_ns - lined.shift_ns) / 1e9
-            self._tell(
+            self.tell(
                 "clock_jump",
                 lined.stamp_ns,
                 topic=topic,
@@ -80,7 +94,7 @@ class Streams:
                 paces=topic == self._topics[self.pace],
             )
         elif lined.order is not StampOrder.RISING:
-            self._tell_once(lined.order.name.lower(), lined.stamp_ns, topic, arrived_ns)
+            self.tell_once(lined.order.name.lower(), lined.stamp_ns, topic, arrived_ns)
         self._shifts_ns[topic] = lined.shift_ns
 
     def look(self, now_ns: int, stamp_ns: int) -> bool:
@@ -92,7 +106,7 @@ class Streams:
         ]
         for topic in fallen:
             self._silent.add(topic)
-            self._tell("stream_silent", stamp_ns, topic=topic, for_s=self._silent_ns / 1e9)
+            self.tell("stream_silent", stamp_ns, topic=topic, for_s=self._silent_ns / 1e9)
         return bool(fallen)
 
     def drop(self, counts: Mapping[str, int], now_ns: int, stamp_ns: int) -> None:
@@ -101,7 +115,7 @@ class Streams:
         if self._dropped and now_ns - self._dropped_ns > _STREAK_NS:
             self._dropped_ns = now_ns
             for topic, count in sorted(self._dropped.items()):
-                self._tell("messages_dropped", stamp_ns, topic=topic, count=count)
+                self.tell("messages_dropped", stamp_ns, topic=topic, count=count)
             self._dropped.clear()
 
     def notices(self) -> Sequence[Event]:
@@ -110,12 +124,16 @@ class Streams:
             told, self._notices = self._notices, []
             return told
 
-    def _tell_once(self, event: str, stamp_ns: int, topic: str, now_ns: int) -> None:
+    def tell_once(
+        self, event: str, stamp_ns: int, topic: str, now_ns: int, **fields: object
+    ) -> None:
+        """Tell what a topic does, and not again while it goes on."""
         last_ns = self._told_ns.get((event, topic))
         self._told_ns[event, topic] = now_ns
         if last_ns is None or now_ns - last_ns > _STREAK_NS:
-            self._tell(event, stamp_ns, topic=topic)
+            self.tell(event, stamp_ns, topic=topic, **fields)
 
-    def _tell(self, event: str, stamp_ns: int, **fields: object) -> None:
+    def tell(self, event: str, stamp_ns: int, **fields: object) -> None:
+        """Take what there is to tell."""
         with self._lock:
             self._notices.append({"event": event, "stamp_ns": stamp_ns, **fields})

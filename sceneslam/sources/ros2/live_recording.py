@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from time import monotonic
 from typing import Any
 
 from sceneslam.ros import names
 from sceneslam.ros.messages import MessageDecoder, TopicType
-from sceneslam.ros.transport.transport import Arrival, Qos, Transport
+from sceneslam.ros.transport.transport import Arrival, Publication, Qos, Transport
 from sceneslam.sources.bag_topics import TYPES
 from sceneslam.sources.recording import Message
 
@@ -18,7 +18,7 @@ _LOOK_S = 0.1  # interval of topic discovery
 _MOST_HELD = 400  # messages kept per topic ...
 _MOST_PICTURES = 40  # ... and per topic with messages of about a megabyte
 _PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")
-_TF = {names.TF: Qos.RELIABLE, names.TF_STATIC: Qos.HISTORY}
+_TF = (names.TF, names.TF_STATIC)
 _TF_TYPE = "tf2_msgs/msg/TFMessage"
 
 
@@ -33,6 +33,8 @@ class LiveRecording:
     def __init__(self) -> None:
         self.topics: dict[str, TopicType] = {}
         self.announced: dict[str, str] = {}  # topic -> type
+        self.other_types: dict[str, str] = {}  # topic -> what is published there too
+        self.is_latched = True  # /tf_static, where it is announced
         self.metadata: Mapping[str, Mapping[str, str]] = {}
         self.faults: Sequence[str] = ()
         self._held: dict[str, deque[Message]] = {}
@@ -46,28 +48,55 @@ class LiveRecording:
         return min(times, default=0), max(times, default=0)
 
     def listen(
-        self, transport: Transport, *, wanted: Collection[str], listen_s: float, wait_s: float
+        self,
+        transport: Transport,
+        *,
+        wanted: Collection[str],
+        listen_s: float,
+        wait_s: float,
+        waits_s: Callable[[], float] = lambda: 0.0,
     ) -> None:
         """Receive until `listen_s` after the first measurement and until all `wanted` topics came.
 
-        Gives up after `wait_s`.
+        `waits_s` says how long after the first measurement what is missing still is worth waiting
+        for. Gives up after `wait_s`.
         """
         until_s, first_s = monotonic() + wait_s, None
         tick = threading.Event()
         while monotonic() < until_s:
-            for topic, msgtype in transport.topics().items():
-                if topic not in self.announced and _may_serve(topic, msgtype):
-                    self.announced[topic] = msgtype
-                    transport.subscribe(topic, msgtype, self.take, _TF.get(topic, Qos.SENSOR))
-            measured = self.topics.keys() - _TF.keys()
-            if measured and first_s is None:
+            self._announce(transport)
+            if self.topics.keys() - set(_TF) and first_s is None:
                 first_s = monotonic()
-            is_long = first_s is not None and monotonic() - first_s >= listen_s
-            if is_long and self.topics.keys() >= set(wanted):
+            listened_s = 0.0 if first_s is None else monotonic() - first_s
+            is_all = listened_s >= listen_s and self.topics.keys() >= set(wanted)
+            if is_all and listened_s >= waits_s():
                 break
             tick.wait(_LOOK_S)
         for topic in self.announced:
             transport.unsubscribe(topic)
+
+    def _announce(self, transport: Transport) -> None:
+        """Subscribe to what may serve of what is announced by now."""
+        publications = transport.publications()
+        for one in publications:
+            if not _may_serve(one.topic, one.msgtype):
+                self.other_types[one.topic] = one.msgtype
+            elif one.topic not in self.announced:
+                self.announced[one.topic] = one.msgtype
+                alike = [each for each in publications if each.topic == one.topic]
+                transport.subscribe(one.topic, one.msgtype, self.take, self._qos(one.topic, alike))
+            elif one.msgtype != self.announced[one.topic]:
+                self.other_types[one.topic] = one.msgtype
+
+    def _qos(self, topic: str, publications: Sequence[Publication]) -> Qos:
+        """Return what all of a topic's publishers offer."""
+        if topic not in _TF or not all(one.is_reliable for one in publications):
+            self.is_latched &= topic != names.TF_STATIC
+            return Qos.SENSOR
+        if topic == names.TF:
+            return Qos.RELIABLE
+        self.is_latched = any(one.is_latched for one in publications)
+        return Qos.HISTORY if self.is_latched else Qos.RELIABLE
 
     def take(self, arrival: Arrival) -> None:
         """Add a message; beyond the limits, the oldest are dropped."""

@@ -7,21 +7,29 @@ from dataclasses import replace
 from time import monotonic_ns
 from typing import Any
 
-from sceneslam.ros import decode
+from sceneslam.ros import decode, names
 from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.ros.pixels import DepthUnits
 from sceneslam.ros.transport.transport import Arrival, Network, Transport, open_transport
 from sceneslam.sources.bag_frames import FrameTree
 from sceneslam.sources.bag_observation import PRIMARY, BundleDecoder, measured
 from sceneslam.sources.bag_rig import Given, make_rig, picture_size_wh, place, sensor_topics
-from sceneslam.sources.bag_topics import NONE, TYPES, choose_topics, first
+from sceneslam.sources.bag_topics import NONE, TYPES, choose_topics
 from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.sources.intrinsics import checked_above_zero, given_intrinsics, given_range_m
 from sceneslam.sources.live.clock import StampOrder
 from sceneslam.sources.live.inbox import Inbox
 from sceneslam.sources.live.measuring import Measuring
 from sceneslam.sources.live.streams import Streams
+from sceneslam.sources.ros2.expected import (
+    USUAL,
+    lacks_calibration,
+    lacks_transforms,
+    oddities,
+    unplaced,
+)
 from sceneslam.sources.ros2.live_recording import LiveRecording
+from sceneslam.sources.ros2.network_watch import NetworkWatch
 from sceneslam.sources.survey.bag_sample import survey_recording
 from sceneslam.sources.survey.survey import Survey
 from sceneslam.sources.synchronise import Sample, SynchronisedSamples, Synchroniser
@@ -30,18 +38,9 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor, Wheels
 
 _TICK_S = 0.1  # interval of checks for silent streams
+_PLACES_S = 3.0  # how long transforms to the sensors are waited for: nodes start one by one
+_NETWORK_S = 1.0  # between two looks at who publishes
 _PATIENCE_S = 0.05  # an image waits so long for odometry: the period of 20 Hz
-_USUAL = {  # usual topic names; other topics are found by their type
-    "image": ("/camera/color/image_raw", "/camera/camera/color/image_raw"),
-    "depth": (
-        "/camera/aligned_depth_to_color/image_raw",
-        "/camera/camera/aligned_depth_to_color/image_raw",
-    ),
-    "camera_info": ("/camera/color/camera_info", "/camera/camera/color/camera_info"),
-    "scan": ("/scan",),
-    "odometry": ("/odom",),
-    "imu": ("/imu", "/camera/imu", "/camera/camera/imu"),
-}
 
 
 class Ros2(Measuring):
@@ -96,6 +95,7 @@ class Ros2(Measuring):
         self._faults = FaultLog()
         self._transport: Transport | None = None
         self._inbox: Inbox[Arrival] = Inbox()
+        self._stamp_ns = 0  # of the newest measurement, for what is told of the network
         self.heard = LiveRecording()
 
     @property
@@ -123,6 +123,7 @@ class Ros2(Measuring):
             sync_tolerance_s=self._sync_tolerance_s,
             unplaced=self._unplaced(),
             silent=sorted(self.heard.announced.keys() - self.heard.topics.keys()),
+            odd=list(oddities(self.heard, [name for name in self._named.values() if name])),
         )
 
     def close(self) -> None:
@@ -136,9 +137,13 @@ class Ros2(Measuring):
         for bundle, primary in self._bundles():
             if self._streams is None or not self._streams.has_begun(bundle.primary.stamp_ns):
                 continue
-            decoded = self._decoders[primary].observe(bundle)
+            try:
+                decoded = self._decoders[primary].observe(bundle)
+            except InputError as error:  # another encoding than at the beginning, say
+                self._leave_out(str(error), bundle.primary.stamp_ns)
+                continue
             for problem in decoded.problems:
-                self._faults.add(problem, at_stamp(decoded.stamp_ns))
+                self._leave_out(problem, decoded.stamp_ns)
             if decoded.observation is not None:
                 yield decoded.observation
 
@@ -148,7 +153,11 @@ class Ros2(Measuring):
         self._transport = open_transport(self._network)
         try:
             self.heard.listen(
-                self._transport, wanted=wanted, listen_s=self._listen_s, wait_s=self._wait_s
+                self._transport,
+                wanted=wanted,
+                listen_s=self._listen_s,
+                wait_s=self._wait_s,
+                waits_s=self._waits_s,
             )
             self._choose(wanted)
         except BaseException:
@@ -163,9 +172,9 @@ class Ros2(Measuring):
             raise InputError(
                 f"{what} within {self._wait_s:g} s in {self._where()}: {self._there()}"
             )
-        names = {need: self._name(need, name) for need, name in self._named.items()}
+        chosen = {need: self._name(need, name) for need, name in self._named.items()}
         try:
-            self.topics = choose_topics(heard, names)
+            self.topics = choose_topics(heard, chosen)
             self._by_sensor = sensor_topics(heard, self.topics)
             if not any(sensor in self._by_sensor for sensor in PRIMARY):
                 raise InputError("no image, depth, points, scan or odometry")
@@ -176,7 +185,7 @@ class Ros2(Measuring):
 
     def _name(self, need: str, name: str | None) -> str | None:
         """Return the configured name of a topic, or the usual one if it was received."""
-        usual = (one for one in _USUAL.get(need, ()) if one in self.heard.topics)
+        usual = (one for one in USUAL.get(need, ()) if one in self.heard.topics)
         return name if name is not None else next(usual, None)
 
     def _follow(self, transport: Transport) -> None:
@@ -196,6 +205,15 @@ class Ros2(Measuring):
         self._streams = Streams(self._by_sensor, self._silent_after_s, monotonic_ns())
         for topic in sorted(used):
             transport.subscribe(topic, types[topic], self._inbox.put)
+        followed = [topic for topic in (self.topics.camera_info, names.TF_STATIC) if topic]
+        self._network_watch = NetworkWatch(
+            types,
+            camera_info=self.topics.camera_info,
+            known=[self.heard.decode(one) for one in self.heard.messages(followed)],
+            unplaced=self._unplaced(),
+            tell=self._tell,
+        )
+        self._network_watch.subscribe(transport)
 
     def _bundles(self) -> Iterator[tuple[SynchronisedSamples, Sensor]]:
         """Yield synchronised samples, each with its primary sensor."""
@@ -209,7 +227,8 @@ class Ros2(Measuring):
             patience_s=_PATIENCE_S,
             extrapolates=True,
         )
-        stamp_ns, looked_ns = 0, monotonic_ns()
+        stamp_ns = asked_ns = 0
+        looked_ns = monotonic_ns()
         while not self._inbox.is_closed:
             arrival = self._inbox.take(_TICK_S)
             if arrival is not None:
@@ -223,6 +242,9 @@ class Ros2(Measuring):
                 looked_ns = now_ns
                 streams.look(looked_ns, stamp_ns)
                 streams.drop(self._inbox.take_dropped(), looked_ns, stamp_ns)
+            if now_ns - asked_ns > _NETWORK_S * 1e9 and self._transport is not None:
+                asked_ns, self._stamp_ns = now_ns, stamp_ns
+                self._network_watch.look(self._transport.publications())
             primary = streams.pace
             synchroniser.follow(primary, streams.waits_for)
 
@@ -232,25 +254,41 @@ class Ros2(Measuring):
         topic = arrival.topic
         message = self._decoder.decode(topic, arrival.cdr)
         if message is None:
-            self._faults.add(f"a message of {topic} makes no sense", "its arrival")
+            self._leave_out(f"a message of {topic} makes no sense", self._stamp_ns)
+            return
+        told = (topic, arrival.publisher, arrival.arrived_ns, self._stamp_ns)
+        if not self._streams.follows(*told):
             return
         lined = self._clock.line_up(topic, decode.stamp_ns(message), arrival.arrived_ns)
         self._streams.hear(topic, lined, arrival.arrived_ns)
         if lined.order is StampOrder.UNORDERED:
             return
-        if lined.shift_ns:
+        if lined.stamp_ns != decode.stamp_ns(message):
             message = _restamped(message, lined.stamp_ns)
         for sensor in (one for one, name in self._by_sensor.items() if name == topic):
             held = measured(message, sensor, self._T_base_imu)
             if held is not None:
                 yield sensor, Sample(stamp_ns=lined.stamp_ns, value=held)
 
+    def _leave_out(self, problem: str, stamp_ns: int) -> None:
+        """Count what cannot be used, and tell it."""
+        assert self._streams is not None
+        self._faults.add(problem, at_stamp(stamp_ns))
+        self._streams.tell_once("left_out", stamp_ns, problem, monotonic_ns())
+
+    def _tell(self, event: str, topic: str, **fields: object) -> None:
+        assert self._streams is not None
+        self._streams.tell_once(event, self._stamp_ns, topic, monotonic_ns(), **fields)
+
+    def _waits_s(self) -> float:
+        """Return how long after the first measurement what is missing is worth waiting for."""
+        if self._given.intrinsics is None and lacks_calibration(self.heard):
+            return self._wait_s
+        is_unplaced = lacks_transforms(self.heard, self._base_frame)
+        return self._listen_s + _PLACES_S if is_unplaced else 0.0
+
     def _unplaced(self) -> list[str]:
-        """Return the sensor frames that no transform connects with the base."""
-        topics = (self.topics.image or self.topics.depth, self.topics.scan, self.topics.points)
-        messages = [first(self.heard, topic) for topic in topics if topic]
-        frames = dict.fromkeys(decode.frame_id(one) for one in messages if one is not None)
-        return [frame for frame in frames if self.frames.T_base(frame) is None]
+        return unplaced(self.heard, self.topics, self.frames)
 
     def _where(self) -> str:
         reach = self._network.reach()

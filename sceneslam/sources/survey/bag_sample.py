@@ -28,6 +28,7 @@ def survey_recording(
     sync_tolerance_s: float,
     unplaced: Sequence[str] = (),
     silent: Sequence[str] = (),
+    odd: Sequence[str] = (),
 ) -> Survey:
     """Return the streams of a recording, sampled in time spans of a second."""
     taken: dict[Sensor, list[int]] = {sensor: [] for sensor in topics}
@@ -63,6 +64,7 @@ def survey_recording(
         gyro_radps=samples.gyro_radps,
         unplaced=unplaced,
         silent=silent,
+        odd=odd,
     )
 
 

@@ -220,6 +220,7 @@ def _of_places(survey: Survey) -> Iterator[str]:
             f"no transform connects frame {frame!r} with the robot's base (source.base_frame): its "
             "sensor is taken to sit in base, a camera to look along x"
         )
+    yield from survey.odd
     for topic in survey.silent:
         yield f"{topic} is announced, but nothing came"
 

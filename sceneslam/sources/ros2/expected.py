@@ -1,0 +1,69 @@
+"""What a robot should tell and has not yet: worth waiting for, or worth a word."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from sceneslam.ros import decode
+from sceneslam.sources.bag_frames import FrameTree
+from sceneslam.sources.bag_topics import TYPES, Topics, first
+from sceneslam.sources.ros2.live_recording import LiveRecording
+from sceneslam.types.errors import ConfigError
+
+USUAL = {  # a RealSense camera's and a robot's names; other topics are found by their type
+    "image": ("/camera/color/image_raw", "/camera/camera/color/image_raw"),
+    "depth": (
+        "/camera/aligned_depth_to_color/image_raw",
+        "/camera/camera/aligned_depth_to_color/image_raw",
+    ),
+    "camera_info": ("/camera/color/camera_info", "/camera/camera/color/camera_info"),
+    "scan": ("/scan",),
+    "odometry": ("/odom",),
+    "imu": ("/imu", "/camera/imu", "/camera/camera/imu"),
+}
+_PLACED = (*TYPES["image"], *TYPES["scan"], *TYPES["points"])
+
+
+def lacks_calibration(heard: LiveRecording) -> bool:
+    """Tell whether there is depth, which is of no use without a camera_info."""
+    kinds = list(heard.topics.items())
+    if any(kind.msgtype in TYPES["camera_info"] for _, kind in kinds):
+        return False
+    pictures = [topic for topic, kind in kinds if kind.msgtype in TYPES["depth"]]
+    messages = [(topic, first(heard, topic)) for topic in pictures]
+    return any(one is not None and decode.is_depth(one, topic) for topic, one in messages)
+
+
+def lacks_transforms(heard: LiveRecording, base_frame: str | None) -> bool:
+    """Tell whether a sensor is not connected with the robot's base yet."""
+    try:
+        frames = FrameTree(heard, base_frame)
+    except ConfigError:  # the base itself is not known yet
+        return True
+    sensors = [topic for topic, kind in list(heard.topics.items()) if kind.msgtype in _PLACED]
+    return bool(_unconnected(heard, sensors, frames))
+
+
+def unplaced(heard: LiveRecording, topics: Topics, frames: FrameTree) -> list[str]:
+    """Return the frames of sensors that no transform connects with the base."""
+    chosen = (topics.image or topics.depth, topics.scan, topics.points)
+    return _unconnected(heard, [topic for topic in chosen if topic], frames)
+
+
+def oddities(heard: LiveRecording, named: Sequence[str]) -> Iterator[str]:
+    """Yield sentences about publishers of other types, and of transforms that are not kept."""
+    wanted = {name for group in USUAL.values() for name in group} | set(named)
+    for topic, msgtype in sorted(heard.other_types.items()):
+        used = heard.announced.get(topic)
+        if used is not None:
+            yield f"{topic} is published as {msgtype} too; it is read as {used}"
+        elif topic in wanted:
+            yield f"{topic} is {msgtype}, which is not a sensor's type: it is not read"
+    if not heard.is_latched:
+        yield "/tf_static is not transient local: who joins late does not hear it"
+
+
+def _unconnected(heard: LiveRecording, topics: Sequence[str], frames: FrameTree) -> list[str]:
+    messages = [first(heard, topic) for topic in topics]
+    names = dict.fromkeys(decode.frame_id(one) for one in messages if one is not None)
+    return [name for name in names if frames.T_base(name) is None]

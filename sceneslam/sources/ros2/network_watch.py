@@ -1,0 +1,106 @@
+"""What changes on the network while a robot drives: types, calibration, mounts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sceneslam.ros import decode, names
+from sceneslam.ros.messages import MessageDecoder, TopicType
+from sceneslam.ros.transport.transport import Arrival, Publication, Qos, Transport
+from sceneslam.types.rig import Camera
+from sceneslam.types.se3 import Transform
+
+_SAME = 1e-6  # of transforms, which come as float64
+
+Tell = Callable[..., None]  # event, and its fields
+
+
+class NetworkWatch:
+    """Tells what a run that goes on cannot take over: it began with something else."""
+
+    def __init__(
+        self,
+        types: Mapping[str, str],
+        *,
+        camera_info: str | None,
+        known: Sequence[Any],
+        unplaced: Sequence[str],
+        tell: Tell,
+    ) -> None:
+        """Begin; `known` are the messages of `camera_info` and /tf_static so far."""
+        self._types, self._tell = types, tell
+        self._told: set[tuple[str, str]] = set()
+        self._camera_info, self._unplaced = camera_info, list(unplaced)
+        self._decoder = MessageDecoder(
+            {
+                names.TF_STATIC: TopicType.of_network("tf2_msgs/msg/TFMessage"),
+                camera_info or "": TopicType.of_network("sensor_msgs/msg/CameraInfo"),
+            }
+        )
+        self._camera: Camera | None = None
+        self._mounts: dict[str, Transform] = {}
+        for message in known:
+            if hasattr(message, "transforms"):
+                self._mounts |= dict(_mounts(message))
+            else:
+                self._camera = decode.camera(message)
+
+    def subscribe(self, transport: Transport) -> None:
+        """Listen to the calibration and to fixed transforms."""
+        if self._camera_info is not None:
+            kind = "sensor_msgs/msg/CameraInfo"
+            transport.subscribe(self._camera_info, kind, self._take_camera)
+        transport.subscribe(
+            names.TF_STATIC, "tf2_msgs/msg/TFMessage", self._take_mounts, Qos.HISTORY
+        )
+
+    def look(self, publications: Sequence[Publication]) -> None:
+        """Notice who publishes something else on a topic that is used."""
+        for one in publications:
+            expected = self._types.get(one.topic, one.msgtype)
+            if one.msgtype != expected and (one.topic, one.msgtype) not in self._told:
+                self._told.add((one.topic, one.msgtype))
+                self._tell("wrong_type", one.topic, type=one.msgtype, expected=expected)
+
+    def _take_camera(self, arrival: Arrival) -> None:
+        message = self._decoder.decode(arrival.topic, arrival.cdr)
+        camera = None if message is None else decode.camera(message)
+        if camera is None or _lens(camera) == _lens(self._camera):
+            return
+        if self._camera is not None:
+            self._tell("camera_info_changed", arrival.topic, fx=camera.fx, fy=camera.fy)
+        self._camera = camera
+
+    def _take_mounts(self, arrival: Arrival) -> None:
+        message = self._decoder.decode(arrival.topic, arrival.cdr)
+        found = dict(_mounts(message))
+        late = [frame for frame in found if frame not in self._mounts]
+        moved = [
+            frame
+            for frame, T_parent_frame in found.items()
+            if frame not in late
+            and not np.allclose(self._mounts[frame], T_parent_frame, atol=_SAME)
+        ]
+        self._mounts |= found
+        if late and self._unplaced:
+            self._tell("tf_late", arrival.topic, frames=late, missed=self._unplaced)
+        if moved:
+            self._tell("tf_changed", arrival.topic, frames=moved)
+
+
+def _lens(camera: Camera | None) -> object:
+    """Return what is compared of a calibration."""
+    if camera is None:
+        return None
+    return camera.size_wh, camera.fx, camera.fy, camera.cx, camera.cy, tuple(camera.distortion)
+
+
+def _mounts(message: Any) -> Iterator[tuple[str, Transform]]:
+    """Yield the frames of a TFMessage, each with its T_parent_frame."""
+    for entry in getattr(message, "transforms", ()):
+        T_parent_frame = decode.transform(entry.transform.translation, entry.transform.rotation)
+        if T_parent_frame is not None:
+            yield str(entry.child_frame_id).lstrip("/"), T_parent_frame

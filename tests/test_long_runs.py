@@ -1,0 +1,120 @@
+"""What a run keeps while it goes on for hours: little per pose, and no more points than allowed."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sceneslam.atlas.atlas import Atlas
+from sceneslam.atlas.rows import Rows
+from sceneslam.bus.events import EventLog
+from sceneslam.engine.slowest import Slowest
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.maps import LandmarkLayer, MapLayers, PointLayer
+from sceneslam.types.run import SlowPose
+from sceneslam.types.trajectory import Trajectory
+
+
+def test_rows_are_what_was_added_and_not_cut():
+    rng = np.random.default_rng(0)
+    given = rng.normal(size=(700, 2, 3))
+    rows = Rows(2, 3)
+    for row in given:
+        rows.append(row)
+    rows.cut(300)
+    for row in given[600:]:
+        rows.append(row)
+    expected = np.concatenate([given[:300], given[600:]])
+    np.testing.assert_array_equal(np.asarray(rows), expected)
+    np.testing.assert_array_equal(np.stack(list(rows)), expected)
+    np.testing.assert_array_equal(rows[-1], expected[-1])
+    with pytest.raises(IndexError):
+        _ = rows[400]
+
+
+def test_empty_rows_keep_their_shape():
+    assert np.asarray(Rows(4, 4)).shape == (0, 4, 4)
+
+
+def test_covariances_come_back_as_they_were_given():
+    atlas, told = Atlas(voxel_m=0.05), np.diag(np.arange(1.0, 7.0))
+    told[0, 5] = told[5, 0] = 0.25
+    atlas.begin_session("laser", se3.identity())
+    atlas.add(1, se3.identity(), "laser", told)
+    np.testing.assert_array_equal(atlas.last_covariance, told)
+    atlas.add(2, se3.identity(), "laser", None)
+    assert atlas.last_covariance is None
+
+
+def test_events_that_are_packed_come_back_and_are_in_the_file_once(tmp_path):
+    log = EventLog(tmp_path / "events.jsonl")
+    for stamp_ns in range(3000):
+        log.add("vote", stamp_ns, scene="Dark", value=0.1 + stamp_ns)
+        log.flush()
+    log.close()
+    assert [one["stamp_ns"] for one in log.events] == list(range(3000))
+    assert log.events[0] == {"event": "vote", "stamp_ns": 0, "scene": "Dark", "value": 0.1}
+    assert log.since(10) == list(log.events[10:]) and len(log.since(2990)) == 10
+    lines = (tmp_path / "events.jsonl").read_text().splitlines()
+    assert [json.loads(line) for line in lines] == list(log.events)
+
+
+def cloud(shift_m=0.0):
+    """Return a square metre of points 1 cm apart, and as many landmarks."""
+    x, y = np.meshgrid(np.arange(0, 1, 0.01), np.arange(0, 1, 0.01))
+    points = np.stack([x.ravel() + 0.005 + shift_m, y.ravel() + 0.005, 0 * x.ravel()], axis=1)
+    points = points.astype(np.float32)
+    count = len(points)
+    return MapLayers(
+        points=PointLayer(points=points, colors_bgr=np.zeros((count, 3), np.uint8)),
+        landmarks=LandmarkLayer(
+            points=points,
+            first_stamps_ns=np.arange(count),
+            sightings=np.ones(count, np.int64),
+        ),
+    )
+
+
+def drive(atlas, clouds, *, is_live=False):
+    atlas._budget.open(is_live=is_live)
+    for layers in clouds:
+        session = atlas.begin_session("rgbd", se3.identity())
+        atlas.close_session(session, layers, Trajectory.empty())
+    atlas.finish()
+    return atlas.fuse_maps()
+
+
+@pytest.mark.parametrize("is_live", [False, True])
+def test_what_was_seen_before_is_not_kept_again_beyond_the_limit(is_live):
+    atlas = Atlas(voxel_m=0.01, point_limit=45_000)
+    fused = drive(atlas, [cloud()] * 9, is_live=is_live)
+    assert len(fused.points.points) == 10_000
+    held = sum(len(session.layers.points.points) for session in atlas._sessions)
+    assert len(atlas._sessions[0].layers.points.points) == 10_000
+    if not is_live:  # in another thread it may be done a session later
+        assert held <= 45_000
+
+
+def test_new_ground_beyond_the_limit_is_kept_more_coarsely():
+    atlas = Atlas(voxel_m=0.01, point_limit=45_000)
+    fused = drive(atlas, [cloud(shift_m) for shift_m in range(9)])
+    seen_m = np.unique(np.floor(fused.points.points[:, 0]))
+    assert len(fused.points.points) <= 45_000 and list(seen_m) == list(range(9))
+    assert len(fused.points.colors_bgr) == len(fused.points.points)
+    assert len(fused.landmarks.sightings) == len(fused.landmarks.points)
+
+
+def test_point_limit_is_checked():
+    with pytest.raises(ConfigError, match="point_limit"):
+        Atlas(voxel_m=0.01, point_limit=0)
+
+
+def test_ten_slowest_poses_are_kept_the_slowest_first():
+    slowest = Slowest()
+    for latency_ms in [5.0, 50.0, 1.0, *range(10, 30)]:
+        if slowest.has_room(latency_ms):
+            slowest.add(
+                SlowPose(stamp_ns=0, latency_ms=latency_ms, parts_ms={}, cpu_ms=0.0, beside=())
+            )
+    assert [pose.latency_ms for pose in slowest.poses] == [50.0, *range(29, 20, -1)]
