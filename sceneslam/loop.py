@@ -84,7 +84,8 @@ class RunLoop:
         parts.atlas.open(parts.rig, self._log.add, is_live=parts.run.mode == LIVE)
         self._sinks: dict[str, Sink] = {}
         try:
-            for key, sink in parts.sinks.items():
+            # Who steers a robot waits for poses; files do not.
+            for key, sink in sorted(parts.sinks.items(), key=lambda one: not _steers(one[1])):
                 self._open_sink(key, sink, results.folder)
         except InputError:
             self.close(is_saved=True)
@@ -360,3 +361,7 @@ class RunLoop:
         said = f"no pose: module {names} was lost from the first observation on"
         said = f"{said}; {self._tally.words()}"
         return f"{said}. Most likely: {'; '.join(self._warnings)}" if self._warnings else said
+
+
+def _steers(sink: Sink) -> bool:
+    return isinstance(sink, Steering)

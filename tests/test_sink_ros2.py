@@ -15,6 +15,7 @@ from sceneslam.app import run
 from sceneslam.bus.beside import InStep
 from sceneslam.engine.steering import Operator, SteeredDetector
 from sceneslam.modules.maps.live_map import GridAndPoints
+from sceneslam.ros import decode
 from sceneslam.ros.encode_results import ResultEncoder
 from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.ros.transport.transport import Arrival
@@ -182,6 +183,25 @@ def test_path_stays_short_however_long_the_run(air, sink, monkeypatch):
     assert 5 <= len(poses) <= 10 and poses[0].pose.position.x == 0.0
     steps = np.diff([pose.pose.position.x for pose in poses])
     np.testing.assert_allclose(steps, steps[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("frame", ["map", "odom_", "f", "longer/name", ""])
+@pytest.mark.parametrize("count", [0, 1, 2, 5])
+def test_path_is_the_bytes_that_a_ros_serialises(frame, count):
+    rng = np.random.default_rng(count)
+    poses = [se3.exp(rng.normal(size=6)) for _ in range(count)]
+    stamps_ns = [1_700_000_000_987_654_321 + index * S for index in range(count)]
+    encoder = ResultEncoder()
+    data = encoder.path(stamps_ns, poses, frame)
+    decoder = MessageDecoder({"/path": TopicType.of_network("nav_msgs/msg/Path")})
+    message = decoder.decode("/path", data)
+    assert [decode.frame_id(one) for one in message.poses] == [frame] * count
+    assert [decode.stamp_ns(one) for one in message.poses] == stamps_ns
+    for T, one in zip(poses, message.poses, strict=True):
+        told = decode.transform(one.pose.position, one.pose.orientation)
+        np.testing.assert_allclose(told, T, atol=1e-12)
+    fields = {"header": message.header, "poses": message.poses}
+    assert encoder._cdr("nav_msgs/msg/Path", **fields) == data
 
 
 def test_grid_shows_the_wall_where_the_scan_met_it(air, sink):

@@ -456,7 +456,13 @@ class TestClock:
         )
         told = [one.stamp_ns - 100 * S for one in lined]
         assert told == [0, 5 * MS, 33 * MS, 40 * MS, 40 * MS + 1]
-        assert [one.order is StampOrder.UNSTAMPED for one in lined] == [False, True, False, True, True]
+        assert [one.order is StampOrder.UNSTAMPED for one in lined] == [
+            False,
+            True,
+            False,
+            True,
+            True,
+        ]
 
     def test_robot_without_any_stamp_is_measured_by_this_machines_clock(self):
         clock = StampClock()

@@ -47,7 +47,9 @@ class MapHistory:
         self._keyframes: dict[int, Keyframe] = {}  # including those just removed from the map
         self.recognizer = PlaceRecognizer(visual_map, localizer, min_inliers=min_inliers)
         detector = LoopDetector(visual_map, self.recognizer, self._graph)
-        self._closer = VisualLoopCloser(visual_map, detector, self._graph, is_repeatable=is_repeatable)
+        self._closer = VisualLoopCloser(
+            visual_map, detector, self._graph, is_repeatable=is_repeatable
+        )
         self.segments = Segments(self._graph)
         self.reference = _NEVER_SAW  # the keyframe that the newest frame refers to
         self.revision = 0  # increases with every correction
