@@ -188,7 +188,7 @@ class TopicSink:
             self._path_step *= 2
 
     def _send_path(self) -> None:
-        poses = self._T_frame_map @ np.reshape(self._poses, (-1, 4, 4))
+        poses = list(self._T_frame_map @ np.reshape(self._poses, (-1, 4, 4)))
         self.send(PATH, self.encoder.path(self._stamps_ns, poses, self._map_frame))
 
     def _send_health(self, stamp_ns: int, module: str) -> None:

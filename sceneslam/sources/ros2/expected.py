@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from sceneslam.ros import decode
 from sceneslam.sources.bag_frames import FrameTree
-from sceneslam.sources.bag_topics import TYPES, Topics, first
+from sceneslam.sources.bag_topics import TYPES, BagTopics, first
 from sceneslam.sources.ros2.live_recording import LiveRecording
 from sceneslam.types.errors import ConfigError
 
@@ -44,7 +44,7 @@ def lacks_transforms(heard: LiveRecording, base_frame: str | None) -> bool:
     return bool(_unconnected(heard, sensors, frames))
 
 
-def unplaced(heard: LiveRecording, topics: Topics, frames: FrameTree) -> list[str]:
+def unplaced(heard: LiveRecording, topics: BagTopics, frames: FrameTree) -> list[str]:
     """Return the frames of sensors that no transform connects with the base."""
     chosen = (topics.image or topics.depth, topics.scan, topics.points)
     return _unconnected(heard, [topic for topic in chosen if topic], frames)
