@@ -7,20 +7,25 @@
 Every 10 s a line: memory of the run and of the processes that it started (resident), threads and
 open files of the run. At the end the latency from an image's stamp to its pose (p50, p99), dropped
 images, switches, the ten slowest poses with what their time went to, and by how much memory grew
-per hour over the second half. Other words are overrides of the run. Latency says something on an
-idle machine alone.
+per hour over the second half. Latency says something on an idle machine alone: how much of it other
+processes took is printed too. `--csv FILE` writes the samples, one a minute, or without `--minutes`
+the latency. Other words are overrides of the run.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
+import os
+import resource
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +59,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=None)
     parser.add_argument("--rate", type=float, default=1.0)
     parser.add_argument("--scenario", default="there_and_back")
+    parser.add_argument("--csv", type=Path, default=None)
     given, overrides = parser.parse_known_args()
     laps = 2 if given.minutes is None else int(given.minutes * 60 * given.rate / LAP_S) + 1
     words = [
@@ -64,9 +70,19 @@ def main() -> None:
         run = subprocess.Popen(
             [sys.executable, "-m", "sceneslam", *words, *overrides, f"hydra.run.dir={folder}/run"]
         )
+        began_s, busy_s = time.monotonic(), machine_busy_s()
         samples = watch(run, Path(folder) / "run", given.minutes)
+        others_s = machine_busy_s() - busy_s - children_busy_s()
+        others = others_s / (time.monotonic() - began_s) / (os.cpu_count() or 1)
         metrics = json.loads((Path(folder) / "run" / "metrics.json").read_text())
     show(samples, metrics)
+    print(f"other processes took {max(others, 0.0):.0%} of the machine")
+    if given.csv is not None:
+        rows = soak_rows(samples) if given.minutes else [latency_row(metrics)]
+        with given.csv.open("w", newline="") as file:
+            writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
 
 
 def watch(run: subprocess.Popen[bytes], folder: Path, minutes: float | None) -> list[Sample]:
@@ -118,6 +134,48 @@ def children(pid: int) -> Iterator[int]:
         for child in found:
             yield int(child)
             yield from children(int(child))
+
+
+def machine_busy_s() -> float:
+    """Return the time that all processors have worked since the machine started."""
+    user, nice, system, _, _, interrupts, soft = map(
+        int, Path("/proc/stat").read_text().split()[1:8]
+    )
+    return (user + nice + system + interrupts + soft) / os.sysconf("SC_CLK_TCK")
+
+
+def children_busy_s() -> float:
+    """Return the time that processes of this one have worked which have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def soak_rows(samples: list[Sample]) -> list[dict[str, str]]:
+    """Return a row a minute."""
+    ends = [one for before, one in pairwise(samples) if before.at_s // 60 != one.at_s // 60]
+    return [
+        {
+            "minute": f"{one.at_s / 60:.0f}",
+            "memory [MB]": f"{one.memory_mb:.0f}",
+            "its processes [MB]": f"{one.children_mb:.0f}",
+            "threads": str(one.threads),
+            "open files": str(one.files),
+        }
+        for one in samples[:1] + ends
+    ]
+
+
+def latency_row(metrics: dict[str, Any]) -> dict[str, str]:
+    """Return a run's latency as a row of the page's table."""
+    latency, slowest = metrics["latency_ms"], metrics["slowest"]
+    return {
+        "observations": str(metrics["observations"]),
+        "switches": str(len(metrics["switches"])),
+        "p50 [ms]": f"{latency['p50']:.0f}",
+        "p99 [ms]": f"{latency['p99']:.0f}",
+        "slowest [ms]": f"{slowest[0]['latency_ms']:.0f}",
+        "images dropped": str(metrics["dropped_images"]),
+    }
 
 
 def show(samples: list[Sample], metrics: dict[str, Any]) -> None:
