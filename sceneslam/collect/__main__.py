@@ -11,7 +11,7 @@ from sceneslam.types.errors import InputError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Collect; return the exit code: 0 written, 2 no run was found."""
+    """Collect; return the exit code: 0 written, 2 no run found."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     if len(words) != 1 or words[0].startswith("-"):
         print("usage: python -m sceneslam.collect DIR (the folder of a sweep)", file=sys.stderr)

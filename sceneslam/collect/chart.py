@@ -1,4 +1,4 @@
-"""Charts as inline SVG: lines with error bars, and a Pareto front. They need no script."""
+"""Charts as inline SVG, without scripts: lines with error bars, and a Pareto front."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from html import escape
 from sceneslam.evaluation.figure_style import PALETTE
 
 _WIDTH, _HEIGHT = 480, 280
-_DOTS_MAX = 30  # of a line; more would hide it
+_DOTS_MAX = 30  # dots per line; more would hide it
 _RIGHT, _TOP, _BOTTOM = 16, 14, 46  # of the axes [px]
 _NAME, _DIGIT = 36, 9.5  # left of the axes: the name of y, and every digit of its numbers [px]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Point:
-    """A point of a chart; `label` is shown where the pointer rests."""
+    """A point of a chart; `label` is its tooltip."""
 
     x: float
     y: float
-    half_width: float | None = None  # of the interval of y
+    half_width: float | None = None  # half width of the confidence interval of y
     label: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Line:
-    """Points that belong together, by rising x."""
+    """A line through points, by rising x."""
 
     name: str
     color: str
@@ -35,7 +35,7 @@ class Line:
 
 
 def draw_lines(lines: Sequence[Line], *, x_label: str, y_label: str, key: str = "") -> str:
-    """Return a chart of lines in colours, with a legend of their names, which `key` explains."""
+    """Return a chart of coloured lines, with a legend of their names under the title `key`."""
     axes = _Axes([point for line in lines for point in line.points])
     parts = [axes.frame(x_label, y_label)]
     for line in lines:
@@ -49,7 +49,7 @@ def draw_lines(lines: Sequence[Line], *, x_label: str, y_label: str, key: str = 
 
 
 def draw_front(points: Sequence[Point], *, x_label: str, y_label: str) -> str:
-    """Return a chart of points, those joined that no other is better than in both."""
+    """Return a chart of points with a line through the Pareto front."""
     axes = _Axes(points)
     best = front(points)
     path = " ".join(f"{axes.x(x):.1f},{axes.y(y):.1f}" for x, y in _steps(best))
@@ -64,7 +64,7 @@ def draw_front(points: Sequence[Point], *, x_label: str, y_label: str) -> str:
 
 
 def front(points: Sequence[Point]) -> list[Point]:
-    """Return the points that no other beats in x and y (smaller is better), by rising x."""
+    """Return the Pareto front of points in x and y (smaller is better), by rising x."""
     best: list[Point] = []
     for point in sorted(points, key=lambda point: (point.x, point.y)):
         is_twin = bool(best) and (point.x, point.y) == (best[-1].x, best[-1].y)
@@ -74,7 +74,7 @@ def front(points: Sequence[Point]) -> list[Point]:
 
 
 class _Axes:
-    """Where values lie in the picture, and round numbers along its edges."""
+    """Scaling of values to pixels, and round numbers for the axes."""
 
     def __init__(self, points: Sequence[Point]) -> None:
         highs = [point.y + (point.half_width or 0.0) for point in points]
@@ -125,7 +125,7 @@ def _share(value: float, ticks: Sequence[float]) -> float:
 
 
 def _steps(best: Sequence[Point]) -> Iterator[tuple[float, float]]:
-    """Yield the corners of the stairs through a front."""
+    """Yield the corners of the step line through a front."""
     for number, point in enumerate(best):
         if number:
             yield point.x, best[number - 1].y

@@ -1,4 +1,4 @@
-"""What is drawn of a sweep: error, delay and false switches against every swept number."""
+"""Charts of a sweep: error, delay and false switches over every swept number."""
 
 from __future__ import annotations
 
@@ -17,9 +17,15 @@ _SHOWN = {  # metric -> name of the axis
     "detection.false": "false detections",
     "detection.missed": "missed changes",
 }
-_RECORDING = ("story", "scenario", "source", "effects", "lights")  # beginnings of keys
-_BEST_MAX = 8  # of the front, in words
-_LINES_MAX = len(PALETTE)  # colours that can be told apart
+_RECORDING = (
+    "story",
+    "scenario",
+    "source",
+    "effects",
+    "lights",
+)  # keys that select the recording
+_BEST_MAX = 8  # points of the front in the caption
+_LINES_MAX = len(PALETTE)  # distinguishable colours
 _POINTS_MAX = 600
 
 
@@ -44,11 +50,11 @@ def _front(groups: Sequence[Group]) -> str:
     most = max((false.count for false in falses if false), default=0)
     for group, false in zip(settings, falses, strict=True):
         delay, missed = group.mean("detection.delay_s"), group.mean("detection.missed")
-        # A setting that failed on a recording is not better for that.
+        # A setting that failed on a recording is not compared.
         if delay and false and false.count == most and not (missed and missed.mean):
             label = ", ".join(f"{key}={value}" for key, value in group.keys.items())
             points.append(Point(x=delay.mean, y=false.mean, label=label))
-    if len({point.y for point in points}) < 2:  # nothing to weigh against the delay
+    if len({point.y for point in points}) < 2:  # no trade-off with the delay
         return ""
     drawn = draw_front(
         points, x_label=_SHOWN["detection.delay_s"], y_label=_SHOWN["detection.false"]
@@ -64,20 +70,20 @@ def _front(groups: Sequence[Group]) -> str:
 
 
 def _twins(best: Sequence[Point]) -> Iterator[Sequence[Point]]:
-    """Yield the points of a front that lie on each other together."""
+    """Yield groups of points of a front with equal x and y."""
     for _, twins in groupby(best, key=lambda point: (point.x, point.y)):
         yield list(twins)
 
 
 def _alike(twins: Sequence[Point]) -> str:
-    """Return settings that do alike in words, by the one in the middle: farthest from failing."""
+    """Return a text on settings with equal results; the middle one is named."""
     one = twins[len(twins) // 2]
     others = f" (as {len(twins) - 1} others)" if len(twins) > 1 else ""
     return f"{one.label}{others}: {one.x:.3g} s, {one.y:.3g} false"
 
 
 def _settings(groups: Sequence[Group]) -> list[Group]:
-    """Return the groups without regard to the recording: a setting is to suit all of them."""
+    """Return the groups by setting, averaged over recordings."""
     found: dict[tuple[tuple[str, Value], ...], list[Row]] = {}
     for group in groups:
         keys = tuple(one for one in group.keys.items() if not one[0].startswith(_RECORDING))
@@ -98,7 +104,7 @@ def _lines(groups: Sequence[Group], key: str, metric: str) -> Iterator[Line]:
 
 
 def _point(groups: Sequence[Group], key: str, x: Value, metric: str) -> Point | None:
-    """Return the mean over the groups; its interval where they differ by the seed alone."""
+    """Return the mean over the groups, with its interval if they differ by the seed only."""
     at = [group for group in groups if group.keys[key] == x]
     numbers = [row.metrics.get(metric) for group in at for row in group.rows]
     mean = mean_of([float(y) for y in numbers if isinstance(y, int | float)])
@@ -126,14 +132,14 @@ def _caption(groups: Sequence[Group], key: str, name: str) -> str:
 
 
 def _other(groups: Sequence[Group], key: str) -> str | None:
-    """Return the other key with the most values, of those whose values have all a line if any."""
+    """Return the other key with the most values, preferably not more than there are colours."""
     counts = {name: len(_values(groups, name)) for name in groups[0].keys if name != key}
     few = {name: count for name, count in counts.items() if count <= _LINES_MAX}
     return max(few or counts, key=lambda name: counts[name], default=None)
 
 
 def _few(values: Sequence[Value]) -> list[Value]:
-    """Return as many values as can be told apart, from the first to the last."""
+    """Return at most as many values as there are colours, evenly from first to last."""
     if len(values) <= _LINES_MAX:
         return list(values)
     steps = [round(k * (len(values) - 1) / (_LINES_MAX - 1)) for k in range(_LINES_MAX)]

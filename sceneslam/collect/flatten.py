@@ -1,4 +1,4 @@
-"""A run's metrics as single numbers under dotted names."""
+"""Conversion of a run's metrics to single numbers with dotted names."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 Number = float | None
 
-# One number for all switches of a run: its name, the entry it is made of, and how.
+# Summaries over all switches of a run: name, entry of the switch, function.
 _OF_SWITCHES: Sequence[tuple[str, str, Callable[[Sequence[float]], float]]] = (
     ("confirm_delay_s", "confirm_delay_s", lambda values: sum(values) / len(values)),
     ("confirm_delay_max_s", "confirm_delay_s", max),
@@ -18,7 +18,7 @@ _OF_SWITCHES: Sequence[tuple[str, str, Callable[[Sequence[float]], float]]] = (
 
 
 def flat(metrics: Mapping[str, object]) -> dict[str, Number]:
-    """Return every number of `metrics.json`; of a list how long it is, of switches also how bad."""
+    """Return every number of `metrics.json`; for lists the length, for switches summaries."""
     found: dict[str, Number] = {}
     for name, value in metrics.items():
         if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""What is looked at first in a table of runs."""
+"""The main metrics of a table of runs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ROWS_MAX = 40
 
 
 def overview(rows: Sequence[Row]) -> str:
-    """Return the table in Markdown with the first metrics, "" where it is too long to be read."""
+    """Return the table of main metrics in Markdown, "" if it is too long."""
     if len(rows) > _ROWS_MAX:
         return ""
     keys = swept_keys(rows)

@@ -1,4 +1,4 @@
-"""The table of a sweep as one HTML file that opens alone."""
+"""The table of a sweep as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _summary(groups: Sequence[Group]) -> str:
 
 
 def _table(folder: Path, rows: Sequence[Row]) -> str:
-    """Return all runs; what is not among the first metrics is hidden until it is asked for."""
+    """Return the table of all runs; metrics other than the main ones are hidden at first."""
     keys = swept_keys(rows)
     shown = rows[:_ROWS_MAX]
     metrics = list(dict.fromkeys(name for row in rows for name in row.metrics))

@@ -1,4 +1,4 @@
-"""The runs below a folder, one row each: what was swept, how it ended, and its metrics."""
+"""The runs below a folder, one row each: swept keys, final state and metrics."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from sceneslam.collect.flatten import flat
 from sceneslam.collect.status import State, Status
 from sceneslam.types.errors import InputError
 
-ROWS = "rows.jsonl"  # rows that are no runs of their own: settings that were tried in one go
+ROWS = "rows.jsonl"  # rows of settings that were evaluated in one process
 Value = str | float | None
-_COSTS = ("_us", "_ms", "realtime_factor", "peak_rss_mb", "wall_s")  # ends of a metric's name
+_COSTS = ("_us", "_ms", "realtime_factor", "peak_rss_mb", "wall_s")  # suffixes of metrics
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """One run; its numbers are split by whether they depend on input and configuration alone."""
+    """One run; its metrics are deterministic, its costs depend on the machine."""
 
-    name: str  # its folder, from the collected one
+    name: str  # its folder, relative to the collected one
     status: str
     error: str = ""
-    keys: Mapping[str, Value]  # what the command line gave it
+    keys: Mapping[str, Value]  # swept values of the command line
     metrics: Mapping[str, Value] = field(default_factory=dict)
-    costs: Mapping[str, Value] = field(default_factory=dict)  # by the clock: never twice the same
+    costs: Mapping[str, Value] = field(default_factory=dict)  # measured times: not reproducible
 
 
 def read_rows(folder: Path) -> list[Row]:
     """Return a row for every run below a folder, numbered ones in order.
 
-    Raises InputError where there is none.
+    Raises InputError if there is none.
     """
     if not folder.is_dir():
         raise InputError(f"expected the folder of a sweep, or of runs: {folder}")
@@ -90,7 +90,7 @@ def _row(root: Path, folder: Path) -> Row:
 
 
 def _figures(path: Path) -> dict[str, Value]:
-    """Return what an experiment found: its promised figures by their names."""
+    """Return an experiment's figures with bounds, by name."""
     figures = _json(path).get("figures")
     named = figures if isinstance(figures, list) else []
     return {str(figure["name"]): figure["value"] for figure in named}
@@ -131,6 +131,6 @@ def _json(path: Path) -> Mapping[str, object]:
 
 
 def _order(root: Path, folder: Path) -> list[tuple[int, str]]:
-    """Sort by the folders' numbers where they are numbered, else by name."""
+    """Sort numbered folders by number, others by name."""
     parts = folder.relative_to(root).parts
     return [(int(part), "") if part.isdecimal() else (sys.maxsize, part) for part in parts]

@@ -1,4 +1,4 @@
-"""How a job of a sweep stands: `job.json` in its folder."""
+"""The status of a sweep's job: `job.json` in its folder."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _FILE = "job.json"
 
 
 class State(Enum):
-    """What became of a job so far."""
+    """The state of a job."""
 
     WAITING = "waiting"
     RUNNING = "running"
     DONE = "done"
-    INCOMPLETE = "incomplete"  # ended early or its input was damaged; what was computed is saved
+    INCOMPLETE = "incomplete"  # ended early or damaged input; partial results are saved
     FAILED = "failed"  # could not be run
     KILLED = "killed"  # its process died
     STOPPED = "stopped"  # with the sweep, by Ctrl-C or SIGTERM
@@ -29,7 +29,7 @@ class State(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Status:
-    """A job's state, and what it is a state of."""
+    """A job's state and overrides."""
 
     state: State
     config_sha256: str = ""
@@ -41,12 +41,12 @@ class Status:
 
     @property
     def is_finished(self) -> bool:
-        """Tell whether its metrics are final: running it again would give the same."""
+        """Tell whether its metrics are final: another run would give the same."""
         return self.state in (State.DONE, State.INCOMPLETE)
 
     @property
     def is_settled(self) -> bool:
-        """Tell whether nothing more is to come of it in this sweep."""
+        """Tell whether it has ended, in any state."""
         return self.state not in (State.WAITING, State.RUNNING)
 
     def now(self, state: State, error: str = "", **values: Any) -> Status:
@@ -54,14 +54,14 @@ class Status:
         return replace(self, state=state, error=error, **values)
 
     def write(self, folder: Path) -> None:
-        """Write it, whole or not at all: others read it meanwhile."""
+        """Write it atomically, since others read it at the same time."""
         part = folder / f"{_FILE}.{os.getpid()}.part"
         part.write_text(json.dumps(asdict(self) | {"state": self.state.value}, indent=2) + "\n")
         part.replace(folder / _FILE)
 
     @classmethod
     def read(cls, folder: Path) -> Status | None:
-        """Return a folder's status, None where it is no job of a sweep."""
+        """Return a folder's status, None if it is not a job of a sweep."""
         path = folder / _FILE
         if not path.is_file():
             return None

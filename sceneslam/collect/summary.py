@@ -24,13 +24,13 @@ class Mean:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Group:
-    """All rows that differ by their seed alone."""
+    """All rows that differ by their seed only."""
 
     keys: dict[str, Value]
     rows: Sequence[Row]
 
     def mean(self, metric: str) -> Mean | None:
-        """Return the mean over the rows that have the metric, None where none has."""
+        """Return the mean over the rows with the metric, None if there are none."""
         values = [row.metrics.get(metric) for row in self.rows]
         return mean_of([float(value) for value in values if isinstance(value, int | float)])
 
@@ -48,7 +48,7 @@ def groups_of(rows: Sequence[Row]) -> list[Group]:
 
 
 def mean_of(values: Sequence[float]) -> Mean | None:
-    """Return mean and 95 % interval by Student's t: seeds are few, their errors about normal."""
+    """Return mean and 95 % confidence interval (Student's t, for few normal values)."""
     count = len(values)
     if not count:
         return None
@@ -63,9 +63,9 @@ def mean_of(values: Sequence[float]) -> Mean | None:
 
 @cache
 def student_t(freedom: int) -> float:
-    """Return t so that 95 % of Student's distribution lie within [-t, t].
+    """Return t for which Student's distribution has a probability of 95 % in [-t, t].
 
-    Bisection on the exact series for whole degrees of freedom (Abramowitz and Stegun 26.7.3-4).
+    Bisection on the exact series for integer degrees of freedom (Abramowitz and Stegun 26.7.3-4).
     """
     low, high = 0.0, 1.0
     while _within(high, freedom) < _CONFIDENCE:

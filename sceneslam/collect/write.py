@@ -1,4 +1,4 @@
-"""The table of a sweep as files: CSV, Parquet, and a page to look at."""
+"""Files of a sweep's table: CSV, Parquet and an HTML page."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def collect(folder: Path) -> Path:
 def write_rows(folder: Path, rows: Sequence[Row]) -> Path:
     """Write the tables and the page of some runs; return the page.
 
-    `table` holds what input and configuration decide: the same for every launcher, to the bit.
-    What the clock tells is in `costs`.
+    `table` holds deterministic metrics, which are the same for every launcher. Measured times are
+    in `costs`.
     """
     keys = swept_keys(rows)
     _write_csv(folder / "table.csv", _table(rows, keys, metrics=True))
@@ -59,7 +59,7 @@ def _table(rows: Sequence[Row], keys: Sequence[str], *, metrics: bool) -> Column
 
 
 def _summary(groups: Sequence[Group]) -> ColumnTable:
-    """Return one row per setting: how many runs, each metric's mean and its 95 % interval."""
+    """Return one row per setting: number of runs, each metric's mean and 95 % interval."""
     columns: dict[str, Sequence[Value]] = {
         key: [group.keys[key] for group in groups] for key in groups[0].keys
     }
@@ -91,7 +91,7 @@ def _write_parquet(path: Path, table: ColumnTable) -> None:
 
 
 def _of_one_type(values: Sequence[Value]) -> Sequence[Value]:
-    """Return a column as Parquet takes it: text where not all values are numbers."""
+    """Return a column for Parquet: text if not all values are numbers."""
     if all(value is None or isinstance(value, int | float) for value in values):
         is_whole = all(value is None or isinstance(value, int) for value in values)
         return values if is_whole else [None if v is None else float(v) for v in values]

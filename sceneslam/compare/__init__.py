@@ -1,1 +1,1 @@
-"""Runs side by side, on one page."""
+"""Comparison of runs on one page."""

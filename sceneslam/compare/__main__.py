@@ -1,4 +1,4 @@
-"""Put finished runs side by side: `python -m sceneslam.compare RUN RUN ...`."""
+"""Compare finished runs on one page: `python -m sceneslam.compare RUN RUN ...`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of several runs: their paths from above, and their errors over time."""
+"""Figures of several runs: paths from above, and errors over time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sceneslam.evaluation.figure_paths import draw_paths
 
 
 def paths(path: Path, runs: Sequence[Run]) -> bool:
-    """Draw all paths from above as a PNG; False where no run has a pose."""
+    """Draw all paths from above as a PNG; False if no run has a pose."""
     if not any(len(run.trajectory) for run in runs):
         return False
     draw_paths(path, {run.name: run.trajectory for run in runs}, runs[0].truth)
@@ -22,7 +22,7 @@ def paths(path: Path, runs: Sequence[Run]) -> bool:
 
 
 def errors(path: Path, runs: Sequence[Run]) -> bool:
-    """Draw the position error of every run over time as a PNG; False where no truth is known."""
+    """Draw the position error of every run over time as a PNG; False without ground truth."""
     figure = look.new_figure(look.WIDTH_IN, 3.6)
     axes = figure.add_subplot()
     is_drawn = False

@@ -1,4 +1,4 @@
-"""One page, and a few lines for the terminal, that put runs side by side."""
+"""The comparison of runs as an HTML page, and as lines for the terminal."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sceneslam.types.errors import InputError
 
 _SHOWN_SETTINGS = 40
 _Measure = tuple[str, Callable[[Any], str]]
-_MEASURES: Sequence[_Measure] = (  # what is told of each run, best known first
+_MEASURES: Sequence[_Measure] = (  # the measures of each run
     ("position error (ATE RMSE)", lambda m: number(m["ate_rmse_m"], 4, " m")),
     ("largest position error", lambda m: number(m["ate_max_m"], 3, " m")),
     ("rotation error (RMSE)", lambda m: degrees(m["ate_rot_rad"])),
@@ -34,7 +34,7 @@ _MEASURES: Sequence[_Measure] = (  # what is told of each run, best known first
 
 
 def measured(runs: Sequence[Run]) -> list[list[str]]:
-    """Return a row for every measure: its name, then a value for each run."""
+    """Return a row per measure: its name, then a value per run."""
     rows = [[name, *(tell(run.metrics) for run in runs)] for name, tell in _MEASURES]
     apart = [compare(run.trajectory, runs[0].trajectory) for run in runs[1:]]
     if any(len(one.stamps_ns) for one in apart):
@@ -55,7 +55,7 @@ def lines(runs: Sequence[Run]) -> list[str]:
 
 
 def write_page(folder: Path, runs: Sequence[Run]) -> Path:
-    """Write `report.html` and its pictures into a folder that is ours; return the page's path.
+    """Write `report.html` and its figures to a folder; return the page's path.
 
     Raises InputError where the folder cannot be written.
     """
@@ -91,7 +91,7 @@ def _write(folder: Path, runs: Sequence[Run]) -> Path:
 
 
 def _links(folder: Path, runs: Sequence[Run]) -> list[str]:
-    """Return each run's name, with a link to its own report where it has one."""
+    """Return each run's name, with a link to its report if there is one."""
     return [
         markup.link(os.path.relpath(run.folder / "report.html", folder), run.name)
         if (run.folder / "report.html").is_file()

@@ -1,4 +1,4 @@
-"""Finished runs as they lie in their folders."""
+"""Reading of finished runs from their folders."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _UNSET = "–"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Run:
-    """One run, as its folder tells it."""
+    """A finished run."""
 
-    name: str  # tells it from the others
+    name: str  # unique among the runs
     folder: Path
     metrics: Mapping[str, Any]
     trajectory: Trajectory  # T_map_base
@@ -30,14 +30,14 @@ class Run:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
-    """A key that the runs do not all give the same value."""
+    """A key with different values in the runs."""
 
     key: str
     values: Sequence[str]  # one per run
 
 
 def read_runs(folders: Sequence[Path]) -> list[Run]:
-    """Return the runs of some folders; raises InputError where one holds no finished run."""
+    """Return the runs of folders; raises InputError if one holds no finished run."""
     names = _names(folders)
     return [_read(folder, name) for folder, name in zip(folders, names, strict=True)]
 
@@ -52,7 +52,7 @@ def differing(runs: Sequence[Run]) -> list[Setting]:
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Return the last part of each path, with as many parts before it as tell them apart."""
+    """Return unique names: the last parts of each path, as many as needed."""
     parts = [folder.resolve().parts for folder in folders]
     for count in range(1, max(map(len, parts)) + 1):
         names = ["/".join(part[-count:]) for part in parts]

@@ -1,4 +1,4 @@
-"""Builds everything a run needs from its configuration, and checks that the parts fit together."""
+"""Building of all parts of a run from its configuration, with checks that they fit together."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunParts:
-    """All that a run is made of."""
+    """All parts of a run."""
 
     source: Source
     rig: Rig
@@ -40,14 +40,14 @@ class RunParts:
     run: RunSettings
 
     def close(self) -> None:
-        """End the processes of the modules that have one."""
+        """End the processes of modules with a process of their own."""
         for module in self.modules.values():
             if isinstance(module, IsolatedModule):
                 module.close()
 
 
 def build(config: Mapping[str, Any]) -> RunParts:
-    """Return all parts; raises ConfigError or InputError naming what does not fit."""
+    """Return all parts; raises ConfigError or InputError that names what does not fit."""
     check_keys(config)
     builder = ComponentBuilder(config)
     run = builder.make("run", RunSettings)
@@ -94,18 +94,18 @@ def make_source(config: Mapping[str, Any], builder: ComponentBuilder) -> Source:
 
 
 def check_detector(config: Mapping[str, Any], detector: Detector, rig: Rig) -> None:
-    """Raise ConfigError when the source lacks the sensors that the detector needs."""
+    """Raise ConfigError if the source lacks sensors that the detector needs."""
     _check_sensors("detector", config["detector"], detector.requires, rig)
 
 
 def _check_mode(run: RunSettings, source: Source) -> None:
-    """Raise ConfigError where a robot would be run as if it were a recording."""
+    """Raise ConfigError if a live source is run in another mode than `live`."""
     if run.mode != LIVE and isinstance(source, Live) and source.live is not None:
         raise ConfigError("run.mode", run.mode, f"{LIVE}, since this source measures now: run=live")
 
 
 def _module(builder: ComponentBuilder, run: RunSettings, key: str) -> SlamModule:
-    """Return a module, or the process that builds it meanwhile."""
+    """Return a module, or the process that is building it."""
     make = partial(builder.make, f"slam.{key}", SlamModule)
     if run.isolation == "inline":
         return make()
@@ -113,7 +113,7 @@ def _module(builder: ComponentBuilder, run: RunSettings, key: str) -> SlamModule
 
 
 def _requires(module: SlamModule, key: str) -> Sequence[frozenset[Sensor]]:
-    """Return what the module requires; raises ConfigError where its process could not build it."""
+    """Return the module's required sensors; raises ConfigError if it could not be built."""
     try:
         return module.requires
     except ConfigError:
@@ -125,7 +125,7 @@ def _requires(module: SlamModule, key: str) -> Sequence[frozenset[Sensor]]:
 
 
 def _table(config: Mapping[str, Any], detector: Detector) -> dict[str, tuple[str, ...]]:
-    """Return scene -> module keys after checking it against the detector and `slam`."""
+    """Return the checked scene table: scene -> keys of modules."""
     modules = [key for key, node in _group(config, "slam").items() if node is not None]
     if not modules:
         raise ConfigError("slam", NOTHING, "SLAM modules; choose a scenario: +scenario=single")
@@ -149,7 +149,7 @@ def _table(config: Mapping[str, Any], detector: Detector) -> dict[str, tuple[str
 
 
 def _tell_of_rows(table: Mapping[str, Any], scenes: Mapping[str, Sequence[str]]) -> None:
-    """Say which rows lack a fallback though there are other modules, and which none asks for."""
+    """Log rows of the scene table without a fallback, and rows of unknown scenes."""
     for scene in table:
         if scene not in scenes:
             _log.warning("scenes.%s: the detector does not report this scene", scene)
@@ -159,7 +159,7 @@ def _tell_of_rows(table: Mapping[str, Any], scenes: Mapping[str, Sequence[str]])
 
 
 def _group(config: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """Return a table of the top level, empty where it is missing."""
+    """Return a table of the top level, empty if it is missing."""
     value = config.get(key)
     if value is not None and not isinstance(value, Mapping):
         raise ConfigError(key, value, "a table of keys")
@@ -167,14 +167,14 @@ def _group(config: Mapping[str, Any], key: str) -> Mapping[str, Any]:
 
 
 def _used(scenes: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return every module key of the table, each once."""
+    """Return all module keys of the table, each once."""
     return list(dict.fromkeys(key for keys in scenes.values() for key in keys))
 
 
 def _check_sensors(
     key: str, node: Mapping[str, Any], requires: Sequence[frozenset[Sensor]], rig: Rig
 ) -> None:
-    """Raise ConfigError when the source lacks the sensors that a component needs."""
+    """Raise ConfigError if the source lacks sensors that a component needs."""
     if any(sensors <= rig.sensors for sensors in requires):
         return
     needs = " or ".join(_names(sensors) for sensors in requires)

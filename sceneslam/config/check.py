@@ -1,4 +1,4 @@
-"""Checks a configuration before anything of it is built: every mistake is named by its full key."""
+"""Checks of a configuration before anything is built; errors name the full key."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.run import Command
 
 OWN_PREFIX = "sceneslam."
-NOT_GIVEN = "???"  # a value that a configuration leaves to its user
+NOT_GIVEN = "???"  # a value that the user has to set
 TOP_LEVEL = (
     "allow_targets",
     "atlas",
@@ -41,7 +41,7 @@ TOP_LEVEL = (
 )
 
 
-_MOST = {  # no recording, robot or machine has more; what is larger overflows or takes for ever
+_MOST = {  # largest plausible values by unit; larger ones overflow or never end
     "s": 1e9,  # 32 years; 64 bits hold 292 years of nanoseconds
     "m": 1e8,  # more than twice around the Earth
     "deg": 1e4,
@@ -54,7 +54,7 @@ _MOST = {  # no recording, robot or machine has more; what is larger overflows o
 
 
 class _Nothing:
-    """Stands in an error message for a value that was not given."""
+    """Placeholder in error messages for a value that was not given."""
 
     def __repr__(self) -> str:
         return "nothing"
@@ -64,7 +64,7 @@ NOTHING = _Nothing()
 
 
 def check_keys(config: Mapping[str, Any]) -> None:
-    """Raise ConfigError for a top-level key that is not known or a value that was not given."""
+    """Raise ConfigError for an unknown top-level key or a value that was not given."""
     for key in config:
         if key not in TOP_LEVEL:
             close = difflib.get_close_matches(key, (*TOP_LEVEL, "scenario", "experiment"), n=1)
@@ -74,10 +74,10 @@ def check_keys(config: Mapping[str, Any]) -> None:
 
 
 def check_node(node: object, key: str, *, allow: Sequence[str], positional: int = 0) -> None:
-    """Raise ConfigError where a component's node does not fit the signature of its `_target_`.
+    """Raise ConfigError if a component's node does not fit the signature of its `_target_`.
 
-    `allow` are the prefixes outside our own package that the user vouches for, since a `_target_`
-    is code. `positional` arguments are passed by the builder and must not be in the node.
+    `allow` are the prefixes outside of our package that the user trusts, since a `_target_` is
+    code. `positional` arguments are passed by the builder and must not be in the node.
     """
     if not isinstance(node, Mapping) or "_target_" not in node:
         raise ConfigError(key, node, "a component: `_target_` and its arguments")
@@ -128,7 +128,7 @@ def _check_inner(value: object, key: str, allow: Sequence[str]) -> bool:
 
 
 def _check_number(value: float, key: str) -> None:
-    """Raise ConfigError for a number that no quantity of the key's unit has."""
+    """Raise ConfigError for a number that is implausible for the key's unit."""
     if isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(key, value, "a finite number")
     unit = re.search(r"_([a-z]+)(\[\d+\])*$", key)
@@ -138,7 +138,7 @@ def _check_number(value: float, key: str) -> None:
 
 
 def hints_of(target: Callable[..., object]) -> dict[str, Any]:
-    """Return the types of a target's arguments, empty where they cannot be found at run time."""
+    """Return the types of a target's arguments, empty if unknown at run time."""
     try:
         return typing.get_type_hints(target.__init__ if inspect.isclass(target) else target)
     except (NameError, TypeError):
@@ -155,10 +155,10 @@ def check_given(value: object, key: str) -> None:
 
 
 def locate(target: object, key: str, allow: Sequence[str]) -> Callable[..., object]:
-    """Return the class or function that a `_target_` names; raises ConfigError for any other.
+    """Return the class or function of a `_target_`; raises ConfigError if it is not allowed.
 
-    Of our own package only classes are components: a function could build what the configuration
-    of its choice names, without these checks.
+    Only classes of our own package are components: a function could build other targets without
+    these checks.
     """
     prefixes = (OWN_PREFIX, *(f"{prefix.rstrip('.')}." for prefix in allow))
     if not isinstance(target, str) or not target.startswith(prefixes):
@@ -171,7 +171,7 @@ def locate(target: object, key: str, allow: Sequence[str]) -> Callable[..., obje
         raise ConfigError(key, target, f"a class that can be imported ({reason})") from error
     if not inspect.isclass(found) and not inspect.isfunction(found):
         raise ConfigError(key, target, "a class or a function")
-    home = f"{found.__module__}."  # a name may lead through an allowed module to another's code
+    home = f"{found.__module__}."  # an allowed module may import the name from elsewhere
     if not home.startswith(prefixes):
         raise ConfigError(key, target, f"what is defined under {' or '.join(prefixes)}")
     if home.startswith(OWN_PREFIX) and not inspect.isclass(found):
@@ -180,7 +180,7 @@ def locate(target: object, key: str, allow: Sequence[str]) -> Callable[..., obje
 
 
 def _how_to_allow(target: str) -> str:
-    """Return how to vouch for code of one's own; a library's name is not for us to propose."""
+    """Return how to allow one's own code; libraries are not proposed."""
     package = target.partition(".")[0]
     is_own = package.isidentifier() and package not in sys.stdlib_module_names
     if is_own and package not in packages_distributions():
@@ -189,17 +189,17 @@ def _how_to_allow(target: str) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """Return what an error says, in one line."""
+    """Return the first line of an error's message."""
     return next(iter(str(error).strip().splitlines()), type(error).__name__)
 
 
 def fits(value: object, hint: Any) -> bool:
-    """Tell whether a value, or a part that was built, can stand for an annotated argument.
+    """Tell whether a value, or a built part, fits an argument's annotation.
 
-    Hints that are not known accept all.
+    Unknown hints accept all values.
     """
     if value == NOT_GIVEN:
-        return True  # which `check_given` names
+        return True  # reported by `check_given`
     hint = getattr(hint, "__supertype__", hint)
     origin = typing.get_origin(hint)
     if origin in (typing.Union, types.UnionType):
@@ -225,7 +225,7 @@ def fits(value: object, hint: Any) -> bool:
 
 
 def missing_members(part: object, kind: type) -> list[str]:
-    """Return the public names that a Protocol or class asks for and a part does not have."""
+    """Return the public members of a Protocol or class that a part does not have."""
     has = dir(part)
     return [name for name in vars(kind) if not name.startswith("_") and name not in has]
 
@@ -248,7 +248,7 @@ _WORDS = {
 
 
 def describe(hint: Any) -> str:
-    """Return in words what an annotation accepts."""
+    """Return a text on the values that an annotation accepts."""
     hint = getattr(hint, "__supertype__", hint)
     if hint in _WORDS:
         return _WORDS[hint]

@@ -1,4 +1,4 @@
-"""Claims the folder of a run or sweep before Hydra writes into it."""
+"""Locking of the folder of a run or sweep before Hydra writes to it."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ class ClaimFolder(Callback):
     """Called by Hydra between composing and running (`hydra.callbacks`)."""
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        """Claim `hydra.run.dir`."""
+        """Lock `hydra.run.dir`."""
         self._claim(config, "run")
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Claim `hydra.sweep.dir`."""
+        """Lock `hydra.sweep.dir`."""
         self._claim(config, "sweep")
 
     def _claim(self, config: DictConfig, kind: str) -> None:
-        """Make the folder this run's own; where its name is an instant that is taken, rename it.
+        """Lock the folder for this run; if its name is a time and exists, add a number.
 
-        Hydra makes a warning of any exception but this one.
+        Hydra turns any exception but this one into a warning.
         """
         key = f"hydra.{kind}.dir"
         node = config.hydra[kind]

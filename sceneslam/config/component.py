@@ -1,4 +1,4 @@
-"""Builds one component of a configuration from its `_target_`."""
+"""Building of single components from their `_target_`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Part = TypeVar("Part")
 
 
 class ComponentBuilder:
-    """Makes single components of one configuration."""
+    """Builds components of one configuration."""
 
     def __init__(self, config: Mapping[str, Any]) -> None:
         self._config = config
@@ -48,7 +48,7 @@ class ComponentBuilder:
     def _build(
         self, node: Mapping[str, Any], key: str, arguments: tuple[object, ...] = ()
     ) -> object:
-        """Return what a node's target makes of the arguments, inner components first."""
+        """Return the object that a node's target builds; inner components are built first."""
         target = locate(node["_target_"], f"{key}._target_", self._allow)
         hints = hints_of(target)
         values = {name: value for name, value in node.items() if name != "_target_"}
@@ -68,7 +68,7 @@ class ComponentBuilder:
             raise ConfigError(key, node["_target_"], f"a target that builds ({reason})") from error
 
     def _built(self, value: Any, key: str) -> Any:
-        """Return a copy of a value with the components in it built."""
+        """Return a copy of a value in which components are built."""
         if isinstance(value, Mapping):
             if "_target_" in value:
                 return self._build(value, key)

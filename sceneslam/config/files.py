@@ -1,4 +1,4 @@
-"""The YAML files of a user's folder: read only if they are of a size that a person writes."""
+"""Reading of users' YAML files, with limits on their size."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from hydra.plugins.config_source import ConfigResult
 from sceneslam.types.errors import InputError
 
 _MOST_BYTES = 1 << 20
-_MOST_VALUES = 20_000  # with what aliases stand for; the largest of ours has a hundred
+_MOST_VALUES = 20_000  # with expanded aliases; our largest file has a hundred
 _DEEPEST = 32
 
 
 class CheckedFiles(FileConfigSource):
-    """Hydra's reader of `--config-dir` and `hydra.searchpath`, which refuses absurd files."""
+    """Hydra's reader of `--config-dir` and `hydra.searchpath`, with limits on file size."""
 
     def load_config(self, config_path: str) -> ConfigResult:
-        """Return what a file holds; raises InputError where reading it would take minutes."""
+        """Return a file's contents; raises InputError if it is too large."""
         path = Path(self.path) / self._normalize_file_name(config_path)
         if path.is_file():
             check_yaml(path)
@@ -29,13 +29,13 @@ class CheckedFiles(FileConfigSource):
 
 
 def register() -> None:
-    """Have Hydra read files by the class above."""
-    Plugins.instance()  # it registers Hydra's own reader
+    """Register this class as Hydra's file reader."""
+    Plugins.instance()  # registers Hydra's own reader first
     SourcesRegistry.instance().types[CheckedFiles.scheme()] = CheckedFiles
 
 
 def check_yaml(path: Path) -> None:
-    """Raise InputError for a file that is huge, or becomes so when its aliases are followed."""
+    """Raise InputError for a file that is too large, also after expansion of its aliases."""
     size = path.stat().st_size
     if size > _MOST_BYTES:
         raise InputError(f"a YAML file has {size} bytes, at most {_MOST_BYTES} are read: {path}")
@@ -43,13 +43,13 @@ def check_yaml(path: Path) -> None:
         try:
             _count_values(file.read(), path)
         except yaml.YAMLError:
-            return  # the reader of the file says where
+            return  # the reader reports the position
         except UnicodeDecodeError:
             return
 
 
 def _count_values(text: bytes, path: Path) -> None:
-    """Go through a file's events, adding up what every alias stands for."""
+    """Raise InputError if a file has too many values, with expanded aliases."""
     sizes: dict[str, int] = {}  # of anchored values
     opened: list[tuple[str | None, int]] = []  # anchor, values before it
     count = 0

@@ -1,4 +1,4 @@
-"""What was chosen, in words: the comment of an experiment's overlay, and the command line."""
+"""Texts on a run: the comment of its experiment's YAML file, and its command line."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _COMMAND_LINE = "command-line"  # Hydra's name for the provider of --config-dir
 
 
 def comment_of(hydra: HydraConf | DictConfig, group: str) -> list[str]:
-    """Return what the chosen option of a group says of itself at its top, as paragraphs.
+    """Return the first comment of a group's chosen YAML file, as paragraphs.
 
-    What is set off further in such a comment is a command, and ends a paragraph.
+    Indented lines of such a comment are commands, and end a paragraph.
     """
     choice = hydra.runtime.choices.get(group)
     for source in hydra.runtime.config_sources:
@@ -27,7 +27,7 @@ def comment_of(hydra: HydraConf | DictConfig, group: str) -> list[str]:
 
 
 def command_of(hydra: HydraConf | DictConfig) -> str:
-    """Return the command line that gives the same once more."""
+    """Return the command line that repeats the run."""
     folders = [s.path for s in hydra.runtime.config_sources if s.provider == _COMMAND_LINE]
     words = [word for word in hydra.overrides.hydra if not word.startswith("hydra.mode=")]
     given = [word for folder in folders for word in ("--config-dir", folder)]

@@ -1,4 +1,4 @@
-"""What a run was made of: its configuration, the versions and the hashes of code and input."""
+"""Provenance of a run: configuration, versions, and hashes of code and input."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import sceneslam
 from sceneslam.types.files import replacing
 from sceneslam.types.input_files import given_path
 
-_EDGE_BYTES = 32 << 20  # of the head and the tail of an input file that are hashed
+_EDGE_BYTES = 32 << 20  # of the beginning and end of large input files are hashed
 
 
 def save_config(config: Mapping[str, Any], path: Path) -> dict[str, str]:
@@ -30,7 +30,7 @@ def save_config(config: Mapping[str, Any], path: Path) -> dict[str, str]:
 
 
 def provenance(config: Mapping[str, Any]) -> dict[str, str]:
-    """Return what a run of this configuration is made of: hashes and versions."""
+    """Return hashes and versions for a run of this configuration."""
     return {
         "config_sha256": _sha256(OmegaConf.to_yaml(OmegaConf.create(dict(config))).encode()),
         "code_sha256": code_sha256(),
@@ -42,7 +42,7 @@ def provenance(config: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _dependencies() -> dict[str, str]:
-    """Return the versions of the packages that SceneSLAM stands on, where they are installed."""
+    """Return the versions of the installed packages that SceneSLAM uses."""
     found = {}
     for requirement in requires("sceneslam") or [] if _is_installed() else []:
         name = requirement.split(";")[0].split("[")[0].strip()
@@ -77,7 +77,7 @@ def code_sha256() -> str:
 def input_sha256(source: Mapping[str, Any]) -> str:
     """Return a hash of the input's names, sizes and contents; "none" without a `path`.
 
-    Of files above 64 MiB it takes the first and last 32, so that a long recording does not wait.
+    Of files above 64 MiB, only the first and last 32 MiB are hashed, to save time.
     """
     path = str(source.get("path") or "")
     root = given_path(path) if path else None

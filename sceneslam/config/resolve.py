@@ -1,4 +1,4 @@
-"""A composed configuration as plain values."""
+"""Conversion of composed configurations to plain values."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from sceneslam.types.errors import ConfigError
 
 
 def composed(overrides: Sequence[str]) -> dict[str, Any]:
-    """Return the configuration that a command line would give, its `${...}` left as they are."""
+    """Return the configuration of a command line, with unresolved `${...}`."""
     config = compose("config", overrides=list(overrides))
     return cast("dict[str, Any]", OmegaConf.to_container(config, resolve=False))
 
 
 def resolved(config: DictConfig | Mapping[str, Any]) -> dict[str, Any]:
-    """Return the configuration as plain values; raises ConfigError for a dead interpolation."""
+    """Return the configuration as plain values; raises ConfigError for an invalid `${...}`."""
     try:
         whole = config if isinstance(config, DictConfig) else OmegaConf.create(dict(config))
         plain = OmegaConf.to_container(whole, resolve=True, throw_on_missing=False)
@@ -31,5 +31,5 @@ def resolved(config: DictConfig | Mapping[str, Any]) -> dict[str, Any]:
 
 
 def without_hydra(config: DictConfig) -> DictConfig:
-    """Return a job's own configuration, as Hydra gives it to a job."""
+    """Return the configuration without Hydra's own part."""
     return OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])

@@ -1,4 +1,4 @@
-"""How a run is carried out."""
+"""Settings of a run."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ DETECT_ONLY = "detect_only"
 LIVE = "live"
 MODES = ("recording", LIVE, DETECT_ONLY)
 ISOLATIONS = ("inline", "process")
-_MOST_THREADS = 256  # of OpenCV, which starts as many as it is asked for
+_MOST_THREADS = 256  # limit for OpenCV, which starts any number
 
 
 @dataclass(slots=True, kw_only=True)
 class RunSettings:
-    """Mode, pace and limits of a run; durations are of the wall clock."""
+    """Mode, rate and limits of a run; durations are wall clock time."""
 
     mode: str  # recording: in step with the data; live: paced by the clock, own thread;
     # detect_only: no SLAM
-    isolation: str  # inline: modules in the bus's own process; process: each in one of its own ...
-    step_deadline_s: float  # ... which is ended when it takes longer to track an observation ...
-    start_deadline_s: float  # ... to be built, to be activated or to hand over its map ...
-    memory_limit_mb: int  # ... or uses more
-    restarts_max: int  # it is started again so many times ...
-    restart_window_s: float  # ... within any such time ...
-    restart_backoff_s: float  # ... waiting so long before the second time, then twice as long
+    isolation: str  # inline: modules in the main process; process: each in its own ...
+    step_deadline_s: float  # ... which is killed if it takes longer to track an observation ...
+    start_deadline_s: float  # ... to be built, to be activated or to return its map ...
+    memory_limit_mb: int  # ... or uses more memory
+    restarts_max: int  # largest number of restarts ...
+    restart_window_s: float  # ... within any time window of this length ...
+    restart_backoff_s: float  # ... delay before the second start, then doubled
     threads: int  # of OpenCV
     progress: bool  # show a progress bar
     report: bool  # draw figures and write report.html
-    max_observations: int | None  # stop after so many, null: all
-    rate: float  # live, of a recording: so many times as fast as it was recorded
-    silent_after_s: float  # live: the events name a source that gave nothing for so long ...
-    end_after_s: float | None  # ... and the run ends after so long; null: never
-    is_repeatable: bool  # modules wait for what they compute beside the poses
-    catch_up_steps: int | None  # remembered observations per new one, at a hand-over; null: all
+    max_observations: int | None  # stop after this number; null: all
+    rate: float  # live, playback rate of a recording; 1: as recorded
+    silent_after_s: float  # live: time without data until the event `silent` ...
+    end_after_s: float | None  # ... and until the run ends; null: never
+    is_repeatable: bool  # poses wait for parallel computations of modules
+    catch_up_steps: int | None  # buffered observations per new one at a hand-over; null: all
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:
@@ -56,12 +56,12 @@ class RunSettings:
 
     @property
     def limits(self) -> Limits:
-        """Return the limits of a module's process; raises ConfigError where one makes no sense."""
+        """Return the limits of a module's process; raises ConfigError for an invalid one."""
         return Limits(**self._part(Limits))
 
     @property
     def live(self) -> LiveSettings:
-        """Return how time passes in a live run; raises ConfigError where that makes no sense."""
+        """Return the timing of a live run; raises ConfigError for an invalid value."""
         return LiveSettings(**self._part(LiveSettings))
 
     def _part(self, settings: type[Limits] | type[LiveSettings]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The words of a command line: paths as people type them, and the code that they vouch for."""
+"""Words of the command line: quoting of paths, and code that the user allows."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def is_override(word: str) -> bool:
 
 
 def readable(word: str, *, is_sweep: bool) -> str:
-    """Return a word as Hydra reads it: a path that it cannot read is put into quotes.
+    """Return a word that Hydra can parse: paths are quoted if necessary.
 
-    In a sweep a comma stands between values, in a path alone it is part of the name. Raises
-    ConfigError for a word that takes longer than some seconds to be parsed.
+    In a sweep a comma separates values, else it is part of a path. Raises ConfigError for a word
+    that would take seconds to parse.
     """
     if not is_override(word):
         return word
@@ -55,14 +55,14 @@ def _check_extent(word: str) -> None:
 
 
 def quoted(text: str) -> str:
-    """Return text as Hydra's grammar takes any: in double quotes."""
+    """Return text in double quotes for Hydra's grammar."""
     inner = re.sub(r'(\\*)"', r'\1\1\\"', text)
     ends = len(inner) - len(inner.rstrip("\\"))
     return f'"{inner}{ends * chr(92)}"'
 
 
 def how_to_quote(word: str, reason: str) -> str:
-    """Return a sentence on a word that Hydra cannot parse, with the word as it can be typed."""
+    """Return a sentence on a word that Hydra cannot parse, with its quoted form."""
     key, equals, value = word.partition("=")
     said = f"{shortened(word)}: {shortened(reason)}"
     if not equals or len(value) > _SHOWN:
@@ -77,10 +77,10 @@ def shortened(text: str) -> str:
 
 
 def check_trust(config: DictConfig, words: Sequence[str]) -> None:
-    """Raise ConfigError where `allow_targets` says anything but what the command line says.
+    """Raise ConfigError if `allow_targets` was changed by a file.
 
-    A `_target_` is code. A file that somebody shares must not vouch for its own code: only the
-    person who types the command does.
+    A `_target_` is code. A shared file must not allow its own code: only the person who types the
+    command does.
     """
     typed = [one.value() for one in map(_parsed, words) if one and one.key_or_group == _TRUST]
     vouched = _plain(typed[-1]) if typed else []
@@ -95,7 +95,7 @@ def check_trust(config: DictConfig, words: Sequence[str]) -> None:
 
 
 def _parsed(word: str) -> Override | None:
-    """Return what Hydra reads in a word, None where it cannot."""
+    """Return the override of a word, None if Hydra cannot parse it."""
     try:
         return OverridesParser.create().parse_override(word)
     except HydraException:

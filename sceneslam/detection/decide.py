@@ -1,4 +1,4 @@
-"""Votes and confirmed scenes from features: what the bus does, without the images and the SLAM."""
+"""Votes and confirmed scenes from stored features, as the bus computes them during a run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sceneslam.types.rig import Rig
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Filtered:
-    """A vote, and what was made of it."""
+    """A vote, and the scene that was confirmed after it."""
 
     vote: SceneVote
     confirmed: ConfirmedScene | None
@@ -23,7 +23,7 @@ class Filtered:
 
 
 def vote(detector: FeatureDetector, rig: Rig, features: RecordingFeatures) -> list[SceneVote]:
-    """Return the detector's votes on every observation."""
+    """Return the detector's vote for each observation of stored features."""
     detector.activate(rig)
     told = zip(
         features.stamps_ns.tolist(), features.values, features.is_there.tolist(), strict=True
@@ -34,7 +34,7 @@ def vote(detector: FeatureDetector, rig: Rig, features: RecordingFeatures) -> li
 
 
 def filtered(votes: Iterable[SceneVote], scenes: SceneFilter) -> Iterator[Filtered]:
-    """Yield what a filter makes of each vote."""
+    """Yield the filter's result after each vote."""
     for one in votes:
         confirmed = scenes.update(one)
         yield Filtered(vote=one, confirmed=confirmed, posterior=scenes.posterior)
@@ -43,6 +43,6 @@ def filtered(votes: Iterable[SceneVote], scenes: SceneFilter) -> Iterator[Filter
 def confirm(
     votes: Iterable[SceneVote], policy: Policy, scenes: Sequence[str]
 ) -> list[ConfirmedScene]:
-    """Return the scenes that the policy confirms by votes for `scenes`."""
+    """Return the confirmed scenes among `scenes`, by the policy."""
     found = map(policy.make_scene_filter(scenes).update, votes)
     return [scene for scene in found if scene is not None]

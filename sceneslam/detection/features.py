@@ -1,4 +1,4 @@
-"""What a detector measures of every observation of a recording, and what is true of it: kept."""
+"""Stored detector features of a recording, with its true scenes."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from sceneslam.types.truth import GroundTruth, SceneChange
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RecordingFeatures:
-    """A recording as a detector sees it."""
+    """A detector's features for every observation of a recording."""
 
     stamps_ns: NDArray[np.int64]  # (N,) of all observations
-    values: NDArray[np.float64]  # (N, F); rows without a measurement are not used
+    values: NDArray[np.float64]  # (N, F); rows without input are not used
     is_there: NDArray[np.bool_]  # (N,) whether the observation had an input for the detector
-    scenes: tuple[SceneChange, ...] | None  # the true ones, None where nothing is known
+    scenes: tuple[SceneChange, ...] | None  # true scenes, None: unknown
 
     @property
     def truth(self) -> GroundTruth | None:
-        """Return what is known to be true."""
+        """Return the ground truth, None if unknown."""
         return None if self.scenes is None else GroundTruth(scenes=self.scenes)
 
     def write(self, path: Path) -> None:
-        """Write a file, whole or not at all."""
+        """Write a file atomically."""
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(f".{os.getpid()}.part")
         scenes = self.scenes and [[change.stamp_ns, change.scene] for change in self.scenes]
@@ -47,7 +47,7 @@ class RecordingFeatures:
 
     @classmethod
     def read(cls, path: Path) -> RecordingFeatures:
-        """Return what a file holds, to the bit what was written."""
+        """Return the features of a file, exactly as written."""
         with np.load(path, allow_pickle=False) as arrays:
             scenes = json.loads(str(arrays["scenes"]))
             return cls(
@@ -63,7 +63,7 @@ class RecordingFeatures:
 def measure(
     observations: Iterable[Observation], detector: FeatureDetector
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Return stamps, features and whether there were any, of all observations."""
+    """Return stamps (N,) [ns], features (N, F) and whether there was input (N,)."""
     stamps_ns, rows = [], []
     for observation in observations:
         stamps_ns.append(observation.stamp_ns)

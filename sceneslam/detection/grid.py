@@ -1,4 +1,4 @@
-"""Thousands of settings of detector and policy, tried on features that were taken once."""
+"""Evaluation of thousands of detector and policy settings on features computed once."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Setting = Mapping[str, Any]  # full key -> value
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Axis:
-    """A key of detector or policy, and the values that are tried."""
+    """A key of detector or policy and its tried values."""
 
     key: str
     values: Sequence[Any]
@@ -32,7 +32,7 @@ class Axis:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tried:
-    """What a setting is worth, or why it could not be tried."""
+    """The metrics of a setting, or why it could not be tried."""
 
     setting: Setting
     metrics: Metrics = field(default_factory=dict)
@@ -41,7 +41,7 @@ class Tried:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Ballot:
-    """What a detector's setting votes on a recording."""
+    """The votes of a detector's setting on a recording."""
 
     watched: Watched
     votes: Sequence[SceneVote]
@@ -49,9 +49,9 @@ class _Ballot:
 
 
 def try_all(config: Mapping[str, Any], axes: Sequence[Axis]) -> Iterator[Tried]:
-    """Yield every combination of the axes' values in a resolved configuration, the last fastest.
+    """Yield the results of all combinations of the axes' values, the last axis fastest.
 
-    The recording is read once per detector whose features differ, and votes are cast once per
+    The recording is read once per detector with different features, and votes are computed once per
     detector's setting.
     """
     detectors = list(_settings(axes, "detector."))
@@ -101,12 +101,12 @@ def _settings(axes: Sequence[Axis], prefix: str) -> Iterator[Setting]:
 
 
 def _place(node: Any, part: str) -> str | int:
-    """Return a part of a key as its node takes it: the places of a list are numbers."""
+    """Return a part of a key as its node needs it: an integer for lists."""
     return int(part) if isinstance(node, list) else part
 
 
 def _with(config: Mapping[str, Any], setting: Setting) -> dict[str, Any]:
-    """Return a copy of a configuration with other values at some keys."""
+    """Return a copy of a configuration with the setting's values."""
     changed = {
         **config,
         "detector": deepcopy(config["detector"]),

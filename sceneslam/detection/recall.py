@@ -1,4 +1,4 @@
-"""Finds the kept features of a recording, or reads the recording once for them."""
+"""Cache of detector features: read from disk, or computed from the recording once."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _CACHE = "~/.cache/sceneslam"
 def recall(
     config: Mapping[str, Any], detector: FeatureDetector, source: Source, run: RunSettings
 ) -> RecordingFeatures:
-    """Return the features that a configuration's detector takes from its source.
+    """Return the detector's features for all observations of the source.
 
-    Raises InputError where the source cannot be read.
+    Raises InputError if the source cannot be read.
     """
     path = _path(config, detector)
     if path.is_file():
@@ -43,7 +43,7 @@ def recall(
 
 
 def _path(config: Mapping[str, Any], detector: FeatureDetector) -> Path:
-    """Return where features are kept, under a name that changes with all that they depend on."""
+    """Return the path of cached features, with a hash of everything that they depend on."""
     source = config["source"]
     node = config["detector"]
     depends_on = {
@@ -52,7 +52,7 @@ def _path(config: Mapping[str, Any], detector: FeatureDetector) -> Path:
         "detector": {name: node.get(name) for name in ("_target_", *detector.feature_settings)},
         "max_observations": config["run"].get("max_observations"),
         "input": input_sha256(source),
-        "model": input_sha256(node),  # of a detector that reads one
+        "model": input_sha256(node),  # file of a trained detector, if any
         "code": code_sha256(),
     }
     text = json.dumps(depends_on, sort_keys=True, default=str)

@@ -1,4 +1,4 @@
-"""A run without SLAM: the scenes that a detector and a policy find in a recording."""
+"""Runs without SLAM: the scenes that detector and policy find in a recording."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ from sceneslam.types.truth import GroundTruth
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Watched:
-    """A recording as a detector saw it; other settings of the detector can be tried on it."""
+    """A recording's features, on which other settings of the detector can be tried."""
 
     rig: Rig
     features: RecordingFeatures
-    faults: Sequence[str]  # of the recording, where it was read just now
+    faults: Sequence[str]  # of the recording, if it was read just now
 
 
 def watch(config: Mapping[str, Any]) -> Watched:
-    """Return what the configuration's detector sees; raises ConfigError or InputError."""
+    """Return the features for a configuration; raises ConfigError or InputError."""
     check_keys(config)
     builder = ComponentBuilder(config)
     run = builder.make("run", RunSettings)
@@ -54,7 +54,7 @@ def watch(config: Mapping[str, Any]) -> Watched:
 
 
 def detect(config: Mapping[str, Any], folder: Path) -> list[str]:
-    """Write a folder with events, metrics and configuration; return a summary in short lines."""
+    """Write events, metrics and configuration to a folder; return a summary in short lines."""
     watched = watch(config)
     builder = ComponentBuilder(config)
     detector = builder.make("detector", FeatureDetector)
@@ -81,7 +81,7 @@ def detect(config: Mapping[str, Any], folder: Path) -> list[str]:
 def score(
     features: RecordingFeatures, confirmed: Sequence[ConfirmedScene], settings: EvaluationSettings
 ) -> Metrics:
-    """Return the metrics of confirmed scenes, named as those of a run with SLAM."""
+    """Return the metrics of confirmed scenes, with the names of a run with SLAM."""
     stamps_ns = features.stamps_ns
     end_ns = int(stamps_ns[-1]) if len(stamps_ns) else 0
     events = [asdict(scene) for scene in confirmed]
@@ -92,7 +92,7 @@ def score(
 
 
 def _shares(votes: Sequence[SceneVote], truth: GroundTruth | None) -> str:
-    """Return in words which share of the votes each scene got, and how many named the true one."""
+    """Return a text with each scene's share of votes, and the share of correct votes."""
     counts = Counter(one.scene for one in votes)
     told = [f"{scene} {100 * count / len(votes):.1f} %" for scene, count in counts.most_common()]
     cast = [one for one in votes if one.scene != UNSURE]
@@ -103,7 +103,7 @@ def _shares(votes: Sequence[SceneVote], truth: GroundTruth | None) -> str:
 
 
 def _write_events(path: Path, told: Sequence[Filtered]) -> None:
-    """Write votes and confirmed scenes as a run with SLAM does."""
+    """Write votes and confirmed scenes in the format of a run with SLAM."""
     log = EventLog(path)
     for one in told:
         log_vote(log, one.vote, one.confirmed, one.posterior)

@@ -1,1 +1,1 @@
-"""Looks after saved maps: `python -m sceneslam.maps`."""
+"""Tools for saved maps: `python -m sceneslam.maps`."""

@@ -1,4 +1,4 @@
-"""Look after saved maps: `python -m sceneslam.maps info|check|merge|prune|export MAP`."""
+"""Inspect and edit saved maps: `python -m sceneslam.maps info|check|merge|prune|export MAP`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OK, INCOMPLETE, UNUSABLE = 0, 1, 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Do what is asked; return 0, 1 where something is wrong with the map, 2 where it is no map."""
+    """Run the command; return 0, 1 if the map has errors, 2 if it is not a map."""
     options = _parser().parse_args(arguments)
     try:
         return int(options.act(options))
@@ -39,7 +39,7 @@ def _check(options: argparse.Namespace) -> int:
     for flaw in found:
         print(f"error: {flaw}", file=sys.stderr)
     if not found:
-        print("the map is whole")
+        print("the map has no errors")
     return INCOMPLETE if found else OK
 
 
@@ -77,8 +77,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m sceneslam.maps", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="info|check|merge|prune|export")
     for name, act, about in (
-        ("info", _info, "say what a map holds"),
-        ("check", _check, "say what is wrong with a map"),
+        ("info", _info, "describe a map"),
+        ("check", _check, "check a map for errors"),
         ("merge", _merge, "join maps, and the pieces of one, where they show the same place"),
         ("prune", _prune, "drop submaps whose ground later ones show as well"),
         ("export", _export, "write the grid for map_server and the graph as g2o"),

@@ -1,4 +1,4 @@
-"""Writes a saved map for other programs: map_server, g2o, TUM."""
+"""Export of a saved map to the formats of map_server, g2o and TUM."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from sceneslam.atlas.submaps.graph import EdgeKind
 from sceneslam.types import planar
 from sceneslam.types.maps import PoseGraphLayer
 
-_UNMEASURED = 1e6  # 1/m^2, 1/rad^2: height, roll and pitch of a level base
+_UNMEASURED = 1e6  # 1/m^2, 1/rad^2: information of height, roll and pitch, which are 0
 
 
 def export(saved: SavedMap, folder: Path) -> list[Path]:
-    """Write `grid.pgm` with `grid.yaml` and `pose_graph.g2o` with `.tum`, of the first piece."""
+    """Write `grid.pgm`, `grid.yaml`, `pose_graph.g2o` and `.tum` of the first piece."""
     folder.mkdir(parents=True, exist_ok=True)
     main = saved.of(np.flatnonzero(saved.pieces == 0).tolist())
     grid, graph = folder / "grid.yaml", folder / "pose_graph.g2o"

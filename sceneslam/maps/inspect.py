@@ -1,4 +1,4 @@
-"""What a saved map holds, and what is wrong with it, in plain sentences."""
+"""Description of a saved map, and of its errors, in sentences."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from sceneslam.atlas.places.floor_plan import CELL_M
 from sceneslam.atlas.submaps.graph import EdgeKind
 from sceneslam.types import planar
 
-_CHI2_3 = 16.27  # of three degrees of freedom, exceeded by one in a thousand
+_CHI2_3 = 16.27  # three degrees of freedom, p = 0.001
 
 
 def described(saved: SavedMap) -> list[str]:
-    """Return what the map holds, a line per piece."""
+    """Return the map's contents, a line per piece."""
     loops = sum(edge.kind is EdgeKind.LOOP for edge in saved.edges)
     lines = [
         f"{len(saved.submaps)} submaps of {saved.runs} runs, {len(saved.edges)} edges, "
@@ -33,7 +33,7 @@ def described(saved: SavedMap) -> list[str]:
 
 
 def flaws(saved: SavedMap) -> list[str]:
-    """Return a sentence for everything that does not fit together."""
+    """Return a sentence for each inconsistency."""
     found = []
     for piece in np.unique(saved.pieces).tolist():
         own = set(np.flatnonzero(saved.pieces == piece).tolist())
@@ -59,7 +59,7 @@ def flaws(saved: SavedMap) -> list[str]:
 
 
 def _connected(saved: SavedMap, own: set[int]) -> set[int]:
-    """Return the submaps that edges lead to from the first of some."""
+    """Return the submaps of `own` that edges connect to the first one."""
     neighbours: dict[int, set[int]] = {node: set() for node in own}
     for edge in saved.edges:
         if edge.first in own and edge.second in own:

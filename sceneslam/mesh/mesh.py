@@ -1,4 +1,4 @@
-"""A coloured mesh of depth images at known poses: truncated signed distances (Open3D)."""
+"""A coloured mesh from depth images with known poses: truncated signed distances (Open3D)."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
-_STEP_M, _STEP_RAD = 0.1, 0.15  # between two images that are used
-_BLOCKS = 20_000  # of 16 x 16 x 16 voxels, to begin with
-_PIXELS_MIN = 100  # with a depth: Open3D refuses images without any
-_WEIGHT_MIN = 2.0  # images that have to agree on a surface
+_STEP_M, _STEP_RAD = 0.1, 0.15  # smallest motion between two used images
+_BLOCKS = 20_000  # initial number of blocks of 16 x 16 x 16 voxels
+_PIXELS_MIN = 100  # valid depths: Open3D refuses images without any
+_WEIGHT_MIN = 2.0  # smallest number of images that show a surface
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,7 +40,7 @@ class ColouredDepthImage:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Meshed:
-    """What was written."""
+    """The properties of the written mesh."""
 
     path: Path
     views: int
@@ -48,10 +48,10 @@ class Meshed:
 
 
 def write_mesh(folder: Path, voxel_m: float) -> Meshed:
-    """Write `map/mesh.ply` (x y z [m, map], colours) of a run; return what it holds.
+    """Write `map/mesh.ply` (x y z [m, map], colours) of a run; return its properties.
 
-    The recording is read again, and its images are placed by `trajectory.tum`. Raises ConfigError
-    or InputError where the run or its recording cannot be read, or has no depth.
+    The recording is read again; the poses of its images are those of `trajectory.tum`. Raises
+    ConfigError or InputError if the run or its recording cannot be read, or has no depth.
     """
     source = _source(folder)
     camera = source.rig.camera
@@ -90,7 +90,7 @@ def views(
 
 
 class Volume:
-    """The space around the cameras, as distances to the nearest surface on a grid of voxels."""
+    """A truncated signed distance field on a grid of voxels."""
 
     def __init__(self, camera: Camera, voxel_m: float) -> None:
         self._open3d = _load_open3d()
@@ -130,7 +130,7 @@ class Volume:
 
 
 def _view(one: Observation, T_map_cam: Transform, camera: Camera) -> ColouredDepthImage:
-    """Return the observation's images without the lens's distortion, depth out of range missing."""
+    """Return the observation's undistorted images; depth out of range is missing."""
     assert one.depth_m is not None
     depth_m = np.where(camera.measures(one.depth_m), one.depth_m, 0.0).astype(np.float32)
     grey = np.full((*depth_m.shape, 3), 128, np.uint8)

@@ -1,4 +1,4 @@
-"""Make the results of a run that was cut off: `python -m sceneslam.recover RUN`."""
+"""Recover the results of a run that was interrupted: `python -m sceneslam.recover RUN`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sceneslam.types.errors import InputError, SceneSlamError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Recover; return the exit code: 0 results are written or were, 1 not all, 2 nothing to do."""
+    """Recover; return the exit code: 0 results are complete, 1 partial, 2 nothing to do."""
     options = _parser().parse_args(arguments)
     folder: Path = options.run.resolve()
     try:

@@ -1,4 +1,4 @@
-"""The results of a run that was killed, from its journal and events, by the code of every run."""
+"""Recovery of the results of a killed run from its journal and events."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ _NEVER_KEPT = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recovered:
-    """What could be made of a run, and what could not."""
+    """The recovered results of a run, and the missing ones."""
 
     metrics: Metrics
-    missing: tuple[str, ...]  # that no run which is cut off leaves behind, or that was torn
-    faults: tuple[str, ...]  # what could not be saved now
+    missing: tuple[str, ...]  # not recoverable, or damaged
+    faults: tuple[str, ...]  # errors of saving
 
 
 def recover(folder: Path) -> Recovered:
-    """Write the results of a run that was cut off; raises InputError where it left no journal."""
+    """Write the results of an interrupted run; raises InputError without a journal."""
     config = _read_config(folder)
-    # The code that a configuration names is run at the user's word alone, not at a file's.
-    # Submaps are made of observations, which a journal does not hold.
+    # `allow_targets` of the file is ignored: only the user may allow code.
+    # Submaps need observations, which the journal does not contain.
     poses_alone = {**(config.get("atlas") or {}), "load": None, "save": None, "mode": "extend"}
     builder = ComponentBuilder(config | {"allow_targets": [], "atlas": poses_alone})
     atlas = builder.make("atlas", Atlas)
@@ -89,7 +89,7 @@ def recover(folder: Path) -> Recovered:
 
 
 class _Retold:
-    """Tells an atlas what a journal says that another was told."""
+    """Repeats the journal's calls on an atlas."""
 
     def __init__(self, atlas: Atlas) -> None:
         self._atlas = atlas
@@ -130,7 +130,7 @@ def _read_config(folder: Path) -> dict[str, Any]:
 
 
 def _events(folder: Path, missing: list[str]) -> list[Event]:
-    """Return the events as far as they are whole; a torn last line is taken off the file."""
+    """Return the complete events; an incomplete last line is removed from the file."""
     path = folder / "events.jsonl"
     lines = path.read_bytes().split(b"\n") if path.is_file() else []
     events: list[Event] = []
@@ -153,7 +153,7 @@ def _truth(
         return make_source(config, builder).ground_truth()
     except SceneSlamError as error:
         missing.append(f"the ground truth: {error}")
-    except Exception as error:  # a reader's own, of a recording that has changed meanwhile
+    except Exception as error:  # any exception of a reader, if the recording has changed
         missing.append(f"the ground truth: {told(error)}")
     return None
 
@@ -181,7 +181,7 @@ def _result(atlas: Atlas, kept: Kept, events: list[Event]) -> RunResult:
 
 
 def _tidy(folder: Path) -> None:
-    """Remove what the run kept for this, and files that it did not come to finish."""
+    """Remove the journal and unfinished files."""
     unfinished = [name for name in owned(folder) if name.endswith(PART)]
     sinks = [name for name in unfinished if (folder / name.removesuffix(PART)).suffix == ".mcap"]
     for name in [JOURNAL, "reserve.bin", *(one for one in unfinished if one not in sinks)]:

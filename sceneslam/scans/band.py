@@ -1,16 +1,16 @@
-"""The band of heights that a scan is made of."""
+"""The band of heights from which a planar scan is made."""
 
 from __future__ import annotations
 
 from sceneslam.types.errors import ConfigError
 
-_HALF_M = 0.15  # around the sensor
+_HALF_M = 0.15  # above and below the sensor
 
 
 def checked_band(
     sensor_m: float, *, height_min_m: float | None, height_max_m: float | None, beams: int
 ) -> tuple[float, float]:
-    """Return the band [m] above base; a limit that is None lies 0.15 m from the sensor's height.
+    """Return the limits [m] above `base`; a limit of None is 0.15 m from the sensor's height.
 
     Raises ConfigError if the band is empty or there are fewer than 2 beams.
     """

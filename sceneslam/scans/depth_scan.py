@@ -1,8 +1,8 @@
-"""A planar laser scan made of a depth image, as in the paper: the depth camera is the laser.
+"""Conversion of depth images to planar laser scans, as in the paper.
 
-The scan's frame `laser` lies below (or above) the camera in base's z = 0 plane and looks along the
-optical axis: T_base_laser = (camera x, camera y, yaw of the axis). So every pixel belongs to one
-beam whatever its depth is, and a scan is three look-ups in a table that is made once per camera.
+The scan's frame `laser` is below (or above) the camera in the plane z = 0 of `base`, with x along
+the optical axis: T_base_laser = (camera x, camera y, yaw of the axis). Then a pixel's beam does not
+depend on its depth, and a scan needs three look-ups in tables that are computed once per camera.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import LaserScan
 from sceneslam.types.rig import Camera
 
-# A beam's return is something that stands: boards and table tops come and go with the distance.
-_UPRIGHT_M, _UPRIGHT_RATIO = 0.1, 1 / 3  # so high, or so much of the band where that is less
-_NOISE_M, _NOISE_PER_M = 0.005, 0.003  # of a range, its square's growing as a triangulation's does
-_LIMIT_RATIO = 0.1  # of the farthest depth at most: noise does not reach a limit that is none
-_FARTHEST_M = 1e6  # instead of a limit that is infinite
+# Only upright surfaces count as returns: shelves and table tops appear at some distances only.
+_UPRIGHT_M, _UPRIGHT_RATIO = 0.1, 1 / 3  # height, absolute or of the band
+_NOISE_M, _NOISE_PER_M = 0.005, 0.003  # sigma = a + b * range^2 (triangulation)
+_LIMIT_RATIO = 0.1  # of the largest depth: upper bound of the noise margin at the limit
+_FARTHEST_M = 1e6  # replaces an infinite limit
 _PER_BIN, _RATIO = np.sqrt(_NOISE_M * _NOISE_PER_M), np.sqrt(_NOISE_PER_M / _NOISE_M)
 
 
 def scan_frame(camera: Camera) -> se3.Transform:
-    """Return T_base_laser of the scans that are made of this camera's depth."""
+    """Return T_base_laser (4, 4) [m] of scans made from this camera's depth."""
     axis = camera.T_base_cam[:3, 2]
-    if np.hypot(axis[0], axis[1]) < 1e-3:  # looks straight up or down: the image's up is forward
+    if np.hypot(axis[0], axis[1]) < 1e-3:  # looks straight up or down: x is up in the image
         axis = -camera.T_base_cam[:3, 1]
     x_m, y_m = camera.T_base_cam[:2, 3]
     return se3.from_xy_yaw(x_m, y_m, float(np.arctan2(axis[1], axis[0])))
@@ -44,7 +44,7 @@ def scan_from_depth(
     beams: int = 180,
     stride_px: int = 2,
 ) -> LaserScan:
-    """Return the scan of one depth image; see DepthScanner, which to keep where there are many."""
+    """Return the scan of one depth image (H, W) [m]; for several images, keep a DepthScanner."""
     scanner = DepthScanner(
         camera,
         height_min_m=height_min_m,
@@ -56,7 +56,7 @@ def scan_from_depth(
 
 
 class DepthScanner:
-    """Makes scans of one camera's depth images: the nearest return per beam within a band."""
+    """Converts one camera's depth images to scans: the nearest return per beam within a band."""
 
     def __init__(
         self,
@@ -67,11 +67,10 @@ class DepthScanner:
         beams: int,
         stride_px: int,
     ) -> None:
-        """Tabulate each pixel's beam, range and height per metre of depth.
+        """Compute tables of each pixel's beam, range and height per metre of depth.
 
-        The band [height_min_m, height_max_m] is above base. None: 0.15 m below (above) the camera,
-        which is the part of the world that stays in view near and far, and, on a robot, holds no
-        floor.
+        The band [height_min_m, height_max_m] is above `base`. None: 0.15 m below (above) the
+        camera, which is visible at all distances and, on a robot, does not contain the floor.
         """
         height_m = float(camera.T_base_cam[2, 3])
         self.band_m = checked_band(
@@ -87,9 +86,9 @@ class DepthScanner:
     def scan(self, depth_m: NDArray[np.float32], *, stamp_ns: int) -> LaserScan:
         """Return the scan of a depth image (H, W) [m] in `laser`.
 
-        A beam without a return in the band is NaN: a depth camera does not tell far from blind.
-        So is one at the camera's limit, where only those are seen that noise makes too near.
-        Raises InputError when the image has another size than the camera.
+        A beam without a return in the band is NaN, since missing depth does not mean free space. A
+        beam at the camera's depth limit is NaN too: only returns that noise shortens are measured
+        there. Raises InputError if the image has another size than the camera.
         """
         width, height = self._camera.size_wh
         if depth_m.shape != (height, width):
@@ -119,10 +118,10 @@ class DepthScanner:
         ranges_m: NDArray[np.float32],
         heights_m: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Return per beam the mean of the returns of the nearest upright surface, NaN without one.
+        """Return the mean range (beams,) [m] of each beam's nearest upright surface, NaN without.
 
-        The mean, since the least of many noisy depths would be too short. A surface is what lies
-        in two neighbouring bins of range; each return adds the height that its pixel covers.
+        The mean is used as the minimum of many noisy depths would be biased. A surface consists of
+        the returns in two neighbouring bins of range; each return adds the height of its pixel.
         """
         depth = (np.arctan(_RATIO * ranges_m) / _PER_BIN).astype(np.int64)
         count = int(depth.max(initial=0)) + 2
@@ -131,7 +130,7 @@ class DepthScanner:
         is_upright = found[:, :-1] + found[:, 1:] >= self._upright_m
         middle_m = np.tan((is_upright.argmax(axis=1) + 1) * _PER_BIN) / _RATIO
         mean_m = np.where(is_upright.any(axis=1), middle_m, np.nan)
-        for _ in range(2):  # the two bins may hold the nearer half of the noise only
+        for _ in range(2):  # the first two bins may hold only the nearer half of the noisy returns
             limit_m = 2.0 * (_NOISE_M + _NOISE_PER_M * mean_m * mean_m)
             agrees = np.abs(ranges_m - mean_m[beam]) <= limit_m[beam]
             total_m = np.bincount(beam[agrees], ranges_m[agrees], minlength=self._beams)
@@ -148,7 +147,7 @@ class DepthScanner:
         z_min_m, z_max_m = self._camera.depth_range_m
         z_max_m = min(z_max_m, _FARTHEST_M)
         farthest, nearest = rays_base[:, 2] * z_max_m, rays_base[:, 2] * z_min_m
-        # A ray that passes the band at none of its depths never gives a return.
+        # A ray that does not cross the band has no return.
         crosses = (np.minimum(nearest, farthest) <= high_m) & (
             np.maximum(nearest, farthest) >= low_m
         )
@@ -167,14 +166,14 @@ class DepthScanner:
         self._height_ratio = rays_base[:, 2].astype(np.float32)
         noise_m = _NOISE_M + _NOISE_PER_M * z_max_m * z_max_m
         self._far_m = z_max_m - min(noise_m, _LIMIT_RATIO * z_max_m)
-        # A pixel's share of an upright surface at 1 m, as a height over the width of a beam.
+        # A pixel's area on an upright surface at 1 m, as a height over the width of a beam.
         solid = self._stride_px**2 / (self._camera.fx * self._camera.fy)
         self._height_per_m = (solid / self._step_rad / self._range_ratio**3).astype(np.float32)
         self._upright_m = min(_UPRIGHT_M, _UPRIGHT_RATIO * (high_m - low_m))
 
 
 def _rays_cam(camera: Camera, stride_px: int) -> NDArray[np.float64]:
-    """Return the rays (N, 3) with z = 1 of every stride-th pixel, lens distortion taken out."""
+    """Return the rays (N, 3), z = 1, of every stride-th pixel, without lens distortion."""
     width, height = camera.size_wh
     u, v = np.meshgrid(np.arange(0, width, stride_px), np.arange(0, height, stride_px))
     rays = np.ones((u.size, 3))

@@ -1,4 +1,4 @@
-"""A level scan of whatever sensor there is: laser, lidar or depth camera."""
+"""Horizontal scans for place recognition, from laser, lidar or depth camera."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
 
-_LEVEL_COS = np.cos(np.radians(5.0))  # a laser that is tilted by more measures floor and ceiling
-_BEAMS = 360  # of a lidar's turn
-_DEPTH_BEAMS, _STRIDE_PX = 160, 4  # a beam of a third of a degree is a cell wide at the far end
-_REACH = 3  # points to either side that a line is laid through
-_SHORTEST_M, _LONGEST_M = 0.03, 0.6  # from the first to the last of them
-_FLAT_RATIO, _FLAT_M = 0.1, 0.02  # how far one in between may lie off the line: the noise of range
-_FAR_M = 15.0  # beyond, neighbouring beams of a degree are five cells apart
+_LEVEL_COS = np.cos(np.radians(5.0))  # lasers with more tilt measure floor and ceiling
+_BEAMS = 360  # of a lidar's revolution
+_DEPTH_BEAMS, _STRIDE_PX = 160, 4  # a beam is one cell wide at the largest range
+_REACH = 3  # neighbours to either side for the fit of a line
+_SHORTEST_M, _LONGEST_M = 0.03, 0.6  # distance from the first to the last neighbour
+_FLAT_RATIO, _FLAT_M = 0.1, 0.02  # largest distance of a neighbour to the line: range noise
+_FAR_M = 15.0  # beyond, beams of a degree are five cells apart
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KeyScan:
-    """Where the beams of one scan ended, in base's x and y."""
+    """The end points of a scan's beams in the x-y plane of `base`."""
 
     stamp_ns: int
     points: NDArray[np.float32]  # (N, 2) [m], base, by rising angle
-    origin: NDArray[np.float64]  # (2,) [m], base: where the beams begin
+    origin: NDArray[np.float64]  # (2,) [m], base: the beams' origin
 
 
 class KeyScanner:
-    """Makes scans of a rig's observations, by the sensor that sees most to the sides."""
+    """Makes scans of observations, by the rig's sensor with the widest field of view."""
 
     def __init__(self, rig: Rig) -> None:
         self._laser = rig.laser
@@ -55,11 +55,11 @@ class KeyScanner:
                     beams=_DEPTH_BEAMS,
                     stride_px=_STRIDE_PX,
                 )
-            except ConfigError:  # it looks at the floor or the ceiling alone
+            except ConfigError:  # it sees only the floor or the ceiling
                 self._depth = None
 
     def make(self, observation: Observation) -> KeyScan | None:
-        """Return the scan of an observation, None where no sensor of it can make one."""
+        """Return the scan of an observation, None without a suitable sensor."""
         if observation.scan is not None and self._laser is not None:
             return _key_scan(observation.stamp_ns, observation.scan, self._laser.T_base_laser)
         if observation.points_lidar is not None and self._lidar is not None:
@@ -84,9 +84,9 @@ def _key_scan(stamp_ns: int, scan: LaserScan, T_base_laser: Transform) -> KeySca
 
 
 def line_normals(scan: KeyScan) -> NDArray[np.float64]:
-    """Return the unit normals (N, 2), towards the sensor, of lines through neighbouring points.
+    """Return the unit normals (N, 2), base, towards the sensor, of lines through neighbours.
 
-    0 where the neighbours lie further apart, or not on a line.
+    Zero if the neighbours are too far apart, or not on a line.
     """
     points, origin = scan.points.astype(np.float64), scan.origin
     normals = np.zeros_like(points)

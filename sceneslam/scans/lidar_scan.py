@@ -1,8 +1,8 @@
-"""A planar laser scan made of a lidar's points: the slice of the world at the lidar's height.
+"""Conversion of lidar clouds to planar laser scans at the lidar's height.
 
-The scan's frame `laser` lies in base's z = 0 plane below (or above) the lidar and looks along the
-lidar's x: T_base_laser = (lidar x, lidar y, yaw of its x axis). Heights are base's, so that a
-tilted lidar gives a level slice.
+The scan's frame `laser` is below (or above) the lidar in the plane z = 0 of `base`, with x along
+the lidar's x: T_base_laser = (lidar x, lidar y, yaw of its x axis). Heights are above `base`, so
+that a tilted lidar gives a horizontal scan.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sceneslam.types.rig import Lidar
 
 
 class LidarScanner:
-    """Makes scans of one lidar's clouds: the nearest return per beam within a band of heights."""
+    """Converts one lidar's clouds to scans: the nearest return per beam within a band."""
 
     def __init__(
         self,
@@ -28,10 +28,10 @@ class LidarScanner:
         height_max_m: float | None,
         beams: int,
     ) -> None:
-        """Place the scans' frame.
+        """Compute the frame of the scans.
 
         The band [height_min_m, height_max_m] is above base. None: 0.15 m below (above) the lidar.
-        `beams` cover the full turn.
+        `beams` cover 360 degrees.
         """
         T_base_lidar = lidar.T_base_lidar
         height_m = float(T_base_lidar[2, 3])
@@ -44,10 +44,10 @@ class LidarScanner:
         self._range_m, self._beams = lidar.range_m, beams
 
     def scan(self, points_lidar: NDArray[np.float32], *, stamp_ns: int) -> LaserScan:
-        """Return the slice of a cloud (N, 3) [m], lidar frame.
+        """Return the scan of a cloud (N, 3) [m], lidar, in `laser`.
 
-        A beam without a return in the band is NaN: most of a lidar's beams point elsewhere.
-        Raises InputError when the cloud has another shape.
+        A beam without a return in the band is NaN: most of a lidar's beams have other directions.
+        Raises InputError if the cloud has another shape.
         """
         if points_lidar.ndim != 2 or points_lidar.shape[1] != 3:
             raise InputError(f"points_lidar: expected (N, 3), got {points_lidar.shape}")

@@ -1,7 +1,7 @@
 """Train a detector on recordings of known scenes, and test it on others.
 
 `train MODEL Bright=FOLDER Dark=FOLDER ...` fits a model, `test MODEL ...` scores it. `label LABELS
-RUNS` writes which module was best when, as examples to train on.
+RUNS` writes time spans with the best module of each, as examples for training.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from sceneslam.scenes.train import Judged, judge, train
 from sceneslam.scenes.words import read_words
 from sceneslam.types.errors import InputError, SceneSlamError
 
-# The upper half of grey follows the light; the lower one, the shadows, whatever lies in them.
+# The upper half of grey values depends on the light, the lower half on shadows.
 _FEATURES = "q50,q75,q90,q98"
 _FEATURES_TARGET = "sceneslam.modules.detectors.image_features.ImageFeatures"
-_CHANGE_M = 0.02  # what wheels lose over the half metre between two modules' poses
+_CHANGE_M = 0.02  # error of wheel odometry over the half metre between two modules' poses
 _COMMAND = ("python", "-m", "sceneslam.scenes")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code (2 for input that cannot be used)."""
+    """Run the command line; return the exit code (2: invalid input)."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     options = _parser().parse_args(words)
     try:
@@ -98,7 +98,7 @@ def _label(options: argparse.Namespace, words: Sequence[str]) -> None:
 
 
 def _table(table: Table) -> str:
-    """Return the table as an override of the configuration."""
+    """Return the scene table as an override of the configuration."""
     rows = ",".join(f"{scene}:[{','.join(modules)}]" for scene, modules in table.items())
     return f'"scenes={{{rows}}}"'
 
@@ -110,7 +110,7 @@ def _told(judged: Sequence[Judged], otherwise: str) -> list[str]:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m sceneslam.scenes", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    for name, help_ in (("train", "fit a model"), ("test", "how well does a model do?")):
+    for name, help_ in (("train", "fit a model"), ("test", "measure how well a model works")):
         command = commands.add_parser(name, help=help_)
         command.add_argument("model", type=Path, help="YAML file of the model")
         command.add_argument(
@@ -127,7 +127,7 @@ def _parser() -> argparse.ArgumentParser:
     commands.choices["test"].add_argument(
         "--sheet", type=Path, default=Path("wrong.png"), help="the wrong images (wrong.png)"
     )
-    command = commands.add_parser("label", help="which module was best when?")
+    command = commands.add_parser("label", help="find the best module for each time span")
     command.add_argument("labels", type=Path, help="YAML file of the labels")
     command.add_argument(
         "runs",

@@ -1,4 +1,4 @@
-"""Recordings of known scenes, and what a detector measures of them."""
+"""Recordings of known scenes, and their detector features."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _THUMBNAIL_PX = 160  # wide
 
 
 class FeatureSource(Protocol):
-    """Measures numbers of an observation."""
+    """Computes features of an observation."""
 
     def get_features(self, observation: Observation) -> NDArray[np.float64] | None:
-        """Return (F,), None where a sensor that it needs was silent."""
+        """Return the features (F,), None if a required sensor is missing."""
         ...
 
 
@@ -38,14 +38,14 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Example:
-    """Those parts of a recording that show one scene."""
+    """The parts of a recording that show one scene."""
 
     scene: str
-    group: str  # examples of one group are held out together
+    group: str  # examples of one group are held out together in cross-validation
     name: str
     parts: Sequence[Stretch]
     config: Mapping[str, Any]  # of the source and its effects
-    is_weighted: bool = False  # by its parts; else it counts as much as every other of its scene
+    is_weighted: bool = False  # by its parts; else all examples of a scene have the same weight
 
     def weight(self, time_s: float) -> float | None:
         """Return the weight of a time after the first observation, None outside the parts."""
@@ -56,21 +56,21 @@ class Example:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MeasuredExample:
-    """What was measured of an example."""
+    """The features of an example."""
 
     example: Example
     features: NDArray[np.float64]  # (N, F)
     weights: NDArray[np.float64]  # (N,)
-    thumbnails: Sequence[NDArray[np.uint8]]  # N, empty where the source has no images
+    thumbnails: Sequence[NDArray[np.uint8]]  # N, empty without images
 
 
 def look(
     examples: Sequence[Example], features: FeatureSource, images: int
 ) -> list[MeasuredExample]:
-    """Return the features of up to so many observations of each recording, evenly over it.
+    """Return the features of up to `images` observations of each recording, evenly over it.
 
-    Examples of one recording, one after the other, are taken from it together. Raises ConfigError
-    or InputError where a recording cannot be read, or an example has no observation.
+    Consecutive examples of one recording are read together. Raises ConfigError or InputError if a
+    recording cannot be read, or an example has no observation.
     """
     seen: list[MeasuredExample] = []
     for _, found in groupby(examples, key=lambda example: id(example.config)):
@@ -80,7 +80,7 @@ def look(
 
 @dataclass(slots=True)
 class _Collected:
-    """What is kept of an example while its recording is read."""
+    """The data of an example while its recording is read."""
 
     example: Example
     count: int = 0
@@ -112,7 +112,7 @@ class _Collected:
 def _look(
     examples: Sequence[Example], features: FeatureSource, images: int
 ) -> list[MeasuredExample]:
-    """Return what is seen of examples of one recording."""
+    """Return the features of examples of one recording."""
     source = make_source(examples[0].config, ComponentBuilder(examples[0].config))
     step = max(1, (source.length or images) // images)
     end_s = max(part.end_s for example in examples for part in example.parts)

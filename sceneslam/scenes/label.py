@@ -1,4 +1,4 @@
-"""Which module was best when: labels for training, and the table that follows from them."""
+"""Labels of the best module over time, for training, and the scene table by these labels."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ Table = Mapping[str, Sequence[str]]  # scene -> modules, the best first
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BestModuleSpan:
-    """A second of a recording or less, in which one module was best."""
+    """A time span of at most a second, in which one module was best."""
 
     start_s: float  # after the first observation
     end_s: float
     scene: str  # named after the module
-    gain_m: float  # by which the other modules' error would have grown more, on average
+    gain_m: float  # mean additional error of the other modules
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -33,14 +33,14 @@ class Labelled:
     """A recording with its labels."""
 
     name: str
-    group: str  # what is held out together: one path, or one story of the simulator
+    group: str  # held out together: one path, or one simulated story
     config: Mapping[str, Any]  # of its source and effects
     spans: Sequence[BestModuleSpan]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Labels:
-    """Labelled recordings, and which modules to try in each scene."""
+    """Labelled recordings, and the modules for each scene."""
 
     recordings: Sequence[Labelled]
     table: Table
@@ -65,7 +65,7 @@ class Labels:
 
     @classmethod
     def read(cls, path: Path) -> Labels:
-        """Return the labels in a file; raises InputError where it is missing or another file."""
+        """Return the labels in a file; raises InputError if it is missing or invalid."""
         if not path.is_file():
             raise InputError(f"labels not found: {path}")
         try:
@@ -93,10 +93,10 @@ class Labels:
 
 
 def label(runs: Sequence[ModuleRun], change_m: float) -> Labels:
-    """Return the labels of all recordings that the runs are of.
+    """Return the labels of all recordings of the runs.
 
-    Of all ways to use the modules one after the other, the one is taken whose error is least; each
-    change of module adds `change_m` [m]. Raises InputError where a recording has one module only.
+    Among all sequences of modules, the one with the smallest error is chosen; each change of module
+    adds `change_m` [m]. Raises InputError if a recording has one module only.
     """
     keys = sorted({run.module for run in runs})
     recordings, drifts = [], []
@@ -111,9 +111,9 @@ def label(runs: Sequence[ModuleRun], change_m: float) -> Labels:
 
 
 def cheapest(costs: NDArray[np.float64], change: float) -> NDArray[np.int64]:
-    """Return (N,) the choice per instant with the least sum of costs (N, K) and changes.
+    """Return (N,) the choices with the least sum of costs (N, K) and cost of changes.
 
-    Dynamic programming (Viterbi): the least sum up to an instant that ends in each choice.
+    Dynamic programming (Viterbi, 1967): the least sum up to an instant, for each last choice.
     """
     count, choices = costs.shape
     came_from = np.zeros((count, choices), np.int64)
@@ -149,7 +149,7 @@ def _instants_ns(group: Sequence[ModuleRun]) -> NDArray[np.int64]:
 def _drifts_mps(
     group: Sequence[ModuleRun], keys: Sequence[str], stamps_ns: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return (N, K) the modules' drift; infinite for a module that was not run."""
+    """Return (N, K) the modules' drift [m/s]; inf for a module that was not run."""
     drift_mps = np.full((len(stamps_ns), len(keys)), np.inf)
     for run in group:
         drift_mps[:, keys.index(run.module)] = run.drift_mps(stamps_ns)
@@ -183,7 +183,7 @@ def _labelled(
 
 
 def _gains_mps(best: NDArray[np.int64], drift_mps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N,) by how much the other modules' drift exceeds the best one's, 0 or more."""
+    """Return (N,) the mean drift [m/s] of the other modules minus the best one's, 0 or more."""
     excess_mps = drift_mps - np.take_along_axis(drift_mps, best[:, None], axis=1)
     was_run = np.isfinite(excess_mps)
     total_mps = np.where(was_run, excess_mps, 0.0).sum(axis=1)
@@ -191,7 +191,7 @@ def _gains_mps(best: NDArray[np.int64], drift_mps: NDArray[np.float64]) -> NDArr
 
 
 def _table(keys: Sequence[str], drifts: NDArray[np.float64]) -> Table:
-    """Return for each module that was best somewhere all modules, by their mean drift there."""
+    """Return, for each module that was best at any time, all modules by their mean drift then."""
     best, drift_mps = drifts[:, 0].astype(int), drifts[:, 1:]
     table = {}
     for place in np.unique(best):

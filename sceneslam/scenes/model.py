@@ -1,4 +1,4 @@
-"""A trained model: which features speak for which scene, as a small YAML file."""
+"""A trained scene classifier, stored as a small YAML file."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from sceneslam.types.errors import ConfigError, InputError
 
-_DIGITS = 5  # significant ones that are written
+_DIGITS = 5  # significant digits in the file
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Model:
-    """A softmax regression on features that are brought to mean 0 and deviation 1."""
+    """A softmax regression on features that are normalised to mean 0 and standard deviation 1."""
 
     scenes: tuple[str, ...]
     features: tuple[str, ...]
@@ -28,11 +28,11 @@ class Model:
     bias: NDArray[np.float64]  # (S,)
 
     def scores(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (N, S), the scenes' logarithmic odds for (N, F) features."""
+        """Return the scenes' logits (N, S) for features (N, F)."""
         return np.asarray((features - self.mean) / self.scale @ self.weights.T + self.bias)
 
     def cooled(self, temperature: float) -> Model:
-        """Return the model with its scores divided by a temperature: more certain below 1."""
+        """Return the model with its logits divided by a temperature (below 1: more certain)."""
         return Model(
             scenes=self.scenes,
             features=self.features,
@@ -43,7 +43,7 @@ class Model:
         )
 
     def write(self, path: Path, comment: Sequence[str]) -> None:
-        """Write a file that a person can read."""
+        """Write a readable YAML file."""
         node = {
             "scenes": list(self.scenes),
             "features": list(self.features),
@@ -61,7 +61,7 @@ class Model:
 
     @classmethod
     def read(cls, path: Path) -> Model:
-        """Return the model in a file; raises InputError where it is missing."""
+        """Return the model in a file; raises InputError if it is missing or invalid."""
         if not path.is_file():
             raise InputError(f"model not found: {path}")
         try:
@@ -80,7 +80,7 @@ class Model:
 
 
 def shares(scores: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N, S) the probabilities of scenes by their scores."""
+    """Return the probabilities (N, S) of scenes by their logits (N, S)."""
     powers = np.exp(scores - scores.max(axis=1, keepdims=True))
     return np.asarray(powers / powers.sum(axis=1, keepdims=True))
 
@@ -91,9 +91,9 @@ def fit(
     weights: NDArray[np.float64],
     names: Sequence[str],
 ) -> Model:
-    """Return the model of (N, F) features with a scene and a weight each.
+    """Return the model for features (N, F) with a scene and a weight each.
 
-    Raises ConfigError where scikit-learn is not installed.
+    Raises ConfigError if scikit-learn is not installed.
     """
     try:
         from sklearn.linear_model import LogisticRegression
@@ -106,7 +106,7 @@ def fit(
     regression: Any = LogisticRegression(max_iter=5000)  # type: ignore[no-untyped-call]
     regression.fit((features - mean) / scale, np.array(labels), sample_weight=weights)
     rows, bias = np.asarray(regression.coef_), np.asarray(regression.intercept_)
-    if len(rows) == 1:  # of two scenes it fits the second's odds against the first
+    if len(rows) == 1:  # with two scenes it fits the logit of the second only
         rows, bias = np.concatenate([-rows, rows]) / 2, np.concatenate([-bias, bias]) / 2
     return Model(
         scenes=tuple(map(str, regression.classes_)),

@@ -1,4 +1,4 @@
-"""Runs of one module each over one recording, and how fast each module's error grew."""
+"""Runs of single modules over recordings, and the drift of each module over time."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from sceneslam.types.observation import TrackingStatus
 from sceneslam.types.trajectory import Trajectory
 
 STEP_S = 0.1  # between the instants that are labelled
-_SPAN_S = 2.0  # motions are compared over the paper's window: no scene is confirmed sooner
-_LEVER_M = 1.0  # at which an error of rotation is counted as one of position
-_LOST_MPS = 1.0  # of a lost module: more than any module that tracks
+_SPAN_S = 2.0  # motions are compared over the paper's confirmation window
+_LEVER_M = 1.0  # lever arm that converts errors of rotation to position
+_LOST_MPS = 1.0  # drift of a lost module: more than that of any tracking module
 _VARIANCES = (1, 7, 12)  # columns of trajectory_covariance.txt: xx, yy, zz
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ModuleRun:
-    """One module alone over a recording."""
+    """A run of one module over a recording."""
 
-    module: str  # its key of `slam`
+    module: str  # its key in `slam`
     folder: Path
     config: Mapping[str, Any]
     estimate: Trajectory  # T_map_base
@@ -37,14 +37,14 @@ class ModuleRun:
 
     @property
     def recording(self) -> str:
-        """Return what tells recordings apart: the source with its effects, as text."""
+        """Return an identifier of the recording: the source with its effects, as text."""
         return json.dumps([self.config["source"], self.config.get("effects")], sort_keys=True)
 
     def drift_mps(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return (N,) how fast its error grows around each stamp [m/s].
+        """Return the drift (N,) [m/s]: growth of its error around each stamp.
 
-        By the ground truth where there is one, else by the growth of its own variance. 1 m/s while
-        it is lost.
+        It is computed by the ground truth or, without it, by the growth of the module's variance.
+        It is 1 m/s while the module is lost.
         """
         half_ns = round(_SPAN_S / 2 * 1e9)
         first_ns, last_ns = self.estimate.stamps_ns[[0, -1]]
@@ -62,7 +62,7 @@ class ModuleRun:
     def _errors(
         self, truth: Trajectory, before_ns: NDArray[np.int64], after_ns: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return (N,) the errors of the motion between two stamps [m]."""
+        """Return the errors (N,) [m] of the motions between pairs of stamps."""
         T_estimated, T_true = (
             se3.inverse(interpolated(one, before_ns).T_world_base)
             @ interpolated(one, after_ns).T_world_base
@@ -75,7 +75,7 @@ class ModuleRun:
     def _growth(
         self, before_ns: NDArray[np.int64], after_ns: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return (N,) the standard deviation that the position gained between two stamps [m]."""
+        """Return the growth (N,) [m] of the position's standard deviation between two stamps."""
         rows = np.loadtxt(self.folder / "trajectory_covariance.txt", ndmin=2)
         stamps_s, variances_m2 = rows[:, 0], rows[:, _VARIANCES].sum(axis=1)
         before_m2, after_m2 = (
@@ -97,9 +97,9 @@ class ModuleRun:
 
 
 def read_runs(folders: Sequence[Path]) -> list[ModuleRun]:
-    """Return the runs in some folders, and in the folders below them.
+    """Return the runs in and below some folders.
 
-    Raises InputError where there is no run, or where a run's table names several modules.
+    Raises InputError if there is no run, or a run's table has several modules.
     """
     found = [path.parent for folder in folders for path in sorted(folder.rglob("trajectory.tum"))]
     if not found:

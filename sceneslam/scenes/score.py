@@ -1,4 +1,4 @@
-"""What votes on examples are worth: confusion, calibration, and the images that were wrong."""
+"""Evaluation of votes on examples: confusion matrix, calibration, and wrongly classified images."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from sceneslam.scenes.train import Judged
 
-_BINS = (0.5, 0.7, 0.9, 0.99)  # lower ends of the probabilities that are held against the truth
-_SHOWN = 48  # images on a sheet, the most certainly wrong first
+_BINS = (0.5, 0.7, 0.9, 0.99)  # lower limits of the probability bins
+_SHOWN = 48  # images on a sheet, by decreasing probability
 _COLUMNS = 6
 _CELL_WH = (160, 150)  # an image with its two lines of text [px]
 
 
 def table(judged: Sequence[Judged]) -> Iterator[str]:
-    """Yield lines: each example's share of right votes, confusion matrix, calibration."""
+    """Yield lines of text: each example's share of correct votes, confusion matrix, calibration."""
     if not judged:
         return
     width = max(len(one.seen.example.name) for one in judged)
@@ -33,7 +33,7 @@ def table(judged: Sequence[Judged]) -> Iterator[str]:
 
 
 def write_sheet(judged: Sequence[Judged], path: Path) -> int:
-    """Write the images that were voted wrongly on one sheet; return how many were wrong."""
+    """Write one sheet of wrongly classified images; return their number."""
     wrong = [
         (float(probability), one, place)
         for one in judged
@@ -42,7 +42,7 @@ def write_sheet(judged: Sequence[Judged], path: Path) -> int:
     ]
     wrong.sort(key=lambda entry: -entry[0])
     if not wrong:
-        path.unlink(missing_ok=True)  # of an earlier test
+        path.unlink(missing_ok=True)  # sheet of an earlier test
         return 0
     cells = [_cell(*entry) for entry in wrong[:_SHOWN]]
     cells += [np.full_like(cells[0], 255)] * (-len(cells) % _COLUMNS)
@@ -62,7 +62,7 @@ def _confusion(judged: Sequence[Judged]) -> Iterator[str]:
 
 
 def _calibration(judged: Sequence[Judged]) -> Iterator[str]:
-    """Yield how often votes of each probability are right; every example weighs the same."""
+    """Yield the share of correct votes per probability bin; all examples have the same weight."""
     top = np.concatenate([one.probabilities.max(axis=1) for one in judged])
     right = np.concatenate([one.is_right for one in judged])
     weights = np.concatenate([np.full(len(one.scores), 1 / len(one.scores)) for one in judged])
@@ -76,7 +76,7 @@ def _calibration(judged: Sequence[Judged]) -> Iterator[str]:
 
 
 def _cell(probability: float, one: Judged, place: int) -> NDArray[np.uint8]:
-    """Return a thumbnail over what it is and what it was taken for."""
+    """Return a thumbnail with its true and its estimated scene below."""
     width, height = _CELL_WH
     cell = np.full((height, width, 3), 255, np.uint8)
     image = one.seen.thumbnails[place][: height - 30]

@@ -1,4 +1,4 @@
-"""Trains a model on examples, and tells by held-out recordings what it is worth."""
+"""Training of a model on examples, with cross-validation on held-out recordings."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from sceneslam.scenes.examples import MeasuredExample
 from sceneslam.scenes.model import Model, fit, shares
 from sceneslam.types.errors import InputError
 
-_IMAGES_PER_SCENE = 10.0  # neighbouring images are alike: all of a scene weigh as so many
+_IMAGES_PER_SCENE = 10.0  # effective number: neighbouring images are similar
 _TEMPERATURES = np.geomspace(1.0, 10.0, 65)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Judged:
-    """An example with the probabilities that a model gave it that was not trained on it."""
+    """An example with the logits of a model that was not trained on it."""
 
     seen: MeasuredExample
     scenes: tuple[str, ...]
@@ -26,7 +26,7 @@ class Judged:
 
     @property
     def probabilities(self) -> NDArray[np.float64]:
-        """Return (N, S)."""
+        """Return the probabilities (N, S) of the scenes."""
         return shares(self.scores)
 
     @property
@@ -42,18 +42,18 @@ class Judged:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trained:
-    """A model, and how models like it did on the recordings that they were not shown."""
+    """A model, and the results of such models on held-out recordings."""
 
     model: Model
-    held_out: Sequence[Judged]  # empty where no recording could be held out
+    held_out: Sequence[Judged]  # empty if no recording could be held out
     temperature: float
 
 
 def train(all_seen: Sequence[MeasuredExample], names: Sequence[str]) -> Trained:
     """Return the model of examples whose features have these names.
 
-    Its probabilities are calibrated on groups of recordings that were held out in turn: those
-    without which every scene still has an example. Raises InputError for fewer than two scenes.
+    Its probabilities are calibrated on held-out groups of recordings: all groups without which
+    every scene still has an example. Raises InputError for fewer than two scenes.
     """
     if len({seen.example.scene for seen in all_seen}) < 2:
         raise InputError("examples: of two scenes or more")
@@ -74,7 +74,7 @@ def train(all_seen: Sequence[MeasuredExample], names: Sequence[str]) -> Trained:
 
 
 def judge(model: Model, seen: MeasuredExample) -> Judged:
-    """Return what a model says of an example."""
+    """Return a model's result for an example."""
     return Judged(seen=seen, scenes=model.scenes, scores=model.scores(seen.features))
 
 
@@ -89,10 +89,10 @@ def _fit(all_seen: Sequence[MeasuredExample], names: Sequence[str]) -> Model:
 
 
 def _weights(all_seen: Sequence[MeasuredExample]) -> NDArray[np.float64]:
-    """Return (N,) the weights of all images, which sum to that of the scenes.
+    """Return the weights (N,) of all images.
 
-    Every scene weighs the same, and in it every example, unless the examples have weights of
-    their own.
+    All scenes have the same weight, and so have all examples of a scene, unless they have weights
+    of their own.
     """
     total = _IMAGES_PER_SCENE * len(_scenes(all_seen))
     if all(seen.example.is_weighted for seen in all_seen):
@@ -107,16 +107,17 @@ def _weights(all_seen: Sequence[MeasuredExample]) -> NDArray[np.float64]:
 
 
 def _temperature(held_out: Sequence[Judged]) -> float:
-    """Return by what scores are to be divided so that held-out scenes are the most likely.
+    """Return the temperature for which the held-out scenes have the largest likelihood.
 
-    One number, so that no vote changes (temperature scaling; Guo et al., ICML 2017). It is 1 or
-    more: that a few recordings were all right is no reason to be more certain than the fit is.
+    The logits are divided by it, which changes no vote (temperature scaling; Guo et al., ICML
+    2017). It is at least 1: a few correct recordings are no reason for more certainty than the fit
+    has.
     """
     losses = [sum(_loss(one, temperature) for one in held_out) for temperature in _TEMPERATURES]
     return float(_TEMPERATURES[int(np.argmin(losses))])
 
 
 def _loss(one: Judged, temperature: float) -> float:
-    """Return the mean negative logarithm of the true scene's probability."""
+    """Return the mean negative log-likelihood of the true scene."""
     true = shares(one.scores / temperature)[:, one.scenes.index(one.seen.example.scene)]
     return float(-np.log(np.maximum(true, 1e-12)).mean())

@@ -1,4 +1,4 @@
-"""Examples as words of the command line: SCENE=PATH, or a file of labels."""
+"""Parsing of examples on the command line: SCENE=PATH, or a file of labels."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _USAGE = (
 
 
 def read_words(words: Sequence[str]) -> list[Example]:
-    """Return the examples that words name; raises InputError."""
+    """Return the examples of all words; raises InputError."""
     return [example for word in words for example in _read(word)]
 
 
@@ -60,7 +60,7 @@ def _stretch(span: BestModuleSpan) -> Stretch:
 
 
 def read_word(word: str) -> Example:
-    """Return the example that a word SCENE=PATH names; raises InputError."""
+    """Return the example of a word SCENE=PATH; raises InputError."""
     found = _WORD.fullmatch(word)
     if not found or found["scene"] == UNSURE:
         raise InputError(f"example: got {word!r}, allowed: {_USAGE}")
@@ -97,7 +97,7 @@ def _config(path: str, overrides: Sequence[str], name: str) -> Mapping[str, Any]
 
 
 def _kind(path: Path) -> str:
-    """Return the source that reads a path."""
+    """Return the name of the source that reads a path."""
     if (path / "rgb.txt").is_file():
         return "tum_rgbd"
     is_bag = (path / "metadata.yaml").is_file() or path.suffix in (".bag", ".mcap")

@@ -1,4 +1,4 @@
-"""A run's folder: claimed by one run at a time, in which nothing foreign is touched."""
+"""A run's folder: locked by one run at a time; files of others in it are not changed."""
 
 from __future__ import annotations
 
@@ -17,31 +17,30 @@ import sceneslam
 from sceneslam.types.errors import ConfigError, told
 from sceneslam.types.files import MARK, owned
 
-_HYDRAS = (".hydra", "multirun.yaml")  # what Hydra writes before a run begins, beside its log
-# What every run writes: none of it may be there already, written by somebody else.
+_HYDRAS = (".hydra", "multirun.yaml")  # written by Hydra before a run begins, beside its log
+# The files of every run: none of them may exist already if no run wrote it.
 _NAMES = (
     *("config.yaml", "events.jsonl", "journal.bin", "metrics.json", "report.html"),
     *("trajectory.tum", "trajectory_online.tum", "trajectory_covariance.txt", "groundtruth.tum"),
     *("map/points.ply", "map/grid.pgm", "map/grid.yaml", "map/pose_graph.g2o"),
     *("map/pose_graph.tum", "map/landmarks.ply"),
 )
-_TRIES = 20  # where another run gives back the folder above this one at the same time
+_TRIES = 20  # in case another run removes a parent folder at the same time
 
 
 @dataclass(slots=True)
 class RunFolder:
-    """A folder that is this run's until `close`, or until the process ends, however it does."""
+    """A folder that is locked for this run until `close` or the end of the process."""
 
     path: Path
-    _lock: int | None  # descriptor of the mark; None: this process claimed the folder before
+    _lock: int | None  # descriptor of the lock file; None: this process has the lock already
 
     @classmethod
     def claim(cls, path: Path, *, is_stamped: bool = False, key: str = "folder") -> RunFolder:
-        """Make a folder, or take one that is empty or that runs made.
+        """Create a folder, or use one that is empty or was written by runs.
 
-        `is_stamped`: its name is an instant; where it is taken, this one gets a number (`_1`).
-        Raises ConfigError for `key` where the folder holds what no run wrote, belongs to a run
-        that is under way, or cannot be made.
+        `is_stamped`: its name is a time; if it exists, a number is added (`_1`). Raises ConfigError
+        for `key` if the folder holds other files, is in use by a run, or cannot be created.
         """
         made = _Made(path=path, folders=[])
         try:
@@ -53,22 +52,22 @@ class RunFolder:
             raise ConfigError(key, str(path), allowed) from error
 
     def clear(self) -> None:
-        """Remove what an earlier run left, so that nothing old stands beside the new."""
+        """Remove the files of an earlier run."""
         for name in owned(self.path):
             (self.path / name).unlink(missing_ok=True)
         _write_mark(self.path, _read_mark(self.path), [])
 
     def close(self) -> None:
-        """Let another run have the folder. May be called twice."""
+        """Unlock the folder. May be called twice."""
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
 
 
 def give_back(path: Path) -> None:
-    """Remove a folder that this process claimed, with the folders made for it: nothing was run.
+    """Remove a folder that this process created without a run, with its created parents.
 
-    It stays where it was there before, or holds more than a run's own files.
+    It is kept if it existed before, or holds other files.
     """
     mark = _read_mark(path)
     if not mark.get("is_new") or not _is_own(mark):
@@ -80,11 +79,11 @@ def give_back(path: Path) -> None:
     hydras = [str(one.relative_to(path)) for one in path.glob("*") if _is_hydras(one.name)]
     hydras += [str(one.relative_to(path)) for one in path.glob(".hydra/*")]
     for name in [*names, *hydras]:
-        with suppress(OSError):  # a folder goes below
+        with suppress(OSError):  # a folder is removed below
             (path / name).unlink()
     (path / MARK).unlink()
     for name in (*tops, *_HYDRAS):
-        with suppress(OSError):  # not there
+        with suppress(OSError):  # does not exist
             (path / name).rmdir()
     _unmake(_Made(path=path, folders=mark["made"]))
 
@@ -92,11 +91,11 @@ def give_back(path: Path) -> None:
 @dataclass(frozen=True, slots=True)
 class _Made:
     path: Path
-    folders: list[str]  # that were made for it, itself last
+    folders: list[str]  # created folders, itself last
 
 
 def _make(path: Path, is_stamped: bool) -> _Made:
-    """Make a folder and those above it; where its name is an instant, one that was not there."""
+    """Create a folder and its parents; with a time as name, a new one."""
     above: list[str] = []
     for attempt in range(_TRIES):
         try:
@@ -107,14 +106,14 @@ def _make(path: Path, is_stamped: bool) -> _Made:
                 one = next(numbered)
                 is_new = _mkdir(one)
             return _Made(path=one, folders=[*above, *([str(one)] if is_new else [])])
-        except FileNotFoundError:  # another run gave a folder above it back just now
+        except FileNotFoundError:  # another run has just removed a parent folder
             if attempt == _TRIES - 1:
                 raise
     raise AssertionError
 
 
 def _unmake(made: _Made) -> None:
-    """Remove the folders that were made, where they are empty but for a mark without a line."""
+    """Remove the created folders if they are empty except for an empty lock file."""
     with suppress(OSError):
         if not (made.path / MARK).stat().st_size:
             (made.path / MARK).unlink()
@@ -124,7 +123,7 @@ def _unmake(made: _Made) -> None:
 
 
 def _mkdir(folder: Path) -> bool:
-    """Make a folder; return whether it was not there."""
+    """Create a folder; return whether it is new."""
     if folder.is_dir():
         return False
     try:
@@ -135,7 +134,7 @@ def _mkdir(folder: Path) -> bool:
 
 
 def _take(made: _Made, key: str) -> int | None:
-    """Lock the mark of a folder, and write it; None where this process has it already."""
+    """Lock and write the lock file of a folder; None if this process has the lock already."""
     path = made.path
     if not (path / MARK).exists():
         _refuse_foreign(path, {one.name for one in path.iterdir()} - {MARK}, key)
@@ -148,7 +147,7 @@ def _take(made: _Made, key: str) -> int | None:
                 raise ConfigError(key, str(path), f"a folder that no run is writing; {by}")
             os.close(mark)
             return None
-        if not _is_there(mark, path / MARK):  # given back between opening and locking
+        if not _is_there(mark, path / MARK):  # removed between opening and locking
             os.close(mark)
             return _take(made, key)
         is_new, names = os.fstat(mark).st_size == 0, owned(path)
@@ -169,7 +168,7 @@ def _is_there(descriptor: int, path: Path) -> bool:
 
 
 def _write_mark(path: Path, about: dict[str, Any], names: list[str]) -> None:
-    """Write the mark anew, in place: it stays locked."""
+    """Rewrite the lock file in place, so that it stays locked."""
     with (path / MARK).open("r+") as file:
         file.write("".join(f"{line}\n" for line in [json.dumps(about), *names]))
         file.truncate()
@@ -178,18 +177,21 @@ def _write_mark(path: Path, about: dict[str, Any], names: list[str]) -> None:
 def _refuse_foreign(path: Path, foreign: set[str], key: str) -> None:
     if foreign:
         more = f" and {len(foreign) - 1} more" if len(foreign) > 1 else ""
-        holds = f"it holds what no run wrote: {min(foreign)}{more}"
+        holds = f"it holds files that no run wrote: {min(foreign)}{more}"
         raise ConfigError(key, str(path), f"a new folder, or an empty one ({holds})")
 
 
 def _is_locked(mark: int) -> bool:
-    """Lock a file for as long as it is open; False where another has it."""
+    """Lock a file while it is open; False if another process has the lock."""
     try:
         fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError as error:
-        if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP):  # a network's disk may know none
+        if error.errno not in (
+            errno.ENOLCK,
+            errno.EOPNOTSUPP,
+        ):  # not supported
             raise
     return True
 
@@ -203,7 +205,7 @@ def _is_own(mark: dict[str, Any]) -> bool:
 
 
 def _read_mark(path: Path) -> dict[str, Any]:
-    """Return what the mark of a folder says of its newest run; empty without a mark."""
+    """Return the contents of a folder's lock file; empty without one."""
     try:
         about = json.loads((path / MARK).read_text().partition("\n")[0])
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""The journal of a run: every call of the atlas, on disk at once, so that a run can be recovered.
+"""The journal of a run: every call of the atlas, written at once, for recovery after a crash.
 
 `journal.bin` begins with `MAGIC`; records follow, little endian: kind (1 byte), length of the body
 (4), CRC-32 of kind and body (4), body. A pose is the upper three rows of its matrix, 12 float64.
@@ -44,18 +44,18 @@ _POSE_BYTES = 12 * 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JournalHeader:
-    """What the results of a run need beside its configuration."""
+    """Data for the results of a run that are not in its configuration."""
 
     title: str
     value_label: str  # of the detector's votes
     has_odometry: bool
-    began_in: str  # the folder that relative paths are meant from
+    began_in: str  # base folder of relative paths
 
 
 class Journal:
-    """Writes the journal: `flush` hands the records to the system, `sync` waits for the disk.
+    """Writes the journal: `flush` passes records to the system, `sync` waits for the disk.
 
-    Where the disk does not take them, the run goes on without, and `fault` says so.
+    If the disk is full, the run continues without the journal, and `fault` says so.
     """
 
     def __init__(
@@ -68,19 +68,19 @@ class Journal:
 
     @property
     def fault(self) -> str:
-        """Return why the file ends before the run did, "" where it does not."""
+        """Return why the file is incomplete, "" if it is complete."""
         return self._file.fault
 
     def add_observation(self, stamp_ns: int) -> None:
-        """Note that an observation was taken."""
+        """Record that an observation was processed."""
         self._add(b"O", _STAMP.pack(stamp_ns))
 
     def add_session(self, module: str, T_map_local: Transform) -> None:
-        """Note that a session begins."""
+        """Record that a session begins."""
         self._add(b"S", _pose(T_map_local) + module.encode())
 
     def add_local(self, stamp_ns: int, T_local_base: Transform) -> None:
-        """Note a pose of the session's own trajectory."""
+        """Record a pose of the session's trajectory, T_local_base (4, 4) [m]."""
         self._add(b"L", _STAMP.pack(stamp_ns) + _pose(T_local_base))
 
     def add_pose(
@@ -90,27 +90,27 @@ class Journal:
         module: str,
         covariance: NDArray[np.float64] | None,
     ) -> None:
-        """Note a pose of the global trajectory."""
+        """Record a pose of the global trajectory, T_map_base (4, 4) [m]; covariance in base."""
         known = b"" if covariance is None else covariance[_UPPER].tobytes()
         body = _STAMP.pack(stamp_ns) + _pose(T_map_base) + bytes([len(known)]) + known
         self._add(b"P", body + module.encode())
 
     def add_rewind(self, stamp_ns: int) -> None:
-        """Note that poses are taken back."""
+        """Record that the poses from a stamp on are removed."""
         self._add(b"R", _STAMP.pack(stamp_ns))
 
     def add_end(self, session: int, revised: Trajectory) -> None:
-        """Note how a module revised its session."""
+        """Record the revised trajectory of a session."""
         poses = np.ascontiguousarray(revised.T_world_base[:, :3]).tobytes()
         self._add(b"C", _STAMP.pack(session) + revised.stamps_ns.tobytes() + poses)
 
     def flush(self) -> None:
-        """Hand what was noted to the system."""
+        """Pass all records to the operating system."""
         self._file.append(bytes(self._waiting))
         self._waiting.clear()
 
     def sync(self) -> None:
-        """Wait until what was handed over outlives a loss of power; may be called by a thread."""
+        """Wait until the records are on disk; may be called by another thread."""
         self._file.sync()
 
     def close(self) -> None:
@@ -119,7 +119,7 @@ class Journal:
         self._file.close()
 
     def remove(self) -> None:
-        """Remove the file, once the run's results say all that it says."""
+        """Remove the file, when the run's results are written."""
         self.close()
         self._path.unlink(missing_ok=True)
 
@@ -130,15 +130,15 @@ class Journal:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kept:
-    """What a journal holds beside the calls of the atlas."""
+    """The contents of a journal, except for the calls of the atlas."""
 
     head: JournalHeader
     observed_ns: NDArray[np.int64]
-    torn_bytes: int  # after the last whole record
+    torn_bytes: int  # bytes after the last complete record
 
 
 def read_journal(path: Path, log: TrajectoryLog) -> Kept:
-    """Repeat on `log` the calls that a journal holds, as far as it is whole.
+    """Repeat the journal's calls on `log`, up to the last complete record.
 
     Raises InputError for a file that is not a journal.
     """
@@ -161,7 +161,7 @@ def read_journal(path: Path, log: TrajectoryLog) -> Kept:
 
 
 def _records(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Yield kind and body of every record, until one is torn."""
+    """Yield kind and body of every complete record."""
     at = len(MAGIC)
     while at + _HEAD.size <= len(data):
         kind, length, crc = _HEAD.unpack_from(data, at)

@@ -1,4 +1,4 @@
-"""Room on the disk that is kept for the results, whatever else fills it."""
+"""Reserved disk space for the results of a run."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pathlib import Path
 from sceneslam.types.files import own
 
 _BASE_BYTES = 1 << 20  # configuration, metrics, a small map and the report of a short run
-_POSE_BYTES = 1500  # of a trajectory three times, its covariance, the journal and the events
-_STEP_POSES = 500  # for so many it is enlarged at once
-_LENT_BYTES = 1 << 18  # at once
+_POSE_BYTES = 1500  # three trajectories, covariances, journal and events
+_STEP_POSES = 500  # poses by which it is enlarged
+_LENT_BYTES = 1 << 18  # released at once
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Reserve:
-    """A file that takes up the room; it shrinks as the journal needs it, and goes at the end."""
+    """A file that occupies the space; it shrinks when the journal needs some."""
 
     def __init__(self, path: Path) -> None:
         self._path = own(path)
@@ -27,7 +27,7 @@ class Reserve:
         self._is_lent = False
 
     def is_enough(self, poses: int) -> bool:
-        """Keep room for the results of so many poses; False where the disk has too little."""
+        """Reserve space for the results of `poses` poses; False if the disk is too full."""
         if self._is_lent:
             return False
         if poses < self._poses:
@@ -36,7 +36,7 @@ class Reserve:
         return self._enlarge(_BASE_BYTES + self._poses * _POSE_BYTES)
 
     def lend(self) -> bool:
-        """Give a part of it to who asks; False where nothing is left."""
+        """Release a part of the space; False if nothing is left."""
         if self._fd < 0 or not self._bytes:
             return False
         self._is_lent = True
@@ -45,7 +45,7 @@ class Reserve:
         return True
 
     def release(self) -> None:
-        """Give all of it back to the disk. May be called twice."""
+        """Release all space. May be called twice."""
         fd, self._fd = self._fd, -1
         if fd >= 0:
             os.close(fd)
@@ -57,6 +57,6 @@ class Reserve:
         except OSError as error:
             with suppress(OSError):
                 os.ftruncate(self._fd, self._bytes)
-            return error.errno not in _FULL  # else this disk, or a limit, knows no reserve
+            return error.errno not in _FULL  # else the file system does not support reservation
         self._bytes = size
         return True

@@ -1,4 +1,4 @@
-"""Syncs files to disk while they grow, in a thread beside their writer."""
+"""Periodic syncing of growing files to disk, in a thread."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 
-_EVERY_S = 0.5  # what a loss of power costs at most, beside the wait itself
+_EVERY_S = 0.5  # largest loss by a power failure, plus the time of one sync
 
 
 class Syncing:
-    """Calls every `sync` again and again, in a thread of its own, until it is closed."""
+    """Calls all `sync` functions periodically in a thread until it is closed."""
 
     def __init__(self, *syncs: Callable[[], None]) -> None:
         self._syncs = syncs
@@ -26,5 +26,5 @@ class Syncing:
     def _run(self) -> None:
         while not self._is_over.wait(_EVERY_S):
             for sync in self._syncs:
-                with suppress(OSError):  # what the disk does not take shows when it is written
+                with suppress(OSError):  # disk errors are reported by writing
                     sync()

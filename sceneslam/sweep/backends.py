@@ -1,4 +1,4 @@
-"""Where the jobs of a sweep run: what each launcher does with orders, each a process of its own."""
+"""Backends that run the jobs of a sweep, each job in a process of its own."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ _LOOK_S = 0.2
 
 
 class Backend(Protocol):
-    """Runs jobs; the death of one, or of what runs it, is noted in its folder."""
+    """Runs jobs; if a job or its worker dies, this is recorded in the job's folder."""
 
     def run(self, orders: Sequence[JobOrder]) -> None:
-        """Run all orders; return when each is settled."""
+        """Run all jobs; return when all have ended."""
         ...
 
 
 class Basic:
-    """One job after the other, here."""
+    """Runs one job after the other, on this machine."""
 
     def run(self, orders: Sequence[JobOrder]) -> None:
-        """Run them in order."""
+        """Run the jobs in order."""
         for order in orders:
             run_job(order)
 
 
 class Joblib:
-    """So many jobs at a time, on this machine."""
+    """Runs several jobs at a time, on this machine."""
 
     def __init__(self, n_jobs: int, cpus_per_job: int) -> None:
         if not isinstance(n_jobs, int) or n_jobs == 0:
@@ -45,7 +45,7 @@ class Joblib:
         self._n_jobs, self._cpus_per_job = n_jobs, cpus_per_job
 
     def run(self, orders: Sequence[JobOrder]) -> None:
-        """Run them from threads; each thread waits for the process of its job."""
+        """Run the jobs in threads; each thread waits for its job's process."""
         try:
             from joblib import Parallel, delayed
         except ImportError as error:
@@ -57,7 +57,7 @@ class Joblib:
 
 
 class Submitit:
-    """Jobs of a SLURM cluster, or of submitit's stand-in for one on this machine.
+    """Runs jobs on a SLURM cluster, or on submitit's local replacement.
 
     `array_parallelism` jobs run at a time; `parameters` are submitit's own (`timeout_min`,
     `cpus_per_task`, `slurm_partition`, ...).
@@ -77,7 +77,7 @@ class Submitit:
         self._parameters = dict(parameters)
 
     def run(self, orders: Sequence[JobOrder]) -> None:
-        """Submit them: to SLURM as one array, else as there is room."""
+        """Submit the jobs: to SLURM as one array, else as cores are free."""
         try:
             from submitit import AutoExecutor
         except ImportError as error:
@@ -85,7 +85,7 @@ class Submitit:
 
         try:
             executor = AutoExecutor(orders[0].stop.parent / "submitit", cluster=self._cluster)
-        except RuntimeError as error:  # there is no such cluster here
+        except RuntimeError as error:  # no such cluster
             raise ConfigError(
                 "hydra.launcher.cluster", self._cluster, f"one that answers ({error})"
             ) from error
@@ -109,12 +109,12 @@ class Submitit:
                     del running[order]
                     _note(order, job.result)
                 elif order.stop.exists() and _is_waiting(order):
-                    running.pop(order).cancel()  # it may wait for long to be told so
+                    running.pop(order).cancel()  # it may be queued for long
             sleep(_LOOK_S)
 
 
 class Ray:
-    """Tasks of a Ray cluster; without an address, of one that is started on this machine."""
+    """Runs jobs as tasks of a Ray cluster; without an address, one is started on this machine."""
 
     def __init__(self, address: str | None, num_cpus: int | None, cpus_per_job: float) -> None:
         if not isinstance(cpus_per_job, int | float) or not cpus_per_job > 0:
@@ -125,7 +125,7 @@ class Ray:
         self._cpus_per_job = cpus_per_job
 
     def run(self, orders: Sequence[JobOrder]) -> None:
-        """Run them as there are cores; a worker that dies takes its own job along, no other."""
+        """Run the jobs as cores are free; if a worker dies, only its own job fails."""
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         try:
             import ray
@@ -156,7 +156,7 @@ def _check_count(name: str, value: object) -> None:
 
 
 def _cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -172,12 +172,12 @@ def _is_waiting(order: JobOrder) -> bool:
 
 
 def _note(order: JobOrder, result: Callable[[], object]) -> None:
-    """Note in the job's folder when what ran it died."""
+    """Record in the job's folder if its worker died."""
     try:
         result()
     except Exception as error:
         reason = str(error).strip().splitlines() or [""]
-        settle(order.folder, State.KILLED, f"what ran it died: {type(error).__name__}: {reason[0]}")
+        settle(order.folder, State.KILLED, f"its worker died: {type(error).__name__}: {reason[0]}")
 
 
 def _missing(package: str, extra: str, error: ImportError) -> ConfigError:

@@ -1,4 +1,4 @@
-"""`run=detect_only` as a sweep: no job per setting, but all settings on what was seen once."""
+"""Sweeps with `run=detect_only`: all settings are evaluated on features computed once."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from sceneslam.collect.write import write_rows
 from sceneslam.config.resolve import resolved, without_hydra
 from sceneslam.detection.grid import Axis, Tried, try_all
 
-_INNER = ("detector.", "policy.")  # what can be changed without composing or reading again
-_TOLD_ERRORS = 5  # the table has all of them
+_INNER = ("detector.", "policy.")  # keys that need no new composition and no new reading
+_TOLD_ERRORS = 5  # shown; the table has all
 
 
 def sweep_detection(
     context: HydraContext, config: DictConfig, words: Sequence[str], folder: Path
 ) -> bool:
-    """Try every combination of overrides, write the table; return whether all could be tried."""
+    """Evaluate all combinations of overrides, write the table; return whether all succeeded."""
     parser = OverridesParser.create(config_loader=context.config_loader)
     overrides = {one.get_key_element(): one for one in parser.parse_overrides(list(words))}
     inner = {key: one for key, one in overrides.items() if key.startswith(_INNER)}
     axes = [Axis(key=key, values=list(_values(one))) for key, one in inner.items()]
-    first = [_words(one)[0] for one in inner.values()]  # a misspelt key is found by composing
+    first = [_words(one)[0] for one in inner.values()]  # composing finds misspelt keys
     outer = [_words(one) for key, one in overrides.items() if key not in inner]
     cells = [_Cell.of(context, config, chosen, axes, first) for chosen in product(*outer)]
     for axis, word in zip(axes, first, strict=True):
@@ -64,7 +64,7 @@ def sweep_detection(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Cell:
-    """A choice of what has to be composed anew, and the axes whose keys it has."""
+    """A combination of the other overrides, and the axes whose keys it has."""
 
     chosen: Sequence[str]
     config: DictConfig
@@ -79,7 +79,7 @@ class _Cell:
         axes: Sequence[Axis],
         first: Sequence[str],
     ) -> _Cell:
-        """Compose a choice with the first value of every axis that it has a key for."""
+        """Compose a combination with the first value of every axis whose key it has."""
         compose = context.config_loader.load_sweep_config
         own = list(zip(axes, first, strict=True))
         try:
@@ -107,13 +107,13 @@ def _row(number: int, chosen: Sequence[str], tried: Tried) -> Row:
 
 
 def _cell(value: Any) -> Value:
-    """Return a value as the table holds it: numbers and text, all else as it is typed."""
+    """Return a value for the table: numbers and text as they are, others as typed."""
     is_plain = isinstance(value, str | int | float) and not isinstance(value, bool)
     return cast(Value, value) if is_plain else json.dumps(value).replace('"', "")
 
 
 def _words(override: Override) -> list[str]:
-    """Return an override once for each of its values."""
+    """Return one override per value."""
     key = override.get_key_element()
     if override.is_sweep_override():
         return [f"{key}={value}" for value in override.sweep_string_iterator()]
@@ -130,7 +130,7 @@ def _values(override: Override) -> Iterator[Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value without the quotes that the command line gave it, or what is in it."""
+    """Return a value, and those inside it, without the command line's quotes."""
     if isinstance(value, QuotedString):
         return value.text
     if isinstance(value, list):

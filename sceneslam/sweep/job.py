@@ -28,7 +28,7 @@ _STATES = {OK: State.DONE, INCOMPLETE: State.INCOMPLETE}
 
 
 def main() -> None:
-    """Run the job of a folder and leave its status there."""
+    """Run the job of a folder and write its status there."""
     folder = Path(sys.argv[1])
     threading.Thread(target=_end_with_parent, daemon=True, name="parent").start()
     status = Status.read(folder) or Status(state=State.WAITING)
@@ -38,7 +38,7 @@ def main() -> None:
 
 
 def _run(folder: Path) -> tuple[State, str]:
-    """Return how a job ended, and what was wrong."""
+    """Return a job's final state and error."""
     try:
         with (folder / COMPOSED).open("rb") as file:
             config: DictConfig = pickle.load(file)
@@ -52,7 +52,7 @@ def _run(folder: Path) -> tuple[State, str]:
 
 
 def _carried_out(config: DictConfig) -> Ended:
-    """Run a configuration as Hydra runs a job, in a Hydra that can compose more like it."""
+    """Run a configuration as a job of Hydra, with the same search path for compositions."""
     search_path = create_config_search_path(CONFIG)
     for source in config.hydra.runtime.config_sources:
         if source.provider == "command-line":  # the user's --config-dir
@@ -70,8 +70,8 @@ def _carried_out(config: DictConfig) -> Ended:
 
 
 def _end_with_parent() -> None:
-    """End when the process that started this one is gone: standard input closes then."""
-    while os.read(0, 1):  # not sys.stdin, whose lock would be held when the job ends
+    """End when the parent process has ended, which closes standard input."""
+    while os.read(0, 1):  # not sys.stdin, whose lock would still be held at the end of the job
         pass
     os.kill(os.getpid(), signal.SIGTERM)
 

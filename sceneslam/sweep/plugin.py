@@ -1,4 +1,4 @@
-"""Sweeps as Hydra asks for them: all jobs are composed before the first one begins."""
+"""Hydra's launcher and sweeper plugins: all jobs are composed before the first one begins."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from sceneslam.sweep.detection import sweep_detection
 from sceneslam.sweep.sweep import run_sweep
 from sceneslam.types.errors import ConfigError, SceneSlamError
 
-INCOMPLETE, UNUSABLE = 1, 2  # exit codes: not all jobs are finished, nothing was run
+INCOMPLETE, UNUSABLE = 1, 2  # exit codes: not all jobs finished; nothing was run
 COMPOSED = ".composed.pickle"  # a job's configuration with Hydra's own part
 
 
 class SweepLauncher(Launcher):
-    """Has jobs run by a backend; those whose folder holds the same job, finished, are kept."""
+    """Runs jobs by a backend; jobs that are already finished in their folder are kept."""
 
     def __init__(self, backend: str, **settings: Any) -> None:
         plain = OmegaConf.to_container(OmegaConf.create(settings), resolve=True)
@@ -44,13 +44,13 @@ class SweepLauncher(Launcher):
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        """Take the sweep's configuration; a job calls the program itself, not `task_function`."""
+        """Set the sweep's configuration; jobs are processes, `task_function` is not used."""
         self._context, self._config = hydra_context, config
 
     def launch(
         self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
     ) -> Sequence[JobReturn]:
-        """Run the jobs that are missing; return how all of them stand."""
+        """Run the missing jobs; return the state of all jobs."""
         setup_globals()
         configure_log(self._config.hydra.hydra_logging, self._config.hydra.verbose)
         sweep = Path(self._config.hydra.sweep.dir).absolute()
@@ -77,7 +77,7 @@ class SweepLauncher(Launcher):
 
 
 class GridSweeper(Sweeper):
-    """Every combination of the values given, as Hydra's own, but composed once."""
+    """All combinations of the given values, as Hydra's own sweeper, but composed once."""
 
     def __init__(self, params: Mapping[str, Any] | None) -> None:
         self._params = params or {}
@@ -85,14 +85,14 @@ class GridSweeper(Sweeper):
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        """Take the sweep's configuration and make its launcher."""
+        """Set the sweep's configuration and make its launcher."""
         self._context, self._config = hydra_context, config
         self._launcher = Plugins.instance().instantiate_launcher(
             hydra_context=hydra_context, task_function=task_function, config=config
         )
 
     def sweep(self, arguments: list[str]) -> Sequence[JobReturn]:
-        """Run all combinations; ends the program where one is not done, or none can be."""
+        """Run all combinations; exit the program if not all are finished."""
         words = [*(f"{key}={value}" for key, value in self._params.items()), *arguments]
         folder = Path(self._config.hydra.sweep.dir)
         folder.mkdir(parents=True, exist_ok=True)
@@ -124,10 +124,10 @@ class GridSweeper(Sweeper):
 
 
 def register() -> None:
-    """Let `hydra/launcher=` and `hydra/sweeper=` choose ours, as the YAML files beside this say.
+    """Register the launchers and sweepers of the YAML files beside this module.
 
-    Hydra takes plugins from its own namespace only, and these files in place of those that it or
-    an installed plugin registered under the same names.
+    Hydra accepts plugins of its own namespace only; these files replace those that Hydra or an
+    installed plugin registered under the same names.
     """
     for plugin in (SweepLauncher, GridSweeper):
         Plugins.instance().class_name_to_class[f"hydra_plugins.{plugin.__name__}"] = plugin
@@ -141,7 +141,7 @@ def register() -> None:
 
 
 def _prepare(folder: Path, config: DictConfig) -> None:
-    """Write a job into its folder, unless the same one is finished there."""
+    """Write a job's files, unless the same job is finished in its folder."""
     digest = hashlib.sha256(OmegaConf.to_yaml(without_hydra(config)).encode()).hexdigest()
     before = Status.read(folder)
     if before is not None and before.is_finished and before.config_sha256 == digest:
@@ -154,7 +154,7 @@ def _prepare(folder: Path, config: DictConfig) -> None:
 
 
 def _returned(folder: Path, config: DictConfig) -> JobReturn:
-    """Return a job's end as Hydra's sweepers take it."""
+    """Return a job's result in Hydra's format."""
     status = Status.read(folder)
     done = JobReturn()
     done.overrides = status.overrides if status else ()

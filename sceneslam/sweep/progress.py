@@ -17,7 +17,7 @@ _TOLD = (State.RUNNING, State.INCOMPLETE, State.FAILED, State.KILLED, State.STOP
 
 
 class Progress:
-    """Shows the states of the jobs, read from their folders, while it is entered."""
+    """A context manager that shows the states of the jobs, read from their folders."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         self._waiting = set(folders)

@@ -1,4 +1,4 @@
-"""A copy of the package as it is when a sweep begins: later edits do not reach its jobs."""
+"""A copy of the package at the start of a sweep, so that later edits do not affect its jobs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _BESIDE = ("conf", "modules", "experiments")  # of a checkout; in a wheel they l
 
 
 def keep_code(folder: Path) -> Path:
-    """Return a folder to import `sceneslam` from, below `folder`; copied where it is not there."""
+    """Return the folder, below `folder`, of the copied package; copy it if it is missing."""
     target = folder / code_sha256()[:12]
     if target.is_dir():
         return target

@@ -1,4 +1,4 @@
-"""Runs a job in a process of its own, so that its death is nobody else's."""
+"""Running of a job in a process of its own, so that a crash does not affect other jobs."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from typing import BinaryIO
 
 from sceneslam.collect.status import State, Status
 
-_LOOK_S = 0.2  # between two looks at whether the sweep is to stop
-_PATIENCE_S = 30.0  # for a job that is to stop to save what it has
+_LOOK_S = 0.2  # interval of checks for a stop of the sweep
+_PATIENCE_S = 30.0  # for a stopped job to save its results
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobOrder:
-    """A job and what it is run with, by any process of any machine that sees the folders."""
+    """A job with all data to run it, on any machine with access to the folders."""
 
     folder: Path
     code: Path  # a copy of the package as it was when the sweep began
-    began_in: Path  # the working folder of the sweep: relative paths are meant from there
-    stop: Path  # the sweep is to stop as soon as there is such a file
-    cores: int | None = None  # that the job may take; None: as many as there are
+    began_in: Path  # working folder of the sweep: base of relative paths
+    stop: Path  # the sweep stops when this file exists
+    cores: int | None = None  # cores for the job; None: all
 
 
 def run_job(order: JobOrder) -> None:
-    """Run a job to its end; how it ended is in its folder, whatever happens."""
+    """Run a job to its end; its final state is always in its folder."""
     if order.stop.exists():
         settle(order.folder, State.STOPPED, "stopped before it began")
         return
@@ -44,7 +44,7 @@ def run_job(order: JobOrder) -> None:
 
 
 def settle(folder: Path, state: State, error: str) -> None:
-    """Note the end of a job that left no word of it itself."""
+    """Write the final state of a job that has not written one itself."""
     status = Status.read(folder) or Status(state=State.WAITING)
     if not status.is_settled:
         status.now(state, error).write(folder)
@@ -53,17 +53,17 @@ def settle(folder: Path, state: State, error: str) -> None:
 def _start(order: JobOrder, log: BinaryIO) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
         [sys.executable, "-P", "-m", "sceneslam.sweep.job", str(order.folder)],
-        stdin=subprocess.PIPE,  # closes with this process: the job does not outlive it
+        stdin=subprocess.PIPE,  # closed at the end of this process, which ends the job
         stdout=log,
         stderr=subprocess.STDOUT,
         cwd=order.began_in,
         env=_environment(order),
-        start_new_session=True,  # Ctrl-C is told to it in order
+        start_new_session=True,  # Ctrl-C is handled by the sweep
     )
 
 
 def _wait(process: subprocess.Popen[bytes], stop: Path) -> None:
-    """Wait for a job's end; ask for it once the sweep is to stop."""
+    """Wait for a job's end; terminate it if the sweep stops."""
     left_s: float | None = None
     while True:
         try:
@@ -80,10 +80,10 @@ def _wait(process: subprocess.Popen[bytes], stop: Path) -> None:
 
 
 def _environment(order: JobOrder) -> dict[str, str]:
-    """Return a job's environment: that code first, and one thread per library.
+    """Return a job's environment: the copied code first, and one thread per library.
 
-    Jobs side by side are faster than threads side by side, and with more threads BLAS adds in
-    another order.
+    Parallel jobs are faster than parallel threads, and with more threads BLAS adds in another
+    order.
     """
     before = os.environ.get("PYTHONPATH")
     path = [str(order.code), str(order.began_in), *([before] if before else [])]

@@ -1,4 +1,4 @@
-"""Runs what is missing of a sweep's jobs, and makes its table."""
+"""Running of the missing jobs of a sweep, and its table."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sceneslam.sweep.snapshot import keep_code
 from sceneslam.sweep.supervise import JobOrder, settle
 from sceneslam.types.errors import ConfigError, InputError
 
-_OWN = ".sweep"  # in a sweep's folder: the launcher, the code, and whether to stop
+_OWN = ".sweep"  # in a sweep's folder: launcher, code and stop file
 _KEPT = "sweep.json"
 _TOLD_ERRORS = 10
 
@@ -30,8 +30,8 @@ def run_sweep(
 ) -> bool:
     """Run the jobs that are not finished; return whether all are. Writes the sweep's table.
 
-    `launcher` is the name of a backend, under `backend`, with its settings; `began_in` the folder
-    that relative paths are meant from.
+    `launcher` has the name of a backend, in `backend`, and its settings; `began_in` is the base
+    folder of relative paths.
     """
     backend = _backend(launcher)
     own = sweep / _OWN
@@ -57,7 +57,7 @@ def run_sweep(
 
 
 def resume(sweep: Path) -> bool:
-    """Run what is missing of a sweep as it was composed; return whether all is finished then."""
+    """Run the missing jobs of a sweep as composed; return whether all are finished then."""
     path = sweep / _OWN / _KEPT
     if not path.is_file():
         raise InputError(f"not the folder of a sweep (it has no {_OWN}/{_KEPT}): {sweep}")
@@ -67,7 +67,7 @@ def resume(sweep: Path) -> bool:
 
 
 def _tell(sweep: Path, folders: Sequence[Path], *, skipped: int) -> None:
-    """Write the sweep's table and page, and say how its jobs ended."""
+    """Write the sweep's table and page, and print how its jobs ended."""
     rows = read_rows(sweep)
     page = write_rows(sweep, rows)
     print(overview(rows), end="")

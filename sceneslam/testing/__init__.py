@@ -1,13 +1,12 @@
-"""Do your own components keep their contracts? For the tests of your own package.
+"""Contract checks of your own components, for the tests of your own package.
 
     from sceneslam.testing import check_module
 
     def test_my_module_keeps_the_contract():
         check_module(lambda: MySlam(max_depth_m=4.0))
 
-Every check raises ContractError, an AssertionError, with a sentence on what was promised in
-`sceneslam.interfaces` and what came instead. The lists hold the single checks, for those who want a
-test of each.
+Every check raises ContractError, an AssertionError, with a sentence on what is required by
+`sceneslam.interfaces` and what was found. The lists hold the single checks, for one test each.
 """
 
 from sceneslam.testing.detectors import DETECTOR_CHECKS, check_detector

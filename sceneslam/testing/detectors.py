@@ -1,4 +1,4 @@
-"""Checks of a scene detector: each takes a function that makes a new one."""
+"""Contract checks of scene detectors; each takes a function that makes a new detector."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ Make = Callable[[], Detector]
 
 
 def check_detector(make: Make) -> None:
-    """Raise ContractError where a detector does not keep the contract of `Detector`."""
+    """Raise ContractError if a detector violates the contract of `Detector`."""
     for check in DETECTOR_CHECKS:
         check(make)
 
 
 def fulfils_the_protocol(make: Make) -> None:
-    """Check that it has all members, and names its scenes."""
+    """Check that the detector has all members, and names its scenes."""
     with _active(make) as detector:
         expect(isinstance(detector, Detector), "all members of Detector")
         is_named = detector.scenes and UNSURE not in detector.scenes
@@ -28,7 +28,7 @@ def fulfils_the_protocol(make: Make) -> None:
 
 
 def votes_at_the_stamp_for_its_scenes(make: Make) -> None:
-    """Check that a vote bears the observation's stamp, and a scene of the detector or UNSURE."""
+    """Check that a vote has the observation's stamp, and a scene of the detector or UNSURE."""
     with _active(make) as detector:
         for index in range(3):
             observation = room_observation(index)
@@ -47,14 +47,14 @@ def repeats_itself(make: Make) -> None:
 
 
 def survives_an_empty_observation(make: Make) -> None:
-    """Check that it answers without any measurement, UNSURE or not."""
+    """Check that the detector votes without any measurement, UNSURE or not."""
     with _active(make) as detector:
         vote = detector.get_scene(Observation(stamp_ns=1))
         expect(vote.scene in (*detector.scenes, UNSURE), "a known scene", vote.scene)
 
 
 def votes_by_features_that_can_be_kept(make: Make) -> None:
-    """Check that features, where it has any, decide the vote whenever they were taken."""
+    """Check that the vote depends on the detector's features only, if it has any."""
     observations = [room_observation(index) for index in range(3)]
     observations.insert(2, Observation(stamp_ns=observations[1].stamp_ns + 1))
     with _active(make) as detector:

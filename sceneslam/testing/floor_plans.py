@@ -1,4 +1,4 @@
-"""Floor plans made of walls, and a planar laser that looks at them: fast enough for many runs."""
+"""Simulated floor plans of walls with a planar laser, fast enough for many runs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def box(x0: float, y0: float, x1: float, y1: float) -> list[Wall]:
     return [(x0, y0, x1, y0), (x1, y0, x1, y1), (x1, y1, x0, y1), (x0, y1, x0, y0)]
 
 
-CUPBOARD = box(1, 1, 1.8, 2)  # of the flat
+CUPBOARD = box(1, 1, 1.8, 2)  # in `flat`
 
 
 def flat() -> list[Wall]:
@@ -51,7 +51,7 @@ FLAT_TOUR: tuple[Corner, ...] = (
 
 
 def twins() -> list[Wall]:
-    """Return two rooms that differ in nothing but their place, off one corridor."""
+    """Return two identical rooms beside one corridor."""
     walls: list[Wall] = [(0, -2, 16, -2), (0, -2, 0, 0), (16, -2, 16, 0)]
     for x in (0.0, 8.0):
         walls += [(x, 0, x, 4), (x, 4, x + 5, 4), (x + 5, 4, x + 5, 0)]
@@ -64,7 +64,7 @@ TWINS_SECOND: tuple[Corner, ...] = tuple((x + 8.0, y) for x, y in reversed(TWINS
 
 
 def niches(count: int, every_m: float = 3.0) -> list[Wall]:
-    """Return a corridor, 2 m wide, with a niche every three metres, each like the next."""
+    """Return a corridor, 2 m wide, with identical niches."""
     length_m = count * every_m
     walls: list[Wall] = [(0, -1, length_m, -1), (0, -1, 0, 1), (length_m, -1, length_m, 1)]
     for number in range(count):
@@ -75,13 +75,13 @@ def niches(count: int, every_m: float = 3.0) -> list[Wall]:
 
 
 def corridor(length_m: float = 40.0) -> list[Wall]:
-    """Return a bare corridor whose ends are out of sight."""
+    """Return a bare corridor whose ends are out of range."""
     return [(-length_m, -1, length_m, -1), (-length_m, 1, length_m, 1)]
 
 
 @dataclass(slots=True, kw_only=True)
 class Scanner:
-    """A planar laser; as narrow and short-sighted as a depth camera with other values."""
+    """A planar laser; with other values, similar to a depth camera."""
 
     beams: int = 270
     field_rad: float = 1.5 * np.pi
@@ -94,14 +94,14 @@ DEPTH_LIKE = Scanner(beams=160, field_rad=float(np.radians(57.0)), range_m=4.5, 
 
 @dataclass(slots=True)
 class World:
-    """Walls, and what looks at them."""
+    """Walls and a laser."""
 
     walls: Sequence[Wall]
     rng: np.random.Generator
     scanner: Scanner
 
     def scan(self, T_world_base: Planar, stamp_ns: int = 0) -> LaserScan:
-        """Return what the laser, which sits in `base`, measures at a pose."""
+        """Return the laser's scan at a pose; the laser is at the origin of `base`."""
         scanner = self.scanner
         angles = np.linspace(-scanner.field_rad / 2, scanner.field_rad / 2, scanner.beams)
         hit_m = self._hit(T_world_base, angles)
@@ -116,7 +116,7 @@ class World:
         )
 
     def _hit(self, T_world_base: Planar, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the distance to the first wall of every beam, inf without one."""
+        """Return the distance (beams,) [m] to each beam's first wall, inf without one."""
         walls = np.array(self.walls, np.float64)
         yaw = T_world_base[2] + angles
         dx, dy = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
@@ -130,7 +130,7 @@ class World:
 
 
 def through(corners: Sequence[Corner], step_m: float = 0.1) -> NDArray[np.float64]:
-    """Return the poses (N, 3) of a drive along straight lines, which turns at the corners."""
+    """Return the poses (N, 3), x, y [m], yaw [rad], of a drive along straight lines with turns."""
     poses: list[list[float]] = []
     for (x0, y0), (x1, y1) in pairwise(corners):
         yaw = float(np.arctan2(y1 - y0, x1 - x0))

@@ -1,4 +1,4 @@
-"""Checks of a SLAM module: each takes a function that makes a new one."""
+"""Contract checks of SLAM modules; each takes a function that makes a new module."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _FAR_M = 20.0  # no map of the room reaches farther
 
 
 def check_module(make: Make, *, is_reproducible: bool = True) -> None:
-    """Raise ContractError where a module does not keep the contract of `SlamModule`.
+    """Raise ContractError if a module violates the contract of `SlamModule`.
 
-    It drives through a small room with every sensor; `make` returns a new module each time. A
-    module with threads that race is not reproducible, and no run with it is.
+    The robot drives through a small room with all sensors; `make` returns a new module each time. A
+    module whose threads race is not reproducible.
     """
     for check in MODULE_CHECKS:
         if is_reproducible or check is not repeats_itself:
@@ -33,7 +33,7 @@ def check_module(make: Make, *, is_reproducible: bool = True) -> None:
 
 
 def fulfils_the_protocol(make: Make) -> None:
-    """Check that it has all members, and names the sets of sensors that it requires."""
+    """Check that the module has all members, and names its required sets of sensors."""
     with _active(make) as module:
         expect(isinstance(module, SlamModule), "all members of SlamModule")
         is_sets = module.requires and all(isinstance(one, frozenset) for one in module.requires)
@@ -41,7 +41,7 @@ def fulfils_the_protocol(make: Make) -> None:
 
 
 def begins_at_the_identity(make: Make) -> None:
-    """Check that local is the base at the first observation."""
+    """Check that `local` is `base` at the first observation."""
     with _active(make) as module:
         tracking = module.track(room_observation(0))
         _expect_pose(tracking, "at the first observation")
@@ -50,7 +50,7 @@ def begins_at_the_identity(make: Make) -> None:
 
 
 def follows_a_known_motion(make: Make) -> None:
-    """Check that it stays within 5 cm and 0.05 rad of the truth over 0.2 m."""
+    """Check that the error is at most 5 cm and 0.05 rad over 0.2 m."""
     T_first = room_observation(0).T_odom_base
     assert T_first is not None
     with _active(make) as module:
@@ -83,7 +83,7 @@ def answers_with_rigid_poses_at_the_stamp(make: Make) -> None:
 
 
 def repeats_itself(make: Make) -> None:
-    """Check that two runs are identical to the bit, also of a module that is activated again."""
+    """Check that two runs are bitwise equal, also after a second activation."""
     with _active(make) as one, _active(make) as two:
         runs = [_drive(one), _drive(two)]
         one.shutdown()
@@ -96,7 +96,7 @@ def repeats_itself(make: Make) -> None:
 
 
 def starts_anew_when_activated_again(make: Make) -> None:
-    """Check that a second session of a module begins at its own first observation."""
+    """Check that `local` of a second session is `base` at its first observation."""
     with _active(make) as module:
         _drive(module)
         module.shutdown()
@@ -128,7 +128,7 @@ def survives_silent_sensors(make: Make) -> None:
 
 
 def maps_in_local(make: Make) -> None:
-    """Check that points and grid are finite float32, and lie in the room."""
+    """Check that points and grid are finite float32 and within the room."""
     with _active(make) as module:
         _drive(module)
         layers = module.get_map()
@@ -174,7 +174,7 @@ MODULE_CHECKS: Sequence[Callable[[Make], None]] = (
 
 
 def without_measurements(observation: Observation) -> Observation:
-    """Return the observation with sensors that speak, but see nothing: black, blind, empty."""
+    """Return the observation with empty measurements: black image, no depth, no returns."""
     assert observation.image_bgr is not None and observation.depth_m is not None
     assert observation.scan is not None
     no_returns = np.full_like(observation.scan.ranges_m, np.nan)

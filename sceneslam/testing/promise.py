@@ -1,13 +1,13 @@
-"""What a check says when a promise is broken."""
+"""The error of contract checks."""
 
 from __future__ import annotations
 
 
 class ContractError(AssertionError):
-    """A component does not do what its interface promises."""
+    """A component violates the contract of its interface."""
 
 
 def expect(holds: object, promise: str, found: object = "") -> None:
-    """Raise ContractError with the promise, and what was found, unless it holds."""
+    """Raise ContractError with the requirement and what was found, unless it holds."""
     if not holds:
         raise ContractError(f"{promise}; got {found}" if found != "" else promise)

@@ -1,4 +1,4 @@
-"""Observations of a small textured room, with every sensor on board."""
+"""Simulated observations of a small textured room with all sensors."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ RIG = Rig(sensors=frozenset(Sensor), camera=CAMERA, laser=Laser(), lidar=Lidar(r
 
 @cache
 def room_observation(index: int, *, rate_hz: float = 30.0) -> Observation:
-    """Return what a robot measures that drives a gentle arc at 0.3 m/s through the room."""
+    """Return the observation of a robot that drives an arc at 0.3 m/s through the room."""
     t_s = index / rate_hz
     return observation_at(se3.from_xy_yaw(-1.0 + 0.3 * t_s, 0.1 * t_s, 0.15 * t_s), t_s)
 
 
 def observation_at(T_room_base: se3.Transform, t_s: float) -> Observation:
-    """Return what all sensors measure at a pose in the room."""
+    """Return the measurements of all sensors at the pose T_room_base (4, 4) [m]."""
     image_bgr, depth_m = _render(T_room_base)
     ranges_m = _hit(T_room_base, _fan())[0]
     cloud = _sphere() * _hit(T_room_base, _sphere())[0][:, None]
@@ -57,7 +57,7 @@ def observation_at(T_room_base: se3.Transform, t_s: float) -> Observation:
 def _render(
     T_room_base: se3.Transform,
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Return colour and depth of the room; every wall wears its own patchwork."""
+    """Return colour (H, W, 3) and depth (H, W) [m] of the room; each wall has its own texture."""
     rays_base = _pixels() @ optical_to_rep103()[:3, :3].T
     scale, wall, surface = _hit(T_room_base, rays_base)
     texel = (surface * 40).astype(int)
@@ -69,7 +69,7 @@ def _render(
 def _hit(
     T_room_base: se3.Transform, rays_base: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return, per ray, the factor to the first wall, which wall, and where on it (2,) [m]."""
+    """Return per ray: factor to the first wall, the wall's index, and the point on it [m]."""
     rays = rays_base @ T_room_base[:3, :3].T
     origin = T_room_base[:3, 3]
     half = np.array([HALF_X_M, HALF_Y_M, HALF_Z_M])

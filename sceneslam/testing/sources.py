@@ -1,4 +1,4 @@
-"""Checks of a source: each takes a function that makes a new one."""
+"""Contract checks of sources; each takes a function that makes a new source."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
 
 Make = Callable[[], Source]
-OBSERVATIONS = 50  # of a source are looked at
+OBSERVATIONS = 50  # number of checked observations
 
 
 def check_source(make: Make) -> None:
-    """Raise ContractError where a source does not keep the contract of `Source`.
+    """Raise ContractError if a source violates the contract of `Source`.
 
-    Its first 50 observations are looked at, twice.
+    Its first 50 observations are read twice.
     """
     for check in SOURCE_CHECKS:
         check(make)
 
 
 def fulfils_the_protocol(make: Make) -> None:
-    """Check that it has all members, and says where sensors that measure distances sit."""
+    """Check that the source has all members, and the poses of its range sensors."""
     source = make()
     expect(isinstance(source, Source), "all members of Source")
     rig = source.rig
@@ -40,7 +40,7 @@ def fulfils_the_protocol(make: Make) -> None:
 
 
 def counts_its_observations(make: Make) -> None:
-    """Check that its length is None, or not less than what it yields."""
+    """Check that the length is None, or not less than the number of observations."""
     source = make()
     length, seen = source.length, len(_first(source))
     expect(length is None or length >= seen, f"length None or >= {seen}", length)
@@ -67,7 +67,7 @@ def begins_anew_each_time(make: Make) -> None:
 
 
 def measures_what_its_rig_has(make: Make) -> None:
-    """Check that an observation holds what the rig names alone, in the shapes it promises."""
+    """Check that an observation holds only sensors of the rig, in the right shapes."""
     source = make()
     rig = source.rig
     for observation in _first(source):
@@ -94,7 +94,7 @@ def _check_arrays(observation: Observation, rig: Rig) -> None:
     height, width = 0, 0
     if rig.camera is not None:
         width, height = rig.camera.size_wh
-    elif observation.image_bgr is not None:  # a film, whose camera nobody knows
+    elif observation.image_bgr is not None:  # a video with unknown camera
         height, width = observation.image_bgr.shape[:2]
     expected = (
         ("image_bgr", (height, width, 3), np.uint8),
