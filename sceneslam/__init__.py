@@ -11,8 +11,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = ["__version__", "run"]
 
-# In a checkout `conf`, `modules` and `experiments` lie beside this package, in a wheel inside it:
-# either way they are `sceneslam.conf`, `sceneslam.modules` and `sceneslam.experiments`.
+# In a checkout, `conf`, `modules` and `experiments` are beside this package, in a wheel inside it:
+# in both cases they are `sceneslam.conf`, `sceneslam.modules` and `sceneslam.experiments`.
 _CHECKOUT = Path(__file__).resolve().parent.parent
 if (_CHECKOUT / "pyproject.toml").is_file() and (_CHECKOUT / "modules" / "slam").is_dir():
     __path__.append(str(_CHECKOUT))
@@ -22,6 +22,6 @@ def run(
     *overrides: str, folder: str | Path | None = None, config_dir: str | Path | None = None
 ) -> Finished:
     """Run a configuration as the command line does; see `sceneslam.script.run`."""
-    from sceneslam import script  # the libraries are loaded when they are needed
+    from sceneslam import script  # libraries are loaded when needed
 
     return script.run(*overrides, folder=folder, config_dir=config_dir)

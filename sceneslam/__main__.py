@@ -3,11 +3,11 @@
 import os
 import signal
 
-# Before NumPy loads it: with more threads, BLAS adds in another order, and a run depended on the
-# number of cores. The processes of modules inherit it.
+# Set before NumPy loads BLAS: its sums depend on the number of threads, and runs would depend on the
+# number of cores. Modules' processes inherit it.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# Ctrl-C while it loads ends it without a traceback; where it is ignored, it stays so.
+# Ctrl-C during loading ends the program without a traceback, unless it is ignored.
 _handler = signal.getsignal(signal.SIGINT)
 if _handler is signal.default_int_handler:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -25,7 +25,7 @@ __all__ = ["main"]
 
 
 def main() -> None:
-    """Run `python -m sceneslam` and exit; `-m` knows our launchers and sweepers."""
+    """Run `python -m sceneslam` and exit, with our launchers and sweepers for `-m`."""
     register()
     cli.main()
 

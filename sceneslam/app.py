@@ -1,4 +1,4 @@
-"""Carries a run out: builds the parts, feeds the bus, saves what came of it, whatever happens."""
+"""Execution of a run: builds the parts, feeds the bus, and saves the results in any case."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from sceneslam.types.truth import GroundTruth
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Finished:
-    """A run that ended, one way or another; its folder is written."""
+    """A finished run, whose folder is written."""
 
     folder: Path
     metrics: Metrics
     trajectory: Trajectory  # T_map_base: `stamps_ns` (N,), `T_world_base` (N, 4, 4)
-    modules: Sequence[str]  # per pose: the key of the module that gave it, "" where it was bridged
+    modules: Sequence[str]  # per pose: key of its module, "" if bridged
     map: HybridMap
     truth: GroundTruth | None
-    faults: tuple[str, ...]  # what was wrong with the input or ended the run early
+    faults: tuple[str, ...]  # errors of the input, or why the run ended early
     is_interrupted: bool  # by Ctrl-C or SIGTERM
 
     def __repr__(self) -> str:
@@ -52,10 +52,10 @@ def run(
     reference: Trajectory | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Finished:
-    """Run a resolved configuration and write its folder; `say` takes what is found before it.
+    """Run a resolved configuration and write its folder; `say` receives the survey's warnings.
 
-    Raises ConfigError or InputError where nothing could be run. What ends a run once it has begun
-    (Ctrl-C, broken input, no module left) is in `faults`, and all that was computed is saved.
+    Raises ConfigError or InputError if nothing could be run. The reason for an early end (Ctrl-C,
+    damaged input, no module left) is in `faults`, and all results so far are saved.
     """
     _reclaim()
     with closing(build(config)) as parts:
@@ -76,7 +76,7 @@ def run(
 
 
 def _begin(config: Mapping[str, Any], parts: RunParts, folder: Path, title: str) -> Results:
-    """Write the configuration, which a run that is cut off can be recovered with."""
+    """Write the configuration, which is needed to recover an interrupted run."""
     try:
         versions = save_config(config, folder / "config.yaml")
     except OSError as error:
@@ -117,7 +117,7 @@ def _end(loop: RunLoop, results: Results, reference: Trajectory | None) -> Finis
 
 
 def _reclaim() -> None:
-    """Give back what the run before this one left in the process: cycles, and freed images."""
+    """Release memory of earlier runs in this process: reference cycles and freed images."""
     gc.collect()
-    with suppress(OSError, AttributeError):  # only glibc keeps freed memory, and can be asked
+    with suppress(OSError, AttributeError):  # glibc only: returns freed memory to the system
         ctypes.CDLL(None).malloc_trim(0)

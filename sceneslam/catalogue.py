@@ -1,4 +1,4 @@
-"""What there is to choose: every option of every group, with the first sentence of its file."""
+"""The list of all options of all groups, with the first sentence of each file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sceneslam.types.errors import ConfigError
 
-GROUPS = {  # group -> what it chooses
+GROUPS = {  # group -> description
     "scenario": "A whole set-up: `+scenario=NAME`.",
     "source": "Where observations come from: `source=NAME`.",
     "effects": "What is done to them on the way: `effects=NAME`.",
@@ -30,7 +30,7 @@ _ALIASES = {f"{group}s": group for group in GROUPS} | {"modules": "slam", "modul
 def listing(words: Sequence[str]) -> list[str]:
     """Return the lines of `python -m sceneslam list [GROUP ...] [--config-dir FOLDER]`.
 
-    Raises ConfigError for a group that does not exist and a folder that is not there.
+    Raises ConfigError for an unknown group or a missing folder.
     """
     parser = argparse.ArgumentParser(
         prog="python -m sceneslam list", description="List what there is to choose."
@@ -53,19 +53,19 @@ def listing(words: Sequence[str]) -> list[str]:
 
 
 def _options(group: str, folders: Sequence[Path]) -> list[str]:
-    """Return a line for each option of a group; the last folder that holds it is taken."""
+    """Return a line for each option of a group; later folders override earlier ones."""
     files = {path.stem: path for folder in folders for path in (folder / group).glob("*.yaml")}
     width = max(map(len, files), default=0)
     return [f"  {name:{width}}  {first_sentence(files[name])}".rstrip() for name in sorted(files)]
 
 
 def first_sentence(path: Path) -> str:
-    """Return the first sentence of the comment that a YAML file opens with; "" without one."""
+    """Return the first sentence of the comment at the top of a YAML file; "" without one."""
     said: list[str] = []
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         if line.startswith("# @package"):
             continue
-        if not line.startswith("# ") or line.startswith("#  "):  # the text or its example follows
+        if not line.startswith("# ") or line.startswith("#  "):  # more text or an example
             break
         said.append(line[2:])
     sentence = re.split(r"(?<!Fig)\. |(?<=\?) ", " ".join(said), maxsplit=1)[0]

@@ -1,7 +1,7 @@
-"""The command line: composes the configuration, runs it, and says in a few lines what happened.
+"""The command line: composes the configuration, runs it, and prints a short summary.
 
-Exit codes: 0 all of the input was used and nothing failed; 1 there is a result, but something is
-missing or failed, as each `error:` says; 2 nothing was run, and one sentence says why.
+Exit codes: 0 all input was used and nothing failed; 1 there is a result, but something is missing
+or failed, as the `error:` lines say; 2 nothing was run, and one sentence says why.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ CONFIG = "pkg://sceneslam.conf"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ended:
-    """How a job ended: its exit code, and what was wrong in one sentence each."""
+    """The result of a job: its exit code, and one sentence per error."""
 
     code: int
     errors: tuple[str, ...] = ()
@@ -64,27 +64,27 @@ def main() -> None:
 
     @hydra.main(version_base="1.3", config_path=CONFIG, config_name="config")
     def job(config: DictConfig) -> None:
-        codes.append(OK)  # it has begun
+        codes.append(OK)  # the job has begun
         codes.append(carry_out(config).code)
 
-    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises then, and does not exit
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises instead of exiting
     try:
         sys.argv[1:] = _words(sys.argv[1:]) or ["--help"]
         job()
     except Exception as error:
-        if codes and not isinstance(error, HydraException):  # a run's own are handled in it
+        if codes and not isinstance(error, HydraException):  # errors of a run are handled there
             raise
         codes.append(_say(error))
-    except KeyboardInterrupt:  # ends a sweep as well
+    except KeyboardInterrupt:  # also ends a sweep
         codes.append(INCOMPLETE)
-    if not codes and (lost := lost_output()):  # a run has its results elsewhere
+    if not codes and (lost := lost_output()):  # the results of a run are in its folder
         print(f"error: standard output: {told(lost)}", file=sys.stderr)
         codes.append(INCOMPLETE)
     sys.exit(max(codes, default=OK))
 
 
 def _tell(find: Callable[[], list[str]]) -> int:
-    """Print what is found; return the exit code."""
+    """Print the lines of `find`; return the exit code."""
     try:
         print("\n".join(find()))
     except SceneSlamError as error:
@@ -95,19 +95,19 @@ def _tell(find: Callable[[], list[str]]) -> int:
 
 
 def _words(words: list[str]) -> list[str]:
-    """Return the command line as Hydra takes it: no option between overrides, paths in quotes."""
+    """Return the command line in Hydra's syntax: options before overrides, quoted paths."""
     is_sweep = bool({"-m", "--multirun"} & set(words))
     return [readable(word, is_sweep=is_sweep) for word in sorted(words, key=is_override)]
 
 
 def _say(error: Exception) -> int:
-    """Say what keeps a job from being run, or its configuration from being shown."""
+    """Print why a job cannot be run, or its configuration cannot be shown."""
     print(f"error: {_said(error)}", file=sys.stderr)
     return UNUSABLE
 
 
 def _said(error: Exception) -> str:
-    """Return what an error before the first job means, in words about what was typed."""
+    """Return a sentence on an error before the first job, in terms of the command line."""
     if isinstance(error, OverrideParseException):
         return how_to_quote(error.override, str(error).removeprefix(f"{error.override}: "))
     if isinstance(error, HydraException):
@@ -118,16 +118,16 @@ def _said(error: Exception) -> str:
 
 
 def _without_advice(error: HydraException) -> str:
-    """Return what Hydra says without an advice that leads astray."""
+    """Return Hydra's message without misleading advice."""
     missing = str(getattr(error.__cause__, "full_key", None) or "of that name")
-    if missing.startswith("scenes."):  # a table that may have more rows
+    if missing.startswith("scenes."):  # a table that can have more rows
         return str(error)
     there = f"There is no key {missing}; --cfg job shows all"
     return re.sub(r"To append to your config use \+(.*)", there, str(error))
 
 
 def _meant(error: Exception) -> str | None:
-    """Return what an error of Hydra's means that does not say which file or key; None: unknown."""
+    """Return a sentence for errors of Hydra that do not name the file or key; None: unknown."""
     if isinstance(error, OSError):
         return f"hydra.run.dir or hydra.sweep.dir: {told(error)}"
     if isinstance(error, RecursionError):
@@ -144,7 +144,7 @@ def _meant(error: Exception) -> str | None:
 
 
 def carry_out(config: DictConfig) -> Ended:
-    """Run one job, say how it went and return how it ended; raises KeyboardInterrupt if stopped."""
+    """Run one job, print its summary and return its result; raises KeyboardInterrupt if stopped."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     try:
         check_trust(config, HydraConfig.get().overrides.task)
@@ -182,7 +182,7 @@ def _code(finished: Finished, errors: Sequence[str]) -> int:
 
 
 def _say_before(lines: str) -> None:
-    """Show what is known of the input before it is run."""
+    """Print the survey of the input before the run."""
     print(lines, file=sys.stderr)
 
 
@@ -201,7 +201,7 @@ def _run(config: DictConfig, folder: Path) -> Finished:
 
 
 def _reference(config: DictConfig) -> dict[str, Any]:
-    """Return the configuration of the run to compare with."""
+    """Return the configuration of the reference run."""
     allowed = "overrides of this configuration, as a table"
     if not isinstance(config.reference, DictConfig):
         raise ConfigError("reference", config.reference, allowed)
@@ -215,6 +215,6 @@ def _reference(config: DictConfig) -> dict[str, Any]:
 
 
 def _short(folder: Path) -> Path:
-    """Return the folder as a user would type it."""
+    """Return the folder relative to the working folder if possible."""
     here = Path.cwd()
     return folder.relative_to(here) if folder.is_relative_to(here) else folder

@@ -1,4 +1,4 @@
-"""Make a run's decisions again from its log alone: `python -m sceneslam.decisions RUN`."""
+"""Repeat a run's decisions from its event log only: `python -m sceneslam.decisions RUN`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sceneslam.types.run import Event
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compare; return the exit code: 0 the same, 1 another decision, 2 nothing to compare."""
+    """Compare; return the exit code: 0 same decisions, 1 different ones, 2 nothing to compare."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     if len(words) != 1:
         print("usage: python -m sceneslam.decisions RUN (the folder of a run)", file=sys.stderr)
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for sentence in wrong:
         print(sentence)
     made = [e for e in events if e["event"] == "situation" and e["verdict"]["action"] != "go on"]
-    print(f"{len(made)} decisions logged, {len(wrong)} that the log does not lead to")
+    print(f"{len(made)} decisions logged, {len(wrong)} that do not follow from the log")
     return 1 if wrong else 0
 
 

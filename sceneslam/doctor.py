@@ -1,4 +1,4 @@
-"""What a source holds, what it lacks for which module, and the command to run it with."""
+"""Check of a source: its sensors, which modules can run on it, and the command for a run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sceneslam.types.se3 import Transform
 
 _log = logging.getLogger(__name__)
 _KEY = "slam.only"
-_BOTH = (  # scenarios and what they need; the first that fits is proposed
+_BOTH = (  # scenarios and required sensors; the first that fits is proposed
     ("+scenario=bright_to_dark", {Sensor.IMAGE, Sensor.DEPTH}),
     ("+scenario=single slam@slam.only=laser", {Sensor.SCAN}),
     ("+scenario=single slam@slam.only=depth", {Sensor.DEPTH}),
@@ -31,7 +31,7 @@ _BOTH = (  # scenarios and what they need; the first that fits is proposed
 def examine(words: Sequence[str]) -> list[str]:
     """Return the lines of `python -m sceneslam doctor source=NAME [source.KEY=VALUE ...]`.
 
-    Raises ConfigError or InputError where the source cannot be read at all.
+    Raises ConfigError or InputError if the source cannot be read.
     """
     if not any(word.startswith("source=") for word in words):
         raise ConfigError("doctor", " ".join(words) or "nothing", "source=NAME, as source=ros2")
@@ -59,7 +59,7 @@ def examine(words: Sequence[str]) -> list[str]:
 
 
 def _places(rig: Rig) -> Iterator[str]:
-    """Yield where the sensors sit on the robot."""
+    """Yield the poses of the sensors on the robot."""
     mounts: dict[str, Transform | None] = {
         "camera": rig.camera.T_base_cam if rig.camera else None,
         "laser": rig.laser.T_base_laser if rig.laser else None,
@@ -81,7 +81,7 @@ def _places(rig: Rig) -> Iterator[str]:
 
 
 def _modules(words: Sequence[str], rig: Rig) -> Iterator[str]:
-    """Yield for every SLAM module whether it can run, and what it lacks."""
+    """Yield for every SLAM module whether it can run, or which sensors are missing."""
     names = sorted(path.name for path in files("sceneslam.conf").joinpath("slam").iterdir())
     for name in (one.removesuffix(".yaml") for one in names if one.endswith(".yaml")):
         try:

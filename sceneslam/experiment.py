@@ -1,4 +1,4 @@
-"""Runs an experiment: a component, named by the key `experiment`, that asks for many runs."""
+"""Execution of experiments: components, named by the key `experiment`, that need many runs."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ from sceneslam.types.files import replacing
 from sceneslam.types.ranges import check_least
 from sceneslam.types.trajectory import Trajectory
 
-_END = "finished.json"  # written into a trial's folder when it has run to its end
+_END = "finished.json"  # written to a trial's folder when it is finished
 
 
 def run_experiment(config: DictConfig, folder: Path) -> Verdict:
-    """Run all trials of the experiment below the key that `experiment` names; write its verdict.
+    """Run all trials of the experiment at the key that `experiment` names; write its verdict.
 
-    A trial that is finished in the folder, by the same configuration, code and input, is not run
-    again: an experiment that was stopped goes on where it is called for the same `hydra.run.dir`.
-    Raises ConfigError or InputError where a trial cannot be run.
+    A trial that is already finished with the same configuration, code and input is not run again:
+    an experiment that was stopped continues if it is called with the same `hydra.run.dir`. Raises
+    ConfigError or InputError if a trial cannot be run.
     """
     key = str(config.experiment)
     plain = resolved(config)
@@ -67,21 +67,21 @@ def run_experiment(config: DictConfig, folder: Path) -> Verdict:
 
 
 class _Trials:
-    """Composes and runs what an experiment asks for."""
+    """Composes and runs the trials of an experiment."""
 
     def __init__(
         self, key: str, folder: Path, overrides: Sequence[str], jobs: int, bar: Any
     ) -> None:
         check_least(1, jobs=jobs)
         self._key, self._folder, self._overrides, self._jobs = key, folder, overrides, jobs
-        self._bar = bar  # of all runs: some experiments ask for one after the other
+        self._bar = bar  # over all runs, as some experiments request them one by one
         self.done: list[Ran] = []
 
     def run(self, trials: Iterable[Trial]) -> Iterator[TrialResult]:
-        """Yield the outcomes in order.
+        """Yield the results in order.
 
-        Before the first is run all are composed, and each input is opened once. With several
-        `jobs`, so many run at a time, each in a process of its own.
+        Before the first run, all are composed, and each input is opened once. With several `jobs`,
+        this number runs in parallel, each in a process of its own.
         """
         configs = [(trial, self._compose(trial)) for trial in trials]
         _try_sources([config for _, config in configs])
@@ -92,16 +92,16 @@ class _Trials:
             yield self._outcome(trial, folder, config["run"]["mode"] != DETECT_ONLY)
 
     def _made(self, configs: Sequence[tuple[Trial, dict[str, Any]]]) -> Iterator[None]:
-        """Make the runs, in order; yield after each."""
+        """Execute the runs in order; yield after each."""
         folders = [self._folder / trial.name for trial, _ in configs]
         if self._jobs == 1:
             for (trial, config), folder in zip(configs, folders, strict=True):
                 _run_unless_finished(config, folder, trial.name)
                 yield
             return
-        context = get_context("spawn")  # libraries with threads of their own do not survive a fork
+        context = get_context("spawn")  # libraries with threads do not survive a fork
         with ProcessPoolExecutor(self._jobs, context) as pool:
-            # What is rendered for an input is rendered once, by the first that reads it.
+            # An input is rendered once, by the first run that reads it.
             inputs = {
                 _input_of(config): config
                 for (_, config), folder in zip(configs, folders, strict=True)
@@ -127,7 +127,7 @@ class _Trials:
         )
 
     def _compose(self, trial: Trial) -> dict[str, Any]:
-        """Return a trial's configuration: the user's, what it overrides, then its values."""
+        """Return a trial's configuration: the user's, with the trial's overrides and values."""
         try:
             config = compose("config", overrides=[*self._overrides, *trial.overrides])
         except HydraException as error:
@@ -146,7 +146,7 @@ class _Trials:
 
 
 def _run_unless_finished(config: dict[str, Any], folder: Path, name: str) -> None:
-    """Run a configuration, unless the same is finished in the folder."""
+    """Run a configuration, unless the same one is finished in the folder."""
     made_by = provenance(config)
     if _finished_by(folder) == made_by:
         return
@@ -165,12 +165,12 @@ def _run_unless_finished(config: dict[str, Any], folder: Path, name: str) -> Non
 
 
 def _prepare(config: dict[str, Any]) -> None:
-    """Read a first observation: the simulator renders its whole story for it, and keeps it."""
+    """Read the first observation, for which the simulator renders and caches its whole story."""
     next(iter(make_source(config, ComponentBuilder(config))), None)
 
 
 def _try_sources(configs: Iterable[Mapping[str, Any]]) -> None:
-    """Raise the error of any source that cannot be opened."""
+    """Raise the error of a source that cannot be opened."""
     for config in {_input_of(config): config for config in configs}.values():
         make_source(config, ComponentBuilder(config))
 
@@ -184,7 +184,7 @@ def _read(path: Path, is_there: bool) -> Trajectory:
 
 
 def _finished_by(folder: Path) -> dict[str, str] | None:
-    """Return what made the finished trial in a folder, None where none is finished."""
+    """Return the provenance of the finished trial in a folder, None without one."""
     path = folder / _END
     if not path.is_file():
         return None

@@ -2,8 +2,8 @@
 
 All poses are (4, 4) float64, metres, REP-103 axes. Calls never overlap and come in the order
 `activate`, then the rest, then `shutdown`; in live mode not all of them from one thread. An
-expected failure is a value (`LOST`, `UNSURE`); an exception means a broken promise, and the bus
-stops the component for it.
+expected failure is a value (`LOST`, `UNSURE`); an exception means a violated contract, and the bus
+then stops the component.
 """
 
 from __future__ import annotations
@@ -32,68 +32,68 @@ class Source(Protocol):
 
     @property
     def rig(self) -> Rig:
-        """Return the sensors, known before the first observation; raises InputError else."""
+        """Return the sensors, before the first observation is read; raises InputError."""
         ...
 
     @property
     def length(self) -> int | None:
-        """Return how many observations there will be (for progress), None when unknown."""
+        """Return the number of observations (for the progress bar), None if unknown."""
         ...
 
     @property
     def faults(self) -> Sequence[str]:
-        """Return, after reading, one sentence per kind of damage found in the input."""
+        """Return one sentence per type of damage found in the input, after reading."""
         ...
 
     def __iter__(self) -> Iterator[Observation]:
-        """Yield observations from the beginning, by rising stamp; every call starts anew.
+        """Yield observations from the beginning, by rising stamp; every call starts again.
 
-        Raises InputError where the input cannot be read on; what came before stays valid.
+        Raises InputError if the input cannot be read further; earlier observations stay valid.
         """
         ...
 
     def ground_truth(self) -> GroundTruth | None:
-        """Return what is known to be true, None when nothing is. Never shown to a module."""
+        """Return the ground truth, None if unknown. It is never passed to a module."""
         ...
 
 
 class LiveFeed(Protocol):
-    """What a live run asks of a source that measures now; may be asked from any thread."""
+    """The interface of live sources for a run; thread-safe."""
 
     def measured_ns(self, observation: Observation) -> int:
-        """Return when an observation was measured, by this machine's monotonic clock [ns]."""
+        """Return the time [ns] at which an observation was measured, on the monotonic clock."""
         ...
 
     def notices(self) -> Sequence[Event]:
-        """Return what happened to the input since the last call, oldest first.
+        """Return the events of the input since the last call, oldest first.
 
-        Such as `clock_jump` (`shift_ns`: from here on added to the robot's stamps, so that they
-        rise), `stream_silent`, `stream_returned`, `late`, `unordered`.
+        For example `clock_jump` (`shift_ns`: offset added to the robot's stamps from here on, so
+        that they rise), `stream_silent`, `stream_returned`, `late`, `unordered`.
         """
         ...
 
     def close(self) -> None:
-        """End the iteration, wherever it waits, and free what it took. May be called twice."""
+        """End the iteration at once, and release all resources. May be called twice."""
         ...
 
 
 @runtime_checkable
 class Live(Protocol):
-    """A source that may measure now: a robot, a camera."""
+    """A source that may be live, such as a robot or a camera."""
 
     @property
     def live(self) -> LiveFeed | None:
-        """Return the feed, None where what the source gives is recorded."""
+        """Return the feed, None if the source is recorded."""
         ...
 
 
 @runtime_checkable
 class Detector(Protocol):
-    """Names the scene around the robot."""
+    """Classifies the scene around the robot."""
 
     @property
     def quantity(self) -> str:
-        """Return what the value of a vote measures, for figures; "" when it has none."""
+        """Return the name of a vote's value, for figures; "" if votes have no value."""
         ...
 
     @property
@@ -103,90 +103,90 @@ class Detector(Protocol):
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return the alternatives of sensors; the source must have every sensor of one of them."""
+        """Return alternative sets of sensors; the source must have all sensors of one set."""
         ...
 
     def activate(self, rig: Rig) -> None:
-        """Get ready for observations of `rig`."""
+        """Prepare for observations of `rig`."""
         ...
 
     def get_scene(self, observation: Observation) -> SceneVote:
-        """Return this observation's vote; UNSURE when it holds nothing to vote on."""
+        """Return the vote for this observation; UNSURE without the necessary measurements."""
         ...
 
     def shutdown(self) -> None:
-        """Free what `activate` took. May be called twice."""
+        """Release the resources of `activate`. May be called twice."""
         ...
 
 
 @runtime_checkable
 class FeatureDetector(Detector, Protocol):
-    """A detector that votes by a few numbers per observation alone.
+    """A detector whose votes depend on a few numbers per observation only.
 
-    `get_scene` is `decide` on `get_features`: the numbers can be kept, and other settings tried on
-    them without the images (`run=detect_only`).
+    `get_scene` is `decide` on `get_features`: the numbers can be stored, and other settings tried
+    on them without the images (`run=detect_only`).
     """
 
-    feature_settings: tuple[str, ...]  # constructor arguments that the features depend on
+    feature_settings: tuple[str, ...]  # constructor arguments on which the features depend
 
     def get_features(self, observation: Observation) -> NDArray[np.float64] | None:
-        """Return (F,) numbers, F the same for all; None when it holds nothing to vote on.
+        """Return the features (F,), with constant F; None without the necessary measurements.
 
-        They depend on nothing but the observations since `activate`, which come by rising stamp,
-        and the `feature_settings`.
+        They depend only on the observations since `activate`, which come by rising stamp, and the
+        `feature_settings`.
         """
         ...
 
     def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
-        """Return the vote on an observation's features; called by rising stamp."""
+        """Return the vote for an observation's features; called by rising stamp."""
         ...
 
 
 @runtime_checkable
 class SlamModule(Protocol):
-    """Estimates the robot's motion in a frame of its own, and maps on the way.
+    """Estimates the robot's pose in a frame of its own, and builds a map.
 
-    `local` is the robot's base at the first observation after `activate`: there T_local_base is
-    the identity. `T_map_local` (the paper's T_conversion) places it in the world.
+    `local` is the robot's base at the first observation after `activate`: there T_local_base is the
+    identity. `T_map_local` (the paper's T_conversion) is the pose of `local` in the map.
     """
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return the alternatives of sensors; the source must have every sensor of one of them."""
+        """Return alternative sets of sensors; the source must have all sensors of one set."""
         ...
 
     def activate(self, rig: Rig) -> None:
-        """Start anew: empty map, `local` at the next observation.
+        """Start a session: empty map, `local` at the next observation.
 
-        What an earlier session saw may be recognised later: `Tracking.revision` tells of it.
+        Places of an earlier session may be recognised later, as `Tracking.revision` reports.
         """
         ...
 
     def set_pose(self, T_map_local: Transform) -> None:
-        """Hear where `local` lies in the map (Eq. 1).
+        """Set T_map_local (4, 4) [m], the pose of `local` in the map (Eq. 1).
 
-        The bus makes T_map_base = T_map_local @ T_local_base of what `track` returns (Eq. 2): that
-        is the paper's GetPose.
+        The bus computes T_map_base = T_map_local @ T_local_base from the result of `track` (Eq. 2),
+        which is the paper's GetPose.
         """
         ...
 
     def set_scene(self, scene: str) -> None:
-        """Hear of the confirmed scene; a module may change its mode for it."""
+        """Set the confirmed scene; a module may change its mode by it."""
         ...
 
     def track(self, observation: Observation) -> Tracking:
-        """Return T_local_base at the observation.
+        """Return T_local_base (4, 4) [m] at the observation, with status and covariance.
 
-        It holds at least one of the sensors in `requires`; another may have been silent. LOST
-        where no pose can be told: the pose is then the last one that was held. Never returns NaN.
+        The observation has at least one of the required sensors; others may be missing. The status
+        is LOST if there is no pose; the pose is then the last tracked one. It is never NaN.
         """
         ...
 
     def get_trajectory(self) -> Trajectory:
-        """Return T_local_base at every stamp that has a pose, as best known by now.
+        """Return the best current estimate of T_local_base at every stamp with a pose.
 
-        Empty where a module never revises what `track` told. Asked once, before `get_map`, when
-        the module is about to be shut down; a last optimisation belongs here. May be slow.
+        It is empty if a module never revises the poses of `track`. Called once, before `get_map`,
+        when the module is about to be shut down, with a last optimisation. May be slow.
         """
         ...
 
@@ -195,7 +195,7 @@ class SlamModule(Protocol):
         ...
 
     def shutdown(self) -> None:
-        """Free what `activate` took. The map stays readable. May be called twice."""
+        """Release the resources of `activate`. The map stays readable. May be called twice."""
         ...
 
 
@@ -203,13 +203,13 @@ class SlamModule(Protocol):
 class PipelinedSlam(Protocol):
     """A SLAM system whose poses come later than their observations.
 
-    `sceneslam.modules.slam.pipelined.Pipelined` makes a `SlamModule` of it. All but `feed` is as
-    there; `local` is the robot's base at the first observation that it is fed.
+    `sceneslam.modules.slam.pipelined.Pipelined` makes a `SlamModule` of it. All methods but `feed`
+    are as there; `local` is the robot's base at the first observation.
     """
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return the alternatives of sensors."""
+        """Return alternative sets of sensors."""
         ...
 
     def activate(self, rig: Rig) -> None:
@@ -217,19 +217,19 @@ class PipelinedSlam(Protocol):
         ...
 
     def set_scene(self, scene: str) -> None:
-        """Hear of the confirmed scene."""
+        """Set the confirmed scene."""
         ...
 
     def feed(self, observation: Observation) -> Sequence[Tracking]:
-        """Take an observation; return the poses that are ready by now, by rising stamp.
+        """Process an observation; return the poses that are available now, by rising stamp.
 
-        None of them ("not yet"), one, or several; each bears the stamp of an observation that was
-        fed and has no pose yet. One that is skipped gets none.
+        There may be none yet, one, or several; each has the stamp of an observation that was fed
+        and has no pose yet. Skipped observations get no pose.
         """
         ...
 
     def get_trajectory(self) -> Trajectory:
-        """Return all poses as best known at the end; empty: those that `feed` returned."""
+        """Return the revised poses at the end; empty: those that `feed` returned."""
         ...
 
     def get_map(self) -> MapLayers:
@@ -243,45 +243,45 @@ class PipelinedSlam(Protocol):
 
 @runtime_checkable
 class Restartable(Protocol):
-    """A SLAM module that can be activated again after it failed, as it is then built anew."""
+    """A SLAM module that can be activated again after a failure, as it is then built again."""
 
     @property
     def is_ready(self) -> bool:
-        """Tell whether `activate` would not have to wait."""
+        """Tell whether `activate` would not wait."""
         ...
 
     @property
     def is_spent(self) -> bool:
-        """Tell whether it failed too often to be activated, for now."""
+        """Tell whether there were too many failures for an activation now."""
         ...
 
     def note_failure(self) -> None:
-        """Take that its session was stopped because it failed."""
+        """Record that its session was stopped because of a failure."""
         ...
 
 
 @runtime_checkable
 class Concurrent(Protocol):
-    """A SLAM module that tracks while its caller does something else: in its own process.
+    """A SLAM module that tracks asynchronously, in a process of its own.
 
-    Give every such module its observation first and collect the answers then: they run on as many
-    cores as there are. Between `submit` and `collect` nothing else is asked of the module; both
-    raise what `track` would.
+    Submit the observation to all such modules first, then collect the results: they run on as many
+    cores as available. Between `submit` and `collect` no other method is called; both raise the
+    exceptions of `track`.
     """
 
     def submit(self, observation: Observation) -> None:
-        """Begin to track, and return at once."""
+        """Start tracking, and return at once."""
         ...
 
     def collect(self) -> Tracking:
-        """Return what `track` would have returned for the observation submitted last."""
+        """Return the result of `track` for the last submitted observation."""
         ...
 
 
 class BackEnd(Protocol):
-    """Keeps one trajectory, and what every activation of a module contributes to it.
+    """Stores the one trajectory, and the sessions of all modules.
 
-    What the bus tells of the way goes here and nowhere else.
+    All poses of the bus are passed to it.
     """
 
     @property
@@ -290,11 +290,11 @@ class BackEnd(Protocol):
         ...
 
     def begin_session(self, module: str, T_map_local: Transform) -> int:
-        """Open a session of a module that was placed in the map (Eq. 1); return its number."""
+        """Begin a session of a module at T_map_local (4, 4) [m] (Eq. 1); return its index."""
         ...
 
     def add_local(self, stamp_ns: int, T_local_base: Transform) -> None:
-        """Add a pose to the current session's own trajectory."""
+        """Add T_local_base (4, 4) [m] to the current session's trajectory."""
         ...
 
     def add(
@@ -304,118 +304,118 @@ class BackEnd(Protocol):
         module: str,
         covariance: NDArray[np.float64] | None = None,
     ) -> None:
-        """Add a pose to the trajectory; a stamp has one pose, the first.
+        """Add T_map_base (4, 4) [m] to the trajectory; a stamp has one pose, the first.
 
-        `module` is "" where none gave it, `covariance` (6, 6) that of T_local_base in base, where
-        the module tells it.
+        `module` is "" for bridged poses, `covariance` (6, 6) that of T_local_base in base, if the
+        module reports it.
         """
         ...
 
     def rewind(self, stamp_ns: int) -> None:
-        """Take the poses from an instant on back, for better ones."""
+        """Remove the poses from a stamp on, to be replaced by better ones."""
         ...
 
     def close_session(self, session: int, layers: MapLayers, revised: Trajectory) -> None:
-        """Take the map that a session leaves behind, and its poses (T_local_base) at the end.
+        """Store a session's map and its revised poses T_local_base (4, 4) [m].
 
-        `revised` is empty where the module stands by what it told.
+        `revised` is empty if the module did not revise its poses.
         """
         ...
 
 
 @runtime_checkable
 class Experiment(Protocol):
-    """Asks a question of many runs."""
+    """A question that is answered by many runs."""
 
     def run(self, run_trials: RunTrials, folder: Path) -> Verdict:
-        """Return what was found; figures and files of its own go into `folder`.
+        """Return the verdict; figures and other files are written to `folder`.
 
-        `run_trials` runs in order. All trials handed to it at once are composed before the first
-        is run, so that a mistake in any of them is found at once.
+        `run_trials` runs trials in order. All trials of one call are composed before the first is
+        run, so that a mistake in any of them is found at once.
         """
         ...
 
 
 @runtime_checkable
 class Sink(Protocol):
-    """Receives what the bus decides, while it runs."""
+    """Receives poses and decisions of a run, while it runs."""
 
     def open(self, rig: Rig, folder: Path) -> None:
-        """Get ready to write; relative paths are relative to `folder`, the run's own."""
+        """Prepare for writing; relative paths are relative to `folder`, the run's folder."""
         ...
 
     def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
-        """Take one observation with its pose (None without a pose) and active module."""
+        """Write an observation with T_map_base (4, 4) [m] (None: no pose) and active module."""
         ...
 
     def write_event(self, event: Event) -> None:
-        """Take one event: a vote, a decision, a hand-over, ..."""
+        """Write an event: a vote, a decision, a hand-over, ..."""
         ...
 
     def write_truth(self, truth: GroundTruth) -> None:
-        """Take what is known to be true, once, after the last observation."""
+        """Write the ground truth, once, after the last observation."""
         ...
 
     def close(self) -> None:
-        """Finish the output so that it can be read, also after an error. May be called twice."""
+        """Complete the output so that it is readable, also after an error. May be called twice."""
         ...
 
 
 @runtime_checkable
 class ResultSink(Protocol):
-    """A sink that also wants what was known at the end."""
+    """A sink that also receives the final results."""
 
     def write_result(self, result: RunResult) -> None:
-        """Take the revised trajectory and the map, once, after the truth, before `close`."""
+        """Write the revised trajectory and the map, once, between `write_truth` and `close`."""
         ...
 
 
 @runtime_checkable
 class CovarianceSink(Protocol):
-    """A sink that also wants to know how certain each pose is."""
+    """A sink that also receives the covariance of each pose."""
 
     def write_covariance(self, stamp_ns: int, covariance: NDArray[np.float64]) -> None:
-        """Take the covariance (6, 6) [m, rad] of the next pose, in base, as its module told it."""
+        """Set the covariance (6, 6) [m, rad] of the next pose, in base, by its module."""
         ...
 
 
 @runtime_checkable
 class Steering(Protocol):
-    """A sink through which an operator steers the run."""
+    """A sink through which an operator controls the run."""
 
     def commands(self) -> Sequence[Command]:
-        """Return what was asked since the last call, oldest first; asked before every step."""
+        """Return the commands since the last call, oldest first; called before every step."""
         ...
 
 
 class LiveMapper(Protocol):
-    """Draws the map while the robot drives, of what the sensors measured at the reported poses."""
+    """Builds a map during the run from measurements at the reported poses."""
 
     def open(self, rig: Rig) -> None:
-        """Begin an empty map."""
+        """Start with an empty map."""
         ...
 
     def add(self, observation: Observation, T_map_base: Transform) -> None:
-        """Draw one observation."""
+        """Add an observation at T_map_base (4, 4) [m]."""
         ...
 
     def map(self) -> HybridMap:
-        """Return the map so far, in `map`."""
+        """Return the current map, in `map`."""
         ...
 
 
 class TrajectoryLog(Protocol):
     """The calls of an atlas, in order; repeated on another atlas, they give the same result.
 
-    Poses and transforms are (4, 4), covariances (6, 6) or None, as the atlas takes them.
+    Poses and transforms are (4, 4) [m], covariances (6, 6) or None, as for the atlas.
     """
 
     def add_session(self, module: str, T_map_local: Transform) -> None:
-        """Take that a session of a module begins."""
+        """Record that a session of a module begins."""
         ...
 
     def add_local(self, stamp_ns: int, T_local_base: Transform) -> None:
-        """Take a pose of the session's own trajectory."""
+        """Record a pose of the session's trajectory."""
         ...
 
     def add_pose(
@@ -425,13 +425,13 @@ class TrajectoryLog(Protocol):
         module: str,
         covariance: NDArray[np.float64] | None,
     ) -> None:
-        """Take a pose of the global trajectory; module "" where none gave it."""
+        """Record a pose of the global trajectory; module "": bridged."""
         ...
 
     def add_rewind(self, stamp_ns: int) -> None:
-        """Take that the poses from an instant on are taken back."""
+        """Record that the poses from a stamp on are removed."""
         ...
 
     def add_end(self, session: int, revised: Trajectory) -> None:
-        """Take how a module revised its session's poses; empty where it did not."""
+        """Record the revised poses of a session; empty if not revised."""
         ...

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP: each ends a run, none spoils what is being saved."""
+"""Handling of Ctrl-C, SIGTERM and SIGHUP: each ends a run, and none interrupts saving."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 def termination_as_interrupt() -> Iterator[None]:
     """Let SIGTERM, and SIGHUP (a closed terminal), end a run as Ctrl-C does.
 
-    SIGINT also where a shell's `&` left it ignored; SIGHUP not where `nohup` did.
+    SIGINT is handled also if a shell's `&` ignores it; SIGHUP is not if `nohup` ignores it.
     """
 
     def interrupt(number: int, frame: object) -> None:
@@ -26,7 +26,7 @@ def termination_as_interrupt() -> Iterator[None]:
 
 @contextmanager
 def termination_noted(note: Callable[[], None]) -> Iterator[None]:
-    """Let Ctrl-C, SIGTERM and SIGHUP do no more than `note`."""
+    """Call `note` on Ctrl-C, SIGTERM and SIGHUP, and do nothing else."""
 
     def handle(number: int, frame: object) -> None:
         note()
@@ -37,14 +37,14 @@ def termination_noted(note: Callable[[], None]) -> Iterator[None]:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Finish saving although one of them comes (again)."""
+    """Delay all three signals until saving is finished."""
     with _handler(signal.SIG_IGN):
         yield
 
 
 @contextmanager
 def _handler(handler: Any) -> Iterator[None]:
-    """Handle all of them so; where this is not the main thread, signals are not ours."""
+    """Set the handler of all three signals; only possible in the main thread."""
     with ExitStack() as stack:
         for number in _ENDING:
             is_nohup = number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN

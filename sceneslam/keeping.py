@@ -1,4 +1,4 @@
-"""Keeps a run on disk while it goes: its journal, its events, and room for its results."""
+"""Data of a run that are written while it runs: journal, events, and reserved disk space."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sceneslam.types.rig import Sensor
 
 
 class Keeping:
-    """What `python -m sceneslam.recover` makes the results of, should the run be cut off."""
+    """Writes the data from which `python -m sceneslam.recover` restores an interrupted run."""
 
     def __init__(self, parts: RunParts, results: Results) -> None:
         folder, self._faults = results.folder, results.faults
@@ -36,17 +36,17 @@ class Keeping:
         parts.atlas.keep_journal(self._journal)
 
     def keep(self, stamp_ns: int) -> None:
-        """Hand all that came of an observation to the system."""
+        """Flush all data of an observation."""
         self._journal.add_observation(stamp_ns)
         self._journal.flush()
         self.events.flush()
 
     def has_room(self, poses: int) -> bool:
-        """Tell whether the disk holds the results of so many poses, which come before all else."""
+        """Tell whether the disk has space for the results of `poses` poses."""
         return self._reserve.is_enough(poses)
 
     def finish(self) -> None:
-        """Make room for the results, once nothing more is kept but them."""
+        """Release the reserved disk space for the results."""
         self._syncing.close()
         self._journal.flush()
         self._reserve.release()
@@ -54,7 +54,7 @@ class Keeping:
         self._faults += [fault for fault in (self.events.fault, self._journal.fault) if fault]
 
     def close(self, *, is_saved: bool) -> None:
-        """Close everything; the journal goes where the results say all that it says."""
+        """Close all files; the journal is removed if the results are saved."""
         self._syncing.close()
         self._reserve.release()
         self.events.close()

@@ -1,4 +1,4 @@
-"""The loop of a run: one observation after the other through the bus, whatever happens."""
+"""The main loop of a run, which passes all observations to the bus and handles errors."""
 
 from __future__ import annotations
 
@@ -38,18 +38,18 @@ from sceneslam.types.rig import Sensor
 from sceneslam.types.run import Event, RunResult, Timings
 from sceneslam.types.truth import GroundTruth
 
-_BAR_S = 0.5  # between two updates of the progress bar
-_LINE_S = 10.0  # the same where it is written into a file
+_BAR_S = 0.5  # update period of the progress bar
+_LINE_S = 10.0  # the same if it is written to a file
 _log = logging.getLogger(__name__)
 
 
 class RunLoop:
-    """Feeds the bus and the sinks; `faults` says what went wrong on the way."""
+    """Passes observations to the bus and results to the sinks; `faults` lists errors."""
 
     def __init__(
         self, parts: RunParts, results: Results, say: Callable[[str], None] | None = None
     ) -> None:
-        self._say = say  # what a user reads before the run
+        self._say = say  # prints messages before the run
         self._warnings: tuple[str, ...] = ()
         self._tally = Tally(parts.rig.sensors)
         self.is_interrupted = False
@@ -92,7 +92,7 @@ class RunLoop:
             raise
 
     def run(self) -> None:
-        """Feed all observations; an error or Ctrl-C ends the run, not the program."""
+        """Process all observations; an error or Ctrl-C ends the run, not the program."""
         try:
             self._survey()
             self._feed()
@@ -107,7 +107,7 @@ class RunLoop:
         self._wall_s = perf_counter() - self._began_s
 
     def finish(self) -> None:
-        """Shut everything down but the sinks, in reverse order, and gather what was wrong."""
+        """Shut down everything but the sinks, in reverse order, and collect errors."""
         if self._bus.state == "terminate":
             self.faults.append(self._why_over())
         self._operator.close(self._last_ns())
@@ -122,8 +122,8 @@ class RunLoop:
         self._keeping.finish()
 
     def read_truth(self) -> None:
-        """Read what is known to be true."""
-        if not self._observed_ns:  # it may have to be rendered first, for nothing
+        """Read the ground truth."""
+        if not self._observed_ns:  # rendering it would be useless
             return
         try:
             self.truth = self._parts.source.ground_truth()
@@ -131,16 +131,16 @@ class RunLoop:
             self.faults.append(f"no ground truth: {error}")
 
     def close_sinks(self) -> None:
-        """Give the sinks what is known at the end, and close them."""
+        """Pass the final results to the sinks, and close them."""
         for key in list(self._sinks):
             self._close_sink(key)
 
     def close(self, *, is_saved: bool) -> None:
-        """Close what kept the run on disk; it goes where the results are saved."""
+        """Close the journal; it is removed if the results are saved."""
         self._keeping.close(is_saved=is_saved)
 
     def result(self) -> RunResult:
-        """Return everything the run produced, once it is closed."""
+        """Return all results of the closed run."""
         if self._result is None:
             self._result = self._gather()
         return self._result
@@ -171,7 +171,7 @@ class RunLoop:
         )
 
     def _fused(self) -> HybridMap:
-        """Return the one map, an empty one where it cannot be had: the trajectory is worth more."""
+        """Return the fused map, empty if fusion fails: the trajectory is still saved."""
         try:
             return self._parts.atlas.fuse_maps()
         except Exception as error:
@@ -181,11 +181,11 @@ class RunLoop:
             return HybridMap(points=nothing, point_modules=np.zeros(0, np.uint8), modules=())
 
     def _survey(self) -> None:
-        """Say what the recording holds, and what is implausible in it."""
+        """Print the survey of the recording, with warnings."""
         source = self._parts.source
         try:
             found = source.survey() if isinstance(source, Surveyed) else None
-        except Exception as error:  # what is wrong with the input shows when it is read
+        except Exception as error:  # errors of the input are reported when it is read
             _log.info("the source could not be surveyed", exc_info=error)
             return
         if found is None:
@@ -204,7 +204,7 @@ class RunLoop:
             with self._progress() as self._bar:
                 self._run_live(observations, source.live)
             return
-        first = next(observations, None)  # a simulator renders, a bag is indexed: not our time
+        first = next(observations, None)  # rendering and indexing are not part of the run's time
         if first is None:
             return
         self._began_s = perf_counter()
@@ -232,10 +232,10 @@ class RunLoop:
             self._log.add("dropped", self._last_ns(), count=self._live.dropped, images=images)
 
     def _note(self, event: Event) -> None:
-        """Take what happened to the input of a live run."""
+        """Record an event of a live run's input."""
         fields = {key: value for key, value in event.items() if key not in ("event", "stamp_ns")}
         self._log.add(event["event"], event["stamp_ns"], **fields)
-        self._write_events()  # before the observation that it is about
+        self._write_events()  # before the observation that it concerns
         if event["event"] == "given_up":
             self.faults.append(f"the source was silent for {event['for_s']:g} s")
 
@@ -250,7 +250,7 @@ class RunLoop:
         )
 
     def _step(self, observation: Observation) -> bool:
-        """Feed one observation; return whether the run goes on."""
+        """Process one observation; return whether the run continues."""
         watch = self._watch
         watch.restart()
         self._steer(observation.stamp_ns)
@@ -276,7 +276,7 @@ class RunLoop:
         return self._bus.state != "terminate"
 
     def _spent(self) -> Spent:
-        """Return what the last step's time went to."""
+        """Return the durations of the parts of the last step."""
         parts_ms, bus = dict(self._watch.parts_ms), self._bus
         if "bus" not in parts_ms:  # the run is paused
             return Spent(parts_ms=parts_ms)
@@ -286,14 +286,14 @@ class RunLoop:
         return Spent(parts_ms={**parts_ms, **own_ms}, cpu_ms=self._watch.cpu_ms, beside=bus.beside)
 
     def _steer(self, stamp_ns: int) -> None:
-        """Do what operators asked since the last observation."""
+        """Execute the operators' commands since the last observation."""
         for sink in list(self._sinks.values()):
             for command in sink.commands() if isinstance(sink, Steering) else ():
                 self._operator.obey(command, stamp_ns)
         self._operator.report(stamp_ns)
 
     def _write(self, observation: Observation) -> None:
-        """Give the sinks the observation with its pose, and then the events."""
+        """Pass the observation with its pose to the sinks, then the events."""
         if not self._keeping.has_room(len(self._observed_ns)):
             for key in list(self._sinks):
                 self._drop_sink(key, OSError(errno.ENOSPC, "what is left is for the results"))
@@ -309,7 +309,7 @@ class RunLoop:
         self._write_events()
 
     def _write_events(self) -> None:
-        """Give the sinks the events since the last one."""
+        """Pass the events since the last call to the sinks."""
         events = self._log.since(self._events_written)
         self._events_written += len(events)
         for key, sink in list(self._sinks.items()):
@@ -339,7 +339,7 @@ class RunLoop:
             self._drop_sink(key, error)
 
     def _drop_sink(self, key: str, error: Exception) -> None:
-        """Go on without a sink that cannot write."""
+        """Remove a sink that cannot write, and continue."""
         _log.info("sinks.%s", key, exc_info=error)
         self.faults.append(f"sinks.{key} stopped writing: {told(error)}")
         del self._sinks[key]

@@ -1,4 +1,4 @@
-"""Keeps small images of what the camera saw when the scene or the module changed."""
+"""Small images of the camera at changes of scene or module."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.run import Event, KeyMoment
 
 _WIDTH_PX = 240
-_MOST = 24  # images that are kept
+_MOST = 24  # stored images
 
 
 class Moments:
-    """The first image, and one of every observation at which the scene or the module changed."""
+    """The first image, and one for every change of scene or module."""
 
     def __init__(self) -> None:
         self.kept: list[KeyMoment] = []
 
     def look(self, observation: Observation, events: Sequence[Event]) -> None:
-        """Keep the observation's image where one of its events is a change."""
+        """Store the observation's image if one of its events is a change."""
         image_bgr = observation.image_bgr
         if image_bgr is None or image_bgr.dtype != np.uint8 or len(self.kept) == _MOST:
             return

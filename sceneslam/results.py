@@ -1,4 +1,4 @@
-"""Writes what came of a run into its folder, what matters most first."""
+"""Writing of a run's results to its folder, the most important first."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Results:
-    """What the files of a run's results need beside the result; `faults` takes what fails."""
+    """Data for the files of a run's results; failures are added to `faults`."""
 
     folder: Path
     config: Mapping[str, Any]
@@ -34,10 +34,10 @@ class Results:
     evaluation: EvaluationSettings
     has_report: bool
     value_label: str  # of the detector's votes, for the figures
-    faults: list[str]  # of the run; each is in the report
+    faults: list[str]  # errors of the run, for the report
 
     def save_trajectories(self, result: RunResult) -> None:
-        """Write the trajectories: nothing is worth as much, and nothing else is waited for."""
+        """Write the trajectories first, as they are the most important result."""
         folder = self.folder
         with self._noting("the trajectory"):
             result.trajectory.write_tum(folder / "trajectory.tum")
@@ -111,7 +111,7 @@ class Results:
 
     @contextmanager
     def _noting(self, what: str) -> Iterator[None]:
-        """Note what a full disk, a lack of memory or the like keeps from being saved; go on."""
+        """Record errors of saving, such as a full disk, and continue."""
         try:
             yield
         except Exception as error:
@@ -120,6 +120,6 @@ class Results:
 
 
 def _peak_rss_mb() -> float:
-    """Return the most memory of this process and, added, of the largest that it started."""
+    """Return the peak memory of this process plus that of its largest child process."""
     who = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
     return sum(resource.getrusage(one).ru_maxrss for one in who) / 1024

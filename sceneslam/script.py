@@ -23,14 +23,14 @@ _STAMPED = "outputs/%Y-%m-%d/%H-%M-%S"
 def run(
     *overrides: str, folder: str | Path | None = None, config_dir: str | Path | None = None
 ) -> app.Finished:
-    """Run a configuration as the command line does; write its folder and return what came of it.
+    """Run a configuration as the command line does; write its folder and return the result.
 
-    `overrides` are the command line's words: `"+scenario=bright_to_dark", "source.path=FOLDER"`.
-    `folder` is where the results go (`outputs/DATE/TIME`), `config_dir` a folder of
-    configurations of your own. Sweeps (`-m`) and experiments are for the command line.
+    `overrides` are words of the command line: `"+scenario=bright_to_dark", "source.path=FOLDER"`.
+    `folder` is the folder of the results (`outputs/DATE/TIME`), `config_dir` a folder of your own
+    configurations. Sweeps (`-m`) and experiments need the command line.
 
-    Raises ConfigError or InputError where nothing could be run. What failed later is in the
-    result's `faults`.
+    Raises ConfigError or InputError if nothing could be run. Later failures are in the result's
+    `faults`.
     """
     config = composed(overrides, config_dir)
     if config.get("experiment"):
@@ -46,14 +46,14 @@ def run(
 
 
 def composed(overrides: tuple[str, ...], config_dir: str | Path | None) -> dict[str, object]:
-    """Return the resolved configuration; raises ConfigError where it cannot be composed."""
+    """Return the resolved configuration; raises ConfigError if it cannot be composed."""
     words = [*overrides]
     if config_dir is not None:
         path = Path(config_dir).resolve()
         if not path.is_dir():
             raise ConfigError("config_dir", str(config_dir), "a folder that exists")
         words.append(f"hydra.searchpath=['file://{path}']")
-    GlobalHydra.instance().clear()  # a notebook may have left one
+    GlobalHydra.instance().clear()  # a notebook may have initialised it before
     try:
         with initialize_config_module("sceneslam.conf", version_base="1.3"):
             config = compose("config", overrides=words)

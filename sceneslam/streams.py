@@ -1,4 +1,4 @@
-"""Standard output and error that nothing can break: closed, hung up on, or on a full disk."""
+"""Standard streams that never fail: closed, without a reader, or on a full disk."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import os
 import sys
 from typing import TextIO
 
-# In C, and in what an import may bring: nothing else may get the numbers of the standard streams.
+# Native code too: no other file may get the descriptors of the standard streams.
 _DESCRIPTORS = (0, 1, 2)
 
 
 def secure_streams() -> None:
-    """Open what is closed of standard input, output and error, and let writing never fail.
+    """Open closed standard streams, and let writing to them never fail.
 
-    Who reads them has gone, or their disk is full: then what is written is lost, and no more.
-    Call it before anything is imported that may open a file or write.
+    If the reader has ended or the disk is full, output is lost without an error. Must be called
+    before any import that may open a file or write.
     """
-    logging.raiseExceptions = False  # a log that a full disk does not take is no news
+    logging.raiseExceptions = False  # do not report log messages that cannot be written
     for number in _DESCRIPTORS:
         if not _is_open(number):
             _put_nothing(number)
-    if sys.stdout is sys.__stdout__:  # else somebody else's
+    if sys.stdout is sys.__stdout__:  # else it was replaced, and is not ours
         sys.stdout = _stream(1, sys.stdout)
     if sys.stderr is sys.__stderr__:
         sys.stderr = _stream(2, sys.stderr)
@@ -37,7 +37,7 @@ def _is_open(number: int) -> bool:
 
 
 def _put_nothing(number: int) -> None:
-    """Let a descriptor be that of the null device, for this process and those it starts."""
+    """Redirect a descriptor to the null device, for this process and its children."""
     null = os.open(os.devnull, os.O_RDWR)
     if null == number:
         os.set_inheritable(null, True)
@@ -47,7 +47,7 @@ def _put_nothing(number: int) -> None:
 
 
 def _stream(number: int, before: TextIO | None) -> TextIO:
-    """Return a text stream as the interpreter makes it, over a file that takes everything."""
+    """Return a text stream as the interpreter makes it, over a file that never fails."""
     if before is not None:
         before.flush()
     return io.TextIOWrapper(
@@ -59,7 +59,7 @@ def _stream(number: int, before: TextIO | None) -> TextIO:
 
 
 def lost_output() -> OSError | None:
-    """Return why standard output did not take what was written; None too where its reader left."""
+    """Return the error of standard output, None without one or if its reader has ended."""
     sys.stdout.flush()
     raw = getattr(getattr(sys.stdout, "buffer", None), "raw", None)
     error = raw.error if isinstance(raw, _Forgiving) else None
@@ -67,7 +67,7 @@ def lost_output() -> OSError | None:
 
 
 class _Forgiving(io.FileIO):
-    """Writes until that fails, and from then on into nothing."""
+    """A file that ignores writes after the first failure."""
 
     error: OSError | None = None
 
@@ -76,5 +76,5 @@ class _Forgiving(io.FileIO):
             written = super().write(data)  # type: ignore[arg-type]
         except OSError as error:
             written, self.error = None, error
-            _put_nothing(self.fileno())  # for native code too, and processes started later
+            _put_nothing(self.fileno())  # also for native code and child processes
         return memoryview(data).nbytes if written is None else written  # type: ignore[arg-type]

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from sceneslam.types.errors import ConfigError, InputError, SceneSlamError
 
-BRANCHES, LEVELS = 10, 6  # of the published vocabulary
+BRANCHES, LEVELS = 10, 6  # as in the published vocabulary
 FEATURES = 1000  # per image
-IMAGES_MAX = 40  # spread over the folder: more make it slower, and no better in one place
+IMAGES_MAX = 40  # evenly over the folder; more are slower without better results
 _ROUNDS = 10  # of k-medians
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm")
 
@@ -35,7 +35,7 @@ class Vocabulary:
     weights: NDArray[np.float64]  # (N,): inverse document frequency of a word, else 0
 
     def write(self, path: Path) -> None:
-        """Write it as DBoW2's text: k L scoring weighting, then a node per line."""
+        """Write it in DBoW2's text format: k L scoring weighting, then a node per line."""
         lines = [f"{BRANCHES} {LEVELS} 0 0"]
         rows = zip(self.parents, self.is_word, self.descriptors, self.weights, strict=True)
         for parent, is_word, descriptor, weight in rows:
@@ -45,7 +45,7 @@ class Vocabulary:
 
 
 def describe(image_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the ORB descriptors (N, 32) of an image."""
+    """Return the ORB descriptors (N, 32) of a BGR image (H, W, 3)."""
     detector = cv2.ORB_create(FEATURES, fastThreshold=7)  # type: ignore[attr-defined]
     descriptors = detector.detectAndCompute(image_bgr, None)[1]
     if descriptors is None:
@@ -65,7 +65,7 @@ def train(images: Sequence[NDArray[np.uint8]], *, seed: int) -> Vocabulary:
 
 
 class _Tree:
-    """Splits descriptors into branches, level by level, and each branch again."""
+    """Splits descriptors recursively into branches, level by level."""
 
     def __init__(
         self,
@@ -82,7 +82,7 @@ class _Tree:
     def grow(self) -> Vocabulary:
         """Return the tree."""
         todo = [(0, np.arange(len(self._signs)), LEVELS)]
-        for node, members, levels in todo:  # grows while it is walked: breadth first
+        for node, members, levels in todo:  # the list grows during iteration: breadth first
             medians, nearest = self._split(self._signs[members])
             for branch, median in enumerate(medians):
                 inside = members[nearest == branch]
@@ -102,13 +102,13 @@ class _Tree:
         )
 
     def _split(self, signs: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """Return up to k medians, and which of them each descriptor is nearest to."""
+        """Return up to k medians (k, 256), and the nearest one's index for each descriptor (N,)."""
         medians = signs if len(signs) <= BRANCHES else self._seeds(signs)
         nearest = (signs @ medians.T).argmax(axis=1)
         for _ in range(_ROUNDS if len(signs) > BRANCHES else 0):
             is_in = np.eye(len(medians), dtype=np.float32)[nearest]
             votes = is_in.T @ signs
-            medians = np.where(votes != 0, np.sign(votes), medians)  # a tie: as before
+            medians = np.where(votes != 0, np.sign(votes), medians)  # ties keep their value
             before, nearest = nearest, (signs @ medians.T).argmax(axis=1)
             if (before == nearest).all():
                 break
@@ -122,13 +122,13 @@ class _Tree:
         for _ in range(BRANCHES - 1):
             squared = (signs.shape[1] - similar) ** 2
             if not squared.any():
-                break  # all are copies of the chosen
+                break  # all are equal to chosen ones
             chosen.append(int(self._rng.choice(len(signs), p=squared / squared.sum())))
             similar = np.maximum(similar, signs @ signs[chosen[-1]])
         return signs[chosen]
 
     def _weight(self, members: NDArray[np.int64]) -> float:
-        """Return how rare a word is; above 0, since ORB-SLAM skips words without a weight."""
+        """Return a word's weight by its rarity; above 0, since ORB-SLAM skips words of weight 0."""
         seen = len(np.unique(self._owners[members]))
         return float(np.log1p(self._images / max(seen, 1)))
 

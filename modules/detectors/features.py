@@ -1,6 +1,6 @@
-"""What can be measured of an observation in a millisecond or two, each as one number.
+"""Features of an observation, each one number, computed within one or two milliseconds.
 
-FEATURES depend on one observation alone, FEATURES_OVER_TIME also on those before it.
+FEATURES depend on one observation only, FEATURES_OVER_TIME also on earlier ones.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from .silence import Frozen, Silent
 from .wheel_check import WheelCheck
 
 _USABLE = (16, 239)  # grey values that are neither lost in read noise nor saturated
-_CORNER_STEP = 20  # grey values; OpenCV's ORB begins with it
-_SCAN_SPAN = 4  # beams to either side that tell a surface's direction
+_CORNER_STEP = 20  # grey values; the default of OpenCV's ORB
+_SCAN_SPAN = 4  # neighbouring beams to either side for a surface's normal
 _SCAN_STEP_M = 0.3  # neighbouring returns farther apart lie on different surfaces
 
 
-_NEAR_M = 0.1  # beyond a scanner's shortest range: what is so near lies on its window
+_NEAR_M = 0.1  # beyond a scanner's shortest range: nearer returns are from its window
 _DEPTH_STEP_RATIO = 0.1  # of the depth: pixels that differ by more are of different surfaces
 
 Measure = Callable[[Observation], float]
@@ -35,7 +35,7 @@ Measure = Callable[[Observation], float]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Feature:
-    """A number of an observation, NaN where its sensor was silent."""
+    """A function that computes one number of an observation, NaN if its sensor is missing."""
 
     sensor: Sensor
     measure: Measure
@@ -43,32 +43,32 @@ class Feature:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FeatureOverTime:
-    """A number of the observations so far; `make` begins anew. It is never NaN."""
+    """A number of all observations so far, never NaN; `make` returns a new computation."""
 
-    sensor: Sensor  # without which it says nothing
+    sensor: Sensor  # required sensor
     make: Callable[[Rig], Measure]
 
 
 def usable_ratio(image_bgr: NDArray[np.uint8]) -> float:
-    """Return the share of pixels that are neither black nor white: exposure does not hide it."""
+    """Return the share of pixels that are neither too dark nor saturated."""
     grey = cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY)
     return float(cv2.countNonZero(cv2.inRange(grey, *_USABLE)) / grey.size)
 
 
 def corner_count(image_bgr: NDArray[np.uint8]) -> float:
-    """Return the FAST corners per 100 x 100 pixels: what features can be found on."""
+    """Return the number of FAST corners per 100 x 100 pixels."""
     grey = cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY)
     corners = cv2.FastFeatureDetector.create(threshold=_CORNER_STEP).detect(grey)
     return len(corners) / grey.size * 1e4
 
 
 def depth_ratio(depth_m: NDArray[np.float32]) -> float:
-    """Return the share of pixels that have a depth: sunlight and far walls take it away."""
+    """Return the share of pixels with depth, which sunlight and far walls reduce."""
     return float(np.count_nonzero(depth_m > 0) / depth_m.size)
 
 
 def depth_noise_ratio(depth_m: NDArray[np.float32]) -> float:
-    """Return the share of measured pixels, in the image's middle, unlike all four beside them."""
+    """Return the share of pixels in the image's middle that differ from all four neighbours."""
     height, width = depth_m.shape
     middle_m = depth_m[height // 4 : height - height // 4, width // 4 : width - width // 4]
     inner_m = middle_m[1:-1, 1:-1]
@@ -81,19 +81,20 @@ def depth_noise_ratio(depth_m: NDArray[np.float32]) -> float:
 
 
 def scan_near_ratio(scan: LaserScan) -> float:
-    """Return the share of beams that end on the scanner's own window."""
+    """Return the share of beams that end on the scanner's window."""
     return float(np.mean(scan.ranges_m < scan.range_min_m + _NEAR_M))
 
 
 def scan_return_ratio(scan: LaserScan) -> float:
-    """Return the share of beams that return."""
+    """Return the share of beams with a return."""
     return float(np.mean(np.isfinite(scan.ranges_m)))
 
 
 def scan_hold(scan: LaserScan) -> float:
-    """Return how well a scan's surfaces hold its weakest direction: 0 (a bare corridor) to 1.
+    """Return how well a scan constrains translation in its weakest direction, 0 to 1.
 
-    Twice the smaller eigenvalue of the mean of n n' over the surfaces' normals n; 0 without any.
+    It is twice the smaller eigenvalue of the mean of n n' over the surfaces' normals n; 0 without
+    any.
     """
     x = scan.ranges_m * np.cos(scan.angles_rad)
     y = scan.ranges_m * np.sin(scan.angles_rad)

@@ -14,11 +14,11 @@ from sceneslam.types.rig import Rig, Sensor
 
 
 class GreyMean:
-    """Votes the first scene where the mean of S = .299 R + .587 G + .114 B is above the threshold.
+    """Votes for the first scene if the mean of S = .299 R + .587 G + .114 B exceeds the threshold.
 
-    Else it votes the second; the paper calls them Bright and Dark. With hysteresis there are two
-    thresholds: what was voted last is left only where the mean is as far beyond the threshold, so
-    that light that is about as bright as the threshold, and its noise, changes nothing.
+    Else it votes for the second; the paper's are Bright and Dark. With hysteresis there are two
+    thresholds: the vote changes only if the mean is beyond the threshold by `hysteresis`, so that
+    noise near the threshold does not change it.
     """
 
     quantity = "mean of grey"
@@ -28,7 +28,7 @@ class GreyMean:
     def __init__(self, threshold: float, hysteresis: float, scenes: Sequence[str]) -> None:
         if not 0 <= threshold <= 255:
             raise ConfigError("threshold", threshold, "a grey value from 0 to 255")
-        limit = min(threshold, 255 - threshold)  # beyond it one scene could never be left
+        limit = min(threshold, 255 - threshold)  # larger values would make a change impossible
         if not 0 <= hysteresis <= limit:
             raise ConfigError("hysteresis", hysteresis, f"grey values from 0 to {limit:g}")
         if len(scenes) != 2 or scenes[0] == scenes[1] or UNSURE in scenes:
@@ -39,7 +39,7 @@ class GreyMean:
         self.scenes = (scenes[0], scenes[1])
 
     def activate(self, rig: Rig) -> None:
-        """Forget the last vote."""
+        """Reset the last vote."""
         self._voted = None
 
     def get_scene(self, observation: Observation) -> SceneVote:
@@ -53,7 +53,7 @@ class GreyMean:
         return np.array([grey_mean(observation.image_bgr)])
 
     def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
-        """Return on which side of the threshold the mean is, far enough from it."""
+        """Return the vote by threshold and hysteresis."""
         if features is None:
             return SceneVote(stamp_ns=stamp_ns, scene=UNSURE)
         mean = float(features[0])
@@ -63,14 +63,14 @@ class GreyMean:
         return SceneVote(stamp_ns=stamp_ns, scene=scene, value=mean)
 
     def shutdown(self) -> None:
-        """Do nothing: there is nothing to free."""
+        """Do nothing."""
 
 
 def grey_mean(image_bgr: NDArray[np.uint8]) -> float:
     """Return the mean of S over an (H, W, 3) BGR image, in [0, 255].
 
-    The mean is linear, so the sums of the channels, which are whole numbers, give it without
-    rounding any pixel: one pass over the image instead of a conversion and a second pass.
+    The mean is linear, so it is computed from the sums of the channels, without rounding per pixel:
+    one pass over the image instead of a conversion and a second pass.
     """
     blue, green, red, _ = cv2.sumElems(image_bgr)
     pixels = image_bgr.shape[0] * image_bgr.shape[1]

@@ -1,6 +1,6 @@
-"""Numbers of an image that cost a tenth of a millisecond together, for detectors that learn.
+"""Fast image features for learned detectors: all together take a tenth of a millisecond.
 
-They are taken on a grid of about 100 rows, whatever the size of the image.
+They are computed on a grid of about 100 rows for any image size.
 """
 
 from __future__ import annotations
@@ -20,30 +20,30 @@ from sceneslam.types.rig import Sensor
 from .features import FEATURES
 
 _ROWS = 96  # of the grid
-_FLOOR = 4.0  # grey values of read noise: below, a ratio of light means nothing
-_DARK, _WHITE = 16, 250  # grey values that are lost in noise, or nearly saturated
+_FLOOR = 4.0  # grey values of read noise: ratios of smaller values are meaningless
+_DARK, _WHITE = 16, 250  # grey values: below noise, or nearly saturated
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Grid:
-    """The pixels on the grid, and how they are distributed."""
+    """The pixels on the grid and their cumulative distribution."""
 
     image_bgr: NDArray[np.uint8]  # (h, w, 3)
     grey: NDArray[np.uint8]  # (h, w)
-    shares: NDArray[np.float64]  # (256,) of pixels that are at most as bright, rising to 1
+    shares: NDArray[np.float64]  # (256,), cumulative distribution of grey values
 
 
 Measure = Callable[[_Grid], float]
 
 
 def _quantile(share: float, grid: _Grid) -> float:
-    """Return a quantile of grey in powers of two below white, as a change of exposure shifts it."""
+    """Return a quantile of grey values as log2 relative to white."""
     grey = float(np.searchsorted(grid.shares, share))
     return float(np.log2((grey + _FLOOR) / (255.0 + _FLOOR)))
 
 
 def _gradient(grid: _Grid) -> float:
-    """Return the logarithm of the mean step between neighbours on the grid: texture, sharpness."""
+    """Return the logarithm of the mean difference of neighbours on the grid: texture, sharpness."""
     steps = cv2.absdiff(grid.grey[:, 1:], grid.grey[:, :-1])
     return float(np.log2(1.0 + cv2.mean(steps)[0]))
 
@@ -89,7 +89,7 @@ class ImageFeatures:
         return (frozenset(needed),)
 
     def get_features(self, observation: Observation) -> NDArray[np.float64] | None:
-        """Return (F,), None where a sensor was silent."""
+        """Return the features (F,), None if a sensor is missing."""
         if not all(observation.has(sensor) for sensor in self.requires[0]):
             return None
         grid = None if observation.image_bgr is None else _grid(observation.image_bgr)

@@ -1,4 +1,4 @@
-"""What tells a camera that fails from a scene that is poor, each as one number of an image."""
+"""Features of an image that distinguish a failing camera from a difficult scene."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from numpy.typing import NDArray
 from sceneslam.types.observation import Observation
 
 _WHITE = 250  # grey value that is nearly saturated
-_FLOOR = 4.0  # grey values of read noise: below, a ratio of light means nothing
+_FLOOR = 4.0  # grey values of read noise: ratios of smaller values are meaningless
 _EDGE_STEP = 24.0  # grey values of an edge, across a 40th of the image's width
-_EDGES_MIN = 40  # pixels on edges, of every second row or fewer, to judge an image by
-_TEAR_STEP = 6.0  # grey values between the rows of a cut, on average over the width ...
-_TEAR_RATIO = 2.0  # ... and so many times the steps between the rows beside it
-_TEAR_REACH_RATIO = 0.02  # of the height, by which an edge moves from image to image
+_EDGES_MIN = 40  # smallest number of edge pixels in the examined rows
+_TEAR_STEP = 6.0  # smallest mean difference of grey values between the rows of a cut ...
+_TEAR_RATIO = 2.0  # ... and smallest ratio to the difference of the rows beside it
+_TEAR_REACH_RATIO = 0.02  # of the height: largest motion of an edge between images
 _TEAR_IMAGES = 5
-_FLICKER_STEP = 0.4  # powers of two of light between the extremes of a flicker
+_FLICKER_STEP = 0.4  # smallest amplitude of flicker, in powers of two of light
 _FLICKER_SPAN_NS = 1_000_000_000
 
 
 def grey_peak(image_bgr: NDArray[np.uint8]) -> float:
-    """Return the grey value that one pixel in a thousand exceeds: what little light there is."""
+    """Return the grey value that one pixel in a thousand exceeds."""
     counts = np.bincount(_grey(image_bgr)[::2, ::2].ravel(), minlength=256)
     return float(np.searchsorted(np.cumsum(counts), 0.999 * counts.sum()))
 
@@ -36,10 +36,10 @@ def overexposed_ratio(image_bgr: NDArray[np.uint8]) -> float:
 
 
 def sharpness(image_bgr: NDArray[np.uint8]) -> float:
-    """Return how much of the strongest edges' height lies within a 240th of the image's width.
+    """Return the share of the strongest edges' height within a 240th of the image's width.
 
-    About 1 for a step, near 0 for an image out of focus; 1 where there is no edge to judge by.
-    Noise counts for neither: edges are taken over a distance six times as long.
+    It is about 1 for a step, near 0 for an image out of focus, and 1 without any edge. Noise has no
+    effect, as edges are detected over a distance six times as long.
     """
     grey = _grey(image_bgr)
     reach = max(1, round(grey.shape[1] / 240))
@@ -59,13 +59,13 @@ def sharpness(image_bgr: NDArray[np.uint8]) -> float:
 
 @dataclass(slots=True)
 class Tears:
-    """Counts where an image is cut: rows above and below do not belong together.
+    """Counts cuts of an image: rows above and below are from different images, or shifted.
 
-    A cut is a step between two rows, over the whole width, that neither the rows beside it have
-    nor the image before had there: the edges of floors and shelves stay where they are.
+    A cut is a difference between two rows, over the whole width, that neither the rows beside it
+    have nor the previous image had there: edges of floors and shelves stay at their position.
     """
 
-    _before: NDArray[np.float32] | None = None  # (H - 1,) the steps of the last image
+    _before: NDArray[np.float32] | None = None  # (H - 1,) differences of rows in the last image
     _recent: deque[int] = field(default_factory=lambda: deque(maxlen=_TEAR_IMAGES))
 
     def __call__(self, observation: Observation) -> float:
@@ -88,14 +88,14 @@ class Tears:
 
 @dataclass(slots=True)
 class Flicker:
-    """Counts how often a second the light turns between bright and dim."""
+    """Measures the frequency of changes between bright and dim."""
 
     _turns_ns: deque[int] = field(default_factory=deque)
     _extreme: float | None = None
     _is_rising: bool | None = None
 
     def __call__(self, observation: Observation) -> float:
-        """Return the full periods within the last second."""
+        """Return the number of full periods within the last second."""
         now_ns = observation.stamp_ns
         if observation.image_bgr is not None:
             mean = sum(cv2.mean(observation.image_bgr)[:3]) / 3.0

@@ -1,4 +1,4 @@
-"""Scenes by a model that was trained on examples: `python -m sceneslam.scenes train`."""
+"""A detector with a trained model: `python -m sceneslam.scenes train`."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _KEYS = ("scenes", "features", "mean", "scale", "weights", "bias")
 
 
 class Learned:
-    """Votes for the most probable scene, by a softmax regression of a few features.
+    """Votes for the most probable scene by softmax regression of a few features.
 
-    `path` is a model, a small YAML file; null: the one for Bright and Dark that comes with it.
+    `path` is a model, a small YAML file; null: the built-in one for Bright and Dark.
     """
 
     quantity = "probability of the scene"
@@ -37,7 +37,7 @@ class Learned:
             scale = np.array(model["scale"], np.float64)
             weights = np.array([model["weights"][scene] for scene in self.scenes], np.float64)
             bias = np.array([model["bias"][scene] for scene in self.scenes], np.float64)
-            # Scores are W (f - mean) / scale + bias, here as one matrix and one offset.
+            # Logits are W (f - mean) / scale + bias, here as one matrix and one offset.
             self._weights = weights / scale
             self._offset = bias - self._weights @ np.array(model["mean"], np.float64)
         except (KeyError, TypeError, ValueError) as error:
@@ -49,18 +49,18 @@ class Learned:
         return self._features.requires
 
     def activate(self, rig: Rig) -> None:
-        """Do nothing: it remembers nothing."""
+        """Do nothing: the detector has no state."""
 
     def get_scene(self, observation: Observation) -> SceneVote:
-        """Return the most probable scene, UNSURE where a sensor was silent."""
+        """Return the most probable scene, UNSURE if a sensor is missing."""
         return self.decide(observation.stamp_ns, self.get_features(observation))
 
     def get_features(self, observation: Observation) -> NDArray[np.float64] | None:
-        """Return (F,) the model's features."""
+        """Return the model's features (F,), None if a sensor is missing."""
         return self._features.get_features(observation)
 
     def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
-        """Return the most probable scene; it was trained on as much of each scene."""
+        """Return the most probable scene, with equal prior probabilities."""
         if features is None or np.isnan(features).any():
             return SceneVote(stamp_ns=stamp_ns, scene=UNSURE)
         scores = self._weights @ features + self._offset
@@ -75,11 +75,11 @@ class Learned:
         )
 
     def shutdown(self) -> None:
-        """Do nothing: there is nothing to free."""
+        """Do nothing."""
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Return a model as it is written; raises InputError for anything else."""
+    """Return the contents of a model's file; raises InputError if it is invalid."""
     if not path.is_file():
         raise InputError(f"model not found (python -m sceneslam.scenes train makes one): {path}")
     try:

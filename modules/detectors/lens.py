@@ -1,4 +1,4 @@
-"""Dirt on a lens: what stays where it is in the image although the robot turns."""
+"""Detection of dirt on a lens: image regions that do not move while the robot turns."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 
-_WIDTH_PX = 96  # of the small images that are compared
-_TURN_RAD = 0.15  # between two images; a view of 57 degrees moves by 15 % of its width
-_SPAN_NS = 2_000_000_000  # within which the robot turns so far, and for which a finding holds
-_FINDINGS = 7  # of which the median counts: an edge may stay by chance for an image or two
-_REACH_PX = 9  # what else may have moved a point, by parallax: translation, tilt
-_STAYED, _MOVED = 8, 16  # grey values: at most so different where it was, so much from all around
+_WIDTH_PX = 96  # width of the downscaled images
+_TURN_RAD = 0.15  # rotation between two images: 15 % of a field of view of 57 degrees
+_SPAN_NS = 2_000_000_000  # longest time for this rotation, and validity of a result
+_FINDINGS = 7  # results in the median: an edge may stay by chance in one or two images
+_REACH_PX = 9  # tolerance for parallax, translation and tilt
+_STAYED, _MOVED = 8, 16  # grey values: unmoved if below, moved if above
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -31,10 +31,10 @@ class _View:
 
 @dataclass(slots=True)
 class Dirt:
-    """Compares images between which the robot turned: the view moves, dirt does not.
+    """Compares images before and after a rotation of the robot: the view moves, dirt does not.
 
-    A point is dirty where the image is what it was there, and is not what the turn moved there.
-    Without a camera, gyro or wheels nothing is dirty.
+    A pixel is dirty if it has not changed, and differs from the pixels that the rotation moves
+    there. The result is 0 without a camera, or without gyro and wheels.
     """
 
     rig: Rig
@@ -44,7 +44,7 @@ class Dirt:
     _found: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=_FINDINGS))
 
     def __call__(self, observation: Observation) -> float:
-        """Return the share of the image that is dirty, the median of the last findings."""
+        """Return the dirty share of the image, the median of the last results."""
         self._turn(observation)
         if observation.image_bgr is not None and self.rig.camera is not None:
             self._compare(observation.stamp_ns, observation.image_bgr, self.rig.camera.fx)
@@ -53,7 +53,7 @@ class Dirt:
         return median(ratio for _, ratio in self._found) if self._found else 0.0
 
     def _turn(self, observation: Observation) -> None:
-        """Follow the robot's yaw by the gyro, or else by the wheels."""
+        """Integrate the robot's yaw by the gyro, else by the wheels."""
         before, self._last = self._last, observation
         if before is None:
             return
@@ -79,19 +79,19 @@ class Dirt:
         )
         before = next(turned, None)
         if self._views and np.array_equal(now.grey, self._views[-1].grey):
-            before = None  # not a new image: what stayed is the camera, not dirt
+            before = None  # the image is frozen
             self._views.clear()
         self._views.append(now)
         if before is None:
             return
-        # A turn to the left moves the view to the right.
+        # A rotation to the left moves the view to the right.
         shift_px = round(fx_px / width * _WIDTH_PX * np.tan(now.yaw_rad - before.yaw_rad))
         if 0 < abs(shift_px) <= _WIDTH_PX // 2:
             self._found.append((stamp_ns, _dirty_ratio(before.grey, now.grey, shift_px)))
 
 
 def _dirty_ratio(before: NDArray[np.uint8], now: NDArray[np.uint8], shift_px: int) -> float:
-    """Return the share of pixels that stayed although all should have moved to the right."""
+    """Return the share of pixels that did not move although all should have moved to the right."""
     around = np.ones((_REACH_PX, _REACH_PX), np.uint8)
     to = slice(shift_px, None) if shift_px > 0 else slice(None, shift_px)
     come_from = slice(None, -shift_px) if shift_px > 0 else slice(-shift_px, None)

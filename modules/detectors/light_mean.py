@@ -1,4 +1,4 @@
-"""The mean of grey that an image would have at the source's reference exposure."""
+"""Scene by the mean grey value, corrected to the source's reference exposure."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from sceneslam.types.observation import Observation
 
 from .grey_mean import GreyMean
 
-_ROWS = 96  # of the grid of pixels that is looked at
+_ROWS = 96  # rows of the grid of examined pixels
 
 
 class LightMean(GreyMean):
-    """Compares with the threshold how bright the scene is, not how bright its image is.
+    """Compares the brightness of the scene, not that of the image, with the threshold.
 
-    The source has to report the exposure of its images; without it an image is taken as exposed by
-    the reference.
+    The source has to report the exposure of its images; without it, images count as exposed with
+    the reference exposure.
     """
 
     quantity = "mean of grey at the reference exposure"
 
     def get_features(self, observation: Observation) -> NDArray[np.float64] | None:
-        """Return (1,): the mean of grey at the reference exposure."""
+        """Return (1,): the mean grey value at the reference exposure."""
         if observation.image_bgr is None:
             return None
         return np.array([light_mean(observation.image_bgr, observation.exposure_ratio or 1.0)])
 
 
 def light_mean(image_bgr: NDArray[np.uint8], exposure_ratio: float) -> float:
-    """Return the mean of grey, in [0, 255], of an (H, W, 3) BGR image had it been exposed by 1.
+    """Return the mean grey value, in [0, 255], that a BGR image (H, W, 3) has at exposure 1.
 
-    Grey values stand for light by the sRGB curve (IEC 61966-2-1), and light is proportional to the
-    exposure. A saturated pixel counts as just saturated.
+    Grey values are converted to light by the sRGB curve (IEC 61966-2-1), and light is proportional
+    to the exposure. Saturated pixels keep their value.
     """
     step = max(1, min(image_bgr.shape[:2]) // _ROWS)
     grey = cv2.cvtColor(np.ascontiguousarray(image_bgr[::step, ::step]), cv2.COLOR_BGR2GRAY)

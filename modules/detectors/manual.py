@@ -1,4 +1,4 @@
-"""Scenes from a schedule or from an operator's keyboard, as in the authors' manual bus."""
+"""Scenes from a schedule or an operator's keyboard, as in the paper's manual mode."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _SCHEDULE = "a list of [seconds, scene] by rising seconds, the first at 0"
 
 
 class Manual:
-    """Votes for the scene that the schedule names, or that the operator typed last.
+    """Votes for the scene of the schedule, or the last one typed by the operator.
 
     `schedule` holds [seconds since the first observation, scene]. With `operator` a line typed on
-    standard input takes over from the schedule from then on, if it is a scene of the schedule or
-    of `scenes`.
+    standard input replaces the schedule from then on, if it is a scene of the schedule or of
+    `scenes`.
     """
 
     quantity = ""
@@ -49,20 +49,20 @@ class Manual:
         self._first_ns: int | None = None
 
     def activate(self, rig: Rig) -> None:
-        """Start the schedule at the next observation; listen to the operator."""
+        """Start the schedule at the next observation; read standard input."""
         self._first_ns, self._typed = None, None
         if self._operator:
             threading.Thread(target=self._listen, daemon=True, name="operator").start()
 
     def get_scene(self, observation: Observation) -> SceneVote:
-        """Return the scene that holds at the observation's stamp."""
+        """Return the scene at the observation's stamp."""
         return self.decide(observation.stamp_ns, None)
 
     def get_features(self, observation: Observation) -> NDArray[np.float64] | None:
-        """Return None: it looks at nothing."""
+        """Return None: there are no features."""
 
     def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
-        """Return the scene that holds at the stamp."""
+        """Return the scene at the stamp."""
         if self._first_ns is None:
             self._first_ns = stamp_ns
         elapsed_s = (stamp_ns - self._first_ns) / 1e9
@@ -71,7 +71,7 @@ class Manual:
         return SceneVote(stamp_ns=stamp_ns, scene=scene)
 
     def shutdown(self) -> None:
-        """Do nothing: the listening thread ends with the process."""
+        """Do nothing: the reading thread ends with the process."""
 
     def _listen(self) -> None:
         for line in sys.stdin:

@@ -1,4 +1,4 @@
-"""Scenes by an image classifier: any network in ONNX, run by OpenCV."""
+"""Scenes by an image classifier in ONNX format, run by OpenCV."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ Classes = Sequence[int | str]
 
 
 class Onnx:
-    """Votes for the scene whose classes are together the most probable.
+    """Votes for the scene with the largest sum of class probabilities.
 
     `scenes` maps each scene to classes of the network: their numbers or, with a file of `labels`,
     patterns of their names (`kitchen`, `*room*`). It votes at `rate_hz` (null: on every image) and
-    is UNSURE in between, and where no scene is as probable as `probability_min`.
+    is UNSURE in between, and if no scene has the probability `probability_min`.
     """
 
     quantity = "probability of the scene"
@@ -76,7 +76,7 @@ class Onnx:
         self._asked_ns: int | None = None
 
     def activate(self, rig: Rig) -> None:
-        """Vote on the next image."""
+        """Start; the next image gets a vote."""
         self._asked_ns = None
 
     def get_scene(self, observation: Observation) -> SceneVote:
@@ -84,7 +84,7 @@ class Onnx:
         return self.decide(observation.stamp_ns, self.get_features(observation))
 
     def get_features(self, observation: Observation) -> NDArray[np.float64] | None:
-        """Return (C,) the probabilities of the classes, None where it is not time for a vote."""
+        """Return the classes' probabilities (C,), None if no vote is due."""
         if observation.image_bgr is None:
             return None
         since_ns = self._period_ns
@@ -112,10 +112,10 @@ class Onnx:
         )
 
     def shutdown(self) -> None:
-        """Do nothing: the network is freed with the detector."""
+        """Do nothing."""
 
     def _classify(self, image_bgr: NDArray[np.uint8]) -> NDArray[np.float64]:
-        """Return (C,) the probabilities of the classes of an image."""
+        """Return the classes' probabilities (C,) for an image."""
         small = cv2.resize(image_bgr, self._size_wh, interpolation=cv2.INTER_AREA)
         pixels = np.asarray(small[..., ::-1] if self._is_rgb else small, np.float32)
         pixels = (pixels - self._mean) / self._standard_deviation
@@ -132,7 +132,7 @@ class Onnx:
 
 
 def _read_network(path: str) -> cv2.dnn.Net:
-    """Return the network; raises InputError where OpenCV cannot read it."""
+    """Return the network; raises InputError if OpenCV cannot read it."""
     if not Path(path).is_file():
         raise InputError(f"network not found, expected an ONNX file: {path}")
     try:
@@ -151,7 +151,7 @@ def _read_labels(path: Path) -> Sequence[str]:
 def _members(
     scenes: Mapping[str, Classes], names: Sequence[str], count: int
 ) -> NDArray[np.float64]:
-    """Return (S, C), 1 where a class belongs to a scene; raises ConfigError for `scenes`."""
+    """Return (S, C), 1 if a class belongs to a scene; raises ConfigError for `scenes`."""
     members = np.zeros((len(scenes), count))
     for row, (scene, classes) in enumerate(scenes.items()):
         if scene in ("", UNSURE) or not classes:

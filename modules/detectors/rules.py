@@ -1,4 +1,4 @@
-"""Scenes by rules over measured features, so that a new kind of scene needs no code."""
+"""Scenes by configurable rules over features; new scenes need no code."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Limits = Mapping[str, Sequence[Limit]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Rule:
-    """A scene, and within which limits (low, high) each of its features lies."""
+    """A scene with limits (low, high) for its features."""
 
     scene: str
     sensors: frozenset[Sensor]
@@ -30,7 +30,7 @@ class _Rule:
     high: NDArray[np.float64]
 
     def holds(self, features: NDArray[np.float64], margin_ratio: float) -> bool | None:
-        """Tell whether all features lie in the limits, None where one was not measured."""
+        """Tell whether all features are within their limits, None if one is missing."""
         values = features[self.indices]
         if np.isnan(values).any():
             return None
@@ -45,13 +45,13 @@ class _Rule:
 class Rules:
     """Votes for the first scene, in the rules' order, whose conditions all hold.
 
-    Each rule has a name of its own, by which an overlay can change it, and is `{scene: NAME, when:
-    {FEATURE: [low, high], ...}}` with null for no limit. A rule that is null is left out, and with
-    `skip_absent_sensors` so is one on a sensor that the source does not have. Where no rule holds
-    the vote is `otherwise` (null: UNSURE). The scene voted last stays until its limits, wider by
-    `hysteresis_ratio` of themselves, are left, or an earlier rule holds. A measurement counts for
-    `hold_s`, so that sensors need not measure at the same stamps. A limit may be the name of one
-    of the `values`, which several rules then share.
+    Each rule has a name, by which another configuration can change it, and is `{scene: NAME, when:
+    {FEATURE: [low, high], ...}}` with null for no limit. A rule that is null is ignored, and with
+    `skip_absent_sensors` also one that needs a sensor that the source does not have. If no rule
+    holds, the vote is `otherwise` (null: UNSURE). The last scene is kept until its limits, widened by
+    `hysteresis_ratio`, are exceeded, or an earlier rule holds. A measurement is valid for
+    `hold_s`, as sensors measure at different stamps. A limit can be the name of one
+    of the `values`, for use in several rules.
     """
 
     quantity = ""
@@ -82,8 +82,8 @@ class Rules:
         self._skips = skip_absent_sensors
         self._values = dict(values or {})
         self._rules = [self._read(f"rules.{name}", rule) for name, rule in used.items()]
-        self._present = self._rules  # those whose sensors the rig has ...
-        self._told = list(range(len(self._features)))  # ... and the features that votes tell
+        self._present = self._rules  # rules whose sensors the rig has ...
+        self._told = list(range(len(self._features)))  # ... and the features that votes report
         self._otherwise = otherwise or UNSURE
         self._hysteresis_ratio = hysteresis_ratio
         self._voted: str | None = None
@@ -92,13 +92,13 @@ class Rules:
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return the sensors of all features; none where rules on absent ones are left out."""
+        """Return the sensors of all features; none with `skip_absent_sensors`."""
         if self._skips:
             return (frozenset(),)
         return (frozenset(_sensor(name) for name in self._features),)
 
     def activate(self, rig: Rig) -> None:
-        """Forget the last vote and all measurements."""
+        """Reset the last vote and all measurements."""
         self._voted = None
         self._measures: list[Measure] = [
             FEATURES[name].measure if name in FEATURES else FEATURES_OVER_TIME[name].make(rig)
@@ -120,7 +120,7 @@ class Rules:
         return self.decide(observation.stamp_ns, self.get_features(observation))
 
     def get_features(self, observation: Observation) -> NDArray[np.float64] | None:
-        """Return (F,) the configured features, NaN where a sensor was silent for `hold_s`."""
+        """Return the configured features (F,), NaN if its sensor is missing for `hold_s`."""
         values = np.array([measure(observation) for measure in self._measures])
         is_new = ~np.isnan(values)
         self._latest[is_new] = values[is_new]
@@ -130,7 +130,7 @@ class Rules:
         return None if np.isnan(values).all() else values
 
     def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
-        """Return the vote; UNSURE where a rule that comes first cannot be judged."""
+        """Return the vote; UNSURE if an earlier rule has a missing feature."""
         scene = UNSURE if features is None else self._first(features)
         if scene != UNSURE:
             self._voted = scene
@@ -140,7 +140,7 @@ class Rules:
         return SceneVote(stamp_ns=stamp_ns, scene=scene, features=measured)
 
     def shutdown(self) -> None:
-        """Do nothing: there is nothing to free."""
+        """Do nothing."""
 
     def _first(self, features: NDArray[np.float64]) -> str:
         for rule in self._present:

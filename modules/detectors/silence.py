@@ -1,4 +1,4 @@
-"""Sensors that say nothing, or the same again and again, each as a duration."""
+"""Features for missing and frozen sensors, as durations."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
-Read = Callable[[Observation], Any]  # a measurement, None where the sensor was silent
-_STILL_M, _STILL_RAD = 0.002, 0.002  # between two scans: wheels that turn by less stand still
+Read = Callable[[Observation], Any]  # a measurement, None if the sensor is missing
+_STILL_M, _STILL_RAD = 0.002, 0.002  # between two scans; less motion counts as standing still
 
 
 @dataclass(slots=True)
 class Silent:
-    """Measures how long a sensor has not measured anything that can be used."""
+    """Measures how long a sensor has had no valid measurement."""
 
     read: Read
     _last_ns: int | None = None
 
     def __call__(self, observation: Observation) -> float:
-        """Return the time since the last measurement, or the first observation [s]."""
+        """Return the time [s] since the last valid measurement, or since the first observation."""
         if self._last_ns is None or _is_usable(self.read(observation)):
             self._last_ns = observation.stamp_ns
         return (observation.stamp_ns - self._last_ns) * 1e-9
@@ -32,10 +32,10 @@ class Silent:
 
 @dataclass(slots=True)
 class Frozen:
-    """Measures how long a sensor has repeated itself to the bit, which noise does not.
+    """Measures how long a sensor has repeated exactly the same measurement.
 
-    A scan of a few digits may well be the same while the robot stands: where the wheels can tell,
-    `needs_motion` counts only the time in which they turned.
+    Scans of low resolution may repeat while the robot stands still: with wheel odometry,
+    `needs_motion` counts only the time of motion.
     """
 
     read: Read
@@ -46,7 +46,7 @@ class Frozen:
     _T_odom_base: Transform | None = None
 
     def __call__(self, observation: Observation) -> float:
-        """Return for how long [s]; 0 as soon as the measurement is another one."""
+        """Return the duration [s]; 0 as soon as the measurement changes."""
         value = self.read(observation)
         if value is None:
             return self._frozen_ns * 1e-9
@@ -70,7 +70,7 @@ class Frozen:
 
 
 def _is_usable(value: Any) -> bool:
-    """Tell whether there is a measurement with a number in it."""
+    """Tell whether a measurement has a finite value."""
     if value is None:
         return False
     array = np.asarray(value)

@@ -1,4 +1,4 @@
-"""Wheel odometry held against the motion that a laser or a depth camera sees."""
+"""Check of wheel odometry by the motion that a laser or depth camera measures."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from sceneslam.types import se3
 from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Camera, Laser, Rig
 
-_SPAN_S = 0.4  # motions are compared over so long, at most twice as long
+_SPAN_S = 0.4  # time between compared scans, at most twice as long
 _SPAN_MAX_S = 0.8
-_FORWARD_MAX_M, _TURN_MAX_RAD = 0.8, 0.5  # that are tried: 2 m/s and 70 degrees/s
-_COARSE = (21, 17)  # forward and turn: steps of 8 cm and 3.6 degrees ...
-_FINE = (9, 9)  # ... then of 2 cm and 0.9 degrees around the best
-_BEAMS = 60  # of a scan that are compared
-_CLIP_M = 0.3  # a beam that is off by more ends on something else
-_OVERLAP_RATIO = 0.5  # of the beams that both scans have to see
-_MISFIT_M = 0.03  # of the wheels' motion beyond the best one: three times a laser's noise of 1 cm
+_FORWARD_MAX_M, _TURN_MAX_RAD = 0.8, 0.5  # search range: 2 m/s and 70 degrees/s
+_COARSE = (21, 17)  # numbers of steps: 8 cm and 3.6 degrees ...
+_FINE = (9, 9)  # ... then 2 cm and 0.9 degrees around the best
+_BEAMS = 60  # compared beams per scan
+_CLIP_M = 0.3  # larger differences are clipped: other surfaces
+_OVERLAP_RATIO = 0.5  # smallest share of beams in both scans
+_MISFIT_M = 0.03  # largest extra misfit of the wheels' motion: three times a laser's noise of 1 cm
 _STANDING_M, _STANDING_RAD = 0.01, 0.01
-_MOST = 10.0  # the ratio where the wheels say that the robot stands, and it does not
+_MOST = 10.0  # ratio if the wheels report no motion although the robot moves
 
 Planar = NDArray[np.float64]  # (N, 2) [m], base
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Scan:
-    """What was seen around the base, by rising angle."""
+    """A scan in `base`, by rising angle."""
 
     stamp_ns: int
     angles_rad: NDArray[np.float64]  # (N,)
@@ -39,11 +39,11 @@ class _Scan:
 
 
 class WheelCheck:
-    """Tells how many times the wheels' distance the robot really moved, by two scans.
+    """Computes the ratio of the true motion, by two scans, to that of the wheels.
 
-    Of all planar motions that a wheeled robot makes, the one is sought that explains the scans
-    best. Where that of the wheels explains them as well, as in a bare corridor, the wheels are
-    right. Depth is taken along the image's row at the camera's height.
+    Among all motions of a wheeled robot, the one that best aligns the two scans is searched. If the
+    wheels' motion aligns them as well, as in a bare corridor, the wheels count as correct. Of a
+    depth image, the row at the camera's height is used.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -52,7 +52,7 @@ class WheelCheck:
         self._ratio, self._found_ns = 1.0, 0
 
     def __call__(self, observation: Observation) -> float:
-        """Return 1 where the wheels are right; 0: they spin; below: reversed; 10: they stand."""
+        """Return 1 for correct wheels, 0 if they spin, below 0 if reversed, 10 if blocked."""
         scan = self._scan(observation)
         if scan is not None:
             self._compare(scan)
@@ -91,7 +91,7 @@ class WheelCheck:
 
 
 def _ratio(before: _Scan, now: _Scan) -> float:
-    """Return the forward motion that was seen over that of the wheels, 1 where these are right."""
+    """Return the measured forward motion over that of the wheels, 1 if these are correct."""
     T_prev_curr = se3.inverse(before.T_odom_base) @ now.T_odom_base
     wheels_m, wheels_rad = float(T_prev_curr[0, 3]), se3.yaw_rad(T_prev_curr)
     grid_m, grid_rad = (
@@ -101,7 +101,7 @@ def _ratio(before: _Scan, now: _Scan) -> float:
     seen_m, seen_rad, _ = _best(before, now, grid_m, grid_rad)
     steps = (grid_m[1] - grid_m[0], grid_rad[1] - grid_rad[0])
     seen_m, seen_rad, misfit_m = _best(before, now, *_around(seen_m, seen_rad, steps))
-    # The wheels are a little off even when they are right: half a coarse step is granted.
+    # Tolerance for correct wheels: half a coarse step.
     claim = _around(wheels_m, wheels_rad, (steps[0] / 4, steps[1] / 2))
     if _best(before, now, *claim)[2] - misfit_m < _MISFIT_M:
         return 1.0
@@ -122,11 +122,11 @@ def _around(
 def _best(
     before: _Scan, now: _Scan, forward_m: NDArray[np.float64], turn_rad: NDArray[np.float64]
 ) -> tuple[float, float, float]:
-    """Return the motion (forward [m], turn [rad]) that fits best, and its mean misfit [m]."""
+    """Return the best motion (forward [m], turn [rad]) and its mean misfit [m]."""
     step = max(1, len(now.angles_rad) // _BEAMS)
     angles_rad, ranges_m = now.angles_rad[::step], now.ranges_m[::step]
     turned_rad = turn_rad[:, None] + angles_rad  # (A, N)
-    # A wheeled robot moves along an arc, whose chord points half the turn aside.
+    # The motion is an arc, whose chord has half the turn as direction.
     along = np.exp(0.5j * turn_rad)[:, None] * forward_m[:, None, None]  # (D, A, 1)
     ends = ranges_m * np.exp(1j * turned_rad) + along  # (D, A, N) x + iy
     expected_m = np.interp(
@@ -150,7 +150,7 @@ def _of_scan(scan: LaserScan, laser: Laser) -> Planar:
 
 
 def _of_depth(depth_m: NDArray[np.float32], camera: Camera) -> Planar:
-    """Return the points seen along the row at the camera's height."""
+    """Return the points (N, 2) [m], base, of the row at the camera's height."""
     row = int(np.clip(round(camera.cy), 2, depth_m.shape[0] - 3))
     smooth_m = cv2.medianBlur(np.ascontiguousarray(depth_m[row - 2 : row + 3]), 5)[2]
     columns = np.flatnonzero(camera.measures(smooth_m))

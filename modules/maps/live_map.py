@@ -1,4 +1,4 @@
-"""A map drawn at the reported poses: a grid of scans, or of depth as scans, and coloured points."""
+"""A map at the reported poses: a grid of laser or depth scans, and coloured points."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from sceneslam.types.rig import Camera, Rig
 from sceneslam.types.se3 import Transform, apply
 
 _KEY_BITS = 21  # of a voxel's index along each axis
-_UNSEEN_BGR = (160, 160, 160)  # of points that no camera saw
+_UNSEEN_BGR = (160, 160, 160)  # of points without a camera
 
 
 class GridAndPoints:
-    """Draws every observation once, and does not move what was drawn when poses are revised."""
+    """Adds every observation once; revised poses do not change the map."""
 
     def __init__(self, resolution_m: float, voxel_m: float, depth_stride_px: int) -> None:
         if not voxel_m > 0:
@@ -30,14 +30,14 @@ class GridAndPoints:
         self._stride = depth_stride_px
 
     def open(self, rig: Rig) -> None:
-        """Begin an empty map."""
+        """Start with an empty map."""
         self._rig, self._grid = rig, OccupancyGrid(self._resolution_m)
-        self._keys = np.zeros(0, np.int64)  # of the voxels that hold a point, sorted
+        self._keys = np.zeros(0, np.int64)  # of the voxels with a point, sorted
         self._points, self._colors = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
         self._scanner = None if rig.camera is None else _scanner(rig.camera)
 
     def add(self, observation: Observation, T_map_base: Transform) -> None:
-        """Draw one observation."""
+        """Add an observation at T_map_base (4, 4) [m]."""
         camera, laser = self._rig.camera, self._rig.laser
         if observation.scan is not None and laser is not None:
             self._grid.insert(T_map_base @ laser.T_base_laser, observation.scan)
@@ -77,7 +77,7 @@ class GridAndPoints:
         self._add_points(points, colors)
 
     def _add_points(self, points: NDArray[np.float32], colors: NDArray[np.uint8]) -> None:
-        """Add the points of voxels that hold none yet."""
+        """Add the points (N, 3) [m], map, of empty voxels, with colours (N, 3)."""
         cells = np.floor(points / self._voxel_m).astype(np.int64) + (1 << (_KEY_BITS - 1))
         keys = (cells[:, 0] << 2 * _KEY_BITS) | (cells[:, 1] << _KEY_BITS) | cells[:, 2]
         keys, first = np.unique(keys, return_index=True)
@@ -88,5 +88,5 @@ class GridAndPoints:
 
 
 def _scanner(camera: Camera) -> DepthScanner:
-    """Return what makes scans of depth: of all heights that the paper's laser module takes."""
+    """Return the converter of depth to scans, with the paper's range of heights."""
     return DepthScanner(camera, height_min_m=None, height_max_m=None, beams=180, stride_px=2)

@@ -1,4 +1,4 @@
-"""A library's map of clouds, with what such libraries do not tell: overlap and localizability."""
+"""The interface to a library's cloud map, with overlap and localizability of clouds."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from .clouds import Cloud
 from .degeneracy import Localizability
 
 _SLOTS = 1 << 20
-_SHAPE_POINTS = 10_000  # suffice for the shape of a cloud
+_SHAPE_POINTS = 10_000  # points used for the shape of a cloud
 
 
 class CloudMap(ABC):
-    """Registers clouds in `local`; only what is accepted becomes part of the map.
+    """Registers clouds in `local`; only accepted clouds become part of the map.
 
-    `register` leaves behind the points that it registered (`source`) and those that the map gets
-    (`dense`), both (N, 3) [m] in base.
+    `register` stores the registered points (`source`) and those for the map (`dense`), both (N, 3)
+    [m] in base.
     """
 
     source: Cloud
@@ -31,44 +31,44 @@ class CloudMap(ABC):
 
     def __init__(self, *, voxel_m: float, range_max_m: float) -> None:
         self._edge_m, self._range_max_m = voxel_m, range_max_m
-        self._known = np.zeros(_SLOTS, np.bool_)  # a table of hashed voxels; few share a place
+        self._known = np.zeros(_SLOTS, np.bool_)  # a hash table of voxels with few collisions
         self._marked_at = np.zeros(3)
 
     @abstractmethod
     def register(
         self, cloud: Cloud, T_local_guess: se3.Transform, observation: Observation
     ) -> se3.Transform | None:
-        """Return T_local_base of a cloud (N, 3) in base; None where the library refuses it."""
+        """Return T_local_base (4, 4) [m] of a cloud (N, 3) [m], base; None if the library fails."""
 
     @abstractmethod
     def add(self, T_local_guess: se3.Transform, T_local_base: se3.Transform) -> None:
-        """Add the last cloud to the library's map, and let it learn how good guesses are."""
+        """Add the last cloud to the library's map, and update its model of prediction errors."""
 
     @abstractmethod
     def points(self) -> NDArray[Any]:
         """Return the map's points (N, 3) [m], local."""
 
     def overlap(self, T_local_base: se3.Transform) -> tuple[float, int]:
-        """Return the share and the number of points whose voxel the map knows."""
+        """Return the share and the number of points in known voxels of the map."""
         inliers = int(self._known[self._slots(se3.apply(T_local_base, self.source))].sum())
         return inliers / max(len(self.source), 1), inliers
 
     def localizability(self) -> Localizability:
-        """Return how well the last cloud's shape holds the pose, in base."""
+        """Return how well the last cloud's shape constrains the pose, in base."""
         thinned = self.dense[:: max(1, round(len(self.dense) / _SHAPE_POINTS))]
         return cloud_localizability(thinned, 2.0 * self._edge_m)
 
     def accept(self, T_local_guess: se3.Transform, T_local_base: se3.Transform) -> None:
-        """Make the last cloud part of the map."""
+        """Add the last cloud to the map."""
         self.add(T_local_guess, T_local_base)
         if np.linalg.norm(T_local_base[:3, 3] - self._marked_at) > 0.5 * self._range_max_m:
-            self._known[:] = False  # the library forgets what is out of range
+            self._known[:] = False  # the library removes points out of range
             self._known[self._slots(self.points())] = True
             self._marked_at = T_local_base[:3, 3]
         self._known[self._slots(se3.apply(T_local_base, self.dense))] = True
 
     def _slots(self, points: NDArray[Any]) -> NDArray[np.int64]:
-        """Return each point's place in the table."""
+        """Return each point's index (N,) in the hash table."""
         cells = np.floor(points / self._edge_m).astype(np.int64)
         keys = (cells[:, 0] * 73856093) ^ (cells[:, 1] * 19349669) ^ (cells[:, 2] * 83492791)
         return np.asarray(keys & (_SLOTS - 1))

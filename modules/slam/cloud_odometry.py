@@ -1,6 +1,6 @@
-"""A library that registers clouds, as a SLAM module: prediction, judgement and states are here.
+"""A SLAM module by a cloud registration library, with prediction, checks and tracker states.
 
-Such libraries answer with a pose whatever they are given: empty clouds, NaN, a bare corridor.
+Such libraries return a pose for any input, also for empty clouds, NaN or a bare corridor.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from .cloud_map import CloudMap
 from .clouds import CloudReader
 from .degeneracy import Localizability
 
-_POINTS_MIN = 50  # fewer do not hold six degrees of freedom
+_POINTS_MIN = 50  # fewer do not constrain six degrees of freedom
 _DEPTH_VOXEL_M = 0.1
-_DIFFUSE = 1e6  # variances of a cloud: a prediction that ICP alone decides against
+_DIFFUSE = 1e6  # prediction's covariance in units of a cloud's, if ICP decides alone
 
 
 @dataclass(kw_only=True, eq=False)
 class CloudOdometry(ABC):
-    """Fulfils `SlamModule` by a `CloudMap`; the YAML of each says what the settings are."""
+    """Implements `SlamModule` by a `CloudMap`; the settings are described in each YAML file."""
 
     voxel_m: float | None
     depth_range_max_m: float
@@ -60,15 +60,15 @@ class CloudOdometry(ABC):
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return the sensors, one of which suffices; odometry is used when present."""
+        """Return points and depth, one of which is needed; odometry is used when present."""
         return (frozenset({Sensor.POINTS}), frozenset({Sensor.DEPTH}))
 
     @abstractmethod
     def make_map(self, voxel_m: float, reader: CloudReader) -> CloudMap:
-        """Return the library's map, empty, for what a rig's sensor reads."""
+        """Return an empty map of the library, for the clouds of `reader`."""
 
     def activate(self, rig: Rig) -> None:
-        """Start anew, with the lidar where there is one, else with the depth camera."""
+        """Start a session with the lidar or, without one, with the depth camera."""
         self._reader = CloudReader(
             rig, depth_range_max_m=self.depth_range_max_m, depth_stride_px=self.depth_stride_px
         )
@@ -84,13 +84,13 @@ class CloudOdometry(ABC):
         self._has_map = False
 
     def set_pose(self, T_map_local: se3.Transform) -> None:  # noqa: B027
-        """Do nothing: its poses are in `local` wherever that lies."""
+        """Do nothing: poses are reported in `local`."""
 
     def set_scene(self, scene: str) -> None:  # noqa: B027
-        """Do nothing: geometry is the same by day and by night."""
+        """Do nothing: geometry does not depend on the scene."""
 
     def track(self, observation: Observation) -> Tracking:
-        """Return T_local_base at the observation."""
+        """Return T_local_base (4, 4) [m] at the observation."""
         if self._reader is None or self._icp is None:
             raise RuntimeError("track() before activate()")
         prediction = self._predictor.predict(observation)
@@ -118,17 +118,17 @@ class CloudOdometry(ABC):
         return self._answer(observation, status, overlap_ratio, inliers)
 
     def get_trajectory(self) -> Trajectory:
-        """Return no poses: registration with a map that moves along revises nothing."""
+        """Return no poses: registration with a local map does not revise poses."""
         return Trajectory.empty()
 
     def get_map(self) -> MapLayers:
-        """Return the voxel map in `local`: what lies within the sensor's range by now."""
+        """Return the voxel map in `local`, within the sensor's current range."""
         if self._icp is None:
             return MapLayers()
         return MapLayers(points=PointLayer(points=self._icp.points().astype(np.float32)))
 
     def shutdown(self) -> None:
-        """Free the ray table; the map stays."""
+        """Free the ray table; the map stays readable."""
         self._reader = None
 
     def _fuse(
@@ -138,10 +138,11 @@ class CloudOdometry(ABC):
         T_local_icp: se3.Transform,
         shape: Localizability,
     ) -> se3.Transform:
-        """Return the pose between odometry's and ICP's, by the covariance of each.
+        """Return T_local_base (4, 4) [m] fused from odometry and ICP, weighted by covariances.
 
-        Point-to-point registration drags along smooth planes. Without odometry its answer stands,
-        but for the directions that the cloud's shape leaves open: there the prediction does.
+        Point-to-point registration underestimates motion along smooth planes. Without odometry its
+        result is used, except for directions that the cloud's shape does not constrain: there the
+        prediction is used.
         """
         held = shape.held(self.weak_ratio)
         information = held.T @ np.diag(1.0 / self._noise) @ held
@@ -160,8 +161,8 @@ class CloudOdometry(ABC):
     def _is_plausible(
         self, observation: Observation, prediction: Prediction, T_local_icp: se3.Transform
     ) -> bool:
-        """Tell whether a robot can have moved so, in the time since the last good cloud."""
-        # Of a motion that odometry knows, the difference has to be small.
+        """Tell whether the motion since the last accepted cloud is plausible."""
+        # With odometry, the difference to it has to be small.
         is_known = prediction.is_measured
         T_before = prediction.T_local_base if is_known else self._predictor.T_local_measured
         moved = se3.inverse(T_before) @ T_local_icp
@@ -175,7 +176,7 @@ class CloudOdometry(ABC):
     def _bridge(
         self, observation: Observation, prediction: Prediction, *, can_coast: bool
     ) -> Tracking:
-        """Go on without a cloud: by odometry, for a moment as before, else not at all."""
+        """Return the pose by odometry, or shortly by constant velocity, else LOST."""
         can_coast = can_coast and self._has_map
         status = self._predictor.bridge(observation, prediction, can_coast=can_coast)
         is_lost = status is TrackingStatus.LOST

@@ -1,4 +1,4 @@
-"""How well the shape of a bare cloud holds a pose: planes in cells, and where they face."""
+"""Localizability of clouds without normals, by planes in cells."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from .clouds import Cloud
 from .degeneracy import Localizability, localizability
 
 _POINTS_MIN = 5  # of a cell
-_WIDTH_MIN_RATIO = 0.05  # of its middle to its largest variance: not the line of one beam
+_WIDTH_MIN_RATIO = 0.05  # middle to largest variance; below, the points are a line of one beam
 
 
 def cloud_localizability(cloud: Cloud, cell_m: float) -> Localizability:
-    """Return how well the points (N, 3) [m] hold a pose, in the points' frame.
+    """Return how well points (N, 3) [m] constrain a pose, in the points' frame.
 
-    A cell holds along the direction in which it is thinnest: the normal where it is flat, any
-    where it is filled evenly, and counts less then. The trace of a single beam is left out, since
-    it moves with the sensor.
+    A cell constrains the direction of its smallest variance: the normal if it is flat; a cell that
+    is filled evenly has less weight. The points of a single beam are left out, since they move with
+    the sensor.
     """
     means, covariances, counts = _cells(cloud, cell_m)
     variances, axes = np.linalg.eigh(covariances)
@@ -29,7 +29,7 @@ def cloud_localizability(cloud: Cloud, cell_m: float) -> Localizability:
 def _cells(
     cloud: Cloud, cell_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return mean (M, 3), covariance (M, 3, 3) and number of points of each cell with enough."""
+    """Return mean (M, 3), covariance (M, 3, 3) and number of points (M,) of cells with enough."""
     cells = np.floor(cloud / cell_m).astype(np.int64)
     keys = (cells[:, 0] << 42) + (cells[:, 1] << 21) + cells[:, 2]
     order = np.argsort(keys, kind="stable")

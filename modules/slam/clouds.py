@@ -1,4 +1,4 @@
-"""Clouds in base, from a lidar's points or a depth image, with the motion within a sweep undone."""
+"""Clouds in `base` from a lidar or a depth image, with motion compensation."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Cloud = NDArray[np.float64]  # (N, 3) [m], base
 
 
 class CloudReader:
-    """Reads one rig's clouds: the lidar's where there is one, else the depth camera's."""
+    """Reads the clouds of a rig's lidar or, without one, of its depth camera."""
 
     def __init__(self, rig: Rig, *, depth_range_max_m: float, depth_stride_px: int) -> None:
-        """Choose the sensor; `range_m` is what it is believed within, `T_base_sensor` its place."""
+        """Choose the sensor; `range_m` are its trusted limits, `T_base_sensor` its pose."""
         self.is_depth = Sensor.POINTS not in rig.sensors and rig.camera is not None
         self.range_m = (0.0, 100.0)
         self.T_base_sensor = se3.identity()
@@ -34,17 +34,17 @@ class CloudReader:
             self.T_base_sensor = rig.lidar.T_base_lidar
 
     def read(self, observation: Observation) -> Cloud | None:
-        """Return the observation's valid points, unswept; None where it has no cloud."""
+        """Return the valid points (N, 3) [m], base, without motion compensation; None without."""
         found = self._sensed(observation)
         if found is None:
             return None
         return np.asarray(se3.apply(self.T_base_sensor, found[self._valid(found)]))
 
     def read_unswept(self, observation: Observation, twist_s: NDArray[np.float64]) -> Cloud | None:
-        """Return the valid points as they were at the observation's stamp.
+        """Return the valid points (N, 3) [m], in `base` at the observation's stamp.
 
-        `twist_s` is base's motion per second; without times of points, or with broken ones, the
-        points stay where they are.
+        `twist_s` (6,) is the twist of `base` per second; without valid times of points, the points
+        are not moved.
         """
         times_s = observation.point_times_s
         if self.is_depth or times_s is None or observation.points_lidar is None:
@@ -73,7 +73,7 @@ class CloudReader:
         return np.asarray(self._rays_cam * depth.reshape(-1, 1).astype(np.float64))
 
     def _valid(self, points_sensor: Cloud) -> NDArray[np.bool_]:
-        """Tell which points are measurements; a camera's range is its depth."""
+        """Return (N,) whether points are valid; a camera's range is along its axis."""
         near_m, far_m = self.range_m
         with np.errstate(invalid="ignore", over="ignore"):
             if self.is_depth:
@@ -85,7 +85,7 @@ class CloudReader:
 
 
 def _moved(points: Cloud, times_s: NDArray[np.float64], twist_s: NDArray[np.float64]) -> Cloud:
-    """Return each point moved by the motion that base made in its time."""
+    """Return the points (N, 3) [m] moved by the twist times each point's time."""
     rate = twist_s[3:]
     speed = float(np.linalg.norm(rate))
     shift = times_s[:, None] * twist_s[:3]
@@ -99,7 +99,7 @@ def _moved(points: Cloud, times_s: NDArray[np.float64], twist_s: NDArray[np.floa
 
 
 def _rays_cam(camera: Camera, stride_px: int) -> Cloud:
-    """Return the rays (N, 3) with z = 1 of every stride-th pixel, lens distortion taken out."""
+    """Return the rays (N, 3), z = 1, cam, of every stride-th pixel, without distortion."""
     width, height = camera.size_wh
     start = stride_px // 2
     u, v = np.meshgrid(np.arange(start, width, stride_px), np.arange(start, height, stride_px))

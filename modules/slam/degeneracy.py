@@ -1,9 +1,9 @@
-"""How well the shape of what is seen holds a pose, per direction.
+"""Localizability: how well the geometry constrains a pose, per direction.
 
-Planes hold a pose along their normals only (Gelfand et al., "Geometrically Stable Sampling for the
-ICP Algorithm", 3DIM 2003). One wall leaves three directions open, a bare corridor one. There the
-registration follows noise, so its information along them is taken out, and what the motion tells
-remains ("solution remapping", Zhang, Kaess and Singh, ICRA 2016).
+Planes constrain a pose along their normals only (Gelfand et al., "Geometrically Stable Sampling for
+the ICP Algorithm", 3DIM 2003). One wall leaves three directions unconstrained, a bare corridor one.
+In these the registration follows noise, so its information there is removed, and the motion
+prediction is used ("solution remapping", Zhang, Kaess and Singh, ICRA 2016).
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ Doubles = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Localizability:
-    """Ratios between 0 (open) and about 1 (normals to all sides), and their directions.
+    """Ratios from 0 (unconstrained) to about 1 (normals in all directions), and their directions.
 
-    A direction is a motion about the points' centre, by the way that the points make in it.
+    A direction is a motion about the points' centre, in units of the points' displacement.
     """
 
     ratios: Doubles  # (6,), rising
@@ -36,7 +36,7 @@ class Localizability:
         )
 
     def held(self, ratio_min: float) -> Doubles:
-        """Return the (6, 6) projection of a twist on the directions that are not weak."""
+        """Return the projection (6, 6) of a twist on the directions that are not weak."""
         strong = self.directions[:, self.ratios >= ratio_min]
         return np.asarray(np.linalg.solve(self.scale, strong @ strong.T @ self.scale))
 
@@ -44,7 +44,7 @@ class Localizability:
 def localizability(
     points: NDArray[np.floating], normals: NDArray[np.floating], weights: NDArray[np.floating]
 ) -> Localizability:
-    """Return how points (N, 3) [m] with unit normals hold a pose; `weights` (N,) say how much."""
+    """Return how points (N, 3) [m] with unit normals (N, 3) and weights (N,) constrain a pose."""
     total = max(float(weights.sum()), 1e-12)
     centre = (weights @ points) / total
     offsets = (points - centre).astype(np.float64)

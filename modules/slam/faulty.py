@@ -1,4 +1,4 @@
-"""Any SLAM module, made to fail on purpose: for experiments on what the bus survives."""
+"""Fault injection into any SLAM module, for experiments on robustness."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
 IN_ANY_PROCESS = ("raise", "nan", "jump", "silence")
-# With run.isolation=process; else the bus is struck.
+# With run.isolation=process only; else the main process would fail.
 IN_ITS_OWN_PROCESS = ("hang", "kill", "memory", "stop")
 FAULTS = (*IN_ANY_PROCESS, *IN_ITS_OWN_PROCESS)
 _HANG_S = 3600.0
@@ -30,10 +30,10 @@ _GULP = 1 << 22  # numbers of 8 bytes
 
 
 class FaultyModule:
-    """Passes everything on to `module`, but strikes at random observations.
+    """Passes all calls on to `module`, and injects faults at random observations.
 
-    `silence`: it says that it is lost for `lasting_s`. `jump`: its poses are off by `jump_m` in a
-    random direction until it is activated again, and it does not say so.
+    `silence`: it reports LOST for `lasting_s`. `jump`: its poses are off by `jump_m` in a random
+    direction until the next activation, without any report.
     """
 
     def __init__(
@@ -65,20 +65,20 @@ class FaultyModule:
         return self._module.requires
 
     def activate(self, rig: Rig) -> None:
-        """Start anew, without the faults that last."""
+        """Start a session without active faults."""
         self._silent_until_ns, self._T_wrong_local = None, se3.identity()
         self._module.activate(rig)
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Place `local` in the map."""
+        """Set T_map_local (4, 4) [m]."""
         self._module.set_pose(T_map_local)
 
     def set_scene(self, scene: str) -> None:
-        """Tell the scene."""
+        """Set the confirmed scene."""
         self._module.set_scene(scene)
 
     def track(self, observation: Observation) -> Tracking:
-        """Return the module's answer, unless a fault strikes or one lasts."""
+        """Return the module's result, unless a fault is active."""
         fault = self._plan.strike(observation.stamp_ns)
         if fault in ("raise", *IN_ITS_OWN_PROCESS):
             getattr(self, f"_{fault}")()
@@ -97,7 +97,7 @@ class FaultyModule:
         return replace(tracking, T_local_base=T_local_base, status=status)
 
     def get_trajectory(self) -> Trajectory:
-        """Return the module's trajectory, right again."""
+        """Return the module's trajectory, without faults."""
         return self._module.get_trajectory()
 
     def get_map(self) -> MapLayers:
@@ -126,7 +126,7 @@ class FaultyModule:
         os.kill(os.getpid(), signal.SIGSTOP)
 
     def _memory(self) -> None:
-        """Take memory until the process's limit; where there is none, say so at once."""
+        """Allocate memory up to the process's limit; without a limit, raise at once."""
         hoard: list[NDArray[np.float64]] = []
         while resource.getrlimit(resource.RLIMIT_DATA)[0] != resource.RLIM_INFINITY:
             hoard.append(np.ones(_GULP))

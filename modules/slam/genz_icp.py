@@ -1,8 +1,8 @@
-"""The `genz_icp` SLAM module: GenZ-ICP, point to plane and point to point by what a cloud shows.
+"""The `genz_icp` SLAM module: GenZ-ICP, adaptive point-to-plane and point-to-point registration.
 
 Lee, Lim and Han, "GenZ-ICP: Generalizable and Degeneracy-Robust LiDAR Odometry Using an Adaptive
 Weighting", RA-L 2025. Of the library the registration, the map and the adaptive threshold are used;
-its own pipeline takes no guess, and keeps the voxel size of one run for the next.
+its pipeline accepts no initial guess, and keeps the voxel size across runs.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from .cloud_odometry import CloudOdometry
 from .clouds import Cloud, CloudReader
 from .quiet import quiet
 
-_DECIMALS = 9  # kept: its threads add up in any order, which changes the sixteenth
-_VOXEL_RANGE_M = (0.02, 2.0)  # of the voxel that adapts; as in the library
+_DECIMALS = 9  # rounding of results: the library's sums depend on the order of its threads
+_VOXEL_RANGE_M = (0.02, 2.0)  # limits of the adaptive voxel size, as in the library
 
 
 @dataclass(kw_only=True, eq=False)
 class GenzIcp(CloudOdometry):
-    """Registers 3D clouds; `conf/slam/genz_icp.yaml` says what the settings are."""
+    """Registers 3D clouds; the settings are described in `conf/slam/genz_icp.yaml`."""
 
     points_desired: int
     planarity_max: float
@@ -38,7 +38,7 @@ class GenzIcp(CloudOdometry):
     iterations_max: int
 
     def __post_init__(self) -> None:
-        """Check that the library is there, and the settings."""
+        """Check the settings, and that the library is installed."""
         if find_spec("genz_icp") is None:
             raise ConfigError("_target_", "GenzIcp", "pip install 'sceneslam[genz_icp]'")
         super().__post_init__()
@@ -94,14 +94,14 @@ class _GenzMap(CloudMap):
     def register(
         self, cloud: Cloud, T_local_guess: se3.Transform, observation: Observation
     ) -> se3.Transform:
-        """Return T_local_base of a cloud in base."""
+        """Return T_local_base (4, 4) [m] of a cloud (N, 3) [m], base."""
         thinned = self._thinned(cloud, self._voxel_m)
         adapted_m = self._voxel_m * len(thinned) / self._points_desired
         self._voxel_m = float(np.clip(adapted_m, *_VOXEL_RANGE_M))
         self.dense = self._thinned(cloud, max(0.5 * self._voxel_m, _VOXEL_RANGE_M[0]))
         self.source = self._thinned(self.dense, self._voxel_m)
         sigma_m = self._threshold._compute_threshold()
-        with quiet():  # it draws a page of status at every scan
+        with quiet():  # it prints its status at every scan
             T_local_base = self._registration._align_points_to_map(
                 points=self._parts._Vector3dVector(self.source),
                 voxel_map=self._map,
@@ -112,7 +112,7 @@ class _GenzMap(CloudMap):
         return np.asarray(np.round(np.asarray(T_local_base), _DECIMALS), np.float64)
 
     def add(self, T_local_guess: se3.Transform, T_local_base: se3.Transform) -> None:
-        """Add the last cloud to the map, and learn how good guesses are."""
+        """Add the last cloud to the map, and update the adaptive threshold."""
         deviation = se3.inverse(T_local_guess) @ T_local_base
         self._threshold._update_model_deviation(model_deviation=deviation)
         self._map._update(self._parts._Vector3dVector(self.dense), T_local_base)

@@ -1,4 +1,4 @@
-"""An occupancy grid in log odds that grows with what is seen."""
+"""An occupancy grid in log odds whose size grows with the measurements."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import GridLayer
 from sceneslam.types.observation import LaserScan
 
-_LIMIT = 3.5  # log odds; so that a door that opens is believed after some scans
-_STEP = _LIMIT / 127  # cells are int8: saturation is the limit
+_LIMIT = 3.5  # largest log odds; limited so that changes are learned within some scans
+_STEP = _LIMIT / 127  # log odds per unit of the int8 cells
 _HIT, _MISS = round(0.85 / _STEP), round(0.4 / _STEP)  # per measurement
-_GROWTH_CELLS = 128  # rows and columns are added in blocks, since growing copies the grid
+_GROWTH_CELLS = 128  # rows and columns are added in blocks, since each growth copies the grid
 _SHIFT = 4  # cv2 polygons with sub-cell corners, in 1/16 cells
 
 
@@ -27,8 +27,8 @@ class OccupancyGrid:
         """Make an empty grid.
 
         A beam without a return (inf) clears up to `clear_max_m` only: black surfaces, glass and
-        grazed walls give none either. The grid never has more than `cells_max` cells; what lies
-        outside then is left out.
+        walls at grazing angles give none either. The grid never has more than `cells_max` cells;
+        measurements outside are left out.
         """
         if not resolution_m > 0:
             raise ConfigError("resolution_m", resolution_m, "above 0")
@@ -42,14 +42,14 @@ class OccupancyGrid:
         self._origin = np.zeros(2, dtype=np.int64)  # cell (column, row) of the array's corner
 
     def insert(self, T_local_laser: se3.Transform, scan: LaserScan) -> None:
-        """Add a scan that was taken at T_local_laser (any mounting; seen from above)."""
+        """Add a scan at T_local_laser (4, 4) [m], projected to the xy plane."""
         ranges = scan.ranges_m.astype(np.float64)
         hit = np.isfinite(ranges) & (ranges >= scan.range_min_m) & (ranges <= scan.range_max_m)
         free_to = np.where(hit, ranges - 0.5 * self.resolution_m, 0.0)
         free_to[np.isposinf(ranges)] = min(self._clear_max_m, scan.range_max_m)
         angles = scan.angles_rad.astype(np.float64)
         half = 0.5 * scan.angle_step_rad
-        # One star-shaped polygon is the space that all beams passed: each beam is a wedge.
+        # One star-shaped polygon is the free space of all beams: each beam is a wedge.
         corners = _ends(
             T_local_laser,
             np.column_stack([angles - half, angles + half]).ravel(),
@@ -72,7 +72,7 @@ class OccupancyGrid:
 
     def _add(self, free_xy: NDArray[np.float64], hits_xy: NDArray[np.float64]) -> None:
         rows, columns = self._cells.shape
-        polygon = free_xy / self.resolution_m - self._origin - 0.5  # cell centres at whole numbers
+        polygon = free_xy / self.resolution_m - self._origin - 0.5  # cell centres at integers
         lowest = np.clip(np.floor(polygon.min(axis=0)), 0, (columns - 1, rows - 1)).astype(int)
         highest = np.clip(np.ceil(polygon.max(axis=0)), 0, (columns - 1, rows - 1)).astype(int)
         width, height = highest - lowest + 1
@@ -84,7 +84,7 @@ class OccupancyGrid:
         was = self._cells[cells[:, 1], cells[:, 0]].astype(np.int16)
         window = self._cells[lowest[1] : lowest[1] + height, lowest[0] : lowest[0] + width]
         cv2.subtract(window, free, dst=window)
-        # A cell that was hit is not free, and one scan is one measurement of it.
+        # A cell that was hit is not free, and each scan counts once per cell.
         self._cells[cells[:, 1], cells[:, 0]] = np.minimum(was + _HIT, 127)
 
     def _grow(self, seen_xy: NDArray[np.float64]) -> None:
@@ -109,7 +109,7 @@ class OccupancyGrid:
 def _ends(
     T_local_laser: se3.Transform, angles_rad: NDArray[np.float64], ranges_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return where beams end (N, 2) [m] in the local xy plane."""
+    """Return the end points (N, 2) [m] of beams in the xy plane of `local`."""
     x = ranges_m * np.cos(angles_rad)
     y = ranges_m * np.sin(angles_rad)
     return np.asarray(np.column_stack([x, y]) @ T_local_laser[:2, :2].T + T_local_laser[:2, 3])

@@ -1,7 +1,7 @@
 """The `kiss_icp` SLAM module: an adapter over KISS-ICP, for lidars and depth cameras.
 
 Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP", RA-L 2023. Of the library its parts are
-used: its pipeline stops the process where all stamps are equal or a rotation is off by 1e-10.
+used: its pipeline aborts the process if all stamps are equal or a rotation is off by 1e-10.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .clouds import Cloud, CloudReader
 
 @dataclass(kw_only=True, eq=False)
 class KissIcp(CloudOdometry):
-    """Registers 3D clouds; `conf/slam/kiss_icp.yaml` says what the settings are."""
+    """Registers 3D clouds; the settings are described in `conf/slam/kiss_icp.yaml`."""
 
     initial_threshold_m: float | None
     motion_min_m: float | None
@@ -42,7 +42,7 @@ class KissIcp(CloudOdometry):
 
 
 class _KissMap(CloudMap):
-    """KISS-ICP's parts, put together so that its answer can be judged before it joins the map."""
+    """KISS-ICP's parts, combined so that its result is checked before the map is updated."""
 
     def __init__(
         self,
@@ -58,14 +58,14 @@ class _KissMap(CloudMap):
         from kiss_icp.config.parser import KISSConfig
         from kiss_icp.kiss_icp import KissICP
 
-        # Constructed without validation, since the class would also read the environment.
+        # Constructed without validation, since the class would also read environment variables.
         config: Any = KISSConfig.model_construct(
             data=parts.DataConfig(max_range=range_max_m, min_range=0.0, deskew=False),
             mapping=parts.MappingConfig(voxel_size=voxel_m, max_points_per_voxel=points_per_voxel),
             registration=parts.RegistrationConfig(
                 max_num_iterations=iterations_max,
                 convergence_criterion=1e-4,
-                max_num_threads=1,  # more would add up in another order
+                max_num_threads=1,  # more threads change the order of sums
             ),
             adaptive_threshold=parts.AdaptiveThresholdConfig(
                 fixed_threshold=None,
@@ -79,7 +79,7 @@ class _KissMap(CloudMap):
     def register(
         self, cloud: Cloud, T_local_guess: se3.Transform, observation: Observation
     ) -> se3.Transform:
-        """Return T_local_base of a cloud (N, 3) in base."""
+        """Return T_local_base (4, 4) [m] of a cloud (N, 3) [m], base."""
         self.source, self.dense = self._odometry.voxelize(cloud)
         sigma_m = self._odometry.adaptive_threshold.get_threshold()
         T_local_base = self._odometry.registration.align_points_to_map(
@@ -92,7 +92,7 @@ class _KissMap(CloudMap):
         return np.array(T_local_base, dtype=np.float64)
 
     def add(self, T_local_guess: se3.Transform, T_local_base: se3.Transform) -> None:
-        """Add the last cloud to the map, and learn how good guesses are."""
+        """Add the last cloud to the map, and update the adaptive threshold."""
         deviation = se3.inverse(T_local_guess) @ T_local_base
         self._odometry.adaptive_threshold.update_model_deviation(deviation)
         self._odometry.local_map.update(self.dense, T_local_base)

@@ -1,4 +1,4 @@
-"""The `odometry` SLAM module: dead reckoning from the source's own odometry, without a map."""
+"""The `odometry` SLAM module: dead reckoning by the source's odometry, without a map."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor, Wheels
 from sceneslam.types.trajectory import Trajectory
 
-_DEVIATION_MIN = 1e-4  # m and rad, of any pose
+_DEVIATION_MIN = 1e-4  # m and rad: smallest standard deviation
 
 
 @dataclass(kw_only=True, eq=False)
 class Odometry:
-    """Dead reckoning; `conf/slam/odometry.yaml` says what the settings are."""
+    """Dead reckoning; the settings are described in `conf/slam/odometry.yaml`."""
 
     use_gyro: bool
     _motion: MotionModel = field(init=False)
     _wheels: Wheels = field(init=False)
-    _T_odom_base: se3.Transform | None = field(default=None, init=False)  # the last there was
-    _is_gap: bool = field(default=False, init=False)  # since then there was none
+    _T_odom_base: se3.Transform | None = field(default=None, init=False)  # last odometry
+    _is_gap: bool = field(default=False, init=False)  # odometry is missing since then
     _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
     _covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)), init=False)
 
@@ -35,22 +35,22 @@ class Odometry:
         return (frozenset({Sensor.ODOMETRY}),)
 
     def activate(self, rig: Rig) -> None:
-        """Start anew: `local` at the next observation that has odometry."""
+        """Start a session: `local` is at the next observation with odometry."""
         self._motion, self._wheels = MotionModel(rig), rig.wheels
         self._T_odom_base, self._is_gap = None, False
         self._T_local_base = se3.identity()
         self._covariance = np.eye(6) * _DEVIATION_MIN**2
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Do nothing: its poses are in `local` wherever that lies."""
+        """Do nothing: poses are reported in `local`."""
 
     def set_scene(self, scene: str) -> None:
-        """Do nothing: wheels turn alike in every scene."""
+        """Do nothing: odometry does not depend on the scene."""
 
     def track(self, observation: Observation) -> Tracking:
-        """Return T_local_base; LOST where the observation has no odometry.
+        """Return T_local_base (4, 4) [m]; LOST without odometry.
 
-        When odometry is back, its own motion over the gap counts.
+        After a gap, the motion over the gap is that of odometry.
         """
         if not self.use_gyro:
             observation = replace(observation, gyro_base=None)
@@ -61,29 +61,29 @@ class Odometry:
             return self._answer(observation, TrackingStatus.LOST)
         if before is not None:
             T_prev_curr = se3.inverse(before) @ T_odom_base
-            if not self._is_gap:  # the gyro does not speak for a gap
+            if not self._is_gap:  # after a gap the gyro is not used
                 T_prev_curr = se3.with_yaw(T_prev_curr, yaw_rad)
             self._move(T_prev_curr)
         self._T_odom_base, self._is_gap = T_odom_base, False
         return self._answer(observation, TrackingStatus.TRACKING)
 
     def get_trajectory(self) -> Trajectory:
-        """Return no poses: dead reckoning revises nothing."""
+        """Return no poses: dead reckoning does not revise poses."""
         return Trajectory.empty()
 
     def get_map(self) -> MapLayers:
-        """Return no layers: dead reckoning sees nothing."""
+        """Return no layers: dead reckoning makes no map."""
         return MapLayers()
 
     def shutdown(self) -> None:
-        """Do nothing: nothing was taken."""
+        """Do nothing."""
 
     def _move(self, T_prev_curr: se3.Transform) -> None:
         distance_m = float(np.linalg.norm(T_prev_curr[:3, 3]))
         angle_rad = float(se3.rotation_angle_rad(T_prev_curr))
         along = self._wheels.drift_ratio * distance_m
         turn = self._wheels.drift_ratio * angle_rad + self._wheels.drift_rad_per_m * distance_m
-        # Errors of odometry go on in the same way: deviations add up, not variances.
+        # Errors of odometry are systematic: standard deviations add up, not variances.
         carried = se3.adjoint(se3.inverse(T_prev_curr))
         covariance = carried @ self._covariance @ carried.T
         deviation = np.sqrt(np.diag(covariance)) + np.array([along] * 3 + [turn] * 3)

@@ -1,4 +1,4 @@
-"""The `pipelined` SLAM module: a system whose poses come late, several at once, or not yet."""
+"""The `pipelined` SLAM module: a system that returns poses later, possibly several at once."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from sceneslam.types.trajectory import Trajectory
 
 
 class Pipelined:
-    """Fulfils `SlamModule` by a `PipelinedSlam`.
+    """Implements `SlamModule` by a `PipelinedSlam`.
 
-    Until the pose of an observation comes, odometry carries the newest one on (constant velocity
-    without odometry), as DEGRADED; after `late_max_s` it is LOST.
+    Until the pose of an observation arrives, the newest pose is extrapolated by odometry (constant
+    velocity without odometry) and reported as DEGRADED; after `late_max_s` as LOST.
     """
 
     def __init__(self, system: PipelinedSlam, late_max_s: float) -> None:
@@ -29,23 +29,23 @@ class Pipelined:
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return the system's."""
+        """Return the system's required sensors."""
         return self._system.requires
 
     def activate(self, rig: Rig) -> None:
-        """Start anew."""
+        """Start a session."""
         self._pipeline, self._revision = Pipeline(self._late_max_s), 0
         self._system.activate(rig)
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Do nothing: its poses are in `local` wherever that lies."""
+        """Do nothing: poses are reported in `local`."""
 
     def set_scene(self, scene: str) -> None:
-        """Tell the system."""
+        """Pass the scene to the system."""
         self._system.set_scene(scene)
 
     def track(self, observation: Observation) -> Tracking:
-        """Return the pose at the observation; ValueError for poses that nobody waits for."""
+        """Return the pose at the observation; raises ValueError for poses with unknown stamps."""
         self._pipeline.note(observation)
         poses = self._system.feed(observation)
         self._pipeline.take(poses)
@@ -53,7 +53,7 @@ class Pipelined:
         return self._pipeline.report(observation, self._revision)
 
     def get_trajectory(self) -> Trajectory:
-        """Return what the system revised, else the poses that came late, if any."""
+        """Return the system's revised poses, else those that came late, if any."""
         revised = self._system.get_trajectory()
         return revised if len(revised) else self._pipeline.trajectory()
 

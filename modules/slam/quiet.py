@@ -1,4 +1,4 @@
-"""Libraries that write to standard output, which is the command line's."""
+"""Suppression of libraries' output to standard output."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Drop what is written to standard output meanwhile, by C++ and by every thread."""
+    """Discard all output to standard output in this context, by C++ and by all threads."""
     kept = os.dup(1)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:

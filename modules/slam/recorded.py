@@ -1,4 +1,4 @@
-"""The `recorded` SLAM module: replays what another system put out, gaps and all."""
+"""The `recorded` SLAM module: replays the trajectory of another system, with its gaps."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from sceneslam.types.recorded import RecordedTrajectory, read_recorded
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
-_BASE_FRAMES = ("", "base", "base_link")  # need no extrinsics
+_BASE_FRAMES = ("", "base", "base_link")  # frames that need no extrinsics
 
 
 class Recorded:
-    """Gives the recorded pose of every observation; `conf/slam/recorded.yaml` names the settings.
+    """Returns recorded poses; the settings are described in `conf/slam/recorded.yaml`.
 
-    Between two recorded poses it interpolates, which looks ahead by less than one gap. LOST
-    before the recording begins, after it ends, in its gaps, and while it starts up.
+    Between two recorded poses it interpolates, which looks ahead by less than one gap. LOST before
+    the recording begins, after it ends, in its gaps, and during its start-up time.
     """
 
     def __init__(
@@ -43,28 +43,28 @@ class Recorded:
         period_ns = float(np.median(np.diff(self._stamps_ns))) if len(self._stamps_ns) > 1 else 0.0
         self._gap_ns = gap_periods * period_ns
         self._startup_ns = round(startup_s * 1e9)
-        self._ready_ns: int | None = None  # from when on it gives poses
+        self._ready_ns: int | None = None  # stamp from which on it returns poses
         self._T_local_world: se3.Transform | None = None
         self._T_local_base = se3.identity()
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return every sensor alone: a stamp is all it takes, whatever was measured."""
+        """Return each sensor as an alternative: only stamps are used."""
         return tuple(frozenset({sensor}) for sensor in Sensor)
 
     def activate(self, rig: Rig) -> None:
-        """Start anew: `local` at the first observation that has a recorded pose."""
+        """Start a session: `local` is at the first observation with a recorded pose."""
         self._ready_ns, self._T_local_world = None, None
         self._T_local_base = se3.identity()
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Do nothing: its poses are in `local` wherever that lies."""
+        """Do nothing: poses are reported in `local`."""
 
     def set_scene(self, scene: str) -> None:
-        """Do nothing: what was recorded stands."""
+        """Do nothing: recorded poses do not depend on the scene."""
 
     def track(self, observation: Observation) -> Tracking:
-        """Return the recorded T_local_base; LOST where there is none, or not yet."""
+        """Return the recorded T_local_base (4, 4) [m]; LOST without one."""
         if self._ready_ns is None:
             self._ready_ns = observation.stamp_ns + self._startup_ns
         T_world_base = self._pose_at(observation.stamp_ns)
@@ -76,7 +76,7 @@ class Recorded:
         return self._answer(observation.stamp_ns, TrackingStatus.TRACKING)
 
     def get_trajectory(self) -> Trajectory:
-        """Return no poses: a recording revises nothing."""
+        """Return no poses: recorded poses are not revised."""
         return Trajectory.empty()
 
     def get_map(self) -> MapLayers:
@@ -84,10 +84,10 @@ class Recorded:
         return MapLayers()
 
     def shutdown(self) -> None:
-        """Do nothing: nothing was taken."""
+        """Do nothing."""
 
     def _pose_at(self, stamp_ns: int) -> se3.Transform | None:
-        """Return T_world_base at a stamp, None in a gap and outside of the recording."""
+        """Return T_world_base (4, 4) [m] at a stamp, None in a gap or outside of the recording."""
         after = int(np.searchsorted(self._stamps_ns, stamp_ns))
         if after == len(self._stamps_ns):
             return None
@@ -112,7 +112,7 @@ class Recorded:
 
 
 def _chosen(found: tuple[RecordedTrajectory, ...], sequence: int | None) -> RecordedTrajectory:
-    """Return the sequence that is asked for, or the only one."""
+    """Return the configured sequence, or the only one."""
     matching = [one for one in found if sequence is None or one.sequence == sequence]
     if len(matching) != 1:
         held = ", ".join(str(one.sequence) for one in found) or "none"
@@ -121,7 +121,7 @@ def _chosen(found: tuple[RecordedTrajectory, ...], sequence: int | None) -> Reco
 
 
 def _extrinsics(values: list[float] | None, frame: str) -> se3.Transform:
-    """Return T_base_frame of `x y z qx qy qz qw`; a frame other than base's has to have it."""
+    """Return T_base_frame (4, 4) [m] of `x y z qx qy qz qw`, required unless it is base."""
     if values is None and frame in _BASE_FRAMES:
         return se3.identity()
     quat_is_zero = values is not None and not any(values[3:])

@@ -1,8 +1,8 @@
 """The `rko_lio` SLAM module: lidar-inertial odometry by RKO-LIO.
 
 Malladi et al., "A Robust Approach for LiDAR-Inertial Odometry Without Sensor-Specific Modeling",
-RA-L 2026. The library predicts and deskews by gyro and accelerometer, and levels its world by
-gravity; of its answers the motions from cloud to cloud are used.
+RA-L 2026. The library predicts and compensates motion by gyro and accelerometer, and aligns its
+world with gravity; its motions between clouds are used.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from .quiet import quiet
 
 @dataclass(kw_only=True, eq=False)
 class RkoLio(CloudOdometry):
-    """Registers a lidar's clouds; `conf/slam/rko_lio.yaml` says what the settings are."""
+    """Registers a lidar's clouds; the settings are described in `conf/slam/rko_lio.yaml`."""
 
     correspondence_max_m: float | None
     is_at_rest_first: bool
@@ -35,14 +35,14 @@ class RkoLio(CloudOdometry):
     depth_stride_px: int = field(default=1, init=False)
 
     def __post_init__(self) -> None:
-        """Check that the library is there, and the settings."""
+        """Check the settings, and that the library is installed."""
         if find_spec("rko_lio") is None:
             raise ConfigError("_target_", "RkoLio", "pip install 'sceneslam[rko_lio]'")
         super().__post_init__()
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return the sensors, all of which are needed."""
+        """Return the required sensors, all of which are needed."""
         return (frozenset({Sensor.POINTS, Sensor.GYRO, Sensor.ACCELEROMETER}),)
 
     def make_map(self, voxel_m: float, reader: CloudReader) -> CloudMap:
@@ -57,7 +57,7 @@ class RkoLio(CloudOdometry):
 
 
 class _RkoMap(CloudMap):
-    """The library, which takes every cloud into its own map at its own pose."""
+    """The library, which adds every cloud to its own map at its own pose."""
 
     def __init__(self, reader: CloudReader, voxel_m: float, **settings: Any) -> None:
         from rko_lio.config import LIOConfig
@@ -67,14 +67,14 @@ class _RkoMap(CloudMap):
         super().__init__(voxel_m=voxel_m, range_max_m=far_m)
         self._T_base_lidar = reader.T_base_sensor
         common = {"voxel_size": voxel_m, "min_range": near_m, "max_range": far_m}
-        # More threads would add up in another order.
+        # More threads change the order of sums.
         self._lio = LIO(LIOConfig(**common, **settings, max_num_threads=1))
         self._T_local_world: se3.Transform | None = None
 
     def register(
         self, cloud: Cloud, T_local_guess: se3.Transform, observation: Observation
     ) -> se3.Transform | None:
-        """Return T_local_base of the observation's own points and inertial samples."""
+        """Return T_local_base (4, 4) [m] by the observation's points and IMU samples."""
         from rko_lio.rko_lio_pybind import InputError
 
         self.source = self.dense = cloud
@@ -86,7 +86,7 @@ class _RkoMap(CloudMap):
         times_s = observation.point_times_s
         after_ns = np.zeros(len(points)) if times_s is None else times_s * 1e9
         stamps_ns = observation.stamp_ns + np.rint(after_ns).astype(np.int64)
-        with quiet():  # it logs there
+        with quiet():  # it prints logs
             try:
                 self._lio.register_scan(points, stamps_ns, self._T_base_lidar)
             except InputError:
@@ -97,7 +97,7 @@ class _RkoMap(CloudMap):
         return self._T_local_world @ self._T_world_base
 
     def add(self, T_local_guess: se3.Transform, T_local_base: se3.Transform) -> None:
-        """Go on from this pose."""
+        """Continue from this pose."""
         self._T_local_world = T_local_base @ se3.inverse(self._T_world_base)
 
     def points(self) -> NDArray[Any]:
@@ -108,7 +108,7 @@ class _RkoMap(CloudMap):
 
 
 def _inertial(observation: Observation) -> list[tuple[float, NDArray[Any], NDArray[Any]]]:
-    """Return time after the stamp [s], rate and force, at the gyro's samples."""
+    """Return (time after the stamp [s], rate (3,), force (3,)) at the gyro's samples."""
     gyro, force = observation.gyro_base, observation.accelerometer_base
     if gyro is None or force is None:
         return []

@@ -1,4 +1,4 @@
-"""The poses that were told, each tied to a keyframe, so that they follow when it is moved."""
+"""Reported poses relative to keyframes, so that they move with the keyframes' corrections."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .keyframe_map import KeyframeMap
 
 
 class PoseHistory:
-    """One entry per observation that held a pose; 150 bytes each."""
+    """One entry of 150 bytes per tracked observation."""
 
     def __init__(self, keyframes: KeyframeMap) -> None:
         self._map = keyframes
@@ -20,13 +20,13 @@ class PoseHistory:
         self._T_key_base: list[se3.Transform] = []
 
     def add(self, stamp_ns: int, reference: int, T_local_base: se3.Transform) -> None:
-        """Remember a pose as seen from the keyframe `reference`."""
+        """Add T_local_base (4, 4) [m] relative to the keyframe `reference`."""
         self._stamps_ns.append(stamp_ns)
         self._references.append(reference)
         self._T_key_base.append(self._map[reference].T_cam_local @ T_local_base)
 
     def trajectory(self) -> Trajectory:
-        """Return T_local_base at all stamps, by the keyframes' poses of now."""
+        """Return T_local_base at all stamps, by the keyframes' current poses."""
         if not self._stamps_ns:
             return Trajectory.empty()
         keys = np.array([keyframe.T_local_cam for keyframe in self._map.keyframes])

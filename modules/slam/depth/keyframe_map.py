@@ -1,4 +1,4 @@
-"""The keyframes, and which of them show what the camera sees."""
+"""The keyframes, and search for those that overlap with the camera's view."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from ..surfaces.keyframe import SurfaceKeyframe
 from ..surfaces.registration import Samples, compare
 from ..surfaces.surface import Floats, Grid, Surface
 
-_PROBES = 300  # points by which an overlap is measured
+_PROBES = 300  # sample points for the overlap
 _PROBE_GATE_M = 0.1
-_NEAREST = 8  # keyframes whose overlap is measured
-_IMAGES_MIN = 2  # a cell of the cloud was seen at least so often
+_NEAREST = 8  # nearest keyframes whose overlap is computed
+_IMAGES_MIN = 2  # smallest number of images of a cell in the cloud
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Overlap:
-    """A keyframe, by its number, and the share of the points that it shows too."""
+    """A keyframe's index, and the share of the sample points that it shows."""
 
     index: int
     ratio: float
 
 
 class KeyframeMap:
-    """All keyframes, in the order in which they were made."""
+    """All keyframes in order of time."""
 
     def __init__(self, grid: Grid) -> None:
         self.grid = grid
@@ -42,12 +42,12 @@ class KeyframeMap:
         return self.keyframes[index]
 
     def add(self, surface: Surface, T_local_cam: se3.Transform, *, stamp_ns: int) -> int:
-        """Keep a view; return its number."""
+        """Add a keyframe at T_local_cam (4, 4) [m]; return its index."""
         self.keyframes.append(SurfaceKeyframe(surface, T_local_cam, stamp_ns=stamp_ns))
         return len(self.keyframes) - 1
 
     def overlaps(self, samples: Samples, T_local_cam: se3.Transform) -> Sequence[Overlap]:
-        """Return the keyframes that look at the same place, the best first."""
+        """Return the overlapping keyframes, the best first."""
         probes = samples.thinned(_PROBES)
         found = []
         for index in self._nearest(probes, T_local_cam):
@@ -58,7 +58,7 @@ class KeyframeMap:
         return sorted(found, key=lambda overlap: (-overlap.ratio, overlap.index))
 
     def alike(self, surface: Surface, count: int) -> Sequence[int]:
-        """Return the keyframes whose view looks most like the surface, wherever they are."""
+        """Return the `count` keyframes whose depth thumbnails are most similar to the surface's."""
         view = self._thumbnail(surface.disparity, surface.valid)
         unlike = []
         for keyframe in self.keyframes:
@@ -79,7 +79,7 @@ class KeyframeMap:
         return np.asarray(points[np.sort(rows)])
 
     def _nearest(self, probes: Samples, T_local_cam: se3.Transform) -> NDArray[np.int64]:
-        """Return the keyframes whose view's middle is nearest to that of this view."""
+        """Return the keyframes whose view has the nearest centre."""
         depth_m = float(np.median(probes.points[:, 2]))
         poses = np.array([keyframe.T_local_cam for keyframe in self.keyframes])
         middles = poses[:, :3, 3] + depth_m * poses[:, :3, 2]

@@ -1,4 +1,4 @@
-"""Where the camera is beside the keyframes: near where it should be, else where it looks alike."""
+"""Localization of the camera: by keyframes near the prediction, else by similar keyframes."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from ..surfaces.registration import CameraPrior, Samples, SurfaceRegistration, r
 from ..surfaces.surface import Surface
 from .keyframe_map import KeyframeMap
 
-_TOGETHER = 3  # keyframes that an image is registered with
+_TOGETHER = 3  # keyframes for one registration
 _USEFUL_OVERLAP = 0.2
-_ALIKE = 3  # keyframes that a lost camera is tried at
-_GOOD_RATIO = 0.8  # of the points that agree; with less, another start is tried as well
-_SURE_RATIO = 0.6  # of the points that agree, for a place that motion did not lead to
-_FAR = 100.0  # squared deviations from where motion led to, ten in one direction
+_ALIKE = 3  # candidate keyframes for relocalization
+_GOOD_RATIO = 0.8  # share of matching points; below, another start is tried as well
+_SURE_RATIO = 0.6  # share of matching points for relocalization
+_FAR = 100.0  # largest squared Mahalanobis distance to the prediction: ten sigma in one direction
 
 
 class DepthLocalizer:
@@ -30,9 +30,9 @@ class DepthLocalizer:
     def near(
         self, samples: Samples, prior: CameraPrior, T_local_cam_before: se3.Transform | None
     ) -> SurfaceRegistration | None:
-        """Return the camera's pose around the prior; where that fits badly, around the last pose.
+        """Return the camera's pose near the prior; if the fit is poor, near the last pose.
 
-        A hand that stopped, or turned back, is nearer to where it was than to where it went.
+        After a sudden stop or reversal, the last pose is a better start than the prediction.
         """
         found = self._register(samples, prior)
         is_good = found is not None and found.matched_ratio >= _GOOD_RATIO
@@ -46,7 +46,7 @@ class DepthLocalizer:
     def alike(
         self, samples: Samples, surface: Surface, expected: CameraPrior
     ) -> SurfaceRegistration | None:
-        """Return the camera's pose by a keyframe that looks alike, where motion can lead to it."""
+        """Return the camera's pose by a similar keyframe, if it is consistent with the motion."""
         for index in self._map.alike(surface, _ALIKE):
             there = self._register(samples, CameraPrior(self._map[index].T_local_cam, np.eye(6)))
             if there is None or there.localizability.ratios[0] < self._weak_ratio:

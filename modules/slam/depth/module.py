@@ -26,7 +26,7 @@ _SAMPLES_MIN = 100
 
 @dataclass(kw_only=True, eq=False)
 class DepthSlam:
-    """Registers depth images with keyframes; `conf/slam/depth.yaml` says what the settings are."""
+    """Registers depth images with keyframes; settings as in `conf/slam/depth.yaml`."""
 
     keyframe_overlap_ratio: float
     matched_min_ratio: float
@@ -46,16 +46,16 @@ class DepthSlam:
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return that depth suffices; odometry and gyro are used when present."""
+        """Return depth; odometry and gyro are used when present."""
         return (frozenset({Sensor.DEPTH}),)
 
     @property
     def keyframe_count(self) -> int:
-        """Return how many views are kept; each takes 0.5 MB."""
+        """Return the number of keyframes; each takes 0.5 MB."""
         return len(self._map)
 
     def activate(self, rig: Rig) -> None:
-        """Start anew with an empty map; raises InputError for a rig without a camera."""
+        """Start a session with an empty map; raises InputError for a rig without a camera."""
         if rig.camera is None:
             raise InputError("rig: depth needs the camera's intrinsics, got none")
         self._camera = rig.camera
@@ -71,13 +71,13 @@ class DepthSlam:
         self._reference, self._revision = 0, 0
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Do nothing: its poses are in `local` wherever that lies."""
+        """Do nothing: poses are reported in `local`."""
 
     def set_scene(self, scene: str) -> None:
-        """Do nothing: depth is the same by day and by night."""
+        """Do nothing: depth does not depend on the scene."""
 
     def track(self, observation: Observation) -> Tracking:
-        """Return T_local_base at the observation."""
+        """Return T_local_base (4, 4) [m] at the observation."""
         prediction = self._predictor.predict(observation)
         if observation.depth_m is None:
             return self._bridge(observation, prediction, can_coast=True)
@@ -107,12 +107,12 @@ class DepthSlam:
         return MapLayers(points=PointLayer(points=self._map.cloud(self.cloud_voxel_m)))
 
     def shutdown(self) -> None:
-        """Do nothing: only memory is held, and the map stays readable."""
+        """Do nothing; the map stays readable."""
 
     def _start(
         self, observation: Observation, surface: Surface, samples: Samples, prediction: Prediction
     ) -> Tracking:
-        """Make the first keyframe, or the first of a place that odometry alone leads to."""
+        """Make the first keyframe of the session, or after tracking was lost."""
         T_local_cam = prediction.T_local_base @ self._camera.T_base_cam
         self._add_keyframe(observation, surface, T_local_cam)
         is_first = len(self._map) == 1 and not self._predictor.is_lost
@@ -168,7 +168,7 @@ class DepthSlam:
         samples: Samples,
         T_local_cam: se3.Transform,
     ) -> None:
-        """Improve the map by the image: a new keyframe, or a better one."""
+        """Add the image to the map: as a new keyframe, or fused into an existing one."""
         overlaps = self._map.overlaps(samples, T_local_cam)
         best = overlaps[0]
         self._reference = best.index
@@ -193,7 +193,7 @@ class DepthSlam:
     def _bridge(
         self, observation: Observation, prediction: Prediction, *, can_coast: bool
     ) -> Tracking:
-        """Go on without depth: by odometry, for a moment as before, else not at all."""
+        """Return the pose by odometry, or shortly by constant velocity, else LOST."""
         can_coast = can_coast and len(self._map) > 0
         status = self._predictor.bridge(observation, prediction, can_coast=can_coast)
         if status is not TrackingStatus.LOST:

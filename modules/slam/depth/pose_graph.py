@@ -1,7 +1,7 @@
-"""Keyframes made consistent: each is registered with the others that show the same place.
+"""Pose graph over keyframes: each is registered with all overlapping ones.
 
-Frame-to-model tracking drifts from keyframe to keyframe; the graph takes back what a return to
-known places contradicts. Batch Levenberg-Marquardt in gtsam: there are few keyframes.
+Frame-to-model tracking drifts; the graph corrects the drift when known places are revisited. Batch
+Levenberg-Marquardt in gtsam is used, as there are few keyframes.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ _MATCHED_MIN_RATIO = 0.5
 _OVERLAP_MIN_RATIO = 0.25
 _PARTNERS_MAX = 8
 _HUBER_SIGMAS = 3.0
-_LOOSE = 10.0  # information [1/m^2, 1/rad^2] by which keyframes stay where tracking put them
+_LOOSE = 10.0  # information [1/m^2, 1/rad^2] of the edges by tracking
 _GTSAM_ORDER = [3, 4, 5, 0, 1, 2]  # rotation first
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegistrationEdge:
-    """A keyframe seen from another."""
+    """The measured pose of a keyframe relative to another."""
 
     first: int
     second: int
@@ -36,16 +36,16 @@ class RegistrationEdge:
 
 
 class DepthPoseGraph:
-    """Registrations among keyframes, done one per call, so that no frame waits for many."""
+    """Registrations among keyframes, one per call, to bound the time per frame."""
 
     def __init__(self, keyframes: KeyframeMap, *, weak_ratio: float) -> None:
         self._map, self._weak_ratio = keyframes, weak_ratio
         self._edges: list[RegistrationEdge] = []
         self._waiting: list[tuple[int, int]] = []
-        self.is_fresh = False  # there are edges that the poses do not know yet
+        self.is_fresh = False  # there are new edges since the last optimisation
 
     def connect(self, index: int) -> None:
-        """Have a new keyframe registered with those that it overlaps."""
+        """Queue registrations of a new keyframe with all overlapping ones."""
         if index:
             self._edges.append(self._chain(index))
         samples = samples_of(self._map[index].surface(), self._map.grid)
@@ -54,7 +54,7 @@ class DepthPoseGraph:
         self._waiting += [(partner, index) for partner in partners[:_PARTNERS_MAX]]
 
     def advance(self) -> bool:
-        """Do one registration that waits; return whether it was the last of them."""
+        """Do one queued registration; return whether it was the last."""
         if not self._waiting:
             return False
         edge = self._register(*self._waiting.pop(0))
@@ -64,14 +64,14 @@ class DepthPoseGraph:
         return not self._waiting and self.is_fresh
 
     def finish(self) -> None:
-        """Do all registrations that wait, and solve."""
+        """Do all queued registrations, and optimise."""
         while self._waiting:
             self.advance()
         if self.is_fresh:
             self.solve()
 
     def solve(self) -> None:
-        """Move the keyframes to where their registrations agree best; the first stays."""
+        """Optimise the keyframes' poses; the first is fixed."""
         import gtsam
 
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -97,7 +97,7 @@ class DepthPoseGraph:
         self.is_fresh = False
 
     def _chain(self, index: int) -> RegistrationEdge:
-        """Return what tracking told of a keyframe, which holds it where nothing else does."""
+        """Return the weak edge by tracking, for directions without another constraint."""
         before, this = self._map[index - 1], self._map[index]
         return RegistrationEdge(
             index - 1, index, before.T_cam_local @ this.T_local_cam, np.zeros((6, 6))

@@ -1,4 +1,4 @@
-"""The keyframes as a map: a thinned cloud, and a graph of the motions between them."""
+"""Keyframes of direct tracking: a downsampled cloud, and a pose graph."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from sceneslam.types.maps import PointLayer, PoseGraphLayer
 
 from .view import DirectView, Tracker
 
-_CLOUD_STEP_M, _CLOUD_TURN_RAD = 0.2, 0.2  # between two keyframes that give points
+_CLOUD_STEP_M, _CLOUD_TURN_RAD = 0.2, 0.2  # smallest motion between keyframes that add points
 _CLOUD_STRIDE_PX = 2
 
 
 class DirectKeyframes:
-    """Keeps poses of all keyframes, and points of those that show something new."""
+    """Stores the poses of all keyframes, and points of those with a new view."""
 
     def __init__(self, tracker: Tracker, voxel_m: float) -> None:
         self._tracker, self._voxel_m = tracker, voxel_m
         self._stamps_ns: list[int] = []
         self._T_local_cam: list[se3.Transform] = []
-        self._edges: list[tuple[int, NDArray[np.float64]]] = []  # to a node, with information
+        self._edges: list[tuple[int, NDArray[np.float64]]] = []  # target node and information
         self._points: list[NDArray[np.float32]] = []
-        self._T_local_shown: se3.Transform | None = None  # of the last that gave points
+        self._T_local_shown: se3.Transform | None = None  # of the last keyframe that added points
 
     def add(
         self,
@@ -48,7 +48,7 @@ class DirectKeyframes:
         self._points.append(points.astype(np.float32))
 
     def cloud(self) -> PointLayer | None:
-        """Return the points in local, one per voxel; None without a point."""
+        """Return the points (N, 3) [m], local, one per voxel; None without a point."""
         if not self._points:
             return None
         points = np.concatenate(self._points)
@@ -57,7 +57,7 @@ class DirectKeyframes:
         return PointLayer(points=points[np.sort(first)])
 
     def graph(self, T_cam_base: se3.Transform) -> PoseGraphLayer | None:
-        """Return base at the keyframes and the motions between them; None without a keyframe."""
+        """Return the graph of T_local_base at the keyframes; None without a keyframe."""
         if not self._stamps_ns:
             return None
         T_local_base = np.stack(self._T_local_cam) @ T_cam_base

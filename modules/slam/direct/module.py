@@ -1,8 +1,8 @@
 """The `direct` SLAM module: RGB-D tracking on pixels, frame to keyframe, without features.
 
 Photometric and depth residuals are minimised by OpenCV's RGB-D odometry (after Steinbruecker, Sturm
-and Cremers, "Real-Time Visual Odometry from Dense RGB-D Images", ICCVW 2011). It is for rooms with
-few corners but shading. What it lacks is here: whether an answer is one, and its covariance.
+and Cremers, "Real-Time Visual Odometry from Dense RGB-D Images", ICCVW 2011). It suits rooms with
+few corners but shading. This module adds checks of the result, and its covariance.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _POSITIVE = (
     "width_px keyframe_step_m keyframe_turn_rad step_max_m turn_max_rad weak_m weak_rad "
     "cloud_voxel_m"
 )
-_PIXELS_MIN = 300  # that both views show; with fewer there is nothing to compare
+_PIXELS_MIN = 300  # smallest number of pixels that both views show
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Located:
-    """Where a view is, and how it lies on another there."""
+    """The pose of a view, and its comparison with a reference view."""
 
     T_local_cam: se3.Transform
     comparison: Comparison
@@ -40,7 +40,7 @@ class _Located:
 
 @dataclass(kw_only=True, eq=False)
 class DirectSlam:
-    """Registers images with depth; `conf/slam/direct.yaml` says what the settings are."""
+    """Registers images with depth; the settings are described in `conf/slam/direct.yaml`."""
 
     width_px: int
     keyframe_step_m: float
@@ -67,7 +67,7 @@ class DirectSlam:
         return (frozenset({Sensor.IMAGE, Sensor.DEPTH}),)
 
     def activate(self, rig: Rig) -> None:
-        """Start anew with an empty map; raises InputError for a rig without a camera."""
+        """Start a session with an empty map; raises InputError for a rig without a camera."""
         if rig.camera is None:
             raise InputError("rig: direct needs the camera's intrinsics, got none")
         self._camera = rig.camera
@@ -80,13 +80,13 @@ class DirectSlam:
         self._T_local_base = se3.identity()
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Do nothing: its poses are in `local` wherever that lies."""
+        """Do nothing: poses are reported in `local`."""
 
     def set_scene(self, scene: str) -> None:
-        """Do nothing: it says itself when it sees too little."""
+        """Do nothing: tracking does not depend on the scene."""
 
     def track(self, observation: Observation) -> Tracking:
-        """Return T_local_base at the observation."""
+        """Return T_local_base (4, 4) [m] at the observation."""
         prediction = self._predictor.predict(observation)
         image, depth_m = observation.image_bgr, observation.depth_m
         if image is None or depth_m is None:
@@ -121,10 +121,10 @@ class DirectSlam:
         return MapLayers(points=points, pose_graph=graph)
 
     def shutdown(self) -> None:
-        """Do nothing: only memory is held, and the map stays readable."""
+        """Do nothing; the map stays readable."""
 
     def _locate(self, view: DirectView) -> _Located | None:
-        """Return the view's place beside the keyframe, or else beside the view before."""
+        """Return the view's pose relative to the keyframe, else to the previous view."""
         candidates = ((self._key, self._T_local_key), (self._last, self._T_local_last))
         for other, T_local_other in candidates:
             T_other_cam = None if other is None else self._tracker.register(view, other)
@@ -139,7 +139,7 @@ class DirectSlam:
     def _begin(
         self, observation: Observation, prediction: Prediction, view: DirectView
     ) -> Tracking:
-        """Make the first keyframe, or the first of a place that odometry alone leads to."""
+        """Make the first keyframe of the session, or after tracking was lost."""
         is_first = self._key is None
         self._predictor.coast(prediction)
         self._T_local_base = prediction.T_local_base
@@ -156,7 +156,7 @@ class DirectSlam:
         view: DirectView,
         located: _Located,
     ) -> Tracking:
-        """Go on from an answer, weighed against the prediction by the covariance of each."""
+        """Return the pose fused from registration and prediction, weighted by their covariances."""
         found = located.comparison
         T_base_cam = self._camera.T_base_cam
         back = se3.adjoint(se3.inverse(T_base_cam))
@@ -185,7 +185,7 @@ class DirectSlam:
     def _add_keyframe(
         self, observation: Observation, view: DirectView, information: NDArray[np.float64] | None
     ) -> None:
-        """Make the view the keyframe; without information it is not connected with the last."""
+        """Make the view the keyframe; without `information` it has no edge to the last one."""
         self._key = self._last = view
         self._T_local_key = self._T_local_last = self._T_local_base @ self._camera.T_base_cam
         self._keyframes.add(observation.stamp_ns, view, self._T_local_key, information)
@@ -193,7 +193,7 @@ class DirectSlam:
     def _bridge(
         self, observation: Observation, prediction: Prediction, *, can_coast: bool
     ) -> Tracking:
-        """Go on without an image: by odometry, for a moment as before, else not at all."""
+        """Return the pose by odometry, or shortly by constant velocity, else LOST."""
         can_coast = can_coast and self._key is not None
         status = self._predictor.bridge(observation, prediction, can_coast=can_coast)
         is_lost = status is TrackingStatus.LOST

@@ -1,4 +1,4 @@
-"""An image with depth, small and without distortion, and what it measures beside another."""
+"""Downscaled and undistorted images with depth, and their comparison."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from sceneslam.types.rig import Camera
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
-_STEP_PX = 4  # between the pixels that are compared
-_DEPTH_NOISE = (0.003, 0.0015)  # m, 1/m: of a structured-light camera at a depth z, a + b z^2
-_GATE_SIGMAS = 5.0  # depths further apart are of two surfaces
-_GREY_SIGMA_MIN = 3.0  # grey values: no image is quieter
-_CORRELATION = 100.0  # neighbouring pixels share errors: so many know as much as one
+_STEP_PX = 4  # distance between compared pixels
+_DEPTH_NOISE = (0.003, 0.0015)  # sigma = a + b z^2 [m], structured light
+_GATE_SIGMAS = 5.0  # larger differences of depth are other surfaces
+_GREY_SIGMA_MIN = 3.0  # grey values: smallest image noise
+_CORRELATION = 100.0  # correlated pixels with the information of one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,20 +28,20 @@ class DirectView:
 
     grey: NDArray[np.uint8]  # (h, w)
     depth_m: Floats  # (h, w), 0 = missing
-    frame: Any  # as OpenCV prepared it
+    frame: Any  # prepared by OpenCV
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Comparison:
-    """How a view lies on another."""
+    """The agreement of two views at a relative pose."""
 
     information: Doubles  # (6, 6) of se3.log order, cam
-    compared: int  # pixels whose depth both views show
-    matched: int  # of these, on one surface
+    compared: int  # pixels with depth in both views
+    matched: int  # of these, on the same surface
 
     @property
     def matched_ratio(self) -> float:
-        """Return the share of what both views show that agrees."""
+        """Return the share of compared pixels that agree."""
         return self.matched / max(self.compared, 1)
 
 
@@ -94,7 +94,7 @@ class Tracker:
         return np.stack([x * z, y * z, z], axis=-1).reshape(-1, 3).astype(np.float32)
 
     def register(self, view: DirectView, other: DirectView) -> se3.Transform | None:
-        """Return T_other_view, None where the two do not fit together."""
+        """Return T_other_view (4, 4) [m], None if the registration fails."""
         found, T_other_view = self._odometry.compute(view.frame, other.frame)
         if not found or not np.isfinite(T_other_view).all():
             return None
@@ -103,7 +103,7 @@ class Tracker:
     def compare(
         self, view: DirectView, other: DirectView, T_other_view: se3.Transform
     ) -> Comparison:
-        """Return what the pixels of a view, laid on another, know of T_other_view."""
+        """Return the agreement of two views at T_other_view (4, 4) [m], and its information."""
         points_view = self.points(view, _STEP_PX).astype(np.float64)
         greys = view.grey[::_STEP_PX, ::_STEP_PX].reshape(-1).astype(np.float64)
         points = np.asarray(se3.apply(T_other_view, points_view), np.float64)
@@ -136,7 +136,7 @@ class Tracker:
 def _jacobians(
     points_view: Doubles, T_other_view: se3.Transform, points: Doubles, K: Doubles
 ) -> Doubles:
-    """Return (N, 3, 6): how pixel and depth in the other view move with a twist of the view."""
+    """Return (N, 3, 6): derivative of pixel and depth in the other view by the view's twist."""
     x, y, z = points.T
     zero = np.zeros_like(z)
     projection = np.stack(
@@ -161,7 +161,7 @@ def _jacobians(
 
 
 def _slopes(view: DirectView, row: NDArray[np.int64], column: NDArray[np.int64]) -> Doubles:
-    """Return (N, 2, 2): slope of grey and of depth [m] along x and y [1/px], at pixels."""
+    """Return (N, 2, 2): gradients of grey value and depth [m] along x and y [1/px], at pixels."""
     found = []
     for picture in (view.grey.astype(np.float64), view.depth_m.astype(np.float64)):
         along_x = 0.5 * (picture[row, column + 1] - picture[row, column - 1])
@@ -170,5 +170,5 @@ def _slopes(view: DirectView, row: NDArray[np.int64], column: NDArray[np.int64])
     depth = view.depth_m
     around = [depth[row, column + d] for d in (-1, 1)] + [depth[row + d, column] for d in (-1, 1)]
     steps = np.ptp(np.stack([*around, depth[row, column]]), axis=0)
-    found[1][steps > 0.05 * depth[row, column]] = 0.0  # an edge, or missing beside: no slope
+    found[1][steps > 0.05 * depth[row, column]] = 0.0  # an edge, or missing neighbours: no gradient
     return np.stack(found, axis=1)

@@ -1,4 +1,4 @@
-"""Where a map of ORB-SLAM3 lies in `local`."""
+"""The pose and scale of a map of ORB-SLAM3 in `local`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Transform = NDArray[np.float64]
 
 
 def inverse(T_a_b: Transform) -> Transform:
-    """Return T_b_a."""
+    """Return T_b_a (4, 4) [m]."""
     T_b_a = np.eye(4)
     T_b_a[:3, :3] = T_a_b[:3, :3].T
     T_b_a[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
@@ -19,18 +19,18 @@ def inverse(T_a_b: Transform) -> Transform:
 
 
 class Anchor:
-    """Places one map, whose unit is so many `metres`: T_local_cam = T_local_world @ T_world_cam."""
+    """The transform of one map with unit `metres`: T_local_cam = T_local_world @ T_world_cam."""
 
     def __init__(self, T_local_cam: Transform, T_world_cam: Transform, metres: float = 1.0) -> None:
         self._metres = metres
         self._T_local_world = T_local_cam @ inverse(self._scaled(T_world_cam))
 
     def place(self, T_world_cam: Transform) -> Transform:
-        """Return T_local_cam."""
+        """Return T_local_cam (4, 4) [m] of T_world_cam in units of the map."""
         return np.asarray(self._T_local_world @ self._scaled(T_world_cam))
 
     def place_points(self, points_world: NDArray[Any]) -> NDArray[np.float32]:
-        """Return points (N, 3) in local."""
+        """Return points (N, 3) [m], local, of points in units of the map."""
         T = self._T_local_world
         return np.asarray(self._metres * points_world @ T[:3, :3].T + T[:3, 3], np.float32)
 

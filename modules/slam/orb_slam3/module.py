@@ -2,7 +2,7 @@
 
 Campos et al., "ORB-SLAM3: An Accurate Open-Source Library for Visual, Visual-Inertial and Multi-Map
 SLAM", T-RO 2021. The package is GPL-3: the user installs it, `worker.py` imports it in another
-process, and nothing but the bytes of the protocol passes between that and this one.
+process, and both processes exchange only messages of the protocol.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sceneslam.types.run import Command
 
 from ..process.module import ProcessSlam
 
-# The path is set when the interpreter is up: what lies in a user's folder must not shadow its own.
+# The path is set after start-up: files in the user's folder must not shadow standard modules.
 _MAIN = """
 import json, sys
 settings, *sys.path = sys.argv[1:]
@@ -28,7 +28,7 @@ main(json.loads(settings))
 
 
 class OrbSlam3(ProcessSlam):
-    """ORB-SLAM3 on colour and depth; its threads race, so no two runs are the same to the bit."""
+    """ORB-SLAM3 on colour and depth; because of its threads, runs are not reproducible."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""How many metres a unit of a monocular map is: odometry measures the same motion."""
+"""Scale of a monocular map, estimated by odometry."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ import numpy as np
 
 from .anchor import Transform, inverse
 
-_BASELINE_M = 0.5  # of odometry, which is off by some per cent, and a map's first metre by less
-_ALIKE_MIN = 0.9  # cosine between both paths; with less the map is not one of this motion
+_BASELINE_M = 0.5  # smallest path by odometry for an estimate
+_ALIKE_MIN = 0.9  # smallest cosine between both paths; below, the map is wrong
 
 
 class Scale:
-    """Compares the camera's path in one map with the path by odometry."""
+    """Compares the camera's path in the map with that by odometry."""
 
     def __init__(self) -> None:
         self._T_world_first: Transform | None = None
         self._T_odom_first: Transform = np.eye(4)
-        self._sums = np.zeros(3)  # of the paths' products: both, the map's alone, odometry's alone
+        self._sums = np.zeros(3)  # of products: both paths, map's, odometry's
         self._length_m = 0.0
 
     def add(self, T_world_cam: Transform, T_odom_cam: Transform) -> None:
-        """Take where the camera is in the map and by odometry."""
+        """Add the camera's poses (4, 4) in the map and by odometry [m]."""
         if self._T_world_first is None:
             self._T_world_first, self._T_odom_first = T_world_cam, T_odom_cam
         unscaled = (inverse(self._T_world_first) @ T_world_cam)[:3, 3]
@@ -30,7 +30,7 @@ class Scale:
 
     @property
     def metres(self) -> float | None:
-        """Return the metres per unit, None while the paths are too short or unlike."""
+        """Return the metres per unit, None if the paths are too short or too different."""
         both, unscaled, measured = self._sums
         if self._length_m < _BASELINE_M or both < _ALIKE_MIN * np.sqrt(unscaled * measured):
             return None

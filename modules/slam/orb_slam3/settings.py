@@ -1,4 +1,4 @@
-"""ORB-SLAM3's settings file, from what a rig tells of its camera."""
+"""Writing of ORB-SLAM3's settings file for a rig."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-_DEPTH_BASELINE_M = 0.08  # of the stereo pair as which ORB-SLAM3 sees a depth camera, as published
-_NEAR_BASELINES = 40.0  # depths within so many baselines are triangulated from one image
-_RATE_HZ = 30  # of images: how often at least a keyframe is made
+_DEPTH_BASELINE_M = 0.08  # baseline of the virtual stereo pair, as in the published settings
+_NEAR_BASELINES = 40.0  # depths within this many baselines count as near
+_RATE_HZ = 30  # of images; largest time between keyframes
 
 _TEXT = """%YAML:1.0
 File.version: "1.0"
@@ -48,7 +48,7 @@ Viewer.ViewpointF: 500.0
 
 
 def write_settings(rig: Mapping[str, Any], path: Path, *, features: int, fast: int) -> None:
-    """Write the settings for the fields of a rig; the published values for all else."""
+    """Write the settings for the fields of a rig, with the published values for the rest."""
     k1, k2, p1, p2, k3 = rig["camera.distortion"].tolist()
     width, height = rig["camera.size_wh"].tolist()
     text = _TEXT.format(

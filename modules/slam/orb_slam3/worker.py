@@ -1,6 +1,6 @@
 """The program that runs ORB-SLAM3: the only file that imports pyorbslam3, which is GPL-3.
 
-It is never imported: `module.py` starts it in a process of its own, and both exchange bytes.
+It is never imported: `module.py` starts it in another process and exchanges messages with it.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from .scale import Scale
 from .settings import write_settings
 
 _POINTS_EVERY = 10  # images
-_POINT_M = 0.02  # of several points within a cube of this edge one is kept
+_POINT_M = 0.02  # edge of the voxels that keep one point each
 
 
 class OrbSlam3Worker:
-    """Tracks with ORB-SLAM3; `pyorbslam3` and a folder for its files are given."""
+    """Tracks with ORB-SLAM3; `orb` is the package, `folder` holds its files."""
 
     requires = "image depth\nimage odometry"
 
     def __init__(self, orb: Any, folder: Path, settings: dict[str, Any]) -> None:
         self._orb, self._folder, self._settings = orb, folder, settings
         self._slam: Any = None
-        self._anchors: list[Anchor] = []  # of the maps, the current one last
+        self._anchors: list[Anchor] = []  # of all maps, the current one last
         self._is_new_map = True
-        self._scale: Scale | None = None  # of the current map, where there is no depth
+        self._scale: Scale | None = None  # of the current map, without depth
         self._T_local_base: Transform = np.eye(4)
-        self._T_odom_base: Transform | None = None  # at that pose
+        self._T_odom_base: Transform | None = None  # odometry at that pose
         self._revision, self._images = 0, 0
         self._points: list[NDArray[np.float32]] = []
 
     def activate(self, rig: Fields) -> None:
-        """Write the settings; with a vocabulary, start ORB-SLAM3."""
+        """Write the settings; start ORB-SLAM3 if there is a vocabulary."""
         self._T_base_cam = rig["camera.T_base_cam"]
         self._has_depth = "depth" in as_text(rig["sensors"]).split()
         names = ("features", "fast")
@@ -57,7 +57,7 @@ class OrbSlam3Worker:
         """Do nothing."""
 
     def track(self, observation: Fields) -> dict[str, Any]:
-        """Return the pose; none without the rig's image or depth: odometry carries it on then."""
+        """Return the pose; empty without image or depth, then odometry is used."""
         image = observation.get("image_bgr")
         depth = observation.get("depth_m")
         if image is None or (depth is None and self._has_depth):
@@ -66,7 +66,7 @@ class OrbSlam3Worker:
         if self._slam is None:
             try:
                 self._start(self._trained(image))
-            except InputError:  # nothing to be seen yet
+            except InputError:  # no features yet
                 return pose(stamp_ns, self._T_local_base, LOST)
         if self._has_depth:
             found = self._slam.track_rgbd(image, depth, stamp_ns * 1e-9)
@@ -75,8 +75,8 @@ class OrbSlam3Worker:
         return self._answer(stamp_ns, found, observation.get("T_odom_base"))
 
     def trajectory(self) -> dict[str, Any]:
-        """Return the frames' poses as corrected by loops, where there was one map only."""
-        if len(self._anchors) != 1 or not self._has_depth:  # it writes no monocular trajectory
+        """Return the poses corrected by loop closures, if there was only one map."""
+        if len(self._anchors) != 1 or not self._has_depth:  # no trajectory in monocular mode
             return poses([], [])
         path = self._folder / "trajectory.txt"
         self._slam.save_trajectory_tum(str(path))
@@ -88,7 +88,7 @@ class OrbSlam3Worker:
         return poses([round(stamp_s * 1e9) for stamp_s in rows[:, 0]], placed)
 
     def map(self) -> dict[str, Any]:
-        """Return the map points that were tracked."""
+        """Return the tracked map points, in local [m]."""
         if not self._points:
             return {}
         points = np.concatenate(self._points)
@@ -102,7 +102,7 @@ class OrbSlam3Worker:
         self._slam = self._orb.Slam(vocabulary, settings, sensor)
 
     def _trained(self, image: NDArray[np.uint8]) -> Path:
-        """Return a vocabulary of the first image alone: good enough to match features by."""
+        """Return the path of a vocabulary of the first image, sufficient for feature matching."""
         path = self._folder / "vocabulary.txt"
         train([describe(image)], seed=0).write(path)
         return path
@@ -128,14 +128,14 @@ class OrbSlam3Worker:
             self._T_odom_base, status = T_odom_base, TRACKING
             self._keep_points()
         elif not self._has_depth and T_odom_base is not None and (is_tracked or is_beginning):
-            # The map has no scale yet, and nothing but odometry to take one from.
+            # The map has no scale yet; only odometry can provide it.
             self._T_local_base, self._T_odom_base, status = T_expected_base, T_odom_base, DEGRADED
         inliers = int(found.num_tracked_points) if status == TRACKING else 0
         reply = pose(stamp_ns, self._T_local_base, status, inliers=inliers)
         return {**reply, "revision": self._revision}
 
     def _metres(self, T_world_cam: Transform, T_odom_base: Any) -> float | None:
-        """Return the metres per unit of the current map, None while they are not known."""
+        """Return the metres per unit of the current map, None if unknown."""
         if self._has_depth:
             return 1.0
         if T_odom_base is not None and self._is_new_map:
@@ -144,17 +144,17 @@ class OrbSlam3Worker:
         return None if self._scale is None else self._scale.metres
 
     def _place(self, T_world_cam: Transform, T_expected_cam: Transform, metres: float) -> None:
-        """Find where the current map lies: a new one where the camera is expected to be."""
+        """Find the anchor of the current map; a new map is placed at the expected pose."""
         if self._is_new_map:
             self._anchors.append(Anchor(T_expected_cam, T_world_cam, metres))
             self._is_new_map = False
         elif self._slam.map_changed():
             self._revision += 1
-            # A loop was closed, or two maps were merged: then the pose is one of the older map's.
+            # After a loop closure or a merge of maps, the pose is in an older map.
             self._anchors.sort(key=lambda one: -_distance(one.place(T_world_cam), T_expected_cam))
 
     def _expected(self, T_odom_base: Any) -> Transform:
-        """Return the last pose, moved as odometry says."""
+        """Return the last pose moved by odometry, T_local_cam (4, 4) [m]."""
         if T_odom_base is None:
             return self._T_local_base
         if self._T_odom_base is None:
@@ -162,7 +162,7 @@ class OrbSlam3Worker:
         return np.asarray(self._T_local_base @ inverse(self._T_odom_base) @ T_odom_base)
 
     def _keep_points(self) -> None:
-        if self._images % _POINTS_EVERY == 1:  # the first among them
+        if self._images % _POINTS_EVERY == 1:  # including the first
             points_world = self._slam.tracked_map_points()
             self._points.append(self._anchors[-1].place_points(points_world))
 
@@ -172,7 +172,7 @@ def _distance(T_a: Transform, T_b: Transform) -> float:
 
 
 def _transforms(rows: NDArray[np.float64]) -> list[Transform]:
-    """Return x y z qx qy qz qw as matrices."""
+    """Return the transforms (4, 4) of rows x y z qx qy qz qw (N, 7)."""
     found = []
     for x, y, z, qx, qy, qz, qw in rows:
         T = np.eye(4)
@@ -187,10 +187,10 @@ def _transforms(rows: NDArray[np.float64]) -> list[Transform]:
 
 
 def main(settings: dict[str, Any]) -> None:
-    """Serve until the input is closed."""
+    """Serve requests until the input is closed."""
     import pyorbslam3
 
     with tempfile.TemporaryDirectory(prefix="orb_slam3_") as folder:
         serve(OrbSlam3Worker(pyorbslam3, Path(folder), settings))
     sys.stderr.flush()
-    os._exit(0)  # its threads would go on
+    os._exit(0)  # its threads would keep running

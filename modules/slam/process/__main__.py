@@ -1,4 +1,4 @@
-"""Build a C++ program that comes along: `python -m sceneslam.modules.slam.process NAME OUT`.
+"""Build an included C++ program: `python -m sceneslam.modules.slam.process NAME OUT`.
 
 Without arguments it prints the folder of the header `sceneslam.hpp`, for a compiler's `-I`.
 """
@@ -35,7 +35,7 @@ def build(name: str, out: Path) -> None:
 
 
 def _mrpt_flags(libraries: tuple[str, ...]) -> list[str]:
-    """Return where MRPT's headers lie, and its libraries; it comes without pkg-config files."""
+    """Return compiler flags for MRPT, which has no pkg-config files."""
     headers = [path for prefix in _PREFIXES for path in sorted(prefix.glob("mrpt/*/include"))]
     if not headers:
         raise ModuleError("MRPT is missing: install libmrpt-dev, as it is called on Debian")

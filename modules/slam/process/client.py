@@ -1,6 +1,6 @@
-"""The other end, for programs in Python: `serve` asks an object whatever SceneSLAM asks.
+"""The client side for Python programs: `serve` calls an object for every request.
 
-Needs NumPy and `protocol.py` alone, so that a program may live in an environment of its own.
+It needs only NumPy and `protocol.py`, so that a program can use another Python environment.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ Reply = Mapping[str, Any]
 
 
 class Slam(Protocol):
-    """What a program has to be able to do; every reply maps names to arrays."""
+    """The methods of a program; every reply maps names to arrays."""
 
     requires: str  # a line per set of sensors that suffices: "scan odometry\\nscan"
 
     def activate(self, rig: Fields) -> None:
-        """Start; called once."""
+        """Start a session; called once."""
         ...
 
     def set_scene(self, scene: str) -> None:
-        """Hear of the scene."""
+        """Set the confirmed scene."""
         ...
 
     def track(self, observation: Fields) -> Reply:
-        """Return `pose(...)`, or `poses([...])` for several; an empty list: none is known yet."""
+        """Return `pose(...)`, or `poses([...])` for several; an empty list: no pose yet."""
         ...
 
     def trajectory(self) -> Reply:
-        """Return all poses as revised: `poses([...])`."""
+        """Return all revised poses: `poses([...])`."""
         ...
 
     def map(self) -> Reply:
@@ -48,7 +48,7 @@ class Slam(Protocol):
 def pose(
     stamp_ns: int, T_local_base: NDArray[np.float64], status: int = TRACKING, **more: Any
 ) -> dict[str, Any]:
-    """Return the reply to `track` with one pose; `more` are covariance, quality_ratio, inliers."""
+    """Return a reply with one pose (4, 4) [m]; `more`: covariance, quality_ratio, inliers."""
     reply = {"stamps_ns": [stamp_ns], "T_local_base": [T_local_base], "status": [status]}
     return {**reply, **{name: [value] for name, value in more.items()}}
 
@@ -56,7 +56,7 @@ def pose(
 def poses(
     stamps_ns: list[int], T_local_base: list[NDArray[np.float64]] | NDArray[np.float64]
 ) -> dict[str, Any]:
-    """Return a reply with any number of poses, none among them."""
+    """Return a reply with any number of poses (4, 4) [m], also none."""
     return {
         "stamps_ns": np.array(stamps_ns, np.int64),
         "T_local_base": np.asarray(T_local_base, np.float64).reshape(-1, 4, 4),
@@ -64,7 +64,7 @@ def poses(
 
 
 def serve(slam: Slam) -> None:
-    """Answer until the input is closed. What is printed goes to the standard error."""
+    """Serve requests until the input is closed. Printed text goes to standard error."""
     wire = os.dup(1)
     os.dup2(2, 1)
     while True:

@@ -1,4 +1,4 @@
-"""A rig and its observations as named arrays, and what a program answers as values of ours."""
+"""Conversion between SceneSLAM's types and the protocol's named arrays."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Layer = TypeVar("Layer")
 
 
 def rig_fields(rig: Rig) -> dict[str, NDArray[Any]]:
-    """Return the sensors, and each part's values under its name: `camera.fx`, ..."""
+    """Return the rig as named arrays: `sensors`, `camera.fx`, ..."""
     found = {"sensors": text(" ".join(sorted(sensor.value for sensor in rig.sensors)))}
     for name in ("camera", "laser", "lidar"):
         found |= _flat(getattr(rig, name), name)
@@ -35,7 +35,7 @@ def rig_fields(rig: Rig) -> dict[str, NDArray[Any]]:
 
 
 def observation_fields(observation: Observation) -> dict[str, NDArray[Any]]:
-    """Return what was measured; a silent sensor's fields are missing."""
+    """Return the measurements as named arrays; missing sensors have no fields."""
     found: dict[str, NDArray[Any]] = {}
     for field in fields(observation):
         found |= _flat(getattr(observation, field.name), field.name)
@@ -43,7 +43,7 @@ def observation_fields(observation: Observation) -> dict[str, NDArray[Any]]:
 
 
 def required(answer: Fields) -> tuple[frozenset[Sensor], ...]:
-    """Return the sets of sensors of a greeting: a line per set, such as `scan odometry`."""
+    """Return the required sensors of the first reply: a line per set, such as `scan odometry`."""
     known = {sensor.value: sensor for sensor in Sensor}
     lines = [line.split() for line in as_text(_of(answer, "requires")).splitlines()]
     unknown = {name for line in lines for name in line} - set(known)
@@ -56,7 +56,7 @@ def required(answer: Fields) -> tuple[frozenset[Sensor], ...]:
 
 
 def answers(reply: Fields) -> list[Tracking]:
-    """Return the poses of a reply to `track`, none where the program is not that far yet."""
+    """Return the poses of a reply to `track`; empty if there is no pose yet."""
     stamps_ns = _of(reply, "stamps_ns").reshape(-1)
     count = len(stamps_ns)
     T_local_base = _rigid(_of(reply, "T_local_base"), count)
@@ -78,7 +78,7 @@ def answers(reply: Fields) -> list[Tracking]:
 
 
 def trajectory(reply: Fields) -> Trajectory:
-    """Return the poses that a program revised."""
+    """Return the revised poses of a reply."""
     stamps_ns = _of(reply, "stamps_ns").reshape(-1).astype(np.int64)
     T_world_base = _rigid(_of(reply, "T_local_base"), len(stamps_ns))
     return Trajectory(stamps_ns=stamps_ns, T_world_base=T_world_base)
@@ -110,7 +110,7 @@ def _layer(reply: Fields, name: str, kind: type[Layer]) -> Layer | None:
 
 
 def _flat(value: object, name: str) -> dict[str, NDArray[Any]]:
-    """Return a value's arrays by dotted names, nothing for None."""
+    """Return a value's arrays by dotted names; empty for None."""
     if value is None:
         return {}
     if is_dataclass(value):
@@ -137,7 +137,7 @@ def _optional(reply: Fields, name: str, shape: tuple[int, ...]) -> NDArray[Any] 
 
 
 def _rigid(array: NDArray[Any], count: int) -> NDArray[np.float64]:
-    """Return `count` rigid transforms; raises ProtocolError for any other array."""
+    """Return `count` rigid transforms (4, 4) [m]; raises ProtocolError for invalid ones."""
     if array.shape != (count, 4, 4):
         raise ProtocolError(f"answered T_local_base {array.shape}, expected {(count, 4, 4)}")
     T_local_base = array.astype(np.float64)

@@ -1,4 +1,4 @@
-"""The `process` SLAM module: a program in any language that answers on its standard output."""
+"""The `process` SLAM module: a program in any language, connected by pipes."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ Value = TypeVar("Value")
 
 
 class ProcessSlam(Restarted):
-    """Fulfils `SlamModule`, `Restartable` and `Concurrent` by one run of a program per session.
+    """Implements `SlamModule`, `Restartable` and `Concurrent` by one run of a program per session.
 
-    Whatever the program does wrong ends it, and the call raises ModuleError with one sentence.
-    The next run of it is started at once, so that it loads while nobody waits for it.
+    Any error of the program ends it, and the call raises ModuleError with one sentence. The next
+    run is started at once, so that it is loaded before it is needed.
     """
 
     def __init__(self, *, command: Command, late_max_s: float, limits: Limits) -> None:
@@ -45,13 +45,13 @@ class ProcessSlam(Restarted):
         self._program: Program | None = None
         self._pipeline = Pipeline(late_max_s)
         self._revision = 0
-        self._observation: Observation | None = None  # its answer was not collected yet
-        self._layers: MapLayers | None = None  # as asked for last, None where outdated
+        self._observation: Observation | None = None  # submitted, and not yet collected
+        self._layers: MapLayers | None = None  # last returned map, None if outdated
         self._start()
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return the sets of sensors that the program names when it is greeted."""
+        """Return the sets of sensors that the program requires, by its first reply."""
         if self._requires is None:
             try:
                 self._greet()
@@ -62,12 +62,12 @@ class ProcessSlam(Restarted):
         return self._requires
 
     def note_failure(self) -> None:
-        """Take that a session failed, and end the run of the program that it had."""
+        """Record that a session failed, and end its run of the program."""
         self._kill()
         super().note_failure()
 
     def activate(self, rig: Rig) -> None:
-        """Start anew, in a run of the program that no session has used."""
+        """Start a session in a new run of the program."""
         self._bury()
         if self._is_active:
             self._close()
@@ -81,34 +81,34 @@ class ProcessSlam(Restarted):
         self._ask("activate", rig_fields(rig), self._limits.start_deadline_s, lambda _: None)
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Do nothing: its poses are in `local` wherever that lies."""
+        """Do nothing: poses are reported in `local`."""
 
     def set_scene(self, scene: str) -> None:
-        """Tell the program of the scene."""
+        """Send the scene to the program."""
         fields = {"scene": text(scene)}
         self._ask("scene", fields, self._limits.step_deadline_s, lambda _: None)
 
     def track(self, observation: Observation) -> Tracking:
-        """Return T_local_base at the observation."""
+        """Return T_local_base (4, 4) [m] at the observation."""
         self.submit(observation)
         return self.collect()
 
     def submit(self, observation: Observation) -> None:
-        """Hand the observation over; others may be given work before `collect`."""
+        """Send the observation without waiting; `collect` returns the result."""
         self._pipeline.note(observation)
         self._observation, self._layers = observation, None
         fields = observation_fields(observation)
         self._session().send("track", fields, self._limits.step_deadline_s)
 
     def collect(self) -> Tracking:
-        """Return the pose at the observation submitted last."""
+        """Return the result of `submit`."""
         observation, self._observation = self._observation, None
         assert observation is not None
         self._receive("track", self._limits.step_deadline_s, self._take)
         return self._pipeline.report(observation, self._revision)
 
     def get_trajectory(self) -> Trajectory:
-        """Return the poses that the program revised, else those that it gave late, if any."""
+        """Return the program's revised poses, else those that came late, if any."""
         if not self._is_active:
             return self._pipeline.trajectory()
         revised = self._ask("trajectory", {}, self._limits.start_deadline_s, trajectory)
@@ -137,7 +137,7 @@ class ProcessSlam(Restarted):
         return self._program
 
     def _start(self) -> None:
-        """Start the program and greet it, without waiting."""
+        """Start the program and send the first request, without waiting."""
         self._is_greeted = self._is_active = False
         self._program = Program(self._command, self._limits)
         self._program.send("hello", {}, self._limits.start_deadline_s)
@@ -152,7 +152,7 @@ class ProcessSlam(Restarted):
             self._requires, self._is_greeted = found, True
 
     def _bury(self) -> None:
-        """Notice a program that ended while nobody asked it for anything."""
+        """Detect a program that ended while it was idle."""
         if self._program is not None and not self._program.is_alive:
             self.note_failure()
 
@@ -183,7 +183,7 @@ class ProcessSlam(Restarted):
         return self._receive(kind, deadline_s, read)
 
     def _receive(self, kind: str, deadline_s: float, read: Callable[[Fields], Value]) -> Value:
-        """Return what an answer says; what is no answer ends the program."""
+        """Return the decoded reply; an invalid reply ends the program."""
         reply = self._own_program().receive(kind, deadline_s)
         try:
             return read(reply)

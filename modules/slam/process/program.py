@@ -1,4 +1,4 @@
-"""A program on two pipes: started, asked with a deadline, and ended with all that it started."""
+"""A program with two pipes: start, requests with deadlines, and end with all its children."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from .protocol import (
 
 _log = logging.getLogger(__name__)
 _CHUNK_BYTES = 1 << 20
-_PIPE_BYTES = 1 << 20  # an image passes in few turns; what an unprivileged user may ask for
+_PIPE_BYTES = 1 << 20  # pipe buffer: the largest for unprivileged users
 _LAST_WORDS_CHARS = 300
-_LINES_MAX = 1000  # of a program's log
-_PATIENCE_S = 1.0  # for a program whose input was closed to be gone
-# The program's memory is bounded, and the kernel ends it when the lifeline's other end closes,
-# as for the processes of modules (`supervision/worker.py`); both last through exec.
+_LINES_MAX = 1000  # stored lines of a program's log
+_PATIENCE_S = 1.0  # for a program to end after its input was closed
+# The program's memory is limited, and the kernel ends it when the other end of the lifeline closes,
+# as for the processes of modules (`supervision/worker.py`); both settings survive exec.
 _LAUNCH = """
 import fcntl, os, resource, signal, sys
 lifeline, limit = map(int, sys.argv[1:3])
@@ -52,10 +52,10 @@ os.execvp(sys.argv[3], sys.argv[3:])
 
 
 class Program:
-    """One run of a command; every failure ends it and raises ModuleError with one sentence."""
+    """One run of a command; any failure ends it and raises ModuleError with one sentence."""
 
     def __init__(self, command: Sequence[str], limits: Limits) -> None:
-        """Start it, without waiting for anything."""
+        """Start the program, without waiting."""
         self._limits = limits
         self._inbox = bytearray()
         self._number = 0
@@ -72,7 +72,7 @@ class Program:
             stderr=subprocess.PIPE,
             bufsize=0,
             pass_fds=(lifeline,),
-            process_group=0,  # a terminal's Ctrl-C is the parent's to handle
+            process_group=0,  # Ctrl-C is handled by the parent
         )
         os.close(lifeline)
         pipes = (self._popen.stdin, self._popen.stdout, self._popen.stderr)
@@ -84,15 +84,15 @@ class Program:
 
     @property
     def is_alive(self) -> bool:
-        """Tell whether it runs."""
+        """Tell whether the program is running."""
         return self._end.alive and self._popen.poll() is None
 
     def has_answer(self) -> bool:
-        """Tell whether `receive` would not have to wait long: it wrote something, or is gone."""
+        """Tell whether there is output to read, or the program has ended."""
         return bool(self._inbox) or _await([self._stdout], [], 0.0)
 
     def send(self, kind: str, fields: Fields, deadline_s: float) -> None:
-        """Write a request, for which `receive` returns the answer."""
+        """Write a request; `receive` returns its reply."""
         self._asked_s = monotonic()
         self._read()
         if self._inbox:
@@ -102,7 +102,7 @@ class Program:
             self._write(part, deadline_s)
 
     def receive(self, kind: str, deadline_s: float) -> dict[str, NDArray[Any]]:
-        """Return the fields of the answer; the deadline counts from `send` on."""
+        """Return the fields of the reply; the deadline starts at `send`."""
         try:
             head = self._head(deadline_s)
             self._fill(HEAD_BYTES + head.length, deadline_s)
@@ -118,12 +118,12 @@ class Program:
         return fields
 
     def refuse(self, reason: str) -> ModuleError:
-        """End it for what it answered; return the error to raise."""
+        """End the program because of an invalid reply; return the error to raise."""
         self._end()
         return ModuleError(f"the program {reason}")
 
     def end(self) -> None:
-        """Close its input, give it a moment to end by itself, then end it."""
+        """Close the program's input, wait shortly, then kill it."""
         if self._end.alive:
             with suppress(OSError):
                 assert self._popen.stdin is not None
@@ -142,7 +142,7 @@ class Program:
         return head
 
     def _fill(self, count: int, deadline_s: float) -> None:
-        """Read until the inbox holds so many bytes; what is there already is never too late."""
+        """Read until `count` bytes are in the buffer; available bytes are never too late."""
         if len(self._inbox) < count:
             self._read()
         while len(self._inbox) < count:
@@ -160,7 +160,7 @@ class Program:
                 self._fail_ended()
 
     def _read(self) -> None:
-        """Take what it wrote; raises ModuleError where it closed its output."""
+        """Read available output; raises ModuleError if the output was closed."""
         self._log.take(_read(self._stderr))
         data = _read(self._stdout)
         if data == b"":
@@ -186,14 +186,14 @@ class Program:
 
 
 class _Log:
-    """What a program writes on its standard error: passed on, and remembered for the end."""
+    """A program's standard error: passed to the log, and kept for error messages."""
 
     def __init__(self, name: str) -> None:
         self._name, self._tail, self._lines = name, b"", 0
         self.is_closed = False
 
     def take(self, data: bytes | None) -> None:
-        """Take some bytes, b"" at the end, None where there is nothing."""
+        """Add bytes; b"" at the end, None if there are none."""
         self.is_closed = self.is_closed or data == b""
         if not data:
             return
@@ -205,14 +205,14 @@ class _Log:
 
     @property
     def last_words(self) -> str:
-        """Return the last line, to be put behind a sentence."""
+        """Return the last line, as the end of an error message."""
         lines = self._tail.decode("utf-8", "replace").split("\n")
         last = next((line.strip() for line in reversed(lines) if line.strip()), "")
         return f"; it wrote last: {last[-_LAST_WORDS_CHARS:]}" if last else ""
 
 
 def _read(pipe: int) -> bytes | None:
-    """Return what is there, None where nothing is, b"" where the other end is closed."""
+    """Return the available bytes, None if there are none, b"" if the other end is closed."""
     try:
         return os.read(pipe, _CHUNK_BYTES)
     except BlockingIOError:
@@ -220,7 +220,7 @@ def _read(pipe: int) -> bytes | None:
 
 
 def _await(readable: Sequence[int], writable: Sequence[int], timeout_s: float) -> bool:
-    """Wait until a pipe is ready, or closed at its other end; tell whether one is."""
+    """Wait until a pipe is ready or closed; return whether one is."""
     arrivals = select.poll()
     for pipe in readable:
         arrivals.register(pipe, select.POLLIN)
@@ -230,12 +230,12 @@ def _await(readable: Sequence[int], writable: Sequence[int], timeout_s: float) -
 
 
 def _widen(pipe: int) -> None:
-    with suppress(AttributeError, OSError):  # only Linux can, and only within the user's share
+    with suppress(AttributeError, OSError):  # Linux only, within the user's limit
         fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
 
 
 def _end(popen: subprocess.Popen[bytes], lifeline: int, mark: str) -> None:
-    """Kill a program with all that it started, and leave no zombie and no pipe."""
+    """Kill a program with all its children, and close its pipes."""
     kill_all(popen, mark)
     for pipe in (popen.stdin, popen.stdout, popen.stderr):
         if pipe is not None:

@@ -1,6 +1,6 @@
-"""Messages as bytes: a head of 40 bytes, then named arrays. `docs/own_program.md` describes them.
+"""Messages as bytes: a header of 40 bytes, then named arrays (see `docs/own_program.md`).
 
-This file needs nothing but NumPy: both ends use it.
+This file needs only NumPy, since both ends use it.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ Fields = Mapping[str, NDArray[Any]]
 
 
 class ProtocolError(Exception):
-    """What arrived is no message of this protocol."""
+    """The received bytes are not a valid message."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MessageHeader:
-    """What a message is, before its fields."""
+    """The header of a message."""
 
     kind: str
-    number: int  # of the request; its answer bears the same
+    number: int  # of the request; its reply has the same
     count: int  # of fields
     length: int  # of the fields together [bytes]
 
 
 def pack(kind: str, number: int, fields: Fields) -> list[memoryview]:
-    """Return a message as buffers to be written in turn; large arrays are not copied."""
+    """Return a message as a list of buffers; large arrays are not copied."""
     parts: list[memoryview] = []
     for name, value in fields.items():
         array = np.asarray(value)
@@ -55,7 +55,7 @@ def pack(kind: str, number: int, fields: Fields) -> list[memoryview]:
 
 
 def read_head(data: bytes) -> MessageHeader:
-    """Return the head in the first 40 bytes; raises ProtocolError where they are not one."""
+    """Return the header in the first 40 bytes; raises ProtocolError if it is invalid."""
     magic, kind, number, count, length = _HEAD.unpack(data)
     if magic[:-1] != MAGIC[:-1]:
         raise ProtocolError(f"wrote what is no message: {data[:24]!r}")
@@ -65,7 +65,7 @@ def read_head(data: bytes) -> MessageHeader:
 
 
 def read_fields(head: MessageHeader, data: bytes | bytearray) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a message, read-only; raises ProtocolError where they do not fit it."""
+    """Return the arrays of a message, read-only; raises ProtocolError if they are invalid."""
     fields: dict[str, NDArray[Any]] = {}
     start = 0
     for _ in range(head.count):
@@ -95,7 +95,7 @@ def text(value: str) -> NDArray[np.uint8]:
 
 
 def as_text(array: NDArray[Any]) -> str:
-    """Return the text that an array of bytes holds."""
+    """Return an array of bytes as text."""
     return array.tobytes().decode("utf-8", "replace")
 
 

@@ -1,4 +1,4 @@
-"""The program between `slam=process` and ROS 2: sensors out as topics, poses and maps back."""
+"""The program between `slam=process` and ROS 2: publishes sensors, receives poses and maps."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ _TYPES = {
     "odometry": "nav_msgs/msg/Odometry",
     "imu": "sensor_msgs/msg/Imu",
 }
-_KEPT = 1000  # observations whose poses may still come
+_KEPT = 1000  # stored observations without a pose
 
 
 class NodeClient:
-    """Sends what is observed, and answers with what the node says."""
+    """Publishes observations, and returns the node's poses and maps."""
 
     def __init__(self, settings: dict[str, Any]) -> None:
         self._settings, self._topics = settings, settings["topics"]
@@ -46,10 +46,10 @@ class NodeClient:
         self._sent: dict[int, Transform | None] = {}  # stamp -> T_odom_base
         self._first: tuple[int, Transform | None] | None = None
         self._T_local_world: Transform | None = None
-        self._given_ns = 0  # stamp of the newest pose that was handed on
+        self._given_ns = 0  # stamp of the newest returned pose
 
     def activate(self, rig: Fields) -> None:
-        """Join the domain and start the node; what it says on standard output is its log."""
+        """Join the domain and start the node; its standard output is its log."""
         self._transport = open_transport(Network(**self._settings["network"]))
         self._heard = NodeListener(self._transport, self._settings)
         self._camera = _camera(rig)
@@ -77,7 +77,7 @@ class NodeClient:
         """Do nothing."""
 
     def track(self, observation: Fields) -> dict[str, Any]:
-        """Send what was measured; return the poses that have come by now."""
+        """Publish the measurements; return the poses received so far."""
         if self._node is not None and self._node.poll() is not None:
             command = " ".join(self._settings["command"])
             raise ProtocolError(f"the node ended with {self._node.returncode}: {command}")
@@ -99,17 +99,17 @@ class NodeClient:
         return self._answer(said)
 
     def trajectory(self) -> dict[str, Any]:
-        """Return no poses: what a node revises it does not say by stamp."""
+        """Return no poses: nodes do not publish revised poses by stamp."""
         return poses([], [])
 
     def map(self) -> dict[str, Any]:
-        """Return the newest map."""
+        """Return the latest map."""
         if self._T_local_world is None:
             return {}
         return moved(self._heard.map(), self._T_local_world)
 
     def _answer(self, said: dict[int, tuple[Transform, float]]) -> dict[str, Any]:
-        """Return the poses of observations that were sent, those that came too late left out."""
+        """Return the poses of published observations, without those that are too late."""
         stamps_ns = sorted(ns for ns in said if ns in self._sent and ns > self._given_ns)
         statuses, found = [], []
         for stamp_ns in stamps_ns:
@@ -124,7 +124,7 @@ class NodeClient:
         return {**poses(stamps_ns, found), "status": np.array(statuses, np.int64)}
 
     def _since_first(self, stamp_ns: int) -> Transform:
-        """Return the motion by odometry since the first observation, none where it is silent."""
+        """Return the motion by odometry since the first observation, identity without odometry."""
         assert self._first is not None
         T_first, T_now = self._first[1], self._sent[stamp_ns]
         return np.eye(4) if T_first is None or T_now is None else se3.inverse(T_first) @ T_now
@@ -150,7 +150,7 @@ class NodeClient:
                 self._publish(name, encoder.image, stamp_ns, pixels, encoding)
 
     def _publish(self, name: str, encode: Callable[..., bytes], *values: Any) -> None:
-        """Send a message on a sensor's topic, where it has one."""
+        """Publish a message on a sensor's topic, if it has one."""
         if self._topics[name] is not None:
             publisher = self._transport.publisher(self._topics[name], _TYPES[name], Qos.RELIABLE)
             publisher.publish(encode(*values))
@@ -186,7 +186,7 @@ def _inertial(stamp_ns: int, observation: Fields) -> dict[int, dict[Sensor, NDAr
 
 
 def main(settings: dict[str, Any]) -> None:
-    """Serve until the input is closed; the node ends with this program's group."""
+    """Serve requests until the input is closed; the node ends with this process group."""
     serve(NodeClient(settings))
     sys.stderr.flush()
-    os._exit(0)  # the transport's threads would go on
+    os._exit(0)  # the transport's threads would keep running

@@ -1,4 +1,4 @@
-"""What a SLAM node says: poses by stamp, and the newest map."""
+"""Poses and maps received from a SLAM node."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from sceneslam.types.se3 import Transform
 
 _MAP_TYPES = {"grid": "nav_msgs/msg/OccupancyGrid", "points": "sensor_msgs/msg/PointCloud2"}
 _POSE_TYPES = {"odometry": "nav_msgs/msg/Odometry", "pose": "geometry_msgs/msg/PoseStamped"}
-_LOG_ODDS = 4.0  # of a cell that is said to be occupied for sure
+_LOG_ODDS = 4.0  # of a cell with occupancy 100
 
 
 class NodeListener:
-    """Listens; what is said comes in a thread of the transport's."""
+    """Receives the node's messages, in the transport's thread."""
 
     def __init__(self, transport: Transport, settings: dict[str, Any]) -> None:
         from rosbags.typesys import Stores, get_typestore
 
         self._store: Any = get_typestore(Stores.ROS2_HUMBLE)
         self._came = threading.Condition()
-        self._poses: dict[int, tuple[Transform, float]] = {}  # stamp -> pose, deviation [m]
+        self._poses: dict[int, tuple[Transform, float]] = {}  # stamp -> pose, sigma [m]
         self.T_map_odom: Transform | None = None
         self._map: dict[str, NDArray[Any]] = {}
         topics, self._map_kind = settings["topics"], settings["map_kind"]
@@ -43,7 +43,7 @@ class NodeListener:
             transport.subscribe(topics["map"], kind, self._hear_map, qos)
 
     def wait(self, stamp_ns: int, wait_s: float) -> dict[int, tuple[Transform, float]]:
-        """Return the poses that came, once there is one for a stamp or the time is over."""
+        """Return the received poses (4, 4) [m] when there is one for a stamp, or after `wait_s`."""
         until_s = monotonic() + wait_s
         with self._came:
             while stamp_ns not in self._poses and monotonic() < until_s:
@@ -52,7 +52,7 @@ class NodeListener:
         return found
 
     def map(self) -> dict[str, NDArray[Any]]:
-        """Return the newest map's layers, in the node's own frame."""
+        """Return the layers of the latest map, in the node's map frame."""
         with self._came:
             return dict(self._map)
 
@@ -86,7 +86,7 @@ class NodeListener:
 
 
 def _grid(message: Any) -> dict[str, NDArray[Any]]:
-    """Return an OccupancyGrid as log odds; its axes have to be those of the map frame."""
+    """Return an OccupancyGrid as log odds; its axes must be parallel to the map frame's."""
     info = message.info
     percent = np.asarray(message.data, np.float32).reshape(info.height, info.width)
     log_odds = np.where(percent < 0, 0.0, (percent - 50.0) / 50.0 * _LOG_ODDS)
@@ -103,7 +103,7 @@ def _points(message: Any) -> dict[str, NDArray[Any]]:
 
 
 def moved(layers: dict[str, NDArray[Any]], T_local_world: Transform) -> dict[str, NDArray[Any]]:
-    """Return the layers in local; a grid is left out where local is turned against it."""
+    """Return the layers in `local`; a grid is left out if `local` is rotated against it."""
     if "points.points" in layers:
         points = se3.apply(T_local_world, layers["points.points"])
         return {"points.points": points.astype(np.float32)}

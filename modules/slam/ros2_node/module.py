@@ -1,7 +1,7 @@
-"""The `ros2_node` SLAM module: any SLAM node of ROS 2, as the paper ran its systems.
+"""The `ros2_node` SLAM module: any ROS 2 SLAM node, as the paper used ROS nodes.
 
-The node is started by a program of ours that speaks the protocol of `slam=process` on one side and
-ROS 2 over DDS on the other. Deadlines, restarts and poses that come late are those of `process`.
+The node is started by a program that uses the protocol of `slam=process` on one side and ROS 2 over
+DDS on the other. Deadlines, restarts and late poses are handled by `process`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ..process.module import ProcessSlam
 
 POSES = ("odometry", "pose", "tf")
 MAPS = ("grid", "points")
-# The path is set when the interpreter is up: what lies in a user's folder must not shadow its own.
+# The path is set after start-up: files in the user's folder must not shadow standard modules.
 _MAIN = """
 import json, sys
 settings, *sys.path = sys.argv[1:]
@@ -36,7 +36,7 @@ main(json.loads(settings))
 
 @dataclass(slots=True, kw_only=True)
 class NodeTopics:
-    """Names of topics; null: not sent, or not listened to."""
+    """Names of topics; null: not published, or not subscribed to."""
 
     image: str | None
     camera_info: str | None
@@ -55,10 +55,10 @@ class NodeTopics:
 
 
 class Ros2Node(ProcessSlam):
-    """Runs a command, or attaches to what runs already; answers with the poses that it publishes.
+    """Starts a node by a command, or uses a running one; returns the poses that it publishes.
 
-    `pose_kind`: what comes on `topics.pose`: `odometry` (Odometry) or `pose` (PoseStamped) of
-    base_link, or `tf`: map -> odom on /tf, chained with the odometry that the node is sent.
+    `pose_kind` is the type of `topics.pose`: `odometry` (Odometry) or `pose` (PoseStamped) of
+    base_link, or `tf`: map -> odom on /tf, multiplied with the odometry that the node receives.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""A view that is kept: a grid of planes, made better by every later image that shows it too."""
+"""A keyframe: a grid of planes, averaged over later images that show it."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from sceneslam.types import se3
 
 from .surface import Floats, Grid, Surface
 
-FACING_COS = 0.7  # normals that differ by more than 45 degrees are of two surfaces
+FACING_COS = 0.7  # normals that differ by more than 45 degrees belong to different surfaces
 _FUSE_SIGMAS = 4.0
-_COUNT_MAX = 50.0  # images that a plane is the mean of; then the oldest fade
+_COUNT_MAX = 50.0  # largest number of images in a plane's mean
 
 
 class SurfaceKeyframe:
@@ -26,18 +26,18 @@ class SurfaceKeyframe:
         self.move(T_local_cam)
 
     def move(self, T_local_cam: se3.Transform) -> None:
-        """Put the view elsewhere, where both directions undo each other.
+        """Set T_local_cam and its exact inverse.
 
-        Poses lead from keyframe to keyframe: rounding that one keeps is multiplied by every next.
+        Rounding errors would grow along the chain of keyframes.
         """
         self.T_local_cam = se3.orthonormal(T_local_cam)
         self.T_cam_local = se3.inverse(self.T_local_cam)
 
     def fuse(self, surface: Surface, T_local_cam: se3.Transform, grid: Grid) -> None:
-        """Average what the surface at T_local_cam shows of this view into it, per cell.
+        """Fuse another surface at T_local_cam (4, 4) [m] into this keyframe, per cell.
 
-        Each cell's ray is cut with the plane that the other image shows there, so that both
-        measure the same quantity: the disparity along this ray.
+        Each cell's ray is intersected with the other surface's plane there, so that both measure
+        the same quantity: the disparity along this ray.
         """
         rows = np.flatnonzero(self._count)
         T_other_cam = (se3.inverse(T_local_cam) @ self.T_local_cam).astype(np.float32)
@@ -56,11 +56,11 @@ class SurfaceKeyframe:
         self._average(rows[same], change[same], normals[same], grid)
 
     def surface(self) -> Surface:
-        """Return the planes as they are by now."""
+        """Return the current planes."""
         return Surface(self._disparity, self.planes, self._count > 0, self.noise_per_m)
 
     def points_local(self, grid: Grid, images_min: int) -> Floats:
-        """Return the points (N, 3) of the cells that at least `images_min` images agree on."""
+        """Return the points (N, 3) [m], local, of cells with at least `images_min` images."""
         rows = np.flatnonzero(self._count >= images_min)
         points_cam = grid.rays[rows] / self._disparity[rows, None]
         return np.asarray(se3.apply(self.T_local_cam, points_cam))

@@ -1,8 +1,8 @@
 """Point-to-plane registration of a depth image with keyframes, by projection.
 
-Gauss-Newton (Chen and Medioni 1991; projective data association as in KinectFusion, Newcombe et
-al. 2011): each point is compared with the plane that a keyframe shows in the cell where the point
-is seen. Several keyframes at once, so that the pose agrees with all of them.
+Gauss-Newton (Chen and Medioni 1991; projective data association as in KinectFusion, Newcombe et al.
+2011): each point is compared with the plane that a keyframe has in the cell to which the point
+projects. Several keyframes are used at once, so that the pose agrees with all of them.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from .keyframe import FACING_COS, SurfaceKeyframe
 from .surface import Doubles, Floats, Grid, Surface
 
 _ITERATIONS_MAX = 12
-_GATE_M = (0.15, 0.03)  # residuals beyond are of other surfaces: at first, and in the end
+_GATE_M = (0.15, 0.03)  # largest residuals, in the first and last iteration
 _GATE_SHRINK = 0.7
-_KERNEL_SIGMAS = 12.0  # where a residual begins to count less
-_SURFACE_SIGMA_M = 0.001  # no surface is flatter than this
+_KERNEL_SIGMAS = 12.0  # threshold of the robust kernel
+_SURFACE_SIGMA_M = 0.001  # smallest standard deviation: roughness of surfaces
 _STEP_MIN = 1e-4  # m and rad: converged
-_CORRELATION = 100.0  # neighbouring planes share errors: so many points know as much as one
+_CORRELATION = 100.0  # correlated points with the information of one
 _POINTS_MIN = 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Points of one depth image that are registered."""
+    """Points of one depth image for registration."""
 
     points: Floats  # (N, 3) [m], cam
     normals: Floats  # (N, 3), cam, smooth
@@ -41,7 +41,7 @@ class Samples:
         return len(self.points)
 
     def localizability(self, rows: NDArray[np.bool_] | None = None) -> Localizability:
-        """Return how well the samples, or those of `rows`, hold the camera."""
+        """Return how well the samples, or those of `rows`, constrain the camera's pose."""
         chosen = slice(None) if rows is None else rows
         return localizability(
             self.points[chosen], self.normals[chosen], self.sigmas_m[chosen] ** np.float32(-2)
@@ -70,7 +70,7 @@ def samples_of(surface: Surface, grid: Grid, stride: int = 2) -> Samples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPrior:
-    """Where the camera should be by its motion."""
+    """The predicted pose of the camera, with its information."""
 
     T_local_cam: se3.Transform
     information: Doubles  # (6, 6) of se3.log order, cam
@@ -78,17 +78,17 @@ class CameraPrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceRegistration:
-    """A pose and what holds it."""
+    """A registered pose and its quality."""
 
     T_local_cam: se3.Transform
-    information: Doubles  # (6, 6) of se3.log order, cam: of the image, none along weak directions
-    localizability: Localizability  # by the points that matched, cam
+    information: Doubles  # (6, 6) of se3.log order, cam: of the image, 0 along weak directions
+    localizability: Localizability  # by the matched points, cam
     seen: int  # points that a keyframe shows
     matched: int  # of these, the points that lie on its planes
 
     @property
     def matched_ratio(self) -> float:
-        """Return the share of what both show that agrees."""
+        """Return the share of the points in view that match."""
         return self.matched / max(self.seen, 1)
 
 
@@ -100,7 +100,7 @@ def register(
     *,
     weak_ratio: float,
 ) -> SurfaceRegistration | None:
-    """Return the pose of the samples beside the keyframes; None where too few match."""
+    """Return the camera's pose by registration with keyframes; None if too few points match."""
     held = samples.localizability().held(weak_ratio)
     T_local_cam, gate_m = prior.T_local_cam, _GATE_M[0]
     for _ in range(_ITERATIONS_MAX):
@@ -166,7 +166,7 @@ class _System:
 def compare(
     samples: Samples, keyframe: SurfaceKeyframe, T_key_cam: se3.Transform, gate_m: float, grid: Grid
 ) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return residuals [m], the keyframe's normals, who is seen, and who is on its surface."""
+    """Return residuals (N,) [m], normals (N, 3), and whether points are in view and match (N,)."""
     T = T_key_cam.astype(np.float32)
     points = samples.points @ T[:3, :3].T + T[:3, 3]
     cells, in_view = grid.index(points)
@@ -179,7 +179,7 @@ def compare(
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    """Return the cross products of rows; np.cross takes several times as long."""
+    """Return the cross products of rows; several times faster than np.cross."""
     x = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
     y = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
     z = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -1,9 +1,9 @@
-"""A depth image as a grid of small planes, with the noise that it shows itself.
+"""Conversion of a depth image to a grid of small planes, with an estimate of its noise.
 
-A depth camera by triangulation errs evenly in disparity 1/z, and a plane is linear in it: cells of
-pixels are averaged there, and a plane is fitted to each cell and its neighbours. What does not fit
-a plane (edges, flying pixels, what is too far to be measured) is left out. The scatter of the
-fits is the sensor's noise; a limit of range or a sensor's name is not needed.
+The noise of triangulating depth cameras is uniform in disparity 1/z, in which planes are linear:
+pixels are averaged per cell in disparity, and a plane is fitted to each cell and its neighbours.
+Cells without a plane (edges, flying pixels, depth that is too far) are invalid. The residuals of
+the fits give the sensor's noise, so that no range limit or sensor model is needed.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from sceneslam.types.rig import Camera
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
-_NEAR_M = 0.05  # no camera sees nearer
-_COLUMNS = 160  # of the grid; finer ones cost more and gave no better poses
+_NEAR_M = 0.05  # smallest depth
+_COLUMNS = 160  # columns of the grid; finer grids cost more without better poses
 _SMOOTH = (5, 5)  # cells
 _OUTLIER_SIGMAS = 3.0
 _GRAZING_COS = 0.17  # between ray and normal: 80 degrees
@@ -29,7 +29,7 @@ _NOISE_MIN_PER_M = 2e-4  # of disparity [1/m]: 0.2 mm at 1 m
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
-    """An ideal pinhole camera of few pixels: the camera's view, lens distortion taken out."""
+    """A pinhole camera with few pixels and without distortion, with the camera's field of view."""
 
     width: int
     height: int
@@ -40,7 +40,7 @@ class Grid:
     rays: Floats  # (height * width, 3) with z = 1, cam
 
     def index(self, points_cam: Floats) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-        """Return the cell (N,) that each point (N, 3) is seen in, and whether it is in view."""
+        """Return the cell (N,) of points (N, 3) [m], cam, and whether it is in view (N,)."""
         z = points_cam[:, 2]
         scale = 1.0 / np.maximum(z, np.float32(_NEAR_M))
         u = (points_cam[:, 0] * scale * np.float32(self.fx) + np.float32(self.cx + 0.5)).astype(
@@ -55,7 +55,7 @@ class Grid:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """What one depth image shows, per cell of the grid; `valid` says where it shows a plane."""
+    """The planes of one depth image, per cell of the grid."""
 
     disparity: Floats  # (N,) [1/m], of the plane at the cell's ray
     planes: Floats  # (N, 4) normal (away from the camera) and offset [m]: n @ X = d; else 0
@@ -63,7 +63,7 @@ class Surface:
     noise_per_m: float  # standard deviation of a cell's disparity [1/m]
 
     def smooth_normals(self, grid: Grid) -> Floats:
-        """Return normals (N, 3) averaged over neighbours: noise in them feigns other walls."""
+        """Return normals (N, 3), cam, averaged over neighbours to reduce noise."""
         image = self.planes[:, :3].reshape(grid.height, grid.width, 3)
         total = np.asarray(cv2.blur(image, _SMOOTH, borderType=cv2.BORDER_CONSTANT)).reshape(-1, 3)
         length = np.linalg.norm(total, axis=1, keepdims=True)
@@ -71,10 +71,10 @@ class Surface:
 
 
 class DepthSurfaceReader:
-    """Makes surfaces of one camera's depth images."""
+    """Converts one camera's depth images to surfaces."""
 
     def __init__(self, camera: Camera) -> None:
-        """Choose the grid, and tabulate where each of its pixels lies in the camera's image."""
+        """Choose the grid, and compute a table from its pixels to the camera's."""
         width, height = camera.size_wh
         self._factor = max(1, round(width / _COLUMNS))
         columns, rows = width // self._factor, height // self._factor
@@ -87,7 +87,7 @@ class DepthSurfaceReader:
         self.grid = Grid(columns, rows, fx, fy, cx, cy, rays)
         self._reach = np.linalg.norm(rays, axis=1)
         near_m, far_m = camera.depth_range_m
-        self._range_m = (max(near_m, _NEAR_M), far_m)  # 0 is missing, whatever the range says
+        self._range_m = (max(near_m, _NEAR_M), far_m)  # 0 is missing in any case
         self._crop = (slice(rows * self._factor), slice(columns * self._factor))
         self._undistort = None
         if any(camera.distortion):
@@ -96,7 +96,7 @@ class DepthSurfaceReader:
             )
 
     def read(self, depth_m: Floats) -> Surface:
-        """Return the surface of a depth image (H, W) [m]; nothing of it is valid where 0 or NaN."""
+        """Return the surface of a depth image (H, W) [m]; cells of 0 or NaN are invalid."""
         disparity, seen = self._cells(depth_m)
         fit = _PlaneFit(disparity.astype(np.float64), seen.astype(np.float64))
         w, slope_x, slope_y = fit.value, fit.slope_u * self.grid.fx, fit.slope_v * self.grid.fy
@@ -113,7 +113,7 @@ class DepthSurfaceReader:
         return Surface(w.astype(np.float32), planes, valid, noise)
 
     def _cells(self, depth_m: Floats) -> tuple[Floats, Floats]:
-        """Return the mean disparity per cell, and 1 where at least half of the cell is seen."""
+        """Return the mean disparity per cell, and 1 where at least half of the cell has depth."""
         if self._undistort is not None:
             depth_m = np.asarray(
                 cv2.remap(depth_m, *self._undistort, cv2.INTER_NEAREST), np.float32
@@ -132,7 +132,7 @@ class DepthSurfaceReader:
 class _PlaneFit:
     """Least squares of w(u, v) over each cell and its neighbours, by box filters.
 
-    In float64, since the scatter is a small difference of large sums.
+    It uses float64, since the residual is a small difference of large sums.
     """
 
     def __init__(self, w: Doubles, seen: Doubles) -> None:
@@ -160,7 +160,7 @@ class _PlaneFit:
         self.scatter = np.sqrt(rest / np.maximum(count - 3.0, 1.0))  # [1/m], per cell
 
     def noise(self) -> float:
-        """Return the scatter that is usual in this image."""
+        """Return the median residual of this image."""
         scatter = self.scatter[self.held]
         return (
             max(float(np.median(scatter)), _NOISE_MIN_PER_M) if len(scatter) else _NOISE_MIN_PER_M
