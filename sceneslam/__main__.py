@@ -3,7 +3,7 @@
 import os
 import signal
 
-# Set before NumPy loads BLAS: its sums depend on the number of threads, and runs would depend on the
+# Set before NumPy loads BLAS: its sums depend on the number of threads, so runs would depend on the
 # number of cores. Modules' processes inherit it.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

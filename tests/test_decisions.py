@@ -11,7 +11,7 @@ from sceneslam.decisions import main
 def test_decisions_of_a_run_are_made_again_from_its_folder(tmp_path, capsys):
     run(config(), tmp_path)
     assert main([str(tmp_path)]) == 0
-    assert "0 that the log does not lead to" in capsys.readouterr().out
+    assert "0 that do not follow from the log" in capsys.readouterr().out
 
 
 def test_another_policy_would_have_decided_otherwise(tmp_path, capsys):

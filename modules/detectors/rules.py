@@ -48,7 +48,7 @@ class Rules:
     Each rule has a name, by which another configuration can change it, and is `{scene: NAME, when:
     {FEATURE: [low, high], ...}}` with null for no limit. A rule that is null is ignored, and with
     `skip_absent_sensors` also one that needs a sensor that the source does not have. If no rule
-    holds, the vote is `otherwise` (null: UNSURE). The last scene is kept until its limits, widened by
+    holds, the vote is `otherwise` (null: UNSURE). The last scene is kept until its limits, wider by
     `hysteresis_ratio`, are exceeded, or an earlier rule holds. A measurement is valid for
     `hold_s`, as sensors measure at different stamps. A limit can be the name of one
     of the `values`, for use in several rules.
