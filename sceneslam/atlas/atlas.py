@@ -17,7 +17,6 @@ from sceneslam.atlas.places.floor_plan import grid_of
 from sceneslam.atlas.pose_path import OpenSession, PoseLog, PosePath, trajectory_of
 from sceneslam.atlas.revision import Revised, revise
 from sceneslam.atlas.submaps.correction import Correction
-from sceneslam.atlas.submaps.own_loops import own_loops
 from sceneslam.atlas.uncertainty import VELOCITY, WHEELS, Covariance, propagate
 from sceneslam.interfaces import TrajectoryLog
 from sceneslam.types.errors import ConfigError, told
@@ -106,7 +105,7 @@ class Atlas:
         at = partial(self._revised_at, revised)
         self._correction = self._mapper.finish(
             at,
-            own_loops(self._sessions, at),
+            [session.layers for session in self._sessions],
             frozenset(
                 number
                 for number, session in enumerate(self._sessions)

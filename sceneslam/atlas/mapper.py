@@ -1,13 +1,14 @@
 """The back end of a run: submaps, localization in a loaded map, and the final pose graph.
 
-Planar: for a robot whose base stays level. Scans that are not level are ignored, and a run without
-level scans keeps the trajectory that its modules reported.
+The graph is spatial. Places are recognized by floor plans, so that scans which are not level are
+ignored; a module recognizes its own earlier sessions, and reports loops to them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,11 +18,12 @@ from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map
 from sceneslam.atlas.places.localizer import Fix, LocalizationEvent, MapLocalizer, PlacedScan
 from sceneslam.atlas.submaps.collector import Collector, Known
 from sceneslam.atlas.submaps.correction import Correction
-from sceneslam.atlas.submaps.graph import Edge, EdgeKind, consistent, solve
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind, PlanarEdge, consistent, solve
 from sceneslam.atlas.submaps.loop_closure import LoopFinder
-from sceneslam.atlas.submaps.own_loops import OwnLoop, Path
+from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops, recognized_loops
 from sceneslam.scans.key_scan import KeyScanner
 from sceneslam.types import planar, se3
+from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation
 from sceneslam.types.planar import Planar
 from sceneslam.types.rig import Rig
@@ -58,8 +60,8 @@ class Mapper:
         self._T_map_run: Planar | None = None
         self._began_ns: int | None = None
         self._has_told = False
-        self._loops: list[Edge] = []
-        self._T_map_node: NDArray[np.float64] | None = None  # (N, 3) all nodes, once solved
+        self._loops: list[PlanarEdge] = []
+        self._T_map_node: NDArray[np.float64] | None = None  # (N, 3) the run's nodes, once solved
 
     @property
     def is_placed(self) -> bool:
@@ -85,15 +87,14 @@ class Mapper:
         is_step = self._collector.has_moved(known.T_map_base)
         if not is_step and not self._looks(observation.stamp_ns):
             return
-        if is_step and not self._collector.step_to(known.T_map_base):
-            return
-        scan = self._scanner.make(observation)
+        is_level = not is_step or self._collector.step_to(known.T_map_base)
+        scan = self._scanner.make(observation) if is_level else None
+        if is_step:
+            self._collector.add(observation.stamp_ns, scan)
         if scan is None:
             return
         if self._began_ns is None:
             self._began_ns = scan.stamp_ns
-        if is_step:
-            self._collector.add(scan)
         if self._localizer is not None:
             T_run_base = planar.from_transform(known.T_map_base)
             self._recent = [
@@ -102,52 +103,42 @@ class Mapper:
             ]
             self._localize(self._localizer, scan.stamp_ns)
 
-    def finish(
-        self, path: Path, own_loops: Sequence[OwnLoop], closed: frozenset[int]
-    ) -> Correction:
+    def finish(self, path: Path, maps: Sequence[MapLayers], closed: frozenset[int]) -> Correction:
         """Solve the graph; return the correction of the poses.
 
-        `path` is revised by the modules, `own_loops` are the loops that they closed; `closed` are
-        the sessions whose modules close loops themselves.
+        `path` is revised by the modules, `maps` are theirs, with their own loops; `closed` are the
+        sessions whose modules close loops themselves.
         """
-        self._collector.finish()
+        own = self._collector
+        own.finish()
         if self._thread is not None:
             self._thread.shutdown()
-        submaps = self._collector.submaps
-        if not submaps or not self._collector.is_level:
+        if not own.submaps:
             return Correction.none()
-        stamps_ns = np.array([submap.stamps_ns[0] for submap in submaps], np.int64)
-        old = np.array([_planar_at(path, int(stamp_ns)) for stamp_ns in stamps_ns])
-        self._collector.remeasure(old)
-        self._collector.motions += [
-            edge for loop in own_loops if (edge := self._edge_of(loop, path)) is not None
-        ]
-        T_map_run = planar.from_transform(self.T_map_run)
-        new = self._solve(np.array([planar.compose(T_map_run, T) for T in old]), path, closed)
+        stamps_ns = np.array([submap.stamps_ns[0] for submap in own.submaps], np.int64)
+        old = np.array([path(int(stamp_ns)) for stamp_ns in stamps_ns])
+        own.remeasure(old)
+        own.motions += self._edges_of(closed_loops(maps), path)
+        candidates = self._edges_of(recognized_loops(maps), path)
+        new = self._solve(self.T_map_run @ old, candidates, path, closed)
         if not self._loops and not self.is_placed:
             return Correction.none()
-        T_new_old = [
-            planar.compose(T, planar.between(before, np.zeros(3)))
-            for T, before in zip(new, old, strict=True)
-        ]
-        return Correction(stamps_ns=stamps_ns, T_new_old=np.array(T_new_old))
+        return Correction(stamps_ns=stamps_ns, T_new_old=new @ se3.inverse(old))
 
     def saved(self) -> SavedMap:
         """Return the loaded map with this run in it: a separate piece if it was not located."""
         count, pieces = len(self._loaded.submaps), self._loaded.pieces
-        T_map_run, own = planar.from_transform(self.T_map_run), self._collector
-        nodes = self._T_map_node
+        own, nodes = self._collector, self._T_map_node
         if nodes is None:
-            placed = [planar.compose(T_map_run, T) for T in own.T_run_node]
-            nodes = np.concatenate([self._loaded.T_map_node, np.reshape(placed, (-1, 3))])
+            nodes = _planar([self.T_map_run @ T for T in own.T_run_node])
         piece = 0 if self.is_found else int(pieces.max(initial=-1)) + 1
         return SavedMap(
             submaps=(*self._loaded.submaps, *own.submaps),
-            T_map_node=nodes,
+            T_map_node=np.concatenate([self._loaded.T_map_node, nodes]),
             pieces=np.concatenate([pieces, np.full(len(own.submaps), piece, np.int64)]),
             edges=(
                 *self._loaded.edges,
-                *(edge.shifted(count) for edge in own.motions),
+                *(edge.planar.shifted(count) for edge in own.motions),
                 *self._loops,
             ),
         )
@@ -191,90 +182,115 @@ class Mapper:
     # At the end.
 
     def _solve(
-        self, new: NDArray[np.float64], path: Path, closed: frozenset[int]
+        self,
+        T_map_node: NDArray[np.float64],
+        candidates: Sequence[Edge],
+        path: Path,
+        closed: frozenset[int],
     ) -> NDArray[np.float64]:
-        """Find the loops and solve; return the run's nodes (N, 3), from the initial `new`."""
+        """Find the loops and solve; return the run's nodes (N, 4, 4), from initial ones.
+
+        `candidates` are the loops that modules recognized between their sessions.
+        """
         own, count = self._collector, len(self._loaded.submaps)
-        nodes = np.concatenate([self._loaded.T_map_node, new])
-        drift = np.concatenate([np.zeros((count, 3)), np.array(own.drift)])
+        plane, drift = _planar(T_map_node), np.array(own.drift)
+        fixes = self._fix_edges(path)
+        loops = [*fixes, *(edge.planar.shifted(count) for edge in candidates)]
+        spatial = [*(fix.spatial for fix in fixes), *(_shifted(edge, count) for edge in candidates)]
         finder = LoopFinder(own.submaps, closed)
-        candidates = fixes = self._fix_edges(path)
-        for second in range(len(own.submaps)):
-            found = finder.loops_to(second, new, np.array(own.drift))
-            candidates = [*candidates, *(edge.shifted(count) for edge in found)]
-        loops = consistent(candidates, nodes, drift)
-        if len(loops) < 2 and not fixes:
-            loops = []  # no other loop agrees with it
-        motions = [*self._loaded.edges, *(edge.shifted(count) for edge in own.motions)]
-        solved = solve(nodes, motions, loops, fixed=range(count), loose=count)
-        self._loops, self._T_map_node = list(solved.loops), solved.T_map_node
+        for second in range(len(own.submaps) if own.is_level else 0):
+            found = [edge.shifted(count) for edge in finder.loops_to(second, plane, drift)]
+            loops, spatial = [*loops, *found], [*spatial, *(edge.spatial for edge in found)]
+        nodes = np.concatenate([self._loaded.T_map_node, plane])
+        agreeing = consistent(loops, nodes, np.concatenate([np.zeros((count, 3)), drift]))
+        if len(agreeing) < 2 and not fixes:
+            agreeing = []  # no other loop agrees with it
+        solved = solve(
+            np.concatenate([_spatial(self._loaded.T_map_node), T_map_node]),
+            [_shifted(edge, count) for edge in own.motions],
+            [spatial[index] for index in agreeing],
+            fixed=range(count),
+            loose=count,
+        )
+        self._loops = [loops[agreeing[index]] for index in solved.accepted]
+        self._T_map_node = _planar(solved.T_map_node[count:])
         for loop in self._loops:
             self._tell(loop, count)
         return solved.T_map_node[count:]
 
-    def _tell(self, loop: Edge, count: int) -> None:
+    def _tell(self, loop: PlanarEdge, count: int) -> None:
         submaps = [*self._loaded.submaps, *self._collector.submaps]
         first, second = submaps[loop.first], submaps[loop.second]
         fields: dict[str, Any] = {"module": second.module, "to_module": first.module}
         fields |= {"to_ns": int(first.stamps_ns[0]), "in_loaded_map": loop.first < count}
         self._note("loop", int(second.stamps_ns[0]), **fields)
 
-    def _edge_of(self, loop: OwnLoop, path: Path) -> Edge | None:
-        """Return a module's own loop as an edge between submaps, None where they are the same."""
-        first, second = (self._collector.node_at(stamp) for stamp in (loop.from_ns, loop.to_ns))
-        start, end = path(loop.from_ns), path(loop.to_ns)
-        if start is None or end is None or first == second:
-            return None
-        T_from_second = planar.compose(loop.T_from_to, self._back(end, second))
-        return Edge(
-            first=first,
-            second=second,
-            T_first_second=planar.compose(self._away(start, first), T_from_second),
-            covariance=loop.covariance,
-            kind=EdgeKind.LOOP,
-        )
+    def _edges_of(self, loops: Sequence[OwnLoop], path: Path) -> list[Edge]:
+        """Return a module's own loops as edges between submaps, without those within one."""
+        found = []
+        for loop in loops:
+            first, second = (self._collector.node_at(ns) for ns in (loop.from_ns, loop.to_ns))
+            start, end = path(loop.from_ns), path(loop.to_ns)
+            if start is None or end is None or first == second:
+                continue
+            T_first_from = se3.inverse(self._collector.T_run_node[first]) @ start
+            T_to_second = se3.inverse(end) @ self._collector.T_run_node[second]
+            found.append(
+                Edge(
+                    first=first,
+                    second=second,
+                    T_first_second=T_first_from @ loop.T_from_to @ T_to_second,
+                    covariance=_carried(loop.covariance, T_to_second),
+                    kind=EdgeKind.LOOP,
+                )
+            )
+        return found
 
-    def _fix_edges(self, path: Path) -> list[Edge]:
+    def _fix_edges(self, path: Path) -> list[PlanarEdge]:
         """Return the loops from the loaded map's submaps to the run's, at most one per run submap.
 
         More would not be independent: fixes in one place share their errors.
         """
         if self._localizer is None or not self.is_placed:
             return []
-        edges: dict[int, Edge] = {}
+        edges: dict[int, PlanarEdge] = {}
         for fix in self._localizer.fixes:
             node, pose = self._collector.node_at(fix.stamp_ns), path(fix.stamp_ns)
             if pose is not None and node not in edges:
-                edges[node] = self._fix_edge(fix, node, self._back(pose, node))
+                edges[node] = self._fix_edge(
+                    fix, node, se3.inverse(pose) @ self._collector.T_run_node[node]
+                )
         return list(edges.values())
 
-    def _fix_edge(self, fix: Fix, node: int, T_base_node: Planar) -> Edge:
+    def _fix_edge(self, fix: Fix, node: int, T_base_node: Transform) -> PlanarEdge:
         """Return the loop to a node from the nearest submap of the loaded map."""
         count, nodes = len(self._loaded.submaps), self._loaded.T_map_node
         away_m = np.hypot(*(nodes[:, :2] - fix.T_map_base[:2]).T)
         first = int(np.argmin(np.where(self._loaded.pieces == 0, away_m, np.inf)))
-        T_map_node = planar.compose(fix.T_map_base, T_base_node)
-        # In base's axes at the fix, then carried to the node.
-        carried = planar.propagate(fix.match.covariance, np.zeros(3), T_base_node, np.zeros((3, 3)))
-        turn = planar.turn(-float(T_base_node[2]))
-        return Edge(
+        T_map_node = planar.compose(fix.T_map_base, planar.from_transform(T_base_node))
+        covariance = planar.spatial_covariance(fix.match.covariance)
+        return PlanarEdge(
             first=first,
             second=count + node,
             T_first_second=planar.between(nodes[first], T_map_node),
-            covariance=turn @ carried @ turn.T,
+            covariance=planar.planar_covariance(_carried(covariance, T_base_node)),
             kind=EdgeKind.LOOP,
         )
 
-    def _away(self, T_run_base: Transform, node: int) -> Planar:
-        """Return T_node_base."""
-        return planar.between(self._collector.T_run_node[node], planar.from_transform(T_run_base))
 
-    def _back(self, T_run_base: Transform, node: int) -> Planar:
-        """Return T_base_node."""
-        return planar.between(self._away(T_run_base, node), np.zeros(3))
+def _shifted(edge: Edge, by: int) -> Edge:
+    return replace(edge, first=edge.first + by, second=edge.second + by)
 
 
-def _planar_at(path: Path, stamp_ns: int) -> Planar:
-    found = path(stamp_ns)
-    assert found is not None  # its scan had a pose
-    return planar.from_transform(found)
+def _carried(covariance: NDArray[np.float64], T_base_node: Transform) -> NDArray[np.float64]:
+    """Return the covariance (6, 6) of a pose of base as that of a node fixed to it, its axes."""
+    carry = se3.adjoint(se3.inverse(T_base_node))
+    return np.asarray(carry @ covariance @ carry.T)
+
+
+def _planar(poses: Sequence[Transform] | NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.array([planar.from_transform(T) for T in poses]).reshape(-1, 3)
+
+
+def _spatial(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.array([planar.to_transform(T) for T in poses]).reshape(-1, 4, 4)

@@ -8,7 +8,14 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.types.maps import GridLayer, LandmarkLayer, MapLayers, PointLayer, PoseGraphLayer
+from sceneslam.types.maps import (
+    GridLayer,
+    LandmarkLayer,
+    LoopLayer,
+    MapLayers,
+    PointLayer,
+    PoseGraphLayer,
+)
 from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.trajectory import Trajectory
 
@@ -32,6 +39,10 @@ _LAYERS: dict[str, tuple[type, _Shapes]] = {
     "landmarks": (
         LandmarkLayer,
         {"points": ("N", 3), "first_stamps_ns": ("N",), "sightings": ("N",)},
+    ),
+    "loops": (
+        LoopLayer,
+        {"stamps_ns": ("M", 2), "T_from_to": ("M", 4, 4), "information": ("M", 6, 6)},
     ),
 }
 Value = TypeVar("Value")

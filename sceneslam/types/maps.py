@@ -50,6 +50,18 @@ class LandmarkLayer:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopLayer:
+    """Loops from a module's earlier sessions to this one, measured by recognizing places.
+
+    The information is the inverse covariance of se3.log(T_from_to) about the measurement.
+    """
+
+    stamps_ns: NDArray[np.int64]  # (M, 2), of the poses from and to
+    T_from_to: NDArray[np.float64]  # (M, 4, 4), base then to base now
+    information: NDArray[np.float64]  # (M, 6, 6) [1/m^2, 1/rad^2]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapLayers:
     """The map of one module, in its `local` frame."""
 
@@ -57,6 +69,7 @@ class MapLayers:
     grid: GridLayer | None = None
     pose_graph: PoseGraphLayer | None = None
     landmarks: LandmarkLayer | None = None
+    loops: LoopLayer | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

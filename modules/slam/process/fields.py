@@ -8,7 +8,14 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.types.maps import GridLayer, LandmarkLayer, MapLayers, PointLayer, PoseGraphLayer
+from sceneslam.types.maps import (
+    GridLayer,
+    LandmarkLayer,
+    LoopLayer,
+    MapLayers,
+    PointLayer,
+    PoseGraphLayer,
+)
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
@@ -21,6 +28,7 @@ _LAYERS = {
     "grid": GridLayer,
     "pose_graph": PoseGraphLayer,
     "landmarks": LandmarkLayer,
+    "loops": LoopLayer,
 }
 _SKEW_MAX = 1e-3  # as the bus allows
 Layer = TypeVar("Layer")

@@ -64,7 +64,7 @@ class RgbdSlam:
         check_limits(self._arguments)
         self._monocular_scenes = frozenset(monocular_scenes)
         self._ignores_depth = False
-        self._reunion = Reunion(keyframe_limit=keyframe_limit)
+        self._reunion = Reunion(keyframe_limit=10 * keyframe_limit)
         self._T_local_base = se3.identity()
 
     @property
@@ -137,7 +137,7 @@ class RgbdSlam:
         """Return in `local` the cloud, a planar robot's grid, the pose graph and the landmarks."""
         layers = self._layers.build(list(self._map.keyframes.all()))
         graph, landmarks = self._memory.pose_graph(), self._memory.landmarks()
-        return replace(layers, pose_graph=graph, landmarks=landmarks)
+        return replace(layers, pose_graph=graph, landmarks=landmarks, loops=self._reunion.loops)
 
     def shutdown(self) -> None:
         """Stop the workers; the map stays readable."""

@@ -1,7 +1,8 @@
-"""Relocalize across sessions, so that all sessions of the module lie in one map.
+"""Relocalize across sessions.
 
 Every session has its own map, and the poses of other modules in between have drifted. When the
-camera sees a place of an earlier session, its pose in `map` is known again.
+camera sees a place of an earlier session, its pose in `map` is known again; every such place is
+reported as a loop.
 """
 
 from __future__ import annotations
@@ -9,8 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.types import se3
+from sceneslam.types.maps import LoopLayer
 from sceneslam.types.se3 import Transform
 
 from .recognition import PlaceRecognizer
@@ -22,6 +25,8 @@ _TRIED = 2  # keyframes per past session that an image is compared with
 _SAME_M, _SAME_RAD = 0.1, 0.05  # largest difference of two agreeing results
 _DRIFT_M, _DRIFT_RAD = 0.3, 0.2  # accepted drift between the sessions
 _DRIFT_M_PER_S, _DRIFT_RAD_PER_S = 0.05, 0.05  # accepted drift per second: 5 % of walking pace
+_KEYFRAME_M, _KEYFRAME_RAD = 0.005, 0.002  # error of a keyframe (experiments/rgbd_loop.md)
+_LOOP_M = 1.0  # between two loops, less would not be independent
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,20 +47,32 @@ class _Query:
     T_local_base: Transform
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Loop:
+    """A place of an earlier session that was recognized."""
+
+    stamps_ns: tuple[int, int]  # of the keyframe, and now
+    T_from_to: Transform  # base then to base now
+    covariance: NDArray[np.float64]  # (6, 6) of se3.log order
+    T_new_old: Transform  # aligns the session with the past one
+
+
 class Reunion:
     """Searches past sessions, some work per image, until the current session is aligned."""
 
     def __init__(self, *, keyframe_limit: int) -> None:
         self._limit = keyframe_limit
         self._past: list[_Past] = []
+        self._loops: list[_Loop] = []  # of the current session
         self._T_map_local: Transform | None = None
         self._queries: list[tuple[_Past, _Query]] = []
-        self._hypothesis: Transform | None = None
+        self._hypothesis: _Loop | None = None
         self._is_known, self._images, self._end_ns = False, 0, 0
+        self._looped_at = np.full(3, np.inf)  # where the last loop was
 
     def begin(self) -> None:
         """Begin a session, which is not placed yet."""
-        self._T_map_local, self._end_ns = None, 0
+        self._T_map_local, self._end_ns, self._loops = None, 0, []
         self._forget()
 
     def place(self, T_map_local: Transform) -> None:
@@ -63,27 +80,49 @@ class Reunion:
         self._T_map_local = T_map_local.copy()
         self._forget()
 
+    @property
+    def loops(self) -> LoopLayer | None:
+        """Return the loops from earlier sessions to the current one."""
+        if not self._loops:
+            return None
+        return LoopLayer(
+            stamps_ns=np.array([loop.stamps_ns for loop in self._loops], np.int64),
+            T_from_to=np.array([loop.T_from_to for loop in self._loops]),
+            information=np.array([np.linalg.inv(loop.covariance) for loop in self._loops]),
+        )
+
     def see(self, view: View, T_local_base: Transform) -> None:
         """Take a view with a tracked pose."""
         self._end_ns = view.observation.stamp_ns
         self._images += 1
-        if self._past and not self._is_known and not self._queries and self._images % _EVERY == 0:
-            query = _Query(view=view, T_local_base=T_local_base.copy())
-            self._queries = [(past, query) for past in self._past]
+        if not self._past or self._queries or self._images % _EVERY:
+            return
+        if self._is_known and np.linalg.norm(T_local_base[:3, 3] - self._looped_at) < _LOOP_M:
+            return
+        query = _Query(view=view, T_local_base=T_local_base.copy())
+        self._queries = [(past, query) for past in self._past]
 
     def step(self) -> Transform | None:
         """Do one image's share; return T_new_old (4, 4) once two views agree on it, else None."""
         if not self._queries or self._T_map_local is None:
             return None
         past, query = self._queries.pop()
-        T_new_old = self._recognise(past, query, self._T_map_local)
-        if T_new_old is None:
+        loop = self._recognise(past, query, self._T_map_local)
+        if loop is None:
             return None
-        earlier, self._hypothesis, self._queries = self._hypothesis, T_new_old, []
-        if earlier is None or not _is_small(se3.inverse(earlier) @ T_new_old, _SAME_M, _SAME_RAD):
+        self._queries = []
+        if self._is_known:
+            self._add(loop, query)
+            return None
+        earlier, self._hypothesis = self._hypothesis, loop
+        if earlier is None or not _is_small(
+            se3.inverse(earlier.T_new_old) @ loop.T_new_old, _SAME_M, _SAME_RAD
+        ):
             return None
         self._is_known = True
-        return T_new_old
+        self._loops.append(earlier)
+        self._add(loop, query)
+        return loop.T_new_old
 
     def end(self, visual_map: VisualMap, recognizer: PlaceRecognizer) -> None:
         """Keep the session's map if it was placed; remove the oldest maps beyond the limit."""
@@ -108,21 +147,34 @@ class Reunion:
         self._queries, self._hypothesis = [], None
         self._is_known, self._images = False, 0
 
-    def _recognise(self, past: _Past, query: _Query, T_map_local: Transform) -> Transform | None:
-        """Return T_new_old (4, 4) that aligns the session with a past one, by this view."""
+    def _add(self, loop: _Loop, query: _Query) -> None:
+        self._loops.append(loop)
+        self._looped_at = query.T_local_base[:3, 3]
+
+    def _recognise(self, past: _Past, query: _Query, T_map_local: Transform) -> _Loop | None:
+        """Return the loop that aligns the session with a past one, by this view."""
         view = query.view
         alike = past.recognizer.places.alike(view.features.descriptors)
         for place in alike[:_TRIED]:
             seen = past.recognizer.recognize(place.place_id, view.features, view.depth_m)
             if seen is None:
                 continue
-            T_map_base = past.T_map_local @ seen.fix.estimate.T_local_base
-            T_new_old = se3.inverse(T_map_local) @ T_map_base @ se3.inverse(query.T_local_base)
+            estimate = seen.fix.estimate
+            T_map_base = past.T_map_local @ estimate.T_local_base
             T_error = se3.inverse(T_map_local @ query.T_local_base) @ T_map_base
             elapsed_s = max(0.0, (view.observation.stamp_ns - past.end_ns) * 1e-9)
             drift_m = _DRIFT_M + _DRIFT_M_PER_S * elapsed_s
             drift_rad = _DRIFT_RAD + _DRIFT_RAD_PER_S * elapsed_s
-            return np.asarray(T_new_old) if _is_small(T_error, drift_m, drift_rad) else None
+            if not _is_small(T_error, drift_m, drift_rad):
+                return None
+            keyframe = past.visual_map.keyframes[seen.keyframe_id]
+            floor = np.repeat([_KEYFRAME_M**2, _KEYFRAME_RAD**2], 3)
+            return _Loop(
+                stamps_ns=(keyframe.stamp_ns, view.observation.stamp_ns),
+                T_from_to=se3.inverse(keyframe.T_local_base) @ estimate.T_local_base,
+                covariance=estimate.covariance + np.diag(floor),
+                T_new_old=se3.inverse(T_map_local) @ T_map_base @ se3.inverse(query.T_local_base),
+            )
         return None
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan
-from sceneslam.atlas.submaps.graph import Edge, EdgeKind
+from sceneslam.atlas.submaps.graph import EdgeKind, PlanarEdge
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.types.errors import InputError, told
 from sceneslam.types.files import PART, replacing
@@ -238,7 +238,7 @@ def _unpacked(arrays: Mapping[str, NDArray[Any]], modules: list[str]) -> SavedMa
             )
         )
     edges = [
-        Edge(
+        PlanarEdge(
             first=int(nodes[0]),
             second=int(nodes[1]),
             T_first_second=motion,

@@ -12,7 +12,7 @@ from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
-from sceneslam.atlas.submaps.graph import Edge, EdgeKind, consistent, solve
+from sceneslam.atlas.submaps.graph import EdgeKind, PlanarEdge, consistent, solve
 from sceneslam.types import planar
 
 _AROUND = 1  # neighbouring submaps on either side that are searched together with one
@@ -55,7 +55,7 @@ def _joined(saved: SavedMap, piece: int) -> SavedMap | None:
     own = np.flatnonzero(saved.pieces == piece).tolist()
     loops = _loops(saved, own)
     drift = np.zeros_like(saved.T_map_node)
-    agreeing = consistent(loops, saved.T_map_node, drift)
+    agreeing = [loops[index] for index in consistent(loops, saved.T_map_node, drift)]
     if len(agreeing) < _LOOPS_MIN:
         return None
     nodes = np.array(saved.T_map_node)
@@ -71,7 +71,7 @@ def _joined(saved: SavedMap, piece: int) -> SavedMap | None:
     return replace(saved, T_map_node=solved, pieces=pieces, edges=(*saved.edges, *agreeing))
 
 
-def _loops(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
+def _loops(saved: SavedMap, own: Sequence[int]) -> list[PlanarEdge]:
     """Return loops from the first piece to the submaps `own` of another piece."""
     main = np.flatnonzero(saved.pieces == 0)
     target, found = Recognizer(PlanField(saved.plan())), []
@@ -90,7 +90,7 @@ def _loops(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
         away_m = np.linalg.norm(saved.T_map_node[main, :2] - match.T_target_query[:2], axis=1)
         first = int(main[np.argmin(away_m)])
         found.append(
-            Edge(
+            PlanarEdge(
                 first=first,
                 second=node,
                 T_first_second=planar.between(saved.T_map_node[first], match.T_target_query),
@@ -102,13 +102,21 @@ def _loops(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
 
 
 def _solve(
-    saved: SavedMap, nodes: NDArray[np.float64], own: Sequence[int], loops: Sequence[Edge]
+    saved: SavedMap, nodes: NDArray[np.float64], own: Sequence[int], loops: Sequence[PlanarEdge]
 ) -> NDArray[np.float64]:
     """Return the optimised nodes (N, 3); those of the other pieces stay."""
     inside = set(own)
-    motions = [edge for edge in saved.edges if edge.first in inside and edge.second in inside]
-    fixed = [node for node in range(len(nodes)) if node not in inside]
-    return solve(nodes, motions, loops, fixed=fixed, loose=own[0]).T_map_node
+    motions = [
+        edge.spatial for edge in saved.edges if edge.first in inside and edge.second in inside
+    ]
+    solved = solve(
+        np.array([planar.to_transform(node) for node in nodes]),
+        motions,
+        [loop.spatial for loop in loops],
+        fixed=[node for node in range(len(nodes)) if node not in inside],
+        loose=own[0],
+    )
+    return np.array([planar.from_transform(T) for T in solved.T_map_node])
 
 
 def _renumbered(saved: SavedMap) -> SavedMap:

@@ -7,7 +7,7 @@ import numpy as np
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
-from sceneslam.atlas.submaps.graph import Edge, EdgeKind
+from sceneslam.atlas.submaps.graph import EdgeKind, PlanarEdge
 from sceneslam.types import planar
 
 _COVERED_RATIO = 0.95  # of a submap's walls, covered by later submaps
@@ -54,7 +54,7 @@ def _is_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
     return bool((far_m <= 0.1).mean() >= _COVERED_RATIO)  # two cells
 
 
-def _bridges(saved: SavedMap, kept: set[int]) -> list[Edge]:
+def _bridges(saved: SavedMap, kept: set[int]) -> list[PlanarEdge]:
     """Return the composed motions across removed submaps."""
     onward = {edge.first: edge for edge in saved.edges if edge.kind is not EdgeKind.LOOP}
     found = []
@@ -68,13 +68,13 @@ def _bridges(saved: SavedMap, kept: set[int]) -> list[Edge]:
     return found
 
 
-def _in_a_row(start: int, edge: Edge, after: Edge) -> Edge:
+def _in_a_row(start: int, edge: PlanarEdge, after: PlanarEdge) -> PlanarEdge:
     T = after.T_first_second
     back = planar.turn(-float(T[2]))
     carry = np.eye(3)
     carry[:2, 2] = -T[1], T[0]
     carried = back @ carry @ edge.covariance @ carry.T @ back.T
-    return Edge(
+    return PlanarEdge(
         first=start,
         second=after.second,
         T_first_second=planar.compose(edge.T_first_second, T),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan, join
-from sceneslam.atlas.submaps.graph import Edge
+from sceneslam.atlas.submaps.graph import PlanarEdge
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.types import planar
 
@@ -21,7 +21,7 @@ class SavedMap:
     submaps: tuple[Submap, ...]
     T_map_node: NDArray[np.float64]  # (N, 3) [m, m, rad]
     pieces: NDArray[np.int64]  # (N,), piece of every node; 0 is the first
-    edges: tuple[Edge, ...]
+    edges: tuple[PlanarEdge, ...]
 
     @property
     def runs(self) -> int:

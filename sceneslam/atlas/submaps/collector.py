@@ -1,4 +1,4 @@
-"""Collect scans at the poses of a run, and group them into submaps once the poses are final."""
+"""Collect the poses and scans of a run, and group them into submaps once the poses are final."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from sceneslam.atlas.submaps.submap import (
 from sceneslam.atlas.uncertainty import MAPPED, VELOCITY, WHEELS
 from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar, se3
-from sceneslam.types.planar import Planar
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
 
 _SETTLED_NS = 20_000_000_000  # a hand-over does not replace older poses (policy.buffer_s)
 _LEVEL_COS = np.cos(np.radians(3.0))  # at this tilt a wall 4 m away is seen 0.2 m higher or lower
+_USUAL_STEPS = 50  # 5 m: over less, no module's tilt drifts by a degree
 _SLOPE = 0.2  # m per m: steeper than any ramp on a floor
 _LEVEL_RATIO = 0.5  # least share of level steps; less with a hand-held sensor
 
@@ -49,56 +49,63 @@ class Collector:
     def __init__(self, rig: Rig, known: Callable[[int], Known | None], run: int) -> None:
         """Begin; `known` returns the current estimate of the pose at a stamp."""
         self.submaps: list[Submap] = []
-        self.T_run_node: list[Planar] = []
+        self.T_run_node: list[Transform] = []
         self.motions: list[Edge] = []
         self.drift = [np.zeros(3)]  # per submap: summed standard deviations [m, m, rad]
         self._known, self._run = known, run
         self._bridge = WHEELS if Sensor.ODOMETRY in rig.sensors else VELOCITY
-        self._scans: list[KeyScan] = []  # not yet in a submap
+        self._steps: list[tuple[int, KeyScan | None]] = []  # stamp and scan, not yet in a submap
         self._part: list[KeyPose] = []  # of the newest submap
-        self._last: Transform | None = None  # pose of the last scan
-        self._level = self._steps = 0
+        self._last: Transform | None = None  # pose of the last step
+        self._up = np.zeros(3)  # of the base, the mean over the last steps
+        self._level = self._count = 0
 
     @property
     def is_level(self) -> bool:
         """Tell whether the base moves on a floor."""
-        return self._level >= _LEVEL_RATIO * self._steps
+        return self._level >= _LEVEL_RATIO * self._count
 
     def has_moved(self, T_run_base: Transform) -> bool:
-        """Tell whether it is time for a scan."""
+        """Tell whether it is time for a step."""
         if self._last is None:
             return True
         step = se3.inverse(self._last) @ T_run_base
         return bool(np.hypot(*step[:2, 3]) >= STEP_M or abs(se3.yaw_rad(step)) >= STEP_RAD)
 
     def step_to(self, T_run_base: Transform) -> bool:
-        """Record a step; return whether the new pose is level, as of a robot on a floor."""
-        is_level = bool(T_run_base[2, 2] >= _LEVEL_COS)
+        """Record a step; return whether the new pose is level, as of a robot on a floor.
+
+        Level is how the base stood on the mean of the last metres, as modules drift in tilt.
+        """
+        self._count += 1
+        self._up += (T_run_base[:3, 2] - self._up) / min(self._count, _USUAL_STEPS)
+        up = self._up / np.linalg.norm(self._up)
+        is_level = bool(T_run_base[:3, 2] @ up >= _LEVEL_COS)
         if self._last is not None:
             step_m = T_run_base[:3, 3] - self._last[:3, 3]
-            is_level &= bool(abs(step_m[2]) <= _SLOPE * max(np.hypot(*step_m[:2]), STEP_M))
+            climbed_m = float(step_m @ up)
+            ahead_m = float(np.linalg.norm(step_m - climbed_m * up))
+            is_level &= abs(climbed_m) <= _SLOPE * max(ahead_m, STEP_M)
         self._last = T_run_base
-        self._steps, self._level = self._steps + 1, self._level + is_level
+        self._level += is_level
         return is_level
 
-    def add(self, scan: KeyScan) -> None:
-        """Add a scan after its step, and make submaps of scans with final poses."""
-        self._scans.append(scan)
-        settled = bisect_right(
-            self._scans, scan.stamp_ns - _SETTLED_NS, key=lambda each: each.stamp_ns
-        )
-        if 2 * settled > len(self._scans):
+    def add(self, stamp_ns: int, scan: KeyScan | None) -> None:
+        """Add a step with its scan, and make submaps of steps with final poses."""
+        self._steps.append((stamp_ns, scan))
+        settled = bisect_right(self._steps, stamp_ns - _SETTLED_NS, key=lambda each: each[0])
+        if 2 * settled > len(self._steps):
             self._cut(settled, is_end=False)
 
     def finish(self) -> None:
-        """Make submaps of the remaining scans."""
-        self._cut(len(self._scans), is_end=True)
+        """Make submaps of the remaining steps."""
+        self._cut(len(self._steps), is_end=True)
 
     def remeasure(self, poses: NDArray[np.float64]) -> None:
-        """Set the submaps' poses (N, 3) [m, m, rad] as revised, and the motions between them."""
+        """Set the submaps' poses (N, 4, 4) as revised, and the motions between them."""
         self.T_run_node = list(poses)
         self.motions = [
-            replace(edge, T_first_second=planar.between(poses[edge.first], poses[edge.second]))
+            replace(edge, T_first_second=se3.inverse(poses[edge.first]) @ poses[edge.second])
             for edge in self.motions
         ]
 
@@ -108,26 +115,26 @@ class Collector:
         return max(bisect_right(starts, stamp_ns) - 1, 0)
 
     def _cut(self, count: int, *, is_end: bool) -> None:
-        """Make submaps of the oldest scans; the last may still grow, unless `is_end`."""
-        poses = [pose for scan in self._scans[:count] if (pose := self._posed(scan)) is not None]
+        """Make submaps of the oldest steps; the last may still grow, unless `is_end`."""
+        poses = [pose for step in self._steps[:count] if (pose := self._posed(*step)) is not None]
         parts = split(poses)
         for part in parts if is_end else parts[:-1]:
             self._append(part)
         done_ns = -1 if not self._part else self._part[-1].stamp_ns
-        self._scans = [scan for scan in self._scans if scan.stamp_ns > done_ns]
+        self._steps = [step for step in self._steps if step[0] > done_ns]
 
-    def _posed(self, scan: KeyScan) -> KeyPose | None:
-        known = self._known(scan.stamp_ns)
+    def _posed(self, stamp_ns: int, scan: KeyScan | None) -> KeyPose | None:
+        known = self._known(stamp_ns)
         if known is None:
             return None
-        told = known.covariance
         return KeyPose(
+            stamp_ns=stamp_ns,
             scan=scan,
-            T_map_base=planar.from_transform(known.T_map_base),
+            T_map_base=known.T_map_base,
             session=known.session,
             module=known.module,
             drift=self._bridge if known.module == BRIDGED else MAPPED,
-            told=None if told is None else planar.planar_covariance(told),
+            told=known.covariance,
         )
 
     def _append(self, part: list[KeyPose]) -> None:
@@ -137,12 +144,13 @@ class Collector:
                 Edge(
                     first=len(self.submaps) - 1,
                     second=len(self.submaps),
-                    T_first_second=planar.between(self._part[0].T_map_base, part[0].T_map_base),
+                    T_first_second=se3.inverse(self._part[0].T_map_base) @ part[0].T_map_base,
                     covariance=covariance,
                     kind=self._kind(part[0]),
                 )
             )
-            self.drift.append(self.drift[-1] + np.sqrt(np.diag(covariance)))
+            deviations = np.sqrt(np.diag(planar.planar_covariance(covariance)))
+            self.drift.append(self.drift[-1] + deviations)
         self.submaps.append(make_submap(part, self._run))
         self.T_run_node.append(part[0].T_map_base)
         self._part = part

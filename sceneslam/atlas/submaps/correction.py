@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.types import planar, se3
+from sceneslam.types import se3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -15,12 +15,12 @@ class Correction:
     """A correction of the map at each node of a run, ordered by stamp."""
 
     stamps_ns: NDArray[np.int64]  # (N,)
-    T_new_old: NDArray[np.float64]  # (N, 3)
+    T_new_old: NDArray[np.float64]  # (N, 4, 4)
 
     @classmethod
     def none(cls) -> Correction:
         """Return the correction that leaves all poses unchanged, bit by bit."""
-        return cls(stamps_ns=np.zeros(0, np.int64), T_new_old=np.zeros((0, 3)))
+        return cls(stamps_ns=np.zeros(0, np.int64), T_new_old=np.zeros((0, 4, 4)))
 
     def apply(
         self, stamps_ns: NDArray[np.int64], T_map_base: NDArray[np.float64]
@@ -36,8 +36,7 @@ class Correction:
         moved = np.array(T_map_base)
         for row, share in enumerate(shares.tolist()):
             first, second = (
-                planar.to_transform(self.T_new_old[node[row]]) @ T_map_base[row]
-                for node in (before, after)
+                self.T_new_old[node[row]] @ T_map_base[row] for node in (before, after)
             )
             moved[row] = se3.interpolate(first, second, share)
         return moved

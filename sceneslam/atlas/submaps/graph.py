@@ -17,10 +17,14 @@ from numpy.typing import NDArray
 
 from sceneslam.types import planar
 from sceneslam.types.planar import Matrix, Planar
+from sceneslam.types.se3 import Transform
 
-_CHI2_3 = 11.34  # chi-square with 3 degrees of freedom, 99th percentile
-_FIXED = np.array([1e-4, 1e-4, 1e-5])  # m, m, rad
-_LOOSE = np.array([10.0, 10.0, 3.0])  # m, m, rad: any loop moves it
+_CHI2_3, _CHI2_6 = 11.34, 16.81  # chi-square with 3 and 6 degrees of freedom, 99th percentile
+_FIXED = np.repeat([1e-4, 1e-5], 3)  # m, rad
+_LOOSE = np.array([10.0, 10.0, 1.0, 0.05, 0.05, 3.0])  # m, rad: any loop moves it
+_FLOOR = np.array([0.05, 0.02, 0.02]) ** 2  # m, rad: height and tilt between places of one floor
+_LEVEL = [2, 3, 4]  # height, roll and pitch in se3.log order
+_TO_GTSAM = [3, 4, 5, 0, 1, 2]  # rotation first
 
 
 class EdgeKind(IntEnum):
@@ -38,21 +42,56 @@ class Edge:
 
     first: int
     second: int
+    T_first_second: Transform
+    covariance: NDArray[np.float64]  # (6, 6) of se3.log order [m, rad], axes of second
+    kind: EdgeKind
+
+    @property
+    def planar(self) -> PlanarEdge:
+        """Return the motion in the plane."""
+        return PlanarEdge(
+            first=self.first,
+            second=self.second,
+            T_first_second=planar.from_transform(self.T_first_second),
+            covariance=planar.planar_covariance(self.covariance),
+            kind=self.kind,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PlanarEdge:
+    """A measured motion between two nodes on one floor, as a map keeps it."""
+
+    first: int
+    second: int
     T_first_second: Planar
     covariance: Matrix  # (3, 3), axes of second
     kind: EdgeKind
 
-    def shifted(self, by: int) -> Edge:
+    def shifted(self, by: int) -> PlanarEdge:
         """Return the edge with its node numbers increased by `by`."""
         return replace(self, first=self.first + by, second=self.second + by)
+
+    @property
+    def spatial(self) -> Edge:
+        """Return the motion in space: neither height nor tilt changes on a floor."""
+        covariance = planar.spatial_covariance(self.covariance)
+        covariance[_LEVEL, _LEVEL] = _FLOOR
+        return Edge(
+            first=self.first,
+            second=self.second,
+            T_first_second=planar.to_transform(self.T_first_second),
+            covariance=covariance,
+            kind=self.kind,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Solved:
     """The graph after optimisation."""
 
-    T_map_node: NDArray[np.float64]  # (N, 3)
-    loops: tuple[Edge, ...]  # that were accepted
+    T_map_node: NDArray[np.float64]  # (N, 4, 4)
+    accepted: list[int]  # indices of the accepted loops
 
 
 def solve(
@@ -63,7 +102,7 @@ def solve(
     fixed: Sequence[int],
     loose: int,
 ) -> Solved:
-    """Return the poses (N, 3) [m, m, rad] that best fit the motions and the accepted loops.
+    """Return the poses (N, 4, 4) that best fit the motions and the accepted loops.
 
     `fixed` nodes stay; `loose` has a weak prior, so that only a loop to a fixed node moves it.
     Every node must be connected to one of these. The result is deterministic.
@@ -71,44 +110,46 @@ def solve(
     import gtsam
 
     if not loops:
-        return Solved(T_map_node=T_map_node, loops=())
+        return Solved(T_map_node=T_map_node, accepted=[])
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for number, pose in enumerate(T_map_node):
-        values.insert(number, gtsam.Pose2(*pose))
-    noise = gtsam.noiseModel.Diagonal.Sigmas(_FIXED)
+    poses = [gtsam.Pose3(T) for T in T_map_node]
+    for number, pose in enumerate(poses):
+        values.insert(number, pose)
+    noise = gtsam.noiseModel.Diagonal.Sigmas(_FIXED[_TO_GTSAM])
     for number in fixed:
-        graph.add(gtsam.PriorFactorPose2(number, gtsam.Pose2(*T_map_node[number]), noise))
-    slack = gtsam.noiseModel.Diagonal.Sigmas(_LOOSE if len(fixed) else _FIXED)
-    graph.add(gtsam.PriorFactorPose2(loose, gtsam.Pose2(*T_map_node[loose]), slack))
+        graph.add(gtsam.PriorFactorPose3(number, poses[number], noise))
+    slack = gtsam.noiseModel.Diagonal.Sigmas((_LOOSE if len(fixed) else _FIXED)[_TO_GTSAM])
+    graph.add(gtsam.PriorFactorPose3(loose, poses[loose], slack))
     for edge in [*motions, *loops]:
         graph.add(_factor(gtsam, edge))
     trusted = list(range(len(fixed) + 1 + len(motions)))
     parameters = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
     parameters.setKnownInliers(trusted)
     optimizer = gtsam.GncLMOptimizer(graph, values, parameters)
-    optimizer.setInlierCostThresholds(0.5 * _CHI2_3)
+    optimizer.setInlierCostThresholds(0.5 * _CHI2_6)
     result = optimizer.optimize()
     weights = np.asarray(optimizer.getWeights())[len(trusted) :]
-    poses = [result.atPose2(number) for number in range(len(T_map_node))]
     return Solved(
-        T_map_node=np.array([[pose.x(), pose.y(), pose.theta()] for pose in poses]),
-        loops=tuple(loop for loop, weight in zip(loops, weights, strict=True) if weight > 0.5),
+        T_map_node=np.array([result.atPose3(row).matrix() for row in range(len(poses))]),
+        accepted=np.flatnonzero(weights > 0.5).tolist(),
     )
 
 
 def _factor(gtsam: Any, edge: Edge) -> Any:
-    noise = gtsam.noiseModel.Gaussian.Covariance(edge.covariance)
-    return gtsam.BetweenFactorPose2(
-        edge.first, edge.second, gtsam.Pose2(*edge.T_first_second), noise
+    covariance = edge.covariance[np.ix_(_TO_GTSAM, _TO_GTSAM)]
+    noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    return gtsam.BetweenFactorPose3(
+        edge.first, edge.second, gtsam.Pose3(edge.T_first_second), noise
     )
 
 
 def consistent(
-    loops: Sequence[Edge], T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
-) -> list[Edge]:
-    """Return the largest set of loops that agree pairwise within the drift between them.
+    loops: Sequence[PlanarEdge], T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
+) -> list[int]:
+    """Return the indices of the largest set of loops that agree pairwise within the drift.
 
-    `drift` (N, 3): standard deviations [m, m, rad], summed up along the path to each node.
+    `T_map_node` (N, 3) are the estimated nodes [m, m, rad], `drift` (N, 3) the standard deviations
+    [m, m, rad], summed up along the path to each node.
     """
     count = len(loops)
     agree = np.zeros((count, count), bool)
@@ -116,10 +157,12 @@ def consistent(
         for column in range(row):
             agree[row, column] = _agree(loops[row], loops[column], T_map_node, drift)
     agree |= agree.T
-    return [loops[index] for index in _largest_clique(agree)]
+    return _largest_clique(agree)
 
 
-def _agree(a: Edge, b: Edge, T_map_node: NDArray[np.float64], drift: NDArray[np.float64]) -> bool:
+def _agree(
+    a: PlanarEdge, b: PlanarEdge, T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
+) -> bool:
     """Tell whether the cycle of a, the path to b's end, b and the path back closes."""
     T_ends = planar.between(T_map_node[a.second], T_map_node[b.second])
     T_starts = planar.between(T_map_node[a.first], T_map_node[b.first])

@@ -11,32 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import FloorPlan, draw
-from sceneslam.atlas.uncertainty import Drift
+from sceneslam.atlas.uncertainty import Covariance, Drift
 from sceneslam.scans.key_scan import KeyScan
-from sceneslam.types import planar
-from sceneslam.types.planar import Matrix, Planar
+from sceneslam.types import planar, se3
+from sceneslam.types.planar import Planar
+from sceneslam.types.se3 import Transform
 
 LENGTH_M = 2.5  # length of path in a submap: by MAPPED it drifts 1 cm
 TURN_RAD = 2 * np.pi  # or this much turning, after which everything around was seen
 STEP_M, STEP_RAD = 0.1, 0.1  # between two scans of a submap
-_FLOOR = np.array([0.003, 0.003, 0.002])  # m, m, rad: least standard deviation between two submaps
+_FLOOR_M, _FLOOR_RAD = 0.003, 0.002  # least standard deviation between two submaps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KeyPose:
-    """A scan with its pose and the uncertainty of the motion to it."""
+    """A pose of the path with its scan, and the uncertainty of the motion to it."""
 
-    scan: KeyScan
-    T_map_base: Planar  # as estimated when it was added
+    stamp_ns: int
+    scan: KeyScan | None  # None: no sensor saw walls, or it was tilted
+    T_map_base: Transform  # as estimated when it was added
     session: int
     module: str
     drift: Drift  # of the motion from the one before
-    told: Matrix | None  # (3, 3) covariance of T_local_base, as the module reported it
-
-    @property
-    def stamp_ns(self) -> int:
-        """Return the scan's stamp."""
-        return self.scan.stamp_ns
+    told: Covariance | None  # (6, 6) of T_local_base, as the module reported it
 
 
 class Drawing:
@@ -59,12 +56,12 @@ class Drawing:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Submap:
-    """A node of the graph; its frame is base, level, at its first scan."""
+    """A node of the graph; its frame is base, level, at its first pose."""
 
     run: int  # index of the run, by age, in a saved map
     session: int
     module: str
-    stamps_ns: NDArray[np.int64]  # (K,) of its scans
+    stamps_ns: NDArray[np.int64]  # (K,) of its poses
     T_submap_base: NDArray[np.float64]  # (K, 3)
     drawing: Drawing  # of its plan
 
@@ -79,16 +76,17 @@ class Submap:
 
 
 def make_submap(poses: Sequence[KeyPose], run: int) -> Submap:
-    """Return the submap of consecutive scans of one session."""
+    """Return the submap of consecutive poses of one session."""
     first = poses[0]
-    T_submap_base = [planar.between(first.T_map_base, pose.T_map_base) for pose in poses]
+    T_submap_base = [_planar(first, pose) for pose in poses]
+    placed = zip(T_submap_base, (pose.scan for pose in poses), strict=True)
     return Submap(
         run=run,
         session=first.session,
         module=first.module,
         stamps_ns=np.array([pose.stamp_ns for pose in poses], np.int64),
         T_submap_base=np.array(T_submap_base),
-        drawing=Drawing(scans=list(zip(T_submap_base, (pose.scan for pose in poses), strict=True))),
+        drawing=Drawing(scans=[(T, scan) for T, scan in placed if scan is not None]),
     )
 
 
@@ -98,7 +96,7 @@ def split(poses: Sequence[KeyPose]) -> list[list[KeyPose]]:
     length_m = turn_rad = 0.0
     for pose in poses:
         if parts and parts[-1][-1].session == pose.session:
-            step = planar.between(parts[-1][-1].T_map_base, pose.T_map_base)
+            step = _planar(parts[-1][-1], pose)
             length_m += float(np.hypot(step[0], step[1]))
             turn_rad += abs(float(step[2]))
             if length_m <= LENGTH_M and turn_rad <= TURN_RAD:
@@ -109,15 +107,13 @@ def split(poses: Sequence[KeyPose]) -> list[list[KeyPose]]:
     return parts
 
 
-def motion_covariance(poses: Sequence[KeyPose]) -> Matrix:
-    """Return the covariance (3, 3), axes of the last, of the motion from the first to the last.
+def motion_covariance(poses: Sequence[KeyPose]) -> Covariance:
+    """Return the covariance (6, 6), axes of the last, of the motion from the first to the last.
 
     Errors of one kind are systematic: standard deviations add up. The error of a map's rotation is
     random: variances add up.
     """
-    motions = np.array(
-        [planar.between(a.T_map_base, b.T_map_base) for a, b in pairwise(poses)]
-    ).reshape(-1, 3)
+    motions = np.array([_planar(a, b) for a, b in pairwise(poses)]).reshape(-1, 3)
     along_m, turned = np.hypot(motions[:, 0], motions[:, 1]), np.abs(motions[:, 2])
     kinds = [pose.drift for pose in poses[1:]]
     per_m = np.array([kind.per_m for kind in kinds])
@@ -126,21 +122,22 @@ def motion_covariance(poses: Sequence[KeyPose]) -> Matrix:
     rad_per_root = np.array([kind.rad_per_root for kind in kinds])
     turn = float(rad_per_m @ along_m + rad_per_rad @ turned)
     turn = float(np.hypot(turn, np.sqrt(rad_per_root**2 @ (along_m + turned))))
-    away = planar.between(poses[0].T_map_base, poses[-1].T_map_base)
+    away = _planar(poses[0], poses[-1])
     lever_m = 0.5 * float(np.hypot(away[0], away[1]))
     shift_m = float(np.hypot(per_m @ along_m, turn * lever_m))
-    covariance = np.diag(np.array([shift_m, shift_m, turn]) ** 2 + _FLOOR**2)
-    return covariance + _grown(poses[0], poses[-1])
+    variances = np.repeat([shift_m**2 + _FLOOR_M**2, turn**2 + _FLOOR_RAD**2], 3)
+    return np.diag(variances) + _grown(poses[0], poses[-1])
 
 
-def _grown(first: KeyPose, last: KeyPose) -> Matrix:
-    """Return the growth (3, 3) of a module's covariance between two poses of its session."""
+def _grown(first: KeyPose, last: KeyPose) -> Covariance:
+    """Return the growth (6, 6) of a module's covariance between two poses of its session."""
     if first.session != last.session or first.told is None or last.told is None:
-        return np.zeros((3, 3))
-    x, y, _ = planar.between(last.T_map_base, first.T_map_base)
-    carry = np.eye(3)
-    carry[:2, 2] = y, -x
-    turn = planar.turn(float(first.T_map_base[2] - last.T_map_base[2]))
-    carried = carry @ turn @ first.told @ turn.T @ carry.T
-    values, vectors = np.linalg.eigh(last.told - carried)
+        return np.zeros((6, 6))
+    carry = se3.adjoint(se3.inverse(last.T_map_base) @ first.T_map_base)
+    values, vectors = np.linalg.eigh(last.told - carry @ first.told @ carry.T)
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+def _planar(first: KeyPose, second: KeyPose) -> Planar:
+    """Return the planar part of the motion from one pose to another."""
+    return planar.from_transform(se3.inverse(first.T_map_base) @ second.T_map_base)
