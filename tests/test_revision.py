@@ -6,7 +6,9 @@ from hypothesis import strategies as st
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.types import se3
-from sceneslam.types.maps import MapLayers
+from sceneslam.types.maps import LoopLayer, MapLayers
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.trajectory import Trajectory
 
@@ -80,6 +82,42 @@ def test_a_session_starts_where_the_one_before_it_ended_whatever_its_module_revi
     atlas.close_session(second, MapLayers(), revised)
     np.testing.assert_allclose(atlas.trajectory.T_world_base, poses, atol=1e-9)
     np.testing.assert_allclose(atlas.sessions[1].T_map_local, se3.inverse(shift), atol=1e-9)
+
+
+def test_a_loop_between_sessions_puts_right_what_drifted_between_them():
+    atlas, rig = Atlas(voxel_m=0.05), Rig(sensors=frozenset({Sensor.ODOMETRY}))
+    atlas.open(rig, lambda *_, **__: None)
+    turn = se3.exp(np.array([0.2, 0, 0, 0, 0, 0.02 * np.pi]))  # 100 steps around a circle
+    slow = turn @ se3.exp(np.array([0.02, 0, 0.01, 0, 0.001, 0.002]))
+    true, told = [se3.identity()], [se3.identity()]
+    for step in range(1, 121):
+        true.append(true[-1] @ turn)
+        told.append(told[-1] @ (slow if 10 <= step < 100 else turn))
+    stamp = lambda step: step * 10**9  # noqa: E731
+    for number, (first, last) in enumerate(((0, 10), (10, 100), (100, 121))):
+        atlas.begin_session("ab"[number % 2], told[first])
+        for step in range(first, last):
+            atlas.add_local(stamp(step), se3.inverse(told[first]) @ told[step])
+            atlas.add(stamp(step), told[step], "ab"[number % 2])
+            atlas.observe(Observation(stamp_ns=stamp(step)))
+    pairs = [(2, 103), (8, 109)]
+    loops = LoopLayer(
+        stamps_ns=np.array([(stamp(a), stamp(b)) for a, b in pairs]),
+        T_from_to=np.array([se3.inverse(true[a]) @ true[b] for a, b in pairs]),
+        information=np.array([np.eye(6) / 0.005**2] * 2),
+    )
+    for number in range(3):
+        layers = MapLayers(loops=loops if number == 2 else None)
+        atlas.close_session(number, layers, Trajectory.empty())
+    assert atlas.finish() == []
+    before, after = (
+        np.linalg.norm(found.positions_m - np.array(true)[:, :3, 3], axis=1)
+        for found in (atlas.online, atlas.trajectory)
+    )
+    assert before.max() > 0.5 and after.max() < 0.25 * before.max()
+    assert after[-20:].max() < 0.02 and after[:10].max() < 0.02
+    apart_m = np.linalg.norm(np.diff(atlas.trajectory.positions_m, axis=0), axis=1)
+    assert apart_m.max() < 0.24  # no jump at a seam
 
 
 def test_a_module_that_returns_without_knowing_its_place_moves_nothing():

@@ -49,17 +49,31 @@ def returned():
     module.shutdown()
     module.shutdown()
     answers, revised = drive(module, T_DRIFT, late=True)
+    loops = module.get_map().loops
     module.shutdown()
-    return answers, revised
+    return answers, revised, loops
 
 
 def test_second_session_finds_its_place_in_the_map_and_says_that_it_jumps(returned):
-    answers, revised = returned
+    answers, revised, _ = returned
     told = T_DRIFT @ np.stack([answer.T_local_base for answer in answers])
     jump = next(i for i, answer in enumerate(answers) if answer.revision)
     assert (errors_m(told)[:jump] > 0.1).all() and (errors_m(told)[jump:] < 0.03).all()
     assert answers[-1].revision == 1 and 15 < jump < 35
     assert (errors_m(T_DRIFT @ revised.T_world_base) < 0.03).all()
+
+
+def test_loops_to_the_earlier_session_are_reported_as_measured(returned):
+    _, _, loops = returned
+    assert len(loops.stamps_ns) >= 2
+    index_of = {seen(i, late=late).stamp_ns: i for i in range(IMAGES) for late in (False, True)}
+    for (from_ns, to_ns), T_from_to, information in zip(
+        loops.stamps_ns.tolist(), loops.T_from_to, loops.information, strict=True
+    ):
+        T_true = se3.inverse(true_pose(index_of[from_ns])) @ true_pose(index_of[to_ns])
+        off = se3.log(se3.inverse(T_true) @ T_from_to)
+        assert from_ns < PAUSE_NS < to_ns
+        assert off @ information @ off < 22.5  # chi-square, 6 degrees of freedom, 0.1 %
 
 
 def test_session_that_was_never_placed_stays_by_itself():

@@ -8,11 +8,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.hold import Hold
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.wheel_scale import WheelScale
 from sceneslam.motion.model import MotionModel
+from sceneslam.motion.tilt import levelled, up_by
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
@@ -31,12 +35,14 @@ class DeadReckoning:
         self._scales: dict[str, WheelScale] = {}  # by the module that measured it
         self._T_odom_base: Transform | None = None  # the last odometry, uncorrected
         self._T_corrected_base: Transform | None = None  # the same, corrected
+        self._stamp_ns: int | None = None  # of the last observation
         self._is_gap = False  # the last observation had no odometry
         self._turned_rad = 0.0  # rotation angle since the observation before [rad]
 
     def correct(self, observation: Observation, module: str) -> Observation:
         """Return the observation for a module, corrected by the calibration so far."""
-        yaw_rad = self._yaw_rad(observation)
+        turn = self._turn(observation)
+        duration_s, self._stamp_ns = self._since_s(observation), observation.stamp_ns
         before, now = self._T_odom_base, observation.T_odom_base
         is_gap, self._is_gap = self._is_gap, now is None
         self._turned_rad = 0.0
@@ -48,17 +54,21 @@ class DeadReckoning:
             self._T_corrected_base = now
             return observation
         T_prev_curr = se3.inverse(before) @ now
-        if yaw_rad is not None and not is_gap:  # the gyro does not cover a gap
-            T_prev_curr = se3.with_yaw(T_prev_curr, yaw_rad)
+        if turn is not None and not is_gap:  # the gyro does not cover a gap
+            T_prev_curr = se3.from_parts(turn, T_prev_curr[:3, 3])
         if self._learns:
             self._turned_rad = float(se3.rotation_angle_rad(T_prev_curr))
         learnt = self._taught(module)
-        if yaw_rad is None and learnt is None and self._T_corrected_base is before:
+        if turn is None and learnt is None and self._T_corrected_base is before:
             self._T_corrected_base = now  # nothing was corrected so far
             return observation
         T_prev_curr[:3, 3] *= 1.0 if learnt is None else learnt.scale
         assert self._T_corrected_base is not None
         self._T_corrected_base = se3.chained(self._T_corrected_base, T_prev_curr)
+        if turn is not None:
+            up_base = up_by(observation.accelerometer_base)
+            rotation = levelled(self._T_corrected_base[:3, :3], up_base, duration_s)
+            self._T_corrected_base[:3, :3] = rotation
         self._T_corrected_base.setflags(write=False)
         return replace(observation, T_odom_base=self._T_corrected_base)
 
@@ -80,11 +90,15 @@ class DeadReckoning:
             log.add("calibration", stamp_ns, **known)
         self._scales, self._motion = {}, None
 
-    def _yaw_rad(self, observation: Observation) -> float | None:
-        """Return the yaw since the last observation [rad], None without a gyro."""
+    def _turn(self, observation: Observation) -> NDArray[np.float64] | None:
+        """Return the rotation (3, 3) since the last observation, None without a gyro."""
         if self._motion is None:
             return None
-        return se3.yaw_rad(self._motion.predict(observation).T_prev_curr)
+        return self._motion.predict(observation).T_prev_curr[:3, :3]
+
+    def _since_s(self, observation: Observation) -> float:
+        before_ns = self._stamp_ns
+        return 0.0 if before_ns is None else max((observation.stamp_ns - before_ns) * 1e-9, 0.0)
 
     def _without_bias(self, observation: Observation) -> Observation:
         if self._motion is None or observation.gyro_base is None:

@@ -71,7 +71,8 @@ _BROKEN_RATIO = 0.5  # of the distance; no wrong scale explains more: the turn i
 # A robot accelerates by up to 1.5 m/s^2; a point 1 m ahead also by the angular acceleration.
 _STEP_S = 0.3  # interval for velocities and their changes
 _LATE_NS = 1_900_000_000  # a disagreement shows within the shortest horizon after it began
-_JUMP_M_S = 0.2  # less is noise
+_JUMP_M_S = 0.2  # less is noise of the best modules
+_JUMP_SIGMAS = 2.0  # of a module's own noise
 _JUMP_RATIO = 1.5  # times the other's change of velocity, to be the one that jumped
 # Median difference of normal errors: below 0.7 standard deviations; of the larger of two: below 1.
 _USUAL_SIGMAS = 1.5
@@ -227,7 +228,10 @@ class Gate:
             return False
         if not self._has_jumped:
             by_module, by_wheels = self._jumps(now)
-            self._has_jumped = by_module > _JUMP_M_S and by_module > _JUMP_RATIO * by_wheels
+            # A change of velocity is made of three positions, weighted 1, -2, 1.
+            noise_m_s = math.sqrt(6.0) * deviation_m / _STEP_S
+            least_m_s = max(_JUMP_M_S, _JUMP_SIGMAS * noise_m_s)
+            self._has_jumped = by_module > max(least_m_s, _JUMP_RATIO * by_wheels)
         return not self._has_jumped
 
     def _jumps(self, now: _Sample) -> tuple[float, float]:

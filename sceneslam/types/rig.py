@@ -14,6 +14,9 @@ from sceneslam.types.ranges import check_above
 from sceneslam.types.se3 import Transform, identity
 
 
+GRAVITY = 9.81  # m/s^2
+
+
 class Sensor(Enum):
     """One kind of measurement that an observation can hold.
 

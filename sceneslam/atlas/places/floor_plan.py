@@ -51,11 +51,11 @@ def empty() -> FloorPlan:
 
 def draw(scans: Sequence[tuple[Planar, KeyScan]]) -> FloorPlan:
     """Return the plan of scans at poses T_plan_base."""
+    if not any(len(scan.points) for _, scan in scans):
+        return empty()
     ends = [planar.apply(T, scan.points.astype(np.float64)) for T, scan in scans]
     starts = [planar.apply(T, scan.origin[None])[0] for T, scan in scans]
     everything = np.concatenate([*ends, *(start[None] for start in starts)])
-    if not sum(len(each) for each in ends):
-        return empty()
     low, (rows, columns) = _box(everything)
     misses = np.zeros((rows, columns), np.uint16)
     for start, end in zip(starts, ends, strict=True):
