@@ -55,7 +55,7 @@ class DeadReckoning:
             return observation
         T_prev_curr = se3.inverse(before) @ now
         if turn is not None and not is_gap:  # the gyro does not cover a gap
-            T_prev_curr = se3.from_parts(turn, T_prev_curr[:3, 3])
+            T_prev_curr = self._turned(T_prev_curr, turn)
         if self._learns:
             self._turned_rad = float(se3.rotation_angle_rad(T_prev_curr))
         learnt = self._taught(module)
@@ -65,10 +65,13 @@ class DeadReckoning:
         T_prev_curr[:3, 3] *= 1.0 if learnt is None else learnt.scale
         assert self._T_corrected_base is not None
         self._T_corrected_base = se3.chained(self._T_corrected_base, T_prev_curr)
-        if turn is not None:
-            up_base = up_by(observation.accelerometer_base)
-            rotation = levelled(self._T_corrected_base[:3, :3], up_base, duration_s)
-            self._T_corrected_base[:3, :3] = rotation
+        if self._measures_tilt:
+            self._T_corrected_base = levelled(
+                self._T_corrected_base,
+                duration_s,
+                by_gravity=up_by(observation.accelerometer_base),
+                by_odometry=now[2, :3],
+            )
         self._T_corrected_base.setflags(write=False)
         return replace(observation, T_odom_base=self._T_corrected_base)
 
@@ -90,11 +93,21 @@ class DeadReckoning:
             log.add("calibration", stamp_ns, **known)
         self._scales, self._motion = {}, None
 
+    @property
+    def _measures_tilt(self) -> bool:
+        return self._motion is not None and self._motion.measures_tilt
+
     def _turn(self, observation: Observation) -> NDArray[np.float64] | None:
         """Return the rotation (3, 3) since the last observation, None without a gyro."""
         if self._motion is None:
             return None
         return self._motion.predict(observation).T_prev_curr[:3, :3]
+
+    def _turned(self, T_prev_curr: Transform, turn: NDArray[np.float64]) -> Transform:
+        """Return the odometry's motion with the gyro's rotation, or its yaw if that is biased."""
+        if self._measures_tilt:
+            return se3.from_parts(turn, T_prev_curr[:3, 3])
+        return se3.with_yaw(T_prev_curr, float(np.arctan2(turn[1, 0], turn[0, 0])))
 
     def _since_s(self, observation: Observation) -> float:
         before_ns = self._stamp_ns

@@ -127,6 +127,7 @@ class Gate:
         self._way_m, self._turn_rad = 0.0, 0.0
         self._distance_since_ns: int | None = None  # since when the distance has been within bounds
         self._has_jumped = False  # the module has jumped as no robot can, since the two agreed
+        self._is_wheels = False  # the wheels were at fault, since the two agreed
         self._distances = RecentMedian(_USUAL_KEPT, width=1)  # the newest excesses
         self._usual_excess = 0.0  # their median
         self._usual_m, self._usual_ns = 0.0, 0  # path length and stamp at the newest
@@ -199,7 +200,7 @@ class Gate:
         if self._distance_since_ns is None or max(distance, turn) > 1.0:
             self._distance_since_ns = now.stamp_ns
         elif now.stamp_ns - self._distance_since_ns >= _PROBATION_NS:
-            self._has_jumped = False  # the jump belonged to another disagreement
+            self._has_jumped = self._is_wheels = False  # they belong to another disagreement
         is_wrong = max(distance, turn) > 1.0
         if is_wrong and self._is_wheels_fault(found[-1], now, deviation_m):
             return Judgement(
@@ -222,17 +223,17 @@ class Gate:
 
         The one at fault changes its velocity abruptly, as no robot can, and the other does not. If
         neither did, a module that is more certain than the wheels is right: wheel errors persist.
+        While the module is less certain, what was found last of this disagreement stands.
         """
         wheels_m = _DISTANCE_M + self._wheels.drift_ratio * (now.way_m - then.way_m)
-        if deviation_m is None or deviation_m > wheels_m:
-            return False
-        if not self._has_jumped:
+        if deviation_m is not None and deviation_m <= wheels_m and not self._has_jumped:
             by_module, by_wheels = self._jumps(now)
             # A change of velocity is made of three positions, weighted 1, -2, 1.
             noise_m_s = math.sqrt(6.0) * deviation_m / _STEP_S
             least_m_s = max(_JUMP_M_S, _JUMP_SIGMAS * noise_m_s)
             self._has_jumped = by_module > max(least_m_s, _JUMP_RATIO * by_wheels)
-        return not self._has_jumped
+            self._is_wheels = not self._has_jumped
+        return self._is_wheels
 
     def _jumps(self, now: _Sample) -> tuple[float, float]:
         """Return the largest recent changes of velocity [m/s]: the module's, the wheels'."""

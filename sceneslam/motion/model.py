@@ -101,6 +101,11 @@ class MotionModel:
         return self._turns.gyro_bias
 
     @property
+    def measures_tilt(self) -> bool:
+        """Tell whether the gyro's bias about the horizontal axes is known."""
+        return self._turns.knows_level_bias
+
+    @property
     def velocity(self) -> NDArray[np.float64]:
         """Return the base's twist (6,) [m/s, rad/s] in se3.log order, 0 if unknown."""
         return np.zeros(6) if self._twist_s is None else self._twist_s

@@ -1,7 +1,7 @@
-"""Roll and pitch by a gyro, held by gravity or by the floor.
+"""Roll and pitch by a gyro, held by gravity or by the odometry.
 
 A complementary filter on rotations (Mahony, Hamel and Pflimlin, "Nonlinear complementary filters on
-the special orthogonal group", TAC 2008, Eq. 32) without its bias: the gyro's is estimated elsewhere.
+the special orthogonal group", TAC 2008, Eq. 32), without its bias: `TurnErrors` estimates that.
 """
 
 from __future__ import annotations
@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.rig import GRAVITY
+from sceneslam.types.se3 import Transform
 
 _BY_GRAVITY_S = 5.0  # time constant: accelerating and braking last a second
-_BY_FLOOR_S = 10.0  # a robot is seldom on a slope for longer
+_BY_ODOMETRY_S = 10.0  # wheels know no slope; a robot is seldom on one for longer
 _FORCE_RATIO = 0.1  # a force that differs by more from gravity's is mostly acceleration
 
 
@@ -32,15 +33,21 @@ def up_by(accelerometer: NDArray[np.float64] | None) -> NDArray[np.float64] | No
 
 
 def levelled(
-    rotation: NDArray[np.float64], up_base: NDArray[np.float64] | None, duration_s: float
-) -> NDArray[np.float64]:
-    """Return a rotation R_odom_base (3, 3), turned towards where `up_base` (3,) points upwards.
+    T_odom_base: Transform,
+    duration_s: float,
+    *,
+    by_gravity: NDArray[np.float64] | None,
+    by_odometry: NDArray[np.float64],
+) -> Transform:
+    """Return T_odom_base (4, 4), turned so that a direction (3,) in base points upwards.
 
-    By the share of the error that belongs to `duration_s`. None: towards where base is level, more
-    slowly.
+    The direction is that of gravity, or of the odometry without it. The pose is turned by the share
+    of the error that belongs to `duration_s`.
     """
-    time_s = _BY_FLOOR_S if up_base is None else _BY_GRAVITY_S
-    up = rotation[:, 2] if up_base is None else rotation @ up_base
+    up_base, time_s = by_odometry, _BY_ODOMETRY_S
+    if by_gravity is not None:
+        up_base, time_s = by_gravity, _BY_GRAVITY_S
+    up = T_odom_base[:3, :3] @ up_base
     axis = np.array([up[1], -up[0], 0.0])  # up x z: turns up towards z
-    share = min(duration_s / time_s, 1.0)
-    return np.asarray(se3.so3_exp(share * axis) @ rotation)
+    turn = se3.so3_exp(min(duration_s / time_s, 1.0) * axis)
+    return se3.from_parts(turn @ T_odom_base[:3, :3], T_odom_base[:3, 3])

@@ -45,6 +45,11 @@ class TurnErrors:
         """Return the estimated gyro bias (3,) [rad/s], base axes."""
         return np.array([*self._level_radps, -self._errors[2]])
 
+    @property
+    def knows_level_bias(self) -> bool:
+        """Tell whether the bias about the horizontal axes was measured, at rest."""
+        return self._rests > 0.0
+
     def of_wheels(self, distance_m: float, turn_rad: float) -> float:
         """Return the estimated error of the wheels' turn [rad]."""
         return float(self._errors[0] * distance_m + self._errors[1] * turn_rad)

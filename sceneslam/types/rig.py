@@ -13,7 +13,6 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.ranges import check_above
 from sceneslam.types.se3 import Transform, identity
 
-
 GRAVITY = 9.81  # m/s^2
 
 

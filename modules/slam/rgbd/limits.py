@@ -23,6 +23,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "keyframe_turn_rad": (0.001, 3.2),
     "keyframe_inlier_ratio": (0, 1),
     "keyframe_limit": (3, 1_000_000),
+    "past_keyframe_limit": (0, 1_000_000),
     "landmark_limit": (1000, 100_000_000),
     "cloud_stride_px": (1, 100),
     "cloud_voxel_m": (0.001, 10),

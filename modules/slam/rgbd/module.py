@@ -53,6 +53,7 @@ class RgbdSlam:
         keyframe_turn_rad: float,
         keyframe_inlier_ratio: float,
         keyframe_limit: int,
+        past_keyframe_limit: int,
         landmark_limit: int,
         cloud_stride_px: int,
         cloud_voxel_m: float,
@@ -64,7 +65,7 @@ class RgbdSlam:
         check_limits(self._arguments)
         self._monocular_scenes = frozenset(monocular_scenes)
         self._ignores_depth = False
-        self._reunion = Reunion(keyframe_limit=10 * keyframe_limit)
+        self._reunion = Reunion(keyframe_limit=past_keyframe_limit)
         self._T_local_base = se3.identity()
 
     @property

@@ -37,6 +37,7 @@ class _Past:
     recognizer: PlaceRecognizer
     T_map_local: Transform
     end_ns: int
+    is_known: bool  # it shows a place of a session before it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -125,7 +126,10 @@ class Reunion:
         return loop.T_new_old
 
     def end(self, visual_map: VisualMap, recognizer: PlaceRecognizer) -> None:
-        """Keep the session's map if it was placed; remove the oldest maps beyond the limit."""
+        """Keep the session's map if it was placed; beyond the limit one is removed.
+
+        First those of places that earlier sessions show, too, then the oldest.
+        """
         if self._T_map_local is None or not len(visual_map.keyframes):
             return
         self._past.append(
@@ -134,10 +138,11 @@ class Reunion:
                 recognizer=recognizer,
                 T_map_local=self._T_map_local,
                 end_ns=self._end_ns,
+                is_known=self._is_known,
             )
         )
         while len(self._past) > 1 and self._size() > self._limit:
-            del self._past[0]
+            self._past.remove(next((past for past in self._past if past.is_known), self._past[0]))
         self.begin()
 
     def _size(self) -> int:
