@@ -116,7 +116,11 @@ def hall() -> ZoneKind:
         lamps=tuple((float(x), float(y), 1.5, 0.4) for x in (3, 8, 13, 17) for y in (-5, 0, 5)),
         power=9.0,
         has_polished_floor=True,
-        slippery=(((10.0, 11.0), (-3.0, -0.6), 0.3), ((7.0, 10.0), (0.9, 1.6), 0.3)),
+        slippery=(
+            ((10.0, 11.0), (-3.0, -0.6), 0.3),
+            ((7.0, 10.0), (0.9, 1.6), 0.3),
+            ((12.5, 18.0), (-1.0, 1.5), 0.2),
+        ),
     )
 
 
@@ -182,7 +186,7 @@ def atrium() -> ZoneKind:
         ceiling=None,
         pictures={"north": bricks, "west": ends, "east": ends},
         windows={"south": (1.5, 1.9, 9.0, 2.1)},
-        slippery=(((5.6, 6.4), (-4.0, 1.0), 0.3),),
+        slippery=(((5.0, 9.0), (-4.0, 1.0), 0.2),),
     )
 
 
