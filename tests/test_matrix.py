@@ -38,14 +38,13 @@ def at_seconds(trajectory):
 def test_oracle_takes_each_piece_from_the_module_that_errs_least():
     truth = driven([1.0, 1.0, 1.0])
     oracle = best_of([driven([1.0, 1.5, 1.2]), driven([1.3, 1.1, 1.0])], truth, 1.0)
-    np.testing.assert_allclose(at_seconds(oracle), [0.0, 1.0, 2.1, 3.1])
+    np.testing.assert_allclose(np.diff(at_seconds(oracle)), [1.0, 1.1, 1.0])
 
 
-def test_oracle_weighs_a_choice_by_where_it_leads_not_by_its_own_error():
+def test_oracle_puts_a_module_where_its_whole_path_fits_the_truth():
     truth = driven([1.0, 1.0, 1.0])
-    ahead, behind = driven([1.1, 1.1, 1.0]), driven([1.1, 0.88, 1.0])
-    oracle = best_of([ahead, behind], truth, 1.0)  # 0.12 short makes up for 0.1 too far
-    np.testing.assert_allclose(at_seconds(oracle), [0.0, 1.1, 1.98, 2.98])
+    oracle = best_of([driven([1.5, 1.0, 1.0])], truth, 1.0)
+    assert abs(at_seconds(oracle)[1:] - [1.0, 2.0, 3.0]).max() < 0.3  # chained: 0.5
 
 
 def test_oracle_lets_a_module_go_on_in_the_frame_that_it_had():

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.evaluation.accuracy import absolute_errors
+from sceneslam.evaluation.alignment import align
 from sceneslam.evaluation.association import interpolated
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
@@ -38,19 +39,22 @@ def best_of(modules: Sequence[Trajectory], truth: Trajectory, piece_s: float) ->
     """Return the trajectory of an oracle that knows which module errs least in each piece.
 
     All modules ran side by side over the whole drive, and the drive is cut into pieces of
-    `piece_s`. A piece is one module's estimate, and it begins where the piece before it ended, or
-    where the module's own frame was put when it was last chosen: so a module that recognises a
-    place takes the drift since then back. Of all choices (a beam search) it is the one with the
-    smallest absolute error, and no worse than the best module alone. In a piece that no module
-    covers it knows the true motion.
+    `piece_s`. A piece is one module's estimate. It begins where the piece before it ended, or lies
+    in the module's own frame: as that was put when the module was last chosen, or as its whole path
+    fits the truth best. So a module that recognises a place takes the drift since then back. Of all
+    choices (a beam search) it is the one with the smallest absolute error, and no worse than the
+    best module alone. In a piece that no module covers it knows the true motion.
     """
     stamps_ns = _stamps_ns(truth)
     T_gt_base = interpolated(truth, stamps_ns).T_world_base
     true = se3.inverse(T_gt_base[0]) @ T_gt_base
     told = [_poses(module, stamps_ns) for module in modules]
+    fitted = [_fitted(poses, true) for poses in told]
     choices = [_Choice(cost_m2=0.0, pieces=(), T_map_modules=(None,) * len(modules))]
     for piece in _pieces(len(stamps_ns), piece_s):
-        longer = [one for choice in choices for one in _continued(choice, told, true, piece)]
+        longer = [
+            one for choice in choices for one in _continued(choice, told, fitted, true, piece)
+        ]
         choices = sorted(longer, key=lambda choice: choice.cost_m2)[:_BEAM]
     found = [Trajectory(stamps_ns=stamps_ns, T_world_base=_joined(one)) for one in choices]
     whole = [
@@ -90,10 +94,11 @@ def _poses(module: Trajectory, stamps_ns: NDArray[np.int64]) -> NDArray[np.float
 def _continued(
     choice: _Choice,
     told: Sequence[NDArray[np.float64]],
+    fitted: Sequence[Transform | None],
     true: NDArray[np.float64],
     piece: slice,
 ) -> Iterator[_Choice]:
-    """Yield a choice with each way to go on: chained, or in the module's own frame again."""
+    """Yield a choice with each way to go on: chained, or in a module's own frame."""
     offered = [k for k, poses in enumerate(told) if not np.isnan(poses[piece]).any()]
     if not offered:
         motion = se3.inverse(true[piece][0]) @ true[piece]
@@ -101,13 +106,17 @@ def _continued(
     for k in offered:
         poses = told[k][piece]
         chained = choice.T_map_base @ se3.inverse(poses[0])
-        frames = [chained]
-        if (before := choice.T_map_modules[k]) is not None:
-            frames.append(before)
-        for T_map_module in frames:
+        frames = [chained, choice.T_map_modules[k], fitted[k]]
+        for T_map_module in (frame for frame in frames if frame is not None):
             placed = [*choice.T_map_modules]
             placed[k] = T_map_module
             yield _with(choice, T_map_module @ poses, true[piece], tuple(placed))
+
+
+def _fitted(poses: NDArray[np.float64], true: NDArray[np.float64]) -> Transform | None:
+    """Return a module's frame (4, 4) as its poses (N, 4, 4) fit the true ones best."""
+    is_known = ~np.isnan(poses).any(axis=(1, 2))
+    return align(poses[is_known], true[is_known]) if is_known.any() else None
 
 
 def _with(
