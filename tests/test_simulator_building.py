@@ -173,7 +173,7 @@ def test_wheels_measure_the_slope_and_turn_in_vain_on_a_slippery_floor() -> None
     assert excess["bare"] == pytest.approx(0.0, abs=0.01)
     assert excess["corridor"] == pytest.approx(0.0, abs=0.01)
     for slippery in ("store", "atrium", "hall"):
-        assert 0.15 < excess[slippery] < 2.0  # in all: a third of a metre or two, driven twice
+        assert 0.15 < excess[slippery] < 2.5  # in all: a fifth or a third of some metres
 
 
 @pytest.mark.parametrize(
