@@ -72,7 +72,7 @@ _BROKEN_RATIO = 0.5  # of the distance; no wrong scale explains more: the turn i
 _STEP_S = 0.3  # interval for velocities and their changes
 _LATE_NS = 1_900_000_000  # a disagreement shows within the shortest horizon after it began
 _JUMP_M_S = 0.2  # less is noise of the best modules
-_JUMP_SIGMAS = 2.0  # of a module's own noise
+_JUMP_SIGMAS = 3.0  # of a module's own noise; every observation is judged
 _JUMP_RATIO = 1.5  # times the other's change of velocity, to be the one that jumped
 # Median difference of normal errors: below 0.7 standard deviations; of the larger of two: below 1.
 _USUAL_SIGMAS = 1.5
