@@ -13,16 +13,16 @@ from sceneslam.types.errors import ConfigError
 GROUPS = {  # group -> description
     "scenario": "A whole set-up: `+scenario=NAME`.",
     "source": "Where observations come from: `source=NAME`.",
-    "effects": "What is done to them on the way: `effects=NAME`.",
-    "detector": "What tells the scene: `detector=NAME`.",
+    "effects": "How observations are changed: `effects=NAME`.",
+    "detector": "How the scene is detected: `detector=NAME`.",
     "slam": "The SLAM modules, each under a key of its own: `slam@slam.KEY=NAME`.",
     "policy": "When the scene and the module change: `policy=NAME`.",
     "atlas": "How maps are fused: `atlas=NAME`.",
-    "run": "How a run is carried out: `run=NAME`.",
-    "evaluation": "How a run is measured: `evaluation=NAME`.",
-    "sinks": "What writes along: `+sinks@sinks.KEY=NAME`; `~sinks@sinks.rerun` leaves one out.",
-    "viewer": "What shows the run while it runs: `viewer=NAME`.",
-    "experiment": "A question that takes many runs, or a second one: `+experiment=NAME`.",
+    "run": "Mode of a run: `run=NAME`.",
+    "evaluation": "Evaluation of a run: `evaluation=NAME`.",
+    "sinks": "Outputs: `+sinks@sinks.KEY=NAME`; `~sinks@sinks.rerun` removes one.",
+    "viewer": "Live viewers: `viewer=NAME`.",
+    "experiment": "Questions that need several runs: `+experiment=NAME`.",
 }
 _ALIASES = {f"{group}s": group for group in GROUPS} | {"modules": "slam", "module": "slam"}
 
