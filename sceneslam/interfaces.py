@@ -138,7 +138,7 @@ class FeatureDetector(Detector, Protocol):
         ...
 
     def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
-        """Return the vote for an observation's features; called by rising stamp."""
+        """Return the vote for an observation's features (F,); called by rising stamp."""
         ...
 
 

@@ -134,7 +134,7 @@ class _Tree:
 
 
 def read_images(folder: Path) -> list[NDArray[np.uint8]]:
-    """Return the descriptors of up to 40 images, spread evenly; raises ConfigError without any."""
+    """Return the descriptors (N, 32) of up to 40 images, evenly; raises ConfigError without any."""
     paths = [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in _SUFFIXES]
     if not paths:
         raise ConfigError("IMAGES", str(folder), f"a folder with images ({', '.join(_SUFFIXES)})")

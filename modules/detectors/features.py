@@ -50,25 +50,25 @@ class FeatureOverTime:
 
 
 def usable_ratio(image_bgr: NDArray[np.uint8]) -> float:
-    """Return the share of pixels that are neither too dark nor saturated."""
+    """Return the share of pixels of (H, W, 3) that are neither too dark nor saturated."""
     grey = cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY)
     return float(cv2.countNonZero(cv2.inRange(grey, *_USABLE)) / grey.size)
 
 
 def corner_count(image_bgr: NDArray[np.uint8]) -> float:
-    """Return the number of FAST corners per 100 x 100 pixels."""
+    """Return the number of FAST corners per 100 x 100 pixels of (H, W, 3)."""
     grey = cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY)
     corners = cv2.FastFeatureDetector.create(threshold=_CORNER_STEP).detect(grey)
     return len(corners) / grey.size * 1e4
 
 
 def depth_ratio(depth_m: NDArray[np.float32]) -> float:
-    """Return the share of pixels with depth, which sunlight and far walls reduce."""
+    """Return the share of pixels of (H, W) with depth, which sunlight and far walls reduce."""
     return float(np.count_nonzero(depth_m > 0) / depth_m.size)
 
 
 def depth_noise_ratio(depth_m: NDArray[np.float32]) -> float:
-    """Return the share of pixels in the image's middle that differ from all four neighbours."""
+    """Return the share of pixels in the middle of (H, W) that differ from all four neighbours."""
     height, width = depth_m.shape
     middle_m = depth_m[height // 4 : height - height // 4, width // 4 : width - width // 4]
     inner_m = middle_m[1:-1, 1:-1]

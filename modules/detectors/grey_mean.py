@@ -53,7 +53,7 @@ class GreyMean:
         return np.array([grey_mean(observation.image_bgr)])
 
     def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
-        """Return the vote by threshold and hysteresis."""
+        """Return the vote for features (1,) by threshold and hysteresis."""
         if features is None:
             return SceneVote(stamp_ns=stamp_ns, scene=UNSURE)
         mean = float(features[0])

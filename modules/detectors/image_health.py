@@ -24,19 +24,19 @@ _FLICKER_SPAN_NS = 1_000_000_000
 
 
 def grey_peak(image_bgr: NDArray[np.uint8]) -> float:
-    """Return the grey value that one pixel in a thousand exceeds."""
+    """Return the grey value that one pixel in a thousand of (H, W, 3) exceeds."""
     counts = np.bincount(_grey(image_bgr)[::2, ::2].ravel(), minlength=256)
     return float(np.searchsorted(np.cumsum(counts), 0.999 * counts.sum()))
 
 
 def overexposed_ratio(image_bgr: NDArray[np.uint8]) -> float:
-    """Return the share of pixels that are nearly saturated."""
+    """Return the share of pixels of (H, W, 3) that are nearly saturated."""
     grey = _grey(image_bgr)
     return float(cv2.countNonZero(cv2.inRange(grey, _WHITE, 255)) / grey.size)
 
 
 def sharpness(image_bgr: NDArray[np.uint8]) -> float:
-    """Return the share of the strongest edges' height within a 240th of the image's width.
+    """Return the share of the strongest edges' height within a 240th of the width, of (H, W, 3).
 
     It is about 1 for a step, near 0 for an image out of focus, and 1 without any edge. Noise has no
     effect, as edges are detected over a distance six times as long.

@@ -60,7 +60,7 @@ class Learned:
         return self._features.get_features(observation)
 
     def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
-        """Return the most probable scene, with equal prior probabilities."""
+        """Return the most probable scene for features (F,), with equal prior probabilities."""
         if features is None or np.isnan(features).any():
             return SceneVote(stamp_ns=stamp_ns, scene=UNSURE)
         scores = self._weights @ features + self._offset

@@ -96,7 +96,7 @@ class Onnx:
         return self._classify(observation.image_bgr)
 
     def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
-        """Return the most probable scene, with the probabilities as likelihoods."""
+        """Return the most probable scene for class probabilities (C,), as likelihoods of scenes."""
         if features is None:
             return SceneVote(stamp_ns=stamp_ns, scene=UNSURE)
         shares = self._members @ features

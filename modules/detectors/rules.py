@@ -130,7 +130,7 @@ class Rules:
         return None if np.isnan(values).all() else values
 
     def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
-        """Return the vote; UNSURE if an earlier rule has a missing feature."""
+        """Return the vote for features (F,); UNSURE if an earlier rule has a missing feature."""
         scene = UNSURE if features is None else self._first(features)
         if scene != UNSURE:
             self._voted = scene

@@ -64,7 +64,7 @@ def _owners(
 def one_per_voxel(
     points: NDArray[np.float32], owner: NDArray[np.uint8], voxel_m: float
 ) -> NDArray[np.intp]:
-    """Return the indices of the first point of every (voxel, owner), in their old order."""
+    """Return the indices (M,) of the first of points (N, 3) [m] per voxel and owner (N,)."""
     cells = np.floor(points / voxel_m).astype(np.int64)
     cells -= cells.min(axis=0, initial=0)
     spans = cells.max(axis=0, initial=0) + 1

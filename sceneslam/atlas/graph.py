@@ -33,7 +33,7 @@ def join_pose_graphs(placed: Sequence[tuple[Transform, PoseGraphLayer]]) -> Pose
 
 
 def join_landmarks(placed: Sequence[tuple[Transform, LandmarkLayer]]) -> LandmarkLayer | None:
-    """Return all sessions' landmarks in `map`; a landmark that two sessions saw occurs twice."""
+    """Return all sessions' landmarks (N, 3) [m], map; shared landmarks occur once per session."""
     if not placed:
         return None
     layers = [layer for _, layer in placed]

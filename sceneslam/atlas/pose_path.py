@@ -78,7 +78,7 @@ class PosePath:
         session: int,
         covariance: Covariance | None,
     ) -> None:
-        """Add a pose unless its stamp already has one."""
+        """Add T_map_base (4, 4) [m] unless its stamp already has a pose."""
         if self.stamps_ns and stamp_ns <= self.stamps_ns[-1]:
             return
         self._covariances.append(_NONE if covariance is None else covariance[_UPPER])

@@ -109,7 +109,7 @@ def _grown(covariance: Covariance, T_prev_curr: Transform, drift: Drift) -> Cova
 def write_covariances(
     path: Path, stamps_ns: NDArray[np.int64], covariances: NDArray[np.float64]
 ) -> None:
-    """Write a line per pose: stamp [s], then the upper triangle, row by row, 21 numbers.
+    """Write a line per pose: stamp [s], then the upper triangle of its (6, 6) row by row.
 
     Of x y z [m] and the rotation vector [rad] in `base`: T_true = T_told exp(xi).
     """

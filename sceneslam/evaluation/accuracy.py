@@ -104,5 +104,5 @@ def relative_errors(
 
 
 def root_mean_square(values: NDArray[np.float64]) -> float:
-    """Return the root mean square, NaN of an empty array."""
+    """Return the root mean square of values (N,), NaN of an empty array."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

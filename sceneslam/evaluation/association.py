@@ -25,7 +25,7 @@ class PosePairs:
 
 
 def nearest(stamps_ns: NDArray[np.int64], wanted_ns: NDArray[np.int64]) -> Indices:
-    """Return for each wanted stamp the index of the nearest of `stamps_ns` (sorted, not empty).
+    """Return (M,) the index of the nearest of `stamps_ns` (N,), sorted, for each of `wanted_ns`.
 
     Of two equally near stamps it is the earlier one.
     """
@@ -49,7 +49,7 @@ def associate(first: Trajectory, second: Trajectory, max_gap_s: float) -> PosePa
 
 
 def select(trajectory: Trajectory, index: Indices) -> Trajectory:
-    """Return the poses at `index`."""
+    """Return the poses at the indices (N,)."""
     return Trajectory(
         stamps_ns=trajectory.stamps_ns[index], T_world_base=trajectory.T_world_base[index]
     )
@@ -66,7 +66,7 @@ def clip(trajectory: Trajectory, start_ns: int, end_ns: int) -> Trajectory:
 
 
 def covered(trajectory: Trajectory, stamps_ns: NDArray[np.int64], max_gap_s: float) -> Indices:
-    """Return the indices of the stamps with a pose at most `max_gap_s` away on either side."""
+    """Return the indices (M,) of stamps (N,) with poses at most `max_gap_s` away on both sides."""
     if not len(trajectory):
         return np.zeros(0, np.int64)
     times = trajectory.stamps_ns
@@ -80,7 +80,7 @@ def covered(trajectory: Trajectory, stamps_ns: NDArray[np.int64], max_gap_s: flo
 
 
 def interpolated(trajectory: Trajectory, stamps_ns: NDArray[np.int64]) -> Trajectory:
-    """Return the poses at the given stamps, which the trajectory has to cover.
+    """Return the poses at the stamps (N,), which the trajectory has to cover.
 
     Positions are interpolated linearly, rotations by slerp.
     """

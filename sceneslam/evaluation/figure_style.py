@@ -122,7 +122,7 @@ def scene_tints(scenes: Iterable[str]) -> dict[str, str]:
 
 
 def elapsed_s(result: RunResult, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return stamps as seconds since the first observation."""
+    """Return stamps (N,) as seconds since the first observation."""
     origin_ns = result.observed_ns[0] if len(result.observed_ns) else np.int64(0)
     return np.asarray((stamps_ns - origin_ns) * 1e-9)
 
@@ -130,7 +130,7 @@ def elapsed_s(result: RunResult, stamps_ns: NDArray[np.int64]) -> NDArray[np.flo
 def thinned(
     times_s: NDArray[np.float64], values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a long curve as minima and maxima of equal intervals; it looks the same."""
+    """Return a curve (N,) as the minima and maxima (M,) of equal intervals, for faster drawing."""
     if len(values) <= 2 * _STRETCHES:
         return times_s, values
     starts = np.linspace(0, len(values), _STRETCHES, endpoint=False).astype(int)
@@ -144,7 +144,7 @@ def duration_s(result: RunResult) -> float:
 
 
 def spans(times_s: NDArray[np.float64], labels: Sequence[str], end_s: float) -> list[LabelledSpan]:
-    """Return the stretches of equal labels; each lasts until the next begins."""
+    """Return the time spans of equal labels at times (N,); each lasts until the next begins."""
     if not len(labels):
         return []
     names = np.array(labels, dtype=object)

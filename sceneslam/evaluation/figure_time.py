@@ -72,7 +72,7 @@ def draw_series(
     limit_m: float | None = None,
     online_m: NDArray[np.float64] | None = None,
 ) -> Any:
-    """Return a distance over time with a band per module, None without values.
+    """Return a figure of distances (N,) [m] over time with a band per module, None without any.
 
     `online_m` is the distance of the poses as reported at the time, at the same stamps.
     """

@@ -21,7 +21,7 @@ class SegmentErrors:
 
 
 def driven_m(trajectory: Trajectory, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the distance driven along a trajectory up to each stamp [m]."""
+    """Return the distance (N,) [m] driven along a trajectory up to each stamp (N,)."""
     return np.interp(stamps_ns, trajectory.stamps_ns, _distances_m(trajectory.positions_m))
 
 

@@ -24,7 +24,7 @@ class Cloud:
 
 
 def cloud(message: Any, stamp_ns: int) -> Cloud | None:
-    """Return the points of a PointCloud2, None if its data are cut off.
+    """Return the points (N, 3) [m], lidar, of a PointCloud2, None if its data are cut off.
 
     Raises InputError if it has no fields x, y and z.
     """

@@ -56,7 +56,7 @@ class Encoder:
         )
 
     def compressed_image(self, stamp_ns: int, encoding: str, data: NDArray[np.uint8]) -> bytes:
-        """Return a CompressedImage; `encoding` is image_transport's format."""
+        """Return a CompressedImage of bytes (N,); `encoding` is image_transport's format."""
         return self._cdr(
             names.TYPES[names.IMAGE],
             header=self._header(stamp_ns, names.CAMERA),

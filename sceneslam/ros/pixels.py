@@ -37,7 +37,7 @@ def decode_bgr(data: bytes) -> NDArray[np.uint8] | None:
 
 
 def locked(array: NDArray[Scalar]) -> NDArray[Scalar]:
-    """Make the array read-only and return it."""
+    """Make the array (...) of any shape read-only and return it."""
     array.flags.writeable = False
     return array
 

@@ -34,7 +34,7 @@ def write_end(
     start_ns: int,
     colors: Colors,
 ) -> None:
-    """Log all results at the recording's current time; `first` is the first pose with its stamp.
+    """Log all results at the recording's current time; `first` is the first stamp and T_map_base.
 
     The ground truth is aligned with the estimate at that pose, so errors are relative to it.
     """

@@ -78,7 +78,7 @@ class DimSensor:
 
 
 def srgb_to_linear(srgb: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return linear light of sRGB values, both 0 to 1 (IEC 61966-2-1)."""
+    """Return linear light (...) of sRGB values (...), both 0 to 1 (IEC 61966-2-1)."""
     return np.asarray(np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4))
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def longest_rising(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the indices of the longest strictly rising subsequence."""
+    """Return the indices (M,) of the longest strictly rising subsequence of stamps (N,)."""
     tails: list[int] = []  # the smallest stamp that ends a rising run of each length
     ends: list[int] = []  # and its index
     before = np.full(len(stamps_ns), -1)
@@ -27,7 +27,7 @@ def longest_rising(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def rising_order(stamps_ns: NDArray[np.int64], *, late_max_ns: int) -> NDArray[np.int64]:
-    """Return the indices sorted by stamp; unsorted if one is late by more than `late_max_ns`."""
+    """Return indices (N,) sorted by stamp; unsorted if one is late by more than `late_max_ns`."""
     behind_ns = np.maximum.accumulate(stamps_ns) - stamps_ns
     if behind_ns.max(initial=0) > late_max_ns:
         return np.arange(len(stamps_ns))
@@ -35,7 +35,7 @@ def rising_order(stamps_ns: NDArray[np.int64], *, late_max_ns: int) -> NDArray[n
 
 
 def rising_stamps(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return rising stamps: those out of order are interpolated between their neighbours.
+    """Return rising stamps (N,): those out of order are interpolated between neighbours.
 
     At the ends, with one neighbour only, they are set 1 ms apart.
     """

@@ -101,7 +101,7 @@ class World:
     scanner: Scanner
 
     def scan(self, T_world_base: Planar, stamp_ns: int = 0) -> LaserScan:
-        """Return the laser's scan at a pose; the laser is at the origin of `base`."""
+        """Return the laser's scan at T_world_base (3,); the laser is at the origin of `base`."""
         scanner = self.scanner
         angles = np.linspace(-scanner.field_rad / 2, scanner.field_rad / 2, scanner.beams)
         hit_m = self._hit(T_world_base, angles)

@@ -18,7 +18,7 @@ def to_transform(pose: Planar) -> se3.Transform:
 
 
 def from_transform(T_a_b: se3.Transform) -> Planar:
-    """Return the planar part of a transform."""
+    """Return the planar part (3,), x, y [m], yaw [rad], of a transform (4, 4)."""
     return np.array([T_a_b[0, 3], T_a_b[1, 3], se3.yaw_rad(T_a_b)])
 
 
@@ -53,7 +53,7 @@ def betweens(T_a_b: NDArray[np.float64], T_a_c: NDArray[np.float64]) -> NDArray[
 
 
 def wrapped(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return angles in [-pi, pi)."""
+    """Return angles (...) [rad] in [-pi, pi)."""
     return np.asarray((angle_rad + np.pi) % (2 * np.pi) - np.pi)
 
 

@@ -69,7 +69,7 @@ class Camera:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     def measures(self, depth_m: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Return where depths [m] of any shape are measured: above 0, and within the range."""
+        """Return (...) whether depths (...) [m] are valid: above 0, and within the range."""
         low_m, high_m = self.depth_range_m
         return np.asarray((depth_m > 0) & (depth_m >= low_m) & (depth_m <= high_m))  # NaN: false
 

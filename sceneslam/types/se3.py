@@ -27,7 +27,7 @@ def from_parts(rotation: NDArray[np.float64], translation_m: NDArray[np.float64]
 
 
 def from_xy_yaw(x_m: float, y_m: float, yaw_rad: float) -> Transform:
-    """Return the planar motion (x, y, yaw) as a transform."""
+    """Return the transform (4, 4) of a planar motion: x, y [m], yaw [rad]."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     T_a_b = np.eye(4)
     T_a_b[:2, :2] = [[c, -s], [s, c]]
@@ -41,7 +41,7 @@ def yaw_rad(T_a_b: Transform) -> float:
 
 
 def with_yaw(T_a_b: Transform, rad: float) -> Transform:
-    """Return a motion over the same distance, with the same roll and pitch, by another yaw."""
+    """Return T_a_b (4, 4) with the same translation, roll and pitch, and another yaw."""
     return T_a_b @ from_xy_yaw(0.0, 0.0, rad - yaw_rad(T_a_b))
 
 
@@ -133,7 +133,7 @@ def adjoint(T_a_b: Transform) -> NDArray[np.float64]:
 
 
 def interpolate(T_w_0: Transform, T_w_1: Transform, ratio: float) -> Transform:
-    """Return the pose at `ratio` of the way from 0 to 1 (straight line, slerp)."""
+    """Return the pose (4, 4) at `ratio` between T_w_0 and T_w_1 (linear, slerp)."""
     step = so3_log(T_w_0[:3, :3].T @ T_w_1[:3, :3])
     rotation = T_w_0[:3, :3] @ so3_exp(ratio * step)
     return from_parts(rotation, (1.0 - ratio) * T_w_0[:3, 3] + ratio * T_w_1[:3, 3])
@@ -194,7 +194,7 @@ def chained(T_a_b: Transform, T_b_c: Transform) -> Transform:
 
 
 def orthonormal(T_a_b: Transform) -> Transform:
-    """Return the transform without the rounding that many products leave in its rotation."""
+    """Return the transform (4, 4) with an exactly orthonormal rotation."""
     return from_quat_xyzw(T_a_b[..., :3, 3], to_quat_xyzw(T_a_b))
 
 

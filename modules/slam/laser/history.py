@@ -26,7 +26,7 @@ class RelativePoseHistory:
     _motions: array[float] = field(default_factory=lambda: array("d"))  # T_keyframe_base
 
     def add(self, stamp_ns: int, T_local_base: Planar) -> None:
-        """Add a pose, stored relative to the newest keyframe."""
+        """Add T_local_base (3,), stored relative to the newest keyframe."""
         owner = len(self.keyframes) - 1
         if owner != _NONE:
             T_local_base = between(self.keyframes.frames[owner].T_local_base, T_local_base)

@@ -78,7 +78,7 @@ class LoopSearch:
         window_rad: float,
         score_min: float,
     ) -> Found | None:
-        """Return the best pose within a window of `around` (submap), None if no pose fits."""
+        """Return the best pose (3,) of points (N, 2) [m] near `around`, submap; None without."""
         points = points_base[:: max(1, len(points_base) // _POINTS)]
         radius_m = float(np.median(np.linalg.norm(points, axis=1))) + 0.1
         step_rad = self._cell_m / radius_m

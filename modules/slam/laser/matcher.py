@@ -103,13 +103,13 @@ class MotionPrior:
         return np.asarray(self.information * np.outer(root, root))
 
     def cost_at(self, pose: Planar) -> float:
-        """Return the negative log-likelihood of a pose, up to a constant."""
+        """Return the negative log-likelihood of a pose (3,), up to a constant."""
         return self.cost + sum(
             float(_tail(each, n, self.freedom)) for n, each in self._squared(pose).items()
         )
 
     def is_apart(self, pose: Planar) -> bool:
-        """Tell whether a refinement from here may converge differently than from `pose`."""
+        """Tell whether a refinement from here may converge differently than from `pose` (3,)."""
         off = np.abs(self.off(pose))
         return bool(max(off[0], off[1]) > _APART_M or off[2] > _APART_RAD)
 
@@ -154,7 +154,7 @@ class Matcher:
     def refine(
         self, scan_base: SurfacePoints, field: LikelihoodField, start: Planar, prior: Matrix
     ) -> Match:
-        """Return the pose of a scan, without a search, from `start` with covariance `prior`."""
+        """Return the pose of a scan, without search, from `start` (3,) with covariance (3, 3)."""
         return self._refine(scan_base, field, start, [MotionPrior.of(start, prior)], self.shift_m)
 
     def _search(
@@ -287,7 +287,7 @@ class Matcher:
 
 
 def novelty(T_before_now: Planar) -> float:
-    """Return the independent share of a scan's error, by the motion since the last scan."""
+    """Return the independent share of a scan's error, by the motion (3,) since the last scan."""
     moved = np.hypot(*T_before_now[:2]) / _VIEW_M, abs(T_before_now[2]) / _VIEW_RAD
     return float(np.clip(max(moved), _NOVELTY_MIN, 1.0))
 

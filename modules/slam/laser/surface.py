@@ -32,7 +32,7 @@ class SurfacePoints:
         return len(self.points)
 
     def moved(self, T_a_b: Planar) -> SurfacePoints:
-        """Return the points, given in frame b, in frame a."""
+        """Return the points (N, 2) [m] of frame b in frame a."""
         R = rotation(T_a_b[2])
         c, s = R[0, 0], R[1, 0]
         xx, xy, yy = self.shape.T

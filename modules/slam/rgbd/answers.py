@@ -41,7 +41,7 @@ def held(
     covariance: NDArray[np.float64] | None,
     revision: int,
 ) -> Tracking:
-    """Return the answer when the map was seen; a pose by odometry has no covariance."""
+    """Return the answer with T_local_base (4, 4) [m]; covariance (6, 6), None for odometry."""
     return Tracking(
         stamp_ns=view.observation.stamp_ns,
         T_local_base=T_local_base.copy(),

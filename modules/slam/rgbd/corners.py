@@ -99,7 +99,7 @@ class CornerFinder:
         self._beside = thread_beside("rgbd-corners")
 
     def find(self, gray: Image) -> Corners:
-        """Return the corners of an image that are clearly above its noise."""
+        """Return the corners of a grey image (H, W) that are clearly above its noise."""
         shrunk = self._beside.submit(_pyramid, gray)
         threshold = self._threshold(gray)
         coming = self._beside.submit(lambda: self._detect(shrunk.result(), _BESIDE, threshold))

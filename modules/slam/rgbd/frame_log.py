@@ -57,7 +57,7 @@ class FrameLog:
         self._keyframe_ids[rows] = heir
 
     def straighten(self, readout_s: float, twist_per_s: Mapping[int, NDArray[np.float64]]) -> None:
-        """Correct all frames for a readout that is longer by `readout_s`, with their keyframes'."""
+        """Correct all frames for a readout longer by `readout_s`, by keyframes' twists (6,)."""
         for keyframe_id, twist in twist_per_s.items():
             rows = np.flatnonzero(self._keyframe_ids[: self._count] == keyframe_id)
             T_new_old = [se3.exp(readout_s * moved) for moved in self._twist_per_s[rows]]

@@ -104,7 +104,7 @@ class KeyframeStore:
         del self._keyframes[keyframe_id]
 
     def covisible(self, landmark_ids: NDArray[np.int64], *, limit: int) -> list[int]:
-        """Return up to `limit` keyframes that share most of these landmarks, most first."""
+        """Return up to `limit` keyframes that share most of the landmarks (N,), most first."""
         ids, shared = np.array(self.ids), self.shared(landmark_ids, self.ids)
         order = np.argsort(-shared, kind="stable")[:limit]
         return [int(keyframe_id) for keyframe_id in ids[order][shared[order] > 0]]
@@ -112,19 +112,19 @@ class KeyframeStore:
     def shared(
         self, landmark_ids: NDArray[np.int64], keyframe_ids: Iterable[int]
     ) -> NDArray[np.int64]:
-        """Return how many of these landmarks each of the keyframes shows."""
+        """Return (K,) how many of the landmarks (N,) each of the keyframes shows."""
         wanted = self._marked(landmark_ids)
         shows = [self._keyframes[keyframe_id].landmark_ids for keyframe_id in keyframe_ids]
         return np.array([np.count_nonzero(wanted[ids]) for ids in shows], np.int64)
 
     def landmarks_of(self, keyframe_ids: Iterable[int]) -> NDArray[np.int64]:
-        """Return the ids of all landmarks that these keyframes saw, ascending."""
+        """Return the ids (N,) of all landmarks in these keyframes, ascending."""
         seen = [self._keyframes[keyframe_id].landmark_ids for keyframe_id in keyframe_ids]
         marks = self._marked(np.concatenate([*seen, np.array([NO_LANDMARK])]))
         return np.flatnonzero(marks)
 
     def owned_landmarks(self) -> dict[int, NDArray[np.int64]]:
-        """Return for every keyframe the landmarks that it saw first."""
+        """Return for every keyframe the ids (N,) of the landmarks that it saw first."""
         taken, owned = np.zeros(self._id_limit + 1, bool), {}
         taken[NO_LANDMARK] = True
         for keyframe_id, keyframe in self._keyframes.items():
@@ -133,7 +133,7 @@ class KeyframeStore:
         return owned
 
     def forget_landmarks(self, landmark_ids: NDArray[np.int64]) -> None:
-        """Remove these landmarks from all keyframes."""
+        """Remove the landmarks (N,) from all keyframes."""
         gone = self._marked(landmark_ids)
         for keyframe in self.all():
             keyframe.landmark_ids[gone[keyframe.landmark_ids]] = NO_LANDMARK

@@ -121,7 +121,7 @@ class LandmarkTable:
         self.normals_local[ids], self.reach_m[ids] = looks.normals_local, looks.reach_m
 
     def remove(self, ids: NDArray[np.int64]) -> None:
-        """Remove landmarks; their ids are reused."""
+        """Remove landmarks (N,); their ids are reused."""
         self.alive[ids] = False
 
     def _reserve(self, count: int) -> None:

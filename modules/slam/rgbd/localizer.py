@@ -63,7 +63,7 @@ class VisualLocalizer:
     def near(
         self, features: Features, T_predicted: Transform, held_ids: NDArray[np.int64]
     ) -> VisualFix | None:
-        """Return the pose found by matching landmarks near their pixels at a predicted pose.
+        """Return the pose by matching landmarks (N,) near their pixels at T_predicted (4, 4).
 
         First the landmarks tracked last (`held_ids`), then all around them, then with a larger
         radius.
@@ -91,11 +91,11 @@ class VisualLocalizer:
         )
 
     def around(self, features: Features, held_ids: NDArray[np.int64]) -> VisualFix | None:
-        """Return the pose found by descriptors alone, among all landmarks around `held_ids`."""
+        """Return the pose by descriptors only, among all landmarks around `held_ids` (N,)."""
         return self.anywhere(features, self._map.around(held_ids))
 
     def anywhere(self, features: Features, landmark_ids: NDArray[np.int64]) -> VisualFix | None:
-        """Return the pose found by descriptors alone, among `landmark_ids`."""
+        """Return the pose by descriptors only, among `landmark_ids` (N,)."""
         matches = match_anywhere(
             self._map.landmarks.descriptors.take(landmark_ids, axis=0), features
         )

@@ -64,7 +64,7 @@ class MapHistory:
         self._before, self.revision = joined(before._before, frames), before.revision + 1
 
     def hold(self, stamp_ns: int, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> None:
-        """Record a frame's pose relative to the keyframe that shares most landmarks with it."""
+        """Record T_local_base (4, 4) relative to the keyframe with most of the landmarks (N,)."""
         keyframes = self._map.keyframes
         near = [self.reference, keyframes.ids[-1], *self._graph.neighbours(self.reference)]
         shared = keyframes.shared(landmark_ids, near)
@@ -84,7 +84,7 @@ class MapHistory:
     def insert(
         self, fix: VisualFix | None, depth_m: NDArray[np.float32] | None, *, guessed_s: float | None
     ) -> None:
-        """Add the map's newest keyframe; `fix` is its pose in the map, None for odometry.
+        """Add the newest keyframe with depth (H, W) [m]; `fix`: its pose, None for odometry.
 
         `guessed_s`: time without a pose if its pose is a guess; then it begins a segment.
         """
@@ -103,7 +103,7 @@ class MapHistory:
         self.reference = keyframe_id
 
     def segment(self, landmark_ids: NDArray[np.int64]) -> set[int] | None:
-        """Return the keyframes of these landmarks' segment; None: there is only one segment."""
+        """Return the keyframes of the landmarks' (N,) segment; None: there is only one segment."""
         if not self.segments.are_many:
             return None
         return self.segments.around(self._map.keyframes.covisible(landmark_ids, limit=1)[0])

@@ -55,7 +55,7 @@ class PlaceIndex:
     def alike(
         self, descriptors: NDArray[np.uint8], place_ids: Collection[int] | None = None
     ) -> list[Likeness]:
-        """Return the places (of `place_ids`, or all), the most similar first."""
+        """Return the places most similar to descriptors (N, 32), of `place_ids` or all."""
         words = self._words(descriptors)
         rarity = np.log((1.0 + len(self._places)) / np.maximum(self._holders[words], 1))
         weights = np.zeros(_WORDS, np.float32)

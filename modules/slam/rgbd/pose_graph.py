@@ -169,7 +169,7 @@ class PoseGraph:
 def solve(
     T_local_base: Mapping[int, Transform], edges: Iterable[KeyframeEdge], *, held: int
 ) -> dict[int, Transform]:
-    """Return the poses that best fit the edges (Levenberg-Marquardt, Huber's kernel on loops).
+    """Return the poses (4, 4) that best fit the edges (Levenberg-Marquardt, Huber on loops).
 
     `held` is the id of the fixed pose.
     """

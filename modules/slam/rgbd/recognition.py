@@ -48,7 +48,7 @@ class PlaceRecognizer:
     def recognize(
         self, keyframe_id: int, features: Features, depth_m: NDArray[np.float32] | None
     ) -> Recognition | None:
-        """Return the pose at which a keyframe's landmarks and depth agree with an image's."""
+        """Return the pose at which a keyframe agrees with an image and depth (H, W) [m]."""
         if len(features) < self._min_inliers:
             return None
         keyframe = self._map.keyframes[keyframe_id]

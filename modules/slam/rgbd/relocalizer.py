@@ -29,7 +29,7 @@ class Relocalizer:
         self._keyframes, self._recognizer = keyframes, recognizer
 
     def find(self, features: Features, depth_m: NDArray[np.float32] | None) -> VisualFix | None:
-        """Return the pose in the map, None if no place or more than one is confirmed."""
+        """Return T_local_base in the map, None if no place or more than one is confirmed."""
         if not len(features):
             return None
         alike = [found.place_id for found in self._recognizer.places.alike(features.descriptors)]

@@ -45,7 +45,7 @@ def seen_by(
 
 
 def renew(parts: RgbdParts, seen: Mapping[int, LocatedView]) -> dict[int, Transform]:
-    """Insert a keyframe for each view in this order; return their new poses by the same ids.
+    """Insert a keyframe for each view in this order; return T_local_base by id.
 
     The first keeps its pose; the others are localized relative to those before them. If that fails,
     the motion from the last one in the old map is used.

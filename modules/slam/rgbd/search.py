@@ -19,7 +19,7 @@ class Search:
         self._localizer, self._relocalizer = localizer, relocalizer
 
     def find(self, view: View, held_ids: NDArray[np.int64], *, is_lost: bool) -> VisualFix | None:
-        """Return the pose of a view; `held_ids` are the landmarks tracked last.
+        """Return the pose of a view; `held_ids` (N,) are the landmarks tracked last.
 
         If the prediction is far off, similar landmarks around it may agree by chance: then the
         correct pose has more inliers.

@@ -78,7 +78,7 @@ class VisualMap:
         return np.asarray(np.hypot(self.inverse_depth_sigma_per_m, by_shift))
 
     def doubts(self, T_local_base: Transform, landmark_ids: NDArray[np.int64]) -> Doubts:
-        """Return the landmarks' own uncertainty as the camera sees it from a pose."""
+        """Return the uncertainty of landmarks (N,) in the camera at T_local_base (4, 4) [m]."""
         T_cam_local = se3.inverse(T_local_base @ self.camera.T_base_cam)
         points_local = self.landmarks.points_local.take(landmark_ids, axis=0)
         x, y, z = T_cam_local[:3, :3] @ points_local.T + T_cam_local[:3, 3:]
@@ -98,13 +98,13 @@ class VisualMap:
         )
 
     def around(self, landmark_ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the local map: all landmarks of the keyframes that saw these landmarks."""
+        """Return the local map (M,): all landmarks of the keyframes that saw the landmarks (N,)."""
         return self.keyframes.landmarks_of(self.keyframes.covisible(landmark_ids, limit=_COVISIBLE))
 
     def predict(
         self, T_local_base: Transform, landmark_ids: NDArray[np.int64]
     ) -> ExpectedLandmarks:
-        """Return which of these landmarks the image should contain at a pose, and their pixels."""
+        """Return which of the landmarks (N,) are in view at a pose (4, 4), and their pixels."""
         camera, table = self.camera, self.landmarks
         T_local_cam = T_local_base @ camera.T_base_cam
         # Component by component: NumPy is slow along axes of two or three.
@@ -135,14 +135,14 @@ class VisualMap:
     def count_sightings(
         self, expected_ids: NDArray[np.int64], found_ids: NDArray[np.int64]
     ) -> None:
-        """Count the images that should contain landmarks, and those that did."""
+        """Count the images that should contain landmarks (N,), and those that did."""
         self.landmarks.expected[expected_ids] += 1
         self.landmarks.found[found_ids] += 1
 
     def insert(self, keyframe: Keyframe, *, deep_rows: NDArray[np.int64]) -> int:
-        """Add a keyframe: fuse the landmarks it saw, make new ones of its other features.
+        """Add a keyframe: fuse its landmarks, and make new ones of its other features.
 
-        Returns its id. `deep_rows` are the features whose depth agrees with their landmark.
+        Returns its id. `deep_rows` (N,) are the features whose depth agrees with their landmark.
         """
         features, ids = keyframe.features, keyframe.landmark_ids
         known = np.flatnonzero(ids != NO_LANDMARK)
@@ -234,7 +234,7 @@ class VisualMap:
         self.landmarks.remove(gone_ids)
 
     def drop(self, landmark_ids: NDArray[np.int64]) -> None:
-        """Remove landmarks."""
+        """Remove the landmarks (N,)."""
         self.keyframes.forget_landmarks(landmark_ids)
         self.landmarks.remove(landmark_ids)
 

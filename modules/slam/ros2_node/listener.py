@@ -52,7 +52,7 @@ class NodeListener:
         return found
 
     def map(self) -> dict[str, NDArray[Any]]:
-        """Return the layers of the latest map, in the node's map frame."""
+        """Return the latest map: points (N, 3) [m] or a grid, in the node's map frame."""
         with self._came:
             return dict(self._map)
 

@@ -41,7 +41,7 @@ class Samples:
         return len(self.points)
 
     def localizability(self, rows: NDArray[np.bool_] | None = None) -> Localizability:
-        """Return how well the samples, or those of `rows`, constrain the camera's pose."""
+        """Return how well the samples, or those of `rows` (N,), constrain the camera's pose."""
         chosen = slice(None) if rows is None else rows
         return localizability(
             self.points[chosen], self.normals[chosen], self.sigmas_m[chosen] ** np.float32(-2)

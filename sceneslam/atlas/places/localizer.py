@@ -54,7 +54,7 @@ class Fix:
 
     @property
     def T_map_base(self) -> Planar:
-        """Return the robot's pose in the map."""
+        """Return T_map_base (3,): x, y [m], yaw [rad]."""
         return self.match.T_target_query
 
 

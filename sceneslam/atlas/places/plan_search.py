@@ -145,6 +145,6 @@ def _apart(peaks: list[Peak], most: int) -> list[Peak]:
 
 
 def is_apart(first: Planar, second: Planar) -> bool:
-    """Tell whether two poses are different places, beyond the accuracy of the search."""
+    """Tell whether two poses (3,) differ by more than the accuracy of the search."""
     away_m = float(np.hypot(*(first - second)[:2]))
     return away_m > _APART_M or abs(planar.wrap(float(first[2] - second[2]))) > _APART_RAD

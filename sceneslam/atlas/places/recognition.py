@@ -28,7 +28,7 @@ class Recognizer:
     def recognize(
         self, query: PlanField, window: SearchWindow | None, *, known_min: float = _KNOWN_MIN
     ) -> PlanRegistration | None:
-        """Return the pose of the query in the target, None if no pose or more than one fits.
+        """Return T_target_query (3,), None if no pose or more than one fits.
 
         A pose is refuted if walls of one plan lie in free space of the other, or away from its
         walls. `window` None: search the whole target.

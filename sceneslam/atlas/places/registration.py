@@ -49,7 +49,7 @@ class PlanRegistration:
 
 
 def register(query: PlanField, target: PlanField, start: Planar) -> PlanRegistration:
-    """Return the query's pose in the target, from a start within about 0.5 m and 0.2 rad."""
+    """Return T_target_query (3,), from a start (3,) within about 0.5 m and 0.2 rad."""
     walls = _Walls.of(query)
     few, pose = walls.thinned(), planar.compose(start, walls.T_query_centre)
     pose = _refined(few, target, pose, _KERNELS_M[0])

@@ -18,7 +18,7 @@ class NoiseTable:
         self._normals.flags.writeable = False
 
     def normals(self, rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:
-        """Return a read-only array of the table from a random position on."""
+        """Return a read-only array (...) of `shape` from a random position of the table."""
         count = prod(shape)
         start = int(rng.integers(0, max(_ENTRIES - count, 1)))
         part = self._normals[start : start + count]

@@ -85,7 +85,7 @@ class Door:
     y_m: tuple[float, float]
 
     def is_passed(self, start_m: Values, end_m: Values) -> bool:
-        """Tell whether the line between two points (x, y) [m], gt, passes the door."""
+        """Tell whether the line between two points (2,) [m], gt, passes the door."""
         before_m, after_m = start_m[0] - self.x_m, end_m[0] - self.x_m
         if before_m * after_m >= 0.0:
             return False

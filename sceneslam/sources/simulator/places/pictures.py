@@ -1,4 +1,4 @@
-"""Textures with visual features: paintings, posters, book spines and pin boards."""
+"""Textures (rows, columns, 3) with visual features: paintings, posters, book spines, pin boards."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ def texels(width_m: float, height_m: float) -> tuple[int, int]:
 
 
 def noise(rng: np.random.Generator, shape: tuple[int, int], cell_wh: tuple[float, float]) -> Field:
-    """Return smooth noise of unit standard deviation and correlation length `cell_wh` [texels]."""
+    """Return smooth noise (rows, columns) of unit variance and correlation length `cell_wh`."""
     rows, columns = shape
     coarse = (max(2, round(rows / cell_wh[1]) + 1), max(2, round(columns / cell_wh[0]) + 1))
     values = rng.standard_normal(coarse, dtype=np.float32)
@@ -39,13 +39,13 @@ def noise(rng: np.random.Generator, shape: tuple[int, int], cell_wh: tuple[float
 
 
 def clouds(rng: np.random.Generator, shape: tuple[int, int], cell_px: float) -> Field:
-    """Return noise at four scales, the coarsest of `cell_px` texels."""
+    """Return noise (rows, columns) at four scales, the coarsest of `cell_px` texels."""
     octaves = [0.5**k * noise(rng, shape, (cell_px / 2**k,) * 2) for k in range(4)]
     return _field(sum(octaves[1:], octaves[0]))
 
 
 def finish(colour: NDArray[np.floating] | Colour, shade: Field, gain: float = 1.0) -> Texture:
-    """Return a colour (one, or per texel) plus `gain` * `shade` grey levels."""
+    """Return a colour (3,) or (rows, columns, 3) plus `gain` * `shade` grey levels."""
     base = np.asarray(colour, dtype=np.float32)
     return np.clip(base + gain * shade[..., None] + 0.5, 4, 250).astype(np.uint8)
 
@@ -204,7 +204,7 @@ def slats(colour: Colour) -> Material:
 
 
 def write_lines(rng: np.random.Generator, page: Texture, ink: Colour) -> None:
-    """Write illegible lines of print onto a page, in place."""
+    """Write illegible lines of print onto a page (rows, columns, 3), in place."""
     rows, columns = page.shape[:2]
     step = max(4, rows // 9)
     for row in range(2, rows - 3, step):  # lines of print
