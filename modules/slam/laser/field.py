@@ -75,7 +75,7 @@ class LikelihoodField:
         return np.asarray(found.mean(axis=-1))
 
     def pooled(self, factor: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """Return the best likelihood (rows, columns) per `factor`^2 cells, and the corner's cell."""
+        """Return the best likelihood (rows, columns) per `factor`^2 cells, and its corner."""
         before = self._origin % factor
         rows, columns = self._likelihood.shape
         behind = -(before + np.array([columns, rows])) % factor
