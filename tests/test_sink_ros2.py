@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -125,7 +126,20 @@ def test_map_to_odom_leads_to_the_pose_over_the_robots_own_odometry(air, sink):
     assert len(air.sent["/tf"]) == 1  # odom -> base_link is the robot's
 
 
-def test_robot_without_odometry_gets_map_to_base(air, sink):
+def test_base_keeps_its_one_parent_while_odometry_is_silent(air, sink):
+    sink.write(seen(S), at(0.0), "laser")
+    assert "/tf" not in air.sent
+    sink.write(seen(2 * S, at(2.0)), at(5.0), "laser")
+    sink.write(seen(3 * S), at(6.0), "laser")
+    sent = [transform(message) for message in air.sent["/tf"]]
+    assert [(frame, child) for frame, child, _, _ in sent] == [("map", "odom")] * 2
+    np.testing.assert_allclose(sent[1][2], sent[0][2])
+    assert sent[1][3] == 3 * S + 100_000_000
+
+
+def test_robot_without_odometry_gets_map_to_base(air, tmp_path):
+    sink = make()
+    sink.open(replace(RIG, sensors=frozenset({Sensor.SCAN})), tmp_path)
     sink.write(seen(S), at(1.0), "laser")
     frame, child, T_map_base, _ = transform(air.last("/tf"))
     assert (frame, child) == ("map", "base_link")

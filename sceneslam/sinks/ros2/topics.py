@@ -19,7 +19,7 @@ from sceneslam.types.command import Command, SaveMap
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import HybridMap
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Rig
+from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import Event, RunResult
 from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import GroundTruth
@@ -85,6 +85,8 @@ class TopicSink:
         self._requests = Requests(self._transport, map_frame=self._map_frame)
         self._T_frame_map = se3.identity()
         self._T_smooth_odom = se3.identity()
+        self._T_frame_odom: Transform | None = None
+        self._has_odometry = Sensor.ODOMETRY in rig.sensors
         self._shift_ns = 0  # offset of the run's stamps to the robot's
         self._covariance: NDArray[np.float64] | None = None
         self._stamps_ns: list[int] = []
@@ -173,7 +175,11 @@ class TopicSink:
         child, T_frame_child = self._base_frame, T_frame_base
         if T_smooth_base is not None:
             T_odom_base = se3.inverse(self._T_smooth_odom) @ T_smooth_base
-            child, T_frame_child = self._odom_frame, T_frame_base @ se3.inverse(T_odom_base)
+            self._T_frame_odom = T_frame_base @ se3.inverse(T_odom_base)
+        if self._has_odometry:  # base has one parent: while odometry is silent, the last one holds
+            if self._T_frame_odom is None:
+                return
+            child, T_frame_child = self._odom_frame, self._T_frame_odom
         at_ns = stamp_ns + self._ahead_ns
         message = self.encoder.transforms(at_ns, self._map_frame, {child: T_frame_child})
         self.send(names.TF, message)
