@@ -70,7 +70,7 @@ class Streams:
         """
         followed, heard_ns = self._publishers.get(topic, (publisher, arrived_ns))
         if publisher != followed and arrived_ns - heard_ns < _FOLLOWED_NS:
-            self.tell_once("second_publisher", stamp_ns, topic, arrived_ns)
+            self.tell_once("second_publisher", stamp_ns, arrived_ns, topic=topic)
             return False
         self._publishers[topic] = publisher, arrived_ns
         return True
@@ -94,7 +94,7 @@ class Streams:
                 paces=topic == self._topics[self.pace],
             )
         elif lined.order is not StampOrder.RISING:
-            self.tell_once(lined.order.name.lower(), lined.stamp_ns, topic, arrived_ns)
+            self.tell_once(lined.order.name.lower(), lined.stamp_ns, arrived_ns, topic=topic)
         self._shifts_ns[topic] = lined.shift_ns
 
     def look(self, now_ns: int, stamp_ns: int) -> bool:
@@ -124,14 +124,13 @@ class Streams:
             told, self._notices = self._notices, []
             return told
 
-    def tell_once(
-        self, event: str, stamp_ns: int, topic: str, now_ns: int, **fields: object
-    ) -> None:
+    def tell_once(self, event: str, stamp_ns: int, now_ns: int, **fields: object) -> None:
         """Tell what a topic does, and not again while it goes on."""
-        last_ns = self._told_ns.get((event, topic))
-        self._told_ns[event, topic] = now_ns
+        key = (event, str(fields))
+        last_ns = self._told_ns.get(key)
+        self._told_ns[key] = now_ns
         if last_ns is None or now_ns - last_ns > _STREAK_NS:
-            self.tell(event, stamp_ns, topic=topic, **fields)
+            self.tell(event, stamp_ns, **fields)
 
     def tell(self, event: str, stamp_ns: int, **fields: object) -> None:
         """Take what there is to tell."""

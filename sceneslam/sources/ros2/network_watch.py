@@ -63,7 +63,7 @@ class NetworkWatch:
             expected = self._types.get(one.topic, one.msgtype)
             if one.msgtype != expected and (one.topic, one.msgtype) not in self._told:
                 self._told.add((one.topic, one.msgtype))
-                self._tell("wrong_type", one.topic, type=one.msgtype, expected=expected)
+                self._tell("wrong_type", topic=one.topic, type=one.msgtype, expected=expected)
 
     def _take_camera(self, arrival: Arrival) -> None:
         message = self._decoder.decode(arrival.topic, arrival.cdr)
@@ -71,7 +71,7 @@ class NetworkWatch:
         if camera is None or _lens(camera) == _lens(self._camera):
             return
         if self._camera is not None:
-            self._tell("camera_info_changed", arrival.topic, fx=camera.fx, fy=camera.fy)
+            self._tell("camera_info_changed", topic=arrival.topic, fx=camera.fx, fy=camera.fy)
         self._camera = camera
 
     def _take_mounts(self, arrival: Arrival) -> None:
@@ -86,9 +86,9 @@ class NetworkWatch:
         ]
         self._mounts |= found
         if late and self._unplaced:
-            self._tell("tf_late", arrival.topic, frames=late, missed=self._unplaced)
+            self._tell("tf_late", frames=late, missed=self._unplaced)
         if moved:
-            self._tell("tf_changed", arrival.topic, frames=moved)
+            self._tell("tf_changed", frames=moved)
 
 
 def _lens(camera: Camera | None) -> object:

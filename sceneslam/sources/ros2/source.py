@@ -274,11 +274,11 @@ class Ros2(Measuring):
         """Count what cannot be used, and tell it."""
         assert self._streams is not None
         self._faults.add(problem, at_stamp(stamp_ns))
-        self._streams.tell_once("left_out", stamp_ns, problem, monotonic_ns())
+        self._streams.tell_once("left_out", stamp_ns, monotonic_ns(), what=problem)
 
-    def _tell(self, event: str, topic: str, **fields: object) -> None:
+    def _tell(self, event: str, **fields: object) -> None:
         assert self._streams is not None
-        self._streams.tell_once(event, self._stamp_ns, topic, monotonic_ns(), **fields)
+        self._streams.tell_once(event, self._stamp_ns, monotonic_ns(), **fields)
 
     def _waits_s(self) -> float:
         """Return how long after the first measurement what is missing is worth waiting for."""
