@@ -190,8 +190,8 @@ def show(samples: list[Sample], metrics: dict[str, Any]) -> None:
     late = samples[len(samples) // 2 :]
     if len(late) > 2:
         hours = np.array([one.at_s for one in late]) / 3600
-        total_mb = np.array([one.memory_mb + one.children_mb for one in late])
-        print(f"memory over the second half: {np.polyfit(hours, total_mb, 1)[0]:+.0f} MB per hour")
+        memory_mb = np.array([one.memory_mb for one in late])  # its processes come and go
+        print(f"memory over the second half: {np.polyfit(hours, memory_mb, 1)[0]:+.0f} MB per hour")
         threads, files = {one.threads for one in late}, {one.files for one in late}
         print(f"threads {min(threads)} to {max(threads)}, files {min(files)} to {max(files)}")
 

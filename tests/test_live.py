@@ -6,7 +6,7 @@ from time import monotonic
 import numpy as np
 import pytest
 
-from sceneslam.engine.live import LiveSettings, LiveTally, run_live
+from sceneslam.engine.live import LiveSettings, LiveTally, Spent, run_live
 from sceneslam.engine.mailbox import Mailbox, Waited
 from sceneslam.sources.rising_live import RisingLive
 from sceneslam.types.errors import ConfigError
@@ -121,6 +121,22 @@ def test_recording_that_is_read_too_slowly_is_played_later_and_says_so():
     assert len(run.taken) == 4 and max(run.tally.latencies_ms) < 500
     (behind,) = [one for one in run.events if one["event"] == "behind"]
     assert behind["by_s"] == pytest.approx(1.19, abs=0.3)
+
+
+def test_slowest_pose_is_kept_with_what_its_time_went_to():
+    def step(observation):
+        if observation.stamp_ns == 0:
+            threading.Event().wait(0.1)
+        return True
+
+    spent = Spent(parts_ms={"bus": 100.0}, cpu_ms=1.0, beside=("dark starts",))
+    tally = run_live(
+        observations(6, 1, image_bgr=IMAGE), step, print, settings=AT_ONCE, spent=lambda: spent
+    )
+    slowest = tally.slowest.poses[0]
+    assert slowest.latency_ms >= 100.0 and slowest.beside == ("dark starts",)
+    assert set(slowest.parts_ms) == {"arriving", "waiting", "bus"}
+    assert slowest.latency_ms == pytest.approx(max(tally.latencies_ms))
 
 
 def test_interrupted_run_still_knows_what_it_cost():
