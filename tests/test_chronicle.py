@@ -51,7 +51,7 @@ def test_chronicle_of_a_switch_tells_scene_choice_and_change_by_time():
 def test_chronicle_says_what_a_switch_was_decided_on_and_what_it_cost():
     entries = tell(run_with(situation(100)), true_loop())
     told = " ".join(entries[-1].details)
-    assert "The scene asks for it; “rgbd” held its pose." in told
+    assert "The scene asks for it; “rgbd” was tracking." in told
     assert "Candidates, best first: laser, rgbd." in told
     assert "Error of the motion across it: 0.00" in told
     assert "Cost: 3.5 ms" in told
@@ -69,7 +69,7 @@ def test_chronicle_says_what_was_revised_at_a_hand_over():
     at = int(stamps(200)[100])
     revised = happened("revised", at, from_ns=at - 20 * PERIOD_NS, poses=21)
     entries = tell(run_with(situation(100), revised))
-    assert any("21 poses told since then were replaced" in text for text in entries[-1].details)
+    assert any("21 poses reported since then were replaced" in text for text in entries[-1].details)
 
 
 def test_chronicle_tells_long_trouble_and_counts_short():
@@ -80,7 +80,7 @@ def test_chronicle_tells_long_trouble_and_counts_short():
     ]
     whats = [entry.what for entry in tell(run_with(*events))]
     assert "“rgbd” is lost for 1.0 s" in whats
-    assert "Besides, a module was in trouble once for less than 0.5 s" in whats
+    assert "Also, tracking was impaired once for less than 0.5 s" in whats
     assert not any("degraded" in what for what in whats)
 
 
@@ -123,7 +123,7 @@ def test_chronicle_tells_trials_refusals_and_faults():
     assert kinds["“rgbd” stays for Dark"] == "decision"
     assert kinds["“laser” was not taken: it was lost itself"] == "decision"
     assert kinds["the wheels fell off"] == "fault"
-    assert kinds["“rgbd” is not believed"] == "trouble"
+    assert kinds["“rgbd” is rejected"] == "trouble"
     assert sum("dropped" in what for what in kinds) == 1
 
 
@@ -141,4 +141,4 @@ def test_chronicle_tells_what_happened_to_the_input_of_a_live_run():
         )
     )
     told = [entry.what for entry in entries if entry.kind == "trouble"]
-    assert told == ["the clock of /scan jumped by -100 s", "/imu said nothing for 1 s"]
+    assert told == ["the clock of /scan jumped by -100 s", "/imu was silent for 1 s"]

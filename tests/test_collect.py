@@ -214,7 +214,7 @@ def test_front_weighs_settings_over_all_recordings_where_they_ran_to_the_end():
     ]
     rows.append(Row(name="3", status="failed", keys={"story": "hard", "window": 3}, metrics={}))
     page = " ".join(charts(groups_of(rows)))
-    assert "no other is better than: window=1: 1 s, 2 false; window=2: 3 s, 0.5 false." in page
+    assert "the Pareto front: window=1: 1 s, 2 false; window=2: 3 s, 0.5 false." in page
 
 
 def test_settings_that_do_alike_are_told_once_by_the_one_in_the_middle():

@@ -249,6 +249,6 @@ def test_images_of_changes_are_in_the_report_with_what_changed(tmp_path):
     change = {"event": "scene", "stamp_ns": START_NS, "scene": "Dark"}
     seen = KeyMoment(stamp_ns=int(run.observed_ns[0]), events=[change], image_bgr=image)
     html = report(tmp_path, replace(run, moments=(seen,)), true_loop())
-    assert "What the camera saw" in html and "0.0 s: scene Dark confirmed" in html
+    assert "Camera images at changes" in html and "0.0 s: scene Dark confirmed" in html
     assert "data:image/jpeg;base64," in html
-    assert "What the camera saw" not in report(tmp_path, run, true_loop())
+    assert "Camera images at changes" not in report(tmp_path, run, true_loop())

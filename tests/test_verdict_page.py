@@ -38,7 +38,7 @@ def page(tmp_path):
 
 
 def test_what_fails_comes_first_with_what_was_measured_and_what_was_promised(page):
-    assert "1 of 2 promises hold" in page
+    assert "1 of 2 bounds hold" in page
     badges = re.findall(r"<b>(holds|FAILS)</b><div>(\w+)</div><span>([^<]*)</span>", page)
     assert badges == [
         ("FAILS", "broken", "0.04 m (at most 0.03)"),

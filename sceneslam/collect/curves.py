@@ -63,8 +63,8 @@ def _front(groups: Sequence[Group]) -> str:
     return figure(
         drawn,
         "Every setting that ran wherever others did and found all true changes: how late it found "
-        "them, and how many false ones it found, on average over recordings. The line joins "
-        "those that no other is better than: "
+        "them, and how many false ones it found, on average over recordings. The line is "
+        "the Pareto front: "
         f"{'; '.join(best[:_BEST_MAX])}{'; ...' if len(best) > _BEST_MAX else '.'}",
     )
 

@@ -19,8 +19,8 @@ _ADVICE = (  # part of the reason for a missing pose -> advice
         "python -m sceneslam list slam.",
     ),
     (
-        r"while (.+) was not believed",
-        "“{0}” moved otherwise than the wheels. If the wheels are wrong: policy.gate=null.",
+        r"while (.+) was rejected",
+        "“{0}” reported another motion than the wheels. If the wheels are wrong: policy.gate=null.",
     ),
     (
         r"before a module tracked",
@@ -62,7 +62,7 @@ def answer(metrics: Metrics, faults: Sequence[str]) -> Answer:
             f"The pose was correct for {percent(rate)} of the time, and off by {largest} at most."
         )
     if false:
-        where.append(f"{false} changes of module followed a scene that was not there.")
+        where.append(f"{false} changes of module followed a wrong scene.")
     if where:
         return Answer(kind="partly", headline="It worked in part.", where=where, advice=advice)
     told = f"{percent(metrics['coverage'])} of the observations have a pose"
@@ -84,7 +84,7 @@ def _advice(metrics: Metrics) -> Iterator[str]:
     if metrics["false_switches"]:
         yield (
             "Look at the detector's figure: the threshold (detector.threshold) should lie between "
-            "the scenes, and policy.confirm_window_s outlast what flickers."
+            "the scenes, and policy.confirm_window_s be longer than flicker."
         )
 
 

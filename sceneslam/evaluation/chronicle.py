@@ -15,17 +15,17 @@ _TOLD_TROUBLES = 5  # of one kind and module; more are summed up
 
 
 _OF_INPUT = {  # events of the input and of the map -> text
-    "silent": "the source gave nothing for {for_s:g} s",
+    "silent": "the source was silent for {for_s:g} s",
     "returned": "the source is back",
     "behind": "the recording was read too slowly, and is played {by_s:.1f} s later",
-    "given_up": "the source gave nothing for {for_s:g} s, and the run ended",
-    "stream_silent": "{topic} said nothing for {for_s:g} s",
+    "given_up": "the source was silent for {for_s:g} s, and the run ended",
+    "stream_silent": "{topic} was silent for {for_s:g} s",
     "stream_returned": "{topic} is back",
     "clock_jump": "the clock of {topic} jumped by {jumped_s:g} s",
-    "relocalized": "the run was found in the loaded map",
-    "not_relocalized": "the run was not found in the loaded map within {after_s:.1f} s",
-    "relocalization_withdrawn": "the loaded map is contradicted: the run is taken out of it",
-    "odometry_jump": "odometry jumped: it was reset, or moved as no vehicle does",
+    "relocalized": "the run relocalized in the loaded map",
+    "not_relocalized": "the run did not relocalize in the loaded map within {after_s:.1f} s",
+    "relocalization_withdrawn": "the loaded map is contradicted: the run is separated from it",
+    "odometry_jump": "odometry jumped: it was reset, or its motion was impossible",
 }
 
 
@@ -137,7 +137,7 @@ class _Writer:
             self._situation = event
         elif action == "try":
             first = event["verdict"]["to"][0]
-            waited = f"“{event['active']}” runs in its place and holds its pose."
+            waited = f"“{event['active']}” runs in its place and is tracking."
             self._add(event["stamp_ns"], "decision", f"“{first}” is tried again", waited)
         elif action == "tell":
             what = f"“{event['active']}” stays for {event['scene']}"
@@ -185,7 +185,7 @@ class _Writer:
         passing = len(self._troubles) - len(long)
         if passing:
             times = "once" if passing == 1 else f"{passing} times"
-            what = f"Besides, a module was in trouble {times} for less than {_SHORT_S:g} s"
+            what = f"Also, tracking was impaired {times} for less than {_SHORT_S:g} s"
             self._add(end_ns, "trouble", what)
 
     def _sum_up(self, same: Sequence[_Trouble]) -> None:
@@ -200,8 +200,8 @@ class _Writer:
         )
 
     def _tell_suspicion(self, event: Event) -> None:
-        what = f"“{event['module']}” is not believed"
-        why = "It moved otherwise than the wheels; its motion is bridged until they agree again."
+        what = f"“{event['module']}” is rejected"
+        why = "It reported another motion than the wheels; poses are bridged until they agree."
         self._add(event["stamp_ns"], "trouble", what, why)
 
     def _tell_fault(self, event: Event) -> None:
@@ -209,7 +209,7 @@ class _Writer:
 
     def _tell_dropped(self, event: Event) -> None:
         if event["count"]:
-            what = f"{event['count']} observations were dropped in all, for newer ones had come"
+            what = f"{event['count']} observations were dropped in all, as newer ones arrived"
             self._add(event["stamp_ns"], "fault", what)
 
     def _tell_input(self, event: Event) -> None:

@@ -51,7 +51,7 @@ def _state(event: Event, state: str) -> str:
     if event["event"] == "fault":
         return "after a module failed"
     if event["event"] == "suspect":
-        return f"while {event['module']} was not believed"
+        return f"while {event['module']} was rejected"
     if event["status"] == "lost":
         return f"while {event['module']} was lost"
     return "during a change of module"

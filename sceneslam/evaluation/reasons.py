@@ -9,10 +9,10 @@ from sceneslam.evaluation.summary import degrees, number
 from sceneslam.types.run import Event
 
 _HEALTH = {
-    "held": "held its pose",
+    "held": "was tracking",
     "lost": "had been lost for {since:.2f} s",
     "silent": "had got no data for {since:.2f} s",
-    "suspect": "had moved otherwise than the wheels for {since:.2f} s",
+    "suspect": "had reported another motion than the wheels for {since:.2f} s",
     "failed": "had failed",
 }
 
@@ -51,7 +51,7 @@ def _situation(decision: Event, now: Event) -> str:
         return f"The scene asks for it; {active}."
     if decision["reason"] == "return":
         scene = now["served_scene"]
-        return f"It is the first choice for {scene}, and held its pose beside “{now['active']}”."
+        return f"It is the first choice for {scene}, and tracks beside “{now['active']}”."
     bridge = "constant velocity" if now["is_blind"] else "odometry"
     return f"{active}; {bridge} bridged meanwhile." if now["health"] != "failed" else f"{active}."
 
@@ -70,7 +70,7 @@ def _handover(event: Event, at_once: Sequence[Event], origin_ns: int) -> str:
         return f"Handed over ({kind}) at the pose of that instant."
     return (
         f"Handed over ({kind}) in the past, at the last trusted pose before {from_s:.2f} s: "
-        f"{revised} poses told since then were replaced, and the current one moved by "
+        f"{revised} poses reported since then were replaced, and the current one moved by "
         f"{number(event['jump_m'], 3, ' m')} and {degrees(event['jump_rad'])}."
     )
 

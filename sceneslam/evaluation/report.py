@@ -27,20 +27,20 @@ _SHOWN_FAULTS, _SHOWN_ENTRIES = 20, 80
 _CAPTIONS = {
     "map": "The map from above: occupancy grid in grey, points and trajectory in the colour of "
     "the module that gave them, ground truth dashed.",
-    "path": "The same, as near as the path allows.",
-    "view": "The map from above and one side, with the path. Points have the colour that the "
-    "camera saw, else that of their module.",
-    "timeline": "Which module gave the poses. Hatched: degraded, it tracks with less hold than it "
-    "needs and is less certain; crossed: lost, it has no pose.",
-    "grey_mean": "What the detector measured. Shading: the true scene, where it is known; "
+    "path": "The same map, zoomed in on the path.",
+    "view": "The map in third-person view, with the path. Points have the camera's colour, "
+    "or without a camera that of their module.",
+    "timeline": "The active module over time. Hatched: degraded, it tracks with weak constraints "
+    "and a large covariance; crossed: lost, it has no pose.",
+    "grey_mean": "The detector's value. Shading: the true scene, where it is known; "
     "dash-dotted: the instant at which a change of scene was confirmed.",
-    "features": "What the rules measure, and their limits (dashed): a limit suits where the curve "
-    "is on one side of it in one scene, and on the other in the others. Shading as above.",
-    "posterior": "How probable each scene is by the votes so far. Shading and lines as above.",
+    "features": "The features of the rules, and their limits (dashed): a good limit separates the "
+    "values of one scene from those of the others. Shading as above.",
+    "posterior": "The probability of each scene by the votes so far. Shading and lines as above.",
     "error": "Distance from the true position after one rigid alignment of the whole trajectory. "
-    "Shading: who gave the pose; dash-dotted: a change of module.",
+    "Shading: the active module; dash-dotted: a change of module.",
     "error_path": "The path from above, coloured by the distance from the true position.",
-    "pose": "Position and heading in the frame `map` over time.",
+    "pose": "Position and heading in the frame map over time.",
     "difference": "Distance from the reference run over the same path, without any alignment.",
 }
 
@@ -98,7 +98,7 @@ def _seen(result: RunResult) -> str:
     """Return the camera images at changes, under a heading."""
     start_ns = int(result.observed_ns[0]) if len(result.observed_ns) else 0
     images = pictures(result.moments, start_ns)
-    return f"<h2>What the camera saw when something changed</h2>{images}" if images else ""
+    return f"<h2>Camera images at changes</h2>{images}" if images else ""
 
 
 def _told(metrics: Metrics) -> dict[str, str]:

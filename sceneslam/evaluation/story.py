@@ -13,9 +13,9 @@ _WHY = {
     "scene": "the scene was confirmed to be {scene}",
     "lost": "“{from}” had lost track",
     "silent": "the sensors of “{from}” had gone silent",
-    "suspect": "“{from}” moved otherwise than the robot",
+    "suspect": "“{from}” reported another motion than the wheels",
     "failed": "“{from}” had failed",
-    "return": "it held its pose again beside “{from}”",
+    "return": "it was tracking again beside “{from}”",
 }
 
 
@@ -35,11 +35,11 @@ def _opening(metrics: Metrics) -> str:
         return "The source gave no observations, so there is nothing to report."
     seen = f"{metrics['observations']} observations over {metrics['duration_s']:.1f} s"
     if metrics["dropped"]:
-        seen += f" ({metrics['dropped']} more were dropped, for newer ones had come)"
+        seen += f" ({metrics['dropped']} more were dropped, as newer ones arrived)"
     if not metrics["poses"]:
-        return f"The run took in {seen}, but no module ever gave a pose."
+        return f"The run processed {seen}, but no module ever gave a pose."
     text = (
-        f"The run took in {seen}. From the first pose on, {percent(metrics['coverage'])} of them "
+        f"The run processed {seen}. From the first pose on, {percent(metrics['coverage'])} of them "
         f"got a pose; the path is {metrics['path_length_m']:.2f} m long."
     )
     if metrics["bridged"]:
@@ -83,5 +83,5 @@ def _accuracy(metrics: Metrics) -> str:
         f"For {percent(metrics['correct_rate'])} of the time the pose was correct"
     )
     if metrics["false_switches"]:
-        return text + f"; {metrics['false_switches']} switches followed a scene that was not there."
+        return text + f"; {metrics['false_switches']} switches followed a wrong scene."
     return text + "."

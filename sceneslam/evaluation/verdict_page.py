@@ -62,8 +62,8 @@ def write_verdict_page(folder: Path, asked: Asked, verdict: Verdict, runs: Seque
 def _kept(figures: Sequence[Figure]) -> str:
     held = sum(figure.holds for figure in figures)
     if not figures:
-        return "Nothing was promised"
-    return f"{held} of {len(figures)} promises hold"
+        return "No bounds are set"
+    return f"{held} of {len(figures)} bounds hold"
 
 
 def _promises(figures: Sequence[Figure]) -> str:
