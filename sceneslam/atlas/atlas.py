@@ -74,7 +74,7 @@ class Atlas:
         )
 
     def observe(self, observation: Observation) -> None:
-        """Take an observation; its pose must have been added before."""
+        """Add an observation; its pose must have been added before."""
         if self._mapper is None or self._note is None:
             return
         try:
@@ -158,7 +158,7 @@ class Atlas:
         self._path.cut(stamp_ns)
 
     def close_session(self, session: int, layers: MapLayers, revised: Trajectory) -> None:
-        """Take the final map of a session, and its revised poses (T_local_base).
+        """Add the final map of a session, and its revised poses T_local_base (4, 4) [m].
 
         `revised` is empty if the module did not revise its poses.
         """

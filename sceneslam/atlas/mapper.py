@@ -80,7 +80,7 @@ class Mapper:
         return se3.identity() if found is None else planar.to_transform(found)
 
     def observe(self, observation: Observation) -> None:
-        """Take an observation whose pose is known."""
+        """Add an observation with a known pose."""
         known = self._known(observation.stamp_ns)
         if known is None:
             return

@@ -51,7 +51,7 @@ class SessionPose:
 
 @dataclass(slots=True)
 class _Known:
-    """A pose with its covariance; `told` is the part that its module reported."""
+    """A pose with its covariance; `told` is the part reported by its module."""
 
     T_map_base: Transform
     carried: Covariance

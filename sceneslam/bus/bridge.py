@@ -37,7 +37,7 @@ class Bridge:
     def update(
         self, observation: Observation, T_map_base: Transform, *, is_jump: bool = False
     ) -> None:
-        """Take a pose that a module measured.
+        """Add a pose T_local_base measured by a module.
 
         `is_jump`: the pose jumped by a correction, so that no velocity is derived from it.
         """
@@ -79,7 +79,7 @@ class Bridge:
         return self._T_map_base
 
     def _note(self, stamp_ns: int, T_map_base: Transform) -> None:
-        """Take a measured pose, from which the velocity follows."""
+        """Add a measured pose, and compute the velocity from it."""
         if self._known is not None and self._known[0] < stamp_ns:
             self._before = self._known  # at a hand-over two modules give a pose at the same stamp
         self._known = (stamp_ns, T_map_base)

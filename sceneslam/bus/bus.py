@@ -163,7 +163,7 @@ class Bus:
         return self._candidates.scene
 
     def step(self, observation: Observation) -> None:
-        """Take one observation: vote, track, and change state where that is called for."""
+        """Process one observation: vote, track, and change state if necessary."""
         began_ns = perf_counter_ns()
         spent_ns = self._spent_ns()
         self._watch.look(observation)

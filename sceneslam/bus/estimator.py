@@ -102,8 +102,8 @@ class Estimator:
     def begin(self, runner: Runner, since_ns: int | None, *, is_trial: bool = False) -> Handover:
         """Begin to hand over to a module that has started.
 
-        `since_ns`: when the scene that calls for it began, None for another reason. A trial
-        begins now, whatever the kind of hand-over.
+        `since_ns`: when the scene that calls for it began, None for another reason. A trial begins
+        now, whatever the kind of hand-over.
         """
         anchor = self._memory.newest
         if self._policy.handover == "rewind" and not is_trial:
@@ -135,7 +135,7 @@ class Estimator:
         self._placed = []
 
     def close(self) -> None:
-        """Shut the active module down for good, and forget what was observed."""
+        """Shut the active module down, and delete the buffered observations."""
         self.retire()
         self._keep_maps(waits=True)
         self._memory.clear()

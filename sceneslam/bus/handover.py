@@ -91,7 +91,7 @@ class Handover:
         return True
 
     def settle(self, anchor: BufferedObservation) -> None:
-        """Place the module, which has caught up, anew: at the pose of the given moment.
+        """Place the module, which has caught up, at the pose of the given observation.
 
         Its earlier observations belong to its trial, not to the hand-over.
         """

@@ -77,7 +77,7 @@ class Runner:
         return ""
 
     def start(self, rig: Rig, scene: str) -> None:
-        """Begin to activate the module anew; `has_started` gives the result."""
+        """Start the next activation of the module; `has_started` returns the result."""
         self.T_map_local, self.is_failed = None, False
         with self._timed():
             self._starting = self._executor.submit(self._activate, rig, scene)

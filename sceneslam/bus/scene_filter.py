@@ -55,7 +55,7 @@ class WindowFilter:
     def update(self, vote: SceneVote) -> ConfirmedScene | None:
         """Return the scene that this vote confirms, None when nothing changes.
 
-        After a gap between votes longer than the window, the window starts anew.
+        After a gap between votes longer than the window, the window restarts.
         """
         if vote.scene == UNSURE:
             return None

@@ -51,7 +51,7 @@ class LiveTally:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spent:
-    """What the last step's time went to; see SlowPose."""
+    """The durations of the parts of the last step; see SlowPose."""
 
     parts_ms: Mapping[str, float] = field(default_factory=dict)
     cpu_ms: float = 0.0
@@ -102,7 +102,7 @@ class _LiveRun:
         self._lag_ns: int | None = None  # clock - stamp / rate, of the first observation
         self._last_ns = 0
         self._due_at_ns: dict[int, int] = {}  # stamp -> due time of queued observations
-        self._came_at_ns: dict[int, int] = {}  # stamp -> when they were queued
+        self._came_at_ns: dict[int, int] = {}  # stamp -> time of queueing
         self._behind_s = self._told_behind_s = 0.0  # delay of playback
 
     def carry_out(self) -> LiveTally:
@@ -189,7 +189,7 @@ class _LiveRun:
         self._is_over.set()
 
     def _count(self, taken: Observation, began_ns: int) -> None:
-        """Keep how long an observation's pose took, and why where that was long."""
+        """Record the latency of a pose, with its parts if it is one of the longest."""
         now_ns, stamp_ns = monotonic_ns(), taken.stamp_ns
         came_ns, due_ns = _taken(self._came_at_ns, stamp_ns), _taken(self._due_at_ns, stamp_ns)
         measured_ns = self._feed.measured_ns(taken) if self._feed else due_ns
@@ -221,7 +221,7 @@ class _LiveRun:
 
 
 def _taken(at_ns: dict[int, int], stamp_ns: int) -> int:
-    """Return when a stamp was; forget it, and those before it, which were dropped."""
+    """Return the time of a stamp [ns]; remove it and all earlier ones, which were dropped."""
     found_ns = at_ns.get(stamp_ns, 0)
     for earlier_ns in [one for one in list(at_ns) if one <= stamp_ns]:
         del at_ns[earlier_ns]

@@ -69,7 +69,7 @@ def draw_view(result: RunResult) -> Any:
 
 
 def _viewer(points_map: NDArray[np.float64]) -> _Viewer:
-    """Return a viewer who has nearly all points in view."""
+    """Return a viewpoint from which nearly all points are visible."""
     low, high = np.percentile(points_map, _INSIDE, axis=0)
     centre_map, reach_m = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     away = np.array(

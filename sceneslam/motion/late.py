@@ -45,7 +45,7 @@ class Pipeline:
             self._first_ns, self._T_odom_newest = observation.stamp_ns, T_odom_base
 
     def take(self, answers: Sequence[Tracking]) -> None:
-        """Take answers by increasing stamp; raises ValueError for one that is not expected."""
+        """Add answers by increasing stamp; raises ValueError for an unexpected one."""
         for answer in answers:
             if answer.stamp_ns not in self._waiting:
                 given = f"the last was {max(self._waiting, default=None)}"

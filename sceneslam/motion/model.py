@@ -151,8 +151,8 @@ class MotionModel:
     def learn(self, T_before_now: Transform, covariance: NDArray[np.float64]) -> None:
         """Calibrate by the motion (4, 4) since the last call, as measured by another sensor alone.
 
-        `covariance` (6, 6) is the measurement's alone, without any prediction: large in
-        directions that the sensor did not measure. Axes of `now`.
+        `covariance` (6, 6) is the measurement's alone, without any prediction: large in directions
+        that the sensor did not measure. Axes of `now`.
         """
         duration_s, wheels, guess = self._since_s, self._since_wheels, self._since_guess
         had_velocity = self._twist_s is not None
@@ -213,7 +213,7 @@ class MotionModel:
         self._twist_s = None
 
     def _note_velocity(self, twist_s: NDArray[np.float64], covariance: NDArray[np.float64]) -> None:
-        """Take a velocity; components that the sensor did not measure decay."""
+        """Add a velocity; components without a measurement decay."""
         unknown = np.diag(np.repeat(_FASTEST**2, 3))
         gain = unknown @ np.linalg.inv(unknown + covariance)
         kept = self.velocity * math.exp(-self._since_s / self._fade_s)

@@ -9,21 +9,21 @@ from sceneslam.types.maps import HybridMap
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SelectScene:
-    """Take a scene for the one around the robot, as in the authors' manual bus."""
+    """Select the scene around the robot, as in the paper's manual mode."""
 
     scene: str  # one of the detector's; "": as detected
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SelectModule:
-    """Take the scene whose first module this is for the one around the robot."""
+    """Select the scene whose first module this is."""
 
     module: str  # a key of slam; "": as detected
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pause:
-    """Take no observation, or take them again."""
+    """Pause or continue processing of observations."""
 
     is_paused: bool
 

@@ -51,15 +51,15 @@ class KeyMoment:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlowPose:
-    """A pose of a live run that came late, and what its time went to."""
+    """A pose of a live run with large latency, and the parts of it."""
 
     stamp_ns: int
     latency_ms: float  # from the stamp to the pose
-    # `arriving`: until the observation could be taken; `waiting`: for the one before; then each
-    # part of the work on it.
+    # `arriving`: until the observation was available; `waiting`: for the previous one; then each
+    # part of its processing.
     parts_ms: Mapping[str, float]
-    cpu_ms: float  # of the work, what its thread computed; the rest it waited
-    beside: Sequence[str]  # what other threads did for the modules meanwhile
+    cpu_ms: float  # CPU time of the thread; the rest of the time it waited
+    beside: Sequence[str]  # parallel computations of other threads for the modules
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

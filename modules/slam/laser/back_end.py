@@ -25,7 +25,7 @@ class LaserBackEnd:
     revision: int = field(default=0, init=False)
 
     def take(self) -> bool:
-        """Take the newest keyframe; return whether poses were corrected."""
+        """Process the newest keyframe; return whether poses were corrected."""
         number = len(self.keyframes) - 1
         frames = self.keyframes.frames
         if number > 0:

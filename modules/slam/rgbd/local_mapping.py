@@ -50,7 +50,7 @@ class LocalMapping:
         self.beginning: dict[int, View] = {}  # by keyframe id, until that is known
 
     def insert(self, keyframe_id: int, view: View) -> None:
-        """Take a new keyframe's view; without depth it gets no relative-pose constraint."""
+        """Add a new keyframe's view; without depth it gets no relative-pose constraint."""
         self._process()
         if not self._is_aligned:
             self.beginning[keyframe_id] = view

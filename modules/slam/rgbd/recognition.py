@@ -34,7 +34,7 @@ class Recognition:
 class PlaceRecognizer:
     """Recognises the map's keyframes in images, independent of the predicted pose.
 
-    The same poster on two walls is told apart: at the wrong wall the other landmarks are not found,
+    The same poster on two walls is distinguished: at the wrong wall, other landmarks are not found,
     and the depths around it differ.
     """
 

@@ -93,7 +93,7 @@ class Reunion:
         )
 
     def see(self, view: View, T_local_base: Transform) -> None:
-        """Take a view with a tracked pose."""
+        """Add a view with a tracked pose."""
         self._end_ns = view.observation.stamp_ns
         self._images += 1
         if not self._past or self._queries or self._images % _EVERY:

@@ -29,7 +29,7 @@ class LoopFinder:
     """Measures the motion between submaps of different sessions."""
 
     def __init__(self, submaps: Sequence[Submap], closed: frozenset[int]) -> None:
-        """Take all submaps; in sessions in `closed` the modules close loops themselves."""
+        """Set all submaps; in the sessions `closed`, modules close loops themselves."""
         self._submaps, self._closed = submaps, closed
         self._targets: dict[tuple[int, int], Recognizer] = {}
 

@@ -12,8 +12,8 @@ from sceneslam.types.rig import Sensor
 from sceneslam.types.run import Event
 
 _WAITED_FOR = frozenset({Sensor.DEPTH, Sensor.ODOMETRY, Sensor.GYRO, Sensor.ACCELEROMETER})
-_STREAK_NS = 5_000_000_000  # a condition that lasts is reported once per so long
-_FOLLOWED_NS = 300_000_000  # without a message, a topic's publisher has left: three at 10 Hz
+_STREAK_NS = 5_000_000_000  # a lasting condition is reported at this interval
+_FOLLOWED_NS = 300_000_000  # a silent publisher has left: three periods at 10 Hz
 
 
 class Streams:
@@ -26,7 +26,7 @@ class Streams:
         self._silent: set[str] = set()
         self._first_ns: dict[str, int] = {}
         self._told_ns: dict[tuple[str, str], int] = {}
-        self._publishers: dict[str, tuple[int, int]] = {}  # topic -> who is followed, last heard
+        self._publishers: dict[str, tuple[int, int]] = {}  # topic -> publisher, last arrival
         self._shifts_ns: dict[str, int] = {}
         self._dropped: Counter[str] = Counter()
         self._dropped_ns = now_ns
@@ -64,9 +64,9 @@ class Streams:
         return True
 
     def follows(self, topic: str, publisher: int, arrived_ns: int, stamp_ns: int) -> bool:
-        """Tell whether a message is of the topic's one publisher.
+        """Tell whether a message is from the topic's used publisher.
 
-        Where there are two, the first is followed until it has been silent for a while.
+        With two publishers, the first is used until it is silent.
         """
         followed, heard_ns = self._publishers.get(topic, (publisher, arrived_ns))
         if publisher != followed and arrived_ns - heard_ns < _FOLLOWED_NS:
@@ -125,7 +125,7 @@ class Streams:
             return told
 
     def tell_once(self, event: str, stamp_ns: int, now_ns: int, **fields: object) -> None:
-        """Tell what a topic does, and not again while it goes on."""
+        """Report a condition of a topic once while it lasts."""
         key = (event, str(fields))
         last_ns = self._told_ns.get(key)
         self._told_ns[key] = now_ns
@@ -133,6 +133,6 @@ class Streams:
             self.tell(event, stamp_ns, **fields)
 
     def tell(self, event: str, stamp_ns: int, **fields: object) -> None:
-        """Take what there is to tell."""
+        """Add an event."""
         with self._lock:
             self._notices.append({"event": event, "stamp_ns": stamp_ns, **fields})

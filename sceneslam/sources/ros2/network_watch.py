@@ -19,7 +19,7 @@ Tell = Callable[..., None]  # event, and its fields
 
 
 class NetworkWatch:
-    """Tells what a run that goes on cannot take over: it began with something else."""
+    """Reports changes of a topic that a running source cannot apply."""
 
     def __init__(
         self,
