@@ -43,7 +43,12 @@ pytestmark = [
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     pytest.importorskip("cyclonedds")
-    exact = ("+sinks@sinks.mcap=mcap", "sinks.mcap.depth_every=1", "run.report=false")
+    exact = (
+        "source.laser=true",
+        "+sinks@sinks.mcap=mcap",
+        "sinks.mcap.depth_every=1",
+        "run.report=false",
+    )
     return run(SCENARIO, *exact, folder=tmp_path_factory.mktemp("recorded"))
 
 

@@ -21,7 +21,7 @@ class StampOrder(Enum):
     UNORDERED = "its stamp is before that of the message before"
     LATE = "it came late"
     JUMPED = "the clock jumped"
-    UNSTAMPED = "it has no stamp: it counts as measured when it came"
+    UNSTAMPED = "it has no stamp; its arrival is used"
 
 
 @dataclass(slots=True, kw_only=True)
@@ -77,7 +77,7 @@ class StampClock:
         return Lined(stamp_ns=lined_ns, order=order, shift_ns=stream.shift_ns)
 
     def _stamped(self, topic: str, arrived_ns: int) -> Lined:
-        """Return a message without a stamp as one of the fastest, sent when it came."""
+        """Return a stamp for a message without one: its arrival minus the shortest delay."""
         if self._delay_ns is None:
             self._delay_ns, self._noted_ns = self._real_ns, arrived_ns
         stamp_ns, last = arrived_ns - self._delay_ns, self._streams.get(topic)

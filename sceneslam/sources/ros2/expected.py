@@ -1,4 +1,4 @@
-"""What a robot should tell and has not yet: worth waiting for, or worth a word."""
+"""Checks for what a robot should publish: calibration, transforms, types."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PLACED = (*TYPES["image"], *TYPES["scan"], *TYPES["points"])
 
 
 def lacks_calibration(heard: LiveRecording) -> bool:
-    """Tell whether there is depth, which is of no use without a camera_info."""
+    """Tell whether there is depth but no camera_info, without which depth cannot be used."""
     kinds = list(heard.topics.items())
     if any(kind.msgtype in TYPES["camera_info"] for _, kind in kinds):
         return False
@@ -35,7 +35,7 @@ def lacks_calibration(heard: LiveRecording) -> bool:
 
 
 def lacks_transforms(heard: LiveRecording, base_frame: str | None) -> bool:
-    """Tell whether a sensor is not connected with the robot's base yet."""
+    """Tell whether no transform connects a sensor with the robot's base yet."""
     try:
         frames = FrameTree(heard, base_frame)
     except ConfigError:  # the base itself is not known yet
@@ -51,7 +51,7 @@ def unplaced(heard: LiveRecording, topics: BagTopics, frames: FrameTree) -> list
 
 
 def oddities(heard: LiveRecording, named: Sequence[str]) -> Iterator[str]:
-    """Yield sentences about publishers of other types, and of transforms that are not kept."""
+    """Yield warnings of publishers with other types, and of transforms that are not latched."""
     wanted = {name for group in USUAL.values() for name in group} | set(named)
     for topic, msgtype in sorted(heard.other_types.items()):
         used = heard.announced.get(topic)

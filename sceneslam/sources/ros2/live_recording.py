@@ -58,8 +58,8 @@ class LiveRecording:
     ) -> None:
         """Receive until `listen_s` after the first measurement and until all `wanted` topics came.
 
-        `waits_s` says how long after the first measurement what is missing still is worth waiting
-        for. Gives up after `wait_s`.
+        `waits_s` returns how long after the first measurement to wait for what is missing. Gives up
+        after `wait_s`.
         """
         until_s, first_s = monotonic() + wait_s, None
         tick = threading.Event()

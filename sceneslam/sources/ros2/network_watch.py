@@ -1,4 +1,4 @@
-"""What changes on the network while a robot drives: types, calibration, mounts."""
+"""Detect changes of types, calibration and mounts while a robot drives."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class NetworkWatch:
         )
 
     def look(self, publications: Sequence[Publication]) -> None:
-        """Notice who publishes something else on a topic that is used."""
+        """Report publishers with another type on a topic that is used."""
         for one in publications:
             expected = self._types.get(one.topic, one.msgtype)
             if one.msgtype != expected and (one.topic, one.msgtype) not in self._told:

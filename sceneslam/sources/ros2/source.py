@@ -271,7 +271,7 @@ class Ros2(Measuring):
                 yield sensor, Sample(stamp_ns=lined.stamp_ns, value=held)
 
     def _leave_out(self, problem: str, stamp_ns: int) -> None:
-        """Count what cannot be used, and tell it."""
+        """Count a message that cannot be used, and report it."""
         assert self._streams is not None
         self._faults.add(problem, at_stamp(stamp_ns))
         self._streams.tell_once("left_out", stamp_ns, monotonic_ns(), what=problem)
@@ -281,7 +281,7 @@ class Ros2(Measuring):
         self._streams.tell_once(event, self._stamp_ns, monotonic_ns(), **fields)
 
     def _waits_s(self) -> float:
-        """Return how long after the first measurement what is missing is worth waiting for."""
+        """Return how long after the first measurement to wait for what is missing."""
         if self._given.intrinsics is None and lacks_calibration(self.heard):
             return self._wait_s
         is_unplaced = lacks_transforms(self.heard, self._base_frame)
