@@ -141,7 +141,7 @@ class Estimator:
         self._memory.clear()
 
     def _distrust(self, since_ns: int, moment: BufferedObservation) -> BufferedObservation:
-        """Replace the poses after `since_ns` by bridged ones; return the newest moment, bridged."""
+        """Replace the poses after `since_ns` by bridged ones; return the newest one, bridged."""
         self._log.add("suspect", moment.stamp_ns, module=self._session.key)
         untrusted, before = self._memory.after(since_ns), self._memory.last_until(since_ns)
         if before is None or not untrusted:
@@ -156,7 +156,7 @@ class Estimator:
         return bridged[-1]
 
     def _put(self, moments: list[BufferedObservation], stamp_ns: int) -> None:
-        """Replace reported moments by their corrected ones."""
+        """Replace buffered observations by those with corrected poses."""
         for moment in moments:
             self._report(moment)
         if moments:

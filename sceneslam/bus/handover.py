@@ -17,10 +17,10 @@ from sceneslam.types.se3 import Transform
 
 
 class Handover:
-    """Advances a session from a remembered moment to now; nothing changes until it is accepted.
+    """Advances a session from a buffered observation to now; nothing changes until it is accepted.
 
-    The module is placed at the pose of the last trusted moment at which it tracks. From there on
-    its poses are the robot's, and gaps in its tracking are bridged.
+    The module is placed at the pose of the last trusted observation at which it tracks. From there
+    on its poses are the robot's, and gaps in its tracking are bridged.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class Handover:
             self._cost_ns += perf_counter_ns() - self._since_ns
 
     def _go_on_to(self, moment: BufferedObservation) -> bool:
-        """Give the module a moment's observation or skip it; return whether it was given."""
+        """Give the module a buffered observation or skip it; return whether it was given."""
         session, motion = self.session, self._motion_to(moment)
         self._done_ns, self._reported = moment.stamp_ns, moment.T_map_base
         if not session.is_placed and moment.is_trusted:
@@ -128,7 +128,7 @@ class Handover:
         return True
 
     def _ask(self, moment: BufferedObservation, motion: Transform | None) -> None:
-        """Give the module a moment's observation, with the gyro samples of skipped ones."""
+        """Give the module a buffered observation, with the gyro samples of skipped ones."""
         session, given = self.session, moment.observation
         was_placed = session.is_placed
         if self.runner.can_use(given):
@@ -153,13 +153,13 @@ class Handover:
         self._remember(moment, replace(found, observation=moment.observation))
 
     def _motion_to(self, moment: BufferedObservation) -> Transform | None:
-        """Return the motion (4, 4) since the moment before, as it was estimated then."""
+        """Return the motion (4, 4) since the previous observation, as it was estimated then."""
         if self._reported is None or moment.T_map_base is None:
             return None
         return se3.inverse(self._reported) @ moment.T_map_base
 
     def _remember(self, moment: BufferedObservation, found: BufferedObservation) -> None:
-        """Continue to a moment with its newly estimated pose."""
+        """Continue to a buffered observation with its newly estimated pose."""
         if moment is not self.anchor or moment.module == BRIDGED:
             self.trail.append(found)
 

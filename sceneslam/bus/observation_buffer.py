@@ -24,7 +24,9 @@ class BufferedObservation:
     T_map_base: Transform | None  # None: no pose could be given
     module: str  # the module that gave the pose, BRIDGED without one
     bridge: Bridge  # after the observation
-    turn: NDArray[np.float64] | None  # (3, 3) rotation since the moment before, of a trusted module
+    turn: (
+        NDArray[np.float64] | None
+    )  # (3, 3) rotation since the previous entry, of a trusted module
     covariance: NDArray[np.float64] | None  # (6, 6) of its T_local_base, as the module reports it
     is_trusted: bool  # a module that was not suspect was tracking, as certain as usual
 
@@ -34,7 +36,7 @@ class BufferedObservation:
         return self.observation.stamp_ns
 
     def bridged(self, T_map_base: Transform | None, bridge: Bridge) -> BufferedObservation:
-        """Return the moment with a bridged pose."""
+        """Return the entry with a bridged pose."""
         return replace(
             self,
             T_map_base=T_map_base,
@@ -46,11 +48,11 @@ class BufferedObservation:
 
 
 class ObservationBuffer:
-    """The moments of the last while, bounded in time and in bytes.
+    """The observations of the last seconds, bounded in time and in bytes.
 
-    When the bytes do not suffice, older moments lose their sensor data, so that the spacing of
-    those left grows with their age: a module that catches up gets fewer of the older images, and
-    every moment still gets its pose.
+    When the limit is reached, older entries lose their sensor data, so that the spacing of those
+    left grows with their age: a module that catches up gets fewer of the older images, and every
+    moment still gets its pose.
     """
 
     def __init__(self, *, span_s: float, limit_mb: float, keeps_sensors: bool) -> None:
@@ -63,11 +65,11 @@ class ObservationBuffer:
 
     @property
     def newest(self) -> BufferedObservation:
-        """Return the moment that was added last."""
+        """Return the newest entry."""
         return self._moments[-1]
 
     def add(self, moment: BufferedObservation) -> None:
-        """Add a moment; remove those that are too old."""
+        """Add an entry; remove those that are too old."""
         self._append(moment)
         old = self._count(moment.stamp_ns - self._span_ns - 1)
         if old:
@@ -79,9 +81,9 @@ class ObservationBuffer:
             self._strip(self._least_missed())
 
     def anchor(self, until_ns: int | None) -> BufferedObservation:
-        """Return the newest trusted moment, not after `until_ns` if that is given.
+        """Return the newest trusted entry, not after `until_ns` if that is given.
 
-        Without a trusted moment, the oldest that has a pose; without a pose, the oldest.
+        Without a trusted entry, the oldest with a pose; without a pose, the oldest.
         """
         posed = [moment for moment in self._moments if moment.T_map_base is not None]
         for moment in reversed(posed):
@@ -90,16 +92,16 @@ class ObservationBuffer:
         return posed[0] if posed else self._moments[0]
 
     def after(self, stamp_ns: int) -> list[BufferedObservation]:
-        """Return all moments after an instant."""
+        """Return all entries after a stamp."""
         return self._moments[self._count(stamp_ns) :]
 
     def last_until(self, stamp_ns: int) -> BufferedObservation | None:
-        """Return the newest moment up to an instant, None if it was removed."""
+        """Return the newest entry up to a stamp, None if it was removed."""
         count = self._count(stamp_ns)
         return self._moments[count - 1] if count else None
 
     def rewrite(self, moments: list[BufferedObservation]) -> None:
-        """Replace all moments from the first of `moments` on by these, with corrected poses."""
+        """Replace all entries from the first of `moments` on by these, with corrected poses."""
         from_ns = moments[0].stamp_ns
         del self._moments[self._count(from_ns - 1) :]
         self._drop(slice(bisect_left(self._full_ns, from_ns), None))
@@ -107,12 +109,12 @@ class ObservationBuffer:
             self._append(moment)
 
     def clear(self) -> None:
-        """Remove all moments, to free memory when a finished run is kept for its results."""
+        """Remove all entries, to free memory when a finished run is kept for its results."""
         self._moments, self._bytes = [], 0
         self._full_ns, self._sizes = [], []
 
     def _count(self, stamp_ns: int) -> int:
-        """Return how many moments there are up to an instant."""
+        """Return the number of entries up to a stamp."""
         return bisect_right(self._moments, stamp_ns, key=_stamp_ns)
 
     def _append(self, moment: BufferedObservation) -> None:
@@ -124,18 +126,18 @@ class ObservationBuffer:
             self._bytes += size
 
     def _drop(self, full: slice) -> None:
-        """Remove the sizes of moments that were removed."""
+        """Remove the sizes of removed entries."""
         self._bytes -= sum(self._sizes[full])
         del self._full_ns[full], self._sizes[full]
 
     def _least_missed(self) -> int:
-        """Return the index, among the moments with sensor data, of the one least needed."""
+        """Return the index, among the entries with sensor data, of the least needed one."""
         stamps_ns = np.array(self._full_ns, np.float64)
         ages_ns = stamps_ns[-1] - stamps_ns[1:-1]
         return int(np.argmin((stamps_ns[2:] - stamps_ns[:-2]) / ages_ns)) + 1
 
     def _strip(self, full: int) -> None:
-        """Remove the sensor data of one of the moments that still have it."""
+        """Remove the sensor data of one entry."""
         index = self._count(self._full_ns[full]) - 1
         self._bytes -= self._sizes.pop(full)
         del self._full_ns[full]

@@ -77,7 +77,7 @@ class MapHistory:
         self._frames.add(stamp_ns, self.reference, T_keyframe_base, self._eye.twist_per_s)
 
     def around(self, T_local_base: Transform) -> list[Transform]:
-        """Return T_keyframe_base of a pose for the keyframes around the newest frame's."""
+        """Return T_keyframe_base of a pose for the keyframes near the newest frame."""
         near = [self.reference, *self._graph.neighbours(self.reference)]
         return [se3.inverse(self._map.keyframes[k].T_local_base) @ T_local_base for k in near]
 
