@@ -33,7 +33,7 @@ from sceneslam.types.rig import Rig
 from sceneslam.types.trajectory import Trajectory
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
-HEAD = "| run | trans [m] | rot [deg] | told: trans, rot | x real time | ms: median, p99, max |"
+HEAD = "| run | trans [m] | rot [deg] | online: trans, rot | x real time | ms: median, p99, max |"
 
 
 def settings(path: str) -> dict[str, object]:

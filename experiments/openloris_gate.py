@@ -2,7 +2,7 @@
 
     python experiments/openloris_gate.py FOLDER > table.md
 
-FOLDER is laid out as for `+experiment=openloris`. Poses are as told at the time: nothing is
+FOLDER is laid out as for `+experiment=openloris`. Poses are as reported online: nothing is
 revised. `+ 1 deg/m`: the same wheels, turning by so much too much on the way. Below each scene:
 Correct Rate [%] / ATE [m] / share of the time the module was trusted [%].
 """

@@ -37,7 +37,7 @@ CONF = Path(__file__).resolve().parents[1] / "conf" / "slam" / "rgbd.yaml"
 COUNTS = (700, 940, 970, 1030, 1060, 1500)
 GAP_S = 0.01  # between a pose and its truth
 HEAD = (
-    "| run | ATE told (max) [mm] | revised [mm] | no pose | keyframes "
+    "| run | ATE online (max) [mm] | revised [mm] | no pose | keyframes "
     "| CPU ms: median, p95 | wall ms: median, p95 | CPU in all, per image [ms] |"
 )
 

@@ -200,8 +200,8 @@ def main() -> None:
     for name, start in stretches:
         judge(scores[name], WAYS[name], answers, start, truth)
     print(
-        "| images | stretches | LOST after, at most | told after the third: tracking, degraded "
-        "| error told while fading, blind: worst [m] | back after |\n" + "|---" * 6 + "|"
+        "| images | stretches | LOST after, at most | reported after the third: tracking, degraded "
+        "| reported error while fading, blind: worst [m] | back after |\n" + "|---" * 6 + "|"
     )
     for name, score in scores.items():
         if score.after:

@@ -95,7 +95,7 @@ def loops(overrides: list[str]) -> Row:
         "wrong": int(wrong.sum()),
         "worst edge [m]": f"{errors[:, 0].max(initial=0):.3f}",
         "revisions": answers[-1].revision,
-        "ATE told [m]": f"{absolute_errors(told, truth, MAX_GAP_S).rmse_m:.4f}",
+        "ATE online [m]": f"{absolute_errors(told, truth, MAX_GAP_S).rmse_m:.4f}",
         "ATE revised [m]": f"{absolute_errors(revised, truth, MAX_GAP_S).rmse_m:.4f}",
         **cost,
     }
@@ -160,7 +160,7 @@ def kidnap(overrides: list[str]) -> Row:
         "put back": JUMPS,
         "found": len(first_m),
         "images until found, at most": max(delays, default=-1),
-        "told as degraded": guesses,
+        "reported as degraded": guesses,
         **_spread("first error", np.array(first_m)),
         **_spread("within a second", np.array(all_m)),
     }

@@ -91,7 +91,7 @@ def bridge(overrides: list[str], length_s: float) -> str:
 
 def main() -> None:
     """Print the table."""
-    head = "gap | lost | degraded | ATE told (max) [mm] | revised [mm] | scale in it "
+    head = "gap | lost | degraded | ATE online (max) [mm] | revised [mm] | scale in it "
     head += "| sigma claimed (most), error then [mm] | CPU ms"
     print(f"| {head} |\n" + "|---" * 8 + "|")
     for length_s in LENGTHS_S:

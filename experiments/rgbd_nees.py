@@ -92,7 +92,7 @@ def main() -> None:
     images, words = int(sys.argv[1]), sys.argv[2:]
     print(
         "| run | of | poses | claimed, error: median | NEES: mean, median | in the 95 % band "
-        "| surer than that | less sure |\n" + "|---" * 8 + "|"
+        "| too certain | too uncertain |\n" + "|---" * 8 + "|"
     )
     others = [word for word in words if not word.startswith("seed=")]
     found = []

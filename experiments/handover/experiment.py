@@ -108,5 +108,5 @@ def _table(seams: Sequence[Seam]) -> Table:
         )
         for one in seams
     ]
-    more = ("own drift [cm]", "beyond it [cm]", "gap [s]", "as told [cm]")
+    more = ("own drift [cm]", "beyond it [cm]", "gap [s]", "online [cm]")
     return Table(columns=(*columns, *more), rows=rows)

@@ -21,7 +21,7 @@ class Seam:
     lost_s: float
     error_m: float  # of the motion from where the scene changed to the new module's live poses
     drift_m: float  # what the new module's own motion, as far as it covers that, is off by
-    online_m: float  # the error of the motion as it was told at the time
+    online_m: float  # the error of the motion as it was reported online
     gap_s: float  # the longest time without a pose, beyond the usual period
 
     @property

@@ -19,7 +19,7 @@ class Rates:
     alone: float
     odometry: float
     together: float
-    told: float  # together, as told at the time: without what was revised later
+    told: float  # together, as reported online: without what was revised later
     ate_odometry_m: float  # absolute trajectory error, RMSE
     ate_together_m: float
 
@@ -51,7 +51,7 @@ def table(rates: Sequence[Rates]) -> Table:
         "alone [%]",
         "odometry [%]",
         "together [%]",
-        "as told [%]",
+        "online [%]",
         "ATE odometry [m]",
         "ATE together [m]",
         "above the better [points]",
