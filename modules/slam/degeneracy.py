@@ -45,13 +45,17 @@ def localizability(
     points: NDArray[np.floating], normals: NDArray[np.floating], weights: NDArray[np.floating]
 ) -> Localizability:
     """Return how points (N, 3) [m] with unit normals (N, 3) and weights (N,) constrain a pose."""
+    # Centre and moments of inertia of the points.
     total = max(float(weights.sum()), 1e-12)
     centre = (weights @ points) / total
     offsets = (points - centre).astype(np.float64)
     moments = offsets.T @ (offsets * weights[:, None]) / total
     inertia = np.trace(moments) * np.eye(3) - moments
+    # Root mean square displacement of the points per radian, about each axis.
     squares, axes = np.linalg.eigh(inertia)
     turn_m = axes @ np.diag(np.sqrt(np.maximum(squares, 1e-12))) @ axes.T  # [m/rad], symmetric
+    # Derivative of the plane residual n' x by displacement (Gelfand et al., Sec. 3), with
+    # rotations in units of displacement.
     turns = np.linalg.solve(turn_m, np.cross(offsets, normals).T).T
     rows = np.concatenate([normals, turns], axis=1)
     shape = 3.0 * rows.T @ (rows * weights[:, None]) / total

@@ -128,6 +128,7 @@ class DepthScanner:
         found = np.bincount(beam * count + depth, heights_m, minlength=self._beams * count)
         found = found.reshape(self._beams, count)
         is_upright = found[:, :-1] + found[:, 1:] >= self._upright_m
+        # Range of the nearest pair of bins with an upright surface.
         middle_m = np.tan((is_upright.argmax(axis=1) + 1) * _PER_BIN) / _RATIO
         mean_m = np.where(is_upright.any(axis=1), middle_m, np.nan)
         for _ in range(2):  # the first two bins may hold only the nearer half of the noisy returns
@@ -136,6 +137,7 @@ class DepthScanner:
             total_m = np.bincount(beam[agrees], ranges_m[agrees], minlength=self._beams)
             number = np.bincount(beam[agrees], minlength=self._beams)
             mean_m = np.where(number > 0, total_m / np.maximum(number, 1), np.nan)
+        # Returns at the depth limit are dropped: only noise brings them into range.
         total_m = np.bincount(beam[agrees], depths_m[agrees], minlength=self._beams)
         scan = np.where(total_m <= self._far_m * number, mean_m, np.nan).astype(np.float32)
         scan.flags.writeable = False
@@ -155,6 +157,7 @@ class DepthScanner:
         if not crosses.any():
             raise ConfigError("height_min_m", self.band_m, "a band that the depth camera sees")
         self._pixels, rays_base = np.flatnonzero(crosses), rays_base[crosses]
+        # Each pixel's beam, by its angle about z of base.
         angle = np.arctan2(rays_base[:, 1], rays_base[:, 0]) - se3.yaw_rad(self.T_base_laser)
         angle = (angle + np.pi) % (2 * np.pi) - np.pi
         half_rad = float(np.abs(angle).max()) + 1e-9
@@ -162,6 +165,7 @@ class DepthScanner:
         self._step_rad = 2 * half_rad / self._beams
         beam = np.floor((angle + half_rad) / self._step_rad).astype(np.int64)
         self._beam = np.clip(beam, 0, self._beams - 1)
+        # Range and height per metre of depth.
         self._range_ratio = np.hypot(rays_base[:, 0], rays_base[:, 1]).astype(np.float32)
         self._height_ratio = rays_base[:, 2].astype(np.float32)
         noise_m = _NOISE_M + _NOISE_PER_M * z_max_m * z_max_m

@@ -118,11 +118,13 @@ def cheapest(costs: NDArray[np.float64], change: float) -> NDArray[np.int64]:
     count, choices = costs.shape
     came_from = np.zeros((count, choices), np.int64)
     total = costs[0].copy()
+    # Forward: keep the choice, or change from the best one at the cost of a change.
     for at in range(1, count):
         best = int(np.argmin(total))
         changes = total[best] + change < total
         came_from[at] = np.where(changes, best, np.arange(choices))
         total = np.where(changes, total[best] + change, total) + costs[at]
+    # Backward: follow the stored predecessors from the best last choice.
     path = np.zeros(count, np.int64)
     path[-1] = int(np.argmin(total))
     for at in range(count - 1, 0, -1):

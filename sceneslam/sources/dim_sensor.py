@@ -63,6 +63,7 @@ class DimSensor:
         limits = srgb_to_linear((values[:-1] + 0.5) / 255.0) * self._full_well / gain
         added = electrons * (1.0 - light)  # missing variance of shot noise
         sigma = max(self._read_noise * np.sqrt(1.0 - light**2), _SMALLEST_SIGMA)
+        # below[v, k]: probability that recorded value v becomes at most k.
         below = np.empty((_LEVELS, _LEVELS))
         below[:, -1] = 1.0
         is_small = added < _GAUSS_FROM
@@ -72,6 +73,7 @@ class DimSensor:
         below[is_small, :-1] = _poisson_cdf(
             limits - (electrons - added)[is_small, None], added[is_small], sigma
         )
+        # Each new value gets a number of quantiles proportional to its probability.
         edges = np.rint(np.maximum.accumulate(below, axis=1) * _QUANTILES).astype(np.int64)
         counts = np.diff(edges, axis=1, prepend=0)
         return np.repeat(np.tile(values.astype(np.uint8), _LEVELS), counts.ravel())
@@ -92,11 +94,13 @@ def _poisson_cdf(
     below = np.ones_like(limits)
     if not len(mean):
         return below
+    # Six standard deviations above the largest mean, all probabilities are 1.
     most = float(mean.max() + 6.0 * np.sqrt(mean.max()) + 6.0 * sigma + 6.0)
     columns = int(np.count_nonzero(limits.min(axis=0) < most))
     near = limits[:, :columns]
     total = np.zeros_like(near)
     share, rest = np.exp(-mean), np.ones_like(mean)  # P(N = count), P(N >= count)
+    # P(N + G < limit) = sum over counts of P(N = count) P(G < limit - count).
     count = 0
     while rest.max() > _RARE:
         total += share[:, None] * _gauss_cdf((near - count) / sigma)

@@ -104,6 +104,7 @@ class Tracker:
         self, view: DirectView, other: DirectView, T_other_view: se3.Transform
     ) -> Comparison:
         """Return the agreement of two views at T_other_view (4, 4) [m], and its information."""
+        # Project the view's points into the other image.
         points_view = self.points(view, _STEP_PX).astype(np.float64)
         greys = view.grey[::_STEP_PX, ::_STEP_PX].reshape(-1).astype(np.float64)
         points = np.asarray(se3.apply(T_other_view, points_view), np.float64)
@@ -116,6 +117,7 @@ class Tracker:
         column, row = np.where(inside[:, None], place, 1).T
         depth_there = other.depth_m[row, column].astype(np.float64)
         inside &= depth_there > 0
+        # Points match where the other depth agrees within its noise.
         sigma_m = _DEPTH_NOISE[0] + _DEPTH_NOISE[1] * z**2
         matched = inside & (np.abs(depth_there - z) < _GATE_SIGMAS * sigma_m)
         rows = np.flatnonzero(matched)
@@ -123,9 +125,12 @@ class Tracker:
         if len(rows):
             jacobians = _jacobians(points_view[rows], T_other_view, points[rows], self.K)
             slopes = _slopes(other, row[rows], column[rows])
+            # Noise of grey values: robust standard deviation (1.4826 MAD) of the differences.
             missed = other.grey[row[rows], column[rows]] - greys[rows]
             missed = missed - np.median(missed)  # exposure
             grey_sigma = max(1.4826 * float(np.median(np.abs(missed))), _GREY_SIGMA_MIN)
+            # Derivatives of both residuals, grey(pixel) and depth(pixel) - z, over their sigmas
+            # (Steinbruecker et al., ICCVW 2011); the information is J' J.
             photometric = np.einsum("ni,nij->nj", slopes[:, 0], jacobians[:, :2]) / grey_sigma
             geometric = np.einsum("ni,nij->nj", slopes[:, 1], jacobians[:, :2]) - jacobians[:, 2]
             geometric /= sigma_m[rows, None]
@@ -137,6 +142,7 @@ def _jacobians(
     points_view: Doubles, T_other_view: se3.Transform, points: Doubles, K: Doubles
 ) -> Doubles:
     """Return (N, 3, 6): derivative of pixel and depth in the other view by the view's twist."""
+    # Derivative of (u, v, z) by the point in the other camera: pinhole projection.
     x, y, z = points.T
     zero = np.zeros_like(z)
     projection = np.stack(
@@ -147,6 +153,7 @@ def _jacobians(
         ],
         axis=1,
     )
+    # Derivative of the point by a twist on the right, T exp(xi): R (I, -[p]x).
     a, b, c = points_view.T
     minus_hat = np.stack(
         [

@@ -150,10 +150,12 @@ class _System:
         grid: Grid,
     ) -> None:
         residuals, normals, seen, same = compare(samples, keyframe, T_key_cam, gate_m, grid)
+        # Derivative of n' (T exp(xi) p) - d by the twist xi: (n', (p x n)') in cam.
         rows = np.flatnonzero(same)
         normals_cam = normals[rows] @ T_key_cam[:3, :3].astype(np.float32)
         jacobian = np.concatenate([normals_cam, _cross(samples.points[rows], normals_cam)], axis=1)
         sigmas_m, residuals = samples.sigmas_m[rows], residuals[rows]
+        # Robust weights (Geman and McClure), then the normal equations J' W J and -J' W r.
         kernel = 1.0 / (1.0 + (residuals / (_KERNEL_SIGMAS * sigmas_m)) ** 2) ** 2
         weighted = jacobian * (kernel / sigmas_m**2)[:, None]
         self.information += (jacobian.T @ weighted).astype(np.float64)
@@ -168,10 +170,12 @@ def compare(
 ) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
     """Return residuals (N,) [m], normals (N, 3), and whether points are in view and match (N,)."""
     T = T_key_cam.astype(np.float32)
+    # Projective data association: the cell of the keyframe's grid that a point projects to.
     points = samples.points @ T[:3, :3].T + T[:3, 3]
     cells, in_view = grid.index(points)
     planes = keyframe.planes[cells]
     normals = planes[:, :3]
+    # Signed distance to the plane; a match needs a small one and similar normals.
     residuals = np.einsum("ij,ij->i", normals, points) - planes[:, 3]
     seen = in_view & (planes[:, 3] > 0)
     facing = np.einsum("ij,ij->i", normals, samples.normals @ T[:3, :3].T)

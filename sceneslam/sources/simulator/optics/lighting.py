@@ -177,6 +177,7 @@ def _bounce(direct: Values, sky: Values, albedo: Values, seen: NDArray[np.int64]
     source = np.zeros((count + 2, groups, 3), np.float32)
     source[count + 1] = sky[:, None]
     bounced = np.zeros((count, groups, 3), np.float32)
+    # Radiosity by iteration: B = albedo (E_direct + E_bounced), E_bounced = mean of B over rays.
     for _ in range(_BOUNCES):
         source[:count] = albedo[:, None] * (direct[..., None] + bounced)
         bounced[:] = 0.0

@@ -58,6 +58,7 @@ def _reach(person: Walker, time_s: float, start: Values, ways: Values) -> Values
     Solves |o + t d|^2 = r^2 for t, horizontally, with o from the cylinder's axis to the start.
     """
     offset = start[:2] - person.position_m(time_s).astype(np.float32)
+    # a t^2 + 2 b t + c = 0; the nearer root is (-b - sqrt(b^2 - a c)) / a.
     a = np.maximum((ways[:, :2] ** 2).sum(axis=1), np.float32(1e-12))
     b = ways[:, :2] @ offset
     c = np.float32(offset @ offset - person.radius_m**2)

@@ -37,8 +37,10 @@ class Sight:
         1 / z = g_n d / g_n corner, u = z g_u d - g_u corner.
         """
         x, y = directions_cam[..., 0], directions_cam[..., 1]
+        # 1 / z = (g_n d) / (g_n corner).
         inverse = self._dot(0, panels, x, y)
         depth_m = np.reciprocal(inverse)
+        # u = z (g_u d) - g_u corner, and v alike.
         u = self._dot(3, panels, x, y)
         u *= depth_m
         u += np.take(self.table[9], panels)
