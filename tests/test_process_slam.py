@@ -199,7 +199,7 @@ def test_a_command_that_cannot_be_run_is_refused(command):
 
 def test_a_program_that_is_no_slam_program_is_refused_before_the_first_frame(started):
     with pytest.raises(
-        ConfigError, match=r"command: .*greeting .*wrote what is no message: b'Usage"
+        ConfigError, match=r"command: .*greeting .*wrote bytes that are not a message: b'Usage"
     ):
         _ = started(
             "sh", "-c", "echo 'Usage: slam [options] and much more text than fits'"

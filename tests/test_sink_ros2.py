@@ -331,8 +331,8 @@ def test_selected_scene_is_voted_for_until_it_is_given_back(tmp_path):
     [
         (SelectScene(scene="Fog"), "the detector's scenes are: Bright, Dark"),
         (SelectModule(module="orb"), "first of a scene are: laser, rgbd"),
-        (SaveMap(name="../x", hybrid=None), "a name without slashes is wanted"),
-        (SaveMap(name="", hybrid=None), "a name without slashes is wanted"),
+        (SaveMap(name="../x", hybrid=None), "expected a name without slashes"),
+        (SaveMap(name="", hybrid=None), "expected a name without slashes"),
     ],
 )
 def test_wish_that_cannot_be_met_is_refused_with_what_can(tmp_path, command, why):

@@ -130,7 +130,7 @@ class Operator:
                 firsts = ", ".join(sorted({keys[0] for keys in self._table.values()}))
                 return self._select(scenes[0]) if scenes else f"first of a scene are: {firsts}"
             case SaveMap():
-                return "a name without slashes is wanted"
+                return "expected a name without slashes"
         return ""
 
     def _select(self, scene: str) -> str:

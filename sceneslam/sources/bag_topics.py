@@ -155,7 +155,7 @@ def _beside(picture: str | None, infos: Sequence[str]) -> list[str]:
 def _only(need: str, candidates: Sequence[str]) -> str:
     if len(candidates) > 1:
         raise InputError(
-            f"topics.{need}: several topics could be it ({', '.join(candidates)}): "
+            f"topics.{need}: several topics fit ({', '.join(candidates)}): "
             f"choose one, such as source.topics.{need}={candidates[0]} ({NONE}: do without)"
         )
     return candidates[0] if candidates else NONE

@@ -164,7 +164,7 @@ class RosBag:
             if held is not None:
                 yield sensor, Sample(stamp_ns=stamp_ns, value=held)
             elif sensor is Sensor.ODOMETRY:
-                fault = f"a pose of {message.topic} is no rigid motion"
+                fault = f"a pose of {message.topic} is not a rigid transform"
                 self._faults.add(fault, at_stamp(stamp_ns))
 
     def _stamp_ns(self, message: Message) -> int:

@@ -132,7 +132,9 @@ def _flat(value: object, name: str) -> dict[str, NDArray[Any]]:
 
 def _of(reply: Fields, name: str) -> NDArray[Any]:
     if name not in reply:
-        raise ProtocolError(f"answered without {name!r}; it gave: {', '.join(reply) or 'nothing'}")
+        raise ProtocolError(
+            f"sent a reply without {name!r}; it has: {', '.join(reply) or 'nothing'}"
+        )
     return reply[name]
 
 
@@ -147,20 +149,20 @@ def _optional(reply: Fields, name: str, shape: tuple[int, ...]) -> NDArray[Any] 
 def _rigid(array: NDArray[Any], count: int) -> NDArray[np.float64]:
     """Return `count` rigid transforms (4, 4) [m]; raises ProtocolError for invalid ones."""
     if array.shape != (count, 4, 4):
-        raise ProtocolError(f"answered T_local_base {array.shape}, expected {(count, 4, 4)}")
+        raise ProtocolError(f"sent T_local_base {array.shape}, expected {(count, 4, 4)}")
     T_local_base = array.astype(np.float64)
     if not np.isfinite(T_local_base).all():
-        raise ProtocolError("answered a T_local_base that is not finite")
+        raise ProtocolError("sent a T_local_base that is not finite")
     rotations = T_local_base[:, :3, :3]
     skew = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(initial=0.0)
     if skew > _SKEW_MAX or (np.linalg.det(rotations) < 0).any():
-        raise ProtocolError("answered a T_local_base that is no rotation")
+        raise ProtocolError("sent a T_local_base that is not a rotation")
     if (T_local_base[:, 3] != (0, 0, 0, 1)).any():
-        raise ProtocolError("answered a T_local_base whose last row is not 0 0 0 1")
+        raise ProtocolError("sent a T_local_base whose last row is not 0 0 0 1")
     return T_local_base
 
 
 def _status(code: Any) -> TrackingStatus:
     if not 0 <= code < len(_STATUSES):
-        raise ProtocolError(f"answered the status {code}, allowed: 0 tracking, 1 degraded, 2 lost")
+        raise ProtocolError(f"sent the status {code}, allowed: 0 tracking, 1 degraded, 2 lost")
     return _STATUSES[int(code)]

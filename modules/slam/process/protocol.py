@@ -58,7 +58,7 @@ def read_head(data: bytes) -> MessageHeader:
     """Return the header in the first 40 bytes; raises ProtocolError if it is invalid."""
     magic, kind, number, count, length = _HEAD.unpack(data)
     if magic[:-1] != MAGIC[:-1]:
-        raise ProtocolError(f"wrote what is no message: {data[:24]!r}")
+        raise ProtocolError(f"wrote bytes that are not a message: {data[:24]!r}")
     if magic != MAGIC:
         raise ProtocolError(f"speaks version {magic[-1:].decode('latin1')}, expected {VERSION}")
     return MessageHeader(kind=_text(kind), number=number, count=count, length=length)

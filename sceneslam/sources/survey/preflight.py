@@ -222,7 +222,7 @@ def _of_places(survey: Survey) -> Iterator[str]:
         )
     yield from survey.odd
     for topic in survey.silent:
-        yield f"{topic} is announced, but nothing came"
+        yield f"{topic} is announced, but has no messages"
 
 
 def _measured(depths_m: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
