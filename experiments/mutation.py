@@ -29,7 +29,12 @@ _PARTS = {  # name -> its code, and the tests that guard it
     ),
     "atlas": (
         ["sceneslam/atlas"],
-        ["tests/test_atlas.py", "tests/test_revision.py", "tests/test_uncertainty.py"],
+        [
+            "tests/test_atlas.py",
+            "tests/test_revision.py",
+            "tests/test_uncertainty.py",
+            "tests/test_one_map.py",
+        ],
     ),
     "bus": (
         ["sceneslam/bus"],
@@ -38,6 +43,8 @@ _PARTS = {  # name -> its code, and the tests that guard it
             "tests/test_policy.py",
             "tests/test_gate.py",
             "tests/test_bus*.py",
+            "tests/test_calibration.py",
+            "tests/test_tilt.py",
         ],
     ),
 }
