@@ -8,19 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map
-from sceneslam.atlas.places.localizer import Fix, LocalizationEvent, MapLocalizer, PlacedScan
+from sceneslam.atlas.places.localizer import LocalizationEvent, MapLocalizer, PlacedScan
 from sceneslam.atlas.submaps.collector import Collector, Known
 from sceneslam.atlas.submaps.correction import Correction
-from sceneslam.atlas.submaps.graph import Edge, EdgeKind, PlanarEdge, consistent, solve
-from sceneslam.atlas.submaps.loop_closure import LoopFinder
-from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops, recognized_loops
+from sceneslam.atlas.submaps.graph import PlanarEdge
+from sceneslam.atlas.submaps.own_loops import Path
+from sceneslam.atlas.submaps.run_graph import RunGraph, planar_of
 from sceneslam.scans.key_scan import KeyScanner
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import MapLayers
@@ -118,19 +117,22 @@ class Mapper:
         stamps_ns = np.array([submap.stamps_ns[0] for submap in own.submaps], np.int64)
         old = np.array([path(int(stamp_ns)) for stamp_ns in stamps_ns])
         own.remeasure(old)
-        own.motions += self._edges_of(closed_loops(maps), path)
-        candidates = self._edges_of(recognized_loops(maps), path)
-        new = self._solve(self.T_map_run @ old, candidates, path, closed)
+        graph = RunGraph(own, self._loaded, path)
+        fixes = self._localizer.fixes if self._localizer is not None and self.is_placed else []
+        solved = graph.solve(self.T_map_run @ old, maps, fixes, closed)
+        self._loops, self._T_map_node = list(solved.loops), planar_of(solved.T_map_node)
+        for loop in self._loops:
+            self._tell(loop)
         if not self._loops and not self.is_placed:
             return Correction.none()
-        return Correction(stamps_ns=stamps_ns, T_new_old=new @ se3.inverse(old))
+        return Correction(stamps_ns=stamps_ns, T_new_old=solved.T_map_node @ se3.inverse(old))
 
     def saved(self) -> SavedMap:
         """Return the loaded map with this run in it: a separate piece if it was not located."""
         count, pieces = len(self._loaded.submaps), self._loaded.pieces
         own, nodes = self._collector, self._T_map_node
         if nodes is None:
-            nodes = _planar([self.T_map_run @ T for T in own.T_run_node])
+            nodes = planar_of([self.T_map_run @ T for T in own.T_run_node])
         piece = 0 if self.is_found else int(pieces.max(initial=-1)) + 1
         return SavedMap(
             submaps=(*self._loaded.submaps, *own.submaps),
@@ -179,118 +181,10 @@ class Mapper:
             self._note("not_relocalized", stamp_ns, after_s=after_s)
             self._has_told = True
 
-    # At the end.
-
-    def _solve(
-        self,
-        T_map_node: NDArray[np.float64],
-        candidates: Sequence[Edge],
-        path: Path,
-        closed: frozenset[int],
-    ) -> NDArray[np.float64]:
-        """Find the loops and solve; return the run's nodes (N, 4, 4), from initial ones.
-
-        `candidates` are the loops that modules recognized between their sessions.
-        """
-        own, count = self._collector, len(self._loaded.submaps)
-        plane, drift = _planar(T_map_node), np.array(own.drift)
-        fixes = self._fix_edges(path)
-        loops = [*fixes, *(edge.planar.shifted(count) for edge in candidates)]
-        spatial = [*(fix.spatial for fix in fixes), *(_shifted(edge, count) for edge in candidates)]
-        finder = LoopFinder(own.submaps, closed)
-        for second in range(len(own.submaps) if own.is_level else 0):
-            found = [edge.shifted(count) for edge in finder.loops_to(second, plane, drift)]
-            loops, spatial = [*loops, *found], [*spatial, *(edge.spatial for edge in found)]
-        nodes = np.concatenate([self._loaded.T_map_node, plane])
-        agreeing = consistent(loops, nodes, np.concatenate([np.zeros((count, 3)), drift]))
-        if len(agreeing) < 2 and not fixes:
-            agreeing = []  # no other loop agrees with it
-        solved = solve(
-            np.concatenate([_spatial(self._loaded.T_map_node), T_map_node]),
-            [_shifted(edge, count) for edge in own.motions],
-            [spatial[index] for index in agreeing],
-            fixed=range(count),
-            loose=count,
-        )
-        self._loops = [loops[agreeing[index]] for index in solved.accepted]
-        self._T_map_node = _planar(solved.T_map_node[count:])
-        for loop in self._loops:
-            self._tell(loop, count)
-        return solved.T_map_node[count:]
-
-    def _tell(self, loop: PlanarEdge, count: int) -> None:
+    def _tell(self, loop: PlanarEdge) -> None:
         submaps = [*self._loaded.submaps, *self._collector.submaps]
         first, second = submaps[loop.first], submaps[loop.second]
         fields: dict[str, Any] = {"module": second.module, "to_module": first.module}
-        fields |= {"to_ns": int(first.stamps_ns[0]), "in_loaded_map": loop.first < count}
+        fields |= {"to_ns": int(first.stamps_ns[0])}
+        fields |= {"in_loaded_map": loop.first < len(self._loaded.submaps)}
         self._note("loop", int(second.stamps_ns[0]), **fields)
-
-    def _edges_of(self, loops: Sequence[OwnLoop], path: Path) -> list[Edge]:
-        """Return a module's own loops as edges between submaps, without those within one."""
-        found = []
-        for loop in loops:
-            first, second = (self._collector.node_at(ns) for ns in (loop.from_ns, loop.to_ns))
-            start, end = path(loop.from_ns), path(loop.to_ns)
-            if start is None or end is None or first == second:
-                continue
-            T_first_from = se3.inverse(self._collector.T_run_node[first]) @ start
-            T_to_second = se3.inverse(end) @ self._collector.T_run_node[second]
-            found.append(
-                Edge(
-                    first=first,
-                    second=second,
-                    T_first_second=T_first_from @ loop.T_from_to @ T_to_second,
-                    covariance=_carried(loop.covariance, T_to_second),
-                    kind=EdgeKind.LOOP,
-                )
-            )
-        return found
-
-    def _fix_edges(self, path: Path) -> list[PlanarEdge]:
-        """Return the loops from the loaded map's submaps to the run's, at most one per run submap.
-
-        More would not be independent: fixes in one place share their errors.
-        """
-        if self._localizer is None or not self.is_placed:
-            return []
-        edges: dict[int, PlanarEdge] = {}
-        for fix in self._localizer.fixes:
-            node, pose = self._collector.node_at(fix.stamp_ns), path(fix.stamp_ns)
-            if pose is not None and node not in edges:
-                edges[node] = self._fix_edge(
-                    fix, node, se3.inverse(pose) @ self._collector.T_run_node[node]
-                )
-        return list(edges.values())
-
-    def _fix_edge(self, fix: Fix, node: int, T_base_node: Transform) -> PlanarEdge:
-        """Return the loop to a node from the nearest submap of the loaded map."""
-        count, nodes = len(self._loaded.submaps), self._loaded.T_map_node
-        away_m = np.hypot(*(nodes[:, :2] - fix.T_map_base[:2]).T)
-        first = int(np.argmin(np.where(self._loaded.pieces == 0, away_m, np.inf)))
-        T_map_node = planar.compose(fix.T_map_base, planar.from_transform(T_base_node))
-        covariance = planar.spatial_covariance(fix.match.covariance)
-        return PlanarEdge(
-            first=first,
-            second=count + node,
-            T_first_second=planar.between(nodes[first], T_map_node),
-            covariance=planar.planar_covariance(_carried(covariance, T_base_node)),
-            kind=EdgeKind.LOOP,
-        )
-
-
-def _shifted(edge: Edge, by: int) -> Edge:
-    return replace(edge, first=edge.first + by, second=edge.second + by)
-
-
-def _carried(covariance: NDArray[np.float64], T_base_node: Transform) -> NDArray[np.float64]:
-    """Return the covariance (6, 6) of a pose of base as that of a node fixed to it, its axes."""
-    carry = se3.adjoint(se3.inverse(T_base_node))
-    return np.asarray(carry @ covariance @ carry.T)
-
-
-def _planar(poses: Sequence[Transform] | NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.array([planar.from_transform(T) for T in poses]).reshape(-1, 3)
-
-
-def _spatial(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.array([planar.to_transform(T) for T in poses]).reshape(-1, 4, 4)

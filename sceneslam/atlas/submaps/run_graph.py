@@ -1,0 +1,143 @@
+"""The graph of a run and of the map that it was located in: its loops, and its solution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.atlas.lasting.saved_map import SavedMap
+from sceneslam.atlas.places.localizer import Fix
+from sceneslam.atlas.submaps.collector import Collector
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind, PlanarEdge, consistent, solve
+from sceneslam.atlas.submaps.loop_closure import LoopFinder
+from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops, recognized_loops
+from sceneslam.types import planar, se3
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.se3 import Transform
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SolvedRun:
+    """The run's nodes after optimisation, and the accepted loops."""
+
+    T_map_node: NDArray[np.float64]  # (N, 4, 4), as many as the run has submaps
+    loops: tuple[PlanarEdge, ...]  # nodes of the loaded map are counted first
+
+
+class RunGraph:
+    """Joins the submaps of a run, at their revised poses, with a loaded map."""
+
+    def __init__(self, own: Collector, loaded: SavedMap, path: Path) -> None:
+        """Take the finished submaps of a run; `path` are its poses as revised by the modules."""
+        self._own, self._loaded, self._path = own, loaded, path
+        self._count = len(loaded.submaps)
+
+    def solve(
+        self,
+        T_map_node: NDArray[np.float64],
+        maps: Sequence[MapLayers],
+        fixes: Sequence[Fix],
+        closed: frozenset[int],
+    ) -> SolvedRun:
+        """Find the loops and solve, from the initial nodes (N, 4, 4) of the run.
+
+        `maps` are those of the modules, with their own loops, `fixes` the places where the run was
+        located in the loaded map, `closed` the sessions whose modules close loops themselves.
+        """
+        own, count = self._own, self._count
+        motions = [*own.motions, *self._edges_of(closed_loops(maps))]
+        plane, drift = planar_of(T_map_node), np.array(own.drift)
+        fixed = self._fix_edges(fixes)
+        recognized = self._edges_of(recognized_loops(maps))
+        loops = [*fixed, *(edge.planar.shifted(count) for edge in recognized)]
+        spatial = [*(edge.spatial for edge in fixed), *(_shifted(e, count) for e in recognized)]
+        finder = LoopFinder(own.submaps, closed)
+        for second in range(len(own.submaps) if own.is_level else 0):
+            found = [edge.shifted(count) for edge in finder.loops_to(second, plane, drift)]
+            loops, spatial = [*loops, *found], [*spatial, *(edge.spatial for edge in found)]
+        nodes = np.concatenate([self._loaded.T_map_node, plane])
+        agreeing = consistent(loops, nodes, np.concatenate([np.zeros((count, 3)), drift]))
+        if len(agreeing) < 2 and not fixed:
+            agreeing = []  # no other loop agrees with it
+        solved = solve(
+            np.concatenate([_spatial(self._loaded.T_map_node), T_map_node]),
+            [_shifted(edge, count) for edge in motions],
+            [spatial[index] for index in agreeing],
+            fixed=range(count),
+            loose=count,
+        )
+        return SolvedRun(
+            T_map_node=solved.T_map_node[count:],
+            loops=tuple(loops[agreeing[index]] for index in solved.accepted),
+        )
+
+    def _edges_of(self, loops: Sequence[OwnLoop]) -> list[Edge]:
+        """Return a module's own loops as edges between submaps, without those within one."""
+        found = []
+        for loop in loops:
+            first, second = (self._own.node_at(ns) for ns in (loop.from_ns, loop.to_ns))
+            start, end = self._path(loop.from_ns), self._path(loop.to_ns)
+            if start is None or end is None or first == second:
+                continue
+            T_first_from = se3.inverse(self._own.T_run_node[first]) @ start
+            T_to_second = se3.inverse(end) @ self._own.T_run_node[second]
+            found.append(
+                Edge(
+                    first=first,
+                    second=second,
+                    T_first_second=T_first_from @ loop.T_from_to @ T_to_second,
+                    covariance=_carried(loop.covariance, T_to_second),
+                    kind=EdgeKind.LOOP,
+                )
+            )
+        return found
+
+    def _fix_edges(self, fixes: Sequence[Fix]) -> list[PlanarEdge]:
+        """Return the loops from the loaded map's submaps to the run's, at most one per run submap.
+
+        More would not be independent: fixes in one place share their errors.
+        """
+        edges: dict[int, PlanarEdge] = {}
+        for fix in fixes:
+            node, pose = self._own.node_at(fix.stamp_ns), self._path(fix.stamp_ns)
+            if pose is not None and node not in edges:
+                T_base_node = se3.inverse(pose) @ self._own.T_run_node[node]
+                edges[node] = self._fix_edge(fix, node, T_base_node)
+        return list(edges.values())
+
+    def _fix_edge(self, fix: Fix, node: int, T_base_node: Transform) -> PlanarEdge:
+        """Return the loop to a node from the nearest submap of the loaded map."""
+        nodes = self._loaded.T_map_node
+        away_m = np.hypot(*(nodes[:, :2] - fix.T_map_base[:2]).T)
+        first = int(np.argmin(np.where(self._loaded.pieces == 0, away_m, np.inf)))
+        T_map_node = planar.compose(fix.T_map_base, planar.from_transform(T_base_node))
+        covariance = planar.spatial_covariance(fix.match.covariance)
+        return PlanarEdge(
+            first=first,
+            second=self._count + node,
+            T_first_second=planar.between(nodes[first], T_map_node),
+            covariance=planar.planar_covariance(_carried(covariance, T_base_node)),
+            kind=EdgeKind.LOOP,
+        )
+
+
+def planar_of(poses: Sequence[Transform] | NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return x [m], y [m] and yaw [rad] (N, 3) of poses (4, 4)."""
+    return np.array([planar.from_transform(T) for T in poses]).reshape(-1, 3)
+
+
+def _spatial(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.array([planar.to_transform(T) for T in poses]).reshape(-1, 4, 4)
+
+
+def _shifted(edge: Edge, by: int) -> Edge:
+    return replace(edge, first=edge.first + by, second=edge.second + by)
+
+
+def _carried(covariance: NDArray[np.float64], T_base_node: Transform) -> NDArray[np.float64]:
+    """Return the covariance (6, 6) of a pose of base as that of a node fixed to it, its axes."""
+    carry = se3.adjoint(se3.inverse(T_base_node))
+    return np.asarray(carry @ covariance @ carry.T)
