@@ -73,6 +73,11 @@ def test_gravity_straightens_a_tilt_and_keeps_the_heading():
     )
 
 
+def test_an_accelerometer_that_is_mounted_on_its_side_says_nothing():
+    assert up_by(np.array([[0.0, GRAVITY, 0.0, 0.0]])) is None
+    assert up_by(np.array([[0.0, np.nan, 0.0, GRAVITY]])) is None
+
+
 def test_while_the_base_accelerates_gravity_is_unknown():
     samples = np.array([[0.0, 3.0, 0.0, GRAVITY + 2.0]])
     assert up_by(samples) is None and up_by(None) is None

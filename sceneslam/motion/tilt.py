@@ -15,13 +15,14 @@ from sceneslam.types.se3 import Transform
 
 _BY_GRAVITY_S = 5.0  # time constant: accelerating and braking last a second
 _BY_ODOMETRY_S = 10.0  # wheels know no slope; a robot is seldom on one for longer
+_STEEPEST_COS = np.cos(np.radians(30.0))  # no robot stands steeper: the sensor is mounted otherwise
 _FORCE_RATIO = 0.1  # a force that differs by more from gravity's is mostly acceleration
 
 
 def up_by(accelerometer: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
     """Return the upward direction (3,) in base by samples (M, 4) of specific force, if they tell.
 
-    None without samples, and while the base accelerates.
+    None without samples, while the base accelerates, and for a direction far from base's own z.
     """
     if accelerometer is None or not len(accelerometer):
         return None
@@ -29,7 +30,7 @@ def up_by(accelerometer: NDArray[np.float64] | None) -> NDArray[np.float64] | No
     size = float(np.linalg.norm(force))
     if not abs(size - GRAVITY) < _FORCE_RATIO * GRAVITY:  # false for NaN
         return None
-    return np.asarray(force / size)
+    return np.asarray(force / size) if force[2] >= _STEEPEST_COS * size else None
 
 
 def levelled(
