@@ -29,9 +29,9 @@ from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.evaluation.alignment import align
 from sceneslam.evaluation.association import interpolated
 from sceneslam.interfaces import SlamModule, Source
-from sceneslam.modules.slam.rgbd.keyframes import KeyframeStore
+from sceneslam.modules.slam.rgbd.locate.places import PlaceIndex
+from sceneslam.modules.slam.rgbd.map.keyframes import KeyframeStore
 from sceneslam.modules.slam.rgbd.module import RgbdSlam
-from sceneslam.modules.slam.rgbd.places import PlaceIndex
 from sceneslam.sources.ordered import Ordered
 from sceneslam.types import se3
 from sceneslam.types.maps import PoseGraphLayer

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from sceneslam.modules.slam.rgbd.features import Features
-from sceneslam.modules.slam.rgbd.shutter import Turning
-from sceneslam.modules.slam.rgbd.visual_map import VisualMap
+from sceneslam.modules.slam.rgbd.map.visual_map import VisualMap
+from sceneslam.modules.slam.rgbd.see.features import Features
+from sceneslam.modules.slam.rgbd.see.shutter import Turning
 
 AT_REST = Turning(rate_cam=np.zeros(3), twist_per_s=np.zeros(6))
 

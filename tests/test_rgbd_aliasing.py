@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_rgbd import make
 
-from sceneslam.modules.slam.rgbd import loop_detection
+from sceneslam.modules.slam.rgbd.loops import loop_detection
 from sceneslam.testing import room as scenery
 from sceneslam.testing.room import observation_at
 from sceneslam.types import se3

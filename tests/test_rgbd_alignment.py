@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sceneslam.modules.slam.rgbd.alignment import Alignment
-from sceneslam.modules.slam.rgbd.alignment_search import AlignmentSearch, Pair
-from sceneslam.modules.slam.rgbd.ties import DepthTies
+from sceneslam.modules.slam.rgbd.adjust.ties import DepthTies
+from sceneslam.modules.slam.rgbd.see.alignment import Alignment
+from sceneslam.modules.slam.rgbd.see.alignment_search import AlignmentSearch, Pair
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from rgbd_features import AT_REST, empty_map, features_at, random_descriptors
 
-from sceneslam.modules.slam.rgbd.alignment import Alignment
-from sceneslam.modules.slam.rgbd.bundle import Bundle, adjust
-from sceneslam.modules.slam.rgbd.fusion import join_duplicates
-from sceneslam.modules.slam.rgbd.keyframes import NO_LANDMARK, DepthView, Keyframe
-from sceneslam.modules.slam.rgbd.local_mapping import LocalMapping
-from sceneslam.modules.slam.rgbd.mapping_work import MappingWork
-from sceneslam.modules.slam.rgbd.residuals import Sightings, errors
-from sceneslam.modules.slam.rgbd.ties import Tie, Ties
+from sceneslam.modules.slam.rgbd.adjust.bundle import Bundle, adjust
+from sceneslam.modules.slam.rgbd.adjust.fusion import join_duplicates
+from sceneslam.modules.slam.rgbd.adjust.local_mapping import LocalMapping
+from sceneslam.modules.slam.rgbd.adjust.mapping_work import MappingWork
+from sceneslam.modules.slam.rgbd.adjust.ties import Tie, Ties
+from sceneslam.modules.slam.rgbd.locate.residuals import Sightings, errors
+from sceneslam.modules.slam.rgbd.map.keyframes import NO_LANDMARK, DepthView, Keyframe
+from sceneslam.modules.slam.rgbd.see.alignment import Alignment
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 

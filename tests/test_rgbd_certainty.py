@@ -9,8 +9,8 @@ from rgbd_features import features_at, random_descriptors
 from test_rgbd import drive, make
 from test_rgbd_mono import IMAGES, error_m, images
 
-from sceneslam.modules.slam.rgbd.certainty import Certainty, common_ratio
-from sceneslam.modules.slam.rgbd.pose_solver import Linearised
+from sceneslam.modules.slam.rgbd.locate.certainty import Certainty, common_ratio
+from sceneslam.modules.slam.rgbd.locate.pose_solver import Linearised
 from sceneslam.types import se3
 from sceneslam.types.observation import TrackingStatus
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sceneslam.modules.slam.rgbd.corners import CornerFinder
+from sceneslam.modules.slam.rgbd.see.corners import CornerFinder
 
 
 def finder_of(count):

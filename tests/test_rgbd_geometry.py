@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 from rgbd_features import features_at, random_descriptors
 
-from sceneslam.modules.slam.rgbd.matching import match_anywhere, match_near
-from sceneslam.modules.slam.rgbd.pose_errors import PoseErrors
-from sceneslam.modules.slam.rgbd.pose_solver import Measurements, PoseSolver
-from sceneslam.modules.slam.rgbd.residuals import Sightings
+from sceneslam.modules.slam.rgbd.locate.matching import match_anywhere, match_near
+from sceneslam.modules.slam.rgbd.locate.pose_errors import PoseErrors
+from sceneslam.modules.slam.rgbd.locate.pose_solver import Measurements, PoseSolver
+from sceneslam.modules.slam.rgbd.locate.residuals import Sightings
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 

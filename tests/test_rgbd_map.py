@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from rgbd_features import AT_REST, empty_map, features_at, random_descriptors
 
-from sceneslam.modules.slam.rgbd.alignment import Alignment
-from sceneslam.modules.slam.rgbd.features import FeatureExtractor
-from sceneslam.modules.slam.rgbd.keyframes import DepthView, Keyframe, KeyframeStore
-from sceneslam.modules.slam.rgbd.landmarks import LandmarkTable, Looks
-from sceneslam.modules.slam.rgbd.layers import LayerBuilder
-from sceneslam.modules.slam.rgbd.localizer import VisualLocalizer
-from sceneslam.modules.slam.rgbd.pose_solver import PoseSolver
+from sceneslam.modules.slam.rgbd.locate.localizer import VisualLocalizer
+from sceneslam.modules.slam.rgbd.locate.pose_solver import PoseSolver
+from sceneslam.modules.slam.rgbd.map.keyframes import DepthView, Keyframe, KeyframeStore
+from sceneslam.modules.slam.rgbd.map.landmarks import LandmarkTable, Looks
+from sceneslam.modules.slam.rgbd.map.layers import LayerBuilder
+from sceneslam.modules.slam.rgbd.see.alignment import Alignment
+from sceneslam.modules.slam.rgbd.see.features import FeatureExtractor
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sceneslam.modules.slam.rgbd.frame_log import FrameLog
-from sceneslam.modules.slam.rgbd.pose_graph import KeyframeEdge, PoseGraph, solve
+from sceneslam.modules.slam.rgbd.loops.pose_graph import KeyframeEdge, PoseGraph, solve
+from sceneslam.modules.slam.rgbd.map.frame_log import FrameLog
 from sceneslam.types import se3
 
 TWISTS = st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6).map(np.array)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from test_rgbd_bundle import CAMERA, exact_bundle, keyframe_at, true_poses
 
-from sceneslam.modules.slam.rgbd.bundle import adjust
-from sceneslam.modules.slam.rgbd.keyframes import Reckoned
-from sceneslam.modules.slam.rgbd.localizer import VisualFix
-from sceneslam.modules.slam.rgbd.pose_solver import PoseEstimate
-from sceneslam.modules.slam.rgbd.reckoning import led, reckoned_ties
-from sceneslam.modules.slam.rgbd.ties import Ties
+from sceneslam.modules.slam.rgbd.adjust.bundle import adjust
+from sceneslam.modules.slam.rgbd.adjust.reckoning import led, reckoned_ties
+from sceneslam.modules.slam.rgbd.adjust.ties import Ties
+from sceneslam.modules.slam.rgbd.locate.localizer import VisualFix
+from sceneslam.modules.slam.rgbd.locate.pose_solver import PoseEstimate
+from sceneslam.modules.slam.rgbd.map.keyframes import Reckoned
 from sceneslam.motion.predictor import Prediction
 from sceneslam.types import se3
 

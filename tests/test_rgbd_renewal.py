@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 from test_rgbd import camera_only, drive, make, true_pose
 
-from sceneslam.modules.slam.rgbd.alignment import Alignment
-from sceneslam.modules.slam.rgbd.keyframes import KeyframeStore
-from sceneslam.modules.slam.rgbd.renewal import NEWEST, LocatedView, seen_by
+from sceneslam.modules.slam.rgbd.adjust.renewal import NEWEST, LocatedView, seen_by
+from sceneslam.modules.slam.rgbd.map.keyframes import KeyframeStore
+from sceneslam.modules.slam.rgbd.see.alignment import Alignment
 from sceneslam.types import se3
 from sceneslam.types.observation import TrackingStatus
 

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sceneslam.modules.slam.rgbd.localizer import VisualFix
-from sceneslam.modules.slam.rgbd.search import Search
+from sceneslam.modules.slam.rgbd.locate.localizer import VisualFix
+from sceneslam.modules.slam.rgbd.locate.search import Search
 
 EXPECTED = 500
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from rgbd_features import empty_map, features_at, random_descriptors
 
-from sceneslam.modules.slam.rgbd.keyframes import NO_LANDMARK, Keyframe, nothing_seen
-from sceneslam.modules.slam.rgbd.pose_solver import Measurements, PoseSolver
-from sceneslam.modules.slam.rgbd.residuals import Sightings
-from sceneslam.modules.slam.rgbd.shutter import RollingShutter, Turning, moves_px_per_s
+from sceneslam.modules.slam.rgbd.locate.pose_solver import Measurements, PoseSolver
+from sceneslam.modules.slam.rgbd.locate.residuals import Sightings
+from sceneslam.modules.slam.rgbd.map.keyframes import NO_LANDMARK, Keyframe, nothing_seen
+from sceneslam.modules.slam.rgbd.see.shutter import RollingShutter, Turning, moves_px_per_s
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 

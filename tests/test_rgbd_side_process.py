@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sceneslam.modules.slam.rgbd.side_process import SideProcess
+from sceneslam.modules.slam.rgbd.see.side_process import SideProcess
 from sceneslam.types.errors import ModuleError
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from rgbd_features import AT_REST, empty_map, features_at, random_descriptors
 
-from sceneslam.modules.slam.rgbd.keyframes import NO_LANDMARK, DepthView, Keyframe
-from sceneslam.modules.slam.rgbd.triangulation import triangulate
+from sceneslam.modules.slam.rgbd.adjust.triangulation import triangulate
+from sceneslam.modules.slam.rgbd.map.keyframes import NO_LANDMARK, DepthView, Keyframe
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.se3 import Transform
 
-from .localizer import VisualFix
-from .segments import Segments
-from .view import View
+from .locate.localizer import VisualFix
+from .map.segments import Segments
+from .see.view import View
 
 _START_VARIANCE = 1e-8  # the first pose is the origin by definition
 

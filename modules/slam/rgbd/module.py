@@ -16,16 +16,17 @@ from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
-from .alignment import Alignment
+from .adjust.reckoning import Reckoner, led
+from .adjust.renewal import NEWEST, LocatedView, renew, seen_by
 from .answers import held, lost, placed, repeated, started
-from .limits import check_limits, check_sizes
-from .localizer import VisualFix
+from .locate.localizer import VisualFix
+from .loops.reunion import Reunion
 from .parts import RgbdParts
-from .reckoning import Reckoner, led
-from .renewal import NEWEST, LocatedView, renew, seen_by
-from .reunion import Reunion
-from .turn_rate import expected_rate
-from .view import View
+from .see.alignment import Alignment
+from .see.sizes import check_sizes
+from .see.turn_rate import expected_rate
+from .see.view import View
+from .settings import RgbdSettings
 
 
 class RgbdSlam:
@@ -61,8 +62,29 @@ class RgbdSlam:
         is_repeatable: bool,
         seed: int,
     ) -> None:
-        self._arguments = {name: value for name, value in locals().items() if name != "self"}
-        check_limits(self._arguments)
+        self._settings = RgbdSettings(
+            segment_patience_s=segment_patience_s,
+            feature_count=feature_count,
+            fast_threshold_min=fast_threshold_min,
+            fast_noise_ratio=fast_noise_ratio,
+            sigma_px=sigma_px,
+            inverse_depth_sigma_per_m=inverse_depth_sigma_per_m,
+            search_radius_px=search_radius_px,
+            min_inliers=min_inliers,
+            degraded_inliers=degraded_inliers,
+            degraded_sigma_m=degraded_sigma_m,
+            keyframe_step_m=keyframe_step_m,
+            keyframe_turn_rad=keyframe_turn_rad,
+            keyframe_inlier_ratio=keyframe_inlier_ratio,
+            keyframe_limit=keyframe_limit,
+            past_keyframe_limit=past_keyframe_limit,
+            landmark_limit=landmark_limit,
+            cloud_stride_px=cloud_stride_px,
+            cloud_voxel_m=cloud_voxel_m,
+            grid_resolution_m=grid_resolution_m,
+            is_repeatable=is_repeatable,
+            seed=seed,
+        )
         self._monocular_scenes = frozenset(monocular_scenes)
         self._ignores_depth = False
         self._reunion = Reunion(keyframe_limit=past_keyframe_limit)
@@ -147,7 +169,7 @@ class RgbdSlam:
         self._reunion.end(self._map, self._memory.recognizer)
 
     def _build(self, alignment: Alignment | None) -> RgbdParts:
-        parts = RgbdParts(self._arguments, self._camera, alignment, self._reunion)
+        parts = RgbdParts(self._settings, self._camera, alignment, self._reunion)
         self._eye, self._health, self._search = parts.eye, parts.health, parts.search
         self._map, self._mapping, self._memory = parts.map, parts.mapping, parts.memory
         self._layers, self._place_rule = parts.layers, parts.place_rule

@@ -1,27 +1,25 @@
-"""Build the module's parts from its arguments and the camera."""
+"""Build the parts of the module from its settings and the camera."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from sceneslam.types.rig import Camera
 
-from .alignment import Alignment
-from .certainty import Certainty
-from .features import FeatureExtractor
-from .judgement import HealthRule, KeyframeRule, PlaceRule
-from .keyframe_maker import KeyframeMaker
-from .layers import LayerBuilder
-from .local_mapping import LocalMapping
-from .localizer import VisualLocalizer
-from .map_history import MapHistory
-from .pose_solver import PoseSolver
-from .rectifying_extractor import RectifyingExtractor
-from .relocalizer import Relocalizer
-from .reunion import Reunion
-from .search import Search
-from .visual_map import VisualMap
+from .adjust.local_mapping import LocalMapping
+from .locate.certainty import Certainty
+from .locate.judgement import HealthRule, KeyframeRule, PlaceRule
+from .locate.localizer import VisualLocalizer
+from .locate.pose_solver import PoseSolver
+from .locate.relocalizer import Relocalizer
+from .locate.search import Search
+from .loops.reunion import Reunion
+from .map.keyframe_maker import KeyframeMaker
+from .map.layers import LayerBuilder
+from .map.map_history import MapHistory
+from .map.visual_map import VisualMap
+from .see.alignment import Alignment
+from .see.features import FeatureExtractor
+from .see.rectifying_extractor import RectifyingExtractor
+from .settings import RgbdSettings
 
 
 class RgbdParts:
@@ -29,36 +27,34 @@ class RgbdParts:
 
     def __init__(
         self,
-        arguments: Mapping[str, Any],
+        settings: RgbdSettings,
         depth_camera: Camera,
         alignment: Alignment | None,
         reunion: Reunion,
     ) -> None:
         """Build; `alignment` None: assume registered depth until the search shows otherwise."""
-
-        def chosen(**names: str) -> dict[str, Any]:
-            return {name: arguments[argument] for name, argument in names.items()}
-
-        def same(*names: str) -> dict[str, Any]:
-            return {name: arguments[name] for name in names}
-
         known = alignment or Alignment()
         camera = known.color_camera(depth_camera)
         extractor = FeatureExtractor(
             depth_camera,
             known,
-            **chosen(count="feature_count"),
-            **same("fast_threshold_min", "fast_noise_ratio"),
+            count=settings.feature_count,
+            fast_threshold_min=settings.fast_threshold_min,
+            fast_noise_ratio=settings.fast_noise_ratio,
         )
         self.map = VisualMap(
             camera,
             depth_camera,
-            **same("sigma_px", "inverse_depth_sigma_per_m", "keyframe_limit", "landmark_limit"),
+            sigma_px=settings.sigma_px,
+            inverse_depth_sigma_per_m=settings.inverse_depth_sigma_per_m,
+            keyframe_limit=settings.keyframe_limit,
+            landmark_limit=settings.landmark_limit,
         )
         localizer = VisualLocalizer(
             self.map,
-            PoseSolver(camera, **same("seed")),
-            **chosen(radius_px="search_radius_px", min_inliers="min_inliers"),
+            PoseSolver(camera, seed=settings.seed),
+            radius_px=settings.search_radius_px,
+            min_inliers=settings.min_inliers,
         )
         self.eye = RectifyingExtractor(self.map, localizer, extractor)
         self.memory = MapHistory(
@@ -66,25 +62,28 @@ class RgbdParts:
             localizer,
             self.eye,
             reunion,
-            **chosen(min_inliers="degraded_inliers"),
-            **same("is_repeatable"),
+            min_inliers=settings.degraded_inliers,
+            is_repeatable=settings.is_repeatable,
         )
         relocalizer = Relocalizer(self.map.keyframes, self.memory.recognizer)
         self.search = Search(localizer, relocalizer)
         self.mapping = LocalMapping(
-            depth_camera, self.map, alignment=alignment, **same("is_repeatable")
+            depth_camera, self.map, alignment=alignment, is_repeatable=settings.is_repeatable
         )
         self.layers = LayerBuilder(
-            depth_camera, **same("cloud_stride_px", "cloud_voxel_m", "grid_resolution_m")
+            depth_camera,
+            cloud_stride_px=settings.cloud_stride_px,
+            cloud_voxel_m=settings.cloud_voxel_m,
+            grid_resolution_m=settings.grid_resolution_m,
         )
         self.maker = KeyframeMaker(self.map, self.layers, self.memory, self.mapping)
         self.keyframe_rule = KeyframeRule(
-            **chosen(
-                step_m="keyframe_step_m",
-                turn_rad="keyframe_turn_rad",
-                inlier_ratio="keyframe_inlier_ratio",
-            )
+            step_m=settings.keyframe_step_m,
+            turn_rad=settings.keyframe_turn_rad,
+            inlier_ratio=settings.keyframe_inlier_ratio,
         )
-        self.place_rule = PlaceRule(**chosen(patience_s="segment_patience_s"))
+        self.place_rule = PlaceRule(patience_s=settings.segment_patience_s)
         self.certainty = Certainty(self.map.landmarks)
-        self.health = HealthRule(**same("degraded_inliers", "degraded_sigma_m"))
+        self.health = HealthRule(
+            degraded_inliers=settings.degraded_inliers, degraded_sigma_m=settings.degraded_sigma_m
+        )

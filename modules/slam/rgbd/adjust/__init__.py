@@ -1,0 +1,1 @@
+"""Adjustment of the map: bundles, constraints, new landmarks."""

@@ -1,0 +1,102 @@
+"""The covariance of a pose relative to the local map, including errors beyond pixel noise.
+
+Pixel noise does not cover the errors of a wrong camera model (intrinsics, shutter, registration of
+depth), nor, without depth, the drift of the map's scale, which no image shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.se3 import Transform
+
+from ..loops.pose_graph import motion_covariance
+from ..map.landmarks import LandmarkTable
+from ..see.view import View
+from .localizer import VisualFix
+from .pose_solver import Linearised
+
+_CELLS = 8  # per image width, in which residuals are summed
+_INDEPENDENT = 1.5  # common ratio of a correct model, at most: 1.0 to 1.7 in simulations,
+# 2.1 to 3.8 on freiburg1_rpy, 1.3 to 2.6 on RedKitchen
+_NOT_HELD = 1e-9  # share of all information, added to every direction
+_AROUND_M = 1.5  # length of five keyframes, adjusted together; beyond, wheels give the scale
+_KEPT = 0.95  # smoothing of the common ratio from image to image
+
+
+class Certainty:
+    """Increases a pose's covariance by the model errors that residuals and landmarks show."""
+
+    def __init__(self, landmarks: LandmarkTable) -> None:
+        self._landmarks = landmarks
+        self._common: float | None = None  # `common_ratio`, smoothed over images
+        self._scaled_local = np.zeros(3)  # (3,) [m], the last position with known scale
+        self.by_wheels = np.zeros((6, 6))  # share of the last covariance due to wheels
+
+    def covariance(
+        self,
+        view: View,
+        fix: VisualFix,
+        T_local_base: Transform,
+        T_keyframe_base: Sequence[Transform],
+    ) -> NDArray[np.float64]:
+        """Return the covariance (6, 6) of a pose, of se3.log order [m, rad], in base.
+
+        It is relative to the local map. If neighbouring pixels have common residuals, which are
+        not noise, the pixels' information is reduced accordingly, and a share of the motion from
+        the surrounding keyframes is added. The scale error of triangulated landmarks grows from
+        the place where depth was seen last.
+        """
+        common = self._follow(common_ratio(view, fix))
+        measured = fix.estimate.covariance * common
+        motions = motion_covariance(np.stack(T_keyframe_base), np.zeros((6, 6)))
+        model = motions.mean(axis=0) * np.clip(common - _INDEPENDENT, 0.0, 1.0)
+        # A shift compensates a wrong turn, in proportion to the landmarks' distance.
+        away_m = self._landmarks.points_local[fix.landmark_ids] - T_local_base[:3, 3]
+        model[:3, :3] += np.median((away_m**2).sum(axis=1)) * model[3:, 3:]
+        scale = np.zeros((6, 6))
+        scale[:3, :3] = self.scale_variance(view, fix, T_local_base)
+        self.by_wheels = scale if view.reckoned is not None else 0.0 * scale
+        return np.asarray(measured + model + scale)
+
+    def _follow(self, ratio: float) -> float:
+        before = ratio if self._common is None else self._common
+        self._common = _KEPT * before + (1.0 - _KEPT) * ratio
+        return max(1.0, self._common)
+
+    def scale_variance(
+        self, view: View, fix: VisualFix, T_local_base: Transform
+    ) -> NDArray[np.float64]:
+        """Return (3, 3) [m^2]: variance by the scale's error over the motion since it was known."""
+        sigmas = self._landmarks.scale_sigma[fix.landmark_ids]
+        if not view.is_monocular or not sigmas.any():
+            self._scaled_local = T_local_base[:3, 3].copy()
+        way_local = T_local_base[:3, 3] - self._scaled_local
+        length_m = float(np.linalg.norm(way_local))
+        if view.reckoned is not None and length_m > _AROUND_M:
+            way_local = way_local * (_AROUND_M / length_m)
+        way_base = T_local_base[:3, :3].T @ way_local
+        return np.asarray(np.mean(sigmas**2) * np.outer(way_base, way_base))
+
+
+def common_ratio(view: View, fix: VisualFix) -> float:
+    """Return how much stronger the residuals' gradient is than that of independent residuals.
+
+    The squared sum of the gradients of a cell's pixels over the sum of their squares: 1 if they are
+    independent, as in a cluster-robust covariance (Liang and Zeger 1986).
+    """
+    seen: Linearised = fix.estimate.linearised
+    pulls = (seen.jacobian * seen.residuals).reshape(6, 2, -1).sum(axis=1)  # (6, N)
+    normal = seen.jacobian @ seen.jacobian.T
+    # Pixels alone do not constrain every pose, e.g. corners on a line; their depths may.
+    root = np.linalg.cholesky(normal + _NOT_HELD * np.trace(normal) * np.eye(6))
+    pulls = np.linalg.solve(root, pulls)
+    side_px = view.gray.shape[1] / _CELLS
+    columns, rows = np.floor(view.features.uv_px[fix.feature_rows].T / side_px).astype(np.int64)
+    columns -= columns.min()
+    flat = (rows - rows.min()) * (columns.max() + 1) + columns
+    sums = np.stack([np.bincount(flat, row) for row in pulls])
+    return float((sums**2).sum() / max((pulls**2).sum(), 1e-12))

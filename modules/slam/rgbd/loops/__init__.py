@@ -1,0 +1,1 @@
+"""Places seen before: in this session, and in earlier ones."""

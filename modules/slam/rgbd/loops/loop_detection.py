@@ -1,0 +1,130 @@
+"""Detect loops: two new keyframes that agree on showing a place seen before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.se3 import Transform
+
+from ..locate.recognition import PlaceRecognizer, Recognition
+from ..map.visual_map import VisualMap
+from .pose_graph import KeyframeEdge, PoseGraph, Way, motion_covariance
+
+_RECENT = 5  # newest keyframes, which are never loop candidates
+_OUTSTANDING = 2.0  # sigmas above the similarity of unrelated keyframes
+_FEWEST = 5  # keyframes needed for the usual similarity
+_CHI2 = 22.5  # 99.9 % of six degrees of freedom
+_DRIFT_RATIO = 0.05  # of the path length: a loop with more drift is rejected
+_SIGMAS = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Query:
+    """A new keyframe with its depth image."""
+
+    keyframe_id: int
+    depth_m: NDArray[np.float32] | None  # (H, W) [m], None: no depth
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopClosure:
+    """A loop: the edge from an old to a new keyframe, and the new one's pose by it."""
+
+    edge: KeyframeEdge
+    T_local_base: Transform  # of the new keyframe, by the old part of the map
+
+    @property
+    def keyframe_id(self) -> int:
+        """Return the new keyframe."""
+        return self.edge.end
+
+
+class LoopDetector:
+    """Checks one keyframe at a time: first by appearance, then by geometry."""
+
+    def __init__(
+        self, visual_map: VisualMap, recognizer: PlaceRecognizer, graph: PoseGraph
+    ) -> None:
+        self._map, self._recognizer, self._graph = visual_map, recognizer, graph
+        self._hypothesis: LoopClosure | None = None
+
+    def candidate(self, query: Query) -> int | None:
+        """Return the unconnected keyframe that is exceptionally similar to the new one."""
+        keyframes = self._map.keyframes
+        new = keyframes[query.keyframe_id]
+        known = set(keyframes.covisible(new.landmark_ids, limit=len(keyframes)))
+        known |= set(keyframes.ids[-_RECENT:])
+        far = [k for k in keyframes.ids if k not in known]
+        alike = self._recognizer.places.alike(new.features.descriptors, far)
+        if not alike:
+            return None
+        ratios = np.array([likeness.ratio for likeness in alike])
+        usual = float(np.median(ratios))
+        sigma = 1.4826 * float(np.median(np.abs(ratios - usual)))
+        if len(alike) >= _FEWEST and ratios[0] < usual + _OUTSTANDING * sigma:
+            return None
+        return alike[0].place_id
+
+    def check(self, query: Query, candidate: int) -> list[LoopClosure]:
+        """Return the loops that two keyframes agree on: this one's and an earlier one's."""
+        new = self._map.keyframes[query.keyframe_id]
+        seen = self._recognizer.recognize(candidate, new.features, query.depth_m)
+        if seen is None:
+            return []
+        loop = self._loop(query.keyframe_id, seen)
+        way = self._graph.way(candidate, query.keyframe_id)
+        if way is not None and not _believable(loop, new.T_local_base, way):
+            return []
+        earlier, self._hypothesis = self._hypothesis, loop
+        if earlier is None or earlier.keyframe_id not in self._graph:
+            return []
+        if not self._agree(earlier, loop):
+            return []
+        self._hypothesis = None
+        return [earlier, loop]
+
+    def is_news(self, loop: LoopClosure) -> bool:
+        """Tell whether a loop moves its keyframe by more than its uncertainty."""
+        T_local_base = self._map.keyframes[loop.keyframe_id].T_local_base
+        xi = se3.log(se3.inverse(T_local_base) @ loop.T_local_base)
+        return float(xi @ np.linalg.solve(loop.edge.covariance, xi)) > _CHI2
+
+    def _loop(self, keyframe_id: int, seen: Recognition) -> LoopClosure:
+        T_old = self._map.keyframes[seen.keyframe_id].T_local_base
+        T_local_base = seen.fix.estimate.T_local_base
+        T_start_end = se3.inverse(T_old) @ T_local_base
+        edge = KeyframeEdge(
+            start=seen.keyframe_id,
+            end=keyframe_id,
+            T_start_end=T_start_end,
+            covariance=motion_covariance(T_start_end, seen.fix.estimate.covariance),
+            is_loop=True,
+        )
+        return LoopClosure(edge=edge, T_local_base=T_local_base)
+
+    def _agree(self, earlier: LoopClosure, later: LoopClosure) -> bool:
+        """Tell whether both loops imply the same motion between the two new keyframes."""
+        T_first, T_second = (
+            self._map.keyframes[loop.keyframe_id].T_local_base for loop in (earlier, later)
+        )
+        T_tracked = se3.inverse(T_first) @ T_second
+        T_looped = se3.inverse(earlier.T_local_base) @ later.T_local_base
+        xi = se3.log(se3.inverse(T_tracked) @ T_looped)
+        covariance = motion_covariance(T_tracked, earlier.edge.covariance + later.edge.covariance)
+        return float(xi @ np.linalg.solve(covariance, xi)) <= _CHI2
+
+
+def _believable(loop: LoopClosure, T_local_base: Transform, way: Way) -> bool:
+    """Tell whether the drift that the loop implies is plausible for the path."""
+    T_error = se3.inverse(T_local_base) @ loop.T_local_base
+    sigmas = np.sqrt(np.diag(loop.edge.covariance))
+    turn_rad = _DRIFT_RATIO * way.turned_rad + _SIGMAS * way.sigma_rad
+    shift_m = _DRIFT_RATIO * way.length_m + _SIGMAS * way.sigma_m + turn_rad * way.reach_m
+    return bool(
+        se3.rotation_angle_rad(T_error) <= turn_rad + _SIGMAS * sigmas[3:].max()
+        and np.linalg.norm(T_error[:3, 3]) <= shift_m + _SIGMAS * sigmas[:3].max()
+    )

@@ -1,0 +1,1 @@
+"""The map: keyframes, landmarks, and the history of both."""

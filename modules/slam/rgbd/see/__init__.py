@@ -1,0 +1,1 @@
+"""What one image shows: features, depth, and the shutter that read it."""
