@@ -4,7 +4,8 @@ import numpy as np
 from test_laser_world import box, room, scan_at
 
 from sceneslam.modules.slam.laser.field import LikelihoodField
-from sceneslam.modules.slam.laser.matcher import Matcher, MotionPrior
+from sceneslam.modules.slam.laser.matcher import Matcher
+from sceneslam.modules.slam.laser.prior import MotionPrior
 from sceneslam.modules.slam.laser.surface import ScanSurfaceReader
 from sceneslam.types import se3
 

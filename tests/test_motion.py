@@ -118,13 +118,41 @@ def test_lie_about_the_distance_leaves_the_turn_to_the_wheels():
     assert turned_rad == pytest.approx((0.2 + 0.5 * np.sin(19)) * PERIOD_S, abs=0.01)
 
 
-def test_rival_is_the_motion_by_whoever_is_not_believed():
+def test_alternatives_are_distance_and_turn_by_the_sources_that_are_not_used():
     drive = Drive()
     for _ in range(100):
         drive.step()
-    drive.step(factor=-1.0)
-    assert drive.last.T_prev_curr[0, 3] == pytest.approx(-0.05, abs=0.005)
-    assert drive.last.rival.T_prev_curr[0, 3] == pytest.approx(0.05, abs=0.01)
+    drive.step(factor=-1.0, rate=-0.5)
+    motions = (drive.last, *drive.last.alternatives)
+    distances_m = [motion.T_prev_curr[0, 3] for motion in motions]
+    assert distances_m == pytest.approx([-0.05] * 2 + [0.05] * 4, abs=0.01)
+    is_guessed = [(distance, turn) for distance in (False, True, True) for turn in (False, True)]
+    assert [motion.is_guessed for motion in motions] == is_guessed
+    by_inertia, anywhere = (motions[k].covariance[0, 0] for k in (2, 4))
+    assert anywhere > by_inertia
+    assert not drive.last.is_doubted
+
+
+def test_evidence_is_how_much_more_likely_a_measurement_made_wrong_wheels():
+    drive = Drive()
+    for _ in range(100):
+        drive.step()
+    before = np.array([one.probability for one in (drive.last, *drive.last.alternatives)])
+    assert drive.last.evidence(before / before.sum()) == pytest.approx([0.0, 0.0])
+    is_wrong = [one.is_guessed[0] for one in (drive.last, *drive.last.alternatives)]
+    distance, turn = drive.last.evidence(np.where(is_wrong, 10.0 * before, before))
+    assert distance == pytest.approx(np.log(10.0))
+    assert turn < distance
+
+
+@pytest.mark.parametrize(("speed", "is_possible"), [(0.6, True), (-0.5, False)])
+def test_inertia_contradicts_wheels_that_reverse_between_two_observations(speed, is_possible):
+    drive = Drive()
+    for _ in range(100):
+        drive.step()
+    for _ in range(3):
+        drive.step(speed=speed, teaches=False)
+    assert (drive.model.lying[0] < 0.1) == is_possible
 
 
 def test_what_no_scan_sees_teaches_nothing():
@@ -136,7 +164,6 @@ def test_what_no_scan_sees_teaches_nothing():
         drive.step(factor=-1.0, teaches=False)
         drive.model.learn(se3.from_xy_yaw(0.05, 0.0, 0.02), blind)
     assert drive.model.noise_ratios[0] == pytest.approx(before[0], rel=0.05)
-    assert drive.model.lying[0] < 0.1
 
 
 @pytest.mark.parametrize("scale", [0.96, 1.03])
@@ -179,7 +206,7 @@ def test_without_wheels_the_velocity_goes_on_and_the_gyro_turns_it():
     motion = model.predict(Observation(stamp_ns=300_000_000))
     np.testing.assert_allclose(motion.T_prev_curr, se3.from_xy_yaw(0.1, 0.0, 0.05), atol=1e-4)
     assert not motion.is_measured
-    assert motion.rival is None
+    assert motion.alternatives == ()
     gyro = constant_rate(-0.5)
     motion = model.predict(Observation(stamp_ns=400_000_000, gyro_base=gyro))
     assert se3.yaw_rad(motion.T_prev_curr) == pytest.approx(-0.05)

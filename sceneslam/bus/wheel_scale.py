@@ -8,13 +8,13 @@ scale estimated from one module corrects the odometry for the other modules.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.bus.hold import Hold
+from sceneslam.motion.distance_error import DistanceError
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
@@ -24,7 +24,6 @@ _DRIFT = 0.002  # standard deviation of the change between spans: tyres wear, fl
 _SPAN_M = 0.5  # distance between two poses that are compared
 _TURN_MAX_RAD = 0.3  # largest turn between them: an arc is longer than its chord
 _SLIP = 0.015  # standard deviation of the wheels' slip over a span, independent for each span
-_SIGMAS = 3.0  # larger innovations are rejected: a wheel slipped, or the module erred
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -41,9 +40,19 @@ class WheelScale:
     """Estimates the scale of the wheels' distances from one module."""
 
     def __init__(self) -> None:
-        self.scale, self.variance = 1.0, _UNKNOWN**2
+        self._error = DistanceError(_UNKNOWN, drift=_DRIFT)
         self._mark: _Mark | None = None
         self._turned_rad = 0.0  # sum since the mark
+
+    @property
+    def scale(self) -> float:
+        """Return the true distance per metre of odometry."""
+        return 1.0 + min(max(self._error.ratio, -_LIMIT), _LIMIT)
+
+    @property
+    def variance(self) -> float:
+        """Return the variance of the scale."""
+        return self._error.variance
 
     def learn(self, hold: Hold, T_odom_base: Transform | None, turned_rad: float) -> None:
         """Compare uncorrected odometry (4, 4) and its yaw [rad] with the module's pose."""
@@ -62,19 +71,9 @@ class WheelScale:
             self._mark = mark
         else:
             way_m, variance_m2 = _measured(mark, here)
-            self._take(way_m / odom_m, variance_m2 / odom_m**2 + _SLIP**2)
+            missed_m = way_m - odom_m * (1.0 + self._error.ratio)
+            self._error.learn(missed_m, odom_m, variance_m2 + (_SLIP * odom_m) ** 2)
             self._turned_rad = 0.0
-
-    def _take(self, ratio: float, noise: float) -> None:
-        """Update the scale by the ratio measured over a span, with variance `noise`."""
-        self.variance += _DRIFT**2
-        missed = ratio - self.scale
-        if abs(missed) > _SIGMAS * math.sqrt(self.variance + noise):
-            self.variance = min(2.0 * self.variance, _UNKNOWN**2)  # else a wrong estimate stays
-            return
-        gain = self.variance / (self.variance + noise)
-        self.scale = min(max(self.scale + gain * missed, 1.0 - _LIMIT), 1.0 + _LIMIT)
-        self.variance *= 1.0 - gain
 
 
 def _here(hold: Hold, T_odom_base: Transform) -> _Mark | None:

@@ -10,13 +10,14 @@ a module is not calibrated by that module.
 from __future__ import annotations
 
 import copy
-import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.motion.distance_error import DistanceError
+from sceneslam.motion.inertia import Inertia
+from sceneslam.motion.motion import BELIEVED, Motion, motion_of
 from sceneslam.motion.step import Step, still
 from sceneslam.motion.trust import LieDetector, NoiseRatio, evidence_of_a_lie
 from sceneslam.motion.turn_errors import TurnErrors
@@ -25,34 +26,14 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
 
-_ACCELERATION = np.array([1.5, 4.0])  # m/s^2, rad/s^2: largest usual of a robot
-_FADE_S = {False: 0.5, True: 5.0}  # time constant of an unmeasured velocity, by: has wheels
-_JUMP = 3.0  # times the acceleration: a larger change of velocity is a jump
-_KEPT_S = 0.5  # longest time that an unmeasured velocity is kept
-_UNKNOWN = np.array([1.0, 2.0])  # m/s, rad/s: standard deviation of an unknown velocity
-_STEP = np.array([1e-4, 1e-4])  # m, rad: least standard deviation of a predicted step
 _STILL_M, _STILL_RAD = 1e-5, 1e-5  # per step: less than one encoder tick
-_FASTEST = np.array([25.0, 20.0])  # m/s, rad/s: with a larger deviation a velocity is unknown
 _AT_REST = 0.3  # share of the wheels' constant noise while the wheels stand still
 _TURN_PER_METRE = 0.1  # base turns by a degree in a metre: wheels roll unevenly
 _METRE_PER_TURN = 0.1  # base moves 2 cm per radian in place: it is not exactly above the axle
 _LATE_M, _SPEED_MAX_M_S = 1.0, 25.0  # odometry that moves farther was reset
-_BELIEVED = 0.5  # wheels are not used if they are wrong with this probability
-_RIVAL_MIN = 0.01  # least probability of the alternative
 _TAUGHT_MIN = 0.25  # least weight of wheels that are probably wrong, in estimating their noise
+_WEAR = 1e-3  # change of the wheels' scale from one scan to the next, as a share of its deviation
 _PLANAR = np.array([0, 1, 5])  # forward, left, yaw
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Motion:
-    """The base's motion since the last observation."""
-
-    T_prev_curr: Transform
-    covariance: NDArray[np.float64]  # (6, 6) of se3.log order [m, rad], axes of curr
-    is_measured: bool  # wheels covered all motion since another sensor measured
-    is_doubted: bool = False  # the wheels are probably wrong: it is predicted without
-    probability: float = 1.0  # that this motion is right and not the alternative
-    rival: Motion | None = None  # the alternative: the motion by the source that is not used
 
 
 class MotionModel:
@@ -61,15 +42,11 @@ class MotionModel:
     def __init__(self, rig: Rig) -> None:
         self._wheels, self._gyro = rig.wheels, rig.gyro
         self._floors = np.array([rig.wheels.floor_m, rig.wheels.floor_rad])
-        self._has_wheels = Sensor.ODOMETRY in rig.sensors
-        self._fade_s = _FADE_S[self._has_wheels]
+        self._inertia = Inertia(Sensor.ODOMETRY in rig.sensors)
         self._noise = [NoiseRatio(rig.wheels.noise_ratio) for _ in range(2)]  # distance, turn
         self._lies = [LieDetector() for _ in range(2)]
         self._turns = TurnErrors(rig.gyro.bias_radps)
-        self._distance = DistanceError(rig.wheels.drift_ratio)
-        self._twist_s: NDArray[np.float64] | None = None  # (6,) last measured twist per second
-        self._twist_variance = np.zeros(2)
-        self._unmeasured_s = np.zeros(2)  # time since it was measured: distance, turn
+        self._distance = DistanceError(rig.wheels.drift_ratio, drift=_WEAR * rig.wheels.drift_ratio)
         self._stamp_ns: int | None = None
         self._T_odom_base: Transform | None = None  # the last odometry
         self._silent_s = 0.0  # time since then
@@ -108,7 +85,7 @@ class MotionModel:
     @property
     def velocity(self) -> NDArray[np.float64]:
         """Return the base's twist (6,) [m/s, rad/s] in se3.log order, 0 if unknown."""
-        return np.zeros(6) if self._twist_s is None else self._twist_s
+        return np.zeros(6) if self._inertia.twist_s is None else self._inertia.twist_s
 
     def copy(self) -> MotionModel:
         """Return an independent copy with the same state."""
@@ -129,7 +106,10 @@ class MotionModel:
         for lie in self._lies:
             lie.wait(duration_s)
         gap = self._gap
-        wheels, guess = self._take_odometry(observation, duration_s), self._by_velocity(duration_s)
+        wheels, guess = (
+            self._take_odometry(observation, duration_s),
+            self._inertia.predict(duration_s),
+        )
         turn = self._turns.by_gyro(observation, duration_s)
         if turn is not None:
             noise_rad = self._gyro.bias_radps * duration_s + self._gyro.noise_rad
@@ -137,30 +117,47 @@ class MotionModel:
             if wheels is not None and gap is None:
                 self._compare(turn, wheels, duration_s)
                 wheels = wheels.turned(turn, noise_rad, duration_s)
+        if wheels is not None and gap is None:
+            evidence = self._inertia.evidence(wheels, guess, duration_s)
+            for lie, one in zip(self._lies, evidence.tolist(), strict=True):
+                lie.judge(one)
         self._since_s += duration_s
         self._since_guess = self._since_guess.then(guess)
         if wheels is not None and self._since_wheels is not None:
             self._since_wheels = self._since_wheels.then(wheels)
         if wheels is not None and gap is not None:  # motion in the gap was predicted already
             wheels = replace(wheels, T=se3.inverse(gap) @ wheels.T)
-        motion = self._joined(wheels, guess)
+        motion = motion_of(
+            wheels,
+            guess,
+            self._inertia.anywhere(guess, duration_s),
+            lying=self.lying,
+            is_measured=self._is_measured,
+        )
         if self._gap is not None:
             self._gap = self._gap @ motion.T_prev_curr
         return motion
 
-    def learn(self, T_before_now: Transform, covariance: NDArray[np.float64]) -> None:
+    def learn(
+        self,
+        T_before_now: Transform,
+        covariance: NDArray[np.float64],
+        evidence: NDArray[np.float64] | None = None,
+    ) -> None:
         """Calibrate by the motion (4, 4) since the last call, as measured by another sensor alone.
 
-        `covariance` (6, 6) is the measurement's alone, without any prediction: large in directions
-        that the sensor did not measure. Axes of `now`.
+        `covariance` (6, 6) is the measurement's alone, without any prediction: large in
+        directions that the sensor did not measure. Axes of `now`. `evidence` (2,) of distance and
+        turn is that of `Motion.evidence`; None: that of the measured motion.
         """
         duration_s, wheels, guess = self._since_s, self._since_wheels, self._since_guess
-        had_velocity = self._twist_s is not None
+        had_velocity = self._inertia.twist_s is not None
         if duration_s <= 0.0 or not self._is_followed:  # the interval is unknown
             self.skip()
             return
-        before = self._twist_variance * duration_s**2
-        self._note_velocity(se3.log(T_before_now) / duration_s, covariance / duration_s**2)
+        self._inertia.learn(
+            *self._with_wheels(T_before_now, covariance), guess=guess, duration_s=duration_s
+        )
         self._forget()
         if wheels is None:
             return
@@ -170,13 +167,15 @@ class MotionModel:
         )
         for channel, axes in enumerate((slice(0, 2), slice(2, 3))):
             R = measured[axes, axes]
-            if had_velocity:
+            if evidence is not None:
+                self._lies[channel].judge(float(evidence[channel]))
+            elif had_velocity:
                 self._lies[channel].judge(
                     evidence_of_a_lie(
                         wheels=off[axes],
                         guess=off_guess[axes],
                         wheels_variance=float(wheels.variance[channel]),
-                        guess_variance=float((guess.variance + before)[channel]),
+                        guess_variance=float(guess.variance[channel]),
                         covariance=R,
                     )
                 )
@@ -188,14 +187,26 @@ class MotionModel:
                     variance=variance,
                     share=max(1.0 - self._lies[channel].lying, _TAUGHT_MIN) / len(R),
                 )
-        if self._lies[0].lying < _BELIEVED:
+        if self._lies[0].lying < BELIEVED:
             self._distance.learn(
                 float(off[0]), float(wheels.T[0, 3]), float(wheels.variance[0] + measured[0, 0])
             )
-        if self._lies[1].lying < _BELIEVED:
+        if self._lies[1].lying < BELIEVED:
             self._turns.learn(
                 float(off[2]), wheels.causes, float(wheels.variance[1] + measured[2, 2])
             )
+
+    def _with_wheels(
+        self, T_before_now: Transform, covariance: NDArray[np.float64]
+    ) -> tuple[Transform, NDArray[np.float64]]:
+        """Return a measured motion, completed by the wheels where it is weak."""
+        wheels = self._since_wheels
+        if wheels is None:
+            return T_before_now, covariance
+        R = np.diag((self._inertia.noise_of(wheels, self.lying, self._since_s))[[0, 0, 1]])
+        gain = covariance[:, _PLANAR] @ np.linalg.inv(covariance[np.ix_(_PLANAR, _PLANAR)] + R)
+        off = se3.log(se3.inverse(T_before_now) @ wheels.T)[_PLANAR]
+        return T_before_now @ se3.exp(gain @ off), covariance - gain @ covariance[_PLANAR]
 
     def skip(self) -> None:
         """Discard the motion since the last call, which no sensor measured."""
@@ -210,21 +221,7 @@ class MotionModel:
 
     def slow_down(self) -> None:
         """Reset the velocity only."""
-        self._twist_s = None
-
-    def _note_velocity(self, twist_s: NDArray[np.float64], covariance: NDArray[np.float64]) -> None:
-        """Add a velocity; components without a measurement decay."""
-        unknown = np.diag(np.repeat(_FASTEST**2, 3))
-        gain = unknown @ np.linalg.inv(unknown + covariance)
-        kept = self.velocity * math.exp(-self._since_s / self._fade_s)
-        twist_s = kept + gain @ (twist_s - kept)
-        if self._has_wheels and self._twist_s is not None:  # else a jump cannot be detected
-            reach = np.repeat(_JUMP * _ACCELERATION * self._since_s, 3)
-            twist_s = self._twist_s + np.clip(twist_s - self._twist_s, -reach, reach)
-        self._twist_s = twist_s
-        self._twist_variance = np.diag(covariance)[[0, 5]]
-        is_measured = np.diag(gain).reshape(2, 3).min(axis=1) > 0.5
-        self._unmeasured_s = np.where(is_measured, 0.0, self._unmeasured_s)
+        self._inertia.reset()
 
     def _forget(self) -> None:
         """Restart the comparison; odometry that is missing now has to restart, too."""
@@ -272,20 +269,6 @@ class MotionModel:
             causes=np.array([forward_m, yaw_rad, 0.0]),
         )
 
-    def _by_velocity(self, duration_s: float) -> Step:
-        """Return the motion at constant velocity."""
-        before_s, self._unmeasured_s = self._unmeasured_s, self._unmeasured_s + duration_s
-        variance = self._reach(self._unmeasured_s) ** 2 - self._reach(before_s) ** 2 + _STEP**2
-        T_prev_curr = se3.exp(self.velocity * min(duration_s, _KEPT_S))
-        return replace(still(), T=T_prev_curr, variance=variance)
-
-    def _reach(self, unmeasured_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the standard deviations (2,) [m, rad] of a prediction; they add up over time."""
-        reach = _UNKNOWN * unmeasured_s
-        if self._twist_s is None:
-            return reach
-        return np.minimum(reach, 0.5 * _ACCELERATION * unmeasured_s**2)
-
     def _compare(self, turn: NDArray[np.float64], wheels: Step, duration_s: float) -> None:
         self._turns.compare(
             turn,
@@ -294,30 +277,6 @@ class MotionModel:
             variance=float(wheels.variance[1]),
             duration_s=duration_s,
         )
-
-    def _joined(self, wheels: Step | None, guess: Step) -> Motion:
-        """Return the motion with distance and turn by the wheels, unless they are wrong."""
-        if wheels is None:
-            return _motion(guess, guess, is_measured=False)
-        lies = self.lying >= _BELIEVED
-        distance, turn = (guess if lie else wheels for lie in lies)
-        probability = float(np.maximum(self.lying, 1.0 - self.lying).prod())
-        rival = _motion(wheels if lies.any() else guess, wheels, is_measured=False)
-        return replace(
-            _motion(distance, turn, is_measured=self._is_measured),
-            is_doubted=bool(lies.any()),
-            probability=probability,
-            rival=replace(rival, probability=max(1.0 - probability, _RIVAL_MIN)),
-        )
-
-
-def _motion(distance: Step, turn: Step, *, is_measured: bool) -> Motion:
-    variance = np.repeat([distance.variance[0], turn.variance[1]], 3)
-    return Motion(
-        T_prev_curr=se3.from_parts(turn.T[:3, :3], distance.T[:3, 3]),
-        covariance=np.diag(variance),
-        is_measured=is_measured,
-    )
 
 
 def _finite(T_odom_base: Transform | None) -> Transform | None:

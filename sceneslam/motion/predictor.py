@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.motion.model import Motion, MotionModel
+from sceneslam.motion.model import MotionModel
+from sceneslam.motion.motion import Motion
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, TrackingStatus
 from sceneslam.types.rig import Rig

@@ -98,6 +98,11 @@ def evidence_of_a_lie(
     return by_inertia - _log_likelihood(wheels, wheels_variance * unit + covariance)
 
 
+def student_cost(squared: Matrix | float, size: int) -> Matrix:
+    """Return the negative log-density of Student's distribution at squared normalised errors."""
+    return np.asarray(0.5 * (_STUDENT + size) * np.log1p(squared / _STUDENT))
+
+
 def _log_likelihood(missed: NDArray[np.float64], covariance: Matrix) -> float:
     """Return the log-density of an error (N,) under a normal distribution, up to a constant."""
     factor = np.linalg.cholesky(covariance)

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sceneslam.motion.model import Motion, MotionModel
+from sceneslam.motion.model import MotionModel
+from sceneslam.motion.motion import Motion
 from sceneslam.types.observation import LaserScan, Observation, TrackingStatus
 from sceneslam.types.planar import (
     Matrix,
@@ -26,7 +27,8 @@ from .field import LikelihoodField
 from .history import RelativePoseHistory
 from .keyframes import ScanKeyframe, ScanKeyframes
 from .loop_search import LoopSearch
-from .matcher import Match, Matcher, MotionPrior, novelty
+from .matcher import Match, Matcher, novelty
+from .prior import MotionPrior
 from .surface import SurfacePoints
 
 _OVERLAP_MIN_RATIO = 0.5  # with less, the map does not cover this place yet
@@ -76,6 +78,7 @@ class FrontEnd:
     _held_covariance: Matrix = field(default_factory=lambda: np.diag(_DEVIATION_MIN**2), init=False)
     _held_ns: int | None = field(default=None, init=False)
     _seen_pose: Planar = field(default_factory=lambda: np.zeros(3), init=False)  # of its scan
+    _fit_ns: int | None = field(default=None, init=False)  # scans fitted as usual until then
     _failures: int = field(default=0, init=False)
     _field: LikelihoodField | None = field(default=None, init=False)
 
@@ -105,16 +108,10 @@ class FrontEnd:
         if self._field is None:
             self._extend(predicted_then, None, scan, surfaces)
             return self._hold(observation, predicted, None)
-        priors = [MotionPrior.of(predicted_then, self._covariance, motion.probability)]
-        if motion.rival is not None:
-            T_rival, noise = (
-                from_transform(motion.rival.T_prev_curr),
-                planar_covariance(motion.rival.covariance),
-            )
-            there = propagate(known, before, T_rival, noise)
-            priors.append(
-                MotionPrior.of(compose(before, ratio * T_rival), there, motion.rival.probability)
-            )
+        if self.matcher.misfit == 0.0 or self._fit_ns is None:
+            self._fit_ns = before_ns
+        motion = motion.since_misfit(self.matcher.misfit, self._since_fit_s(observation))
+        priors = [self._prior(known, before, ratio, one) for one in (motion, *motion.alternatives)]
         is_known = motion.is_measured and not motion.is_doubted
         new = novelty(between(self._seen_pose, predicted_then)) if is_known else 1.0
         match = self.matcher.match(surfaces, self._field, priors, novelty=new)
@@ -122,11 +119,21 @@ class FrontEnd:
             match = self._find_again(surfaces, self._field, predicted_then) or match
         if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
-        self._teach(match, T_then_now)
+        self._teach(match, T_then_now, motion)
         estimate = self._hold(observation, compose(match.T_local_base, T_then_now), match)
         if self.keyframes.is_due(match.T_local_base):
             self._extend(match.T_local_base, match, scan, surfaces)
         return estimate
+
+    def _prior(self, known: Matrix, before: Planar, ratio: float, motion: Motion) -> MotionPrior:
+        """Return the prior of the pose after a share `ratio` of a motion from `before`."""
+        T_prev_curr = from_transform(motion.T_prev_curr)
+        noise = planar_covariance(motion.covariance)
+        covariance = propagate(known, before, T_prev_curr, noise)
+        return MotionPrior.of(compose(before, ratio * T_prev_curr), covariance, motion.probability)
+
+    def _since_fit_s(self, observation: Observation) -> float:
+        return 0.0 if self._fit_ns is None else (observation.stamp_ns - self._fit_ns) * 1e-9
 
     def _read(self, scan: LaserScan | None) -> SurfacePoints | None:
         if scan is None:
@@ -157,7 +164,7 @@ class FrontEnd:
             and bool(np.isfinite(match.T_local_base).all())
         )
 
-    def _teach(self, match: Match, T_then_now: Planar) -> None:
+    def _teach(self, match: Match, T_then_now: Planar, motion: Motion) -> None:
         """Calibrate the motion model by the motion since the last matched scan."""
         G = turn(-float(match.T_local_base[2]))
         known = np.linalg.inv(match.information + _UNSEEN) + self._held_covariance
@@ -165,6 +172,7 @@ class FrontEnd:
         self.motion.learn(
             to_transform(between(self._held_pose, alone)),
             spatial_covariance(G @ known @ G.T),
+            motion.evidence(match.probabilities) if len(match.probabilities) > 1 else None,
         )
 
     def _hold(self, observation: Observation, pose: Planar, match: Match | None) -> Estimate:

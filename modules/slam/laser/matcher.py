@@ -18,7 +18,7 @@ bias a turn: on the side to which the robot turns, the scan always shows more th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +26,11 @@ from numpy.typing import NDArray
 from sceneslam.types.planar import Matrix, Planar, rotation, wrap
 
 from .field import LikelihoodField
+from .prior import MotionPrior, difference, is_apart
 from .surface import SurfacePoints
 
 _SEARCH_POINTS = 120  # more do not change the coarse answer
 _SEARCH_STEP_M = 0.1
-_SEARCH_SIGMAS = (
-    10.0  # beyond, there is less than a thousandth of the prior, heavy as its tails are
-)
 _PRIOR_WEIGHT = 0.02  # mean likelihood of a point that outweighs one nat of the prior
 _KERNELS_M = (0.25, 0.12, 0.06)  # of the robust weight: coarse to fine
 _ITERATIONS = (3, 3, 8)  # at most, per kernel
@@ -40,9 +38,9 @@ _CONVERGED = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: a step this small is the
 _INLIER_M = 0.1
 _END_M = 0.1  # a mapped surface may continue this far, or twice the beams' spacing
 _CORRELATION = 4.0  # neighbouring beams have common errors: information is divided by this
-_STUDENT = 4.0  # degrees of freedom of the prior: an error of 10 sigmas has weight 1/20
-_NORMAL = 1e6  # degrees of freedom of a normal distribution
-_APART_M, _APART_RAD = 0.06, 0.02  # nearer starts converge to the same pose
+_UNEVEN = 3.0  # by so much scans usually fit better or worse than on average
+_SLACK = 2.0  # scans that fit worse by less do not add up
+_USUAL_SCANS = 20.0  # over which that average is taken
 _VIEW_M, _VIEW_RAD = 0.1, 0.1  # scans this far apart have independent errors
 _NOVELTY_MIN = 1e-3
 
@@ -59,65 +57,22 @@ class Match:
     overlap_ratio: float  # share of points near a mapped surface
     weak_directions: int  # 0 to 3: unconstrained by the geometry
     T_local_alone: Planar  # by the laser alone, except for weak directions
-    cost: float  # negative log-likelihood of scan and pose, up to a constant
+    cost: float  # negative logarithm of the evidence of scan and prior, up to a constant
+    scan_cost: float  # of that, the scan's
+    probabilities: NDArray[np.float64]  # of the priors, given the scan
 
+    def cost_with(self, prior: MotionPrior) -> float:
+        """Return the cost with another prior, by the shape of the scan's cost here.
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MotionPrior:
-    """The predicted pose of a scan by one source of motion.
-
-    The wheels' prior has heavy tails (Student's distribution), so that a contradicting scan
-    prevails. Position and heading are weighted separately: slipping wheels may turn correctly.
-    """
-
-    pose: Planar
-    covariance: Matrix
-    information: Matrix
-    cost: float  # negative logarithm of the prior's probability and of its density's peak
-    freedom: float  # degrees of freedom of Student's distribution
-
-    @classmethod
-    def of(cls, pose: Planar, covariance: Matrix, probability: float = 1.0) -> MotionPrior:
-        """Return the prior of a pose (3,) with covariance (3, 3); normal if it is the only one."""
-        information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-        spread = 0.5 * float(np.linalg.slogdet(covariance)[1])
-        return cls(
-            pose=pose,
-            covariance=covariance,
-            information=information,
-            cost=spread - float(np.log(probability)),
-            freedom=_NORMAL if probability == 1.0 else _STUDENT,
-        )
-
-    def off(self, pose: Planar) -> Planar:
-        """Return the difference (3,) of a pose from this prior."""
-        off = pose - self.pose
-        off[2] = wrap(float(off[2]))
-        return off
-
-    def weighed(self, pose: Planar) -> Matrix:
-        """Return the prior's information (3, 3) at a pose, reduced by the heavy tails."""
-        squared = self._squared(pose)
-        weight = [min((self.freedom + n) / (self.freedom + squared[n]), 1.0) for n in (2, 1)]
-        root = np.sqrt([weight[0], weight[0], weight[1]])
-        return np.asarray(self.information * np.outer(root, root))
-
-    def cost_at(self, pose: Planar) -> float:
-        """Return the negative log-likelihood of a pose (3,), up to a constant."""
-        return self.cost + sum(
-            float(_tail(each, n, self.freedom)) for n, each in self._squared(pose).items()
-        )
-
-    def is_apart(self, pose: Planar) -> bool:
-        """Tell whether a refinement from here may converge differently than from `pose` (3,)."""
-        off = np.abs(self.off(pose))
-        return bool(max(off[0], off[1]) > _APART_M or off[2] > _APART_RAD)
-
-    def _squared(self, pose: Planar) -> dict[int, float]:
-        """Return the squared normalised deviations of position and heading by number of axes."""
-        off, information = self.off(pose), self.information
-        position = float(off[:2] @ information[:2, :2] @ off[:2])
-        return {2: position, 1: float(off[2] ** 2 * information[2, 2])}
+        Where it leads farther away than that shape is known, the scan says nothing about it.
+        """
+        H, pose, weight = self.information, self.T_local_base, prior.weighed(self.T_local_base)
+        pull = difference(self.T_local_alone, pose)
+        step: Planar = np.linalg.inv(H + weight) @ (H @ pull - weight @ prior.off(pose))
+        if is_apart(step):
+            return self.cost - float(np.log(prior.probability))
+        gained = 0.5 * float(pull @ H @ pull - (step - pull) @ H @ (step - pull))
+        return self.scan_cost - gained + prior.cost_at(pose + step) - prior.spread_after(H)
 
 
 @dataclass(slots=True)
@@ -128,6 +83,8 @@ class Matcher:
     window_rad: float
     degeneracy_ratio: float
     shift_m: float  # standard deviation of a scan's common error
+    misfit: float = 0.0  # by how much the last scans fit worse than those before [nats]
+    _usual: float | None = None  # cost of a point of the last scans
 
     def match(
         self,
@@ -142,29 +99,54 @@ class Matcher:
         `novelty` (0 to 1): the share of the scan's error that is independent of the scan before;
         1 if the prediction is not measured.
         """
-        first = priors[0]
-        starts = [first.pose, self._search(scan_base, field, first)]
-        starts += [other.pose for other in priors[1:] if other.is_apart(first.pose)]
-        if np.array_equal(starts[0], starts[1]):
-            del starts[1]
         shift_m = self.shift_m / float(np.sqrt(novelty))
-        refined = [self._refine(scan_base, field, start, priors, shift_m) for start in starts]
-        return min(refined, key=lambda match: match.cost)
+        usual_cost = 0.0 if self._usual is None else self._usual * len(scan_base)
+        best = self._refine(scan_base, field, priors[0].pose, priors[0], shift_m)
+        costs = np.array([best.cost, *(best.cost_with(prior) for prior in priors[1:])])
+        least = min(best.scan_cost, usual_cost - _UNEVEN)
+        open_to = [
+            k
+            for k, prior in enumerate(priors)
+            if is_apart(prior.off(best.T_local_base))
+            and least + prior.cost_least(best.information) < best.cost
+        ]
+        matches = {0: [best]}
+        if open_to or best.cost > usual_cost + _UNEVEN + priors[0].cost_least(best.information):
+            found = self._search(scan_base, field, priors)
+            likely = int(np.argmin([prior.cost_at(found) for prior in priors]))
+            for k, start in [(likely, found), *((k, priors[k].pose) for k in open_to if k > 0)]:
+                match = self._refine(scan_base, field, start, priors[k], shift_m)
+                matches.setdefault(k, []).append(match)
+        best = min((one for some in matches.values() for one in some), key=lambda one: one.cost)
+        for k, some in matches.items():
+            costs[k] = min(one.cost for one in some)
+        self._compare(best, len(scan_base))
+        weights = np.exp(best.cost - costs)
+        return replace(best, probabilities=weights / weights.sum())
+
+    def _compare(self, match: Match, count: int) -> None:
+        """Compare how a scan of `count` points fits with the scans before (Page's CUSUM)."""
+        each = match.scan_cost / max(count, 1)
+        if self._usual is None:
+            self._usual = each
+        worse = match.scan_cost - self._usual * count - _SLACK
+        self.misfit = max(self.misfit + min(worse, _UNEVEN), 0.0)
+        self._usual += (each - self._usual) / _USUAL_SCANS
 
     def refine(
         self, scan_base: SurfacePoints, field: LikelihoodField, start: Planar, prior: Matrix
     ) -> Match:
         """Return the pose of a scan, without search, from `start` (3,) with covariance (3, 3)."""
-        return self._refine(scan_base, field, start, [MotionPrior.of(start, prior)], self.shift_m)
+        return self._refine(scan_base, field, start, MotionPrior.of(start, prior), self.shift_m)
 
     def _search(
-        self, scan_base: SurfacePoints, field: LikelihoodField, prior: MotionPrior
+        self, scan_base: SurfacePoints, field: LikelihoodField, priors: Sequence[MotionPrior]
     ) -> Planar:
-        """Return the most likely pose on a grid around the prediction."""
-        predicted, sigma = prior.pose, np.sqrt(np.diag(prior.covariance))
+        """Return the most likely pose on a grid that covers every source of motion."""
+        predicted = priors[0].pose
         stride = max(1, len(scan_base) // _SEARCH_POINTS)
         points = scan_base.points[::stride]
-        reach = _SEARCH_SIGMAS * sigma
+        reach = np.max([prior.reach(predicted) for prior in priors], axis=0)
         half_m = float(np.clip(max(reach[0], reach[1]), _SEARCH_STEP_M, self.window_m))
         radius_m = float(np.median(np.linalg.norm(points, axis=1))) + 0.1
         step_rad = _SEARCH_STEP_M / radius_m
@@ -177,10 +159,8 @@ class Matcher:
         x, y = points.T
         rotated = np.stack([c * x - s * y, s * x + c * y], axis=-1) + predicted[:2]
         scores = field.likelihood(rotated, offsets)
-        near = np.sum(offsets**2, axis=1) / max(sigma[0], sigma[1]) ** 2
-        penalty = _tail(near, 2, prior.freedom)[None]
-        penalty = penalty + _tail((turns / sigma[2]) ** 2, 1, prior.freedom)[:, None]
-        best = int(np.argmax(scores - _PRIOR_WEIGHT * penalty))
+        costs = np.min([prior.costs(predicted, offsets, turns) for prior in priors], axis=0)
+        best = int(np.argmax(scores - _PRIOR_WEIGHT * costs))
         turn, offset = divmod(best, len(offsets))
         return np.array([*(predicted[:2] + offsets[offset]), wrap(float(yaws[turn]))])
 
@@ -189,11 +169,10 @@ class Matcher:
         scan_base: SurfacePoints,
         field: LikelihoodField,
         start: Planar,
-        priors: Sequence[MotionPrior],
+        expected: MotionPrior,
         shift_m: float,
     ) -> Match:
-        """Return the pose by Gauss-Newton from a start, with its most likely prior."""
-        expected = min(priors, key=lambda prior: prior.cost_at(start))
+        """Return the pose by Gauss-Newton from a start, with one prior."""
         pose = start.copy()
         for kernel_m, iterations in zip(_KERNELS_M, _ITERATIONS, strict=True):
             for _ in range(iterations):
@@ -214,6 +193,8 @@ class Matcher:
         inlier = residual < _INLIER_M
         count = max(len(scan_base), 1)
         prior, off = expected.weighed(pose), expected.off(pose)
+        pull = np.linalg.pinv(H, rcond=1e-9, hermitian=True) @ prior @ off
+        scan_cost = _scan_cost(scan_base, evident)
         return Match(
             T_local_base=pose,
             information=alone,
@@ -222,8 +203,10 @@ class Matcher:
             inlier_ratio=float(inlier.sum() / count),
             overlap_ratio=float((far < 0.5).sum() / count),
             weak_directions=weak,
-            T_local_alone=pose + np.linalg.pinv(H, rcond=1e-9, hermitian=True) @ prior @ off,
-            cost=_scan_cost(scan_base, evident) + expected.cost_at(pose),
+            T_local_alone=pose + pull,
+            cost=scan_cost + expected.cost_at(pose) - expected.spread_after(H),
+            scan_cost=scan_cost,
+            probabilities=np.ones(1),
         )
 
     def _laser_equations(
@@ -309,11 +292,6 @@ def _residuals(
     is_near = far < 4 * _INLIER_M
     evident = np.where(is_near | (far < 2.0 * scan_base.spacing_m), across, far)
     return np.where(is_near & ~unknown, across, far), far, np.where(unknown, 0.0, evident)
-
-
-def _tail(squared: NDArray[np.float64] | float, size: int, freedom: float) -> NDArray[np.float64]:
-    """Return the negative log-density of Student's distribution at squared deviations."""
-    return np.asarray(0.5 * (freedom + size) * np.log1p(squared / freedom))
 
 
 def _scan_cost(scan_base: SurfacePoints, residual: NDArray[np.float64]) -> float:

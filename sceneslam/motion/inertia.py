@@ -1,0 +1,134 @@
+"""The base's velocity: what it predicts, and how well wheels agree with it.
+
+A robot has inertia, so that its velocity continues: a Kalman filter with a random acceleration. How
+well that predicts a motion is estimated on the way, since it depends on the robot, on the rate of
+the sensors and on how exact their stamps are.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.motion.step import Step, still
+from sceneslam.motion.trust import NoiseRatio, student_cost
+from sceneslam.types import se3
+
+_ACCELERATION = np.array([1.5, 4.0])  # m/s^2, rad/s^2: largest usual of a robot
+_USUAL = {False: 1.0, True: 1 / 3}  # of that: deviation of the acceleration, by: has wheels
+_FADE_S = {False: 0.5, True: 5.0}  # time constant of an unmeasured velocity, by: has wheels
+_JUMP = 3.0  # times the acceleration: a larger change of velocity is a jump
+_KEPT_S = 0.5  # longest time that an unmeasured velocity is kept
+_UNKNOWN = np.array([1.0, 2.0])  # m/s, rad/s: standard deviation of an unknown velocity
+_STEP = np.array([1e-4, 1e-4])  # m, rad: least standard deviation of a predicted step
+_FASTEST = np.array([25.0, 20.0])  # m/s, rad/s: with a larger deviation a velocity is unknown
+_MISSED = (0.05, 0.1)  # m, rad: standard deviation of a predicted motion before it is learnt
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class Inertia:
+    """Predicts the motion at constant velocity."""
+
+    has_wheels: bool
+    twist_s: NDArray[np.float64] | None = field(default=None, init=False)  # (6,) per second
+    _covariance: Matrix = field(default_factory=lambda: np.zeros((6, 6)), init=False)
+    _unmeasured_s: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2), init=False)
+    _missed: list[NoiseRatio] = field(
+        default_factory=lambda: [NoiseRatio(missed) for missed in _MISSED], init=False
+    )
+
+    @property
+    def missed(self) -> NDArray[np.float64]:
+        """Return the estimated standard deviations (2,) [m, rad] of a predicted motion."""
+        return np.array([noise.ratio for noise in self._missed])
+
+    def reset(self) -> None:
+        """Reset the velocity."""
+        self.twist_s, self._covariance = None, np.zeros((6, 6))
+
+    def predict(self, duration_s: float) -> Step:
+        """Return the motion of the next `duration_s`."""
+        before_s, self._unmeasured_s = self._unmeasured_s, self._unmeasured_s + duration_s
+        variance = self._reach(self._unmeasured_s) ** 2 - self._reach(before_s) ** 2 + _STEP**2
+        twist_s = np.zeros(6) if self.twist_s is None else self.twist_s
+        return replace(still(), T=se3.exp(twist_s * min(duration_s, _KEPT_S)), variance=variance)
+
+    def anywhere(self, guess: Step, duration_s: float) -> Step:
+        """Return the motion of a robot whose velocity is unknown."""
+        variance = np.array([(_UNKNOWN[0] * duration_s) ** 2, guess.variance[1]])
+        return replace(guess, variance=np.maximum(variance, guess.variance))
+
+    def evidence(self, wheels: Step, guess: Step, duration_s: float) -> NDArray[np.float64]:
+        """Return the log-likelihood ratios (2,) of the wheels' motion: wheels wrong against right.
+
+        Distance and turn. Wheels that are wrong may report any motion that a robot is capable of.
+        """
+        if self.twist_s is None:
+            return np.zeros(2)
+        off = se3.inverse(guess.T) @ wheels.T
+        missed = np.array([off[0, 3], se3.yaw_rad(off)])
+        right = self._known(duration_s) + wheels.variance + self.missed**2
+        wrong = right + (_UNKNOWN * duration_s) ** 2
+        cost_right = student_cost(missed**2 / right, 1) + 0.5 * np.log(right)
+        cost_wrong = student_cost(missed**2 / wrong, 1) + 0.5 * np.log(wrong)
+        return np.asarray(cost_right - cost_wrong)
+
+    def noise_of(
+        self, wheels: Step, lying: NDArray[np.float64], duration_s: float
+    ) -> NDArray[np.float64]:
+        """Return the variances (2,) of the wheels' motion, wrong with the probabilities `lying`."""
+        wrong = (_UNKNOWN * duration_s) ** 2
+        return np.asarray(self.missed**2 + wheels.variance + lying * wrong)
+
+    def learn(
+        self, T_before_now: Matrix, covariance: Matrix, guess: Step, duration_s: float
+    ) -> None:
+        """Take a measured motion over `duration_s` with its covariance (6, 6), axes of `now`.
+
+        `guess` is what was predicted. Components that were not measured decay.
+        """
+        off = se3.log(se3.inverse(guess.T) @ T_before_now)
+        if self.twist_s is not None:
+            variance = self._known(duration_s) + np.diag(covariance)[[0, 5]]
+            for channel, axis in enumerate((0, 5)):
+                self._missed[channel].learn(
+                    float(off[axis]), 1.0, floor=0.0, variance=float(variance[channel]), share=1.0
+                )
+        self._filter(se3.log(T_before_now) / duration_s, covariance / duration_s**2, duration_s)
+
+    def _filter(self, twist_s: NDArray[np.float64], covariance: Matrix, duration_s: float) -> None:
+        unknown = np.diag(np.repeat(_FASTEST**2, 3))
+        seen = unknown @ np.linalg.inv(unknown + covariance)
+        is_measured = np.diag(seen).reshape(2, 3).min(axis=1) > 0.5
+        self._unmeasured_s = np.where(is_measured, 0.0, self._unmeasured_s)
+        if self.twist_s is None:
+            before, expected = np.zeros(6), unknown
+        else:
+            before = self.twist_s
+            usual = np.repeat((_USUAL[self.has_wheels] * _ACCELERATION * duration_s) ** 2, 3)
+            expected = self._covariance + np.diag(usual)
+        fading = 1.0 - math.exp(-duration_s / _FADE_S[self.has_wheels])
+        kept = before - fading * (before - seen @ before)
+        gain = expected @ np.linalg.inv(expected + covariance)
+        now = kept + gain @ (twist_s - kept)
+        if self.has_wheels and self.twist_s is not None:  # else a jump cannot be detected
+            reach = np.repeat(_JUMP * _ACCELERATION * duration_s, 3)
+            now = before + np.clip(now - before, -reach, reach)
+        self.twist_s, self._covariance = now, expected - gain @ expected
+
+    def _known(self, duration_s: float | NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the variances (2,) [m^2, rad^2] of a motion by that of the velocity."""
+        return np.asarray(np.diag(self._covariance)[[0, 5]] * duration_s**2)
+
+    def _reach(self, unmeasured_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the standard deviations (2,) [m, rad] of a prediction; they add up over time."""
+        reach = _UNKNOWN * unmeasured_s
+        if self.twist_s is None:
+            return reach
+        changed = (0.5 * _ACCELERATION * unmeasured_s**2) ** 2
+        return np.minimum(reach, np.sqrt(self._known(unmeasured_s) + changed))

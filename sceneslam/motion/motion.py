@@ -1,0 +1,114 @@
+"""A motion of the base, with the alternatives if wheels or inertia are wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.motion.step import Step
+from sceneslam.types import se3
+from sceneslam.types.se3 import Transform
+
+UNKNOWN_M_S = 1.0  # standard deviation of an unknown velocity
+BELIEVED = 0.5  # wheels are not used if they are wrong with this probability
+_RARE = 0.003  # least probability of an alternative: one scan in 300
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Motion:
+    """The base's motion since the last observation."""
+
+    T_prev_curr: Transform
+    covariance: NDArray[np.float64]  # (6, 6) of se3.log order [m, rad], axes of curr
+    is_measured: bool  # wheels covered all motion since another sensor measured
+    is_guessed: tuple[bool, bool] = (False, False)  # distance, turn at constant velocity
+    is_unknown: bool = False  # the distance is by neither of both
+    probability: float = 1.0  # that this motion is right and none of the alternatives
+    alternatives: tuple[Motion, ...] = ()  # distance, turn or both by the source that is not used
+
+    @property
+    def is_doubted(self) -> bool:
+        """Tell whether the wheels are probably wrong, so that it is predicted without."""
+        return any(self.is_guessed)
+
+    def since_misfit(self, misfit: float, since_s: float) -> Motion:
+        """Return this motion where scans have fitted worse by `misfit` nats for `since_s`.
+
+        Then a motion that neither wheels nor inertia predict is that much more likely, and has led
+        the farther away.
+        """
+        if misfit <= 0.0:
+            return self
+        reach = np.diag([(UNKNOWN_M_S * since_s) ** 2] * 3 + [0.0] * 3)
+        alternatives = tuple(
+            replace(
+                other,
+                covariance=np.maximum(other.covariance, reach),
+                probability=min(other.probability * math.exp(misfit), BELIEVED),
+            )
+            if other.is_unknown
+            else other
+            for other in self.alternatives
+        )
+        return replace(self, alternatives=alternatives)
+
+    def evidence(self, probabilities: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the log-likelihood ratios (2,) of distance and turn: wheels wrong against right.
+
+        `probabilities` (N,): of this motion and its alternatives, given a measurement.
+        """
+        motions = (self, *self.alternatives)
+        before = np.array([motion.probability for motion in motions])
+        is_wrong = np.array([motion.is_guessed for motion in motions])
+        after, before = (
+            np.clip(p @ is_wrong / p.sum(), 1e-9, 1 - 1e-9) for p in (probabilities, before)
+        )
+        return np.asarray(np.log(after / (1.0 - after)) - np.log(before / (1.0 - before)))
+
+
+def motion_of(
+    wheels: Step | None,
+    guess: Step,
+    anywhere: Step,
+    *,
+    lying: NDArray[np.float64],
+    is_measured: bool,
+) -> Motion:
+    """Return the motion with distance and turn by the wheels, unless they are wrong.
+
+    `lying` (2,): the probabilities of that. `guess` is by inertia; `anywhere` is what a robot of
+    unknown velocity does, the distance if neither wheels nor inertia are right.
+    """
+    if wheels is None:
+        return _motion(guess, guess, is_measured=False)
+    distances, turns = (_ranked(wheels, guess, p) for p in lying.tolist())
+    distances.append((anywhere, _RARE))
+    best, *others = (
+        replace(
+            _motion(distance, turn, is_measured=is_measured),
+            is_guessed=(distance is not wheels, turn is not wheels),
+            is_unknown=distance is anywhere,
+            probability=max(p_distance * p_turn, _RARE),
+        )
+        for distance, p_distance in distances
+        for turn, p_turn in turns
+    )
+    return replace(best, alternatives=tuple(others))
+
+
+def _ranked(wheels: Step, guess: Step, lying: float) -> list[tuple[Step, float]]:
+    """Return both sources with their probabilities, the one that is used first."""
+    sources = [(wheels, 1.0 - lying), (guess, lying)]
+    return sources[::-1] if lying >= BELIEVED else sources
+
+
+def _motion(distance: Step, turn: Step, *, is_measured: bool) -> Motion:
+    variance = np.repeat([distance.variance[0], turn.variance[1]], 3)
+    return Motion(
+        T_prev_curr=se3.from_parts(turn.T[:3, :3], distance.T[:3, 3]),
+        covariance=np.diag(variance),
+        is_measured=is_measured,
+    )
