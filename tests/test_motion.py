@@ -155,6 +155,17 @@ def test_inertia_contradicts_wheels_that_reverse_between_two_observations(speed,
     assert (drive.model.lying[0] < 0.1) == is_possible
 
 
+def test_inertia_does_not_contradict_wheels_once_the_velocity_is_old():
+    drive = Drive()
+    for _ in range(100):
+        drive.step()
+    for _ in range(30):
+        drive.step(teaches=False)
+    for _ in range(10):
+        drive.step(speed=0.0, rate=0.0, teaches=False)
+    assert drive.model.lying.max() < 0.1
+
+
 def test_what_no_scan_sees_teaches_nothing():
     drive = Drive()
     for _ in range(100):

@@ -72,7 +72,8 @@ class Inertia:
             return np.zeros(2)
         off = se3.inverse(guess.T) @ wheels.T
         missed = np.array([off[0, 3], se3.yaw_rad(off)])
-        right = self._known(duration_s) + wheels.variance + self.missed**2
+        changed = _USUAL[self.has_wheels] * _ACCELERATION * self._unmeasured_s * duration_s
+        right = self._known(duration_s) + changed**2 + wheels.variance + self.missed**2
         wrong = right + (_UNKNOWN * duration_s) ** 2
         cost_right = student_cost(missed**2 / right, 1) + 0.5 * np.log(right)
         cost_wrong = student_cost(missed**2 / wrong, 1) + 0.5 * np.log(wrong)
