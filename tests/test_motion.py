@@ -150,6 +150,7 @@ def test_inertia_contradicts_wheels_that_reverse_between_two_observations(speed,
     drive = Drive()
     for _ in range(100):
         drive.step()
+    drive.model.learn(np.eye(4), SCAN, np.zeros(2))
     for _ in range(3):
         drive.step(speed=speed, teaches=False)
     assert (drive.model.lying[0] < 0.1) == is_possible
@@ -159,6 +160,7 @@ def test_inertia_does_not_contradict_wheels_once_the_velocity_is_old():
     drive = Drive()
     for _ in range(100):
         drive.step()
+    drive.model.learn(np.eye(4), SCAN, np.zeros(2))
     for _ in range(30):
         drive.step(teaches=False)
     for _ in range(10):

@@ -54,6 +54,7 @@ class MotionModel:
         self._since_s = 0.0  # since the last measured motion
         self._since_wheels: Step | None = still()
         self._since_guess = still()
+        self._is_weighed = False  # the sensor weighs the sources itself, and may clear the wheels
         self._is_followed = True  # `stop` was not called since then
         self._is_measured = True  # the wheels covered all motion since then
 
@@ -117,7 +118,7 @@ class MotionModel:
             if wheels is not None and gap is None:
                 self._compare(turn, wheels, duration_s)
                 wheels = wheels.turned(turn, noise_rad, duration_s)
-        if wheels is not None and gap is None:
+        if self._is_weighed and wheels is not None and gap is None:
             evidence = self._inertia.evidence(wheels, guess, duration_s)
             for lie, one in zip(self._lies, evidence.tolist(), strict=True):
                 lie.judge(one)
@@ -150,6 +151,7 @@ class MotionModel:
         directions that the sensor did not measure. Axes of `now`. `evidence` (2,) of distance and
         turn is that of `Motion.evidence`; None: that of the measured motion.
         """
+        self._is_weighed = evidence is not None
         duration_s, wheels, guess = self._since_s, self._since_wheels, self._since_guess
         had_velocity = self._inertia.twist_s is not None
         if duration_s <= 0.0 or not self._is_followed:  # the interval is unknown
