@@ -39,12 +39,20 @@ _PARTS = {  # name -> its code, and the tests that guard it
     "bus": (
         ["sceneslam/bus"],
         [
-            "tests/test_machine.py",
+            "tests/test_bus_limits.py",
+            "tests/test_module_answers.py",
             "tests/test_policy.py",
-            "tests/test_gate.py",
-            "tests/test_bus*.py",
-            "tests/test_calibration.py",
+            "tests/test_memory.py",
+            "tests/test_machine.py",
             "tests/test_tilt.py",
+            "tests/test_pace.py",
+            "tests/test_bayes_filter.py",
+            "tests/test_bus*.py",
+            "tests/test_restarts.py",
+            "tests/test_gate.py",
+            "tests/test_uncertainty.py",
+            "tests/test_handover.py",
+            "tests/test_calibration.py",
         ],
     ),
 }
@@ -68,7 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="mutation_") as name:
         copy = Path(name)
         _copy_tracked(copy)
-        files = [str(test.relative_to(copy)) for glob in tests for test in sorted(copy.glob(glob))]
+        found = [str(test.relative_to(copy)) for glob in tests for test in sorted(copy.glob(glob))]
+        files = list(dict.fromkeys(found))  # in the order of the list: the quickest first
         pytest = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *files]
         config = _CONFIG.format(
             modules=code, timeout_s=options.timeout_s, command=repr(" ".join(pytest))

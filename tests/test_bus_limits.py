@@ -1,0 +1,322 @@
+"""Durations and thresholds of the bus, each on both sides of its limit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from driving import drive, events, policy
+from fakes import PERIOD_NS, ExactModule, ScriptedDetector, observation
+
+from sceneslam.bus.bridge import Bridge
+from sceneslam.bus.decision import Action, Health, Situation, StandbyTrial, decide
+from sceneslam.bus.events import EventLog
+from sceneslam.bus.gate import Gate, GateSettings, GateVerdict
+from sceneslam.bus.handover_log import log_uncertainty
+from sceneslam.bus.recent import RecentMedian
+from sceneslam.bus.scene_filter import WindowFilter
+from sceneslam.bus.watch import Watch
+from sceneslam.types import se3
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.observation import SceneVote
+from sceneslam.types.rig import Wheels
+from sceneslam.types.run import SessionStart
+
+S = 10**9
+NOW_NS = 100 * S
+
+
+def situation(**changes):
+    """`a`, the first choice, is lost since now; `b` and `c` could take over."""
+    values = {
+        "stamp_ns": NOW_NS,
+        "scene": "Bright",
+        "served_scene": "Bright",
+        "active": "a",
+        "health": Health.LOST,
+        "unheld_since_ns": NOW_NS,
+        "held_ns": 0,
+        "is_blind": False,
+        "choices": ("a", "b", "c"),
+        "served_choices": ("a", "b", "c"),
+        "tried": frozenset("a"),
+        "rounds": 0,
+        "trial": StandbyTrial.NONE,
+        "retry_ns": 10**18,
+        "may_return": False,
+    }
+    return Situation(**(values | changes))
+
+
+def decided(lost_ns, **changes):
+    patient = policy(lost_patience_s=0.3, confirm_window_s=2.0)
+    return decide(patient, situation(unheld_since_ns=NOW_NS - lost_ns, **changes))
+
+
+@pytest.mark.parametrize(("is_blind", "patience_ns"), [(False, 300_000_000), (True, 30_000_000)])
+def test_a_lost_module_is_replaced_when_the_patience_is_over(is_blind, patience_ns):
+    assert decided(patience_ns - 1, is_blind=is_blind).action is Action.GO_ON
+    verdict = decided(patience_ns, is_blind=is_blind)
+    assert (verdict.action, verdict.to, verdict.reason) == (Action.SWITCH, ("b", "c"), "lost")
+
+
+@pytest.mark.parametrize("rounds", [0, 1, 2])
+def test_all_modules_are_tried_again_after_a_window_that_doubles(rounds):
+    changes = {"tried": frozenset("abc"), "rounds": rounds}
+    assert decided((2 * S << rounds) - 1, **changes).action is Action.GO_ON
+    verdict = decided(2 * S << rounds, **changes)
+    assert (verdict.to, verdict.rounds) == (("b", "c"), rounds + 1)
+
+
+def test_a_module_that_tracked_for_a_window_may_be_followed_by_any_other():
+    changes = {"tried": frozenset("ab"), "rounds": 2}
+    short, long = (decided(S, held_ns=ns, **changes) for ns in (2 * S - 1, 2 * S))
+    assert (short.to, short.rounds) == (("c",), 2)
+    assert (long.to, long.rounds) == (("b", "c"), 0)
+
+
+def test_a_failed_module_is_replaced_at_once_by_any_other():
+    assert decided(0, health=Health.FAILED).to == ("b", "c")
+    last = decided(0, health=Health.FAILED, tried=frozenset("abc"), rounds=3)
+    assert (last.to, last.rounds, last.reason) == (("b", "c"), 0, "failed")
+
+
+def test_nothing_is_started_while_failed_modules_restart():
+    gone = {"health": Health.FAILED, "active": "", "served_choices": (), "choices": ()}
+    assert decided(S, may_return=True, **gone).action is Action.GO_ON
+    assert decided(S, may_return=False, **gone).action is Action.SWITCH
+
+
+def test_a_suspect_fallback_gives_way_to_the_first_choice_only_when_that_is_due():
+    suspect = {"health": Health.SUSPECT, "active": "b", "tried": frozenset()}
+    assert decided(S, retry_ns=NOW_NS + 1, **suspect).to == ("c",)
+    assert decided(S, retry_ns=NOW_NS, **suspect).to == ("a", "c")
+
+
+def test_the_first_choice_is_tried_again_when_it_is_due():
+    fallback = {"active": "b", "health": Health.HELD}
+    assert decided(0, retry_ns=NOW_NS + 1, **fallback).action is Action.GO_ON
+    due = decided(0, retry_ns=NOW_NS, **fallback)
+    assert (due.action, due.to) == (Action.TRY, ("a",))
+    running = decided(0, retry_ns=0, trial=StandbyTrial.RUNNING, **fallback)
+    assert running.action is Action.GO_ON
+    assert decided(0, retry_ns=0, active="a", health=Health.HELD).action is Action.GO_ON
+    passed = decided(0, trial=StandbyTrial.PASSED, **fallback)
+    assert (passed.action, passed.to, passed.reason) == (Action.SWITCH, ("a",), "return")
+
+
+def test_a_new_scene_keeps_a_module_that_serves_both_unless_it_failed():
+    new = {"scene": "Dark", "choices": ("a", "b")}
+    assert decided(0, **new).action is Action.TELL
+    assert decided(0, **new, health=Health.FAILED).to == ("a", "b")
+    assert decided(0, **(new | {"choices": ("b", "a")})).to == ("b", "a")
+    assert decided(0, **(new | {"choices": ()})).action is Action.GO_ON
+
+
+@pytest.mark.parametrize(
+    "key", ["confirm_window_s", "lost_patience_s", "retry_s", "buffer_s", "buffer_mb"]
+)
+def test_durations_and_sizes_may_be_zero_and_not_less(key):
+    assert getattr(policy(**{key: 0.0}), key) == 0.0
+    with pytest.raises(ConfigError, match=key):
+        policy(**{key: -1e-9})
+
+
+@pytest.mark.parametrize("value", [-0.1, float("inf"), float("nan"), "long"])
+def test_a_start_up_time_is_some_seconds(value):
+    assert policy(startup_s={"dark": 0.0, "bright": 8}).startup_s["bright"] == 8
+    with pytest.raises(ConfigError, match=r"startup_s\.dark"):
+        policy(startup_s={"dark": value})
+
+
+def test_a_gap_as_long_as_the_window_is_bridged_by_two_votes():
+    for gap_ns, is_confirmed in ((2 * S, True), (2 * S + 1, False)):
+        window = WindowFilter(window_s=2.0, first_window_s=0.0)
+        window.update(SceneVote(stamp_ns=0, scene="Bright"))
+        window.update(SceneVote(stamp_ns=S, scene="Dark"))
+        found = window.update(SceneVote(stamp_ns=S + gap_ns, scene="Dark"))
+        assert (found is not None) == is_confirmed
+
+
+class Likely(ScriptedDetector):
+    """Votes with likelihoods."""
+
+    def __init__(self, likelihoods):
+        super().__init__(lambda index: "Bright")
+        self._likelihoods = likelihoods
+
+    def get_scene(self, observation):
+        return replace(super().get_scene(observation), likelihoods=self._likelihoods)
+
+
+@pytest.mark.parametrize(
+    ("likelihoods", "is_valid"),
+    [
+        (None, True),
+        ({"Bright": 0.0, "Dark": 1e-9}, True),
+        ({"Bright": 7.0}, True),
+        ({"Bright": 0.0, "Dark": 0.0}, False),
+        ({"Bright": 1.0, "Dark": -1e-9}, False),
+        ({"Bright": float("inf"), "Dark": 0.5}, False),
+        ({"Bright": 1.0, "Plain": 1.0}, False),
+        ({"Bright": 1.0, "Dark": 1.0, "Plain": 1.0}, False),
+        ({"Plain": 1.0}, False),
+    ],
+)
+def test_likelihoods_are_finite_of_known_scenes_and_not_all_zero(likelihoods, is_valid):
+    log = EventLog()
+    window = WindowFilter(window_s=1.0, first_window_s=0.0)
+    watch = Watch(Likely(likelihoods), None, log, scene_filter=window)
+    watch.look(observation(0))
+    assert watch.is_working == is_valid and (events(log, "fault") == []) == is_valid
+
+
+def test_constant_velocity_ends_at_its_horizon_and_keeps_the_twist():
+    def at(stamp_ns):
+        return replace(observation(0, has_odometry=False), stamp_ns=stamp_ns)
+
+    T_step = se3.exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.2]))
+    bridge = Bridge(velocity_horizon_s=0.5, uses_odometry=True)
+    bridge.update(at(S), se3.identity())
+    bridge.update(at(S + S // 5), T_step)
+    end_ns = S + S // 5 + S // 2
+    for stamp_ns, steps in ((S + 2 * S // 5, 2.0), (end_ns, 3.5)):
+        expected = se3.exp(steps * se3.log(T_step))
+        np.testing.assert_allclose(bridge.predict(at(stamp_ns), by_velocity=True), expected)
+    assert bridge.copy().predict(at(end_ns + 1), by_velocity=True) is None
+    assert bridge.predict(at(end_ns), by_velocity=False) is not None  # it is known by now
+
+
+@pytest.mark.parametrize("kept", [4, 5])
+def test_the_median_is_that_of_the_newest_values(kept):
+    rng, median, given = np.random.default_rng(0), RecentMedian(kept, width=2), []
+    for count in range(1, 14):
+        given.append(rng.normal(size=2))
+        median.add(given[-1])
+        assert len(median) == min(count, kept)
+        np.testing.assert_allclose(median.median, np.median(given[-kept:], axis=0))
+
+
+def test_events_are_the_same_whether_they_are_packed_or_new():
+    log, count = EventLog(), 2000
+    for index in range(count):
+        log.add("vote", index, value=float("nan") if index % 2 else 1.0)
+        if index % 100 == 0:
+            log.flush()
+    stamps = [event["stamp_ns"] for event in log.events]
+    assert stamps == list(range(count)) and log.events[1]["value"] is None
+    for first in (0, 1, 511, 512, 513, 1023, 1024, 1025, 1536, 1999, 2000):
+        assert [event["stamp_ns"] for event in log.since(first)] == stamps[first:]
+
+
+def test_standard_deviations_of_a_handover_are_those_of_position_and_rotation():
+    log, covariances = EventLog(), np.zeros((3, 6, 6))
+    covariances[2] = np.diag([1.0, 4.0, 4.0, 0.04, 0.04, 0.01])
+    log_uncertainty(log, [SessionStart(stamp_ns=5, session=1, module="b", row=2)], covariances)
+    (event,) = log.events
+    assert event["deviation_m"] == pytest.approx(3.0)
+    assert event["deviation_rad"] == pytest.approx(0.3)
+
+
+SIGMAS, WHEELS = 3.0, Wheels(drift_ratio=0.02, drift_rad_per_m=0.01)
+
+
+def judged(T_local_base, T_odom_base, *, after_ns=S // 2, wheels=WHEELS):
+    """Return the judgement of one motion, from the identity to the poses given."""
+    gate = Gate(GateSettings(sigmas=SIGMAS), wheels)
+    gate.update(0, T_local_base=np.eye(4), T_odom_base=np.eye(4))
+    return gate.update(after_ns, T_local_base=T_local_base, T_odom_base=T_odom_base)
+
+
+def test_the_bound_of_a_distance_grows_with_the_distance():
+    for way_m, apart_m in ((0.0, 0.05), (1.0, 0.12), (4.0, 0.4)):
+        found = judged(se3.from_xy_yaw(way_m + apart_m, 0.0, 0.0), se3.from_xy_yaw(way_m, 0.0, 0.0))
+        assert found.distance_excess == pytest.approx(apart_m / (SIGMAS * (0.03 + 0.02 * way_m)))
+        # No wrong scale explains half of the distance: then the turn is wrong, too.
+        assert found.turn_excess == pytest.approx(apart_m / (SIGMAS * 0.03 + 0.5 * way_m))
+
+
+def test_the_bound_of_a_turn_grows_with_turn_and_distance():
+    for way_m, turn_rad, apart_rad in ((0.0, 0.0, 0.03), (0.0, 0.5, 0.06), (2.0, 0.5, 0.1)):
+        found = judged(
+            se3.from_xy_yaw(way_m, 0.0, turn_rad + apart_rad), se3.from_xy_yaw(way_m, 0.0, turn_rad)
+        )
+        bound_rad = SIGMAS * (0.0175 + 0.02 * turn_rad + 0.01 * way_m)
+        assert found.turn_excess == pytest.approx(apart_rad / bound_rad)
+        assert found.distance_excess == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_motion_as_far_apart_as_the_bound_is_no_disagreement():
+    bound_m = SIGMAS * 0.03
+    for share, verdict in ((0.999, GateVerdict.PROBATION), (1.001, GateVerdict.DISAGREE)):
+        found = judged(se3.from_xy_yaw(share * bound_m, 0.0, 0.0), np.eye(4))
+        assert found.distance is verdict
+
+
+def test_probation_ends_after_one_second():
+    for after_ns, verdict in ((S - 1, GateVerdict.PROBATION), (S, GateVerdict.AGREE)):
+        found = judged(np.eye(4), np.eye(4), after_ns=after_ns)
+        assert found.distance is verdict and found.turn is GateVerdict.AGREE
+
+
+class Clock:
+    """Time that passes only where the test says so."""
+
+    def __init__(self):
+        self.ns = 0
+
+    def __call__(self):
+        return self.ns
+
+    def spend(self, ms):
+        self.ns += round(ms * 1e6)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    for module in ("bus", "handover", "runner", "watch"):
+        monkeypatch.setattr(f"sceneslam.bus.{module}.perf_counter_ns", clock)
+    return clock
+
+
+class Costly(ExactModule):
+    """A start takes 40 ms, an observation 5 ms, the end 70 ms."""
+
+    def __init__(self, clock):
+        super().__init__()
+        self._clock = clock
+
+    def activate(self, rig):
+        self._clock.spend(40)
+        super().activate(rig)
+
+    def track(self, observation):
+        self._clock.spend(5)
+        return super().track(observation)
+
+    def shutdown(self):
+        self._clock.spend(70)
+        super().shutdown()
+
+
+def test_the_time_of_the_bus_is_without_that_of_modules_and_detector(clock):
+    def scene_at(index):
+        clock.spend(3)
+        return "Dark" if index >= 20 else "Bright"
+
+    modules = {key: Costly(clock) for key in ("bright", "dark")}
+    clock.spend(1000)
+    bus, _, log, _ = drive(
+        modules, steps=50, scene_at=scene_at, handover="rewind", confirm_window_s=1.0
+    )
+    assert list(bus.detector_us) == [3000.0] * 50
+    assert list(bus.bus_us) == [0.0] * 50
+    # The first module is started at 0; the second at 30, where the scene since 20 is confirmed.
+    bright, dark = bus.runners["bright"], bus.runners["dark"]
+    assert list(bright.track_ms) == [5.0] * 31 and list(dark.track_ms) == [5.0] * (11 + 19)
+    assert bright.start_ns == dark.start_ns == 40_000_000
+    assert bright.spent_ns == 40_000_000 + 31 * 5_000_000 + 70_000_000
+    first, second = events(log, "cost")
+    assert (first["handover_ms"], first["first_pose_ms"], first["catch_up_s"]) == (45, 45, 0)
+    assert second["handover_ms"] == 40 + 11 * 5 and second["first_pose_ms"] == 40 + 5
+    assert second["catch_up_s"] == 10 * PERIOD_NS / 1e9

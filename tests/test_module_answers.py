@@ -1,0 +1,153 @@
+"""What the bus accepts of a module's answers, up to the limits."""
+
+from dataclasses import replace
+
+import hostile
+import numpy as np
+import pytest
+from fakes import ExactModule, observation
+
+from sceneslam.bus.answers import checked_layers, checked_tracking, checked_trajectory
+from sceneslam.types import se3
+from sceneslam.types.maps import (
+    GridLayer,
+    LandmarkLayer,
+    LoopLayer,
+    MapLayers,
+    PointLayer,
+    PoseGraphLayer,
+)
+from sceneslam.types.trajectory import Trajectory
+
+USABLE = {"covariance huge", "a complex pose"}  # odd, but every number that is used is finite
+USABLE_MAPS = {"a cloud beyond all measure"}
+USABLE_TRAJECTORIES = {"stamps of another time"}
+
+
+def tracked():
+    module = ExactModule()
+    module.activate(None)
+    return module.track(observation(7))
+
+
+STAMP_NS = observation(7).stamp_ns
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", sorted(set(hostile.ANSWERS) - USABLE))
+def test_an_invalid_answer_is_refused(name):
+    with pytest.raises((TypeError, ValueError)):
+        checked_tracking(hostile.ANSWERS[name](tracked()), STAMP_NS)
+
+
+@pytest.mark.parametrize("name", sorted(set(hostile.MAPS) - USABLE_MAPS))
+def test_an_invalid_map_is_refused(name):
+    with pytest.raises((TypeError, ValueError)):
+        checked_layers(hostile.MAPS[name])
+
+
+@pytest.mark.parametrize("name", sorted(set(hostile.TRAJECTORIES) - USABLE_TRAJECTORIES))
+def test_an_invalid_trajectory_is_refused(name):
+    with pytest.raises((TypeError, ValueError)):
+        checked_trajectory(hostile.TRAJECTORIES[name])
+
+
+def with_pose(x_m=0.0, scale=1.0):
+    T_local_base = se3.from_xy_yaw(x_m, 0.0, 0.3)
+    T_local_base[:3, :3] *= scale
+    return {"T_local_base": T_local_base}
+
+
+@pytest.mark.parametrize(
+    ("good", "bad"),
+    [
+        ({"quality_ratio": 0.0}, {"quality_ratio": -0.01}),
+        ({"quality_ratio": 1.0}, {"quality_ratio": 1.01}),
+        ({"covariance": np.zeros((6, 6))}, {"covariance": np.diag([1.0] * 5 + [-1e-9])}),
+        (with_pose(x_m=0.99e8), with_pose(x_m=1.01e8)),
+        (with_pose(x_m=-0.99e8), with_pose(x_m=-1.01e8)),
+        (with_pose(scale=1.00049), with_pose(scale=1.00051)),
+        (with_pose(scale=0.99951), with_pose(scale=0.99949)),
+    ],
+)
+def test_an_answer_is_accepted_up_to_the_limits(good, bad):
+    assert checked_tracking(replace(tracked(), **good), STAMP_NS).stamp_ns == STAMP_NS
+    with pytest.raises(ValueError, match="expected"):
+        checked_tracking(replace(tracked(), **bad), STAMP_NS)
+
+
+def test_a_checked_pose_is_a_copy_that_nobody_changes():
+    given = tracked()
+    pose = checked_tracking(given, STAMP_NS).T_local_base
+    assert not pose.flags.writeable and not np.shares_memory(pose, given.T_local_base)
+
+
+def test_stamps_of_a_trajectory_increase():
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    assert len(checked_trajectory(Trajectory.empty())) == 0
+    assert len(checked_trajectory(Trajectory(stamps_ns=np.arange(3), T_world_base=poses))) == 3
+    with pytest.raises(ValueError, match="rising"):
+        checked_trajectory(Trajectory(stamps_ns=np.array([1, 2, 2]), T_world_base=poses))
+
+
+POSES = np.tile(np.eye(4), (2, 1, 1))
+LAYERS = {
+    "points": PointLayer(points=np.ones((5, 3), np.float32), colors_bgr=np.ones((5, 3), np.uint8)),
+    "grid": GridLayer(
+        log_odds=np.ones((4, 7), np.float32), resolution_m=0.05, origin_xy_m=(1.0, 2.0)
+    ),
+    "pose_graph": PoseGraphLayer(
+        stamps_ns=np.arange(3),
+        T_world_base=np.tile(np.eye(4), (3, 1, 1)),
+        edges=np.array([[0, 1], [1, 2]]),
+        T_from_to=POSES,
+        information=np.ones((2, 6, 6)),
+        is_loop=np.zeros(2, bool),
+    ),
+    "landmarks": LandmarkLayer(
+        points=np.ones((5, 3), np.float32),
+        first_stamps_ns=np.arange(5),
+        sightings=np.ones(5, np.int32),
+    ),
+    "loops": LoopLayer(
+        stamps_ns=np.arange(4).reshape(2, 2), T_from_to=POSES, information=np.ones((2, 6, 6))
+    ),
+}
+ARRAYS = [
+    (name, field)
+    for name, layer in LAYERS.items()
+    for field in layer.__dataclass_fields__
+    if isinstance(getattr(layer, field), np.ndarray)
+]
+
+
+@pytest.mark.parametrize("name", LAYERS)
+def test_a_valid_layer_is_accepted(name):
+    layers = MapLayers(**{name: LAYERS[name]})
+    assert checked_layers(layers) is layers
+
+
+@pytest.mark.parametrize(("name", "field"), ARRAYS)
+def test_an_array_of_a_wrong_shape_is_refused_with_its_name(name, field):
+    array = getattr(LAYERS[name], field)
+    if name == "grid":
+        wrong = [array[0], array[None]]
+    else:
+        wrong = [array[..., None], *(np.delete(array, 0, axis) for axis in range(1, array.ndim))]
+    for one in wrong:
+        with pytest.raises(ValueError, match=rf"^{name}\.{field}: expected"):
+            checked_layers(MapLayers(**{name: replace(LAYERS[name], **{field: one})}))
+
+
+@pytest.mark.parametrize("name", sorted(set(LAYERS) - {"grid"}))
+def test_arrays_of_one_layer_have_one_length(name):
+    layer = LAYERS[name]
+    longest = [field for one, field in ARRAYS if one == name][-1]
+    short = replace(layer, **{longest: getattr(layer, longest)[:-1]})
+    with pytest.raises(ValueError, match=rf"^{name}\."):
+        checked_layers(MapLayers(**{name: short}))
+
+
+def test_a_grid_has_cells_of_some_size():
+    with pytest.raises(ValueError, match="resolution_m: expected above 0, got 0"):
+        checked_layers(MapLayers(grid=replace(LAYERS["grid"], resolution_m=0.0)))
