@@ -1,23 +1,29 @@
 """Durations and thresholds of the bus, each on both sides of its limit."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
+import hostile
 import numpy as np
 import pytest
-from driving import drive, events, policy
+from driving import dark_from, drive, events, policy
 from fakes import PERIOD_NS, ExactModule, ScriptedDetector, observation
 
 from sceneslam.bus.bridge import Bridge
+from sceneslam.bus.changeover import Candidates
 from sceneslam.bus.decision import Action, Health, Situation, StandbyTrial, decide
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.gate import Gate, GateSettings, GateVerdict
 from sceneslam.bus.handover_log import log_uncertainty
+from sceneslam.bus.hold import Hold
 from sceneslam.bus.recent import RecentMedian
 from sceneslam.bus.scene_filter import WindowFilter
+from sceneslam.bus.sureness import Sureness
 from sceneslam.bus.watch import Watch
+from sceneslam.bus.wheel_scale import WheelScale
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.observation import SceneVote
+from sceneslam.types.observation import SceneVote, Tracking, TrackingStatus
 from sceneslam.types.rig import Wheels
 from sceneslam.types.run import SessionStart
 
@@ -256,6 +262,94 @@ def test_probation_ends_after_one_second():
     for after_ns, verdict in ((S - 1, GateVerdict.PROBATION), (S, GateVerdict.AGREE)):
         found = judged(np.eye(4), np.eye(4), after_ns=after_ns)
         assert found.distance is verdict and found.turn is GateVerdict.AGREE
+
+
+def test_a_motion_that_nothing_checks_is_off_by_nothing():
+    found = judged(np.eye(4), None)
+    assert found.distance is GateVerdict.UNCHECKED and found.since_ns is None
+    assert found.distance_excess == found.turn_excess == 0.0 and not found.wheels_lie
+
+
+class Seen:
+    """A module that tracks whatever holds an image, in place of a runner."""
+
+    def can_use(self, observation):
+        return observation.image_bgr is not None
+
+    def track(self, observation):
+        return Tracking(
+            stamp_ns=observation.stamp_ns,
+            T_local_base=np.eye(4),
+            status=TrackingStatus.TRACKING,
+        )
+
+
+def test_a_sensor_is_silent_after_two_of_its_periods():
+    def asked(*seen_ns, silent_ns):
+        hold = Hold(silence_ns=3 * S, gate=None)
+        for stamp_ns in seen_ns:
+            hold.ask(Seen(), replace(observation(0), stamp_ns=stamp_ns))
+        hold.ask(Seen(), replace(observation(0), image_bgr=None, stamp_ns=silent_ns))
+        return hold
+
+    held = asked(0, S // 10, silent_ns=3 * S // 10)
+    assert held.health is Health.HELD and held.is_held and held.unheld_since_ns is None
+    silent = asked(0, S // 10, silent_ns=3 * S // 10 + 1)
+    assert silent.health is Health.SILENT and not silent.is_held
+    assert silent.unheld_since_ns == silent.held_ns == 3 * S // 10 + 1
+    assert asked(0, silent_ns=6 * S).is_held and not asked(0, silent_ns=6 * S + 1).is_held
+    assert asked(silent_ns=5).unheld_since_ns == 5  # it never delivered anything
+
+
+@pytest.mark.parametrize("row", [0, 2, 3, 5])
+def test_a_pose_is_unusually_uncertain_from_twice_the_median_deviation_on(row):
+    for factor, is_usual in ((1.999, True), (2.001, False)):
+        sureness = Sureness()
+        usual = np.zeros((6, 6))
+        usual[row, row] = 1e-4
+        for _ in range(9):
+            sureness.is_usual(usual)
+        assert sureness.is_usual(factor**2 * usual) == is_usual
+    assert Sureness().is_usual(None)
+
+
+def test_the_wait_for_the_first_choice_doubles_three_times():
+    candidates = Candidates({"Bright": ["a", "b"]}, {}, 1.5, waits=True)
+    for seconds in (3.0, 6.0, 12.0, 12.0):
+        candidates.postpone(7 * S, is_in_vain=True)
+        assert candidates.retry_ns == round((7 + seconds) * 1e9)
+    candidates.postpone(7 * S, is_in_vain=False)
+    assert candidates.retry_ns == round(8.5 * 1e9)
+
+
+@pytest.mark.parametrize(("along_m", "is_learnt"), [(0.003, True), (0.5, False)])
+def test_only_the_uncertainty_along_the_motion_hides_the_scale_of_wheels(along_m, is_learnt):
+    """The robot moves at 30 degrees to its x axis, and is uncertain along this or across it."""
+    across_m = 0.503 - along_m
+    R = se3.from_xy_yaw(0.0, 0.0, np.pi / 6)[:3, :3]
+    covariance = np.eye(6) * 1e-6
+    covariance[:3, :3] = R @ np.diag([along_m**2, across_m**2, across_m**2]) @ R.T
+    scale, hold = WheelScale(), SimpleNamespace(is_trusted=True, is_revised=False, is_asked=True)
+    hold.inliers, hold.covariance = 100, covariance
+    for index in range(161):
+        ahead = R @ [0.05 * index, 0.0, 0.0]
+        hold.T_local_base = se3.from_xy_yaw(*ahead[:2], 0.0)
+        scale.learn(hold, se3.from_xy_yaw(*(1.02 * ahead[:2]), 0.0), 0.0)
+    expected = 1 / 1.02 if is_learnt else 1.0
+    assert scale.scale == pytest.approx(expected, abs=0.004)
+
+
+def test_every_change_of_status_is_logged_once():
+    _, _, log, _ = drive({"bright": ExactModule(lost={50, 51}), "dark": ExactModule()})
+    told = [(event["stamp_ns"] // PERIOD_NS, event["status"]) for event in events(log, "tracking")]
+    assert told == [(0, "tracking"), (50, "lost"), (52, "tracking")]
+
+
+def test_a_module_that_leaves_nothing_is_named_once():
+    leaves = hostile.Leaves(layers="text", trajectory="a list")
+    _, _, log, _ = drive({"bright": leaves, "dark": ExactModule()}, scene_at=dark_from(20))
+    (fault,) = events(log, "fault")
+    assert "get_map" in fault["what"] and "could not give its map" in fault["what"]
 
 
 class Clock:

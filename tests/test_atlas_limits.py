@@ -1,0 +1,440 @@
+"""What the back end computes of poses, loops and layers, up to its limits."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneslam.atlas.fusion import fuse, one_per_voxel
+from sceneslam.atlas.lasting.merge import side_by_side
+from sceneslam.atlas.lasting.prune import prune
+from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map
+from sceneslam.atlas.pose_path import trajectory_of
+from sceneslam.atlas.rows import Rows
+from sceneslam.atlas.submaps.collector import Collector, Known
+from sceneslam.atlas.submaps.correction import Correction
+from sceneslam.atlas.submaps.graph import EdgeKind, PlanarEdge, consistent
+from sceneslam.atlas.submaps.own_loops import closed_loops, recognized_loops
+from sceneslam.atlas.submaps.submap import KeyPose, make_submap, motion_covariance, split
+from sceneslam.atlas.uncertainty import MAPPED, VELOCITY, WHEELS, SessionPose, propagate
+from sceneslam.types import planar, se3
+from sceneslam.types.maps import GridLayer, LoopLayer, MapLayers, PointLayer, PoseGraphLayer
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.run import BRIDGED
+
+S = 10**9
+RIG = Rig(sensors=frozenset({Sensor.ODOMETRY}))
+
+
+def at(x_m=0.0, y_m=0.0, yaw_rad=0.0):
+    return se3.from_xy_yaw(x_m, y_m, yaw_rad)
+
+
+def pitched(x_m, z_m=0.0, pitch_rad=0.0):
+    T = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, pitch_rad, 0.0]))
+    T[:3, 3] = x_m, 0.0, z_m
+    return T
+
+
+# The covariance of a pose.
+
+
+@pytest.mark.parametrize(
+    ("drift", "is_bridged"), [(WHEELS, True), (VELOCITY, True), (MAPPED, False)]
+)
+@pytest.mark.parametrize(("way_m", "turn_rad"), [(2.0, 0.0), (0.0, 0.5), (2.0, 0.5)])
+def test_a_motion_adds_the_drift_of_its_kind(drift, is_bridged, way_m, turn_rad):
+    steps = [
+        SessionPose(T_map_base=T, session=0, is_bridged=bridged, covariance=None)
+        for T, bridged in ((at(), False), (at(way_m, 0.0, turn_rad), is_bridged))
+    ]
+    found = propagate(steps, drift)[-1]
+    rotation = drift.rad_per_m * way_m + drift.rad_per_rad * turn_rad
+    random = drift.rad_per_root**2 * (way_m + turn_rad)
+    expected = np.repeat([(drift.per_m * way_m) ** 2, rotation**2 + random], 3)
+    np.testing.assert_allclose(found, np.diag(expected), atol=1e-15)
+
+
+def test_drift_of_wheels_adds_up_like_a_scale_does():
+    steps = [
+        SessionPose(T_map_base=at(x), session=0, is_bridged=x > 0, covariance=None)
+        for x in (0.0, 1.0, 3.0)
+    ]
+    assert np.sqrt(propagate(steps, WHEELS)[-1][0, 0]) == pytest.approx(0.02 * 3.0)
+
+
+def key_pose(index, T_map_base, *, session=0, drift=MAPPED, told=None):
+    return KeyPose(
+        stamp_ns=index * S,
+        scan=None,
+        T_map_base=T_map_base,
+        session=session,
+        module="a",
+        drift=drift,
+        told=told,
+    )
+
+
+@pytest.mark.parametrize("drift", [MAPPED, WHEELS, VELOCITY])
+def test_the_motion_between_two_submaps_is_as_uncertain_as_its_drift(drift):
+    places = [at(), at(1.0, 0.0, 0.1), at(2.0, 0.0, -0.1)]
+    poses = [key_pose(index, T, drift=drift) for index, T in enumerate(places)]
+    systematic = drift.rad_per_m * 2.0 + drift.rad_per_rad * 0.3
+    turn = np.hypot(systematic, drift.rad_per_root * np.sqrt(2.3))
+    shift = np.hypot(drift.per_m * 2.0, turn * 1.0)  # half of the 2 m between the ends
+    expected = np.repeat([shift**2 + 0.003**2, turn**2 + 0.002**2], 3)
+    np.testing.assert_allclose(motion_covariance(poses), np.diag(expected))
+
+
+def test_what_a_module_reports_adds_its_growth_within_one_session():
+    told = (1e-4 * np.eye(6), 3e-4 * np.eye(6))
+    first, last = (key_pose(i, at(), told=one) for i, one in enumerate(told))
+    least = np.repeat([0.003**2, 0.002**2], 3)
+    np.testing.assert_allclose(motion_covariance([first, last]), np.diag(least + 2e-4))
+    np.testing.assert_allclose(motion_covariance([last, first]), np.diag(least), atol=1e-15)
+    other = replace(last, session=1)
+    np.testing.assert_allclose(motion_covariance([first, other]), np.diag(least))
+
+
+# Steps and submaps.
+
+
+def collector(known=lambda stamp_ns: None, rig=RIG):
+    return Collector(rig, known, 0)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_step_is_a_tenth_of_a_metre_or_of_a_radian(sign):
+    own = collector()
+    assert own.has_moved(at())
+    own.step_to(at())
+    for little, enough in (
+        (at(sign * 0.099), at(sign * 0.101)),
+        (at(0.0, sign * 0.099), at(0.0, sign * 0.101)),
+        (at(0.0, 0.0, sign * 0.099), at(0.0, 0.0, sign * 0.101)),
+    ):
+        assert not own.has_moved(little) and own.has_moved(enough)
+
+
+def test_a_pose_is_level_up_to_three_degrees_and_a_slope_of_one_in_five():
+    def is_level_after(T, steps=100):
+        own = collector()
+        assert all(own.step_to(at(0.1 * index)) for index in range(steps))
+        return own.step_to(T)
+
+    for sign in (1.0, -1.0):
+        assert is_level_after(pitched(10.0, pitch_rad=sign * np.radians(2.9)))
+        assert not is_level_after(pitched(10.0, pitch_rad=sign * np.radians(3.2)))
+        assert is_level_after(pitched(9.9 + 0.5, z_m=sign * 0.099))
+        assert not is_level_after(pitched(9.9 + 0.5, z_m=sign * 0.101))
+        assert is_level_after(pitched(9.9, z_m=sign * 0.0199))  # of a step at least
+        assert not is_level_after(pitched(9.9, z_m=sign * 0.0201))
+
+
+def test_a_base_whose_steps_are_mostly_level_moves_on_a_floor():
+    own = collector()
+    for index in range(10):
+        own.step_to(pitched(0.1 * index, z_m=0.5 * (index % 2) * (index < 6)))
+    assert not own.is_level  # 4 of 10
+    for index in range(10, 12):
+        own.step_to(pitched(0.1 * index))
+    assert own.is_level  # 6 of 12
+
+
+def test_a_submap_ends_after_its_length_its_turn_and_its_session():
+    ahead = [key_pose(index, at(0.25 * index)) for index in range(25)]
+    assert [len(part) for part in split(ahead)] == [11, 11, 3]
+    turning = [key_pose(index, at(0.0, 0.0, 0.5 * index)) for index in range(30)]
+    assert [len(part) for part in split(turning)] == [13, 13, 4]
+    two = [key_pose(index, at(), session=index // 4) for index in range(6)]
+    assert [len(part) for part in split(two)] == [4, 2]
+    third = make_submap(split(ahead)[1], run=3)
+    assert (third.run, third.session, third.module) == (3, 0, "a")
+    np.testing.assert_allclose(third.T_submap_base[-1], [2.5, 0.0, 0.0], atol=1e-12)
+    assert third.stamps_ns[0] == 11 * S
+
+
+def run_of(count, *, module=lambda i: "a", session=lambda i: 0, step_s=1):
+    """Return a collector after so many steps of 0.5 m, one a second."""
+
+    def known(stamp_ns):
+        index = stamp_ns // (step_s * S)
+        return Known(
+            T_map_base=at(0.5 * index),
+            session=session(index),
+            module=module(index),
+            covariance=None,
+        )
+
+    own = collector(known)
+    for index in range(count):
+        own.step_to(at(0.5 * index))
+        own.add(index * step_s * S, None)
+    return own
+
+
+def test_submaps_are_made_of_steps_that_no_handover_replaces_any_more():
+    assert len(run_of(39).submaps) == 0  # 19 of 39 steps are 20 s old
+    half = run_of(41)  # 21 of 41
+    assert [len(one.stamps_ns) for one in half.submaps] == [6, 6, 6]
+    assert half.submaps[-1].stamps_ns[-1] == 17 * S
+    half.finish()
+    assert [len(one.stamps_ns) for one in half.submaps] == [6] * 6 + [5]
+    assert half.node_at(0) == 0 and half.node_at(-5) == 0
+    assert [half.node_at(index * S) for index in (5, 6, 35, 36, 99)] == [0, 1, 5, 6, 6]
+
+
+def test_motions_lead_from_submap_to_submap_and_their_deviations_add_up():
+    own = run_of(12)
+    own.finish()
+    (motion,) = own.motions
+    assert (motion.first, motion.second, motion.kind) == (0, 1, EdgeKind.MOTION)
+    np.testing.assert_allclose(motion.T_first_second, at(3.0), atol=1e-12)
+    np.testing.assert_array_equal(own.drift[0], np.zeros(3))
+    expected = np.sqrt(np.diag(planar.planar_covariance(motion.covariance)))
+    np.testing.assert_allclose(own.drift[1], expected)
+    own.remeasure(np.stack([at(1.0), at(5.0)]))
+    np.testing.assert_allclose(own.motions[0].T_first_second, at(4.0), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("bridged", "kind"), [({1, 2, 3}, EdgeKind.MOTION), ({1, 2, 3, 4}, EdgeKind.BRIDGE)]
+)
+def test_a_motion_that_is_bridged_for_more_than_half_is_a_bridge(bridged, kind):
+    own = run_of(7, module=lambda i: BRIDGED if i in bridged else "a")
+    own.finish()
+    assert own.motions[0].kind is kind
+    other = run_of(8, session=lambda i: i // 4)
+    other.finish()
+    assert [edge.kind for edge in other.motions] == [EdgeKind.HANDOVER]
+
+
+# Loops.
+
+
+def loop(first, second, T_first_second, sigma=0.1):
+    return PlanarEdge(
+        first=first,
+        second=second,
+        T_first_second=np.array(T_first_second),
+        covariance=np.diag([sigma**2, sigma**2, 0.01**2]),
+        kind=EdgeKind.LOOP,
+    )
+
+
+def agree(off_m, *, apart_m=0.0, drift=None):
+    """Tell whether two loops agree that differ by `off_m`, their ends `apart_m` from each other."""
+    nodes = np.array([[0, 0, 0], [0, 0, 0], [10, 0, 0], [10 + apart_m, 0, 0]], float)
+    drift = np.zeros((4, 3)) if drift is None else drift
+    loops = [loop(0, 2, [10, 0, 0]), loop(1, 3, [10 + apart_m + off_m, 0, 0])]
+    return len(consistent(loops, nodes, drift)) == 2
+
+
+def test_loops_agree_within_the_99th_percentile_of_their_uncertainty():
+    bound_m = np.sqrt(11.34) * np.sqrt(2) * 0.1
+    for sign in (1.0, -1.0):
+        assert agree(sign * 0.999 * bound_m) and not agree(sign * 1.001 * bound_m)
+
+
+def test_loops_apart_agree_within_what_their_headings_and_the_path_allow():
+    bound_m = np.sqrt(11.34) * (np.sqrt(2) * 0.1 + 3.0 * 0.01)
+    assert agree(0.999 * bound_m, apart_m=3.0) and not agree(1.001 * bound_m, apart_m=3.0)
+    drift = np.zeros((4, 3))
+    drift[2], drift[3] = [0.1, 0.1, 0.02], [0.4, 0.4, 0.08]
+    path_m, measured_m = 0.3 + 0.5 * 3.0 * 0.06, np.sqrt(2) * 0.1 + 3.0 * 0.01
+    bound_m = np.sqrt(11.34) * np.hypot(path_m, measured_m)
+    assert agree(0.999 * bound_m, apart_m=3.0, drift=drift)
+    assert not agree(1.001 * bound_m, apart_m=3.0, drift=drift)
+
+
+def test_the_largest_set_of_loops_that_agree_is_kept():
+    nodes = np.zeros((12, 3))
+    offs = [0.0, 5.0, 0.0, 5.0, 5.0, 9.0]
+    loops = [loop(2 * i, 2 * i + 1, [off, 0, 0]) for i, off in enumerate(offs)]
+    assert consistent(loops, nodes, np.zeros((12, 3))) == [1, 3, 4]
+    assert consistent(loops[:1], nodes, np.zeros((12, 3))) == [0]
+    assert consistent([], nodes, np.zeros((12, 3))) == []
+
+
+def test_a_motion_in_the_plane_keeps_height_and_tilt_as_a_floor_does():
+    covariance = np.diag([0.04, 0.09, 0.01])
+    edge = PlanarEdge(
+        first=1,
+        second=4,
+        T_first_second=np.array([1.0, 2.0, 0.3]),
+        covariance=covariance,
+        kind=EdgeKind.LOOP,
+    ).shifted(2)
+    spatial = edge.spatial
+    assert (spatial.first, spatial.second) == (3, 6)
+    expected = [0.04, 0.09, 0.05**2, 0.02**2, 0.02**2, 0.01]
+    np.testing.assert_allclose(spatial.covariance, np.diag(expected))
+    np.testing.assert_allclose(spatial.planar.covariance, covariance)
+    np.testing.assert_allclose(spatial.planar.T_first_second, [1.0, 2.0, 0.3])
+
+
+def test_loops_of_modules_have_their_stamps_and_the_inverse_of_their_information():
+    information = np.stack([np.diag([4.0, 25.0, 1.0, 100.0, 1.0, 1.0])] * 3)
+    poses = np.stack([at(1.0), at(2.0), at(3.0)])
+    graph = PoseGraphLayer(
+        stamps_ns=np.array([10, 20, 30]),
+        T_world_base=poses,
+        edges=np.array([[0, 1], [1, 2], [0, 2]]),
+        T_from_to=poses,
+        information=information,
+        is_loop=np.array([False, False, True]),
+    )
+    layer = LoopLayer(
+        stamps_ns=np.array([[5, 25]]), T_from_to=poses[:1], information=information[:1]
+    )
+    (closed,) = closed_loops([MapLayers(), MapLayers(pose_graph=graph)])
+    (recognized,) = recognized_loops([MapLayers(pose_graph=graph), MapLayers(loops=layer)])
+    assert (closed.from_ns, closed.to_ns) == (10, 30)
+    assert (recognized.from_ns, recognized.to_ns) == (5, 25)
+    np.testing.assert_array_equal(closed.T_from_to, at(3.0))
+    expected = np.diag([0.25, 0.04, 1.0, 0.01, 1.0, 1.0]) + 1e-6 * np.eye(6)
+    for found in (closed, recognized):
+        np.testing.assert_allclose(found.covariance, expected)
+
+
+@pytest.mark.parametrize("sigma_yaw", [1e-6, 0.1])
+def test_a_correction_is_interpolated_between_nodes_and_kept_outside(sigma_yaw):
+    correction = Correction(
+        stamps_ns=np.array([10 * S, 20 * S]), T_new_old=np.stack([at(1.0), at(3.0, 2.0)])
+    )
+    stamps_ns = np.array([0, 10, 15, 20, 30]) * S
+    moved = correction.apply(stamps_ns, np.tile(at(5.0, 0.0, sigma_yaw), (5, 1, 1)))
+    expected = [[6, 0], [6, 0], [7, 1], [8, 2], [8, 2]]
+    np.testing.assert_allclose(moved[:, :2, 3], expected, atol=1e-9)
+    one = Correction(stamps_ns=np.array([10 * S]), T_new_old=at(1.0)[None])
+    np.testing.assert_allclose(one.apply(stamps_ns, np.tile(at(), (5, 1, 1)))[:, 0, 3], 1.0)
+
+
+# Layers of all sessions in one map.
+
+
+def test_one_point_is_kept_per_voxel_and_owner():
+    points = np.array(
+        [[0.01, 0, 0], [0.09, 0, 0], [0.11, 0, 0], [0.01, 0.11, 0], [0.01, 0, 0.11], [-0.01, 0, 0]],
+        np.float32,
+    )
+    owner = np.zeros(6, np.uint8)
+    assert one_per_voxel(points, owner, 0.1).tolist() == [0, 2, 3, 4, 5]
+    owner[1] = 255
+    assert one_per_voxel(points, owner, 0.1).tolist() == [0, 1, 2, 3, 4, 5]
+    rng = np.random.default_rng(0)
+    many = rng.uniform(-2.0, 2.0, (3000, 3)).astype(np.float32)
+    owners = rng.integers(0, 3, 3000).astype(np.uint8)
+    cells = np.column_stack([np.floor(many / 0.3), owners])
+    _, first = np.unique(cells, axis=0, return_index=True)
+    assert one_per_voxel(many, owners, 0.3).tolist() == sorted(first.tolist())
+
+
+def grid(values, *, resolution_m=0.5, origin=(0.0, 0.0)):
+    return GridLayer(
+        log_odds=np.array(values, np.float32), resolution_m=resolution_m, origin_xy_m=origin
+    )
+
+
+def fused(*placed):
+    return fuse([("a", T, MapLayers(grid=one)) for T, one in placed], voxel_m=0.1).grid
+
+
+def test_a_grid_stays_as_it_is_and_is_moved_by_whole_cells():
+    one = grid([[1, 2, 3], [4, 5, 6]], origin=(-1.0, 0.5))
+    for T, origin in ((at(), (-1.0, 0.5)), (at(1.5, -2.0), (0.5, -1.5))):
+        found = fused((T, one))
+        np.testing.assert_array_equal(found.log_odds, one.log_odds)
+        assert found.origin_xy_m == origin and found.resolution_m == 0.5
+
+
+def test_grids_are_summed_up_to_a_limit_at_the_finer_resolution():
+    coarse, fine = grid([[4, -6]], resolution_m=1.0), grid([[8, 1, -6, 1], [0, 0, 0, 0]])
+    found = fused((at(), coarse), (at(), fine))
+    np.testing.assert_array_equal(found.log_odds, [[10, 5, -10, -5], [4, 4, -6, -6]])
+    assert found.resolution_m == 0.5
+
+
+def test_points_without_a_colour_are_grey_and_know_their_module():
+    cloud = PointLayer(points=np.array([[0, 0, 0], [5, 0, 0]], np.float32))
+    colored = replace(cloud, colors_bgr=np.full((2, 3), 7, np.uint8))
+    placed = [
+        ("b", at(), MapLayers(points=cloud)),
+        ("a", at(1.0), MapLayers(points=colored)),
+        ("b", at(2.0), MapLayers(points=cloud)),
+    ]
+    found = fuse(placed, voxel_m=0.1)
+    assert found.modules == ("b", "a") and found.point_modules.tolist() == [0, 0, 1, 1, 0, 0]
+    np.testing.assert_allclose(found.points.points[:, 0], [0, 5, 1, 6, 2, 7])
+    assert found.points.colors_bgr[:, 0].tolist() == [160, 160, 7, 7, 160, 160]
+
+
+def test_rows_grow_are_cut_and_are_read_back():
+    rows, given = Rows(2), np.arange(1400.0).reshape(700, 2)
+    for row in given:
+        rows.append(row)
+    np.testing.assert_array_equal(np.asarray(rows), given)
+    np.testing.assert_array_equal(rows[-1], given[-1])
+    np.testing.assert_array_equal(rows[256], given[256])
+    for count in (513, 512, 511, 0):
+        rows.cut(count)
+        assert len(rows) == count and np.asarray(rows).shape == (count, 2)
+        np.testing.assert_array_equal(np.asarray(rows), given[:count])
+    rows.append(given[3])
+    rows.cut(5)
+    np.testing.assert_array_equal(list(rows), given[3:4])
+    with pytest.raises(IndexError):
+        rows[1]
+    assert len(trajectory_of([], Rows(4, 4))) == 0
+
+
+# Maps of several runs.
+
+
+def a_map(count=3, *, runs=(0, 0, 1)):
+    own = run_of(6 * count)
+    own.finish()
+    submaps = tuple(replace(one, run=runs[i]) for i, one in enumerate(own.submaps))
+    nodes = np.array([planar.from_transform(T) for T in own.T_run_node])
+    return SavedMap(
+        submaps=submaps,
+        T_map_node=nodes,
+        pieces=np.array([0, 0, 1]),
+        edges=tuple(edge.planar for edge in own.motions),
+    )
+
+
+def test_two_maps_side_by_side_keep_their_runs_pieces_and_motions_apart():
+    both = side_by_side(a_map(), a_map())
+    assert both.runs == 4 and [submap.run for submap in both.submaps] == [0, 0, 1, 2, 2, 3]
+    assert both.pieces.tolist() == [0, 0, 1, 2, 2, 3]
+    assert [(edge.first, edge.second) for edge in both.edges] == [(0, 1), (1, 2), (3, 4), (4, 5)]
+    alone = side_by_side(empty_map(), a_map())
+    assert alone.pieces.tolist() == [0, 0, 1] and alone.runs == 2 and empty_map().runs == 0
+
+
+def test_motions_through_a_removed_submap_are_composed_with_their_uncertainty():
+    """Submaps without walls are covered by any later one of their piece."""
+    nodes = np.array([[0, 0, 0], [1, 0, 0.5], [1, 2, 1.0]], float)
+    covariances = [np.diag([1e-4, 4e-4, 1e-3]), np.diag([9e-4, 1e-4, 4e-3])]
+    motions = [
+        PlanarEdge(
+            first=row,
+            second=row + 1,
+            T_first_second=planar.between(nodes[row], nodes[row + 1]),
+            covariance=covariances[row],
+            kind=kind,
+        )
+        for row, kind in enumerate((EdgeKind.MOTION, EdgeKind.BRIDGE))
+    ]
+    saved = replace(a_map(), T_map_node=nodes, edges=tuple(motions), pieces=np.array([1, 0, 0]))
+    thinned = prune(saved)
+    assert len(thinned.submaps) == 2 and thinned.pieces.tolist() == [1, 0]
+    (edge,) = thinned.edges
+    assert (edge.first, edge.second, edge.kind) == (0, 1, EdgeKind.BRIDGE)
+    np.testing.assert_allclose(edge.T_first_second, nodes[2], atol=1e-12)
+    T = planar.to_transform(motions[1].T_first_second)
+    carry = se3.adjoint(se3.inverse(T))
+    carried = carry @ planar.spatial_covariance(covariances[0]) @ carry.T
+    expected = planar.planar_covariance(carried) + covariances[1]
+    np.testing.assert_allclose(edge.covariance, expected, atol=1e-12)
