@@ -7,10 +7,15 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `python -m sceneslam` sets it
 
+import hypothesis
 import pytest
 
 from sceneslam.ros.writer import ObservationWriter
 from sceneslam.testing.room import RIG, room_observation
+
+# A busy machine is slow; that is no failure of what is tested.
+hypothesis.settings.register_profile("no_deadline", deadline=None)
+hypothesis.settings.load_profile("no_deadline")
 
 _SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
