@@ -2,8 +2,11 @@
 
 import json
 import os
+import pickle
 import shutil
 import signal
+import subprocess
+import sys
 from dataclasses import asdict
 
 import numpy as np
@@ -24,16 +27,21 @@ RESULTS = ("trajectory.tum", "trajectory_online.tum", "metrics.json", "report.ht
 HEAD = JournalHeader(title="test", value_label="grey", has_odometry=True, began_in="/")
 
 
+def started(settings, folder, fds=()):
+    """Start a run in a process of its own; a forked one would lack the libraries' threads."""
+    given = folder.with_suffix(".pickle")
+    given.write_bytes(pickle.dumps((sys.path, settings, folder)))
+    code = "import pickle, sys\nfrom pathlib import Path\n"
+    code += "sys.path, *given = pickle.loads(Path(sys.argv[1]).read_bytes())\n"
+    code += "from sceneslam.app import run\nrun(*given)"
+    return subprocess.Popen([sys.executable, "-c", code, given], pass_fds=fds)
+
+
 def killed(tmp_path, at, has_report=False, **changes):
     """Run in a process that is killed at an observation; return the run's folder."""
-    folder = tmp_path / "run"
-    child = os.fork()
-    if child == 0:
-        sink = {"_target_": "fakes.Killer", "at": at}
-        run(config(sinks={"killer": sink}, run__report=has_report, **changes), folder)
-        os._exit(0)
-    _, status = os.waitpid(child, 0)
-    assert os.WTERMSIG(status) == signal.SIGKILL
+    folder, sink = tmp_path / "run", {"_target_": "fakes.Killer", "at": at}
+    settings = config(sinks={"killer": sink}, run__report=has_report, **changes)
+    assert started(settings, folder).wait() == -signal.SIGKILL
     return folder
 
 
@@ -112,12 +120,9 @@ def test_what_is_no_run_is_told_and_left_alone(tmp_path, capsys, what):
 
 def test_a_run_that_is_under_way_is_not_recovered(tmp_path):
     reading, writing = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.close(writing)
-        sink = {"_target_": "fakes.Waiter", "until": reading, "at": 5}
-        run(config(sinks={"waiter": sink}, run__report=False), tmp_path / "run")
-        os._exit(0)
+    sink = {"_target_": "fakes.Waiter", "until": reading, "at": 5}
+    settings = config(sinks={"waiter": sink}, run__report=False)
+    child = started(settings, tmp_path / "run", fds=(reading,))
     os.close(reading)
     try:
         while not (tmp_path / "run" / "waiting").exists():
@@ -125,7 +130,7 @@ def test_a_run_that_is_under_way_is_not_recovered(tmp_path):
         assert main([str(tmp_path / "run")]) == 2
     finally:
         os.close(writing)
-        os.waitpid(child, 0)
+        child.wait()
     assert len(Trajectory.read_tum(tmp_path / "run" / "trajectory.tum")) == 100
 
 
