@@ -163,7 +163,7 @@ def test_openloris_says_for_every_system_and_scene_whether_harm_was_done(folder)
     assert float(rows["home-1-1"]["alone [%]"]) < 30.0
     assert (folder / "out" / "runs" / VINS / "home-1-1" / "trajectory.tum").is_file()
     page = (folder / "out" / "report.html").read_text()
-    assert "Does the policy ever do harm? What real systems put out" in page
+    assert "Does switching ever increase the error?" in page
     command = "python -m sceneslam +experiment=openloris openloris.path=data hydra.run.dir=out"
     assert f"<pre>{command}</pre>" in page
 

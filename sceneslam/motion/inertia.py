@@ -107,10 +107,10 @@ class Inertia:
         seen = unknown @ np.linalg.inv(unknown + covariance)
         is_measured = np.diag(seen).reshape(2, 3).min(axis=1) > 0.5
         self._unmeasured_s = np.where(is_measured, 0.0, self._unmeasured_s)
-        if self.twist_s is None:
-            before, expected = np.zeros(6), unknown
+        before = np.zeros(6) if self.twist_s is None else self.twist_s
+        if self.twist_s is None or not self.has_wheels:  # nothing else would see it go wrong
+            expected = unknown
         else:
-            before = self.twist_s
             usual = np.repeat((_USUAL[self.has_wheels] * _ACCELERATION * duration_s) ** 2, 3)
             expected = self._covariance + np.diag(usual)
         fading = 1.0 - math.exp(-duration_s / _FADE_S[self.has_wheels])
