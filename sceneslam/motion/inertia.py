@@ -108,7 +108,7 @@ class Inertia:
         is_measured = np.diag(seen).reshape(2, 3).min(axis=1) > 0.5
         self._unmeasured_s = np.where(is_measured, 0.0, self._unmeasured_s)
         before = np.zeros(6) if self.twist_s is None else self.twist_s
-        if self.twist_s is None or not self.has_wheels:  # nothing else would see it go wrong
+        if self.twist_s is None:
             expected = unknown
         else:
             usual = np.repeat((_USUAL[self.has_wheels] * _ACCELERATION * duration_s) ** 2, 3)
@@ -116,7 +116,8 @@ class Inertia:
         fading = 1.0 - math.exp(-duration_s / _FADE_S[self.has_wheels])
         kept = before - fading * (before - seen @ before)
         gain = expected @ np.linalg.inv(expected + covariance)
-        now = kept + gain @ (twist_s - kept)
+        # Without wheels a measured velocity is taken as it is: nothing else would contradict it.
+        now = kept + (gain if self.has_wheels else seen) @ (twist_s - kept)
         if self.has_wheels and self.twist_s is not None:  # else a jump cannot be detected
             reach = np.repeat(_JUMP * _ACCELERATION * duration_s, 3)
             now = before + np.clip(now - before, -reach, reach)
