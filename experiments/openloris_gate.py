@@ -19,7 +19,7 @@ from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from numpy.typing import NDArray
 
-from sceneslam.bus.gate import Gate, GateSettings, GateVerdict, Judgement, with_heading
+from sceneslam.bus.gate import Gate, GateSettings, GateVerdict, Judgement
 from sceneslam.config.resolve import resolved
 from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.evaluation.correctness import CorrectLimits, correct_rate
@@ -135,7 +135,7 @@ def _drive(
         if judgement.is_trusted and module is not None:
             T_prev_curr, trusted = module, trusted + 1
         elif rule == "gate" and judgement.turn is GateVerdict.AGREE and module is not None:
-            T_prev_curr = with_heading(T_prev_curr, module[:3, :3])
+            T_prev_curr = se3.with_yaw(T_prev_curr, se3.yaw_rad(module))
         T_map_base.append(T_map_base[-1] @ T_prev_curr)
     driven = Trajectory(stamps_ns=odometry.stamps_ns, T_world_base=np.stack(T_map_base))
     return Driven(trajectory=driven, trusted_ratio=trusted / len(poses))

@@ -8,7 +8,7 @@ from driving import GATE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneslam.bus.gate import Gate, GateSettings, GateVerdict, with_heading
+from sceneslam.bus.gate import Gate, GateSettings, GateVerdict
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.rig import Wheels
@@ -155,7 +155,7 @@ def test_bridging_takes_the_way_and_the_tilt_from_the_wheels_and_the_heading_fro
     T_odom = se3.from_xy_yaw(0.1, 0.0, 0.3)
     rotation = se3.from_xy_yaw(0.2, 0.0, 0.1)[:3, :3] @ se3.so3_exp(np.array([0.1, 0.0, 0.0]))
     np.testing.assert_allclose(
-        with_heading(T_odom, rotation), se3.from_xy_yaw(0.1, 0.0, 0.1), atol=1e-12
+        se3.with_yaw(T_odom, se3.yaw_rad(rotation)), se3.from_xy_yaw(0.1, 0.0, 0.1), atol=1e-12
     )
 
 

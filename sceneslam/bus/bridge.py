@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.bus.gate import with_heading
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
@@ -69,7 +68,8 @@ class Bridge:
         if self._uses_odometry and T_odom_prev is not None and T_odom_curr is not None:
             T_prev_curr = se3.inverse(T_odom_prev) @ T_odom_curr
             if turn is not None:
-                T_prev_curr = with_heading(T_prev_curr, turn)
+                # Roll and pitch stay the wheels': a module's tilt error would appear as a climb.
+                T_prev_curr = se3.with_yaw(T_prev_curr, se3.yaw_rad(turn))
             self._note(observation.stamp_ns, self.T_map_base @ T_prev_curr)
         elif by_velocity and self._within_horizon(observation.stamp_ns):
             T_prev_curr = self._at_constant_velocity(observation.stamp_ns - self._stamp_ns)

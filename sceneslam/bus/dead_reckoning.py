@@ -35,14 +35,12 @@ class DeadReckoning:
         self._scales: dict[str, WheelScale] = {}  # by the module that measured it
         self._T_odom_base: Transform | None = None  # the last odometry, uncorrected
         self._T_corrected_base: Transform | None = None  # the same, corrected
-        self._stamp_ns: int | None = None  # of the last observation
         self._is_gap = False  # the last observation had no odometry
         self._turned_rad = 0.0  # rotation angle since the observation before [rad]
 
     def correct(self, observation: Observation, module: str) -> Observation:
         """Return the observation for a module, corrected by the calibration so far."""
         turn = self._turn(observation)
-        duration_s, self._stamp_ns = self._since_s(observation), observation.stamp_ns
         before, now = self._T_odom_base, observation.T_odom_base
         is_gap, self._is_gap = self._is_gap, now is None
         self._turned_rad = 0.0
@@ -65,10 +63,10 @@ class DeadReckoning:
         T_prev_curr[:3, 3] *= 1.0 if learnt is None else learnt.scale
         assert self._T_corrected_base is not None
         self._T_corrected_base = se3.chained(self._T_corrected_base, T_prev_curr)
-        if self._measures_tilt:
+        if self._motion is not None and self._motion.measures_tilt:
             self._T_corrected_base = levelled(
                 self._T_corrected_base,
-                duration_s,
+                self._motion.duration_s,
                 by_gravity=up_by(observation.accelerometer_base),
                 by_odometry=now[2, :3],
             )
@@ -93,10 +91,6 @@ class DeadReckoning:
             log.add("calibration", stamp_ns, **known)
         self._scales, self._motion = {}, None
 
-    @property
-    def _measures_tilt(self) -> bool:
-        return self._motion is not None and self._motion.measures_tilt
-
     def _turn(self, observation: Observation) -> NDArray[np.float64] | None:
         """Return the rotation (3, 3) since the last observation, None without a gyro."""
         if self._motion is None:
@@ -105,13 +99,9 @@ class DeadReckoning:
 
     def _turned(self, T_prev_curr: Transform, turn: NDArray[np.float64]) -> Transform:
         """Return the odometry's motion with the gyro's rotation, or its yaw if that is biased."""
-        if self._measures_tilt:
+        if self._motion is not None and self._motion.measures_tilt:
             return se3.from_parts(turn, T_prev_curr[:3, 3])
-        return se3.with_yaw(T_prev_curr, float(np.arctan2(turn[1, 0], turn[0, 0])))
-
-    def _since_s(self, observation: Observation) -> float:
-        before_ns = self._stamp_ns
-        return 0.0 if before_ns is None else max((observation.stamp_ns - before_ns) * 1e-9, 0.0)
+        return se3.with_yaw(T_prev_curr, se3.yaw_rad(turn))
 
     def _without_bias(self, observation: Observation) -> Observation:
         if self._motion is None or observation.gyro_base is None:

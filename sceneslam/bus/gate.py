@@ -81,15 +81,6 @@ _USUAL_MIN, _USUAL_KEPT = 100, 150  # 20 to 30 s of driving: a short fault is no
 _GOOD = (GateVerdict.AGREE, GateVerdict.UNCHECKED)
 
 
-def with_heading(T_prev_curr_odom: Transform, rotation: NDArray[np.float64]) -> Transform:
-    """Return the odometry's motion (4, 4) with the heading of a module whose turn is trusted.
-
-    `rotation` (3, 3) is the module's over the same time. Translation, roll and pitch stay the
-    wheels', which stay on the floor: a module's tilt error would appear as a climb.
-    """
-    return se3.with_yaw(T_prev_curr_odom, float(np.arctan2(rotation[1, 0], rotation[0, 0])))
-
-
 @dataclass(slots=True, kw_only=True, eq=False)
 class _Sample:
     stamp_ns: int

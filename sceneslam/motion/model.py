@@ -48,6 +48,7 @@ class MotionModel:
         self._turns = TurnErrors(rig.gyro.bias_radps)
         self._distance = DistanceError(rig.wheels.drift_ratio, drift=_WEAR * rig.wheels.drift_ratio)
         self._stamp_ns: int | None = None
+        self.duration_s = 0.0  # between the last two observations
         self._T_odom_base: Transform | None = None  # the last odometry
         self._silent_s = 0.0  # time since then
         self._gap: Transform | None = None  # predicted motion since then; None: no gap
@@ -103,7 +104,7 @@ class MotionModel:
                 covariance=np.zeros((6, 6)),
                 is_measured=self._T_odom_base is not None,
             )
-        duration_s = max((observation.stamp_ns - before_ns) * 1e-9, 0.0)
+        duration_s = self.duration_s = max((observation.stamp_ns - before_ns) * 1e-9, 0.0)
         for lie in self._lies:
             lie.wait(duration_s)
         gap = self._gap

@@ -36,7 +36,7 @@ def from_xy_yaw(x_m: float, y_m: float, yaw_rad: float) -> Transform:
 
 
 def yaw_rad(T_a_b: Transform) -> float:
-    """Return the rotation about z [rad] (REP-103: x forward, z up)."""
+    """Return the rotation about z [rad] (REP-103: x forward, z up); T_a_b may be (3, 3), too."""
     return float(np.arctan2(T_a_b[1, 0], T_a_b[0, 0]))
 
 
