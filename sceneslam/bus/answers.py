@@ -8,42 +8,26 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.types.maps import (
-    GridLayer,
-    LandmarkLayer,
-    LoopLayer,
-    MapLayers,
-    PointLayer,
-    PoseGraphLayer,
-)
+from sceneslam.types.maps import LAYER_TYPES, MapLayers
 from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.trajectory import Trajectory
 
 _FAR_M = 1e8  # more than twice around the Earth
 _SKEW_MAX = 1e-3  # largest deviation of R^T R from the identity; float32 rounds to 1e-6
 _Shapes = dict[str, tuple[str | int, ...]]
-_LAYERS: dict[str, tuple[type, _Shapes]] = {
-    "points": (PointLayer, {"points": ("N", 3), "colors_bgr": ("N", 3)}),
-    "grid": (GridLayer, {"log_odds": ("rows", "columns")}),
-    "pose_graph": (
-        PoseGraphLayer,
-        {
-            "stamps_ns": ("N",),
-            "T_world_base": ("N", 4, 4),
-            "edges": ("M", 2),
-            "T_from_to": ("M", 4, 4),
-            "information": ("M", 6, 6),
-            "is_loop": ("M",),
-        },
-    ),
-    "landmarks": (
-        LandmarkLayer,
-        {"points": ("N", 3), "first_stamps_ns": ("N",), "sightings": ("N",)},
-    ),
-    "loops": (
-        LoopLayer,
-        {"stamps_ns": ("M", 2), "T_from_to": ("M", 4, 4), "information": ("M", 6, 6)},
-    ),
+_SHAPES: dict[str, _Shapes] = {  # of the arrays of each layer
+    "points": {"points": ("N", 3), "colors_bgr": ("N", 3)},
+    "grid": {"log_odds": ("rows", "columns")},
+    "pose_graph": {
+        "stamps_ns": ("N",),
+        "T_world_base": ("N", 4, 4),
+        "edges": ("M", 2),
+        "T_from_to": ("M", 4, 4),
+        "information": ("M", 6, 6),
+        "is_loop": ("M",),
+    },
+    "landmarks": {"points": ("N", 3), "first_stamps_ns": ("N",), "sightings": ("N",)},
+    "loops": {"stamps_ns": ("M", 2), "T_from_to": ("M", 4, 4), "information": ("M", 6, 6)},
 }
 Value = TypeVar("Value")
 
@@ -81,10 +65,10 @@ def checked_trajectory(trajectory: object) -> Trajectory:
 def checked_layers(layers: object) -> MapLayers:
     """Return a map whose arrays have the declared shapes and hold finite numbers."""
     layers = _of("get_map's answer", layers, MapLayers)
-    for name, (kind, shapes) in _LAYERS.items():
+    for name, kind in LAYER_TYPES.items():
         layer = getattr(layers, name)
         if layer is not None:
-            _check_layer(name, _of(name, layer, kind), shapes)
+            _check_layer(name, _of(name, layer, kind), _SHAPES[name])
     if layers.grid is not None and not layers.grid.resolution_m > 0:
         raise ValueError(f"grid.resolution_m: expected above 0, got {layers.grid.resolution_m}")
     return layers

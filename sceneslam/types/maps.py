@@ -72,6 +72,15 @@ class MapLayers:
     loops: LoopLayer | None = None
 
 
+LAYER_TYPES: dict[str, type] = {  # by the fields of MapLayers
+    "points": PointLayer,
+    "grid": GridLayer,
+    "pose_graph": PoseGraphLayer,
+    "landmarks": LandmarkLayer,
+    "loops": LoopLayer,
+}
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HybridMap:
     """The map of a run, in `map`: the layers of all modules, and one grid."""

@@ -8,14 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.types.maps import (
-    GridLayer,
-    LandmarkLayer,
-    LoopLayer,
-    MapLayers,
-    PointLayer,
-    PoseGraphLayer,
-)
+from sceneslam.types.maps import LAYER_TYPES, MapLayers
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
@@ -23,13 +16,6 @@ from sceneslam.types.trajectory import Trajectory
 from .protocol import Fields, ProtocolError, as_text, text
 
 _STATUSES = (TrackingStatus.TRACKING, TrackingStatus.DEGRADED, TrackingStatus.LOST)
-_LAYERS = {
-    "points": PointLayer,
-    "grid": GridLayer,
-    "pose_graph": PoseGraphLayer,
-    "landmarks": LandmarkLayer,
-    "loops": LoopLayer,
-}
 _SKEW_MAX = 1e-3  # as the bus allows
 Layer = TypeVar("Layer")
 
@@ -94,7 +80,7 @@ def trajectory(reply: Fields) -> Trajectory:
 
 def layers(reply: Fields) -> MapLayers:
     """Return the map's layers: `points.points`, `grid.log_odds`, ...; other fields are unused."""
-    found = {name: _layer(reply, name, kind) for name, kind in _LAYERS.items()}
+    found = {name: _layer(reply, name, kind) for name, kind in LAYER_TYPES.items()}
     return MapLayers(**found)
 
 
