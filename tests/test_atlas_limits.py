@@ -395,7 +395,7 @@ def a_map(count=3, *, runs=(0, 0, 1)):
     own = run_of(6 * count)
     own.finish()
     submaps = tuple(replace(one, run=runs[i]) for i, one in enumerate(own.submaps))
-    nodes = np.array([planar.from_transform(T) for T in own.T_run_node])
+    nodes = planar.from_transforms(own.T_run_node)
     return SavedMap(
         submaps=submaps,
         T_map_node=nodes,

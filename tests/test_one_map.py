@@ -123,13 +123,13 @@ def edge_of(first, second, T_first_second, sigma, kind=EdgeKind.LOOP):
 def solved(nodes, motions, loops):
     """The solution of a planar graph, and its poses in the plane."""
     result = solve(
-        np.array([planar.to_transform(node) for node in nodes]),
+        planar.to_transforms(nodes),
         [edge.spatial for edge in motions],
         [edge.spatial for edge in loops],
         fixed=(),
         loose=0,
     )
-    return result, np.array([planar.from_transform(T) for T in result.T_map_node])
+    return result, planar.from_transforms(result.T_map_node)
 
 
 def test_loops_that_agree_are_believed_and_a_wrong_one_is_not():

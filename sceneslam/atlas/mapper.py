@@ -19,7 +19,7 @@ from sceneslam.atlas.submaps.collector import Collector, Known
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.submaps.graph import PlanarEdge
 from sceneslam.atlas.submaps.own_loops import Path
-from sceneslam.atlas.submaps.run_graph import RunGraph, planar_of
+from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.scans.key_scan import KeyScanner
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import MapLayers
@@ -120,7 +120,8 @@ class Mapper:
         graph = RunGraph(own, self._loaded, path)
         fixes = self._localizer.fixes if self._localizer is not None and self.is_placed else []
         solved = graph.solve(self.T_map_run @ old, maps, fixes, closed)
-        self._loops, self._T_map_node = list(solved.loops), planar_of(solved.T_map_node)
+        self._loops = list(solved.loops)
+        self._T_map_node = planar.from_transforms(solved.T_map_node)
         for loop in self._loops:
             self._tell(loop)
         if not self._loops and not self.is_placed:
@@ -132,7 +133,7 @@ class Mapper:
         count, pieces = len(self._loaded.submaps), self._loaded.pieces
         own, nodes = self._collector, self._T_map_node
         if nodes is None:
-            nodes = planar_of([self.T_map_run @ T for T in own.T_run_node])
+            nodes = planar.from_transforms([self.T_map_run @ T for T in own.T_run_node])
         piece = 0 if self.is_found else int(pieces.max(initial=-1)) + 1
         return SavedMap(
             submaps=(*self._loaded.submaps, *own.submaps),

@@ -29,15 +29,13 @@ def export(saved: SavedMap, folder: Path) -> list[Path]:
 
 def _graph(saved: SavedMap) -> PoseGraphLayer:
     stamps = np.array([submap.stamps_ns[0] for submap in saved.submaps], np.int64)
-    nodes = np.array([planar.to_transform(pose) for pose in saved.T_map_node])
-    motions = np.array([planar.to_transform(edge.T_first_second) for edge in saved.edges])
     return PoseGraphLayer(
         stamps_ns=stamps,
-        T_world_base=nodes.reshape(-1, 4, 4),
+        T_world_base=planar.to_transforms(saved.T_map_node),
         edges=np.array([(edge.first, edge.second) for edge in saved.edges], np.int64).reshape(
             -1, 2
         ),
-        T_from_to=motions.reshape(-1, 4, 4),
+        T_from_to=planar.to_transforms([edge.T_first_second for edge in saved.edges]),
         information=np.array([_information(edge.covariance) for edge in saved.edges]).reshape(
             -1, 6, 6
         ),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +22,18 @@ def to_transform(pose: Planar) -> se3.Transform:
 def from_transform(T_a_b: se3.Transform) -> Planar:
     """Return the planar part (3,), x, y [m], yaw [rad], of a transform (4, 4)."""
     return np.array([T_a_b[0, 3], T_a_b[1, 3], se3.yaw_rad(T_a_b)])
+
+
+def to_transforms(poses: Sequence[Planar] | NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the transforms (N, 4, 4) of planar ones (N, 3)."""
+    return np.array([to_transform(pose) for pose in poses]).reshape(-1, 4, 4)
+
+
+def from_transforms(
+    T_a_b: Sequence[se3.Transform] | NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the planar parts (N, 3), x, y [m], yaw [rad], of transforms (N, 4, 4)."""
+    return np.array([from_transform(T) for T in T_a_b]).reshape(-1, 3)
 
 
 def compose(T_a_b: Planar, T_b_c: Planar) -> Planar:

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sceneslam.types import se3
-from sceneslam.types.planar import Planar, between, betweens, composed
+from sceneslam.types.planar import Planar, between, betweens, composed, to_transforms
 from sceneslam.types.trajectory import Trajectory
 
 from .keyframes import ScanKeyframes
@@ -55,5 +54,4 @@ class RelativePoseHistory:
         between_ns = np.maximum(kept_ns[own + 1] - kept_ns[own], 1)  # stamps may repeat
         share = (stamps_ns[follows] - kept_ns[own]) / between_ns
         told[follows] = composed(told[follows], np.clip(share, 0.0, 1.0)[:, None] * missed)
-        planar = np.stack([se3.from_xy_yaw(x, y, yaw) for x, y, yaw in told.tolist()])
-        return Trajectory(stamps_ns=stamps_ns, T_world_base=planar)
+        return Trajectory(stamps_ns=stamps_ns, T_world_base=to_transforms(told))

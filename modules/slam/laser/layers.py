@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.types import se3
 from sceneslam.types.maps import MapLayers, PointLayer, PoseGraphLayer
 from sceneslam.types.observation import LaserScan
-from sceneslam.types.planar import Matrix, apply, to_transform
+from sceneslam.types.planar import Matrix, apply, to_transform, to_transforms
 
 from ..grid import OccupancyGrid
 from .keyframes import ScanKeyframes
@@ -53,16 +52,12 @@ def _graph(keyframes: ScanKeyframes, edges: Sequence[ScanEdge]) -> PoseGraphLaye
     information = [np.linalg.inv(covariance_6(edge.covariance)) for edge in edges]
     return PoseGraphLayer(
         stamps_ns=np.array([frame.stamp_ns for frame in keyframes.frames], np.int64),
-        T_world_base=_stack([to_transform(pose) for pose in keyframes.poses]),
+        T_world_base=to_transforms(keyframes.poses),
         edges=np.array([(e.first, e.second) for e in edges], np.int64).reshape(-1, 2),
-        T_from_to=_stack([to_transform(edge.T_first_second) for edge in edges]),
+        T_from_to=to_transforms([edge.T_first_second for edge in edges]),
         information=np.array(information).reshape(-1, 6, 6),
         is_loop=np.array([edge.is_loop for edge in edges], dtype=bool),
     )
-
-
-def _stack(transforms: Sequence[se3.Transform]) -> NDArray[np.float64]:
-    return np.array(transforms).reshape(-1, 4, 4)
 
 
 def _cut(scan: LaserScan, range_max_m: float) -> LaserScan:

@@ -110,13 +110,13 @@ def _solve(
         edge.spatial for edge in saved.edges if edge.first in inside and edge.second in inside
     ]
     solved = solve(
-        np.array([planar.to_transform(node) for node in nodes]),
+        planar.to_transforms(nodes),
         motions,
         [loop.spatial for loop in loops],
         fixed=[node for node in range(len(nodes)) if node not in inside],
         loose=own[0],
     )
-    return np.array([planar.from_transform(T) for T in solved.T_map_node])
+    return planar.from_transforms(solved.T_map_node)
 
 
 def _renumbered(saved: SavedMap) -> SavedMap:

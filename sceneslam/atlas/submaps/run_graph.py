@@ -49,7 +49,7 @@ class RunGraph:
         """
         own, count = self._own, self._count
         motions = [*own.motions, *self._edges_of(closed_loops(maps))]
-        plane, drift = planar_of(T_map_node), np.array(own.drift)
+        plane, drift = planar.from_transforms(T_map_node), np.array(own.drift)
         fixed = self._fix_edges(fixes)
         recognized = self._edges_of(recognized_loops(maps))
         loops = [*fixed, *(edge.planar.shifted(count) for edge in recognized)]
@@ -63,7 +63,7 @@ class RunGraph:
         if len(agreeing) < 2 and not fixed:
             agreeing = []  # no other loop agrees with it
         solved = solve(
-            np.concatenate([_spatial(self._loaded.T_map_node), T_map_node]),
+            np.concatenate([planar.to_transforms(self._loaded.T_map_node), T_map_node]),
             [_shifted(edge, count) for edge in motions],
             [spatial[index] for index in agreeing],
             fixed=range(count),
@@ -122,15 +122,6 @@ class RunGraph:
             covariance=planar.planar_covariance(_carried(covariance, T_base_node)),
             kind=EdgeKind.LOOP,
         )
-
-
-def planar_of(poses: Sequence[Transform] | NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return x [m], y [m] and yaw [rad] (N, 3) of poses (4, 4)."""
-    return np.array([planar.from_transform(T) for T in poses]).reshape(-1, 3)
-
-
-def _spatial(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.array([planar.to_transform(T) for T in poses]).reshape(-1, 4, 4)
 
 
 def _shifted(edge: Edge, by: int) -> Edge:
