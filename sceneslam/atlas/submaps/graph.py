@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,14 +37,24 @@ class EdgeKind(IntEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Edge:
-    """A measured motion between two nodes."""
+class _NodePair:
+    """Two nodes between which a motion was measured."""
 
     first: int
     second: int
+    kind: EdgeKind
+
+    def shifted(self, by: int) -> Self:
+        """Return the edge with its node numbers increased by `by`."""
+        return replace(self, first=self.first + by, second=self.second + by)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Edge(_NodePair):
+    """A measured motion between two nodes."""
+
     T_first_second: Transform
     covariance: NDArray[np.float64]  # (6, 6) of se3.log order [m, rad], axes of second
-    kind: EdgeKind
 
     @property
     def planar(self) -> PlanarEdge:
@@ -59,18 +69,11 @@ class Edge:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PlanarEdge:
+class PlanarEdge(_NodePair):
     """A measured motion between two nodes on one floor, as a map keeps it."""
 
-    first: int
-    second: int
     T_first_second: Planar
     covariance: Matrix  # (3, 3), axes of second
-    kind: EdgeKind
-
-    def shifted(self, by: int) -> PlanarEdge:
-        """Return the edge with its node numbers increased by `by`."""
-        return replace(self, first=self.first + by, second=self.second + by)
 
     @property
     def spatial(self) -> Edge:

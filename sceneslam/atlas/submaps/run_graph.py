@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,27 +51,34 @@ class RunGraph:
         motions = [*own.motions, *self._edges_of(closed_loops(maps))]
         plane, drift = planar.from_transforms(T_map_node), np.array(own.drift)
         fixed = self._fix_edges(fixes)
-        recognized = self._edges_of(recognized_loops(maps))
-        loops = [*fixed, *(edge.planar.shifted(count) for edge in recognized)]
-        spatial = [*(edge.spatial for edge in fixed), *(_shifted(e, count) for e in recognized)]
+        recognized = [edge.shifted(count) for edge in self._edges_of(recognized_loops(maps))]
         finder = LoopFinder(own.submaps, closed)
-        for second in range(len(own.submaps) if own.is_level else 0):
-            found = [edge.shifted(count) for edge in finder.loops_to(second, plane, drift)]
-            loops, spatial = [*loops, *found], [*spatial, *(edge.spatial for edge in found)]
+        found = [
+            edge.shifted(count)
+            for second in range(len(own.submaps) if own.is_level else 0)
+            for edge in finder.loops_to(second, plane, drift)
+        ]
+        loops = [
+            *((edge, edge.spatial) for edge in fixed),
+            *((edge.planar, edge) for edge in recognized),
+            *((edge, edge.spatial) for edge in found),
+        ]
         nodes = np.concatenate([self._loaded.T_map_node, plane])
-        agreeing = consistent(loops, nodes, np.concatenate([np.zeros((count, 3)), drift]))
+        agreeing = consistent(
+            [edge for edge, _ in loops], nodes, np.concatenate([np.zeros((count, 3)), drift])
+        )
         if len(agreeing) < 2 and not fixed:
             agreeing = []  # no other loop agrees with it
         solved = solve(
             np.concatenate([planar.to_transforms(self._loaded.T_map_node), T_map_node]),
-            [_shifted(edge, count) for edge in motions],
-            [spatial[index] for index in agreeing],
+            [edge.shifted(count) for edge in motions],
+            [loops[index][1] for index in agreeing],
             fixed=range(count),
             loose=count,
         )
         return SolvedRun(
             T_map_node=solved.T_map_node[count:],
-            loops=tuple(loops[agreeing[index]] for index in solved.accepted),
+            loops=tuple(loops[agreeing[index]][0] for index in solved.accepted),
         )
 
     def _edges_of(self, loops: Sequence[OwnLoop]) -> list[Edge]:
@@ -122,10 +129,6 @@ class RunGraph:
             covariance=planar.planar_covariance(_carried(covariance, T_base_node)),
             kind=EdgeKind.LOOP,
         )
-
-
-def _shifted(edge: Edge, by: int) -> Edge:
-    return replace(edge, first=edge.first + by, second=edge.second + by)
 
 
 def _carried(covariance: NDArray[np.float64], T_base_node: Transform) -> NDArray[np.float64]:
