@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.motion.step import Step, still
+from sceneslam.motion.step import UNKNOWN_VELOCITY, Step, still
 from sceneslam.motion.trust import NoiseRatio, student_cost
 from sceneslam.types import se3
 
@@ -22,7 +22,6 @@ _USUAL = {False: 1.0, True: 1 / 3}  # of that: deviation of the acceleration, by
 _FADE_S = {False: 0.5, True: 5.0}  # time constant of an unmeasured velocity, by: has wheels
 _JUMP = 3.0  # times the acceleration: a larger change of velocity is a jump
 _KEPT_S = 0.5  # longest time that an unmeasured velocity is kept
-_UNKNOWN = np.array([1.0, 2.0])  # m/s, rad/s: standard deviation of an unknown velocity
 _STEP = np.array([1e-4, 1e-4])  # m, rad: least standard deviation of a predicted step
 _FASTEST = np.array([25.0, 20.0])  # m/s, rad/s: with a larger deviation a velocity is unknown
 _MISSED = (0.05, 0.1)  # m, rad: standard deviation of a predicted motion before it is learnt
@@ -35,7 +34,8 @@ class Inertia:
     """Predicts the motion at constant velocity."""
 
     has_wheels: bool
-    twist_s: NDArray[np.float64] | None = field(default=None, init=False)  # (6,) per second
+    velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6), init=False)  # (6,)
+    is_known: bool = field(default=False, init=False)  # else the velocity is 0
     _covariance: Matrix = field(default_factory=lambda: np.zeros((6, 6)), init=False)
     _unmeasured_s: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2), init=False)
     _missed: list[NoiseRatio] = field(
@@ -49,18 +49,19 @@ class Inertia:
 
     def reset(self) -> None:
         """Reset the velocity."""
-        self.twist_s, self._covariance = None, np.zeros((6, 6))
+        self.velocity, self._covariance = np.zeros(6), np.zeros((6, 6))
+        self.is_known = False
 
     def predict(self, duration_s: float) -> Step:
         """Return the motion of the next `duration_s`."""
         before_s, self._unmeasured_s = self._unmeasured_s, self._unmeasured_s + duration_s
         variance = self._reach(self._unmeasured_s) ** 2 - self._reach(before_s) ** 2 + _STEP**2
-        twist_s = np.zeros(6) if self.twist_s is None else self.twist_s
-        return replace(still(), T=se3.exp(twist_s * min(duration_s, _KEPT_S)), variance=variance)
+        T_now_next = se3.exp(self.velocity * min(duration_s, _KEPT_S))
+        return replace(still(), T=T_now_next, variance=variance)
 
     def anywhere(self, guess: Step, duration_s: float) -> Step:
         """Return the motion of a robot whose velocity is unknown."""
-        variance = np.array([(_UNKNOWN[0] * duration_s) ** 2, guess.variance[1]])
+        variance = np.array([(UNKNOWN_VELOCITY[0] * duration_s) ** 2, guess.variance[1]])
         return replace(guess, variance=np.maximum(variance, guess.variance))
 
     def evidence(self, wheels: Step, guess: Step, duration_s: float) -> NDArray[np.float64]:
@@ -68,13 +69,13 @@ class Inertia:
 
         Distance and turn. Wheels that are wrong may report any motion that a robot is capable of.
         """
-        if self.twist_s is None:
+        if not self.is_known:
             return np.zeros(2)
         off = se3.inverse(guess.T) @ wheels.T
         missed = np.array([off[0, 3], se3.yaw_rad(off)])
         changed = _USUAL[self.has_wheels] * _ACCELERATION * self._unmeasured_s * duration_s
         right = self._known(duration_s) + changed**2 + wheels.variance + self.missed**2
-        wrong = right + (_UNKNOWN * duration_s) ** 2
+        wrong = right + (UNKNOWN_VELOCITY * duration_s) ** 2
         cost_right = student_cost(missed**2 / right, 1) + 0.5 * np.log(right)
         cost_wrong = student_cost(missed**2 / wrong, 1) + 0.5 * np.log(wrong)
         return np.asarray(cost_right - cost_wrong)
@@ -83,7 +84,7 @@ class Inertia:
         self, wheels: Step, lying: NDArray[np.float64], duration_s: float
     ) -> NDArray[np.float64]:
         """Return the variances (2,) of the wheels' motion, wrong with the probabilities `lying`."""
-        wrong = (_UNKNOWN * duration_s) ** 2
+        wrong = (UNKNOWN_VELOCITY * duration_s) ** 2
         return np.asarray(self.missed**2 + wheels.variance + lying * wrong)
 
     def learn(
@@ -94,7 +95,7 @@ class Inertia:
         `guess` is what was predicted. Components that were not measured decay.
         """
         off = se3.log(se3.inverse(guess.T) @ T_before_now)
-        if self.twist_s is not None:
+        if self.is_known:
             variance = self._known(duration_s) + np.diag(covariance)[[0, 5]]
             for channel, axis in enumerate((0, 5)):
                 self._missed[channel].learn(
@@ -107,10 +108,8 @@ class Inertia:
         seen = unknown @ np.linalg.inv(unknown + covariance)
         is_measured = np.diag(seen).reshape(2, 3).min(axis=1) > 0.5
         self._unmeasured_s = np.where(is_measured, 0.0, self._unmeasured_s)
-        before = np.zeros(6) if self.twist_s is None else self.twist_s
-        if self.twist_s is None:
-            expected = unknown
-        else:
+        before, expected = self.velocity, unknown
+        if self.is_known:
             usual = np.repeat((_USUAL[self.has_wheels] * _ACCELERATION * duration_s) ** 2, 3)
             expected = self._covariance + np.diag(usual)
         fading = 1.0 - math.exp(-duration_s / _FADE_S[self.has_wheels])
@@ -118,10 +117,11 @@ class Inertia:
         gain = expected @ np.linalg.inv(expected + covariance)
         # Without wheels a measured velocity is taken as it is: nothing else would contradict it.
         now = kept + (gain if self.has_wheels else seen) @ (twist_s - kept)
-        if self.has_wheels and self.twist_s is not None:  # else a jump cannot be detected
+        if self.has_wheels and self.is_known:  # else a jump cannot be detected
             reach = np.repeat(_JUMP * _ACCELERATION * duration_s, 3)
             now = before + np.clip(now - before, -reach, reach)
-        self.twist_s, self._covariance = now, expected - gain @ expected
+        self.velocity, self._covariance = now, expected - gain @ expected
+        self.is_known = True
 
     def _known(self, duration_s: float | NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the variances (2,) [m^2, rad^2] of a motion by that of the velocity."""
@@ -129,8 +129,8 @@ class Inertia:
 
     def _reach(self, unmeasured_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the standard deviations (2,) [m, rad] of a prediction; they add up over time."""
-        reach = _UNKNOWN * unmeasured_s
-        if self.twist_s is None:
+        reach = UNKNOWN_VELOCITY * unmeasured_s
+        if not self.is_known:
             return reach
         changed = (0.5 * _ACCELERATION * unmeasured_s**2) ** 2
         return np.minimum(reach, np.sqrt(self._known(unmeasured_s) + changed))

@@ -87,7 +87,7 @@ class MotionModel:
     @property
     def velocity(self) -> NDArray[np.float64]:
         """Return the base's twist (6,) [m/s, rad/s] in se3.log order, 0 if unknown."""
-        return np.zeros(6) if self._inertia.twist_s is None else self._inertia.twist_s
+        return self._inertia.velocity
 
     def copy(self) -> MotionModel:
         """Return an independent copy with the same state."""
@@ -154,7 +154,7 @@ class MotionModel:
         """
         self._is_weighed = evidence is not None
         duration_s, wheels, guess = self._since_s, self._since_wheels, self._since_guess
-        had_velocity = self._inertia.twist_s is not None
+        had_velocity = self._inertia.is_known
         if duration_s <= 0.0 or not self._is_followed:  # the interval is unknown
             self.skip()
             return

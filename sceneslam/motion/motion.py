@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.motion.step import Step
+from sceneslam.motion.step import UNKNOWN_VELOCITY, Step
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
-UNKNOWN_M_S = 1.0  # standard deviation of an unknown velocity
 BELIEVED = 0.5  # wheels are not used if they are wrong with this probability
 _RARE = 0.003  # least probability of an alternative: one scan in 300
 
@@ -42,7 +41,7 @@ class Motion:
         """
         if misfit <= 0.0:
             return self
-        reach = np.diag([(UNKNOWN_M_S * since_s) ** 2] * 3 + [0.0] * 3)
+        reach = np.diag([(UNKNOWN_VELOCITY[0] * since_s) ** 2] * 3 + [0.0] * 3)
         alternatives = tuple(
             replace(
                 other,

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
+UNKNOWN_VELOCITY = np.array([1.0, 2.0])  # m/s, rad/s: standard deviation of an unknown velocity
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Step:
