@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -44,6 +46,15 @@ def stamp_ns(message: Any) -> int:
     """Return a message's header stamp [ns]."""
     stamp = message.header.stamp
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameTransform:
+    """The pose of a frame in its parent."""
+
+    parent: str
+    child: str
+    T_parent_child: Transform
 
 
 def frame_id(message: Any) -> str:
@@ -188,6 +199,15 @@ def camera(message: Any) -> Camera | None:
         cy=float(k[5]),
         distortion=distortion,
     )
+
+
+def transforms(message: Any) -> Iterator[FrameTransform]:
+    """Yield the rigid transforms of a TFMessage; none of another message or None."""
+    for entry in getattr(message, "transforms", ()):
+        T_parent_child = transform(entry.transform.translation, entry.transform.rotation)
+        if T_parent_child is not None:
+            child = str(entry.child_frame_id).lstrip("/")
+            yield FrameTransform(parent=frame_id(entry), child=child, T_parent_child=T_parent_child)
 
 
 def transform(at: Any, turn: Any) -> Transform | None:

@@ -23,8 +23,8 @@ class FrameTree:
             if topic not in recording.topics:
                 continue
             for message in islice(recording.messages({topic}), count):
-                for entry in getattr(recording.decode(message), "transforms", ()):
-                    self._add(entry)
+                for one in decode.transforms(recording.decode(message)):
+                    self._up.setdefault(one.child, (one.parent, one.T_parent_child))
         frames = {*self._up, *(parent for parent, _ in self._up.values())}
         if base_frame is not None and base_frame not in frames:
             known = ", ".join(sorted(frames)) or "it has no /tf_static and no /tf"
@@ -40,14 +40,6 @@ class FrameTree:
         if base_root != frame_root:
             return None
         return se3.inverse(T_root_base) @ T_root_frame
-
-    def _add(self, entry: object) -> None:
-        at = entry.transform.translation  # type: ignore[attr-defined]
-        turn = entry.transform.rotation  # type: ignore[attr-defined]
-        T_parent_child = decode.transform(at, turn)
-        child = str(entry.child_frame_id).lstrip("/")  # type: ignore[attr-defined]
-        if T_parent_child is not None:
-            self._up.setdefault(child, (decode.frame_id(entry), T_parent_child))
 
     def _to_root(self, frame: str) -> tuple[str, Transform]:
         T_root_frame, met = se3.identity(), {frame}

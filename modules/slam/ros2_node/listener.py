@@ -72,12 +72,9 @@ class NodeListener:
 
     def _hear_tf(self, arrival: Arrival) -> None:
         message = self._store.deserialize_cdr(arrival.cdr, "tf2_msgs/msg/TFMessage")
-        for one in message.transforms:
-            frames = (decode.frame_id(one), str(one.child_frame_id).lstrip("/"))
-            if frames == (names.MAP, names.ODOM):
-                found = decode.transform(one.transform.translation, one.transform.rotation)
-                if found is not None and np.isfinite(found).all():
-                    self.T_map_odom = found
+        for one in decode.transforms(message):
+            if (one.parent, one.child) == (names.MAP, names.ODOM):
+                self.T_map_odom = one.T_parent_child
 
     def _hear_map(self, arrival: Arrival) -> None:
         message = self._store.deserialize_cdr(arrival.cdr, _MAP_TYPES[self._map_kind])

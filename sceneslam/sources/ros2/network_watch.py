@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -44,7 +44,7 @@ class NetworkWatch:
         self._mounts: dict[str, Transform] = {}
         for message in known:
             if hasattr(message, "transforms"):
-                self._mounts |= dict(_mounts(message))
+                self._mounts |= _mounts(message)
             else:
                 self._camera = decode.camera(message)
 
@@ -76,7 +76,7 @@ class NetworkWatch:
 
     def _take_mounts(self, arrival: Arrival) -> None:
         message = self._decoder.decode(arrival.topic, arrival.cdr)
-        found = dict(_mounts(message))
+        found = _mounts(message)
         late = [frame for frame in found if frame not in self._mounts]
         moved = [
             frame
@@ -98,9 +98,6 @@ def _lens(camera: Camera | None) -> object:
     return camera.size_wh, camera.fx, camera.fy, camera.cx, camera.cy, tuple(camera.distortion)
 
 
-def _mounts(message: Any) -> Iterator[tuple[str, Transform]]:
-    """Yield the frames of a TFMessage, each with its T_parent_frame."""
-    for entry in getattr(message, "transforms", ()):
-        T_parent_frame = decode.transform(entry.transform.translation, entry.transform.rotation)
-        if T_parent_frame is not None:
-            yield str(entry.child_frame_id).lstrip("/"), T_parent_frame
+def _mounts(message: Any) -> dict[str, Transform]:
+    """Return T_parent_frame of the frames of a TFMessage."""
+    return {one.child: one.T_parent_child for one in decode.transforms(message)}
