@@ -11,6 +11,7 @@ from fakes import PERIOD_NS, ExactModule, ScriptedDetector, observation
 
 from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.changeover import Candidates
+from sceneslam.bus.covariance_monitor import CovarianceMonitor
 from sceneslam.bus.decision import Action, Health, Situation, StandbyTrial, decide
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.gate import Gate, GateSettings, GateVerdict
@@ -18,7 +19,6 @@ from sceneslam.bus.handover_log import log_uncertainty
 from sceneslam.bus.hold import Hold
 from sceneslam.bus.recent import RecentMedian
 from sceneslam.bus.scene_filter import WindowFilter
-from sceneslam.bus.sureness import Sureness
 from sceneslam.bus.watch import Watch
 from sceneslam.bus.wheel_scale import WheelScale
 from sceneslam.types import se3
@@ -304,13 +304,13 @@ def test_a_sensor_is_silent_after_two_of_its_periods():
 @pytest.mark.parametrize("row", [0, 2, 3, 5])
 def test_a_pose_is_unusually_uncertain_from_twice_the_median_deviation_on(row):
     for factor, is_usual in ((1.999, True), (2.001, False)):
-        sureness = Sureness()
+        monitor = CovarianceMonitor()
         usual = np.zeros((6, 6))
         usual[row, row] = 1e-4
         for _ in range(9):
-            sureness.is_usual(usual)
-        assert sureness.is_usual(factor**2 * usual) == is_usual
-    assert Sureness().is_usual(None)
+            monitor.is_usual(usual)
+        assert monitor.is_usual(factor**2 * usual) == is_usual
+    assert CovarianceMonitor().is_usual(None)
 
 
 def test_the_wait_for_the_first_choice_doubles_three_times():

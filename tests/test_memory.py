@@ -6,8 +6,8 @@ import numpy as np
 from fakes import PERIOD_NS, observation
 
 from sceneslam.bus.bridge import Bridge
+from sceneslam.bus.covariance_monitor import CovarianceMonitor
 from sceneslam.bus.observation_buffer import BufferedObservation, ObservationBuffer
-from sceneslam.bus.sureness import Sureness
 from sceneslam.types import se3
 
 
@@ -65,14 +65,14 @@ def test_anchor_falls_back_on_the_oldest_pose_then_on_the_oldest_moment():
 
 
 def test_what_lasts_becomes_usual():
-    sureness = Sureness()
-    sure = [sureness.is_usual(1e-6 * np.eye(6)) for _ in range(100)]
-    unsure = [sureness.is_usual(1e-2 * np.eye(6)) for _ in range(200)]
-    assert all(sure) and not any(unsure[:99]) and all(unsure[100:])
+    monitor = CovarianceMonitor()
+    usual = [monitor.is_usual(1e-6 * np.eye(6)) for _ in range(100)]
+    unusual = [monitor.is_usual(1e-2 * np.eye(6)) for _ in range(200)]
+    assert all(usual) and not any(unusual[:99]) and all(unusual[100:])
 
 
 def test_one_pose_that_is_surer_than_all_others_makes_none_unusual():
     """A module's first pose is where its frame begins."""
-    sureness = Sureness()
-    answers = [sureness.is_usual(scale * np.eye(6)) for scale in (1e-9, 1e-6, 1e-6, 1e-6)]
+    monitor = CovarianceMonitor()
+    answers = [monitor.is_usual(scale * np.eye(6)) for scale in (1e-9, 1e-6, 1e-6, 1e-6)]
     assert answers[0] and all(answers[2:])

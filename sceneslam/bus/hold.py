@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.bus.covariance_monitor import CovarianceMonitor
 from sceneslam.bus.decision import Health
 from sceneslam.bus.gate import Gate, GateSettings, GateVerdict
 from sceneslam.bus.runner import Runner
-from sceneslam.bus.sureness import Sureness
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Wheels
@@ -40,7 +40,7 @@ class Hold:
         self._T_odom_prev: Transform | None = None
         self._agreed: tuple[Transform, Transform] | None = None  # local, odom, as turns last agreed
         self._gate = Gate(gate, wheels or Wheels()) if gate is not None else None
-        self._sureness = Sureness()
+        self._covariances = CovarianceMonitor()
         self._revision = 0
         self._fed_ns: int | None = None  # when its sensors last delivered data
         self._period_ns = silence_ns  # their last interval; at first a guess
@@ -77,8 +77,8 @@ class Hold:
             self._lose(tracking.stamp_ns)
             return None
         self.covariance = tracking.covariance
-        is_sure = self._sureness.is_usual(tracking.covariance)
-        self.is_trusted = is_sure and is_tracking
+        is_usual = self._covariances.is_usual(tracking.covariance)
+        self.is_trusted = is_usual and is_tracking
         self.unheld_since_ns = None
         if self.held_since_ns is None:
             self.held_since_ns = tracking.stamp_ns

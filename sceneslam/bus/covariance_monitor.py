@@ -11,7 +11,7 @@ _UNUSUAL = 2.0  # times the usual standard deviation
 _KEPT = 300  # poses in the median: 10 s at 30 Hz, longer than it takes to reach a wall
 
 
-class Sureness:
+class CovarianceMonitor:
     """Follows the standard deviations of a module's poses; their median is the usual value.
 
     A module is seldom lost from one image to the next: its covariance grows before, and its poses
