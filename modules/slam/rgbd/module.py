@@ -20,7 +20,7 @@ from .adjust.reckoning import Reckoner, led
 from .adjust.renewal import NEWEST, LocatedView, renew, seen_by
 from .answers import held, lost, placed, repeated, started
 from .locate.localizer import VisualFix
-from .loops.reunion import Reunion
+from .loops.session_relocalizer import SessionRelocalizer
 from .parts import RgbdParts
 from .see.alignment import Alignment
 from .see.sizes import check_sizes
@@ -87,7 +87,7 @@ class RgbdSlam:
         )
         self._monocular_scenes = frozenset(monocular_scenes)
         self._ignores_depth = False
-        self._reunion = Reunion(keyframe_limit=past_keyframe_limit)
+        self._session_relocalizer = SessionRelocalizer(keyframe_limit=past_keyframe_limit)
         self._T_local_base = se3.identity()
 
     @property
@@ -105,7 +105,7 @@ class RgbdSlam:
             raise InputError("rig: rgbd needs the camera's intrinsics, got none")
         self._camera: Camera = rig.camera
         self._predictor, self._reckoner = Predictor(rig), Reckoner()
-        self._reunion.begin()
+        self._session_relocalizer.begin()
         self._build(None)
         self._T_local_base = se3.identity()
         self._held_ids = np.zeros(0, np.int64)  # landmarks that support the newest pose
@@ -113,7 +113,7 @@ class RgbdSlam:
 
     def set_pose(self, T_map_local: Transform) -> None:
         """Place `local` in the map (Eq. 1)."""
-        self._reunion.place(T_map_local)
+        self._session_relocalizer.place(T_map_local)
 
     def set_scene(self, scene: str) -> None:
         """Set the scene; in `monocular_scenes` depth is not used."""
@@ -160,16 +160,18 @@ class RgbdSlam:
         """Return in `local` the cloud, a planar robot's grid, the pose graph and the landmarks."""
         layers = self._layers.build(list(self._map.keyframes.all()))
         graph, landmarks = self._memory.pose_graph(), self._memory.landmarks()
-        return replace(layers, pose_graph=graph, landmarks=landmarks, loops=self._reunion.loops)
+        return replace(
+            layers, pose_graph=graph, landmarks=landmarks, loops=self._session_relocalizer.loops
+        )
 
     def shutdown(self) -> None:
         """Stop the workers; the map stays readable."""
         self._mapping.shutdown()
         self._memory.shutdown()
-        self._reunion.end(self._map, self._memory.recognizer)
+        self._session_relocalizer.end(self._map, self._memory.recognizer)
 
     def _build(self, alignment: Alignment | None) -> RgbdParts:
-        parts = RgbdParts(self._settings, self._camera, alignment, self._reunion)
+        parts = RgbdParts(self._settings, self._camera, alignment, self._session_relocalizer)
         self._eye, self._health, self._search = parts.eye, parts.health, parts.search
         self._map, self._mapping, self._memory = parts.map, parts.mapping, parts.memory
         self._layers, self._place_rule = parts.layers, parts.place_rule
@@ -238,7 +240,7 @@ class RgbdSlam:
         segment = self._memory.segment(fix.landmark_ids)
         wanted = self._keyframe_rule.wants(T_local_base, fix, self._map.keyframes, segment)
         if status is TrackingStatus.TRACKING:
-            self._reunion.see(view, T_local_base)
+            self._session_relocalizer.see(view, T_local_base)
         if wanted and (status is TrackingStatus.TRACKING or (is_reckoned and view.is_monocular)):
             self._insert_keyframe(view, segment, fix=fix)
         self._memory.hold(view.observation.stamp_ns, T_local_base, fix.landmark_ids)

@@ -11,7 +11,7 @@ from .locate.localizer import VisualLocalizer
 from .locate.pose_solver import PoseSolver
 from .locate.relocalizer import Relocalizer
 from .locate.search import Search
-from .loops.reunion import Reunion
+from .loops.session_relocalizer import SessionRelocalizer
 from .map.keyframe_maker import KeyframeMaker
 from .map.layers import LayerBuilder
 from .map.map_history import MapHistory
@@ -30,7 +30,7 @@ class RgbdParts:
         settings: RgbdSettings,
         depth_camera: Camera,
         alignment: Alignment | None,
-        reunion: Reunion,
+        session_relocalizer: SessionRelocalizer,
     ) -> None:
         """Build; `alignment` None: assume registered depth until the search shows otherwise."""
         known = alignment or Alignment()
@@ -61,7 +61,7 @@ class RgbdParts:
             self.map,
             localizer,
             self.eye,
-            reunion,
+            session_relocalizer,
             min_inliers=settings.degraded_inliers,
             is_repeatable=settings.is_repeatable,
         )

@@ -1,1 +1,1 @@
-"""Places seen before: in this session, and in earlier ones."""
+"""Places that were seen before, and the loops that they close."""

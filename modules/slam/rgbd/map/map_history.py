@@ -17,7 +17,7 @@ from ..locate.recognition import PlaceRecognizer
 from ..loops.loop_closing import VisualLoopCloser
 from ..loops.loop_detection import LoopDetector, Query
 from ..loops.pose_graph import KeyframeEdge, PoseGraph, motion_covariance
-from ..loops.reunion import Reunion
+from ..loops.session_relocalizer import SessionRelocalizer
 from ..see.rectifying_extractor import RectifyingExtractor
 from .frame_log import FrameLog, joined, moved
 from .keyframes import Keyframe
@@ -37,12 +37,12 @@ class MapHistory:
         visual_map: VisualMap,
         localizer: VisualLocalizer,
         eye: RectifyingExtractor,
-        reunion: Reunion,
+        session_relocalizer: SessionRelocalizer,
         *,
         min_inliers: int,
         is_repeatable: bool,
     ) -> None:
-        self._map, self._eye, self._reunion = visual_map, eye, reunion
+        self._map, self._eye, self._session_relocalizer = visual_map, eye, session_relocalizer
         self._graph, self._frames = PoseGraph(), FrameLog()
         self._keyframes: dict[int, Keyframe] = {}  # including those just removed from the map
         self.recognizer = PlaceRecognizer(visual_map, localizer, min_inliers=min_inliers)
@@ -118,7 +118,7 @@ class MapHistory:
             return corrections.get(self.reference, se3.identity())
         if self._closer.is_solving:
             return None
-        T_new_old = self._reunion.step()
+        T_new_old = self._session_relocalizer.step()
         if T_new_old is None:
             return self._straighten(self._eye.step_s())
         keyframes = self._map.keyframes

@@ -58,7 +58,7 @@ class _Loop:
     T_new_old: Transform  # aligns the session with the past one
 
 
-class Reunion:
+class SessionRelocalizer:
     """Searches past sessions, some work per image, until the current session is aligned."""
 
     def __init__(self, *, keyframe_limit: int) -> None:
