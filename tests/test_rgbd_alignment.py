@@ -1,9 +1,9 @@
-"""How the rgbd module finds out that colours and depth are of two cameras, and ties keyframes."""
+"""Alignment of colours and depth of two cameras, and constraints between keyframes by depth."""
 
 import numpy as np
 import pytest
 
-from sceneslam.modules.slam.rgbd.adjust.ties import DepthTies
+from sceneslam.modules.slam.rgbd.adjust.pose_constraints import DepthConstraints
 from sceneslam.modules.slam.rgbd.see.alignment import Alignment
 from sceneslam.modules.slam.rgbd.see.alignment_search import AlignmentSearch, Pair
 from sceneslam.types import se3
@@ -86,36 +86,36 @@ def test_depth_is_looked_up_where_the_other_camera_sees_the_same():
     assert np.median(np.abs(uv_px - true_px)) > 5.0
 
 
-def test_a_tie_leaves_room_for_what_does_not_average_out():
+def test_a_depth_constraint_leaves_room_for_what_does_not_average_out():
     """Depths with a Kinect's noise per pixel (Khoshelham and Elberink, Sensors 2012).
 
-    A whole image averages that out, and what is left (lens, calibration) is not in it: so a tie
-    claims about a seventieth of the information that the noise alone would let it have.
+    A whole image averages that out, and what is left (lens, calibration) is not in it: so a
+    constraint claims about a seventieth of the information that the noise alone would let it have.
     """
     T_one_other = se3.exp(np.array([0.08, -0.05, 0.06, 0.03, -0.05, 0.04]))
     squares = []
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        ties = DepthTies(CAMERA, np.eye(4))
+        constraints = DepthConstraints(CAMERA, np.eye(4))
         for number, T in enumerate((np.eye(4), T_one_other)):
             depth_m = depth_image(T)
             noise_m = 1.425e-3 * depth_m**2 * rng.normal(size=depth_m.shape)
-            ties.look(number, (depth_m + noise_m).astype(np.float32))
-        tie = ties.tie(0, 1, T_one_other)
+            constraints.look(number, (depth_m + noise_m).astype(np.float32))
+        found = constraints.between(0, 1, T_one_other)
         squares.append(
-            np.sum((tie.root @ se3.log(se3.inverse(T_one_other) @ tie.T_one_other)) ** 2)
+            np.sum((found.root @ se3.log(se3.inverse(T_one_other) @ found.T_one_other)) ** 2)
         )
     assert 1 / 140 < np.mean(squares) / 6 < 1 / 35
 
 
-def test_surfaces_tie_two_keyframes_where_they_truly_are():
+def test_surfaces_constrain_two_keyframes_where_they_truly_are():
     T_one_other = se3.exp(np.array([0.08, -0.05, 0.06, 0.03, -0.05, 0.04]))
     T_depth_cam = RAW_KINECT.T_depth_color
-    ties = DepthTies(CAMERA, T_depth_cam)
-    ties.look(0, depth_image(np.eye(4)))
-    ties.look(1, depth_image(T_one_other))
+    constraints = DepthConstraints(CAMERA, T_depth_cam)
+    constraints.look(0, depth_image(np.eye(4)))
+    constraints.look(1, depth_image(T_one_other))
     T_true = se3.inverse(T_depth_cam) @ T_one_other @ T_depth_cam
-    tie = ties.tie(0, 1, T_true @ se3.exp(np.full(6, 0.02)))
-    assert tie is not None
-    assert tie.T_one_other == pytest.approx(T_true, abs=2e-3)
-    assert ties.tie(0, 7, T_true) is None
+    found = constraints.between(0, 1, T_true @ se3.exp(np.full(6, 0.02)))
+    assert found is not None
+    assert found.T_one_other == pytest.approx(T_true, abs=2e-3)
+    assert constraints.between(0, 7, T_true) is None

@@ -12,7 +12,7 @@ from sceneslam.modules.slam.rgbd.adjust.bundle import Bundle, adjust
 from sceneslam.modules.slam.rgbd.adjust.fusion import join_duplicates
 from sceneslam.modules.slam.rgbd.adjust.local_mapping import LocalMapping
 from sceneslam.modules.slam.rgbd.adjust.mapping_work import MappingWork
-from sceneslam.modules.slam.rgbd.adjust.ties import Tie, Ties
+from sceneslam.modules.slam.rgbd.adjust.pose_constraints import PoseConstraint, PoseConstraints
 from sceneslam.modules.slam.rgbd.locate.residuals import Sightings, errors
 from sceneslam.modules.slam.rgbd.map.keyframes import NO_LANDMARK, DepthView, Keyframe
 from sceneslam.modules.slam.rgbd.see.alignment import Alignment
@@ -53,7 +53,7 @@ def exact_bundle(rng, *, has_depth=True):
             depth_m=depth_m if has_depth else np.zeros(count),
             inverse_depth_sigma_per_m=np.full(count, 0.003),
         ),
-        ties=Ties.of({}),
+        constraints=PoseConstraints.of({}),
     )
 
 
@@ -75,14 +75,16 @@ def test_disturbed_bundle_is_put_right_and_its_held_keyframe_stays():
     assert adjusted.bundle.points_local == pytest.approx(exact.points_local, abs=5e-3)
 
 
-def test_tie_pulls_a_keyframe_that_hardly_anything_else_holds():
+def test_a_constraint_moves_a_keyframe_that_has_hardly_any_other():
     rng = np.random.default_rng(6)
     exact = exact_bundle(rng)
     vague = replace(exact.seen, sigma_px=np.full(len(exact.keyframe_rows), 50.0))
     off = se3.exp(np.array([0.02, -0.01, 0.01, 0.01, 0.0, -0.01]))
     T_tied = se3.inverse(exact.T_local_cam[0]) @ exact.T_local_cam[4] @ off
-    tie = Tie(T_one_other=T_tied, root=1e4 * np.eye(6))
-    adjusted = adjust(CAMERA, replace(exact, seen=vague, ties=Ties.of({(0, 4): tie})))
+    constraint = PoseConstraint(T_one_other=T_tied, root=1e4 * np.eye(6))
+    adjusted = adjust(
+        CAMERA, replace(exact, seen=vague, constraints=PoseConstraints.of({(0, 4): constraint}))
+    )
     T_found = se3.inverse(adjusted.bundle.T_local_cam[0]) @ adjusted.bundle.T_local_cam[4]
     assert pytest.approx(T_tied, abs=1e-3) == T_found
 

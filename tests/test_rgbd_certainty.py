@@ -17,7 +17,7 @@ from sceneslam.types.observation import TrackingStatus
 COUNT = 600
 
 
-def sighting(bend, *, is_monocular=False, reckoned=None):
+def sighting(bend, *, is_monocular=False, odometry=None):
     """A view of pixels all over the image, and a fix whose residuals are noise and a bent lens."""
     rng = np.random.default_rng(0)
     uv_px = rng.uniform([0, 0], [640, 480], (COUNT, 2))
@@ -37,7 +37,7 @@ def sighting(bend, *, is_monocular=False, reckoned=None):
     rows = np.arange(COUNT)
     fix = SimpleNamespace(estimate=estimate, feature_rows=rows, landmark_ids=rows)
     view = SimpleNamespace(
-        gray=gray, features=features, is_monocular=is_monocular, reckoned=reckoned
+        gray=gray, features=features, is_monocular=is_monocular, odometry=odometry
     )
     return view, fix
 
@@ -96,7 +96,7 @@ def test_a_scale_that_nothing_holds_counts_from_where_depth_was_seen_last():
 
 def test_a_scale_that_wheels_measure_on_and_on_counts_over_the_map_around():
     certainty = Certainty(landmarks_with(0.02))
-    seen = [sighting(0.0, is_monocular=k > 0, reckoned=object()) for k in range(3)]
+    seen = [sighting(0.0, is_monocular=k > 0, odometry=object()) for k in range(3)]
     for x_m, (view, fix) in zip((0.0, 1.0, 20.0), seen, strict=True):
         T_local_base = se3.from_xy_yaw(x_m, 0.0, 0.0)
         covariance = certainty.covariance(view, fix, T_local_base, [se3.identity()])

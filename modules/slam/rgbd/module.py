@@ -16,7 +16,7 @@ from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
-from .adjust.reckoning import Reckoner, led
+from .adjust.odometry_constraints import OdometryIntegrator, led
 from .adjust.renewal import NEWEST, LocatedView, renew, seen_by
 from .answers import held, lost, placed, repeated, started
 from .locate.localizer import VisualFix
@@ -104,7 +104,7 @@ class RgbdSlam:
         if rig.camera is None:
             raise InputError("rig: rgbd needs the camera's intrinsics, got none")
         self._camera: Camera = rig.camera
-        self._predictor, self._reckoner = Predictor(rig), Reckoner()
+        self._predictor, self._odometry = Predictor(rig), OdometryIntegrator()
         self._session_relocalizer.begin()
         self._build(None)
         self._T_local_base = se3.identity()
@@ -127,7 +127,7 @@ class RgbdSlam:
         self._observations += 1
         self._recall()
         prediction = self._predictor.predict(observation)
-        reckoned = self._reckoner.add(prediction)
+        odometry = self._odometry.add(prediction)
         if observation.image_bgr is None:
             return self._lose(observation, prediction)
         if self._eye.is_repeated(observation.image_bgr):
@@ -138,7 +138,7 @@ class RgbdSlam:
             T_predicted=prediction.T_local_base,
             rate_base=expected_rate(observation, self._predictor),
         )
-        view = replace(view, reckoned=reckoned)
+        view = replace(view, odometry=odometry)
         fix = None
         if len(self._map.keyframes):
             fix = self._search.find(view, self._held_ids, is_lost=self._is_lost)
@@ -224,8 +224,8 @@ class RgbdSlam:
             fix = led(fix, prediction, scale)
         status = self._health.judge(fix.estimate)
         # Over a few frames odometry is more accurate than a pose by few landmarks.
-        is_reckoned = status is TrackingStatus.DEGRADED and prediction.is_measured
-        if is_reckoned:
+        is_by_odometry = status is TrackingStatus.DEGRADED and prediction.is_measured
+        if is_by_odometry:
             T_local_base = view.T_predicted
             self._hold_pose(view.observation, T_local_base, prediction.covariance)
         else:
@@ -241,11 +241,11 @@ class RgbdSlam:
         wanted = self._keyframe_rule.wants(T_local_base, fix, self._map.keyframes, segment)
         if status is TrackingStatus.TRACKING:
             self._session_relocalizer.see(view, T_local_base)
-        if wanted and (status is TrackingStatus.TRACKING or (is_reckoned and view.is_monocular)):
+        if wanted and (status is TrackingStatus.TRACKING or (is_by_odometry and view.is_monocular)):
             self._insert_keyframe(view, segment, fix=fix)
         self._memory.hold(view.observation.stamp_ns, T_local_base, fix.landmark_ids)
         covariance = None
-        if not is_reckoned:
+        if not is_by_odometry:
             around = self._memory.around(T_local_base)
             covariance = self._certainty.covariance(view, fix, T_local_base, around)
             if self._health.is_unsure(covariance - self._certainty.by_wheels):

@@ -15,7 +15,7 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 
 from ..locate.residuals import Errors, Sightings, errors
-from .ties import Pulls, Ties
+from .pose_constraints import ConstraintResiduals, PoseConstraints
 
 _ROUNDS = (5, 5)
 _DAMPING = (1e-4, 1e-8, 1e4)  # of the diagonal: first, least, most
@@ -32,7 +32,7 @@ class Bundle:
     keyframe_rows: NDArray[np.int64]  # (N,), of each sighting, ascending
     landmark_rows: NDArray[np.int64]  # (N,); a keyframe sees a landmark once
     seen: Sightings  # (N,)
-    ties: Ties
+    constraints: PoseConstraints
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,19 +78,22 @@ def adjust(camera: Camera, bundle: Bundle) -> Adjusted:
 
 def _descend(camera: Camera, bundle: Bundle, use: NDArray[np.float64], steps: int) -> Bundle:
     damping, normal = _DAMPING[0], None
-    found, pulls = _errors(camera, bundle), bundle.ties.pull(bundle.T_local_cam)
-    cost = _cost(found, use, pulls)
+    found, off = _errors(camera, bundle), bundle.constraints.residuals_at(bundle.T_local_cam)
+    cost = _cost(found, use, off)
     for _ in range(steps):
         if normal is None:
-            normal = _assemble(bundle, _slopes(bundle, found, use), pulls)
+            normal = _assemble(bundle, _slopes(bundle, found, use), off)
         moved = _step(bundle, normal, damping)
-        found_there, pulls_there = _errors(camera, moved), moved.ties.pull(moved.T_local_cam)
-        cost_there = _cost(found_there, use, pulls_there)
+        found_there, off_there = (
+            _errors(camera, moved),
+            moved.constraints.residuals_at(moved.T_local_cam),
+        )
+        cost_there = _cost(found_there, use, off_there)
         if not cost_there < cost:
             damping = min(damping * 100.0, _DAMPING[2])
             continue
         gain, bundle, found, cost = cost - cost_there, moved, found_there, cost_there
-        pulls, normal = pulls_there, None
+        off, normal = off_there, None
         damping = max(damping * 0.1, _DAMPING[1])
         if gain < _SMALL_GAIN * cost:
             break
@@ -110,13 +113,13 @@ def _errors(camera: Camera, bundle: Bundle) -> Errors:
     return errors(camera, points_cam, bundle.seen)
 
 
-def _cost(found: Errors, use: NDArray[np.float64], pulls: Pulls) -> float:
+def _cost(found: Errors, use: NDArray[np.float64], off: ConstraintResiduals) -> float:
     """Return the Huber cost: quadratic near zero, linear beyond."""
     squares = np.stack([(found.of[:2] ** 2).sum(axis=0), found.of[2] ** 2])
     weight = found.huber_weights()[1:]
     # rho = s^2 w (2 - w): s^2 where w = 1, and 2 h s - h^2 with w = h / s.
     cost = float((use * squares * weight * (2.0 - weight)).sum())
-    return cost + pulls.cost
+    return cost + off.cost
 
 
 def _slopes(bundle: Bundle, found: Errors, use: NDArray[np.float64]) -> _Slopes:
@@ -141,7 +144,7 @@ def _per_landmark(bundle: Bundle, rows: NDArray[np.float64]) -> NDArray[np.float
     return np.stack([np.bincount(bundle.landmark_rows, row, count) for row in rows])
 
 
-def _assemble(bundle: Bundle, slopes: _Slopes, pulls: Pulls) -> _Normal:
+def _assemble(bundle: Bundle, slopes: _Slopes, off: ConstraintResiduals) -> _Normal:
     point_slopes = np.einsum("rin,rn->in", slopes.by_point, slopes.residuals)
     free = np.cumsum(bundle.is_free) - 1
     starts = np.searchsorted(bundle.keyframe_rows, np.arange(len(bundle.is_free) + 1))
@@ -156,7 +159,7 @@ def _assemble(bundle: Bundle, slopes: _Slopes, pulls: Pulls) -> _Normal:
         pose_slopes[free[row]] = jacobian @ slopes.residuals[:, these].ravel()
         blocks = np.einsum("arn,rcn->acn", by_pose, slopes.by_point[:, :, these])
         between[free[row]][:, :, bundle.landmark_rows[these]] = blocks
-    pulls.add_to(np.swapaxes(poses, 1, 2), pose_slopes, bundle.is_free)
+    off.add_to(np.swapaxes(poses, 1, 2), pose_slopes, bundle.is_free)
     return _Normal(
         poses=poses,
         points=_point_blocks(bundle, slopes),

@@ -82,7 +82,7 @@ class LocalMapping:
                         keyframe_ids=self._window.keyframe_ids,
                         free_ids=self._window.free_ids,
                         fresh=fresh,
-                        reckoned=self._window.reckoned,
+                        by_odometry=self._window.by_odometry,
                     )
                 )
         return T_new_old

@@ -11,7 +11,7 @@ from sceneslam.types.rig import Camera
 from ..see.alignment import Alignment
 from ..see.alignment_search import AlignmentSearch, Shown, pair_of
 from .bundle import Adjusted, Bundle, adjust
-from .ties import DepthTies, Tie, Ties
+from .pose_constraints import DepthConstraints, PoseConstraint, PoseConstraints
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -22,7 +22,7 @@ class Task:
     keyframe_ids: list[int]  # (K,) of the bundle's keyframes, ascending
     free_ids: list[int]
     fresh: Mapping[int, Shown]  # views of new keyframes, by id
-    reckoned: Mapping[tuple[int, int], Tie]  # by odometry, by keyframe ids
+    by_odometry: Mapping[tuple[int, int], PoseConstraint]  # by keyframe ids
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -39,22 +39,24 @@ class MappingWork:
 
     def __init__(self, camera: Camera, depth_camera: Camera, alignment: Alignment | None) -> None:
         self._camera = camera
-        self._depth_ties = DepthTies(depth_camera, (alignment or Alignment()).T_depth_color)
+        self._depth_constraints = DepthConstraints(
+            depth_camera, (alignment or Alignment()).T_depth_color
+        )
         self._search = AlignmentSearch(depth_camera, is_over=alignment is not None)
         self._searched: dict[int, Shown] = {}
         self._found: Alignment | None = None
-        self._ties: dict[tuple[int, int], Tie] = {}  # by keyframe ids
+        self._constraints: dict[tuple[int, int], PoseConstraint] = {}  # by keyframe ids
 
     def __call__(self, task: Task) -> MappingResult:
         """Return the task's bundle adjusted with its relative-pose constraints."""
         self._tie(task)
         rows = {keyframe_id: row for row, keyframe_id in enumerate(task.keyframe_ids)}
-        ties = {
-            (rows[one], rows[other]): tie
-            for (one, other), tie in {**task.reckoned, **self._ties}.items()
+        constraints = {
+            (rows[one], rows[other]): constraint
+            for (one, other), constraint in {**task.by_odometry, **self._constraints}.items()
             if one in rows and other in rows
         }
-        bundle = replace(task.bundle, ties=Ties.of(ties))
+        bundle = replace(task.bundle, constraints=PoseConstraints.of(constraints))
         return MappingResult(
             adjusted=adjust(self._camera, bundle),
             alignment=self._found,
@@ -64,7 +66,7 @@ class MappingWork:
     def _tie(self, task: Task) -> None:
         """Register the new keyframes with the free ones before them."""
         for keyframe_id, shown in task.fresh.items():
-            self._depth_ties.look(keyframe_id, shown.depth_m)
+            self._depth_constraints.look(keyframe_id, shown.depth_m)
             if not self._search.is_over:
                 self._searched[keyframe_id] = shown
         poses = dict(zip(task.keyframe_ids, task.bundle.T_local_cam, strict=True))
@@ -72,16 +74,16 @@ class MappingWork:
             for one in task.free_ids:
                 if one < other:
                     T_one_other = se3.inverse(poses[one]) @ poses[other]
-                    tie = self._depth_ties.tie(one, other, T_one_other)
-                    if tie is not None:
-                        self._ties[one, other] = tie
-                        self._compare(one, other, tie)
+                    constraint = self._depth_constraints.between(one, other, T_one_other)
+                    if constraint is not None:
+                        self._constraints[one, other] = constraint
+                        self._compare(one, other, constraint)
 
-    def _compare(self, one: int, other: int, tie: Tie) -> None:
+    def _compare(self, one: int, other: int, constraint: PoseConstraint) -> None:
         """Compare the colours of two keyframes with the depth camera's motion."""
         if one in self._searched and other in self._searched:
             here, there = self._searched[one], self._searched[other]
-            found = self._search.add(pair_of(here, there, se3.inverse(tie.T_one_other)))
+            found = self._search.add(pair_of(here, there, se3.inverse(constraint.T_one_other)))
             self._found = found or self._found
         if self._search.is_over:
             self._searched.clear()

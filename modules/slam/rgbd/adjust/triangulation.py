@@ -116,7 +116,7 @@ def _scale_sigma(visual_map: VisualMap, keyframe: Keyframe, found: _Found) -> fl
     doubts = found.doubt_ratio[found.is_sure]
     more = _CORRELATED * float(np.mean(doubts**2)) / len(doubts)
     variance = before + min(more, _MAX_DOUBT_RATIO**2)
-    if keyframe.reckoned is not None:
+    if keyframe.odometry is not None:
         variance = 1.0 / (1.0 / max(variance, 1e-12) + 1.0 / _WHEELS_RATIO**2)
     return float(np.sqrt(variance))
 

@@ -14,8 +14,8 @@ from ..locate.residuals import Sightings
 from ..map.keyframes import NO_LANDMARK
 from ..map.visual_map import VisualMap
 from .bundle import Adjusted, Bundle
-from .reckoning import reckoned_ties
-from .ties import Tie, Ties
+from .odometry_constraints import odometry_constraints
+from .pose_constraints import PoseConstraint, PoseConstraints
 
 _FREE = 5
 _HELD = 15
@@ -32,7 +32,7 @@ class MapWindow:
     landmark_ids: NDArray[np.int64]  # (L,), ascending
     births: NDArray[np.int64]  # (L,), to distinguish a landmark from a later one of the same id
     feature_rows: NDArray[np.int64]  # (N,), of each sighting in its keyframe
-    reckoned: dict[tuple[int, int], Tie]  # by keyframe ids
+    by_odometry: dict[tuple[int, int], PoseConstraint]  # by keyframe ids
     corrections: int  # of the map, when it was copied
 
 
@@ -74,7 +74,7 @@ def take_window(visual_map: VisualMap, keyframe_id: int) -> MapWindow | None:
                 [visual_map.inverse_depth_sigmas_per_m(f) for f in features]
             )[chosen],
         ),
-        ties=Ties.of({}),
+        constraints=PoseConstraints.of({}),
     )
     return MapWindow(
         bundle=bundle,
@@ -83,7 +83,7 @@ def take_window(visual_map: VisualMap, keyframe_id: int) -> MapWindow | None:
         landmark_ids=landmark_ids,
         births=visual_map.landmarks.births[landmark_ids],
         feature_rows=of_feature[chosen],
-        reckoned=reckoned_ties(
+        by_odometry=odometry_constraints(
             dict(zip(keyframe_ids, keyframes, strict=True)), visual_map.camera.T_base_cam
         ),
         corrections=visual_map.corrections,

@@ -59,7 +59,7 @@ class Certainty:
         model[:3, :3] += np.median((away_m**2).sum(axis=1)) * model[3:, 3:]
         scale = np.zeros((6, 6))
         scale[:3, :3] = self.scale_variance(view, fix, T_local_base)
-        self.by_wheels = scale if view.reckoned is not None else 0.0 * scale
+        self.by_wheels = scale if view.odometry is not None else 0.0 * scale
         return np.asarray(measured + model + scale)
 
     def _follow(self, ratio: float) -> float:
@@ -76,7 +76,7 @@ class Certainty:
             self._scaled_local = T_local_base[:3, 3].copy()
         way_local = T_local_base[:3, 3] - self._scaled_local
         length_m = float(np.linalg.norm(way_local))
-        if view.reckoned is not None and length_m > _AROUND_M:
+        if view.odometry is not None and length_m > _AROUND_M:
             way_local = way_local * (_AROUND_M / length_m)
         way_base = T_local_base[:3, :3].T @ way_local
         return np.asarray(np.mean(sigmas**2) * np.outer(way_base, way_base))

@@ -53,7 +53,7 @@ class KeyframeMaker:
             view=self._layers.view(view.depth_m, view.image_bgr, stamp_ns=stamp_ns),
             turning=view.turning,
             is_monocular=view.is_monocular,
-            reckoned=view.reckoned,
+            odometry=view.odometry,
         )
         deep_rows = landmark_ids[:0] if fix is None else fix.deep_rows
         keyframe_id = self._map.insert(keyframe, deep_rows=deep_rows)

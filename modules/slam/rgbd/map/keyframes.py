@@ -36,10 +36,10 @@ def nothing_seen() -> DepthView:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Reckoned:
+class OdometryPose:
     """A pose by odometry alone."""
 
-    T_reckoned_base: Transform  # never corrected
+    T_odom_base: Transform  # never corrected
     stretch: int  # number of the section of odometry without a gap
 
 
@@ -54,7 +54,7 @@ class Keyframe:
     view: DepthView
     turning: Turning
     is_monocular: bool = False
-    reckoned: Reckoned | None = None
+    odometry: OdometryPose | None = None
 
     def straighten(self, camera: Camera, readout_s: float) -> None:
         """Correct the keyframe for a readout that is longer by `readout_s`."""

@@ -25,7 +25,7 @@ from .segments import Segments
 from .visual_map import VisualMap
 
 _MIN_SHARE = 0.1  # least share of a pose's landmarks from a keyframe, for an edge to it
-_RECKONED_VARIANCE = 0.05**2  # [m^2] and [rad^2], of a keyframe placed by odometry alone
+_ODOMETRY_VARIANCE = 0.05**2  # [m^2] and [rad^2], of a keyframe placed by odometry alone
 _NEVER_SAW = -1
 
 
@@ -195,8 +195,8 @@ class MapHistory:
         if fix is None:
             last = self.reference
             T_last_new = se3.inverse(earlier[last].T_local_base) @ T_local_base
-            reckoned = _RECKONED_VARIANCE * np.eye(6)
-            return [_edge(last, keyframe_id, T_last_new, reckoned)]
+            odometry = _ODOMETRY_VARIANCE * np.eye(6)
+            return [_edge(last, keyframe_id, T_last_new, odometry)]
         counts = self._origins(fix.landmark_ids)
         total = sum(counts.values())
         return [

@@ -1,7 +1,7 @@
 """Detect whether depth is registered to the colours, by comparing the motion that both show.
 
-Surfaces give the depth camera's motion without the colours (see `ties`). The pixel of a corner in
-another image then depends on the colour camera's focal length and position alone.
+Surfaces give the depth camera's motion without the colours (see `pose_constraints`). The pixel of a
+corner in another image then depends on the colour camera's focal length and position alone.
 """
 
 from __future__ import annotations

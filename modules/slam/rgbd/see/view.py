@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
-from ..map.keyframes import Reckoned
+from ..map.keyframes import OdometryPose
 from .features import Features
 from .shutter import Turning
 
@@ -27,7 +27,7 @@ class View:
     features: Features
     T_predicted: Transform  # T_local_base, before the image is used
     turning: Turning
-    reckoned: Reckoned | None = None
+    odometry: OdometryPose | None = None
 
     @property
     def shows_enough(self) -> bool:

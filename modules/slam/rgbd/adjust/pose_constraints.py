@@ -29,7 +29,7 @@ _HUBER = 3.5  # [sigma], 95 % of six degrees of freedom
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Tie:
+class PoseConstraint:
     """A measured T_one_other of two cameras."""
 
     T_one_other: Transform
@@ -37,39 +37,42 @@ class Tie:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Ties:
+class PoseConstraints:
     """The relative-pose constraints of a bundle, by rows of its keyframes."""
 
     one: NDArray[np.int64]  # (M,)
     other: NDArray[np.int64]  # (M,)
     T_other_one: NDArray[np.float64]  # (M, 4, 4)
-    roots: NDArray[np.float64]  # (M, 6, 6), see Tie
+    roots: NDArray[np.float64]  # (M, 6, 6), see PoseConstraint
 
     @staticmethod
-    def of(ties: Mapping[tuple[int, int], Tie]) -> Ties:
+    def of(constraints: Mapping[tuple[int, int], PoseConstraint]) -> PoseConstraints:
         """Return the constraints, given by the rows of the two keyframes."""
-        rows = np.array(list(ties), np.int64).reshape(-1, 2)
-        T_one_other = np.array([tie.T_one_other for tie in ties.values()]).reshape(-1, 4, 4)
-        roots = np.array([tie.root for tie in ties.values()]).reshape(-1, 6, 6)
+        rows = np.array(list(constraints), np.int64).reshape(-1, 2)
+        measured = constraints.values()
+        T_one_other = np.array([each.T_one_other for each in measured]).reshape(-1, 4, 4)
+        roots = np.array([each.root for each in measured]).reshape(-1, 6, 6)
         one, other = rows.T
-        return Ties(one=one, other=other, T_other_one=se3.inverse(T_one_other), roots=roots)
+        return PoseConstraints(
+            one=one, other=other, T_other_one=se3.inverse(T_one_other), roots=roots
+        )
 
-    def pull(self, T_local_cam: NDArray[np.float64]) -> Pulls:
+    def residuals_at(self, T_local_cam: NDArray[np.float64]) -> ConstraintResiduals:
         """Return the constraints' residuals at these poses (K, 4, 4)."""
         T_one_other = se3.inverse(T_local_cam[self.one]) @ T_local_cam[self.other]
         off = se3.log(self.T_other_one @ T_one_other)
-        return Pulls(
-            ties=self,
+        return ConstraintResiduals(
+            constraints=self,
             T_one_other=T_one_other,
             residuals=(self.roots @ off[:, :, None])[:, :, 0],
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Pulls:
+class ConstraintResiduals:
     """Residuals and weights of the constraints at the keyframes' poses."""
 
-    ties: Ties
+    constraints: PoseConstraints
     T_one_other: NDArray[np.float64]  # (M, 4, 4)
     residuals: NDArray[np.float64]  # (M, 6) in sigmas
 
@@ -92,8 +95,8 @@ class Pulls:
     ) -> None:
         """Add the normal equations of the free keyframes to blocks (F, F, 6, 6), slopes (F, 6)."""
         free = np.cumsum(is_free) - 1
-        by_one = -self.ties.roots @ se3.adjoint(se3.inverse(self.T_one_other))
-        ends = [(self.ties.one, by_one), (self.ties.other, self.ties.roots)]
+        by_one = -self.constraints.roots @ se3.adjoint(se3.inverse(self.T_one_other))
+        ends = [(self.constraints.one, by_one), (self.constraints.other, self.constraints.roots)]
         weights = self.weights[:, None, None]
         for rows, by in ends:
             pulled = weights * np.swapaxes(by, 1, 2)
@@ -106,7 +109,7 @@ class Pulls:
                 np.add.at(blocks, cell, (pulled @ by_column)[both])
 
 
-class DepthTies:
+class DepthConstraints:
     """Registers keyframes' depth images with each other; for use in one thread."""
 
     def __init__(self, depth_camera: Camera, T_depth_cam: Transform) -> None:
@@ -122,7 +125,7 @@ class DepthTies:
         for oldest in list(self._views)[:-_KEPT]:
             del self._views[oldest], self._samples[oldest]
 
-    def tie(self, one: int, other: int, T_one_other: Transform) -> Tie | None:
+    def between(self, one: int, other: int, T_one_other: Transform) -> PoseConstraint | None:
         """Return the constraint between two keyframes by their surfaces, None if these disagree.
 
         `T_one_other` (4, 4) is the initial relative pose.
@@ -144,7 +147,7 @@ class DepthTies:
             return None
         squares, axes = np.linalg.eigh(_TRUST * found.information)
         root = np.sqrt(np.maximum(squares, 0.0))[:, None] * axes.T
-        return Tie(
+        return PoseConstraint(
             T_one_other=to_cam @ found.T_local_cam @ self._T_depth_cam,
             root=root @ se3.adjoint(self._T_depth_cam),
         )

@@ -17,8 +17,8 @@ from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
 from ..locate.localizer import VisualFix
-from ..map.keyframes import Keyframe, Reckoned
-from .ties import Tie
+from ..map.keyframes import Keyframe, OdometryPose
+from .pose_constraints import PoseConstraint
 
 _SIGMA_M, _SIGMA_PER_M = 0.003, 0.02  # of the wheels' distance; a slip is an outlier
 _SIGMA_RAD, _SIGMA_RAD_PER_M = 0.005, 0.01  # of the gyro's turn, and of the floor's tilt
@@ -27,17 +27,17 @@ _CORRELATED = 4.0  # images of the same landmarks err alike; 1 and 4 were tried 
 _CHI2 = 16.8  # 99 % of six degrees of freedom
 
 
-class Reckoner:
+class OdometryIntegrator:
     """Integrates wheels and gyro; never corrected by the map."""
 
     def __init__(self) -> None:
-        self._now = Reckoned(T_reckoned_base=se3.identity(), stretch=0)
+        self._now = OdometryPose(T_odom_base=se3.identity(), stretch=0)
 
-    def add(self, prediction: Prediction) -> Reckoned | None:
+    def add(self, prediction: Prediction) -> OdometryPose | None:
         """Return the pose by odometry alone; None without trusted odometry."""
-        T_now = se3.orthonormal(self._now.T_reckoned_base @ prediction.motion.T_prev_curr)
+        T_now = se3.orthonormal(self._now.T_odom_base @ prediction.motion.T_prev_curr)
         is_broken = not prediction.is_measured
-        self._now = Reckoned(T_reckoned_base=T_now, stretch=self._now.stretch + is_broken)
+        self._now = OdometryPose(T_odom_base=T_now, stretch=self._now.stretch + is_broken)
         return None if is_broken else self._now
 
 
@@ -64,27 +64,27 @@ def led(fix: VisualFix, prediction: Prediction, scale_variance: Matrix) -> Visua
     return replace(fix, estimate=estimate)
 
 
-def reckoned_ties(
+def odometry_constraints(
     keyframes: Mapping[int, Keyframe], T_base_cam: Transform
-) -> dict[tuple[int, int], Tie]:
+) -> dict[tuple[int, int], PoseConstraint]:
     """Return odometry's constraints between consecutive keyframes of which one has no depth."""
-    ties: dict[tuple[int, int], Tie] = {}
+    constraints: dict[tuple[int, int], PoseConstraint] = {}
     for one, other in _neighbours(keyframes):
-        here, there = keyframes[one].reckoned, keyframes[other].reckoned
+        here, there = keyframes[one].odometry, keyframes[other].odometry
         if here is None or there is None or here.stretch != there.stretch:
             continue
-        T_one_other = se3.inverse(here.T_reckoned_base) @ there.T_reckoned_base
+        T_one_other = se3.inverse(here.T_odom_base) @ there.T_odom_base
         distance_m = float(np.linalg.norm(T_one_other[:3, 3]))
         if distance_m > _FARTHEST_M:
             continue
         sigmas = np.repeat(
             [_SIGMA_M + _SIGMA_PER_M * distance_m, _SIGMA_RAD + _SIGMA_RAD_PER_M * distance_m], 3
         )
-        ties[one, other] = Tie(
+        constraints[one, other] = PoseConstraint(
             T_one_other=se3.inverse(T_base_cam) @ T_one_other @ T_base_cam,
             root=np.diag(1.0 / sigmas) @ se3.adjoint(T_base_cam),
         )
-    return ties
+    return constraints
 
 
 def _neighbours(keyframes: Mapping[int, Keyframe]) -> Iterable[tuple[int, int]]:
