@@ -63,7 +63,7 @@ def test_drift_of_wheels_adds_up_like_a_scale_does():
     assert np.sqrt(propagate(steps, WHEELS)[-1][0, 0]) == pytest.approx(0.02 * 3.0)
 
 
-def key_pose(index, T_map_base, *, session=0, drift=MAPPED, told=None):
+def key_pose(index, T_map_base, *, session=0, drift=MAPPED, reported=None):
     return KeyPose(
         stamp_ns=index * S,
         scan=None,
@@ -71,7 +71,7 @@ def key_pose(index, T_map_base, *, session=0, drift=MAPPED, told=None):
         session=session,
         module="a",
         drift=drift,
-        told=told,
+        reported=reported,
     )
 
 
@@ -87,8 +87,8 @@ def test_the_motion_between_two_submaps_is_as_uncertain_as_its_drift(drift):
 
 
 def test_what_a_module_reports_adds_its_growth_within_one_session():
-    told = (1e-4 * np.eye(6), 3e-4 * np.eye(6))
-    first, last = (key_pose(i, at(), told=one) for i, one in enumerate(told))
+    reported = (1e-4 * np.eye(6), 3e-4 * np.eye(6))
+    first, last = (key_pose(i, at(), reported=one) for i, one in enumerate(reported))
     least = np.repeat([0.003**2, 0.002**2], 3)
     np.testing.assert_allclose(motion_covariance([first, last]), np.diag(least + 2e-4))
     np.testing.assert_allclose(motion_covariance([last, first]), np.diag(least), atol=1e-15)

@@ -230,7 +230,7 @@ class Atlas:
                 index=index,
                 module=session.module,
                 T_map_local=T_map_local,
-                trajectory=session.revised if len(session.revised) else session.told.online,
+                trajectory=session.revised if len(session.revised) else session.trajectories.online,
             )
             for index, (session, T_map_local) in enumerate(zip(self._sessions, placed, strict=True))
         )
@@ -274,7 +274,7 @@ class Atlas:
 
     def _revise(self) -> Revised:
         return revise(
-            [session.told for session in self._sessions],
+            [session.trajectories for session in self._sessions],
             np.array(self._path.stamps_ns, np.int64),
             np.array(self._path.poses).reshape(-1, 4, 4),
             np.array(self._path.sessions, np.int64),

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sceneslam.atlas.revision import Told
+from sceneslam.atlas.revision import SessionTrajectories
 from sceneslam.atlas.rows import Rows
 from sceneslam.atlas.submaps.collector import Known
 from sceneslam.atlas.uncertainty import Covariance, SessionPose
@@ -34,10 +34,10 @@ class OpenSession:
     revised: Trajectory = field(default_factory=Trajectory.empty)  # T_local_base
 
     @property
-    def told(self) -> Told:
+    def trajectories(self) -> SessionTrajectories:
         """Return its poses, as reported and as revised."""
         online = trajectory_of(self.stamps_ns, self.poses)
-        return Told(
+        return SessionTrajectories(
             module=self.module, T_map_local=self.T_map_local, online=online, revised=self.revised
         )
 
@@ -125,8 +125,8 @@ class PosePath:
     def session_starts(self) -> list[SessionStart]:
         """Return, per session, the first pose that its module gave."""
         starts: dict[int, SessionStart] = {}
-        told = zip(self.sessions, self.modules, self.stamps_ns, strict=True)
-        for row, (session, module, stamp_ns) in enumerate(told):
+        poses = zip(self.sessions, self.modules, self.stamps_ns, strict=True)
+        for row, (session, module, stamp_ns) in enumerate(poses):
             if module != BRIDGED and session not in starts:
                 starts[session] = SessionStart(
                     row=row, session=session, module=module, stamp_ns=stamp_ns

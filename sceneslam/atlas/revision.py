@@ -16,7 +16,7 @@ _ROUNDING = 1e-9  # of products of transforms
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Told:
+class SessionTrajectories:
     """A session as its module reported it, and as the module revised it at its end."""
 
     module: str
@@ -34,7 +34,7 @@ class Revised:
 
 
 def revise(
-    sessions: Sequence[Told],
+    sessions: Sequence[SessionTrajectories],
     stamps_ns: NDArray[np.int64],
     T_map_base: NDArray[np.float64],
     pose_sessions: NDArray[np.int64],
@@ -58,7 +58,7 @@ def revise(
 
 
 def _corrections(
-    session: Told, carried: Transform, stamps_ns: NDArray[np.int64]
+    session: SessionTrajectories, carried: Transform, stamps_ns: NDArray[np.int64]
 ) -> tuple[Transform, NDArray[np.float64]]:
     """Return the revised T_map_local (4, 4), and T_new_told (N, 4, 4) of the poses in `map`."""
     online, revised, T_map_local = session.online, session.revised, carried @ session.T_map_local

@@ -51,11 +51,11 @@ class SessionPose:
 
 @dataclass(slots=True)
 class _Known:
-    """A pose with its covariance; `told` is the part reported by its module."""
+    """A pose with its covariance; `reported` is the part reported by its module."""
 
     T_map_base: Transform
     carried: Covariance
-    told: Covariance = field(default_factory=lambda: np.zeros((6, 6)))
+    reported: Covariance = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 def propagate(steps: Sequence[SessionPose], bridge: Drift) -> NDArray[np.float64]:
@@ -75,13 +75,13 @@ def propagate(steps: Sequence[SessionPose], bridge: Drift) -> NDArray[np.float64
         before = latest
         if not step.is_bridged:
             before = sessions.get(step.session, _Known(latest.T_map_base, _total(latest)))
-        told = np.zeros((6, 6)) if step.is_bridged else step.covariance
+        reported = np.zeros((6, 6)) if step.is_bridged else step.covariance
         drift = bridge if step.is_bridged else MAPPED
         start = _total(before) if step.is_bridged else before.carried
         T_before_now = se3.inverse(before.T_map_base) @ step.T_map_base
         latest = _Known(step.T_map_base, _grown(start, T_before_now, drift))
-        if told is not None:
-            latest.told = told
+        if reported is not None:
+            latest.reported = reported
         if not step.is_bridged:
             sessions[step.session] = latest
         found.append(_total(latest))
@@ -89,7 +89,7 @@ def propagate(steps: Sequence[SessionPose], bridge: Drift) -> NDArray[np.float64
 
 
 def _total(known: _Known) -> Covariance:
-    return np.asarray(known.carried + known.told)
+    return np.asarray(known.carried + known.reported)
 
 
 def _grown(covariance: Covariance, T_prev_curr: Transform, drift: Drift) -> Covariance:

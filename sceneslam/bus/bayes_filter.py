@@ -76,8 +76,8 @@ class BayesFilter:
 
     def _log_likelihoods(self, vote: SceneVote, elapsed_s: float) -> NDArray[np.float64]:
         """Return log P(vote | scene), shape (S,): a mixture of the vote's likelihood and noise."""
-        told = vote.likelihoods or {vote.scene: 1.0}
-        likelihoods = np.array([told.get(scene, 0.0) for scene in self._places])
+        likelihood_of = vote.likelihoods or {vote.scene: 1.0}
+        likelihoods = np.array([likelihood_of.get(scene, 0.0) for scene in self._places])
         likelihoods /= likelihoods.sum()
         noise = self._settings.error_ratio
         mixed = (1.0 - noise) * likelihoods + noise / len(likelihoods)

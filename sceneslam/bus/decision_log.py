@@ -30,8 +30,8 @@ class DecisionLog:
         if is_known and verdict == GO_ON:
             return
         values = {key: _plain(value) for key, value in asdict(now).items() if key != "stamp_ns"}
-        told = {key: _plain(value) for key, value in asdict(verdict).items()}
-        self._log.add("situation", now.stamp_ns, **values, verdict=told)
+        verdict_fields = {key: _plain(value) for key, value in asdict(verdict).items()}
+        self._log.add("situation", now.stamp_ns, **values, verdict=verdict_fields)
 
 
 def decide_again(events: Iterable[Event], policy: Policy) -> list[str]:

@@ -174,8 +174,8 @@ class Estimator:
     def _rewrite(self, handover: Handover) -> None:
         """Replace the untrusted poses by those of a module that has caught up."""
         newest = self._memory.newest
-        told, known = newest.T_map_base, handover.T_map_base
-        jump = se3.identity() if told is None or known is None else se3.inverse(told) @ known
+        before, known = newest.T_map_base, handover.T_map_base
+        jump = se3.identity() if before is None or known is None else se3.inverse(before) @ known
         keeps_anchor = handover.anchor.module != BRIDGED
         self._back_end.rewind(handover.anchor.stamp_ns + keeps_anchor)
         self._begin_session(newest.stamp_ns, handover.tracked[0].stamp_ns, jump=jump)

@@ -26,11 +26,13 @@ def log_vote(
     posterior: Mapping[str, float] | None,
 ) -> None:
     """Log a vote with the scenes' probabilities after it, and the scene that it confirmed."""
-    told: dict[str, Any] = {} if posterior is None else {"posterior": posterior}
+    details: dict[str, Any] = {} if posterior is None else {"posterior": posterior}
     if vote.features is not None:
         values = vote.features.items()
-        told["features"] = {name: value if math.isfinite(value) else None for name, value in values}
-    log.add("vote", vote.stamp_ns, scene=vote.scene, value=vote.value, **told)
+        details["features"] = {
+            name: value if math.isfinite(value) else None for name, value in values
+        }
+    log.add("vote", vote.stamp_ns, scene=vote.scene, value=vote.value, **details)
     if confirmed is not None:
         log.add(
             "scene",
@@ -104,11 +106,11 @@ class Watch:
         return vote
 
 
-def _check_likelihoods(told: Mapping[str, float] | None, scenes: Sequence[str]) -> None:
+def _check_likelihoods(likelihoods: Mapping[str, float] | None, scenes: Sequence[str]) -> None:
     """Raise ValueError unless likelihoods are of known scenes, at least 0, and not all 0."""
-    if told is None:
+    if likelihoods is None:
         return
-    values = list(told.values())
+    values = list(likelihoods.values())
     is_good = all(0 <= value < math.inf for value in values) and sum(values) > 0
-    if not is_good or not set(told) <= set(scenes):
-        raise ValueError(f"likelihoods: got {dict(told)}, expected 0 or more for each scene")
+    if not is_good or not set(likelihoods) <= set(scenes):
+        raise ValueError(f"likelihoods: got {dict(likelihoods)}, expected 0 or more for each scene")

@@ -121,14 +121,14 @@ def _caption(groups: Sequence[Group], key: str, name: str) -> str:
     other = _other(groups, key)
     rest = [one for one in groups[0].keys if one not in (key, other)]
     has_seeds = any(len(group.rows) > 1 for group in groups)
-    told = f"{name[0].upper()}{name[1:]} against {key}"
+    caption = f"{name[0].upper()}{name[1:]} against {key}"
     if other and len(_values(groups, other)) > _LINES_MAX:
-        told += f", for some values of {other}"
+        caption += f", for some values of {other}"
     if rest or has_seeds:
-        told += f"; mean over {', '.join([*rest, *([SEED] if has_seeds else [])])}"
+        caption += f"; mean over {', '.join([*rest, *([SEED] if has_seeds else [])])}"
     if has_seeds and not rest:
-        told += ", bars: its 95 % confidence interval"
-    return f"{told}."
+        caption += ", bars: its 95 % confidence interval"
+    return f"{caption}."
 
 
 def _other(groups: Sequence[Group], key: str) -> str | None:

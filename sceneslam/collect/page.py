@@ -21,7 +21,7 @@ _ERRORS_MAX = 20
 def write_page(folder: Path, rows: Sequence[Row], groups: Sequence[Group]) -> Path:
     """Write `index.html`; return its path."""
     counts = {"runs": len(rows), **Counter(row.status for row in rows)}
-    told = {
+    values = {
         "title": escape("/".join(folder.resolve().parts[-2:])),  # Hydra's are DATE/TIME
         "numbers": tiles({name: str(count) for name, count in counts.items()}),
         "errors": _errors(rows),
@@ -29,16 +29,16 @@ def write_page(folder: Path, rows: Sequence[Row], groups: Sequence[Group]) -> Pa
         "summary": _summary(groups),
         "table": _table(folder, rows),
     }
-    return fill_page(folder / "index.html", "sceneslam.collect", "page.html", told)
+    return fill_page(folder / "index.html", "sceneslam.collect", "page.html", values)
 
 
 def _errors(rows: Sequence[Row]) -> str:
     wrong = [row for row in rows if row.error]
     if not wrong:
         return ""
-    told = bullets(f"{row.name}: {row.error}" for row in wrong[:_ERRORS_MAX])
+    errors = bullets(f"{row.name}: {row.error}" for row in wrong[:_ERRORS_MAX])
     more = f"<p>and {len(wrong) - _ERRORS_MAX} more</p>" if len(wrong) > _ERRORS_MAX else ""
-    return f'<h2>What went wrong</h2><div class="faults">{told}{more}</div>'
+    return f'<h2>What went wrong</h2><div class="faults">{errors}{more}</div>'
 
 
 def _summary(groups: Sequence[Group]) -> str:

@@ -34,7 +34,7 @@ class Row:
 def read_rows(folder: Path) -> list[Row]:
     """Return a row for every run below a folder, numbered ones in order.
 
-    Raises InputError if there is none.
+    Raises InputError if no run is found.
     """
     if not folder.is_dir():
         raise InputError(f"expected the folder of a sweep, or of runs: {folder}")

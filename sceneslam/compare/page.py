@@ -76,7 +76,7 @@ def _write(folder: Path, runs: Sequence[Run]) -> Path:
     shown = [[row.key, *row.values] for row in settings[:_SHOWN_SETTINGS]]
     left = len(settings) - len(shown)
     heads = [run.name for run in runs]
-    told = {
+    values = {
         "title": escape(" · ".join(heads)),
         "measured": markup.table(["", *_links(folder, runs)], measured(runs)),
         "figures": "".join(
@@ -87,7 +87,7 @@ def _write(folder: Path, runs: Sequence[Run]) -> Path:
         else '<p class="muted">None: the configurations are the same.</p>',
         "more": f'<p class="muted">And {left} more keys.</p>' if left else "",
     }
-    return fill_page(folder / "report.html", "sceneslam.compare", "page.html", told)
+    return fill_page(folder / "report.html", "sceneslam.compare", "page.html", values)
 
 
 def _links(folder: Path, runs: Sequence[Run]) -> list[str]:

@@ -25,10 +25,10 @@ class Filtered:
 def vote(detector: FeatureDetector, rig: Rig, features: RecordingFeatures) -> list[SceneVote]:
     """Return the detector's vote for each observation of stored features."""
     detector.activate(rig)
-    told = zip(
+    rows = zip(
         features.stamps_ns.tolist(), features.values, features.is_there.tolist(), strict=True
     )
-    votes = [detector.decide(at, row if is_there else None) for at, row, is_there in told]
+    votes = [detector.decide(at, row if is_there else None) for at, row, is_there in rows]
     detector.shutdown()
     return votes
 

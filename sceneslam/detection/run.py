@@ -60,10 +60,10 @@ def detect(config: Mapping[str, Any], folder: Path) -> list[str]:
     detector = builder.make("detector", FeatureDetector)
     votes = vote(detector, watched.rig, watched.features)
     scene_filter = builder.make("policy", Policy).make_scene_filter(detector.scenes)
-    told = list(filtered(votes, scene_filter))
-    confirmed = [one.confirmed for one in told if one.confirmed is not None]
+    results = list(filtered(votes, scene_filter))
+    confirmed = [one.confirmed for one in results if one.confirmed is not None]
     folder.mkdir(parents=True, exist_ok=True)
-    _write_events(folder / "events.jsonl", told)
+    _write_events(folder / "events.jsonl", results)
     save_config(config, folder / "config.yaml")
     metrics = score(watched.features, confirmed, builder.make("evaluation", EvaluationSettings))
     write_metrics(folder / "metrics.json", metrics)
@@ -94,17 +94,17 @@ def score(
 def _shares(votes: Sequence[SceneVote], truth: GroundTruth | None) -> str:
     """Return a text with each scene's share of votes, and the share of correct votes."""
     counts = Counter(one.scene for one in votes)
-    told = [f"{scene} {100 * count / len(votes):.1f} %" for scene, count in counts.most_common()]
+    shares = [f"{scene} {100 * count / len(votes):.1f} %" for scene, count in counts.most_common()]
     cast = [one for one in votes if one.scene != UNSURE]
     if truth is not None and cast:
         right = sum(true_scene(truth, one.stamp_ns) == one.scene for one in cast)
-        told.append(f"{100 * right / len(cast):.1f} % right")
-    return ", ".join(told) or "none"
+        shares.append(f"{100 * right / len(cast):.1f} % right")
+    return ", ".join(shares) or "none"
 
 
-def _write_events(path: Path, told: Sequence[Filtered]) -> None:
+def _write_events(path: Path, results: Sequence[Filtered]) -> None:
     """Write votes and confirmed scenes in the format of a run with SLAM."""
     log = EventLog(path)
-    for one in told:
+    for one in results:
         log_vote(log, one.vote, one.confirmed, one.posterior)
     log.close()

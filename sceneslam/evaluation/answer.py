@@ -65,10 +65,10 @@ def answer(metrics: Metrics, faults: Sequence[str]) -> Answer:
         where.append(f"{false} changes of module followed a wrong scene.")
     if where:
         return Answer(kind="partly", headline="It worked in part.", where=where, advice=advice)
-    told = f"{percent(metrics['coverage'])} of the observations have a pose"
+    summary = f"{percent(metrics['coverage'])} of the observations have a pose"
     if metrics["ate_rmse_m"] is not None:
-        told += f", {number(metrics['ate_rmse_m'], 3, ' m')} off (root mean square)"
-    return Answer(kind="worked", headline=f"It worked: {told}.", where=[], advice=advice)
+        summary += f", {number(metrics['ate_rmse_m'], 3, ' m')} off (root mean square)"
+    return Answer(kind="worked", headline=f"It worked: {summary}.", where=[], advice=advice)
 
 
 def _advice(metrics: Metrics) -> Iterator[str]:

@@ -98,8 +98,8 @@ class _Writer:
 
     def _add(self, stamp_ns: int, kind: str, what: str, *details: str) -> None:
         at_s = self._seconds(stamp_ns)
-        told = tuple(detail for detail in details if detail)
-        self._entries.append(Entry(at_s=at_s, kind=kind, what=what, details=told))
+        given = tuple(detail for detail in details if detail)
+        self._entries.append(Entry(at_s=at_s, kind=kind, what=what, details=given))
 
     def _seconds(self, stamp_ns: int) -> float:
         return (stamp_ns - self._origin_ns) * 1e-9

@@ -58,8 +58,8 @@ def _delays_s(seen: Seen, truth: GroundTruth, end_ns: int) -> list[float | None]
     stops_ns = [*(change.stamp_ns for change in changes[2:]), end_ns + 1]
     delays_s: list[float | None] = []
     for change, stop_ns in zip(changes[1:], stops_ns, strict=False):
-        told = [*_until(seen, change.stamp_ns)[-1:], *_between(seen, change.stamp_ns, stop_ns)]
-        found_ns = next((ns for ns, scene in told if scene == change.scene), None)
+        detected = [*_until(seen, change.stamp_ns)[-1:], *_between(seen, change.stamp_ns, stop_ns)]
+        found_ns = next((ns for ns, scene in detected if scene == change.scene), None)
         late_ns = None if found_ns is None else max(found_ns - change.stamp_ns, 0)
         delays_s.append(None if late_ns is None else late_ns / 1e9)
     return delays_s

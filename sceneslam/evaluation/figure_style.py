@@ -109,8 +109,8 @@ def _round(tag: re.Match[str]) -> str:
 
 def module_colors(result: RunResult) -> dict[str, str]:
     """Return a colour for every module: in the map's order, then by first appearance."""
-    told = [event["module"] for event in result.events if event["event"] == "tracking"]
-    keys = dict.fromkeys([*result.map.modules, *(key for key in result.modules if key), *told])
+    tracking = [event["module"] for event in result.events if event["event"] == "tracking"]
+    keys = dict.fromkeys([*result.map.modules, *(key for key in result.modules if key), *tracking])
     return {key: PALETTE[number % len(PALETTE)] for number, key in enumerate(keys)}
 
 

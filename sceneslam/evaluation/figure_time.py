@@ -86,8 +86,10 @@ def draw_series(
     label = f"RMS {rms_m:.3f} m, max {values_m.max():.3f} m"
     marker = "o" if len(values_m) == 1 else None
     if online_m is not None:
-        told = look.thinned(times_s, online_m)
-        axes.plot(*told, color=look.MUTED, linewidth=1.1, dashes=(3, 1), label="as reported online")
+        early = look.thinned(times_s, online_m)
+        axes.plot(
+            *early, color=look.MUTED, linewidth=1.1, dashes=(3, 1), label="as reported online"
+        )
     curve = look.thinned(times_s, values_m)
     axes.plot(*curve, color=look.INK, linewidth=1.3, marker=marker, label=label)
     if limit_m is not None:

@@ -51,16 +51,16 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 def figure(svg: str, caption: str) -> str:
     """Return a figure from an SVG element that is safe, with its caption."""
-    told = escape(caption)
-    labelled = svg.replace("<svg ", f'<svg role="img" aria-label="{told}" ', 1)
-    return f"<figure>{labelled}<figcaption>{told}</figcaption></figure>\n"
+    label = escape(caption)
+    labelled = svg.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)
+    return f"<figure>{labelled}<figcaption>{label}</figcaption></figure>\n"
 
 
 def picture(image: bytes, caption: str, kind: str = "png") -> str:
     """Return a figure from the bytes of a PNG or JPEG file, with its caption."""
-    told, data = escape(caption), b64encode(image).decode("ascii")
-    element = f'<img alt="{told}" src="data:image/{kind};base64,{data}">'
-    return f"<figure>{element}<figcaption>{told}</figcaption></figure>\n"
+    label, data = escape(caption), b64encode(image).decode("ascii")
+    element = f'<img alt="{label}" src="data:image/{kind};base64,{data}">'
+    return f"<figure>{element}<figcaption>{label}</figcaption></figure>\n"
 
 
 def _escaped(cell: object) -> str:

@@ -50,12 +50,12 @@ def evaluate(
     incomplete, which makes the exit code 1.
     """
     switches = list_switches(result, truth)
-    told = {str(e["scene"]) for e in result.events if e["event"] == "scene"}
+    detected = {str(e["scene"]) for e in result.events if e["event"] == "scene"}
     metrics: Metrics = {
         **_accuracy(result, truth, settings),
         "coverage": coverage(result),
         "switches": switches,
-        "false_switches": count_false(switches, truth, told, settings.scenes),
+        "false_switches": count_false(switches, truth, detected, settings.scenes),
         "detection": _detection(result, truth, settings),
         **_extent(result),
         **_costs(result),

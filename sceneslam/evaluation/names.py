@@ -42,9 +42,9 @@ def _name(key: str, node: Mapping[str, Any]) -> str:
 
 
 def _renamed(event: Event, names: Mapping[str, str]) -> Event:
-    told = {
+    renamed = {
         key: names[event[key]]
         for key in _NAMING
         if isinstance(event.get(key), str) and event[key] in names
     }
-    return {**event, **told} if told else event
+    return {**event, **renamed} if renamed else event

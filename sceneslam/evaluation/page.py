@@ -10,10 +10,10 @@ from string import Template
 from sceneslam.types.files import replacing
 
 
-def fill_page(path: Path, package: str, template: str, told: Mapping[str, str]) -> Path:
+def fill_page(path: Path, package: str, template: str, values: Mapping[str, str]) -> Path:
     """Fill a package's template, including the style; return the page's path."""
     page = Template(files(package).joinpath(template).read_text("utf-8"))
     style = files("sceneslam.evaluation").joinpath("page.css").read_text("utf-8")
     with replacing(path, encoding="utf-8") as file:
-        file.write(page.substitute(told, style=style))
+        file.write(page.substitute(values, style=style))
     return path

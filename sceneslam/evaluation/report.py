@@ -78,7 +78,7 @@ def write_report(
         faults=faults,
     )
     entries = chronicle(result, metrics["switches"], value_label=value_label)
-    told = {
+    values = {
         **_told(metrics),
         "answer": _answer(answer(metrics, faults)),
         "title": escape(_titled(title, config)),
@@ -91,7 +91,7 @@ def write_report(
         "versions": markup.table(["part", "version"], [[*item] for item in versions.items()]),
         "config": escape(config_yaml),
     }
-    return fill_page(folder / "report.html", "sceneslam.evaluation", "report.html", told)
+    return fill_page(folder / "report.html", "sceneslam.evaluation", "report.html", values)
 
 
 def _seen(result: RunResult) -> str:
@@ -148,8 +148,8 @@ def _kind(node: Mapping[str, Any]) -> str:
 
 def _plain_values(node: Mapping[str, Any]) -> str:
     """Return a component's numeric settings, which matter most."""
-    told = [f"{key} {value:g}" for key, value in node.items() if isinstance(value, float)]
-    return f" ({', '.join(told)})" if told else ""
+    parts = [f"{key} {value:g}" for key, value in node.items() if isinstance(value, float)]
+    return f" ({', '.join(parts)})" if parts else ""
 
 
 def _numbers(metrics: Metrics) -> str:
@@ -178,12 +178,12 @@ def _numbers(metrics: Metrics) -> str:
     return markup.tiles(entries)
 
 
-def _answer(told: Answer) -> str:
+def _answer(answer: Answer) -> str:
     """Return whether it worked, where not and why, and what to change."""
-    advice = f"<p><b>What to change</b></p>{markup.bullets(told.advice)}" if told.advice else ""
-    where = _listed(told.where) if told.where else ""
-    headline = f"<p><b>{escape(told.headline)}</b></p>"
-    return f'<div class="answer {told.kind}">{headline}{where}{advice}</div>'
+    advice = f"<p><b>What to change</b></p>{markup.bullets(answer.advice)}" if answer.advice else ""
+    where = _listed(answer.where) if answer.where else ""
+    headline = f"<p><b>{escape(answer.headline)}</b></p>"
+    return f'<div class="answer {answer.kind}">{headline}{where}{advice}</div>'
 
 
 def _amiss(metrics: Metrics) -> list[str]:

@@ -22,10 +22,10 @@ _WHY = {
 def tell(metrics: Metrics) -> list[str]:
     """Return a run as a few paragraphs, without a term that needs the manual."""
     paragraphs = [_opening(metrics)]
-    told = metrics["switches"][:_TOLD_SWITCHES]
-    if told:
-        paragraphs.append(" ".join(_change(metrics, switch) for switch in told))
-    if len(metrics["switches"]) > len(told):
+    described = metrics["switches"][:_TOLD_SWITCHES]
+    if described:
+        paragraphs.append(" ".join(_change(metrics, switch) for switch in described))
+    if len(metrics["switches"]) > len(described):
         paragraphs.append("The later changes are in the table below.")
     return [*paragraphs, _accuracy(metrics)] if metrics["poses"] else paragraphs
 

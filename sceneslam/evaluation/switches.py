@@ -41,15 +41,15 @@ def list_switches(result: RunResult, truth: GroundTruth | None) -> list[dict[str
 def count_false(
     switches: Sequence[dict[str, Any]],
     truth: GroundTruth | None,
-    told: Collection[str],
+    detected: Collection[str],
     scenes: Mapping[str, str],
 ) -> int | None:
     """Return how many switches followed a scene that was not the true one; None without truth.
 
-    `told` are the scenes that the detector found. If the truth contains none of their names, it is
-    about other scenes, and the result is None. `scenes` maps own scenes to the truth's names.
+    `detected` are the scenes that the detector found. If the truth contains none of their names, it
+    is about other scenes, and the result is None. `scenes` maps own scenes to the truth's names.
     """
-    named = {scenes.get(scene, scene) for scene in told}
+    named = {scenes.get(scene, scene) for scene in detected}
     if truth is None or not {change.scene for change in truth.scenes} & named:
         return None
     by_scene = [switch for switch in switches if switch["reason"] == "scene"]

@@ -39,7 +39,7 @@ class Ran:
 
 def write_verdict_page(folder: Path, asked: Asked, verdict: Verdict, runs: Sequence[Ran]) -> Path:
     """Write `report.html` into the experiment's folder; return its path."""
-    told = {
+    values = {
         "title": escape(asked.name),
         "question": markup.paragraphs(asked.question),
         "kept": escape(_kept(verdict.figures)),
@@ -56,7 +56,7 @@ def write_verdict_page(folder: Path, asked: Asked, verdict: Verdict, runs: Seque
         "command": escape(asked.command),
         "config": escape(asked.config_yaml),
     }
-    return fill_page(folder / "report.html", "sceneslam.evaluation", "verdict.html", told)
+    return fill_page(folder / "report.html", "sceneslam.evaluation", "verdict.html", values)
 
 
 def _kept(figures: Sequence[Figure]) -> str:

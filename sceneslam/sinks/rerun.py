@@ -199,8 +199,8 @@ def _import_rerun(required: bool) -> Any:
 
 def _sentence(event: Mapping[str, Any]) -> str:
     """Return an event as `kind: key value, key value`, numbers short."""
-    told = {key: value for key, value in event.items() if key not in ("event", "stamp_ns")}
-    words = [f"{key} {value}" for key, value in told.items() if isinstance(value, str)]
-    words += [f"{key} {value:.3g}" for key, value in told.items() if isinstance(value, float)]
-    words += [f"{key} {value}" for key, value in told.items() if type(value) is int]
+    fields = {key: value for key, value in event.items() if key not in ("event", "stamp_ns")}
+    words = [f"{key} {value}" for key, value in fields.items() if isinstance(value, str)]
+    words += [f"{key} {value:.3g}" for key, value in fields.items() if isinstance(value, float)]
+    words += [f"{key} {value}" for key, value in fields.items() if type(value) is int]
     return f"{event['event']}: {', '.join(words)}"

@@ -45,8 +45,8 @@ def write_end(
     placed = _placed(truth.trajectory, *first)
     if placed is not None:
         _write_truth(recording, placed)
-        for name, told in (("online", result.online), ("revised", result.trajectory)):
-            _write_errors(recording, f"{at.ERRORS}/{name}", told, placed, start_ns)
+        for name, estimate in (("online", result.online), ("revised", result.trajectory)):
+            _write_errors(recording, f"{at.ERRORS}/{name}", estimate, placed, start_ns)
 
 
 def _write_map(recording: rr.RecordingStream, result: RunResult, colors: Colors) -> None:
@@ -102,17 +102,17 @@ def _write_truth(recording: rr.RecordingStream, true: Trajectory) -> None:
 
 
 def _write_errors(
-    recording: rr.RecordingStream, path: str, told: Trajectory, true: Trajectory, start_ns: int
+    recording: rr.RecordingStream, path: str, estimate: Trajectory, true: Trajectory, start_ns: int
 ) -> None:
     """Log the position error [m] of every pose."""
     import rerun as rr
 
-    after = np.clip(np.searchsorted(true.stamps_ns, told.stamps_ns), 1, len(true) - 1)
-    is_before = 2 * told.stamps_ns < true.stamps_ns[after] + true.stamps_ns[after - 1]
+    after = np.clip(np.searchsorted(true.stamps_ns, estimate.stamps_ns), 1, len(true) - 1)
+    is_before = 2 * estimate.stamps_ns < true.stamps_ns[after] + true.stamps_ns[after - 1]
     nearest = np.maximum(after - is_before, 0)
-    known = np.abs(true.stamps_ns[nearest] - told.stamps_ns) <= _TRUTH_GAP_NS
+    known = np.abs(true.stamps_ns[nearest] - estimate.stamps_ns) <= _TRUTH_GAP_NS
     if not known.any():
         return
-    errors_m = np.linalg.norm(told.positions_m - true.positions_m[nearest], axis=1)[known]
-    times = rr.TimeColumn(at.TIMELINE, duration=(told.stamps_ns[known] - start_ns) * 1e-9)
+    errors_m = np.linalg.norm(estimate.positions_m - true.positions_m[nearest], axis=1)[known]
+    times = rr.TimeColumn(at.TIMELINE, duration=(estimate.stamps_ns[known] - start_ns) * 1e-9)
     recording.send_columns(path, indexes=[times], columns=rr.Scalars.columns(scalars=errors_m))

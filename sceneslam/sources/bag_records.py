@@ -65,7 +65,7 @@ def header_fields(header: bytes) -> dict[bytes, bytes] | None:
 
 
 def record_at(data: Blob, position: int) -> BagRecord | None:
-    """Return the record at a position [bytes], None if there is none; its data may be cut off."""
+    """Return the record at a position [bytes], None at the end of the data; it may be cut off."""
     if position + _U32.size > len(data):
         return None
     (length,) = _U32.unpack_from(data, position)

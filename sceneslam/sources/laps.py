@@ -97,7 +97,7 @@ def _moved(
 
 
 def _repeated(scenes: Sequence[SceneChange], shifts_ns: Sequence[int]) -> tuple[SceneChange, ...]:
-    """Return the scene changes of all laps; a scene that continues into the next lap is none."""
+    """Return the scene changes of all laps; a scene that goes on into the next lap is no change."""
     every = [replace(one, stamp_ns=one.stamp_ns + by) for by in shifts_ns for one in scenes]
     return tuple(
         one

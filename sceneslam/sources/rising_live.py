@@ -67,8 +67,8 @@ class RisingLive(Wrapped):
         `T_smooth_odom`, 16 numbers row by row.
         """
         with self._lock:
-            told, self._notices = self._notices, []
-        return [*self._feed.notices(), *told]
+            notices, self._notices = self._notices, []
+        return [*self._feed.notices(), *notices]
 
     def close(self) -> None:
         """Close the source."""

@@ -159,7 +159,7 @@ class _Late:
     _known: deque[tuple[int, Transform]] = field(default_factory=deque)
 
     def shift(self, stamp_ns: int, T_odom_base: Transform) -> Transform:
-        """Return T_odom_base of `late_ns` before; the first one if there is none."""
+        """Return T_odom_base of `late_ns` before; the first one at the start."""
         self._known.append((stamp_ns, T_odom_base))
         wanted_ns = stamp_ns - self.late_ns
         while len(self._known) > 1 and self._known[1][0] <= wanted_ns:

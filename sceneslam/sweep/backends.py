@@ -52,8 +52,8 @@ class Joblib:
             raise _missing("joblib", "sweep", error) from error
 
         parallel = Parallel(n_jobs=self._n_jobs, backend="threading", batch_size=1)
-        told = _with_cores(orders, self._cpus_per_job)
-        parallel(delayed(run_job)(order) for order in told)
+        prepared = _with_cores(orders, self._cpus_per_job)
+        parallel(delayed(run_job)(order) for order in prepared)
 
 
 class Submitit:
@@ -94,11 +94,11 @@ class Submitit:
         except (NameError, TypeError, ValueError) as error:
             key = "hydra.launcher.parameters"
             raise ConfigError(key, self._parameters, f"submitit's ({error})") from error
-        told = _with_cores(orders, self._parameters.get("cpus_per_task") or 1)
-        waiting, running = deque(told), dict[JobOrder, Any]()
+        prepared = _with_cores(orders, self._parameters.get("cpus_per_task") or 1)
+        waiting, running = deque(prepared), dict[JobOrder, Any]()
         if self._cluster == "slurm":
             executor.update_parameters(slurm_array_parallelism=self._at_once)
-            running = dict(zip(told, executor.map_array(run_job, told), strict=True))
+            running = dict(zip(prepared, executor.map_array(run_job, prepared), strict=True))
             waiting.clear()
         while waiting or running:
             while waiting and len(running) < self._at_once:
@@ -140,8 +140,8 @@ class Ray:
             raise ConfigError("hydra.launcher.address", self._address, reason) from error
         try:
             task = ray.remote(num_cpus=self._cpus_per_job, max_retries=0)(run_job)
-            told = _with_cores(orders, int(self._cpus_per_job))
-            running = {task.remote(order): order for order in told}
+            prepared = _with_cores(orders, int(self._cpus_per_job))
+            running = {task.remote(order): order for order in prepared}
             while running:
                 ended, _ = ray.wait(list(running))
                 for reference in ended:

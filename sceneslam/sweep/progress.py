@@ -50,8 +50,8 @@ class Progress:
         counts = self._states + Counter(
             states[folder] for folder in states if folder not in settled
         )
-        told = [f"{counts[state]} {state.value}" for state in _TOLD if counts[state]]
-        before, self._told = self._told, ", ".join(told)
+        counted = [f"{counts[state]} {state.value}" for state in _TOLD if counts[state]]
+        before, self._told = self._told, ", ".join(counted)
         self._bar.set_postfix_str(self._told, refresh=False)
         self._bar.n += len(settled)
         if settled or self._told != before or sys.stderr.isatty():

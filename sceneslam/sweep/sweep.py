@@ -76,9 +76,9 @@ def _tell(sweep: Path, folders: Sequence[Path], *, skipped: int) -> None:
     wrong = [(folder, status) for folder, status in statuses.items() if status.error]
     for folder, status in wrong[:_TOLD_ERRORS]:
         print(f"error: job {folder.relative_to(sweep)}: {status.error}", file=sys.stderr)
-    told = ", ".join(f"{count} {state}" for state, count in counts.items())
+    counted = ", ".join(f"{count} {state}" for state, count in counts.items())
     was = f" ({skipped} of them before)" if skipped else ""
-    print(f"{len(folders)} jobs: {told}{was}\ntable    {page.parent}/table.csv\npage     {page}")
+    print(f"{len(folders)} jobs: {counted}{was}\ntable    {page.parent}/table.csv\npage     {page}")
 
 
 def _backend(launcher: Mapping[str, Any]) -> Backend:

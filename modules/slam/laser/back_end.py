@@ -43,9 +43,9 @@ class LaserBackEnd:
             self.graph.add(edge)
         if not loops:
             return False
-        told = frames[-1].T_local_base
+        before = frames[-1].T_local_base
         self.keyframes.move(self.graph.smooth(self.keyframes.poses))
-        moved = np.abs(between(told, frames[-1].T_local_base))
+        moved = np.abs(between(before, frames[-1].T_local_base))
         self.revision += bool((moved > _FELT).any())
         return True
 

@@ -45,7 +45,7 @@ class RelativePoseHistory:
         motions = np.array(self._motions).reshape(-1, 3)
         frames = self.keyframes.frames
         poses = np.vstack([self.keyframes.poses, np.zeros((1, 3))])  # the last one is for _NONE
-        told = composed(poses[owners], motions)
+        reported = composed(poses[owners], motions)
         kept_ns = np.array([frame.stamp_ns for frame in frames], np.int64)
         follows = np.flatnonzero((owners >= 0) & (owners + 1 < len(frames)))
         own = owners[follows]
@@ -53,5 +53,5 @@ class RelativePoseHistory:
         missed = betweens(composed(poses[own], measured[own + 1]), poses[own + 1])
         between_ns = np.maximum(kept_ns[own + 1] - kept_ns[own], 1)  # stamps may repeat
         share = (stamps_ns[follows] - kept_ns[own]) / between_ns
-        told[follows] = composed(told[follows], np.clip(share, 0.0, 1.0)[:, None] * missed)
-        return Trajectory(stamps_ns=stamps_ns, T_world_base=to_transforms(told))
+        reported[follows] = composed(reported[follows], np.clip(share, 0.0, 1.0)[:, None] * missed)
+        return Trajectory(stamps_ns=stamps_ns, T_world_base=to_transforms(reported))

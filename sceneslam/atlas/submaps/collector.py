@@ -134,7 +134,7 @@ class Collector:
             session=known.session,
             module=known.module,
             drift=self._bridge if known.module == BRIDGED else MAPPED,
-            told=known.covariance,
+            reported=known.covariance,
         )
 
     def _append(self, part: list[KeyPose]) -> None:

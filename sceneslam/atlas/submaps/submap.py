@@ -33,7 +33,7 @@ class KeyPose:
     session: int
     module: str
     drift: Drift  # of the motion from the one before
-    told: Covariance | None  # (6, 6) of T_local_base, as the module reported it
+    reported: Covariance | None  # (6, 6) of T_local_base, as the module reported it
 
 
 class Drawing:
@@ -131,10 +131,10 @@ def motion_covariance(poses: Sequence[KeyPose]) -> Covariance:
 
 def _grown(first: KeyPose, last: KeyPose) -> Covariance:
     """Return the growth (6, 6) of a module's covariance between two poses of its session."""
-    if first.session != last.session or first.told is None or last.told is None:
+    if first.session != last.session or first.reported is None or last.reported is None:
         return np.zeros((6, 6))
     carry = se3.adjoint(se3.inverse(last.T_map_base) @ first.T_map_base)
-    values, vectors = np.linalg.eigh(last.told - carry @ first.told @ carry.T)
+    values, vectors = np.linalg.eigh(last.reported - carry @ first.reported @ carry.T)
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 

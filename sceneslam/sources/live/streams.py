@@ -121,8 +121,8 @@ class Streams:
     def notices(self) -> Sequence[Event]:
         """Return the events since the last call."""
         with self._lock:
-            told, self._notices = self._notices, []
-            return told
+            notices, self._notices = self._notices, []
+            return notices
 
     def tell_once(self, event: str, stamp_ns: int, now_ns: int, **fields: object) -> None:
         """Report a condition of a topic once while it lasts."""

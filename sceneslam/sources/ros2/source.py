@@ -95,7 +95,7 @@ class Ros2(Measuring):
         self._faults = FaultLog()
         self._transport: Transport | None = None
         self._inbox: Inbox[Arrival] = Inbox()
-        self._stamp_ns = 0  # of the newest measurement, for what is told of the network
+        self._stamp_ns = 0  # of the newest measurement, for events of the network
         self.heard = LiveRecording()
 
     @property
@@ -256,8 +256,8 @@ class Ros2(Measuring):
         if message is None:
             self._leave_out(f"a message of {topic} makes no sense", self._stamp_ns)
             return
-        told = (topic, arrival.publisher, arrival.arrived_ns, self._stamp_ns)
-        if not self._streams.follows(*told):
+        heard = (topic, arrival.publisher, arrival.arrived_ns, self._stamp_ns)
+        if not self._streams.follows(*heard):
             return
         lined = self._clock.line_up(topic, decode.stamp_ns(message), arrival.arrived_ns)
         self._streams.hear(topic, lined, arrival.arrived_ns)
