@@ -8,7 +8,6 @@ import sys
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, islice
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -22,9 +21,10 @@ from sceneslam.bus.handover_log import log_uncertainty
 from sceneslam.config.build import RunParts
 from sceneslam.config.settings import LIVE
 from sceneslam.engine.live import LiveTally, Spent, run_live
+from sceneslam.engine.open_sinks import OpenSinks
 from sceneslam.engine.slowest import Stopwatch
 from sceneslam.engine.steering import Operator, SteeredDetector
-from sceneslam.interfaces import CovarianceSink, Live, LiveFeed, ResultSink, Sink, Steering
+from sceneslam.interfaces import Live, LiveFeed
 from sceneslam.keeping import Keeping
 from sceneslam.moments import Moments
 from sceneslam.results import Results
@@ -82,11 +82,9 @@ class RunLoop:
             is_live=is_live,
         )
         parts.atlas.open(parts.rig, self._log.add, is_live=parts.run.mode == LIVE)
-        self._sinks: dict[str, Sink] = {}
+        self._sinks = OpenSinks(self.faults)
         try:
-            # Who steers a robot waits for poses; files do not.
-            for key, sink in sorted(parts.sinks.items(), key=lambda one: not _steers(one[1])):
-                self._open_sink(key, sink, results.folder)
+            self._sinks.open(parts.sinks, parts.rig, results.folder)
         except InputError:
             self.close(is_saved=True)
             raise
@@ -132,8 +130,7 @@ class RunLoop:
 
     def close_sinks(self) -> None:
         """Pass the final results to the sinks, and close them."""
-        for key in list(self._sinks):
-            self._close_sink(key)
+        self._sinks.close(self.truth, self.result)
 
     def close(self, *, is_saved: bool) -> None:
         """Close the journal; it is removed if the results are saved."""
@@ -287,62 +284,24 @@ class RunLoop:
 
     def _steer(self, stamp_ns: int) -> None:
         """Execute the operators' commands since the last observation."""
-        for sink in list(self._sinks.values()):
-            for command in sink.commands() if isinstance(sink, Steering) else ():
-                self._operator.obey(command, stamp_ns)
+        for command in self._sinks.commands():
+            self._operator.obey(command, stamp_ns)
         self._operator.report(stamp_ns)
 
     def _write(self, observation: Observation) -> None:
         """Pass the observation with its pose to the sinks, then the events."""
         if not self._keeping.has_room(len(self._observed_ns)):
-            for key in list(self._sinks):
-                self._drop_sink(key, OSError(errno.ENOSPC, "what is left is for the results"))
-        T_map_base = self._parts.atlas.pose_at(observation.stamp_ns)
-        covariance = self._parts.atlas.last_covariance
-        for key, sink in list(self._sinks.items()):
-            try:
-                if isinstance(sink, CovarianceSink) and covariance is not None:
-                    sink.write_covariance(observation.stamp_ns, covariance)
-                sink.write(observation, T_map_base, self._bus.active)
-            except Exception as error:
-                self._drop_sink(key, error)
+            self._sinks.drop_all(OSError(errno.ENOSPC, "what is left is for the results"))
+        atlas = self._parts.atlas
+        T_map_base = atlas.pose_at(observation.stamp_ns)
+        self._sinks.write(observation, T_map_base, atlas.last_covariance, self._bus.active)
         self._write_events()
 
     def _write_events(self) -> None:
         """Pass the events since the last call to the sinks."""
         events = self._log.since(self._events_written)
         self._events_written += len(events)
-        for key, sink in list(self._sinks.items()):
-            try:
-                for event in events:
-                    sink.write_event(event)
-            except Exception as error:
-                self._drop_sink(key, error)
-
-    def _open_sink(self, key: str, sink: Sink, folder: Path) -> None:
-        try:
-            sink.open(self._parts.rig, folder)
-        except Exception as error:
-            _log.info("sinks.%s", key, exc_info=error)
-            raise InputError(f"sinks.{key} could not be opened: {told(error)}") from error
-        self._sinks[key] = sink
-
-    def _close_sink(self, key: str) -> None:
-        try:
-            sink = self._sinks[key]
-            if self.truth is not None:
-                sink.write_truth(self.truth)
-            if isinstance(sink, ResultSink):
-                sink.write_result(self.result())
-            sink.close()
-        except Exception as error:
-            self._drop_sink(key, error)
-
-    def _drop_sink(self, key: str, error: Exception) -> None:
-        """Remove a sink that cannot write, and continue."""
-        _log.info("sinks.%s", key, exc_info=error)
-        self.faults.append(f"sinks.{key} stopped writing: {told(error)}")
-        del self._sinks[key]
+        self._sinks.write_events(events)
 
     def _last_ns(self) -> int:
         return self._observed_ns[-1] if self._observed_ns else 0
@@ -361,7 +320,3 @@ class RunLoop:
         said = f"no pose: module {names} was lost from the first observation on"
         said = f"{said}; {self._tally.words()}"
         return f"{said}. Most likely: {'; '.join(self._warnings)}" if self._warnings else said
-
-
-def _steers(sink: Sink) -> bool:
-    return isinstance(sink, Steering)

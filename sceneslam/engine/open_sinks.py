@@ -1,0 +1,97 @@
+"""The open sinks of a run: one that fails is removed, and the run continues."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.interfaces import CovarianceSink, ResultSink, Sink, Steering
+from sceneslam.types.command import Command
+from sceneslam.types.errors import InputError, told
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig
+from sceneslam.types.run import Event, RunResult
+from sceneslam.types.se3 import Transform
+from sceneslam.types.truth import GroundTruth
+
+_log = logging.getLogger(__name__)
+
+
+class OpenSinks:
+    """Passes a run's results to its sinks; `faults` gets a sentence for each that failed."""
+
+    def __init__(self, faults: list[str]) -> None:
+        self._faults = faults
+        self._sinks: dict[str, Sink] = {}
+
+    def __len__(self) -> int:
+        """Return how many sinks are open."""
+        return len(self._sinks)
+
+    def open(self, sinks: Mapping[str, Sink], rig: Rig, folder: Path) -> None:
+        """Open all sinks by key; raises InputError for one that fails."""
+        # Who steers a robot waits for poses; files do not.
+        for key, sink in sorted(sinks.items(), key=lambda one: not isinstance(one[1], Steering)):
+            try:
+                sink.open(rig, folder)
+            except Exception as error:
+                _log.info("sinks.%s", key, exc_info=error)
+                raise InputError(f"sinks.{key} could not be opened: {told(error)}") from error
+            self._sinks[key] = sink
+
+    def commands(self) -> Iterator[Command]:
+        """Yield the operators' commands since the last call."""
+        for sink in list(self._sinks.values()):
+            if isinstance(sink, Steering):
+                yield from sink.commands()
+
+    def write(
+        self,
+        observation: Observation,
+        T_map_base: Transform | None,
+        covariance: NDArray[np.float64] | None,
+        module: str,
+    ) -> None:
+        """Pass an observation with its pose (4, 4) and covariance (6, 6)."""
+        for key, sink in list(self._sinks.items()):
+            try:
+                if isinstance(sink, CovarianceSink) and covariance is not None:
+                    sink.write_covariance(observation.stamp_ns, covariance)
+                sink.write(observation, T_map_base, module)
+            except Exception as error:
+                self._drop(key, error)
+
+    def write_events(self, events: Sequence[Event]) -> None:
+        """Pass events to all sinks."""
+        for key, sink in list(self._sinks.items()):
+            try:
+                for event in events:
+                    sink.write_event(event)
+            except Exception as error:
+                self._drop(key, error)
+
+    def close(self, truth: GroundTruth | None, result: Callable[[], RunResult]) -> None:
+        """Pass the ground truth and the final results to the sinks, and close them."""
+        for key, sink in list(self._sinks.items()):
+            try:
+                if truth is not None:
+                    sink.write_truth(truth)
+                if isinstance(sink, ResultSink):
+                    sink.write_result(result())
+                sink.close()
+            except Exception as error:
+                self._drop(key, error)
+
+    def drop_all(self, error: Exception) -> None:
+        """Remove all sinks because of an error."""
+        for key in list(self._sinks):
+            self._drop(key, error)
+
+    def _drop(self, key: str, error: Exception) -> None:
+        _log.info("sinks.%s", key, exc_info=error)
+        self._faults.append(f"sinks.{key} stopped writing: {told(error)}")
+        del self._sinks[key]
