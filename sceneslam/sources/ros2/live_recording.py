@@ -20,6 +20,7 @@ _MOST_PICTURES = 40  # ... and per topic with messages of about a megabyte
 _PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")
 _TF = (names.TF, names.TF_STATIC)
 _TF_TYPE = "tf2_msgs/msg/TFMessage"
+_NEEDS = ("image", "camera_info", "scan", "points", "odometry", "imu")
 
 
 class LiveRecording:
@@ -136,6 +137,3 @@ def _may_serve(topic: str, msgtype: str) -> bool:
         return msgtype == _TF_TYPE
     is_own = topic.startswith(names.OWN_PREFIX)
     return not is_own and any(msgtype in TYPES[need] for need in _NEEDS)
-
-
-_NEEDS = ("image", "camera_info", "scan", "points", "odometry", "imu")
