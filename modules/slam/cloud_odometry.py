@@ -115,7 +115,9 @@ class CloudOdometry(ABC):
         self._has_map = True
         is_open = shape.ratios[0] < self.weak_ratio
         status = TrackingStatus.DEGRADED if is_open else TrackingStatus.TRACKING
-        return self._answer(observation, status, overlap_ratio, inliers)
+        return self._predictor.tracking(
+            observation, self._T_local_base, status, quality_ratio=overlap_ratio, inliers=inliers
+        )
 
     def get_trajectory(self) -> Trajectory:
         """Return no poses: registration with a local map does not revise poses."""
@@ -182,16 +184,4 @@ class CloudOdometry(ABC):
         is_lost = status is TrackingStatus.LOST
         kept = self._predictor.T_local_measured if is_lost else prediction.T_local_base
         self._T_local_base = kept
-        return self._answer(observation, status, 0.0, 0)
-
-    def _answer(
-        self, observation: Observation, status: TrackingStatus, quality_ratio: float, inliers: int
-    ) -> Tracking:
-        return Tracking(
-            stamp_ns=observation.stamp_ns,
-            T_local_base=self._T_local_base.copy(),
-            status=status,
-            covariance=None if status is TrackingStatus.LOST else self._predictor.covariance.copy(),
-            quality_ratio=quality_ratio,
-            inliers=inliers,
-        )
+        return self._predictor.tracking(observation, self._T_local_base, status)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sceneslam.motion.model import MotionModel
 from sceneslam.motion.motion import Motion
 from sceneslam.types import se3
-from sceneslam.types.observation import Observation, TrackingStatus
+from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
 
@@ -123,6 +123,27 @@ class Predictor:
             return TrackingStatus.DEGRADED if is_known else TrackingStatus.TRACKING
         self.lose(prediction)
         return TrackingStatus.LOST
+
+    def tracking(
+        self,
+        observation: Observation,
+        T_local_base: Transform,
+        status: TrackingStatus,
+        *,
+        quality_ratio: float = 0.0,
+        inliers: int = 0,
+        revision: int = 0,
+    ) -> Tracking:
+        """Return the answer with a pose (4, 4); the covariance is the predictor's unless LOST."""
+        return Tracking(
+            stamp_ns=observation.stamp_ns,
+            T_local_base=T_local_base.copy(),
+            status=status,
+            covariance=None if status is TrackingStatus.LOST else self.covariance.copy(),
+            quality_ratio=quality_ratio,
+            inliers=inliers,
+            revision=revision,
+        )
 
     def correct(self, T_new_old: Transform) -> None:
         """Apply a correction (4, 4) of the map to the poses."""

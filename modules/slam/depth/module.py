@@ -203,14 +203,12 @@ class DepthSlam:
     def _answer(
         self, observation: Observation, status: TrackingStatus, quality_ratio: float, inliers: int
     ) -> Tracking:
-        is_lost = status is TrackingStatus.LOST
-        if not is_lost and len(self._map):
+        if status is not TrackingStatus.LOST and len(self._map):
             self._history.add(observation.stamp_ns, self._reference, self._T_local_base)
-        return Tracking(
-            stamp_ns=observation.stamp_ns,
-            T_local_base=self._T_local_base.copy(),
-            status=status,
-            covariance=None if is_lost else self._predictor.covariance.copy(),
+        return self._predictor.tracking(
+            observation,
+            self._T_local_base,
+            status,
             quality_ratio=quality_ratio,
             inliers=inliers,
             revision=self._revision,

@@ -147,7 +147,9 @@ class DirectSlam:
         if is_first:
             self._predictor.measure(observation, self._T_local_base, prediction.covariance)
         status = TrackingStatus.TRACKING if is_first else TrackingStatus.DEGRADED
-        return self._answer(observation, status, 1.0 if is_first else 0.0, 0)
+        return self._predictor.tracking(
+            observation, self._T_local_base, status, quality_ratio=1.0 if is_first else 0.0
+        )
 
     def _hold(
         self,
@@ -180,7 +182,13 @@ class DirectSlam:
         is_weak = (np.diag(np.linalg.pinv(information, hermitian=True)) > limits**2).any()
         is_weak |= np.linalg.matrix_rank(information, hermitian=True) < 6
         status = TrackingStatus.DEGRADED if is_weak else TrackingStatus.TRACKING
-        return self._answer(observation, status, found.matched_ratio, found.matched)
+        return self._predictor.tracking(
+            observation,
+            self._T_local_base,
+            status,
+            quality_ratio=found.matched_ratio,
+            inliers=found.matched,
+        )
 
     def _add_keyframe(
         self, observation: Observation, view: DirectView, information: NDArray[np.float64] | None
@@ -199,17 +207,4 @@ class DirectSlam:
         is_lost = status is TrackingStatus.LOST
         kept = self._predictor.T_local_measured if is_lost else prediction.T_local_base
         self._T_local_base = kept
-        return self._answer(observation, status, 0.0, 0)
-
-    def _answer(
-        self, observation: Observation, status: TrackingStatus, quality_ratio: float, inliers: int
-    ) -> Tracking:
-        is_lost = status is TrackingStatus.LOST
-        return Tracking(
-            stamp_ns=observation.stamp_ns,
-            T_local_base=self._T_local_base.copy(),
-            status=status,
-            covariance=None if is_lost else self._predictor.covariance.copy(),
-            quality_ratio=quality_ratio,
-            inliers=inliers,
-        )
+        return self._predictor.tracking(observation, self._T_local_base, status)
