@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from sceneslam.ros.pixels import locked
 from sceneslam.sources.carmen_lines import FLASER, ROBOTLASER, ScanLine, parse_scan, stamp_of
-from sceneslam.sources.faults import FaultLog
 from sceneslam.sources.intrinsics import checked_above_zero
 from sceneslam.sources.rising import rising_order, rising_stamps
-from sceneslam.sources.spanned import TimeSpan
+from sceneslam.sources.stamped_scans import StampedScans
 from sceneslam.sources.survey.survey import Stream, Survey, spread
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
@@ -29,7 +28,7 @@ _SAMPLES = 20  # scans that are read for a survey
 _OFFSET = b"robot_frontlaser_offset"
 
 
-class Carmen:
+class Carmen(StampedScans):
     """Gives one observation per FLASER or ROBOTLASER1 line, stamped by its `ipc_timestamp`.
 
     Odometry is that of the line; ODOM and RLASER lines are not used. Scans come in the order of
@@ -48,37 +47,17 @@ class Carmen:
         logged_ns = np.array([stamp_of(line) for line in self._lines], dtype=np.int64)
         order = rising_order(logged_ns, late_max_ns=round(_LATE_MAX_S * 1e9))
         self._lines = [self._lines[place] for place in order]
-        self._stamps_ns = rising_stamps(logged_ns[order])
-        self._warn_of_changed(np.flatnonzero(self._stamps_ns != logged_ns[order]))
+        stamps_ns = rising_stamps(logged_ns[order])
         T_base_laser = se3.from_xy_yaw(self._offset_m(), 0.0, 0.0)
         if first.T_base_laser is not None:
             T_base_laser = first.T_base_laser
-        self._rig = Rig(
+        rig = Rig(
             sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}),
             laser=Laser(T_base_laser=T_base_laser),
             wheels=Wheels.given(wheels),
         )
-        self._faults = FaultLog()
-
-    @property
-    def rig(self) -> Rig:
-        """Return the rig: one laser and wheel odometry."""
-        return self._rig
-
-    @property
-    def length(self) -> int | None:
-        """Return the number of scans."""
-        return len(self._lines)
-
-    @property
-    def faults(self) -> Sequence[str]:
-        """Return the lines that could not be read."""
-        return self._faults.sentences()
-
-    @property
-    def span(self) -> TimeSpan | None:
-        """Return the first and last stamp."""
-        return TimeSpan(start_ns=int(self._stamps_ns[0]), end_ns=int(self._stamps_ns[-1]))
+        super().__init__(rig, stamps_ns)
+        self._warn_of_changed(np.flatnonzero(stamps_ns != logged_ns[order]))
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the scans by rising stamp."""

@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.ros.pixels import locked
-from sceneslam.sources.faults import FaultLog
 from sceneslam.sources.intrinsics import checked_range_m
 from sceneslam.sources.kitti_times import read_times_ns
 from sceneslam.sources.prefetch import prefetched
-from sceneslam.sources.spanned import TimeSpan
+from sceneslam.sources.stamped_scans import StampedScans
 from sceneslam.sources.survey.survey import Stream, Survey, spread
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
@@ -29,7 +28,7 @@ _POINT_BYTES = 16  # float32 x y z reflectance
 _SAMPLES = 3  # scans that are read for a survey
 
 
-class Kitti:
+class Kitti(StampedScans):
     """Gives one observation per scan; base is the lidar.
 
     `velodyne/*.bin` (odometry benchmark) or `velodyne_points/data/*.bin` (raw data). Times are read
@@ -41,29 +40,10 @@ class Kitti:
         low_m, high_m = checked_range_m("range_m", range_m)
         self._folder = given_folder(path)
         self._files = _scan_files(self._folder)
-        self._stamps_ns = read_times_ns(self._folder, len(self._files))
-        self._rig = Rig(sensors=frozenset({Sensor.POINTS}), lidar=Lidar(range_m=(low_m, high_m)))
-        self._faults = FaultLog()
-
-    @property
-    def rig(self) -> Rig:
-        """Return the rig: one lidar."""
-        return self._rig
-
-    @property
-    def length(self) -> int | None:
-        """Return the number of scans."""
-        return len(self._files)
-
-    @property
-    def faults(self) -> Sequence[str]:
-        """Return the scans that were damaged."""
-        return self._faults.sentences()
-
-    @property
-    def span(self) -> TimeSpan | None:
-        """Return the first and last stamp."""
-        return TimeSpan(start_ns=int(self._stamps_ns[0]), end_ns=int(self._stamps_ns[-1]))
+        super().__init__(
+            Rig(sensors=frozenset({Sensor.POINTS}), lidar=Lidar(range_m=(low_m, high_m))),
+            read_times_ns(self._folder, len(self._files)),
+        )
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the scans; reads files ahead in threads."""
