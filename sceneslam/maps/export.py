@@ -44,7 +44,4 @@ def _graph(saved: SavedMap) -> PoseGraphLayer:
 
 
 def _information(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    spatial = np.eye(6) * _UNMEASURED
-    axes = np.ix_([0, 1, 5], [0, 1, 5])
-    spatial[axes] = np.linalg.inv(covariance)
-    return spatial
+    return planar.spatial_covariance(np.linalg.inv(covariance), level=_UNMEASURED)

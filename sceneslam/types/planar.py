@@ -11,7 +11,7 @@ from sceneslam.types import se3
 
 Planar = NDArray[np.float64]  # (3,)
 Matrix = NDArray[np.float64]  # (3, 3), covariance or information of a Planar
-_PLANAR = [0, 1, 5]  # x, y, yaw in se3.log order
+_PLANAR, _LEVEL = [0, 1, 5], [2, 3, 4]  # x, y, yaw; z, roll, pitch; in se3.log order
 
 
 def to_transform(pose: Planar) -> se3.Transform:
@@ -107,8 +107,11 @@ def planar_covariance(covariance: NDArray[np.float64]) -> Matrix:
     return np.asarray(covariance[np.ix_(_PLANAR, _PLANAR)])
 
 
-def spatial_covariance(covariance: Matrix) -> NDArray[np.float64]:
-    """Return the (6, 6) covariance of se3.log order; entries of z, roll and pitch are 0."""
+def spatial_covariance(
+    covariance: Matrix, level: float | NDArray[np.float64] = 0.0
+) -> NDArray[np.float64]:
+    """Return the (6, 6) covariance of se3.log order; `level`: variances (3,) of z, roll, pitch."""
     spatial = np.zeros((6, 6))
+    spatial[_LEVEL, _LEVEL] = level
     spatial[np.ix_(_PLANAR, _PLANAR)] = covariance
     return spatial

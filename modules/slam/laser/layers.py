@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from sceneslam.types.maps import MapLayers, PointLayer, PoseGraphLayer
 from sceneslam.types.observation import LaserScan
-from sceneslam.types.planar import Matrix, apply, to_transform, to_transforms
+from sceneslam.types.planar import Matrix, apply, spatial_covariance, to_transform, to_transforms
 
 from ..grid import OccupancyGrid
 from .keyframes import ScanKeyframes
 from .pose_graph import ScanEdge
 
-_PLANAR = [0, 1, 5]  # x, y, yaw in se3.log's order
 _LEVEL_DEVIATION = 0.01  # m and rad: standard deviation of z, roll and pitch on a floor
 
 
@@ -43,9 +42,7 @@ def map_layers(
 
 def covariance_6(covariance: Matrix) -> NDArray[np.float64]:
     """Return the (6, 6) covariance of se3.log from that of (x, y, yaw), same axes."""
-    full = np.eye(6) * _LEVEL_DEVIATION**2
-    full[np.ix_(_PLANAR, _PLANAR)] = covariance
-    return full
+    return spatial_covariance(covariance, level=_LEVEL_DEVIATION**2)
 
 
 def _graph(keyframes: ScanKeyframes, edges: Sequence[ScanEdge]) -> PoseGraphLayer:

@@ -23,7 +23,6 @@ _CHI2_3, _CHI2_6 = 11.34, 16.81  # chi-square with 3 and 6 degrees of freedom, 9
 _FIXED = np.repeat([1e-4, 1e-5], 3)  # m, rad
 _LOOSE = np.array([10.0, 10.0, 1.0, 0.05, 0.05, 3.0])  # m, rad: any loop moves it
 _FLOOR = np.array([0.05, 0.02, 0.02]) ** 2  # m, rad: height and tilt between places of one floor
-_LEVEL = [2, 3, 4]  # height, roll and pitch in se3.log order
 _TO_GTSAM = [3, 4, 5, 0, 1, 2]  # rotation first
 
 
@@ -78,13 +77,11 @@ class PlanarEdge(_NodePair):
     @property
     def spatial(self) -> Edge:
         """Return the motion in space: neither height nor tilt changes on a floor."""
-        covariance = planar.spatial_covariance(self.covariance)
-        covariance[_LEVEL, _LEVEL] = _FLOOR
         return Edge(
             first=self.first,
             second=self.second,
             T_first_second=planar.to_transform(self.T_first_second),
-            covariance=covariance,
+            covariance=planar.spatial_covariance(self.covariance, level=_FLOOR),
             kind=self.kind,
         )
 
