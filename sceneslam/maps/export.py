@@ -44,4 +44,4 @@ def _graph(saved: SavedMap) -> PoseGraphLayer:
 
 
 def _information(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    return planar.spatial_covariance(np.linalg.inv(covariance), level=_UNMEASURED)
+    return planar.spatial_covariance(np.asarray(np.linalg.inv(covariance)), level=_UNMEASURED)
