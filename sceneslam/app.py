@@ -20,7 +20,7 @@ from sceneslam.interrupts import termination_as_interrupt, uninterrupted
 from sceneslam.loop import RunLoop
 from sceneslam.results import Results
 from sceneslam.storage.folder import RunFolder, give_back
-from sceneslam.types.errors import ConfigError, SceneSlamError, told
+from sceneslam.types.errors import ConfigError, SceneSlamError, text_of
 from sceneslam.types.maps import HybridMap
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
@@ -80,7 +80,7 @@ def _begin(config: Mapping[str, Any], parts: RunParts, folder: Path, title: str)
     try:
         versions = save_config(config, folder / "config.yaml")
     except OSError as error:
-        allowed = f"a folder with room for the results ({told(error)})"
+        allowed = f"a folder with room for the results ({text_of(error)})"
         raise ConfigError("folder", str(folder), allowed) from error
     return Results(
         folder=folder,

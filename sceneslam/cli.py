@@ -35,7 +35,7 @@ from sceneslam.evaluation.verdict import verdict_lines
 from sceneslam.experiment import run_experiment
 from sceneslam.storage.folder import give_back
 from sceneslam.streams import lost_output
-from sceneslam.types.errors import ConfigError, SceneSlamError, told
+from sceneslam.types.errors import ConfigError, SceneSlamError, text_of
 from sceneslam.types.trajectory import Trajectory
 
 OK, INCOMPLETE, UNUSABLE = 0, 1, 2
@@ -78,7 +78,7 @@ def main() -> None:
     except KeyboardInterrupt:  # also ends a sweep
         codes.append(INCOMPLETE)
     if not codes and (lost := lost_output()):  # the results of a run are in its folder
-        print(f"error: standard output: {told(lost)}", file=sys.stderr)
+        print(f"error: standard output: {text_of(lost)}", file=sys.stderr)
         codes.append(INCOMPLETE)
     sys.exit(max(codes, default=OK))
 
@@ -114,7 +114,7 @@ def _said(error: Exception) -> str:
         return _without_advice(error)
     if isinstance(error, SceneSlamError | OmegaConfBaseException | YAMLError):
         return str(error)
-    return _meant(error) or f"the configuration cannot be composed: {shortened(told(error))}"
+    return _meant(error) or f"the configuration cannot be composed: {shortened(text_of(error))}"
 
 
 def _without_advice(error: HydraException) -> str:
@@ -129,7 +129,7 @@ def _without_advice(error: HydraException) -> str:
 def _meant(error: Exception) -> str | None:
     """Return a sentence for errors of Hydra that do not name the file or key; None: unknown."""
     if isinstance(error, OSError):
-        return f"hydra.run.dir or hydra.sweep.dir: {told(error)}"
+        return f"hydra.run.dir or hydra.sweep.dir: {text_of(error)}"
     if isinstance(error, RecursionError):
         return "defaults: a file is in its own list, or in that of a file in it"
     if isinstance(error, UnicodeDecodeError):

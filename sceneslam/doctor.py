@@ -13,7 +13,7 @@ from sceneslam.interfaces import Live, SlamModule
 from sceneslam.script import composed
 from sceneslam.sources.survey.preflight import Preflight, preflight
 from sceneslam.sources.survey.survey import Surveyed
-from sceneslam.types.errors import ConfigError, InputError, told
+from sceneslam.types.errors import ConfigError, InputError, text_of
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
 
@@ -90,7 +90,7 @@ def _modules(words: Sequence[str], rig: Rig) -> Iterator[str]:
             )
             requires = ComponentBuilder(config).make(_KEY, SlamModule).requires
         except (ConfigError, InputError) as error:
-            _log.debug("slam=%s: %s", name, told(error))
+            _log.debug("slam=%s: %s", name, text_of(error))
             yield f"{name:12} not tried: {_first_line(error)}"
             continue
         lacking = [sensors - rig.sensors for sensors in requires]
@@ -116,4 +116,4 @@ def _named(sensors: frozenset[Sensor]) -> list[str]:
 
 
 def _first_line(error: Exception) -> str:
-    return told(error).splitlines()[0].removeprefix("ConfigError: ")
+    return text_of(error).splitlines()[0].removeprefix("ConfigError: ")

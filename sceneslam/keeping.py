@@ -10,7 +10,7 @@ from sceneslam.results import Results
 from sceneslam.storage.journal import JOURNAL, Journal, JournalHeader
 from sceneslam.storage.reserve import Reserve
 from sceneslam.storage.syncing import Syncing
-from sceneslam.types.errors import ConfigError, told
+from sceneslam.types.errors import ConfigError, text_of
 from sceneslam.types.rig import Sensor
 
 
@@ -30,7 +30,7 @@ class Keeping:
             self.events = EventLog(folder / "events.jsonl", self._reserve.lend)
             self._journal = Journal(folder / JOURNAL, head, self._reserve.lend)
         except OSError as error:
-            allowed = f"a folder that can be written ({told(error)})"
+            allowed = f"a folder that can be written ({text_of(error)})"
             raise ConfigError("folder", str(folder), allowed) from error
         self._syncing = Syncing(self._journal.sync, self.events.sync)
         parts.atlas.keep_journal(self._journal)

@@ -31,7 +31,7 @@ from sceneslam.results import Results
 from sceneslam.sources.survey.preflight import preflight
 from sceneslam.sources.survey.survey import Surveyed
 from sceneslam.sources.survey.tally import Tally
-from sceneslam.types.errors import InputError, told
+from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.maps import HybridMap, PointLayer
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Sensor
@@ -101,7 +101,7 @@ class RunLoop:
             self.faults.append(str(error))
         except BaseException as error:
             _log.info("unexpected error", exc_info=error)
-            self.faults.append(f"unexpected {told(error)}; saved so far, traceback in the log")
+            self.faults.append(f"unexpected {text_of(error)}; saved so far, traceback in the log")
         self._wall_s = perf_counter() - self._began_s
 
     def finish(self) -> None:
@@ -173,7 +173,7 @@ class RunLoop:
             return self._parts.atlas.fuse_maps()
         except Exception as error:
             _log.info("the maps could not be fused", exc_info=error)
-            self.faults.append(f"the maps could not be fused: {told(error)}")
+            self.faults.append(f"the maps could not be fused: {text_of(error)}")
             nothing = PointLayer(points=np.zeros((0, 3), np.float32))
             return HybridMap(points=nothing, point_modules=np.zeros(0, np.uint8), modules=())
 

@@ -15,7 +15,7 @@ from sceneslam.atlas.uncertainty import write_covariances
 from sceneslam.evaluation.metrics import Metrics, evaluate, write_metrics
 from sceneslam.evaluation.report import write_report
 from sceneslam.evaluation.settings import EvaluationSettings
-from sceneslam.types.errors import told
+from sceneslam.types.errors import text_of
 from sceneslam.types.run import RunResult
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
@@ -116,7 +116,7 @@ class Results:
             yield
         except Exception as error:
             _log.info("%s could not all be saved", what, exc_info=error)
-            self.faults.append(f"{what} could not all be saved: {told(error)}")
+            self.faults.append(f"{what} could not all be saved: {text_of(error)}")
 
 
 def _peak_rss_mb() -> float:

@@ -19,7 +19,7 @@ from sceneslam.atlas.revision import Revised, revise
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.uncertainty import VELOCITY, WHEELS, Covariance, propagate
 from sceneslam.interfaces import TrajectoryLog
-from sceneslam.types.errors import ConfigError, told
+from sceneslam.types.errors import ConfigError, text_of
 from sceneslam.types.maps import HybridMap, MapLayers
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
@@ -118,7 +118,7 @@ class Atlas:
         """Continue without submaps: the trajectory stays as the modules reported it."""
         _log.info("submaps", exc_info=error)
         self._mapper, self._correction = None, None
-        self._lasting.faults.append(f"the run goes on without submaps and loops: {told(error)}")
+        self._lasting.faults.append(f"the run goes on without submaps and loops: {text_of(error)}")
 
     def begin_session(self, module: str, T_map_local: Transform) -> int:
         """Open a session of a module placed at T_map_local (4, 4) (Eq. 1); return its number."""

@@ -12,7 +12,7 @@ from time import perf_counter_ns
 
 from sceneslam.bus.answers import checked_layers, checked_tracking, checked_trajectory
 from sceneslam.interfaces import Concurrent, Restartable, SlamModule
-from sceneslam.types.errors import ModuleError, told
+from sceneslam.types.errors import ModuleError, text_of
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking
 from sceneslam.types.rig import Rig, Sensor
@@ -200,7 +200,7 @@ class Runner:
         except KeyboardInterrupt:
             raise
         except BaseException as error:
-            sentence = f"slam.{self.key} {what}: {told(error)}"
+            sentence = f"slam.{self.key} {what}: {text_of(error)}"
             _log.info(sentence, exc_info=error)
             raise ModuleError(sentence) from error
 

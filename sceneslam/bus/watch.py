@@ -12,7 +12,7 @@ from typing import Any
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.scene_filter import ConfirmedScene, SceneFilter
 from sceneslam.interfaces import Detector
-from sceneslam.types.errors import ModuleError, told
+from sceneslam.types.errors import ModuleError, text_of
 from sceneslam.types.observation import UNSURE, Observation, SceneVote
 from sceneslam.types.rig import Rig
 
@@ -56,7 +56,7 @@ class Watch:
         try:
             detector.activate(rig)
         except Exception as error:
-            raise ModuleError(f"detector could not be activated: {told(error)}") from error
+            raise ModuleError(f"detector could not be activated: {text_of(error)}") from error
 
     @property
     def scene(self) -> str | None:
@@ -79,7 +79,7 @@ class Watch:
             raise
         except BaseException as error:
             self.is_working = False
-            what = f"the detector failed: {told(error)}"
+            what = f"the detector failed: {text_of(error)}"
             _log.warning(what)
             self._log.add("fault", observation.stamp_ns, what=what)
         self.spent_us.append((perf_counter_ns() - began_ns) / 1e3)
@@ -93,7 +93,7 @@ class Watch:
         try:
             self._detector.shutdown()
         except Exception as error:
-            _log.warning("the detector could not be shut down: %s", told(error))
+            _log.warning("the detector could not be shut down: %s", text_of(error))
 
     def _checked(self, vote: object) -> SceneVote:
         """Return a vote for a scene that the detector knows; raises TypeError or ValueError."""

@@ -18,7 +18,7 @@ from sceneslam.interfaces import Detector, Live, Sink, SlamModule, Source
 from sceneslam.sources.ordered import Ordered
 from sceneslam.sources.rising_live import RisingLive
 from sceneslam.supervision.isolated import IsolatedModule
-from sceneslam.types.errors import ConfigError, ModuleError, told
+from sceneslam.types.errors import ConfigError, ModuleError, text_of
 from sceneslam.types.rig import Rig, Sensor
 
 _log = logging.getLogger(__name__)
@@ -121,7 +121,7 @@ def _requires(module: SlamModule, key: str) -> Sequence[frozenset[Sensor]]:
     except ModuleError as error:
         raise ConfigError(key, "process", f"a target that builds (its process {error})") from error
     except Exception as error:
-        raise ConfigError(f"{key}.requires", told(error), "sets of sensors") from error
+        raise ConfigError(f"{key}.requires", text_of(error), "sets of sensors") from error
 
 
 def _table(config: Mapping[str, Any], detector: Detector) -> dict[str, tuple[str, ...]]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sceneslam.interfaces import CovarianceSink, ResultSink, Sink, Steering
 from sceneslam.types.command import Command
-from sceneslam.types.errors import InputError, told
+from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.run import Event, RunResult
@@ -40,7 +40,7 @@ class OpenSinks:
                 sink.open(rig, folder)
             except Exception as error:
                 _log.info("sinks.%s", key, exc_info=error)
-                raise InputError(f"sinks.{key} could not be opened: {told(error)}") from error
+                raise InputError(f"sinks.{key} could not be opened: {text_of(error)}") from error
             self._sinks[key] = sink
 
     def commands(self) -> Iterator[Command]:
@@ -93,5 +93,5 @@ class OpenSinks:
 
     def _drop(self, key: str, error: Exception) -> None:
         _log.info("sinks.%s", key, exc_info=error)
-        self._faults.append(f"sinks.{key} stopped writing: {told(error)}")
+        self._faults.append(f"sinks.{key} stopped writing: {text_of(error)}")
         del self._sinks[key]

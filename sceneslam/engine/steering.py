@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sceneslam.interfaces import Detector
 from sceneslam.types.command import Command, Pause, SaveMap, SelectModule, SelectScene
-from sceneslam.types.errors import told
+from sceneslam.types.errors import text_of
 from sceneslam.types.maps import HybridMap
 from sceneslam.types.observation import Observation, SceneVote
 from sceneslam.types.rig import Rig, Sensor
@@ -102,7 +102,7 @@ class Operator:
         while self._saving and self._saving[0].saved.done():
             saving = self._saving.pop(0)
             error = saving.saved.exception()
-            self._tell(saving.command, stamp_ns, "" if error is None else told(error))
+            self._tell(saving.command, stamp_ns, "" if error is None else text_of(error))
 
     def close(self, stamp_ns: int) -> None:
         """Wait for the maps that are being saved."""

@@ -20,7 +20,7 @@ from sceneslam.evaluation.figure_pose import draw_error_path, draw_pose
 from sceneslam.evaluation.figure_time import draw_posterior, draw_series, draw_timeline, draw_votes
 from sceneslam.evaluation.figure_view import draw_view
 from sceneslam.types import se3
-from sceneslam.types.errors import told
+from sceneslam.types.errors import text_of
 from sceneslam.types.run import RunResult
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
@@ -109,7 +109,7 @@ def _written(folder: Path, name: str, draw: Callable[[], Any], faults: list[str]
         return Drawn(name=name, png=png, svg=svg)
     except Exception as error:
         _log.info("the figure %s", name, exc_info=error)
-        faults.append(f"the figure {name} could not be drawn: {told(error)}")
+        faults.append(f"the figure {name} could not be drawn: {text_of(error)}")
         return None
 
 

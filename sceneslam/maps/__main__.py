@@ -13,7 +13,7 @@ from sceneslam.atlas.lasting.prune import prune
 from sceneslam.maps.export import export
 from sceneslam.maps.inspect import described, flaws
 from sceneslam.streams import secure_streams
-from sceneslam.types.errors import SceneSlamError, told
+from sceneslam.types.errors import SceneSlamError, text_of
 
 OK, INCOMPLETE, UNUSABLE = 0, 1, 2
 
@@ -24,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return int(options.act(options))
     except (SceneSlamError, OSError) as error:
-        said = str(error) if isinstance(error, SceneSlamError) else told(error)
+        said = str(error) if isinstance(error, SceneSlamError) else text_of(error)
         print(f"error: {said}", file=sys.stderr)
         return UNUSABLE
 

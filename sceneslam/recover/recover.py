@@ -23,7 +23,7 @@ from sceneslam.evaluation.metrics import Metrics
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.results import Results
 from sceneslam.storage.journal import JOURNAL, Kept, read_journal
-from sceneslam.types.errors import InputError, SceneSlamError, told
+from sceneslam.types.errors import InputError, SceneSlamError, text_of
 from sceneslam.types.files import PART, owned, replacing
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.run import Event, RunResult, Timings
@@ -154,7 +154,7 @@ def _truth(
     except SceneSlamError as error:
         missing.append(f"the ground truth: {error}")
     except Exception as error:  # any exception of a reader, if the recording has changed
-        missing.append(f"the ground truth: {told(error)}")
+        missing.append(f"the ground truth: {text_of(error)}")
     return None
 
 

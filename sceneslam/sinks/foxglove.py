@@ -15,7 +15,7 @@ from sceneslam.ros import names
 from sceneslam.ros.transport.transport import Qos, Transport
 from sceneslam.sinks.ros2 import requests
 from sceneslam.sinks.ros2.topics import TopicSink
-from sceneslam.types.errors import ConfigError, told
+from sceneslam.types.errors import ConfigError, text_of
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.run import Event
@@ -101,7 +101,7 @@ class FoxgloveSink(TopicSink):
         try:
             from sceneslam.ros.transport.foxglove_server import FoxgloveTransport
         except ImportError as error:
-            allowed = f"none, or pip install 'sceneslam[foxglove]' ({told(error)})"
+            allowed = f"none, or pip install 'sceneslam[foxglove]' ({text_of(error)})"
             raise ConfigError("viewer", "foxglove", allowed) from error
         served = FoxgloveTransport(self._port, PARAMETERS)
         for topic, (msgtype, qos) in _SENSORS.items():

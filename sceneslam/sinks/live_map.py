@@ -11,7 +11,7 @@ import numpy as np
 
 from sceneslam.interfaces import LiveMapper
 from sceneslam.types import se3
-from sceneslam.types.errors import told
+from sceneslam.types.errors import text_of
 from sceneslam.types.maps import HybridMap, PointLayer
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
@@ -92,5 +92,5 @@ class LiveMap:
                     self._newest = self._mapper.map()
                     self._publish(self._newest)
         except Exception as error:
-            _log.warning("the live map is no longer updated: %s", told(error))
+            _log.warning("the live map is no longer updated: %s", text_of(error))
             _log.debug("the whole error", exc_info=error)

@@ -13,7 +13,7 @@ from sceneslam.sources import bag_records, mcap_records
 from sceneslam.sources.bag_file import open_bag
 from sceneslam.sources.mcap_file import open_mcap
 from sceneslam.sources.recording import Message, Recording
-from sceneslam.types.errors import InputError, told
+from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.input_files import check_regular
 
 _FIRST_LOOK_BACK_NS = 2_000_000_000
@@ -30,7 +30,7 @@ def open_recording(path: Path) -> Recording:
         with path.open("rb") as file:
             start = file.read(16)
     except OSError as error:
-        raise InputError(f"recording cannot be read ({told(error)}): {path}") from error
+        raise InputError(f"recording cannot be read ({text_of(error)}): {path}") from error
     if not start:
         raise InputError(f"recording: the file is empty: {path}")
     if start.startswith(bag_records.MAGIC):

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import sceneslam
-from sceneslam.types.errors import ConfigError, told
+from sceneslam.types.errors import ConfigError, text_of
 from sceneslam.types.files import MARK, owned
 
 _HYDRAS = (".hydra", "multirun.yaml")  # written by Hydra before a run begins, beside its log
@@ -48,7 +48,7 @@ class RunFolder:
             return cls(made.path, _take(made, key))
         except OSError as error:
             _unmake(made)
-            allowed = f"a folder that can be written ({told(error)})"
+            allowed = f"a folder that can be written ({text_of(error)})"
             raise ConfigError(key, str(path), allowed) from error
 
     def clear(self) -> None:

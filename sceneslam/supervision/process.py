@@ -17,7 +17,7 @@ from sceneslam.supervision.ending import MARK, how_it_ended, kill_all
 from sceneslam.supervision.limits import Limits
 from sceneslam.supervision.messages import Reply, Request
 from sceneslam.supervision.transport import Channel
-from sceneslam.types.errors import ModuleError, told
+from sceneslam.types.errors import ModuleError, text_of
 
 _END_PATIENCE_S = 1.0  # for a process to end after its channel was closed
 # The path is set after start-up: files in the user's folder must not shadow standard modules.
@@ -96,7 +96,7 @@ class Process:
                 raise self._died() from error
             except Exception as error:
                 self._end()
-                raise ProcessDeathError(f"sent an invalid reply ({told(error)})") from error
+                raise ProcessDeathError(f"sent an invalid reply ({text_of(error)})") from error
             for line in reply.log:
                 logging.getLogger(line.logger).log(line.level, "%s", line.text)
             if reply.number == self._number:

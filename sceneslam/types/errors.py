@@ -34,7 +34,7 @@ class ModuleError(SceneSlamError):
     """A SLAM module or detector violated its contract and was stopped."""
 
 
-def told(error: BaseException) -> str:
+def text_of(error: BaseException) -> str:
     """Return the error's type and message on one line."""
     kind = type(error).__name__
     try:

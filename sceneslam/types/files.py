@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from sceneslam.types.errors import told
+from sceneslam.types.errors import text_of
 
 MARK = ".sceneslam"  # in a folder that runs write into: one line about the run, then their files
 PART = ".part"  # at the end of a file's name until it is whole
@@ -132,7 +132,7 @@ class LogFile:
         try:
             self._file.append(piece)
         except OSError as error:
-            self.fault = f"{self._name} is not complete: {told(error)}"
+            self.fault = f"{self._name} is not complete: {text_of(error)}"
             self.close()
 
     def sync(self) -> None:

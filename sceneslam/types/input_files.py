@@ -5,7 +5,7 @@ from __future__ import annotations
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from pathlib import Path
 
-from sceneslam.types.errors import InputError, told
+from sceneslam.types.errors import InputError, text_of
 
 
 def given_path(path: str) -> Path:
@@ -57,4 +57,4 @@ def read_text(file: Path) -> str:
         encoding = "utf-16" if data[:2] in (BOM_UTF16_LE, BOM_UTF16_BE) else "utf-8-sig"
         return data.decode(encoding, errors="replace")
     except OSError as error:
-        raise InputError(f"a file cannot be read ({told(error)}): {file}") from error
+        raise InputError(f"a file cannot be read ({text_of(error)}): {file}") from error

@@ -8,7 +8,7 @@ from pathlib import Path
 from sceneslam.atlas.lasting.map_files import HEAD, load_map_files, save_map_files
 from sceneslam.atlas.lasting.saved_map import SavedMap, forget_contradicted
 from sceneslam.atlas.mapper import Mapper, Note
-from sceneslam.types.errors import ConfigError, InputError, told
+from sceneslam.types.errors import ConfigError, InputError, text_of
 
 LOCALIZE, EXTEND, UPDATE = "localize", "extend", "update"
 
@@ -91,7 +91,7 @@ class LastingMap:
         try:
             save_map_files(self._updated(saved, is_found), self._save)
         except (OSError, InputError) as error:
-            fault = f"the map could not be saved: {told(error)}"
+            fault = f"the map could not be saved: {text_of(error)}"
             if fault not in self.faults:
                 self.faults.append(fault)
 

@@ -21,7 +21,7 @@ from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan
 from sceneslam.atlas.submaps.graph import EdgeKind, PlanarEdge
 from sceneslam.atlas.submaps.submap import Drawing, Submap
-from sceneslam.types.errors import InputError, told
+from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.files import PART, replacing
 
 HEAD, FORMAT, VERSION = "map.yaml", "sceneslam-map", 1
@@ -95,7 +95,7 @@ def load_map_files(folder: Path) -> SavedMap:
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
     except (ValueError, OSError, zipfile.BadZipFile, KeyError) as error:
-        raise InputError(f"the map's arrays cannot be read ({told(error)}): {path}") from error
+        raise InputError(f"the map's arrays cannot be read ({text_of(error)}): {path}") from error
     _check(arrays, path)
     modules = head.get("modules")
     if not isinstance(modules, list) or arrays["node_module"].max(initial=-1) >= len(modules):

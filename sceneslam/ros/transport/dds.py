@@ -48,7 +48,7 @@ from sceneslam.ros.transport.transport import (
     Publisher,
     Qos,
 )
-from sceneslam.types.errors import ConfigError, told
+from sceneslam.types.errors import ConfigError, text_of
 
 _log = logging.getLogger(__name__)
 _WAKE_S = 0.1  # interval at which `close` is noticed
@@ -82,7 +82,7 @@ class DdsTransport:
                 self._participant: Any = DomainParticipant(domain)
             self._announced = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         except DDSException as error:
-            allowed = f"a domain that can be joined ({told(error)})"
+            allowed = f"a domain that can be joined ({text_of(error)})"
             raise ConfigError("domain_id", domain, allowed) from error
         self._lock = threading.RLock()
         self._readers: dict[str, _Reader] = {}
@@ -229,7 +229,7 @@ def _deliver(heard: Heard, arrival: Arrival) -> None:
     try:
         heard(arrival)
     except Exception as error:
-        _log.warning("a message of %s could not be processed: %s", arrival.topic, told(error))
+        _log.warning("a message of %s could not be processed: %s", arrival.topic, text_of(error))
         _log.debug("the whole error", exc_info=error)
 
 
@@ -271,7 +271,7 @@ def _keep_local(descriptors: set[int]) -> None:
             with socket.socket(fileno=os.dup(descriptor)) as one:
                 one.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo\0")
         except OSError as error:
-            _log.warning("DDS can be reached from other machines: %s", told(error))
+            _log.warning("DDS can be reached from other machines: %s", text_of(error))
 
 
 def _named(typename: str) -> Any:

@@ -14,7 +14,7 @@ from foxglove.websocket import Capability, Parameter
 
 from sceneslam.ros.encode import Encoder
 from sceneslam.ros.transport.transport import Arrival, Heard, Publication, Publisher, Qos
-from sceneslam.types.errors import ConfigError, told
+from sceneslam.types.errors import ConfigError, text_of
 
 HOST = "127.0.0.1"  # only this machine can connect
 _log = logging.getLogger(__name__)
@@ -45,7 +45,7 @@ class FoxgloveTransport:
                 server_listener=_Listener(self),
             )
         except Exception as error:
-            raise ConfigError("port", port, f"a port that is free ({told(error)})") from error
+            raise ConfigError("port", port, f"a port that is free ({text_of(error)})") from error
 
     @property
     def url(self) -> str:
@@ -101,7 +101,7 @@ class FoxgloveTransport:
         try:
             cdr = data if encoding == "cdr" else self._cdr(msgtype, json.loads(data)["data"])
         except (ValueError, KeyError, TypeError) as error:
-            _log.warning("Foxglove published on %s: %s", topic, told(error))
+            _log.warning("Foxglove published on %s: %s", topic, text_of(error))
             return
         heard(Arrival(topic=topic, cdr=cdr, arrived_ns=monotonic_ns()))
 

@@ -26,7 +26,7 @@ from sceneslam.ros.transport.transport import (
     Publisher,
     Qos,
 )
-from sceneslam.types.errors import ConfigError, told
+from sceneslam.types.errors import ConfigError, text_of
 
 _log = logging.getLogger(__name__)
 _SPIN_S = 0.1
@@ -72,7 +72,7 @@ class RclpyTransport:
             try:
                 heard(Arrival(topic=topic, cdr=bytes(cdr), arrived_ns=monotonic_ns()))
             except Exception as error:
-                _log.warning("a message of %s could not be processed: %s", topic, told(error))
+                _log.warning("a message of %s could not be processed: %s", topic, text_of(error))
 
         self.unsubscribe(topic)
         self._subscriptions[topic] = self._node.create_subscription(
@@ -123,7 +123,7 @@ def _type(msgtype: str) -> Any:
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except (ImportError, AttributeError) as error:
-        allowed = f"dds, or a ROS that has {msgtype} ({told(error)})"
+        allowed = f"dds, or a ROS that has {msgtype} ({text_of(error)})"
         raise ConfigError("transport", "rclpy", allowed) from error
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
 
-from sceneslam.types.errors import ConfigError, told
+from sceneslam.types.errors import ConfigError, text_of
 
 DDS, RCLPY = "dds", "rclpy"
 LOCALHOST, SUBNET = "localhost", "subnet"
@@ -139,7 +139,7 @@ def open_transport(network: Network) -> Transport:
         return DdsTransport(network)
     except ImportError as error:
         installs = "pip install 'sceneslam[ros2]' for dds; a ROS of this Python for rclpy"
-        allowed = f"{DDS} | {RCLPY}, installed ({told(error)}; {installs})"
+        allowed = f"{DDS} | {RCLPY}, installed ({text_of(error)}; {installs})"
         raise ConfigError("transport", network.transport, allowed) from error
 
 

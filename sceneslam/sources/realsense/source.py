@@ -18,7 +18,7 @@ from sceneslam.sources.live.streams import Streams
 from sceneslam.sources.realsense.frames import DeviceFrame, OpenCamera, Wanted
 from sceneslam.sources.realsense.pairing import Paired, Pairing, samples_of
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError, InputError, told
+from sceneslam.types.errors import ConfigError, InputError, text_of
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor, optical_to_rep103
 
@@ -119,7 +119,7 @@ class RealSense(Measuring):
             found = self._opener(self._serial, self._wanted)
             found.start(self._waiting.put)
         except (InputError, RuntimeError) as error:
-            self._faults[:] = [f"the camera could not be opened again: {told(error)}"]
+            self._faults[:] = [f"the camera could not be opened again: {text_of(error)}"]
             return device
         self._faults.clear()
         return found
@@ -156,7 +156,7 @@ def _opener() -> Callable[[str | None, Wanted], OpenCamera]:
     try:
         from sceneslam.sources.realsense.device import Device, find_device
     except ImportError as error:
-        allowed = f"pyrealsense2, installed: pip install 'sceneslam[realsense]' ({told(error)})"
+        allowed = f"pyrealsense2, installed: pip install 'sceneslam[realsense]' ({text_of(error)})"
         raise ConfigError("_target_", "RealSense", allowed) from error
     return lambda serial, wanted: Device(find_device(serial), wanted)
 

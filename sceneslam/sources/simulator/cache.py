@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from sceneslam.types.errors import InputError, told
+from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.input_files import given_path
 
 _BLOCK_BYTES = 1 << 22
@@ -89,8 +89,8 @@ def _writable(cache: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(
-            f"source.cache_dir: {cache} cannot be written ({told(error)}); name another folder, as "
-            "by SCENESLAM_CACHE_DIR=FOLDER before the command"
+            f"source.cache_dir: {cache} cannot be written ({text_of(error)}); name another folder, "
+            "as by SCENESLAM_CACHE_DIR=FOLDER before the command"
         ) from error
 
 
