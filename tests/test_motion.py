@@ -6,7 +6,7 @@ import pytest
 from sceneslam.motion.model import MotionModel
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.rig import Rig, Sensor, Wheels
 
 PERIOD_S = 0.1
 SCAN = np.diag([0.004, 0.004, 1e-4, 1e-4, 1e-4, 0.002]) ** 2  # of a scan's motion
@@ -193,6 +193,22 @@ def test_wheels_that_pull_to_one_side_are_corrected():
         drive.step(pull=0.1, rate=0.0)
     drive.step(pull=0.1, rate=0.0)
     assert abs(se3.yaw_rad(drive.last.T_prev_curr)) < 0.001  # 0.005 by the wheels
+
+
+def test_base_ahead_of_the_axle_is_moved_sideways_by_a_turn():
+    drive = Drive(rig=Rig(sensors=WHEELED.sensors, wheels=Wheels(axle_m=0.05)))
+    T_axle_base = se3.from_xy_yaw(0.1, 0.0, 0.0)
+    missed_m = []
+    for number in range(200):
+        T_axle = se3.from_xy_yaw(0.02, 0.0, 0.1 * (-1) ** (number // 20))
+        drive.T_odom_base = drive.T_odom_base @ T_axle
+        drive.stamp_ns += round(PERIOD_S * 1e9)
+        motion = drive.model.predict(drive.observation())
+        T_true = se3.inverse(T_axle_base) @ T_axle @ T_axle_base
+        missed_m.append(abs(motion.T_prev_curr[1, 3] - T_true[1, 3]))
+        drive.model.learn(T_true, SCAN)
+    assert missed_m[0] > 0.009
+    assert max(missed_m[100:]) < 0.001
 
 
 def test_gyro_turns_the_base_without_its_bias():

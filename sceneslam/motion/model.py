@@ -29,7 +29,7 @@ from sceneslam.types.se3 import Transform
 _STILL_M, _STILL_RAD = 1e-5, 1e-5  # per step: less than one encoder tick
 _AT_REST = 0.3  # share of the wheels' constant noise while the wheels stand still
 _TURN_PER_METRE = 0.1  # base turns by a degree in a metre: wheels roll unevenly
-_METRE_PER_TURN = 0.1  # base moves 2 cm per radian in place: it is not exactly above the axle
+_METRE_PER_TURN = 0.1  # base moves by 2 cm per radian in place: wheels slip sideways
 _LATE_M, _SPEED_MAX_M_S = 1.0, 25.0  # odometry that moves farther was reset
 _TAUGHT_MIN = 0.25  # least weight of wheels that are probably wrong, in estimating their noise
 _WEAR = 1e-3  # change of the wheels' scale from one scan to the next, as a share of its deviation
@@ -47,6 +47,7 @@ class MotionModel:
         self._lies = [LieDetector() for _ in range(2)]
         self._turns = TurnErrors(rig.gyro.bias_radps)
         self._distance = DistanceError(rig.wheels.drift_ratio, drift=_WEAR * rig.wheels.drift_ratio)
+        self._axle = DistanceError(rig.wheels.axle_m, drift=_WEAR * rig.wheels.axle_m)
         self._stamp_ns: int | None = None
         self.duration_s = 0.0  # between the last two observations
         self._T_odom_base: Transform | None = None  # the last odometry
@@ -194,6 +195,9 @@ class MotionModel:
             self._distance.learn(
                 float(off[0]), float(wheels.T[0, 3]), float(wheels.variance[0] + measured[0, 0])
             )
+            self._axle.learn(
+                float(off[1]), se3.yaw_rad(wheels.T), float(wheels.variance[0] + measured[1, 1])
+            )
         if self._lies[1].lying < BELIEVED:
             self._turns.learn(
                 float(off[2]), wheels.causes, float(wheels.variance[1] + measured[2, 2])
@@ -265,9 +269,12 @@ class MotionModel:
         )
         missed_rad = self._turns.of_wheels(forward_m, yaw_rad)
         position_m = T_prev_curr[:3, 3] * (1.0 + self._distance.ratio)
+        T_axle = se3.from_parts(T_prev_curr[:3, :3], position_m) @ se3.from_xy_yaw(0, 0, missed_rad)
+        T_axle_base = se3.from_xy_yaw(self._axle.ratio, 0.0, 0.0)
+        swung = np.array([self._axle.variance * yaw_rad**2, 0.0])
         return Step(
-            T=se3.from_parts(T_prev_curr[:3, :3], position_m) @ se3.from_xy_yaw(0, 0, missed_rad),
-            variance=self.noise_ratios**2 * amounts + self._floors**2,
+            T=se3.inverse(T_axle_base) @ T_axle @ T_axle_base,
+            variance=self.noise_ratios**2 * amounts + self._floors**2 + swung,
             amounts=amounts,
             causes=np.array([forward_m, yaw_rad, 0.0]),
         )

@@ -24,6 +24,7 @@ from sceneslam.types.truth import GroundTruth
 
 _LOG = logging.getLogger(__name__)
 _LATE_MAX_S = 2.0  # messages are out of order by less; a clock that is set jumps farther
+_AXLE_M = 0.05  # a log does not say where the laser is above the axle: some centimetres off
 _SAMPLES = 20  # scans that are read for a survey
 _OFFSET = b"robot_frontlaser_offset"
 
@@ -54,7 +55,7 @@ class Carmen(StampedScans):
         rig = Rig(
             sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}),
             laser=Laser(T_base_laser=T_base_laser),
-            wheels=Wheels.given(wheels),
+            wheels=Wheels.given({"axle_m": _AXLE_M, **(wheels or {})}),
         )
         super().__init__(rig, stamps_ns)
         self._warn_of_changed(np.flatnonzero(stamps_ns != logged_ns[order]))

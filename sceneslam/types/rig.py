@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.ranges import check_above
+from sceneslam.types.ranges import check_above, check_least
 from sceneslam.types.se3 import Transform, identity
 
 GRAVITY = 9.81  # m/s^2
@@ -96,11 +96,14 @@ class Wheels:
     noise_ratio: float = 0.07  # m after a metre, rad after a radian; it grows with the root of them
     drift_ratio: float = 0.02  # per metre and radian: systematic error
     drift_rad_per_m: float = 0.01
+    axle_m: float = 0.0  # base is so far ahead of the axle, or behind; 0: exactly above it
     floor_m: float = 0.0005  # of any step: encoder resolution
     floor_rad: float = 0.0005
 
     def __post_init__(self) -> None:
-        check_above(0, **{each.name: getattr(self, each.name) for each in fields(self)})
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        check_least(0, axle_m=values.pop("axle_m"))
+        check_above(0, **values)
 
     @classmethod
     def given(cls, noise: Mapping[str, float] | None) -> Wheels:
