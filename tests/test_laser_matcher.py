@@ -1,6 +1,9 @@
 """The laser's scan matching alone: what may pull a pose, and how much."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from test_laser_world import box, room, scan_at
 
 from sceneslam.modules.slam.laser.field import LikelihoodField
@@ -28,6 +31,27 @@ def test_scans_that_err_together_leave_the_pose_to_the_prediction():
     assert told_m(0.0, 0.001) == told_m(0.0, 1.0)
     assert 0.012 < told_m(0.01, 0.5) < 0.015
     assert told_m(0.01, 0.001) > 0.019
+
+
+@pytest.mark.parametrize(
+    ("noise_m", "least_m", "most_m"), [(0.005, 0.004, 0.01), (0.04, 0.022, 0.05)]
+)
+def test_noise_of_scans_is_estimated_from_how_they_fit_the_map(noise_m, least_m, most_m):
+    reader = ScanSurfaceReader(
+        T_base_laser=se3.identity(), range_max_m=25.0, noise_m=0.02, noise_per_m=0.0
+    )
+    rng = np.random.default_rng(0)
+    field = LikelihoodField(reader.read(scan_at(room(), se3.identity(), stamp_ns=0)), 0.05)
+    matcher = Matcher(window_m=0.5, window_rad=0.5, degeneracy_ratio=0.01, shift_m=0.0)
+    prior = MotionPrior.of(np.zeros(3), np.diag([0.02**2, 0.02**2, 0.01**2]))
+    deviations_m = []
+    for _ in range(100):
+        scan = scan_at(room(), se3.identity(), stamp_ns=0)
+        ranges_m = scan.ranges_m + noise_m * rng.standard_normal(len(scan.ranges_m))
+        match = matcher.match(reader.read(replace(scan, ranges_m=ranges_m)), field, [prior])
+        deviations_m.append(1.0 / float(np.sqrt(match.information[0, 0])))
+    assert least_m < matcher.noise.ratio * 0.02 < most_m
+    assert (deviations_m[-1] < deviations_m[0]) == (noise_m < 0.02)
 
 
 def pull_m(seen, new, *, beams):

@@ -18,11 +18,12 @@ bias a turn: on the side to which the robot turns, the scan always shows more th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.motion.trust import NoiseRatio
 from sceneslam.types.planar import Matrix, Planar, rotation, wrap
 
 from .field import LikelihoodField
@@ -43,6 +44,7 @@ _SLACK = 2.0  # scans that fit worse by less do not add up
 _USUAL_SCANS = 20.0  # over which that average is taken
 _VIEW_M, _VIEW_RAD = 0.1, 0.1  # scans this far apart have independent errors
 _NOVELTY_MIN = 1e-3
+_NOISE_MIN = 0.1  # least noise of a scan, relative to the expected one: a map has cells
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,6 +61,7 @@ class Match:
     T_local_alone: Planar  # by the laser alone, except for weak directions
     cost: float  # negative logarithm of the evidence of scan and prior, up to a constant
     scan_cost: float  # of that, the scan's
+    noise: float  # deviation of the points from the map, relative to the expected one
     probabilities: NDArray[np.float64]  # of the priors, given the scan
 
     def cost_with(self, prior: MotionPrior) -> float:
@@ -84,6 +87,7 @@ class Matcher:
     degeneracy_ratio: float
     shift_m: float  # standard deviation of a scan's common error
     misfit: float = 0.0  # by how much the last scans fit worse than those before [nats]
+    noise: NoiseRatio = field(default_factory=lambda: NoiseRatio(1.0))  # of points, to the expected
     _usual: float | None = None  # cost of a point of the last scans
 
     def match(
@@ -117,11 +121,22 @@ class Matcher:
             for k, start in [(likely, found), *((k, priors[k].pose) for k in open_to if k > 0)]:
                 match = self._refine(scan_base, field, start, priors[k], shift_m)
                 matches.setdefault(k, []).append(match)
-        best = min((one for some in matches.values() for one in some), key=lambda one: one.cost)
+        likely, best = min(
+            ((k, one) for k, some in matches.items() for one in some), key=lambda each: each[1].cost
+        )
         for k, some in matches.items():
             costs[k] = min(one.cost for one in some)
         self._compare(best, len(scan_base))
         weights = np.exp(best.cost - costs)
+        noise = max(best.noise, _NOISE_MIN)
+        self.noise.learn(noise, 1.0, floor=0.0, variance=0.0, share=1.0)
+        # Motions are weighed by the expected noise, as scans differ by more than noise in how they
+        # fit: moving things and the map's errors are common to many beams. The pose is by the
+        # estimated noise.
+        scan_base = scan_base.with_noise(self.noise.ratio)
+        best = self._refine(
+            scan_base, field, best.T_local_base, priors[likely], shift_m, is_near=True
+        )
         return replace(best, probabilities=weights / weights.sum())
 
     def _compare(self, match: Match, count: int) -> None:
@@ -137,6 +152,7 @@ class Matcher:
         self, scan_base: SurfacePoints, field: LikelihoodField, start: Planar, prior: Matrix
     ) -> Match:
         """Return the pose of a scan, without search, from `start` (3,) with covariance (3, 3)."""
+        scan_base = scan_base.with_noise(self.noise.ratio)
         return self._refine(scan_base, field, start, MotionPrior.of(start, prior), self.shift_m)
 
     def _search(
@@ -171,10 +187,13 @@ class Matcher:
         start: Planar,
         expected: MotionPrior,
         shift_m: float,
+        *,
+        is_near: bool = False,
     ) -> Match:
-        """Return the pose by Gauss-Newton from a start, with one prior."""
+        """Return the pose by Gauss-Newton from a start, with one prior; `is_near`: fine alone."""
         pose = start.copy()
-        for kernel_m, iterations in zip(_KERNELS_M, _ITERATIONS, strict=True):
+        levels = list(zip(_KERNELS_M, _ITERATIONS, strict=True))
+        for kernel_m, iterations in levels[-1:] if is_near else levels:
             for _ in range(iterations):
                 H, g, _ = self._laser_equations(scan_base, field, pose, kernel_m, shift_m)
                 prior = expected.weighed(pose)
@@ -206,6 +225,7 @@ class Matcher:
             T_local_alone=pose + pull,
             cost=scan_cost + expected.cost_at(pose) - expected.spread_after(H),
             scan_cost=scan_cost,
+            noise=_noise(scan_base, evident),
             probabilities=np.ones(1),
         )
 
@@ -299,6 +319,13 @@ def _scan_cost(scan_base: SurfacePoints, residual: NDArray[np.float64]) -> float
     squared, limit = residual**2, _KERNELS_M[-1] ** 2
     each = 0.5 * scan_base.weight * limit * squared / (limit + squared)
     return float(each.sum()) / _CORRELATION
+
+
+def _noise(scan_base: SurfacePoints, residual: NDArray[np.float64]) -> float:
+    """Return the points' deviation from the map, relative to the expected one, without outliers."""
+    squared, limit = residual**2, _KERNELS_M[-1] ** 2
+    robust = np.where(squared > 0.0, (limit / (limit + squared)) ** 2, 0.0)  # 0: no surface
+    return float(np.sqrt(robust @ (scan_base.weight * squared) / max(robust.sum(), 1e-12)))
 
 
 def _steps(half: float, step: float) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,10 @@ class SurfacePoints:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def with_noise(self, ratio: float) -> SurfacePoints:
+        """Return the points with `ratio` times the standard deviation."""
+        return replace(self, weight=self.weight / ratio**2)
 
     def moved(self, T_a_b: Planar) -> SurfacePoints:
         """Return the points (N, 2) [m] of frame b in frame a."""
