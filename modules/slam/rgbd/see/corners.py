@@ -48,12 +48,14 @@ class _Detected:
 class _Octave:
     """ORB on one level; OpenCV allows two threads at a time."""
 
-    def __init__(self, quota: int, scale: float) -> None:
-        self._quota, self._scale, self._weakest = quota, scale, 0
+    def __init__(self, quota: int) -> None:
+        self._quota, self._weakest = quota, 0
         self._orb = cv2.ORB.create(nfeatures=quota, nlevels=1, scoreType=cv2.ORB_FAST_SCORE)
 
-    def detect(self, image: Image, threshold: int) -> _Detected:
+    def detect(self, image: Image, threshold: int, *, full: Image) -> _Detected:
         """Return the strongest corners, as many as wanted, of those above a threshold.
+
+        Their pixels are those of the `full` image, of which `image` is a level.
 
         Most images have many more: detection begins near the strength of the last image's weakest
         corner, and is repeated with a lower threshold if too few are found. This only saves time:
@@ -67,7 +69,9 @@ class _Octave:
         self._weakest = int(strength.min()) if len(strength) else 0
         uv_px = np.asarray(cv2.KeyPoint.convert(keypoints), np.float64).reshape(-1, 2)
         order = np.lexsort((uv_px @ _ROW_BY_ROW, -strength))
-        uv_px = self._scale * uv_px.take(order, axis=0)
+        # A pixel's centre has integer coordinates: those of a smaller image lie half a pixel off.
+        scale = np.divide(full.shape[1::-1], image.shape[1::-1])
+        uv_px = (uv_px.take(order, axis=0) + 0.5) * scale - 0.5
         columns, rows = (uv_px / _CELL_PX).astype(np.int64).T
         return _Detected(
             keypoints=[keypoints[row] for row in order.tolist()],
@@ -95,7 +99,7 @@ class CornerFinder:
         self._threshold_min, self._noise_ratio = fast_threshold_min, fast_noise_ratio
         shares = SCALE ** -np.arange(LEVELS)
         quotas = np.rint(_SURPLUS * count * shares / shares.sum()).astype(int).tolist()
-        self._octaves = [_Octave(quota, SCALE**level) for level, quota in enumerate(quotas)]
+        self._octaves = [_Octave(quota) for quota in quotas]
         self._beside = thread_beside("rgbd-corners")
 
     def find(self, gray: Image) -> Corners:
@@ -133,7 +137,8 @@ class CornerFinder:
     def _detect(
         self, pyramid: Sequence[Image], levels: Sequence[int], threshold: int
     ) -> dict[int, _Detected]:
-        return {i: self._octaves[i].detect(pyramid[i], threshold) for i in levels}
+        full = pyramid[0]
+        return {i: self._octaves[i].detect(pyramid[i], threshold, full=full) for i in levels}
 
     def _describe(
         self,
