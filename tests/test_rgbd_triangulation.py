@@ -28,6 +28,7 @@ def keyframe_at(y_m, points_local, descriptors, *, landmark_ids, depth_m):
             points_base=nothing.astype(np.float32), colors_bgr=nothing.astype(np.uint8), scan=None
         ),
         turning=AT_REST,
+        is_monocular=True,
     )
 
 

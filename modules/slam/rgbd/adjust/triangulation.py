@@ -27,7 +27,8 @@ _NEAREST_SHARE = 0.05  # quantile of the landmarks' depths in a keyframe;
 _NEARER_RATIO = 0.5  # a point nearer than this share of it is a wrong match
 _CORRELATED = 10.0  # errors within one pair of images are correlated
 _WHEELS_RATIO = 0.03  # of the baseline: 3 mm and 2 % of 0.3 m or more
-_MAX_DOUBT_RATIO = 0.3  # of its distance: a less certain landmark waits for another keyframe
+_MAX_DOUBT_RATIO = 0.3  # of the usual inverse distance: a less certain landmark waits
+_FARTHEST_RATIO = 0.2  # of the usual inverse distance: farther points do not measure motion
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -186,12 +187,32 @@ def _intersect(visual_map: VisualMap, new: _Eye, other: _Eye, matches: Matches) 
     distance_m = np.linalg.norm(points @ new.T_cam_local[:3, :3].T + new.T_cam_local[:3, 3], axis=1)
     doubt_m = np.linalg.eigvalsh(information)[:, 0] ** -0.5
     doubt_ratio = doubt_m / distance_m
+    # A nearer corner without depth lies on an edge, or in a shadow, of the depth image.
+    range_m = 0.0 if new.keyframe.is_monocular else visual_map.camera.depth_range_m[1]
+    is_unmeasured = distance_m > range_m
     return _Found(
         points_local=points,
         information=information,
         doubt_ratio=doubt_ratio,
-        is_sure=agrees & (doubt_ratio < _MAX_DOUBT_RATIO),
+        is_sure=_are_sure(agrees & is_unmeasured, distance_m, doubt_m),
     )
+
+
+def _are_sure(
+    agrees: NDArray[np.bool_], distance_m: NDArray[np.float64], doubt_m: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Return which points (N,) are located well enough, whatever their own error is.
+
+    The error of the inverse distance does not depend on the distance. It is compared with the
+    inverse distance that is usual in the two images: compared with a point's own it would favour
+    points that were measured too near, and the map's scale would shrink.
+    """
+    if not agrees.any():
+        return agrees
+    per_m = 1.0 / distance_m
+    usual_per_m = np.median(per_m[agrees])
+    is_located = doubt_m * per_m**2 < _MAX_DOUBT_RATIO * usual_per_m
+    return np.asarray(agrees & is_located & (per_m > _FARTHEST_RATIO * usual_per_m))
 
 
 def _midpoints(new: _Eye, other: _Eye, matches: Matches) -> NDArray[np.float64]:

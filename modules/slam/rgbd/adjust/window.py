@@ -19,7 +19,7 @@ from .pose_constraints import PoseConstraint, PoseConstraints
 
 _FREE = 5
 _HELD = 15
-_MAX_SIGMA_M, _MAX_SIGMA_RATIO = 1.0, 0.3  # limits of a landmark; the second of its distance
+_MAX_SIGMA_M, _MAX_SIGMA_RATIO = 1.0, 1.0  # limits of a landmark; the second of its distance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -32,7 +32,7 @@ class MapWindow:
     landmark_ids: NDArray[np.int64]  # (L,), ascending
     births: NDArray[np.int64]  # (L,), to distinguish a landmark from a later one of the same id
     feature_rows: NDArray[np.int64]  # (N,), of each sighting in its keyframe
-    by_odometry: dict[tuple[int, int], PoseConstraint]  # by keyframe ids
+    by_odometry: list[tuple[tuple[int, int], PoseConstraint]]  # by keyframe ids
     corrections: int  # of the map, when it was copied
 
 
@@ -74,7 +74,7 @@ def take_window(visual_map: VisualMap, keyframe_id: int) -> MapWindow | None:
                 [visual_map.inverse_depth_sigmas_per_m(f) for f in features]
             )[chosen],
         ),
-        constraints=PoseConstraints.of({}),
+        constraints=PoseConstraints.of([]),
     )
     return MapWindow(
         bundle=bundle,

@@ -57,8 +57,7 @@ class KeyframeMaker:
         )
         deep_rows = landmark_ids[:0] if fix is None else fix.deep_rows
         keyframe_id = self._map.insert(keyframe, deep_rows=deep_rows)
-        if view.is_monocular:
-            triangulate(self._map, keyframe_id)
+        triangulate(self._map, keyframe_id)
         join_duplicates(self._map, keyframe, segment)
         self._memory.insert(fix, view.depth_m, guessed_s=guessed_s)
         self._mapping.insert(keyframe_id, view)
