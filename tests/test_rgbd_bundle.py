@@ -53,7 +53,7 @@ def exact_bundle(rng, *, has_depth=True):
             depth_m=depth_m if has_depth else np.zeros(count),
             inverse_depth_sigma_per_m=np.full(count, 0.003),
         ),
-        constraints=PoseConstraints.of({}),
+        constraints=PoseConstraints.of([]),
     )
 
 
@@ -83,7 +83,7 @@ def test_a_constraint_moves_a_keyframe_that_has_hardly_any_other():
     T_tied = se3.inverse(exact.T_local_cam[0]) @ exact.T_local_cam[4] @ off
     constraint = PoseConstraint(T_one_other=T_tied, root=1e4 * np.eye(6))
     adjusted = adjust(
-        CAMERA, replace(exact, seen=vague, constraints=PoseConstraints.of({(0, 4): constraint}))
+        CAMERA, replace(exact, seen=vague, constraints=PoseConstraints.of([((0, 4), constraint)]))
     )
     T_found = se3.inverse(adjusted.bundle.T_local_cam[0]) @ adjusted.bundle.T_local_cam[4]
     assert pytest.approx(T_tied, abs=1e-3) == T_found

@@ -18,41 +18,61 @@ from sceneslam.motion.predictor import Prediction
 from sceneslam.types import se3
 
 
-def keyframes(*, is_monocular=True, stretches=(0, 0, 0, 0)):
+def keyframes(*, stretches=(0, 0, 0, 0)):
     """Return keyframes on a line, half a metre apart, as odometry alone has them."""
     made = {}
     for k, stretch in enumerate(stretches):
         one = keyframe_at(
             np.eye(4), np.zeros((0, 3)), np.zeros((0, 32), np.uint8), np.zeros(0, int)
         )
-        one.is_monocular = is_monocular
-        one.odometry = OdometryPose(T_odom_base=se3.from_xy_yaw(0.5 * k, 0.1, 0.2), stretch=stretch)
+        one.T_local_base = se3.from_xy_yaw(0.5 * k, 0.1, 0.2)
+        one.odometry = odometry(one.T_local_base, k, stretch=stretch)
         made[k] = one
     return made
 
 
-def test_odometry_constrains_keyframes_that_follow_each_other_without_depth():
+def odometry(T_odom_base, k, *, stretch=0):
+    """Return the odometry's pose of the k-th keyframe: 1 cm and 2 mrad less sure than the last."""
+    variance = k * np.array([0.01**2, 0.002**2])
+    return OdometryPose(T_odom_base=T_odom_base, stretch=stretch, variance=variance)
+
+
+def test_odometry_constrains_distance_and_turn_of_keyframes_that_follow_each_other():
     constraints = odometry_constraints(keyframes(), CAMERA.T_base_cam)
-    assert list(constraints) == [(0, 1), (1, 2), (2, 3)]
-    T_base = CAMERA.T_base_cam @ constraints[1, 2].T_one_other @ se3.inverse(CAMERA.T_base_cam)
+    assert [pair for pair, _ in constraints] == [(k, k + 1) for k in (0, 0, 1, 1, 2, 2)]
+    (_, distance), (_, turn) = constraints[2:4]
+    T_base = CAMERA.T_base_cam @ distance.T_one_other @ se3.inverse(CAMERA.T_base_cam)
     assert np.linalg.norm(T_base[:3, 3]) == pytest.approx(0.5)
+    to_cam = se3.adjoint(se3.inverse(CAMERA.T_base_cam))
+    by_base = [constraint.root @ to_cam for constraint in (distance, turn)]
+    np.testing.assert_allclose(np.diag(by_base[0]), [100.0] * 3 + [0.0] * 3, rtol=1e-3)
+    np.testing.assert_allclose(np.diag(by_base[1]), [0.0] * 3 + [1000.0] * 3, rtol=1e-2)
 
 
-def test_odometry_constrains_nothing_that_has_depth_or_lies_beyond_a_gap():
-    assert not odometry_constraints(keyframes(is_monocular=False), CAMERA.T_base_cam)
-    assert list(odometry_constraints(keyframes(stretches=(0, 0, 1, 1)), CAMERA.T_base_cam)) == [
-        (0, 1),
-        (2, 3),
+def test_odometry_constrains_nothing_beyond_a_gap():
+    found = odometry_constraints(keyframes(stretches=(0, 0, 1, 1)), CAMERA.T_base_cam)
+    assert {pair for pair, _ in found} == {(0, 1), (2, 3)}
+
+
+def test_a_distance_that_the_keyframes_contradict_weighs_next_to_nothing():
+    keys = keyframes()
+    honest = odometry_constraints(keys, CAMERA.T_base_cam)
+    for key in list(keys)[2:]:
+        keys[key].T_local_base = se3.from_xy_yaw(0.5 * key - 0.1, 0.1, 0.2)  # wheels slip by 10 cm
+    slipping = odometry_constraints(keys, CAMERA.T_base_cam)
+    weights = [
+        np.linalg.norm(b.root) / np.linalg.norm(a.root)
+        for (_, a), (_, b) in zip(honest, slipping, strict=True)
     ]
+    assert weights == pytest.approx([1.0, 1.0, 9 / 109, 1.0, 1.0, 1.0], rel=0.01)
 
 
 def test_constraints_bring_back_a_scale_that_images_alone_cannot_tell():
     bundle = exact_bundle(np.random.default_rng(0))
     poses, count = true_poses(), len(bundle.T_local_cam)
     keys = dict(enumerate(keyframes(stretches=(0,) * count).values()))
-    for key, T_local_cam in zip(keys.values(), poses, strict=True):
-        T_local_base = T_local_cam @ se3.inverse(CAMERA.T_base_cam)
-        key.odometry = OdometryPose(T_odom_base=T_local_base, stretch=0)
+    for k, T_local_cam in enumerate(poses):
+        keys[k].odometry = odometry(T_local_cam @ se3.inverse(CAMERA.T_base_cam), k)
     shrunk = bundle.T_local_cam.copy()
     first_m = shrunk[0, :3, 3]
     shrunk[:, :3, 3] = first_m + 0.8 * (shrunk[:, :3, 3] - first_m)
@@ -67,6 +87,8 @@ def test_constraints_bring_back_a_scale_that_images_alone_cannot_tell():
 
     true_m = np.linalg.norm(poses[-1][:3, 3] - poses[0][:3, 3])
     assert length_m(adjust(CAMERA, wrong)) == pytest.approx(0.8 * true_m, rel=0.05)
+    for k, T_local_cam in enumerate(shrunk):
+        keys[k].T_local_base = T_local_cam @ se3.inverse(CAMERA.T_base_cam)
     constraints = PoseConstraints.of(odometry_constraints(keys, CAMERA.T_base_cam))
     assert length_m(adjust(CAMERA, replace(wrong, constraints=constraints))) == pytest.approx(
         true_m, rel=0.05
@@ -94,16 +116,14 @@ def found_at(x_m):
 
 
 @pytest.mark.parametrize(
-    ("found_m", "scale_m", "expected_m"),
-    [(1.1, 0.0, 1.05), (1.1, 1.0, 1.0), (1.5, 0.0, 1.5)],
-    ids=["as sure as each other", "scale unknown", "wheels slip"],
+    ("found_m", "expected_m"),
+    [(1.1, 1.05), (1.5, 1.5)],
+    ids=["as sure as each other", "wheels slip"],
 )
-def test_a_pose_without_depth_is_led_by_odometry_unless_they_contradict(
-    found_m, scale_m, expected_m
-):
+def test_a_pose_is_led_by_odometry_unless_they_contradict(found_m, expected_m):
     T_predicted, known = se3.from_xy_yaw(1.0, 0.0, 0.0), 0.04**2 * np.eye(6)
     prediction = Prediction(T_local_base=T_predicted, covariance=known, motion=None)
-    fix = led(found_at(found_m), prediction, np.diag([scale_m**2, 0.0, 0.0]))
+    fix = led(found_at(found_m), prediction)
     assert fix.estimate.T_local_base[0, 3] == pytest.approx(expected_m, abs=0.001)
     is_image_alone = expected_m == found_m
     expected_m2 = 0.02**2 if is_image_alone else 0.04**2 / 2

@@ -115,7 +115,7 @@ class MotionModel:
         )
         turn = self._turns.by_gyro(observation, duration_s)
         if turn is not None:
-            noise_rad = self._gyro.bias_radps * duration_s + self._gyro.noise_rad
+            noise_rad = self._turns.gyro_bias_deviation * duration_s + self._gyro.noise_rad
             guess = guess.turned(turn, noise_rad, duration_s)
             if wheels is not None and gap is None:
                 self._compare(turn, wheels, duration_s)

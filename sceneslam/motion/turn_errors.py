@@ -46,6 +46,11 @@ class TurnErrors:
         return np.array([*self._level_radps, -self._errors[2]])
 
     @property
+    def gyro_bias_deviation(self) -> float:
+        """Return the standard deviation [rad/s] of the estimated bias about the vertical axis."""
+        return math.sqrt(float(self._covariance[2, 2]))
+
+    @property
     def knows_level_bias(self) -> bool:
         """Tell whether the bias about the horizontal axes was measured, at rest."""
         return self._rests > 0.0

@@ -219,9 +219,9 @@ class RgbdSlam:
 
     def _hold(self, view: View, fix: VisualFix, prediction: Prediction) -> Tracking:
         """Accept a pose, and extend the map if a keyframe is due."""
-        if view.is_monocular and prediction.is_measured:
-            scale = self._certainty.scale_variance(view, fix, fix.estimate.T_local_base)
-            fix = led(fix, prediction, scale)
+        seen = fix.estimate.covariance
+        if prediction.is_measured:
+            fix = led(fix, prediction)
         status = self._health.judge(fix.estimate)
         # Over a few frames odometry is more accurate than a pose by few landmarks.
         is_by_odometry = status is TrackingStatus.DEGRADED and prediction.is_measured
@@ -231,9 +231,11 @@ class RgbdSlam:
         else:
             T_local_base = fix.estimate.T_local_base
             # Without depth the scale comes from the wheels and cannot calibrate them.
-            is_seen = not view.is_monocular
             self._hold_pose(
-                view.observation, T_local_base, fix.estimate.covariance, is_seen=is_seen
+                view.observation,
+                T_local_base,
+                fix.estimate.covariance,
+                seen=None if view.is_monocular else seen,
             )
         self._held_ids = fix.landmark_ids
         self._map.count_sightings(fix.expected_ids, fix.landmark_ids)
@@ -262,11 +264,11 @@ class RgbdSlam:
         T_local_base: Transform,
         covariance: NDArray[np.float64],
         *,
-        is_seen: bool = False,
+        seen: NDArray[np.float64] | None = None,
     ) -> None:
         self._T_local_base, self._is_lost = T_local_base, False
         self._place_rule.restart()
-        information = np.asarray(np.linalg.inv(covariance)) if is_seen else None
+        information = None if seen is None else np.asarray(np.linalg.inv(seen))
         self._predictor.measure(observation, T_local_base, covariance, information)
 
     def _repeat(self, observation: Observation, prediction: Prediction) -> Tracking:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from sceneslam.types import se3
@@ -22,7 +22,7 @@ class Task:
     keyframe_ids: list[int]  # (K,) of the bundle's keyframes, ascending
     free_ids: list[int]
     fresh: Mapping[int, Shown]  # views of new keyframes, by id
-    by_odometry: Mapping[tuple[int, int], PoseConstraint]  # by keyframe ids
+    by_odometry: Sequence[tuple[tuple[int, int], PoseConstraint]]  # by keyframe ids
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -51,11 +51,11 @@ class MappingWork:
         """Return the task's bundle adjusted with its relative-pose constraints."""
         self._tie(task)
         rows = {keyframe_id: row for row, keyframe_id in enumerate(task.keyframe_ids)}
-        constraints = {
-            (rows[one], rows[other]): constraint
-            for (one, other), constraint in {**task.by_odometry, **self._constraints}.items()
+        constraints = [
+            ((rows[one], rows[other]), constraint)
+            for (one, other), constraint in [*task.by_odometry, *self._constraints.items()]
             if one in rows and other in rows
-        }
+        ]
         bundle = replace(task.bundle, constraints=PoseConstraints.of(constraints))
         return MappingResult(
             adjusted=adjust(self._camera, bundle),

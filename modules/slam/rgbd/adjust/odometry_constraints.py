@@ -1,28 +1,27 @@
-"""Odometry constraints between keyframes without depth, from wheels and gyro.
+"""Odometry constraints between keyframes, from wheels and gyro.
 
-Two images give a direction but no distance, and selecting landmarks with a certain distance favours
-those estimated too near: without these constraints the scale shrinks from keyframe to keyframe.
+Without depth two images give a direction but no distance. A gyro measures turns better than images
+whose corners all err alike.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
-from sceneslam.motion.predictor import Matrix, Prediction
+from sceneslam.motion.predictor import Prediction
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
 from ..locate.localizer import VisualFix
-from ..map.keyframes import Keyframe, OdometryPose
+from ..map.keyframes import Keyframe, OdometryPose, motion_between
 from .pose_constraints import PoseConstraint
 
-_SIGMA_M, _SIGMA_PER_M = 0.003, 0.02  # of the wheels' distance; a slip is an outlier
-_SIGMA_RAD, _SIGMA_RAD_PER_M = 0.005, 0.01  # of the gyro's turn, and of the floor's tilt
 _FARTHEST_M = 3.0  # largest distance between two keyframes: odometry over more adds nothing
+_SLIP = 3.0  # [sigma] of the distance; beyond, wheels probably slip
 _CORRELATED = 4.0  # images of the same landmarks err alike; 1 and 4 were tried in one hall
 _CHI2 = 16.8  # 99 % of six degrees of freedom
 
@@ -31,25 +30,27 @@ class OdometryIntegrator:
     """Integrates wheels and gyro; never corrected by the map."""
 
     def __init__(self) -> None:
-        self._now = OdometryPose(T_odom_base=se3.identity(), stretch=0)
+        self._now = OdometryPose(T_odom_base=se3.identity(), stretch=0, variance=np.zeros(2))
 
     def add(self, prediction: Prediction) -> OdometryPose | None:
         """Return the pose by odometry alone; None without trusted odometry."""
-        T_now = se3.orthonormal(self._now.T_odom_base @ prediction.motion.T_prev_curr)
+        motion, before = prediction.motion, self._now
         is_broken = not prediction.is_measured
-        self._now = OdometryPose(T_odom_base=T_now, stretch=self._now.stretch + is_broken)
+        self._now = OdometryPose(
+            T_odom_base=se3.orthonormal(before.T_odom_base @ motion.T_prev_curr),
+            stretch=before.stretch + is_broken,
+            variance=before.variance + motion.covariance.diagonal()[[0, 3]],
+        )
         return None if is_broken else self._now
 
 
-def led(fix: VisualFix, prediction: Prediction, scale_variance: Matrix) -> VisualFix:
-    """Return a pose that was found without depth, fused with odometry.
+def led(fix: VisualFix, prediction: Prediction) -> VisualFix:
+    """Return a pose that an image shows, fused with odometry.
 
-    `scale_variance` (3, 3) [m^2], in base, is the pose's variance by the map's scale error. If
-    image and odometry contradict each other, the image's pose is returned, as wheels may slip.
+    If image and odometry contradict each other, the image's pose is returned, as wheels may slip.
     """
     found = fix.estimate
     measured = _CORRELATED * found.covariance
-    measured[:3, :3] += scale_variance
     off = se3.log(se3.inverse(prediction.T_local_base) @ found.T_local_base)
     total = prediction.covariance + measured
     if off @ np.linalg.solve(total, off) > _CHI2:
@@ -66,29 +67,26 @@ def led(fix: VisualFix, prediction: Prediction, scale_variance: Matrix) -> Visua
 
 def odometry_constraints(
     keyframes: Mapping[int, Keyframe], T_base_cam: Transform
-) -> dict[tuple[int, int], PoseConstraint]:
-    """Return odometry's constraints between consecutive keyframes of which one has no depth."""
-    constraints: dict[tuple[int, int], PoseConstraint] = {}
-    for one, other in _neighbours(keyframes):
-        here, there = keyframes[one].odometry, keyframes[other].odometry
-        if here is None or there is None or here.stretch != there.stretch:
-            continue
-        T_one_other = se3.inverse(here.T_odom_base) @ there.T_odom_base
-        distance_m = float(np.linalg.norm(T_one_other[:3, 3]))
-        if distance_m > _FARTHEST_M:
-            continue
-        sigmas = np.repeat(
-            [_SIGMA_M + _SIGMA_PER_M * distance_m, _SIGMA_RAD + _SIGMA_RAD_PER_M * distance_m], 3
-        )
-        constraints[one, other] = PoseConstraint(
-            T_one_other=se3.inverse(T_base_cam) @ T_one_other @ T_base_cam,
-            root=np.diag(1.0 / sigmas) @ se3.adjoint(T_base_cam),
-        )
-    return constraints
+) -> list[tuple[tuple[int, int], PoseConstraint]]:
+    """Return odometry's constraints between consecutive keyframes.
 
-
-def _neighbours(keyframes: Mapping[int, Keyframe]) -> Iterable[tuple[int, int]]:
-    """Yield pairs of consecutive keyframes of which the later one has no depth."""
+    Distance and turn are constrained apart, as wheels that slip still have a gyro. A distance that
+    the keyframes contradict weighs next to nothing (Geman and McClure).
+    """
+    to_base = se3.adjoint(T_base_cam)
+    found = []
     for one, other in pairwise(sorted(keyframes)):
-        if keyframes[other].is_monocular:
-            yield one, other
+        motion = motion_between(keyframes[one], keyframes[other])
+        if motion is None or np.linalg.norm(motion.T_here_there[:3, 3]) > _FARTHEST_M:
+            continue
+        T_one_other = se3.inverse(T_base_cam) @ motion.T_here_there @ T_base_cam
+        seen = se3.inverse(keyframes[one].T_local_base) @ keyframes[other].T_local_base
+        of_m, of_rad = motion.variance
+        off_m2 = float(((seen[:3, 3] - motion.T_here_there[:3, 3]) ** 2).sum())
+        per_m = of_m**-0.5 * _SLIP**2 / (_SLIP**2 + off_m2 / of_m)
+        # Corners err alike, so that their information is too large by comparison.
+        per_rad = (of_rad / _CORRELATED) ** -0.5
+        for weights in ([per_m] * 3 + [0.0] * 3, [0.0] * 3 + [per_rad] * 3):
+            root = np.diag(weights) @ to_base
+            found.append(((one, other), PoseConstraint(T_one_other=T_one_other, root=root)))
+    return found

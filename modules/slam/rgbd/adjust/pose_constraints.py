@@ -6,7 +6,7 @@ all pixels, independent of the colours' calibration. Both together err less than
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,10 +46,10 @@ class PoseConstraints:
     roots: NDArray[np.float64]  # (M, 6, 6), see PoseConstraint
 
     @staticmethod
-    def of(constraints: Mapping[tuple[int, int], PoseConstraint]) -> PoseConstraints:
-        """Return the constraints, given by the rows of the two keyframes."""
-        rows = np.array(list(constraints), np.int64).reshape(-1, 2)
-        measured = constraints.values()
+    def of(constraints: Sequence[tuple[tuple[int, int], PoseConstraint]]) -> PoseConstraints:
+        """Return the constraints, each given with the rows of its two keyframes."""
+        rows = np.array([pair for pair, _ in constraints], np.int64).reshape(-1, 2)
+        measured = [constraint for _, constraint in constraints]
         T_one_other = np.array([each.T_one_other for each in measured]).reshape(-1, 4, 4)
         roots = np.array([each.root for each in measured]).reshape(-1, 6, 6)
         one, other = rows.T

@@ -11,6 +11,7 @@ from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
 from ..locate.recognition import PlaceRecognizer, Recognition
+from ..map.keyframes import motion_between
 from ..map.visual_map import VisualMap
 from .pose_graph import KeyframeEdge, PoseGraph, Way, motion_covariance
 
@@ -20,6 +21,8 @@ _FEWEST = 5  # keyframes needed for the usual similarity
 _CHI2 = 22.5  # 99.9 % of six degrees of freedom
 _DRIFT_RATIO = 0.05  # of the path length: a loop with more drift is rejected
 _SIGMAS = 3.0
+_CHI2_TURN = 16.3  # 99.9 % of three degrees of freedom
+_ALIKE = 16.0  # steps, about a second, in which a gyro's bias or wheels err alike
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -76,6 +79,8 @@ class LoopDetector:
         if seen is None:
             return []
         loop = self._loop(query.keyframe_id, seen)
+        if not self._has_turned(loop):
+            return []
         way = self._graph.way(candidate, query.keyframe_id)
         if way is not None and not _believable(loop, new.T_local_base, way):
             return []
@@ -92,6 +97,16 @@ class LoopDetector:
         T_local_base = self._map.keyframes[loop.keyframe_id].T_local_base
         xi = se3.log(se3.inverse(T_local_base) @ loop.T_local_base)
         return float(xi @ np.linalg.solve(loop.edge.covariance, xi)) > _CHI2
+
+    def _has_turned(self, loop: LoopClosure) -> bool:
+        """Tell whether a loop's rotation is that of odometry and gyro, as far as these know it."""
+        old, new = (self._map.keyframes[k] for k in (loop.edge.start, loop.edge.end))
+        motion = motion_between(old, new)
+        if motion is None:
+            return True
+        off = se3.log(se3.inverse(motion.T_here_there) @ loop.edge.T_start_end)[3:]
+        covariance = loop.edge.covariance[3:, 3:] + _ALIKE * motion.variance[1] * np.eye(3)
+        return float(off @ np.linalg.solve(covariance, off)) <= _CHI2_TURN
 
     def _loop(self, keyframe_id: int, seen: Recognition) -> LoopClosure:
         T_old = self._map.keyframes[seen.keyframe_id].T_local_base

@@ -93,10 +93,16 @@ class SessionRelocalizer:
         )
 
     def see(self, view: View, T_local_base: Transform) -> None:
-        """Add a view with a tracked pose."""
+        """Add a view with a tracked pose.
+
+        It is not searched if the depth camera is too far from everything that the image shows: from
+        there a sideways motion looks like a turn.
+        """
         self._end_ns = view.observation.stamp_ns
         self._images += 1
         if not self._past or self._queries or self._images % _EVERY:
+            return
+        if view.is_monocular and view.observation.depth_m is not None:
             return
         if self._is_known and np.linalg.norm(T_local_base[:3, 3] - self._looped_at) < _LOOP_M:
             return

@@ -17,6 +17,7 @@ from ..see.features import Features
 from ..see.shutter import Turning, straightened
 
 NO_LANDMARK = -1
+_SMALL = 1e-8  # [m^2] and [rad^2], so that a robot at rest has a finite information
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,10 +38,33 @@ def nothing_seen() -> DepthView:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OdometryPose:
-    """A pose by odometry alone."""
+    """A pose by odometry and gyro alone."""
 
     T_odom_base: Transform  # never corrected
     stretch: int  # number of the section of odometry without a gap
+    variance: NDArray[np.float64]  # (2,) [m^2, rad^2]: distance and turn, summed up since the start
+
+    def to(self, later: OdometryPose) -> OdometryMotion | None:
+        """Return the motion to a later pose, None if odometry does not cover it."""
+        if later.stretch != self.stretch:
+            return None
+        variance = np.abs(later.variance - self.variance) + _SMALL
+        return OdometryMotion(
+            T_here_there=se3.inverse(self.T_odom_base) @ later.T_odom_base, variance=variance
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OdometryMotion:
+    """A motion by odometry and gyro alone."""
+
+    T_here_there: Transform
+    variance: NDArray[np.float64]  # (2,) [m^2, rad^2]: distance and turn
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Return the covariance (6, 6) of se3.log order."""
+        return np.diag(self.variance.repeat(3))
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -60,6 +84,13 @@ class Keyframe:
         """Correct the keyframe for a readout that is longer by `readout_s`."""
         self.features = straightened(camera, self.features, self.turning.rate_cam, readout_s)
         self.T_local_base = self.T_local_base @ se3.exp(readout_s * self.turning.twist_per_s)
+
+
+def motion_between(one: Keyframe, other: Keyframe) -> OdometryMotion | None:
+    """Return the motion from one keyframe to another by odometry, None if that is unknown."""
+    if one.odometry is None or other.odometry is None:
+        return None
+    return one.odometry.to(other.odometry)
 
 
 class KeyframeStore:

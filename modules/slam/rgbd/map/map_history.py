@@ -20,12 +20,12 @@ from ..loops.pose_graph import KeyframeEdge, PoseGraph, motion_covariance
 from ..loops.session_relocalizer import SessionRelocalizer
 from ..see.rectifying_extractor import RectifyingExtractor
 from .frame_log import FrameLog, joined, moved
-from .keyframes import Keyframe
+from .keyframes import Keyframe, motion_between
 from .segments import Segments
 from .visual_map import VisualMap
 
 _MIN_SHARE = 0.1  # least share of a pose's landmarks from a keyframe, for an edge to it
-_ODOMETRY_VARIANCE = 0.05**2  # [m^2] and [rad^2], of a keyframe placed by odometry alone
+_GUESSED_VARIANCE = 0.05**2  # [m^2] and [rad^2], of a keyframe that odometry does not place
 _NEVER_SAW = -1
 
 
@@ -193,10 +193,15 @@ class MapHistory:
             return []
         T_local_base = self._map.keyframes[keyframe_id].T_local_base
         if fix is None:
-            last = self.reference
+            last = max(earlier)
             T_last_new = se3.inverse(earlier[last].T_local_base) @ T_local_base
-            odometry = _ODOMETRY_VARIANCE * np.eye(6)
-            return [_edge(last, keyframe_id, T_last_new, odometry)]
+            motion = motion_between(earlier[last], self._map.keyframes[keyframe_id])
+            covariance = _GUESSED_VARIANCE * np.eye(6) if motion is None else motion.covariance
+            return [
+                KeyframeEdge(
+                    start=last, end=keyframe_id, T_start_end=T_last_new, covariance=covariance
+                )
+            ]
         counts = self._origins(fix.landmark_ids)
         total = sum(counts.values())
         return [
