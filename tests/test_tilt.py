@@ -5,7 +5,8 @@ import pytest
 from driving import policy
 
 from sceneslam.bus.dead_reckoning import DeadReckoning
-from sceneslam.motion.tilt import levelled, up_by
+from sceneslam.motion.model import MotionModel
+from sceneslam.motion.tilt import Tilt, up_by, upright
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import GRAVITY, Rig, Sensor
@@ -56,21 +57,29 @@ def test_a_gyro_that_never_rested_tilts_nothing():
     assert abs(found[-1][2, 3]) < 1e-9
 
 
-def test_gravity_straightens_a_tilt_and_keeps_the_heading():
-    T_odom_base = se3.exp(np.array([1.0, 2.0, 3.0, 0.05, -0.1, 0.7]))
-    yaw_rad = se3.yaw_rad(T_odom_base)
-    for _ in range(600):
-        T_odom_base = levelled(
-            T_odom_base,
-            STEP_S,
-            by_gravity=np.array([0.0, 0.0, 1.0]),
-            by_odometry=np.array([1.0, 0.0, 0.0]),
+def test_a_tilt_is_taken_out_and_the_heading_kept():
+    T_world_base = se3.exp(np.array([1.0, 2.0, 3.0, 0.05, -0.1, 0.7]))
+    found = upright(T_world_base, np.array([0.0, 0.0, 1.0]))
+    assert found[2, 2] == pytest.approx(1.0, abs=1e-9)
+    assert se3.yaw_rad(found) == pytest.approx(se3.yaw_rad(T_world_base), abs=0.01)
+    np.testing.assert_array_equal(found[:3, 3], T_world_base[:3, 3])
+
+
+@pytest.mark.parametrize("walked_radps", [0.0, 0.003])
+def test_a_bias_that_walks_after_the_rest_is_found_on_level_floor(walked_radps):
+    model = MotionModel(RIG)
+    tilt = Tilt(model)
+    for index in range(1600):
+        walked = np.array([0.0, walked_radps * (index > 100), 0.0])
+        times_s = np.linspace(-STEP_S + 0.01, 0.0, 5)
+        moved_m = max(0.0, (index - 60) * STEP_S * SPEED)
+        observation = Observation(
+            stamp_ns=round(index * STEP_S * 1e9),
+            T_odom_base=se3.from_xy_yaw(moved_m, 0.0, 0.0),
+            gyro_base=np.column_stack([times_s, np.tile(BIAS + walked, (5, 1))]),
         )
-    assert T_odom_base[2, 2] == pytest.approx(1.0, abs=1e-5)
-    assert se3.yaw_rad(T_odom_base) == pytest.approx(yaw_rad, abs=0.01)
-    np.testing.assert_allclose(
-        T_odom_base[:3, 3], se3.exp(np.array([1, 2, 3, 0.05, -0.1, 0.7]))[:3, 3]
-    )
+        up = tilt.update(observation, model.predict(observation).T_prev_curr[:3, :3])
+    assert np.arccos(up[2]) < 0.01  # if it were not found: 0.003 * 10 s
 
 
 def test_an_accelerometer_that_is_mounted_on_its_side_says_nothing():

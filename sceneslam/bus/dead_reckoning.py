@@ -16,7 +16,7 @@ from sceneslam.bus.hold import Hold
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.wheel_scale import WheelScale
 from sceneslam.motion.model import MotionModel
-from sceneslam.motion.tilt import levelled, up_by
+from sceneslam.motion.tilt import Tilt, upright
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
@@ -32,6 +32,7 @@ class DeadReckoning:
     def __init__(self, policy: Policy, rig: Rig) -> None:
         self._learns = policy.gate is not None and policy.handover != "cold"
         self._motion = MotionModel(rig) if Sensor.GYRO in rig.sensors else None
+        self._tilt = Tilt(self._motion) if self._motion is not None else None
         self._scales: dict[str, WheelScale] = {}  # by the module that measured it
         self._T_odom_base: Transform | None = None  # the last odometry, uncorrected
         self._T_corrected_base: Transform | None = None  # the same, corrected
@@ -41,6 +42,9 @@ class DeadReckoning:
     def correct(self, observation: Observation, module: str) -> Observation:
         """Return the observation for a module, corrected by the calibration so far."""
         turn = self._turn(observation)
+        up_base = None
+        if self._tilt is not None and turn is not None:
+            up_base = self._tilt.update(observation, turn)
         before, now = self._T_odom_base, observation.T_odom_base
         is_gap, self._is_gap = self._is_gap, now is None
         self._turned_rad = 0.0
@@ -63,13 +67,8 @@ class DeadReckoning:
         T_prev_curr[:3, 3] *= 1.0 if learnt is None else learnt.scale
         assert self._T_corrected_base is not None
         self._T_corrected_base = se3.chained(self._T_corrected_base, T_prev_curr)
-        if self._motion is not None and self._motion.measures_tilt:
-            self._T_corrected_base = levelled(
-                self._T_corrected_base,
-                self._motion.duration_s,
-                by_gravity=up_by(observation.accelerometer_base),
-                by_odometry=now[2, :3],
-            )
+        if up_base is not None:
+            self._T_corrected_base = upright(self._T_corrected_base, up_base)
         self._T_corrected_base.setflags(write=False)
         return replace(observation, T_odom_base=self._T_corrected_base)
 
