@@ -15,7 +15,7 @@ ALLOWED = {  # package -> what of ours it may import
     "sceneslam/ros": {"types", "ros"},
     "sceneslam/sources": {"types", "interfaces", "ros", "sources"},
     "sceneslam/sinks": {"types", "interfaces", "ros", "sinks"},
-    "sceneslam/atlas": {"types", "interfaces", "scans", "atlas"},
+    "sceneslam/atlas": {"types", "interfaces", "motion", "scans", "atlas"},
     "sceneslam/scans": {"types", "scans"},
     "sceneslam/maps": {"types", "scans", "atlas", "streams", "maps"},
     "sceneslam/testing": {"types", "interfaces", "testing"},

@@ -20,12 +20,14 @@ from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.submaps.graph import PlanarEdge
 from sceneslam.atlas.submaps.own_loops import Path
 from sceneslam.atlas.submaps.run_graph import RunGraph
+from sceneslam.motion.model import MotionModel
+from sceneslam.motion.tilt import Tilt
 from sceneslam.scans.key_scan import KeyScanner
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation
 from sceneslam.types.planar import Planar
-from sceneslam.types.rig import Rig
+from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
 
 _REST_NS = 1_000_000_000  # between two searches in the map while the robot stands
@@ -50,6 +52,8 @@ class Mapper:
         """Begin. `is_live`: searches in the loaded map run in another thread."""
         self._loaded = loaded if loaded is not None else empty_map()
         self._scanner, self._known, self._note = KeyScanner(rig), known, note
+        self._motion = MotionModel(rig) if Sensor.GYRO in rig.sensors else None
+        self._tilt = Tilt(self._motion) if self._motion is not None else None
         self._collector = Collector(rig, known, self._loaded.runs)
         plan = self._loaded.plan()
         self._localizer = MapLocalizer(plan) if len(plan) else None
@@ -80,6 +84,7 @@ class Mapper:
 
     def observe(self, observation: Observation) -> None:
         """Add an observation with a known pose."""
+        up_base = self._vertical(observation)
         known = self._known(observation.stamp_ns)
         if known is None:
             return
@@ -89,7 +94,7 @@ class Mapper:
         is_level = not is_step or self._collector.step_to(known.T_map_base)
         scan = self._scanner.make(observation) if is_level else None
         if is_step:
-            self._collector.add(observation.stamp_ns, scan)
+            self._collector.add(observation.stamp_ns, scan, up_base)
         if scan is None:
             return
         if self._began_ns is None:
@@ -124,7 +129,7 @@ class Mapper:
         self._T_map_node = planar.from_transforms(solved.T_map_node)
         for loop in self._loops:
             self._tell(loop)
-        if not self._loops and not self.is_placed:
+        if not (self._loops or self._collector.up_node or self.is_placed):
             return Correction.none()
         return Correction(stamps_ns=stamps_ns, T_new_old=solved.T_map_node @ se3.inverse(old))
 
@@ -147,6 +152,13 @@ class Mapper:
         )
 
     # During the run.
+
+    def _vertical(self, observation: Observation) -> NDArray[np.float64] | None:
+        """Return the measured vertical direction (3,) in base, None if unknown."""
+        if self._motion is None or self._tilt is None:
+            return None
+        turn = self._motion.predict(observation).T_prev_curr[:3, :3]
+        return self._tilt.update(observation, turn)
 
     def _looks(self, stamp_ns: int) -> bool:
         """Tell whether a robot at rest should search the map."""

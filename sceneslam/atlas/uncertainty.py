@@ -35,6 +35,8 @@ class Drift:
 MAPPED = Drift(per_m=0.005, rad_per_m=0.0, rad_per_rad=0.0, rad_per_root=0.003)
 # Defaults of `Wheels` in a rig.
 WHEELS = Drift(per_m=0.02, rad_per_m=0.01, rad_per_rad=0.02, rad_per_root=0.0)
+# With a gyro, whose bias is known to a tenth of a degree per second.
+GYRO = Drift(per_m=0.02, rad_per_m=0.002, rad_per_rad=0.005, rad_per_root=0.0)
 # Constant velocity: the robot may have braked meanwhile.
 VELOCITY = Drift(per_m=0.5, rad_per_m=0.1, rad_per_rad=0.5, rad_per_root=0.0)
 

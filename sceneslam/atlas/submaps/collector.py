@@ -19,7 +19,7 @@ from sceneslam.atlas.submaps.submap import (
     motion_covariance,
     split,
 )
-from sceneslam.atlas.uncertainty import MAPPED, VELOCITY, WHEELS
+from sceneslam.atlas.uncertainty import GYRO, MAPPED, VELOCITY, WHEELS
 from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar, se3
 from sceneslam.types.rig import Rig, Sensor
@@ -51,9 +51,12 @@ class Collector:
         self.submaps: list[Submap] = []
         self.T_run_node: list[Transform] = []
         self.motions: list[Edge] = []
+        self.up_node: dict[int, NDArray[np.float64]] = {}  # vertical directions (3,), by submap
         self.drift = [np.zeros(3)]  # per submap: summed standard deviations [m, m, rad]
         self._known, self._run = known, run
-        self._bridge = WHEELS if Sensor.ODOMETRY in rig.sensors else VELOCITY
+        wheels = GYRO if Sensor.GYRO in rig.sensors else WHEELS
+        self._bridge = wheels if Sensor.ODOMETRY in rig.sensors else VELOCITY
+        self._up_base: dict[int, NDArray[np.float64]] = {}  # by stamp, of steps not in a submap
         self._steps: list[tuple[int, KeyScan | None]] = []  # stamp and scan, not yet in a submap
         self._part: list[KeyPose] = []  # of the newest submap
         self._last: Transform | None = None  # pose of the last step
@@ -90,9 +93,16 @@ class Collector:
         self._level += is_level
         return is_level
 
-    def add(self, stamp_ns: int, scan: KeyScan | None) -> None:
-        """Add a step with its scan, and make submaps of steps with final poses."""
+    def add(
+        self, stamp_ns: int, scan: KeyScan | None, up_base: NDArray[np.float64] | None = None
+    ) -> None:
+        """Add a step with its scan, and make submaps of steps with final poses.
+
+        `up_base` (3,) is the measured vertical direction, None if unknown.
+        """
         self._steps.append((stamp_ns, scan))
+        if up_base is not None:
+            self._up_base[stamp_ns] = up_base
         settled = bisect_right(self._steps, stamp_ns - _SETTLED_NS, key=lambda each: each[0])
         if 2 * settled > len(self._steps):
             self._cut(settled, is_end=False)
@@ -151,6 +161,10 @@ class Collector:
             )
             deviations = np.sqrt(np.diag(planar.planar_covariance(covariance)))
             self.drift.append(self.drift[-1] + deviations)
+        up_base = self._up_base.get(part[0].stamp_ns)
+        self._up_base = {ns: up for ns, up in self._up_base.items() if ns > part[0].stamp_ns}
+        if up_base is not None:
+            self.up_node[len(self.submaps)] = up_base
         self.submaps.append(make_submap(part, self._run))
         self.T_run_node.append(part[0].T_map_base)
         self._part = part

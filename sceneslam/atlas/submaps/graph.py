@@ -23,6 +23,7 @@ _CHI2_3, _CHI2_6 = 11.34, 16.81  # chi-square with 3 and 6 degrees of freedom, 9
 _FIXED = np.repeat([1e-4, 1e-5], 3)  # m, rad
 _LOOSE = np.array([10.0, 10.0, 1.0, 0.05, 0.05, 3.0])  # m, rad: any loop moves it
 _FLOOR = np.array([0.05, 0.02, 0.02]) ** 2  # m, rad: height and tilt between places of one floor
+_UPRIGHT_RAD = 0.01  # half a degree: of gyro and gravity, and as floors are uneven
 _TO_GTSAM = [3, 4, 5, 0, 1, 2]  # rotation first
 
 
@@ -87,6 +88,15 @@ class PlanarEdge(_NodePair):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Upright:
+    """The measured vertical direction at a node."""
+
+    node: int
+    up_node: NDArray[np.float64]  # (3,), a unit vector in the node's frame
+    up_map: NDArray[np.float64]  # (3,), the same in the map
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Solved:
     """The graph after optimisation."""
 
@@ -101,15 +111,17 @@ def solve(
     *,
     fixed: Sequence[int],
     loose: int,
+    uprights: Sequence[Upright] = (),
 ) -> Solved:
     """Return the poses (N, 4, 4) that best fit the motions and the accepted loops.
 
     `fixed` nodes stay; `loose` has a weak prior, so that only a loop to a fixed node moves it.
+    `uprights` hold roll and pitch.
     Every node must be connected to one of these. The result is deterministic.
     """
     import gtsam
 
-    if not loops:
+    if not loops and not uprights:
         return Solved(T_map_node=T_map_node, accepted=[])
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     poses = [gtsam.Pose3(T) for T in T_map_node]
@@ -120,9 +132,15 @@ def solve(
         graph.add(gtsam.PriorFactorPose3(number, poses[number], noise))
     slack = gtsam.noiseModel.Diagonal.Sigmas((_LOOSE if len(fixed) else _FIXED)[_TO_GTSAM])
     graph.add(gtsam.PriorFactorPose3(loose, poses[loose], slack))
-    for edge in [*motions, *loops]:
+    for edge in motions:
         graph.add(_factor(gtsam, edge))
-    trusted = list(range(len(fixed) + 1 + len(motions)))
+    tilt = gtsam.noiseModel.Isotropic.Sigma(2, _UPRIGHT_RAD)
+    for one in uprights:
+        directions = gtsam.Unit3(one.up_map), tilt, gtsam.Unit3(one.up_node)
+        graph.add(gtsam.AttitudeFactorPose3(one.node, *directions))
+    trusted = list(range(graph.size()))
+    for edge in loops:
+        graph.add(_factor(gtsam, edge))
     parameters = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
     parameters.setKnownInliers(trusted)
     optimizer = gtsam.GncLMOptimizer(graph, values, parameters)

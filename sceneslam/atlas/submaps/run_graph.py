@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.localizer import Fix
 from sceneslam.atlas.submaps.collector import Collector
-from sceneslam.atlas.submaps.graph import Edge, EdgeKind, PlanarEdge, consistent, solve
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind, PlanarEdge, Upright, consistent, solve
 from sceneslam.atlas.submaps.loop_closure import LoopFinder
 from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops, recognized_loops
 from sceneslam.types import planar, se3
@@ -75,11 +75,24 @@ class RunGraph:
             [loops[index][1] for index in agreeing],
             fixed=range(count),
             loose=count,
+            uprights=self._uprights(T_map_node),
         )
         return SolvedRun(
             T_map_node=solved.T_map_node[count:],
             loops=tuple(loops[agreeing[index]][0] for index in solved.accepted),
         )
+
+    def _uprights(self, T_map_node: NDArray[np.float64]) -> list[Upright]:
+        """Return the measured vertical directions; the first one gives that of the map."""
+        measured = self._own.up_node
+        if not measured:
+            return []
+        first = min(measured)
+        up_map = T_map_node[first, :3, :3] @ measured[first]
+        return [
+            Upright(node=self._count + node, up_node=up_node, up_map=up_map)
+            for node, up_node in measured.items()
+        ]
 
     def _edges_of(self, loops: Sequence[OwnLoop]) -> list[Edge]:
         """Return a module's own loops as edges between submaps, without those within one."""
