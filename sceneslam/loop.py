@@ -111,9 +111,7 @@ class RunLoop:
         self._operator.close(self._last_ns())
         self._bus.close(self._last_ns())
         self.faults += self._parts.atlas.finish()
-        has_odometry = Sensor.ODOMETRY in self._parts.rig.sensors
-        self._covariances = self._parts.atlas.covariances(has_odometry)
-        log_uncertainty(self._log, self._parts.atlas.session_starts(), self._covariances)
+        self._add_covariances()
         if not len(self._parts.atlas.online) and not self.faults:
             self.faults.append(self._why_no_pose())
         self.faults += self._parts.source.faults
@@ -141,6 +139,16 @@ class RunLoop:
         if self._result is None:
             self._result = self._gather()
         return self._result
+
+    def _add_covariances(self) -> None:
+        """Compute the trajectory's covariances; without them the run still has its results."""
+        atlas = self._parts.atlas
+        try:
+            self._covariances = atlas.covariances(Sensor.ODOMETRY in self._parts.rig.sensors)
+            log_uncertainty(self._log, atlas.session_starts(), self._covariances)
+        except Exception as error:
+            _log.info("covariances", exc_info=error)
+            self.faults.append(f"the trajectory has no covariances: {text_of(error)}")
 
     def _gather(self) -> RunResult:
         atlas, bus = self._parts.atlas, self._bus

@@ -16,7 +16,7 @@ from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.submaps.graph import EdgeKind, PlanarEdge, consistent
 from sceneslam.atlas.submaps.own_loops import closed_loops, recognized_loops
 from sceneslam.atlas.submaps.submap import KeyPose, make_submap, motion_covariance, split
-from sceneslam.atlas.uncertainty import MAPPED, VELOCITY, WHEELS, SessionPose, propagate
+from sceneslam.atlas.uncertainty import MAPPED, VELOCITY, WHEELS, drifted
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import GridLayer, LoopLayer, MapLayers, PointLayer, PoseGraphLayer
 from sceneslam.types.rig import Rig, Sensor
@@ -36,31 +36,17 @@ def pitched(x_m, z_m=0.0, pitch_rad=0.0):
     return T
 
 
-# The covariance of a pose.
+# The covariance of a motion.
 
 
-@pytest.mark.parametrize(
-    ("drift", "is_bridged"), [(WHEELS, True), (VELOCITY, True), (MAPPED, False)]
-)
+@pytest.mark.parametrize("drift", [WHEELS, VELOCITY, MAPPED])
 @pytest.mark.parametrize(("way_m", "turn_rad"), [(2.0, 0.0), (0.0, 0.5), (2.0, 0.5)])
-def test_a_motion_adds_the_drift_of_its_kind(drift, is_bridged, way_m, turn_rad):
-    steps = [
-        SessionPose(T_map_base=T, session=0, is_bridged=bridged, covariance=None)
-        for T, bridged in ((at(), False), (at(way_m, 0.0, turn_rad), is_bridged))
-    ]
-    found = propagate(steps, drift)[-1]
-    rotation = drift.rad_per_m * way_m + drift.rad_per_rad * turn_rad
-    random = drift.rad_per_root**2 * (way_m + turn_rad)
-    expected = np.repeat([(drift.per_m * way_m) ** 2, rotation**2 + random], 3)
-    np.testing.assert_allclose(found, np.diag(expected), atol=1e-15)
-
-
-def test_drift_of_wheels_adds_up_like_a_scale_does():
-    steps = [
-        SessionPose(T_map_base=at(x), session=0, is_bridged=x > 0, covariance=None)
-        for x in (0.0, 1.0, 3.0)
-    ]
-    assert np.sqrt(propagate(steps, WHEELS)[-1][0, 0]) == pytest.approx(0.02 * 3.0)
+def test_a_motion_drifts_as_its_kind(drift, way_m, turn_rad):
+    systematic = drift.rad_per_m * way_m + drift.rad_per_rad * turn_rad
+    turn2 = systematic**2 + drift.rad_per_root**2 * (way_m + turn_rad)
+    shift2 = (drift.per_m * way_m) ** 2 + turn2 * (0.5 * way_m) ** 2
+    expected = np.diag(np.repeat([shift2, turn2], 3))
+    np.testing.assert_allclose(drifted(drift, np.array([way_m, turn_rad])), expected, atol=1e-15)
 
 
 def key_pose(index, T_map_base, *, session=0, drift=MAPPED, reported=None):

@@ -1,42 +1,55 @@
-"""The trajectory's covariance: carried through hand-overs, growing on the way."""
+"""The trajectory's covariance: marginals through hand-overs and loops."""
 
 import numpy as np
 import pytest
 from driving import drive, events
 from fakes import ExactModule
 
+from sceneslam.atlas.covariances import PosedPath, calibrated, covariances
+from sceneslam.atlas.submaps.graph import LOADED, Edge, EdgeKind
+from sceneslam.atlas.submaps.submap import LENGTH_M
 from sceneslam.atlas.uncertainty import (
     MAPPED,
     VELOCITY,
     WHEELS,
-    Drift,
-    SessionPose,
-    propagate,
     read_covariances,
     write_covariances,
 )
 from sceneslam.bus.handover_log import log_uncertainty
 from sceneslam.types import se3
+from sceneslam.types.trajectory import Trajectory
 
-T_STEP = se3.from_xy_yaw(0.1, 0.0, 0.05)
-NO_DRIFT = Drift(per_m=0.0, rad_per_m=0.0, rad_per_rad=0.0, rad_per_root=0.0)
+STEP_M = 0.1
+T_STEP = se3.from_xy_yaw(STEP_M, 0.0, 0.05)
+SUBMAP = round(LENGTH_M / STEP_M)  # poses
+CLAIM = np.diag([4.0, 4.0, 4.0, 1.0, 1.0, 1.0]) * 1e-6  # 2 mm, 1 mrad
 
 
-def steps(kinds, covariance=None):
+def path_of(kinds, claim=None, T_step=T_STEP):
     """One pose per kind: a session's number, or "-" where it is bridged."""
-    session, found = -1, []
-    for index, kind in enumerate(kinds):
-        session = session if kind == "-" else int(kind)
-        T_map_base = np.linalg.matrix_power(T_STEP, index)
-        found.append(
-            SessionPose(
-                T_map_base=T_map_base,
-                session=session,
-                is_bridged=kind == "-",
-                covariance=None if kind == "-" else covariance,
-            )
-        )
-    return found
+    sessions = [0]
+    for kind in kinds:
+        sessions.append(sessions[-1] if kind == "-" else int(kind))
+    return PosedPath(
+        T_map_base=np.array([np.linalg.matrix_power(T_step, index) for index in range(len(kinds))]),
+        sessions=np.array(sessions[1:]),
+        is_bridged=np.array([kind == "-" for kind in kinds]),
+        reported=np.array([np.full((6, 6), np.nan) if claim is None else claim] * len(kinds)),
+    )
+
+
+def solved(path, bridge=WHEELS, loops=()):
+    return covariances(path, loops=loops, bridge=bridge)
+
+
+def loop(first, second, sigma):
+    return Edge(
+        first=first,
+        second=second,
+        T_first_second=np.eye(4),
+        covariance=sigma**2 * np.eye(6),
+        kind=EdgeKind.LOOP,
+    )
 
 
 def position_m(covariance):
@@ -44,69 +57,129 @@ def position_m(covariance):
 
 
 def test_the_map_begins_where_the_first_pose_is():
-    np.testing.assert_array_equal(propagate(steps("0"), WHEELS)[0], np.zeros((6, 6)))
+    np.testing.assert_allclose(solved(path_of("0"))[0], np.zeros((6, 6)), atol=1e-9)
+    assert solved(path_of("")).shape == (0, 6, 6)
+
+
+def wrong_path(rng, kinds, claim):
+    """A path whose errors are as claimed: of each pose beside its map, and of each new submap."""
+    path = path_of(kinds, claim, T_step=se3.from_xy_yaw(STEP_M, 0.0, 0.0))
+    root, estimated, T_wrong = np.linalg.cholesky(claim), [], np.eye(4)
+    for row in range(len(kinds)):
+        if row and path.sessions[row] != path.sessions[row - 1]:
+            T_wrong = estimated[-1] @ se3.inverse(path.T_map_base[row - 1])
+        elif row:
+            drift = se3.exp(root @ rng.normal(size=6) / np.sqrt(SUBMAP))
+            T_true = path.T_map_base[row]
+            T_wrong = T_wrong @ T_true @ drift @ se3.inverse(T_true)
+        beside = se3.exp(root @ rng.normal(size=6)) if row else np.eye(4)
+        estimated.append(T_wrong @ path.T_map_base[row] @ beside)
+    return path, np.array(estimated)
+
+
+def test_errors_are_as_large_as_the_covariance_before_and_after_a_seam():
+    rng, kinds = np.random.default_rng(0), "0" * (2 * SUBMAP) + "1" * (2 * SUBMAP)
+    nees = []
+    for _ in range(30):
+        path, estimated = wrong_path(rng, kinds, CLAIM)
+        errors = se3.log(se3.inverse(estimated) @ path.T_map_base)
+        found = solved(path)
+        level = [0, 1, 5]  # the true path is level, which bounds the other axes
+        found, errors = found[:, level][:, :, level], errors[:, level]
+        nees.append(np.einsum("ni,nij,nj->n", errors[1:], np.linalg.inv(found[1:]), errors[1:]) / 3)
+    before, after = np.mean(nees, axis=0)[: 2 * SUBMAP - 1], np.mean(nees, axis=0)[2 * SUBMAP :]
+    assert 0.7 < before.mean() < 1.4 and 0.7 < after.mean() < 1.4
+
+
+def test_poses_of_one_submap_share_its_error():
+    found = solved(path_of("0" * (SUBMAP + 1), CLAIM, T_step=se3.from_xy_yaw(STEP_M, 0.0, 0.0)))
+    assert found[0, 0, 0] == pytest.approx(CLAIM[0, 0], rel=1e-3)  # the pose's own
+    assert found[-1, 0, 0] == pytest.approx(2.0 * CLAIM[0, 0], rel=1e-3)  # and the submap's
+
+
+def test_a_loop_makes_the_path_as_certain_as_it_is_measured():
+    path = path_of("0" * (4 * SUBMAP))
+    found, closed = solved(path), solved(path, loops=[loop(0, 75, 1e-3)])
+    assert position_m(closed[75]) == pytest.approx(np.sqrt(3) * 1e-3, rel=0.1)
+    assert (np.linalg.eigvalsh(found - closed) > -1e-12).all()
+
+
+def test_a_path_is_as_certain_in_a_loaded_map_as_it_was_located():
+    found = solved(path_of("0" * SUBMAP), loops=[loop(LOADED, 0, 0.02)])
+    assert position_m(found[0]) == pytest.approx(np.sqrt(3) * 0.02)
 
 
 def test_a_bridge_costs_more_certainty_than_a_module_and_a_guess_more_than_wheels():
-    held, driven = propagate(steps("000000"), WHEELS), propagate(steps("0-----"), WHEELS)
-    guessed = propagate(steps("0-----"), VELOCITY)
+    held, driven = solved(path_of("000000")), solved(path_of("0-----"))
+    guessed = solved(path_of("0-----"), VELOCITY)
     deviations = [position_m(found[-1]) for found in (held, driven, guessed)]
     assert deviations[0] < 0.5 * deviations[1] < 0.25 * deviations[2]
     assert deviations[1] == pytest.approx(np.sqrt(3) * WHEELS.per_m * 0.5, rel=0.2)
+    assert MAPPED.per_m < WHEELS.per_m
 
 
-def test_a_map_loses_the_rotation_by_the_root_of_the_way_and_wheels_by_the_way():
-    kinds = {"held": "0" * 41, "driven": "0" + "-" * 40}
-    for kind, ratio in (("held", 2.0), ("driven", 4.0)):
-        found = propagate(steps(kinds[kind]), WHEELS)
-        quarter, end = (np.sqrt(found[index, 5, 5]) for index in (10, 40))
-        assert end / quarter == pytest.approx(ratio)
-
-
-def test_what_was_lost_before_a_handover_is_never_regained():
-    found = propagate(steps("000---111111"), WHEELS)
-    assert (np.diff([position_m(one) for one in found]) >= 0).all()
-
-
-def test_a_module_that_comes_back_where_it_was_placed_is_as_sure_as_if_it_had_not_been_away():
-    away, held = propagate(steps("000---000"), WHEELS), propagate(steps("000000000"), WHEELS)
+def test_a_module_that_comes_back_where_it_was_placed_is_as_certain_as_if_it_had_not_been_away():
+    away, held = solved(path_of("000---000")), solved(path_of("000000000"))
     assert position_m(away[5]) > position_m(held[5])
     assert position_m(away[-1]) == pytest.approx(position_m(held[-1]), rel=0.02)
 
 
+def test_a_bridge_before_a_handover_is_not_regained():
+    found = solved(path_of("000---111111"))
+    assert (np.diff([position_m(one) for one in found]) >= -1e-6).all()
+
+
 def test_an_uncertain_heading_becomes_an_uncertain_position_along_the_way():
-    start = np.diag([0, 0, 0, 0, 0, 0.1**2])
-    turned = steps("0-", covariance=start)
-    T_ahead = se3.from_xy_yaw(10.0, 0.0, 0.0)
-    far = SessionPose(T_map_base=T_ahead, session=0, is_bridged=True, covariance=None)
-    found = propagate([turned[0], far], NO_DRIFT)[-1]
-    assert np.sqrt(found[1, 1]) == pytest.approx(10 * 0.1) and found[0, 0] == pytest.approx(0.0)
+    path = path_of("0" * 101, np.diag([0, 0, 0, 0, 0, 1e-4]), se3.from_xy_yaw(0.1, 0.0, 0.0))
+    found = solved(path)[-1]
+    assert np.sqrt(found[1, 1]) == pytest.approx(0.01 * np.hypot(np.hypot(7.5, 5.0), 2.5), rel=0.05)
+    assert found[0, 0] == pytest.approx(0.0, abs=1e-8)
 
 
-def test_the_share_of_the_old_module_goes_with_its_pose_into_the_next_session():
-    unsure = 0.2**2 * np.eye(6)
-    old, new = steps("00", covariance=unsure), steps("0011")[2:]
-    found = propagate([*old, *new], WHEELS)
-    assert position_m(found[-1]) >= np.sqrt(3) * 0.2
-    assert MAPPED.per_m < WHEELS.per_m
+def test_height_and_tilt_are_as_certain_as_the_floor_is_level():
+    unsure = 0.1**2 * np.eye(6)
+    flat = path_of("00001111", CLAIM)
+    flat.reported[4:] = unsure
+    assert (np.diag(solved(flat)[-1])[2:5] < [9e-6, 3e-6, 3e-6]).all()
+    climbing = path_of("00001111", CLAIM, se3.exp(np.array([0.1, 0.0, 0.1, 0.0, 0.1, 0.0])))
+    climbing.reported[4:] = unsure
+    assert (np.diag(solved(climbing)[-1])[[2, 4]] > 100 * CLAIM[[2, 4], [2, 4]]).all()
 
 
-def test_a_run_logs_how_sure_every_session_was_where_it_began():
+def differing(T_off_m, T_step=T_STEP):
+    """Two sessions of one path over the same observations, apart by more and more."""
+    T = path_of("0" * 20, T_step=T_step).T_map_base
+    off = np.array([se3.from_xy_yaw(T_off_m * row / 20, 0.0, 0.0) for row in range(20)])
+    return [Trajectory(stamps_ns=np.arange(20), T_world_base=one) for one in (T, T @ off)]
+
+
+def test_a_claim_is_held_against_the_difference_at_the_handover():
+    path = path_of("0" * 20 + "1" * 20, CLAIM)
+    path.reported[20:] *= 1e4
+    good, bad = (calibrated(path, "ab", differing(off_m)).reported for off_m in (0.002, 0.5))
+    assert good[0, 0, 0] == pytest.approx(CLAIM[0, 0], rel=0.1)
+    assert good[-1, 0, 0] < 1e-2 * path.reported[-1, 0, 0]  # 20 cm were claimed, 2 mm seen
+    assert bad[-1, 0, 0] > 3.0 * good[-1, 0, 0]
+    resting = calibrated(path, "ab", differing(0.002, np.eye(4)))
+    np.testing.assert_array_equal(resting.reported, path.reported)
+
+
+def test_a_run_logs_how_certain_every_session_was_where_it_began():
     modules = {"bright": ExactModule(), "dark": ExactModule()}
     _, atlas, log, _ = drive(modules, scene_at=lambda i: "Dark" if i >= 40 else "Bright")
     covariances = atlas.covariances(True)
     log_uncertainty(log, atlas.session_starts(), covariances)
     told = events(log, "uncertainty")
     assert [event["module"] for event in told] == ["bright", "dark"]
-    assert told[0]["deviation_m"] == 0.0 < told[1]["deviation_m"] < 0.2
+    assert told[0]["deviation_m"] < 1e-4 < told[1]["deviation_m"] < 0.2
     assert covariances.shape == (len(atlas.trajectory), 6, 6)
     assert (np.linalg.eigvalsh(covariances) >= -1e-12).all()
 
 
 def test_covariances_are_read_as_they_were_written(tmp_path):
-    covariances = propagate(steps("000--111", covariance=1e-4 * np.eye(6)), WHEELS)
+    found = solved(path_of("000--111", 1e-4 * np.eye(6)))
     stamps_ns = 10**18 + np.arange(8) * 33_333_333
-    write_covariances(tmp_path / "covariance.txt", stamps_ns, covariances)
+    write_covariances(tmp_path / "covariance.txt", stamps_ns, found)
     stamps_read_ns, read = read_covariances(tmp_path / "covariance.txt")
     np.testing.assert_array_equal(stamps_read_ns, stamps_ns)
-    np.testing.assert_allclose(read, covariances, rtol=1e-5, atol=1e-15)
+    np.testing.assert_allclose(read, found, rtol=1e-5, atol=1e-15)

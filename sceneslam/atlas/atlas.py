@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.budget import Budget
+from sceneslam.atlas.covariances import PosedPath, calibrated, covariances
 from sceneslam.atlas.fusion import fuse
 from sceneslam.atlas.lasting.lasting_map import EXTEND, LastingMap
 from sceneslam.atlas.mapper import Mapper, Note
@@ -17,13 +18,13 @@ from sceneslam.atlas.places.floor_plan import grid_of
 from sceneslam.atlas.pose_path import OpenSession, PoseLog, PosePath, trajectory_of
 from sceneslam.atlas.revision import Revised, revise
 from sceneslam.atlas.submaps.correction import Correction
-from sceneslam.atlas.uncertainty import VELOCITY, WHEELS, Covariance, propagate
+from sceneslam.atlas.uncertainty import VELOCITY, WHEELS, Covariance
 from sceneslam.interfaces import TrajectoryLog
 from sceneslam.types.errors import ConfigError, text_of
 from sceneslam.types.maps import HybridMap, MapLayers
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
-from sceneslam.types.run import Session, SessionStart
+from sceneslam.types.run import BRIDGED, Session, SessionStart
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
@@ -209,12 +210,25 @@ class Atlas:
         return self._path.session_starts()
 
     def covariances(self, has_odometry: bool) -> NDArray[np.float64]:
-        """Return the covariances (N, 6, 6) of the trajectory before its revision by modules.
+        """Return the covariances (N, 6, 6) of the trajectory relative to its first pose.
 
-        In `base`, translation [m] first, then rotation [rad]. With odometry, bridged poses have the
-        wheels' uncertainty, else that of constant velocity.
+        In `base`, translation [m] first, then rotation [rad]; in a loaded map, relative to that.
+        With odometry, bridged poses have the wheels' uncertainty, else that of constant velocity.
         """
-        return propagate(self._path.steps(), WHEELS if has_odometry else VELOCITY)
+        sessions, stamps_ns = self.sessions, np.array(self._path.stamps_ns, np.int64)
+        path = PosedPath(
+            T_map_base=self.trajectory.T_world_base,
+            sessions=np.array(self._path.sessions, np.int64),
+            is_bridged=np.array(self._path.modules) == BRIDGED,
+            reported=self._path.reported(),
+        )
+        path = calibrated(
+            path,
+            [session.module for session in sessions],
+            [session.trajectory for session in sessions],
+        )
+        loops = [] if self._mapper is None else self._mapper.loops(stamps_ns)
+        return covariances(path, loops=loops, bridge=WHEELS if has_odometry else VELOCITY)
 
     @property
     def pose_modules(self) -> tuple[str, ...]:

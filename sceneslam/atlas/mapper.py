@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map
 from sceneslam.atlas.places.localizer import LocalizationEvent, MapLocalizer, PlacedScan
 from sceneslam.atlas.submaps.collector import Collector, Known
 from sceneslam.atlas.submaps.correction import Correction
-from sceneslam.atlas.submaps.graph import PlanarEdge
+from sceneslam.atlas.submaps.graph import LOADED, Edge, PlanarEdge
 from sceneslam.atlas.submaps.own_loops import Path
 from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.motion.model import MotionModel
@@ -132,6 +133,16 @@ class Mapper:
         if not (self._loops or self._collector.up_node or self.is_placed):
             return Correction.none()
         return Correction(stamps_ns=stamps_ns, T_new_old=solved.T_map_node @ se3.inverse(old))
+
+    def loops(self, stamps_ns: NDArray[np.int64]) -> list[Edge]:
+        """Return the accepted loops between rows of the path with these stamps (N,)."""
+        starts_ns = [submap.stamps_ns[0] for submap in self._collector.submaps]
+        rows = np.searchsorted(stamps_ns[:-1], starts_ns).tolist()
+        row_of = [LOADED] * len(self._loaded.submaps) + rows
+        return [
+            replace(loop.spatial, first=row_of[loop.first], second=row_of[loop.second])
+            for loop in self._loops
+        ]
 
     def saved(self) -> SavedMap:
         """Return the loaded map with this run in it: a separate piece if it was not located."""

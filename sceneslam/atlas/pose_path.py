@@ -8,11 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.atlas.revision import SessionTrajectories
 from sceneslam.atlas.rows import Rows
 from sceneslam.atlas.submaps.collector import Known
-from sceneslam.atlas.uncertainty import Covariance, SessionPose
+from sceneslam.atlas.uncertainty import Covariance
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.run import BRIDGED, SessionStart
 from sceneslam.types.se3 import Transform
@@ -133,18 +134,15 @@ class PosePath:
                 )
         return list(starts.values())
 
-    def steps(self) -> list[SessionPose]:
-        """Return every pose with its module and the covariance that this reported."""
-        rows = enumerate(zip(self.poses, self.sessions, self.modules, strict=True))
-        return [
-            SessionPose(
-                T_map_base=T,
-                session=session,
-                is_bridged=module == BRIDGED,
-                covariance=self.covariance_at(row),
-            )
-            for row, (T, session, module) in rows
-        ]
+    def reported(self) -> NDArray[np.float64]:
+        """Return the reported covariances (N, 6, 6), positive semidefinite; NaN: not reported."""
+        covariances = np.empty((len(self.poses), 6, 6))
+        covariances[:, *_UPPER] = covariances[:, *_UPPER[::-1]] = np.asarray(self._covariances)
+        given = ~np.isnan(covariances[:, 0, 0])
+        values, vectors = np.linalg.eigh(covariances[given])
+        scaled = vectors * np.maximum(values, 0.0)[:, None, :]
+        covariances[given] = scaled @ np.swapaxes(vectors, 1, 2)
+        return covariances
 
 
 def trajectory_of(stamps_ns: Sequence[int], poses: Rows) -> Trajectory:

@@ -7,7 +7,7 @@ graduated non-convexity (Yang et al., RA-L 2020), which can still reject each of
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any, Self
@@ -24,7 +24,8 @@ _FIXED = np.repeat([1e-4, 1e-5], 3)  # m, rad
 _LOOSE = np.array([10.0, 10.0, 1.0, 0.05, 0.05, 3.0])  # m, rad: any loop moves it
 _FLOOR = np.array([0.05, 0.02, 0.02]) ** 2  # m, rad: height and tilt between places of one floor
 _UPRIGHT_RAD = 0.01  # half a degree: of gyro and gravity, and as floors are uneven
-_TO_GTSAM = [3, 4, 5, 0, 1, 2]  # rotation first
+LOADED = -1  # node of a loaded map
+_TO_GTSAM = [3, 4, 5, 0, 1, 2]  # rotation first, and back
 
 
 class EdgeKind(IntEnum):
@@ -153,12 +154,47 @@ def solve(
     )
 
 
+def marginals(
+    T_map_node: NDArray[np.float64],
+    drifts: Mapping[tuple[int, int], NDArray[np.float64]],
+    loops: Sequence[Edge],
+) -> dict[int, NDArray[np.float64]]:
+    """Return the marginal covariance (6, 6) of each node, in its axes.
+
+    `drifts` are the covariances (6, 6) of the motions from node to node, in the axes of the second.
+    A motion or loop from LOADED is measured from a fixed map.
+    """
+    import gtsam
+
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    measured = [*drifts.items(), *(((loop.first, loop.second), loop.covariance) for loop in loops)]
+    linked = sorted({node for ends, _ in measured for node in ends} - {LOADED})
+    nodes = {node: gtsam.Pose3(T_map_node[node]) for node in linked}
+    for node, pose in nodes.items():
+        values.insert(node, pose)
+    for (first, second), covariance in measured:
+        noise = _noise(gtsam, covariance)
+        if first == LOADED:
+            graph.add(gtsam.PriorFactorPose3(second, nodes[second], noise))
+        else:
+            motion = nodes[first].between(nodes[second])
+            graph.add(gtsam.BetweenFactorPose3(first, second, motion, noise))
+    parameters = gtsam.ISAM2Params()
+    parameters.setFactorization("QR")  # of the square root: deviations may differ by 1e5
+    solved = gtsam.ISAM2(parameters)
+    solved.update(graph, values)
+    back = np.ix_(_TO_GTSAM, _TO_GTSAM)
+    return {node: solved.marginalCovariance(node)[back] for node in nodes}
+
+
 def _factor(gtsam: Any, edge: Edge) -> Any:
-    covariance = edge.covariance[np.ix_(_TO_GTSAM, _TO_GTSAM)]
-    noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
     return gtsam.BetweenFactorPose3(
-        edge.first, edge.second, gtsam.Pose3(edge.T_first_second), noise
+        edge.first, edge.second, gtsam.Pose3(edge.T_first_second), _noise(gtsam, edge.covariance)
     )
+
+
+def _noise(gtsam: Any, covariance: NDArray[np.float64]) -> Any:
+    return gtsam.noiseModel.Gaussian.Covariance(covariance[np.ix_(_TO_GTSAM, _TO_GTSAM)])
 
 
 def consistent(

@@ -1,0 +1,177 @@
+"""The covariance of every pose in `map`: the marginals of a graph of submaps.
+
+A module measures its poses relative to its map around them, and reports that covariance. Poses in
+one submap share the submap's error, so that only the next submap adds an independent one; it is as
+large as the poses that place the submap are uncertain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.atlas.submaps.graph import LOADED, Edge, marginals
+from sceneslam.atlas.submaps.submap import LENGTH_M, TURN_RAD
+from sceneslam.atlas.uncertainty import MAPPED, Covariance, Drift, drifted
+from sceneslam.types import se3
+from sceneslam.types.trajectory import Trajectory
+
+_LEAST = 1e-10 * np.eye(6)  # (10 um, 10 urad)^2: keeps the graph well-conditioned
+_MOVED_MIN = 0.1  # submaps; two modules' poses over less motion differ by noise alone
+_LEVEL = [2, 3, 4]  # z, roll, pitch of base
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PosedPath:
+    """The poses of a run."""
+
+    T_map_base: NDArray[np.float64]  # (N, 4, 4)
+    sessions: NDArray[np.int64]  # (N,), -1 before the first
+    is_bridged: NDArray[np.bool_]  # (N,): without a module
+    reported: NDArray[np.float64]  # (N, 6, 6) of T_local_base, in base; NaN: not reported
+
+    def claim(self, rows: NDArray[np.int64] | slice) -> Covariance | None:
+        """Return the covariance (6, 6) of a map that is placed by these poses, with common errors.
+
+        It is the inverse of the poses' mean information; None if none was reported.
+        """
+        reported = self.reported[rows][~self.is_bridged[rows]]
+        reported = reported[~np.isnan(reported[:, 0, 0])]
+        if not len(reported):
+            return None
+        return np.asarray(np.linalg.inv(np.linalg.inv(reported + _LEAST).mean(axis=0)))
+
+    def claims(self) -> list[Covariance | None]:
+        """Return the claim of each session."""
+        count = int(self.sessions.max(initial=-1)) + 1
+        return [self.claim(np.flatnonzero(self.sessions == session)) for session in range(count)]
+
+
+def covariances(path: PosedPath, *, loops: Sequence[Edge], bridge: Drift) -> NDArray[np.float64]:
+    """Return the covariance (N, 6, 6) of every pose, in `base`; `map` begins at the first pose.
+
+    `loops` lead from row to row, or from LOADED: then `map` is the loaded map's. `bridge` is the
+    drift of bridged poses. The map of a module that reports no covariance drifts as MAPPED.
+    """
+    T, sessions = path.T_map_base, path.sessions
+    if not len(T):
+        return np.zeros((0, 6, 6))
+    moved = _moved(T)
+    beside = _beside(path, moved, bridge)
+    seams = np.flatnonzero(np.diff(sessions))
+    begins = np.flatnonzero(np.diff(np.floor(_submaps(moved)))) + 1
+    closed = [row for loop in loops for row in (loop.first, loop.second) if row != LOADED]
+    rows = np.unique([0, *begins, *seams, *(seams + 1), *closed, len(T) - 1]).tolist()
+    drifts: dict[tuple[int, int], Covariance] = {}
+    for first, last in pairwise(rows):
+        claim, driven = path.claim(slice(first, last)), moved[last] - moved[first]
+        if sessions[first] != sessions[last]:  # the next session begins at the last one's pose
+            drift = _carried(beside[first], T[first], T[last])
+        else:
+            drift = drifted(MAPPED, driven) if claim is None else _submaps(driven) * claim
+        drifts[first, last] = drift + _LEAST
+    if not any(loop.first == LOADED for loop in loops):
+        drifts[LOADED, 0] = _LEAST
+    of_node = marginals(T, drifts, loops)
+    found = np.repeat(of_node[rows[-1]][None], len(T), axis=0)
+    for first, last in pairwise(rows):
+        submaps = _submaps(moved[first : last + 1] - moved[first])
+        share = (submaps[:-1] / max(submaps[-1], np.finfo(float).tiny))[:, None, None]
+        before = _carried(of_node[first], T[first], T[first:last])
+        after = _carried(of_node[last], T[last], T[first:last])
+        found[first:last] = (1.0 - share) * before + share * after
+    return _on_floor(path, found + beside)
+
+
+def calibrated(
+    path: PosedPath, modules: Sequence[str], trajectories: Sequence[Trajectory]
+) -> PosedPath:
+    """Return the path with the modules' covariances as their differences at hand-overs show.
+
+    `trajectories` (T_local_base) and their `modules` are by session. Two modules that processed
+    the same observations differ by both their errors; the expected share of each, given what both
+    claim, is held against its claim: one step of expectation maximisation of variance components.
+    """
+    claims = path.claims()
+    ratios: dict[str, list[float]] = {module: [] for module in modules}
+    for old, new in pairwise(range(len(claims))):
+        apart = _difference(trajectories[old], trajectories[new])
+        a, b = claims[old], claims[new]
+        if apart is None or a is None or b is None:
+            continue
+        for session, claim in ((old, a), (new, b)):
+            gain = claim @ np.linalg.inv(a + b)
+            expected = gain @ apart @ gain.T + claim - gain @ claim
+            ratios[modules[session]].append(float(np.trace(np.linalg.solve(claim, expected))) / 6)
+    scales = np.array([np.mean(ratios[module] or 1.0) for module in modules] + [1.0])
+    return replace(path, reported=path.reported * scales[path.sessions][:, None, None])
+
+
+def _difference(a: Trajectory, b: Trajectory) -> Covariance | None:
+    """Return the covariance (6, 6) of two modules' difference per pose, None without motion."""
+    _, rows_a, rows_b = np.intersect1d(a.stamps_ns, b.stamps_ns, return_indices=True)
+    T_a, T_b = a.T_world_base[rows_a], b.T_world_base[rows_b]
+    submaps = _submaps(_moved(T_a))
+    if not len(rows_a) or submaps[-1] < _MOVED_MIN:
+        return None
+    off = se3.log(se3.inverse(se3.inverse(T_a[0]) @ T_a) @ se3.inverse(T_b[0]) @ T_b)
+    noise = np.diff(off, axis=0)  # between poses so near one another that nothing drifts
+    drift = off.T @ off - len(off) / (len(off) - 1) * noise.T @ noise
+    values, vectors = np.linalg.eigh(drift / (2.0 * np.minimum(submaps, 1.0)).sum())
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+def _moved(T_map_base: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the metres and radians (N, 2) driven up to each pose."""
+    steps = se3.inverse(T_map_base[:-1]) @ T_map_base[1:]
+    length_m = np.linalg.norm(steps[:, :3, 3], axis=1)
+    moved = np.column_stack([length_m, se3.rotation_angle_rad(steps)])
+    return np.cumsum(np.concatenate([np.zeros((len(T_map_base[:1]), 2)), moved]), axis=0)
+
+
+def _submaps(moved: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how many submaps long motions (..., 2) are [m, rad]."""
+    return np.asarray(moved @ (1.0 / np.array([LENGTH_M, TURN_RAD])))
+
+
+def _beside(path: PosedPath, moved: NDArray[np.float64], bridge: Drift) -> NDArray[np.float64]:
+    """Return the covariance (N, 6, 6) of each pose relative to its session's map."""
+    beside = np.nan_to_num(path.reported)
+    begins = np.diff(path.sessions, prepend=-2) != 0
+    held = np.maximum.accumulate(
+        np.where(begins | ~path.is_bridged, np.arange(len(moved)), 0)
+    )  # the last row that a module measured in this session
+    for row in np.flatnonzero(path.is_bridged).tolist():
+        at, T = held[row], path.T_map_base
+        beside[row] = drifted(bridge, moved[row] - moved[at])
+        if not path.is_bridged[at]:
+            beside[row] += _carried(beside[at], T[at], T[row])
+    return beside
+
+
+def _carried(
+    covariance: Covariance, T_map_from: se3.Transform, T_map_to: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return a pose's covariance (6, 6) at poses (..., 4, 4) that are rigidly connected to it."""
+    carry = se3.adjoint(se3.inverse(T_map_to) @ T_map_from)
+    return np.asarray(carry @ covariance @ np.swapaxes(carry, -1, -2))
+
+
+def _on_floor(path: PosedPath, covariances: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the covariances (N, 6, 6), given how level the path is.
+
+    Height and tilt vary by as much as they do along the estimated path, and as its modules claim.
+    """
+    claim = path.claim(slice(None))
+    if claim is None:
+        return covariances
+    T_first_base = se3.inverse(path.T_map_base[0]) @ path.T_map_base
+    level = np.stack([T_first_base[:, 2, 3], T_first_base[:, 2, 1], -T_first_base[:, 2, 0]], axis=1)
+    varied = (level**2).mean(axis=0) + np.diag(claim)[_LEVEL]
+    known = covariances[:, :, _LEVEL]
+    gain = known @ np.linalg.inv(known[:, _LEVEL] + np.diag(varied))
+    return np.asarray(covariances - gain @ np.swapaxes(known, 1, 2))
