@@ -93,3 +93,17 @@ def test_place_that_no_drift_explains_is_another():
     answers, _ = drive(module, se3.from_xy_yaw(4.0, 0.0, 0.0), late=True)
     module.shutdown()
     assert answers[-1].revision == 0
+
+
+def test_image_in_which_a_depth_camera_sees_nothing_near_is_not_searched():
+    module = make()
+    drive(module, se3.identity(), late=False)
+    module.shutdown()
+    module.activate(RIG)
+    module.track(seen(0, late=True))
+    module.set_pose(T_DRIFT)
+    for index in range(1, IMAGES):
+        one = seen(index, late=True)
+        answer = module.track(replace(one, depth_m=np.zeros_like(one.depth_m)))
+    module.shutdown()
+    assert answer.revision == 0 and module.get_map().loops is None

@@ -14,6 +14,7 @@ from sceneslam.atlas.submaps.collector import Collector
 from sceneslam.atlas.submaps.graph import Edge, EdgeKind, PlanarEdge, Upright, consistent, solve
 from sceneslam.atlas.submaps.loop_closure import LoopFinder
 from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops, recognized_loops
+from sceneslam.motion.tilt import upright
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.se3 import Transform
@@ -83,15 +84,19 @@ class RunGraph:
         )
 
     def _uprights(self, T_map_node: NDArray[np.float64]) -> list[Upright]:
-        """Return the measured vertical directions; the first one gives that of the map."""
-        measured = self._own.up_node
+        """Return the vertical directions; the first one gives that of the map.
+
+        Base is level most of the time: a sensor that is mounted askew has the same tilt everywhere.
+        """
+        nodes, measured = list(self._own.up_node), list(self._own.up_node.values())
         if not measured:
             return []
-        first = min(measured)
-        up_map = T_map_node[first, :3, :3] @ measured[first]
+        askew = upright(se3.identity(), np.median(measured, axis=0))[:3, :3]
+        ups = [askew @ up_base for up_base in measured]
+        up_map = T_map_node[nodes[0], :3, :3] @ ups[0]
         return [
-            Upright(node=self._count + node, up_node=up_node, up_map=up_map)
-            for node, up_node in measured.items()
+            Upright(node=self._count + node, up_node=up, up_map=up_map)
+            for node, up in zip(nodes, ups, strict=True)
         ]
 
     def _edges_of(self, loops: Sequence[OwnLoop]) -> list[Edge]:

@@ -185,7 +185,7 @@ def _intersect(visual_map: VisualMap, new: _Eye, other: _Eye, matches: Matches) 
         information += 1e-9 * np.eye(3)
         points = points - np.linalg.solve(information, slopes[:, :, None])[:, :, 0]
     distance_m = np.linalg.norm(points @ new.T_cam_local[:3, :3].T + new.T_cam_local[:3, 3], axis=1)
-    doubt_m = np.linalg.eigvalsh(information)[:, 0] ** -0.5
+    doubt_m = np.asarray(np.linalg.eigvalsh(information)[:, 0] ** -0.5, np.float64)
     doubt_ratio = doubt_m / distance_m
     # A nearer corner without depth lies on an edge, or in a shadow, of the depth image.
     range_m = 0.0 if new.keyframe.is_monocular else visual_map.camera.depth_range_m[1]
