@@ -1,0 +1,52 @@
+"""A loop whose rotation contradicts gyro and wheels is none, whatever the images look like."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sceneslam.modules.slam.rgbd.loops.loop_detection import LoopDetector, Query
+from sceneslam.modules.slam.rgbd.loops.pose_graph import PoseGraph
+from sceneslam.modules.slam.rgbd.map.keyframes import OdometryPose
+from sceneslam.types import se3
+
+TURN_RAD = 0.002  # standard deviation of odometry's turn from keyframe to keyframe
+
+
+def keyframe(index, *, stretch=0):
+    odometry = OdometryPose(
+        T_odom_base=se3.from_xy_yaw(0.3 * index, 0.0, 0.0),
+        stretch=stretch,
+        variance=index * np.array([0.01**2, TURN_RAD**2]),
+    )
+    T_local_base = se3.from_xy_yaw(0.3 * index, 0.0, 0.0)
+    return SimpleNamespace(T_local_base=T_local_base, odometry=odometry, features=None)
+
+
+def loops(off_rad, *, stretch=0):
+    """Return the loops of two keyframes that both recognize an old one, turned by `off_rad`."""
+    keyframes = {k: keyframe(k, stretch=stretch * (k > 0)) for k in range(3)}
+    graph = PoseGraph()
+    for k in keyframes:
+        graph.insert(k)
+
+    def recognize(candidate, features, depth_m):
+        T_local_base = se3.from_xy_yaw(0.0, 0.0, off_rad) @ keyframes[recognized].T_local_base
+        estimate = SimpleNamespace(T_local_base=T_local_base, covariance=1e-8 * np.eye(6))
+        return SimpleNamespace(keyframe_id=candidate, fix=SimpleNamespace(estimate=estimate))
+
+    visual_map = SimpleNamespace(keyframes=keyframes)
+    detector = LoopDetector(visual_map, SimpleNamespace(recognize=recognize), graph)
+    found = []
+    for recognized in (1, 2):
+        found = detector.check(Query(keyframe_id=recognized, depth_m=None), 0)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("off_rad", "stretch", "count"),
+    [(0.0, 0, 2), (0.03, 0, 2), (0.06, 0, 0), (0.06, 1, 2)],
+    ids=["as measured", "within its deviation", "too far", "odometry had a gap"],
+)
+def test_loop_turns_as_odometry_measured(off_rad, stretch, count):
+    assert len(loops(off_rad, stretch=stretch)) == count
