@@ -157,8 +157,7 @@ def _carried(
     covariance: Covariance, T_map_from: se3.Transform, T_map_to: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return a pose's covariance (6, 6) at poses (..., 4, 4) that are rigidly connected to it."""
-    carry = se3.adjoint(se3.inverse(T_map_to) @ T_map_from)
-    return np.asarray(carry @ covariance @ np.swapaxes(carry, -1, -2))
+    return se3.carried(covariance, se3.inverse(T_map_to) @ T_map_from)
 
 
 def _on_floor(path: PosedPath, covariances: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -53,8 +53,7 @@ class Mapper:
         """Begin. `is_live`: searches in the loaded map run in another thread."""
         self._loaded = loaded if loaded is not None else empty_map()
         self._scanner, self._known, self._note = KeyScanner(rig), known, note
-        self._motion = MotionModel(rig) if Sensor.GYRO in rig.sensors else None
-        self._tilt = Tilt(self._motion) if self._motion is not None else None
+        self._tilt = Tilt(MotionModel(rig)) if Sensor.GYRO in rig.sensors else None
         self._collector = Collector(rig, known, self._loaded.runs)
         plan = self._loaded.plan()
         self._localizer = MapLocalizer(plan) if len(plan) else None
@@ -85,7 +84,7 @@ class Mapper:
 
     def observe(self, observation: Observation) -> None:
         """Add an observation with a known pose."""
-        up_base = self._vertical(observation)
+        up_base = None if self._tilt is None else self._tilt.observe(observation)
         known = self._known(observation.stamp_ns)
         if known is None:
             return
@@ -163,13 +162,6 @@ class Mapper:
         )
 
     # During the run.
-
-    def _vertical(self, observation: Observation) -> NDArray[np.float64] | None:
-        """Return the measured vertical direction (3,) in base, None if unknown."""
-        if self._motion is None or self._tilt is None:
-            return None
-        turn = self._motion.predict(observation).T_prev_curr[:3, :3]
-        return self._tilt.update(observation, turn)
 
     def _looks(self, stamp_ns: int) -> bool:
         """Tell whether a robot at rest should search the map."""

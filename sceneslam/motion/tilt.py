@@ -59,6 +59,10 @@ class Tilt:
         self._R_level_base: NDArray[np.float64] | None = None  # (3, 3)
         self._bias_radps = np.zeros(3)  # that the model has not found
 
+    def observe(self, observation: Observation) -> Vector | None:
+        """Return the upward direction (3,) as `update` does; the model predicts the turn here."""
+        return self.update(observation, self._model.predict(observation).T_prev_curr[:3, :3])
+
     def update(self, observation: Observation, turn: NDArray[np.float64]) -> Vector | None:
         """Return the upward direction (3,) in base, None without odometry or a gyro that rested.
 

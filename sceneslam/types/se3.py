@@ -132,6 +132,12 @@ def adjoint(T_a_b: Transform) -> NDArray[np.float64]:
     return adjoint_a_b
 
 
+def carried(covariance: NDArray[np.float64], T_a_b: Transform) -> NDArray[np.float64]:
+    """Return the covariances (..., 6, 6) of a frame a that is rigidly connected to b, from b's."""
+    carry = adjoint(T_a_b)
+    return np.asarray(carry @ covariance @ np.swapaxes(carry, -1, -2))
+
+
 def interpolate(T_w_0: Transform, T_w_1: Transform, ratio: float) -> Transform:
     """Return the pose (4, 4) at `ratio` between T_w_0 and T_w_1 (linear, slerp)."""
     step = so3_log(T_w_0[:3, :3].T @ T_w_1[:3, :3])

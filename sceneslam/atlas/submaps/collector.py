@@ -43,6 +43,10 @@ class Known:
     covariance: NDArray[np.float64] | None  # (6, 6), as the module reported it
 
 
+# Stamp, scan, and the measured vertical direction (3,) in base.
+_Step = tuple[int, KeyScan | None, NDArray[np.float64] | None]
+
+
 class Collector:
     """The submaps of one run so far, and the motions between them."""
 
@@ -56,8 +60,7 @@ class Collector:
         self._known, self._run = known, run
         wheels = GYRO if Sensor.GYRO in rig.sensors else WHEELS
         self._bridge = wheels if Sensor.ODOMETRY in rig.sensors else VELOCITY
-        self._up_base: dict[int, NDArray[np.float64]] = {}  # by stamp, of steps not in a submap
-        self._steps: list[tuple[int, KeyScan | None]] = []  # stamp and scan, not yet in a submap
+        self._steps: list[_Step] = []  # not yet in a submap
         self._part: list[KeyPose] = []  # of the newest submap
         self._last: Transform | None = None  # pose of the last step
         self._up = np.zeros(3)  # of the base, the mean over the last steps
@@ -100,9 +103,7 @@ class Collector:
 
         `up_base` (3,) is the measured vertical direction, None if unknown.
         """
-        self._steps.append((stamp_ns, scan))
-        if up_base is not None:
-            self._up_base[stamp_ns] = up_base
+        self._steps.append((stamp_ns, scan, up_base))
         settled = bisect_right(self._steps, stamp_ns - _SETTLED_NS, key=lambda each: each[0])
         if 2 * settled > len(self._steps):
             self._cut(settled, is_end=False)
@@ -133,7 +134,9 @@ class Collector:
         done_ns = -1 if not self._part else self._part[-1].stamp_ns
         self._steps = [step for step in self._steps if step[0] > done_ns]
 
-    def _posed(self, stamp_ns: int, scan: KeyScan | None) -> KeyPose | None:
+    def _posed(
+        self, stamp_ns: int, scan: KeyScan | None, up_base: NDArray[np.float64] | None
+    ) -> KeyPose | None:
         known = self._known(stamp_ns)
         if known is None:
             return None
@@ -145,6 +148,7 @@ class Collector:
             module=known.module,
             drift=self._bridge if known.module == BRIDGED else MAPPED,
             reported=known.covariance,
+            up_base=up_base,
         )
 
     def _append(self, part: list[KeyPose]) -> None:
@@ -161,10 +165,8 @@ class Collector:
             )
             deviations = np.sqrt(np.diag(planar.planar_covariance(covariance)))
             self.drift.append(self.drift[-1] + deviations)
-        up_base = self._up_base.get(part[0].stamp_ns)
-        self._up_base = {ns: up for ns, up in self._up_base.items() if ns > part[0].stamp_ns}
-        if up_base is not None:
-            self.up_node[len(self.submaps)] = up_base
+        if part[0].up_base is not None:
+            self.up_node[len(self.submaps)] = part[0].up_base
         self.submaps.append(make_submap(part, self._run))
         self.T_run_node.append(part[0].T_map_base)
         self._part = part

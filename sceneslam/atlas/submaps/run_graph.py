@@ -114,7 +114,7 @@ class RunGraph:
                     first=first,
                     second=second,
                     T_first_second=T_first_from @ loop.T_from_to @ T_to_second,
-                    covariance=_carried(loop.covariance, T_to_second),
+                    covariance=se3.carried(loop.covariance, se3.inverse(T_to_second)),
                     kind=EdgeKind.LOOP,
                 )
             )
@@ -144,12 +144,6 @@ class RunGraph:
             first=first,
             second=self._count + node,
             T_first_second=planar.between(nodes[first], T_map_node),
-            covariance=planar.planar_covariance(_carried(covariance, T_base_node)),
+            covariance=planar.planar_covariance(se3.carried(covariance, se3.inverse(T_base_node))),
             kind=EdgeKind.LOOP,
         )
-
-
-def _carried(covariance: NDArray[np.float64], T_base_node: Transform) -> NDArray[np.float64]:
-    """Return the covariance (6, 6) of a pose of base as that of a node fixed to it, its axes."""
-    carry = se3.adjoint(se3.inverse(T_base_node))
-    return np.asarray(carry @ covariance @ carry.T)

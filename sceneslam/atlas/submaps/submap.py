@@ -34,6 +34,7 @@ class KeyPose:
     module: str
     drift: Drift  # of the motion from the one before
     reported: Covariance | None  # (6, 6) of T_local_base, as the module reported it
+    up_base: NDArray[np.float64] | None = None  # (3,), the measured vertical direction, if known
 
 
 class Drawing:
@@ -133,8 +134,8 @@ def _grown(first: KeyPose, last: KeyPose) -> Covariance:
     """Return the growth (6, 6) of a module's covariance between two poses of its session."""
     if first.session != last.session or first.reported is None or last.reported is None:
         return np.zeros((6, 6))
-    carry = se3.adjoint(se3.inverse(last.T_map_base) @ first.T_map_base)
-    values, vectors = np.linalg.eigh(last.reported - carry @ first.reported @ carry.T)
+    T_last_first = se3.inverse(last.T_map_base) @ first.T_map_base
+    values, vectors = np.linalg.eigh(last.reported - se3.carried(first.reported, T_last_first))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 

@@ -31,23 +31,22 @@ class KeyframeEdge:
 
     def turned(self) -> KeyframeEdge:
         """Return the measurement inverted, from the end to the start."""
-        adjoint = se3.adjoint(self.T_start_end)
         return KeyframeEdge(
             start=self.end,
             end=self.start,
             T_start_end=se3.inverse(self.T_start_end),
-            covariance=adjoint @ self.covariance @ adjoint.T,
+            covariance=se3.carried(self.covariance, self.T_start_end),
             is_loop=self.is_loop,
         )
 
     def then(self, after: KeyframeEdge) -> KeyframeEdge:
         """Return the composition of this edge and one that begins at its end."""
-        adjoint = se3.adjoint(se3.inverse(after.T_start_end))
+        carried = se3.carried(self.covariance, se3.inverse(after.T_start_end))
         return KeyframeEdge(
             start=self.start,
             end=after.end,
             T_start_end=self.T_start_end @ after.T_start_end,
-            covariance=adjoint @ self.covariance @ adjoint.T + after.covariance,
+            covariance=carried + after.covariance,
             is_loop=self.is_loop or after.is_loop,
         )
 
