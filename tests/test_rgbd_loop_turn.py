@@ -1,4 +1,4 @@
-"""A loop whose rotation contradicts gyro and wheels is none, whatever the images look like."""
+"""A loop is rejected if its rotation contradicts that of wheels and gyro."""
 
 from types import SimpleNamespace
 

@@ -118,7 +118,7 @@ def found_at(x_m):
 @pytest.mark.parametrize(
     ("found_m", "expected_m"),
     [(1.1, 1.05), (1.5, 1.5)],
-    ids=["as sure as each other", "wheels slip"],
+    ids=["equally certain", "wheels slip"],
 )
 def test_a_pose_is_led_by_odometry_unless_they_contradict(found_m, expected_m):
     T_predicted, known = se3.from_xy_yaw(1.0, 0.0, 0.0), 0.04**2 * np.eye(6)
