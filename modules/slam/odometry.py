@@ -84,8 +84,7 @@ class Odometry:
         along = self._wheels.drift_ratio * distance_m
         turn = self._wheels.drift_ratio * angle_rad + self._wheels.drift_rad_per_m * distance_m
         # Errors of odometry are systematic: standard deviations add up, not variances.
-        carried = se3.adjoint(se3.inverse(T_prev_curr))
-        covariance = carried @ self._covariance @ carried.T
+        covariance = se3.carried(self._covariance, se3.inverse(T_prev_curr))
         deviation = np.sqrt(np.diag(covariance)) + np.array([along] * 3 + [turn] * 3)
         scale = deviation / np.sqrt(np.diag(covariance))
         self._covariance = covariance * np.outer(scale, scale)

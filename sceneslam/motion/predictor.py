@@ -58,10 +58,10 @@ class Predictor:
     def predict(self, observation: Observation) -> Prediction:
         """Return the predicted pose of the base at an observation."""
         motion = self.model.predict(observation)
-        carried = se3.adjoint(se3.inverse(motion.T_prev_curr))
+        carried = se3.carried(self.covariance, se3.inverse(motion.T_prev_curr))
         return Prediction(
             T_local_base=se3.orthonormal(self.T_local_base @ motion.T_prev_curr),
-            covariance=carried @ self.covariance @ carried.T + motion.covariance,
+            covariance=carried + motion.covariance,
             motion=motion,
         )
 
@@ -89,8 +89,8 @@ class Predictor:
         else:
             alone = np.asarray(np.linalg.inv(information + _UNMEASURED * np.eye(6)))
             T_before_now = se3.inverse(self.T_local_measured) @ T_local_base
-            carried = se3.adjoint(se3.inverse(T_before_now))
-            self.model.learn(T_before_now, alone + carried @ self._alone @ carried.T)
+            carried = se3.carried(self._alone, se3.inverse(T_before_now))
+            self.model.learn(T_before_now, alone + carried)
         self.T_local_base = self.T_local_measured = T_local_base
         self.covariance, self._alone = covariance, alone
         self._measured_ns, self._is_lost = observation.stamp_ns, False

@@ -133,8 +133,7 @@ class DepthSlam:
 
     def _prior(self, prediction: Prediction) -> CameraPrior:
         T_cam_base = se3.inverse(self._camera.T_base_cam)
-        turned = se3.adjoint(T_cam_base)
-        information = np.linalg.inv(turned @ prediction.covariance @ turned.T)
+        information = np.linalg.inv(se3.carried(prediction.covariance, T_cam_base))
         T_local_cam = prediction.T_local_base @ self._camera.T_base_cam
         return CameraPrior(T_local_cam, np.asarray(information, np.float64))
 
@@ -147,13 +146,13 @@ class DepthSlam:
         found: SurfaceRegistration,
     ) -> Tracking:
         T_base_cam = self._camera.T_base_cam
-        turned, back = se3.adjoint(T_base_cam), se3.adjoint(se3.inverse(T_base_cam))
+        back = se3.adjoint(se3.inverse(T_base_cam))
         covariance = np.linalg.inv(found.information + self._prior(prediction).information)
         self._T_local_base = found.T_local_cam @ se3.inverse(T_base_cam)
         self._predictor.measure(
             observation,
             self._T_local_base,
-            turned @ covariance @ turned.T,
+            se3.carried(covariance, T_base_cam),
             information=back.T @ found.information @ back,
         )
         weak = found.localizability.weak_twists(self.weak_ratio)

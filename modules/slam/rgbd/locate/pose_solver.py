@@ -133,8 +133,8 @@ class PoseSolver:
         by_depth = slopes[:, 2, end.depth_inliers]
         # If the errors are larger than their sigmas, the covariance is scaled up.
         pixel_variance = float(residuals @ residuals) / (len(residuals) - 6)
-        carry = se3.adjoint(self._camera.T_base_cam)
-        covariance = carry @ np.linalg.inv(end.normal) @ carry.T * max(1.0, pixel_variance)
+        covariance = se3.carried(np.linalg.inv(end.normal), self._camera.T_base_cam)
+        covariance *= max(1.0, pixel_variance)
         return PoseEstimate(
             T_local_base=se3.orthonormal(end.T_local_cam @ self._T_cam_base),
             covariance=0.5 * (covariance + covariance.T),
