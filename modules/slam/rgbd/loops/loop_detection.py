@@ -13,7 +13,7 @@ from sceneslam.types.se3 import Transform
 from ..locate.recognition import PlaceRecognizer, Recognition
 from ..map.keyframes import motion_between
 from ..map.visual_map import VisualMap
-from .pose_graph import KeyframeEdge, PoseGraph, Way, motion_covariance
+from .pose_graph import KeyframeEdge, PoseGraph, motion_covariance
 
 _RECENT = 5  # newest keyframes, which are never loop candidates
 _OUTSTANDING = 2.0  # sigmas above the similarity of unrelated keyframes
@@ -79,10 +79,7 @@ class LoopDetector:
         if seen is None:
             return []
         loop = self._loop(query.keyframe_id, seen)
-        if not self._has_turned(loop):
-            return []
-        way = self._graph.way(candidate, query.keyframe_id)
-        if way is not None and not _believable(loop, new.T_local_base, way):
+        if not self._is_plausible(loop):
             return []
         earlier, self._hypothesis = self._hypothesis, loop
         if earlier is None or earlier.keyframe_id not in self._graph:
@@ -98,15 +95,27 @@ class LoopDetector:
         xi = se3.log(se3.inverse(T_local_base) @ loop.T_local_base)
         return float(xi @ np.linalg.solve(loop.edge.covariance, xi)) > _CHI2
 
-    def _has_turned(self, loop: LoopClosure) -> bool:
-        """Tell whether a loop's rotation is that of odometry and gyro, as far as these know it."""
-        old, new = (self._map.keyframes[k] for k in (loop.edge.start, loop.edge.end))
+    def _is_plausible(self, loop: LoopClosure) -> bool:
+        """Tell whether drift explains what a loop differs by from odometry's turn and the path."""
+        edge, covariance = loop.edge, loop.edge.covariance
+        old, new = (self._map.keyframes[k] for k in (edge.start, edge.end))
         motion = motion_between(old, new)
-        if motion is None:
+        if motion is not None:
+            off = se3.log(se3.inverse(motion.T_here_there) @ edge.T_start_end)[3:]
+            spread = covariance[3:, 3:] + _ALIKE * motion.variance[1] * np.eye(3)
+            if float(off @ np.linalg.solve(spread, off)) > _CHI2_TURN:
+                return False
+        way = self._graph.way(edge.start, edge.end)
+        if way is None:
             return True
-        off = se3.log(se3.inverse(motion.T_here_there) @ loop.edge.T_start_end)[3:]
-        covariance = loop.edge.covariance[3:, 3:] + _ALIKE * motion.variance[1] * np.eye(3)
-        return float(off @ np.linalg.solve(covariance, off)) <= _CHI2_TURN
+        T_error = se3.inverse(new.T_local_base) @ loop.T_local_base
+        sigmas = np.sqrt(np.diag(covariance))
+        turn_rad = _DRIFT_RATIO * way.turned_rad + _SIGMAS * way.sigma_rad
+        shift_m = _DRIFT_RATIO * way.length_m + _SIGMAS * way.sigma_m + turn_rad * way.reach_m
+        return bool(
+            se3.rotation_angle_rad(T_error) <= turn_rad + _SIGMAS * sigmas[3:].max()
+            and np.linalg.norm(T_error[:3, 3]) <= shift_m + _SIGMAS * sigmas[:3].max()
+        )
 
     def _loop(self, keyframe_id: int, seen: Recognition) -> LoopClosure:
         T_old = self._map.keyframes[seen.keyframe_id].T_local_base
@@ -131,15 +140,3 @@ class LoopDetector:
         xi = se3.log(se3.inverse(T_tracked) @ T_looped)
         covariance = motion_covariance(T_tracked, earlier.edge.covariance + later.edge.covariance)
         return float(xi @ np.linalg.solve(covariance, xi)) <= _CHI2
-
-
-def _believable(loop: LoopClosure, T_local_base: Transform, way: Way) -> bool:
-    """Tell whether the drift that the loop implies is plausible for the path."""
-    T_error = se3.inverse(T_local_base) @ loop.T_local_base
-    sigmas = np.sqrt(np.diag(loop.edge.covariance))
-    turn_rad = _DRIFT_RATIO * way.turned_rad + _SIGMAS * way.sigma_rad
-    shift_m = _DRIFT_RATIO * way.length_m + _SIGMAS * way.sigma_m + turn_rad * way.reach_m
-    return bool(
-        se3.rotation_angle_rad(T_error) <= turn_rad + _SIGMAS * sigmas[3:].max()
-        and np.linalg.norm(T_error[:3, 3]) <= shift_m + _SIGMAS * sigmas[:3].max()
-    )
