@@ -132,7 +132,7 @@ def adjoint(T_a_b: Transform) -> NDArray[np.float64]:
     return adjoint_a_b
 
 
-def carried(covariance: NDArray[np.float64], T_a_b: Transform) -> NDArray[np.float64]:
+def carried(covariance: NDArray[np.floating], T_a_b: Transform) -> NDArray[np.float64]:
     """Return the covariances (..., 6, 6) of a frame a that is rigidly connected to b, from b's."""
     carry = adjoint(T_a_b)
     return np.asarray(carry @ covariance @ np.swapaxes(carry, -1, -2))
