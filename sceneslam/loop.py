@@ -15,7 +15,6 @@ import numpy as np
 from tqdm import tqdm
 
 from sceneslam.atlas.save import save_map
-from sceneslam.bus.beside import executor
 from sceneslam.bus.bus import Bus
 from sceneslam.bus.handover_log import log_uncertainty
 from sceneslam.config.build import RunParts
@@ -24,6 +23,7 @@ from sceneslam.engine.live import LiveTally, Spent, run_live
 from sceneslam.engine.open_sinks import OpenSinks
 from sceneslam.engine.slowest import Stopwatch
 from sceneslam.engine.steering import Operator, SteeredDetector
+from sceneslam.executors import executor
 from sceneslam.interfaces import Live, LiveFeed
 from sceneslam.keeping import Keeping
 from sceneslam.moments import Moments

@@ -6,8 +6,8 @@ import numpy as np
 from driving import TABLE, assert_exact, dark_from, drive, events
 from fakes import PERIOD_NS, ExactModule, observation
 
-from sceneslam.bus.beside import executor
 from sceneslam.engine.steering import Operator
+from sceneslam.executors import executor
 from sceneslam.types.command import SaveMap
 from sceneslam.types.maps import HybridMap, PointLayer
 

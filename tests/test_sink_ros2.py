@@ -13,8 +13,8 @@ from omegaconf import OmegaConf
 from test_source_ros2 import CAMERA, scan
 
 from sceneslam.app import run
-from sceneslam.bus.beside import InStep
 from sceneslam.engine.steering import Operator, SteeredDetector
+from sceneslam.executors import InStep
 from sceneslam.modules.maps.live_map import GridAndPoints
 from sceneslam.ros import decode
 from sceneslam.ros.encode_results import ResultEncoder

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.fusion import one_per_voxel
 from sceneslam.atlas.pose_path import OpenSession
+from sceneslam.executors import InStep, executor
 from sceneslam.types import se3
 from sceneslam.types.maps import LandmarkLayer, PointLayer
 
@@ -28,27 +29,24 @@ class Budget:
 
     def __init__(self, *, limit: int, voxel_m: float) -> None:
         self._limit, self._voxel_m = limit, voxel_m
-        self._thread: ThreadPoolExecutor | None = None
+        self._executor: Executor = InStep()
         self._thinning: Future[None] | None = None
 
     def open(self, *, is_live: bool) -> None:
         """Begin; a live run thins in another thread."""
-        self._thread = ThreadPoolExecutor(1, "budget") if is_live else None
+        self._executor = executor("budget", is_live=is_live)
 
     def keep(self, sessions: Sequence[OpenSession]) -> None:
         """Thin the sessions' layers if there are too many points in all."""
         if sum(_count(session) for session in sessions) <= self._limit:
             return
-        if self._thread is None:
-            thin(sessions, self._voxel_m, round(_REST * self._limit))
-        elif self._thinning is None or self._thinning.done():
+        if self._thinning is None or self._thinning.done():
             rest = round(_REST * self._limit)
-            self._thinning = self._thread.submit(thin, tuple(sessions), self._voxel_m, rest)
+            self._thinning = self._executor.submit(thin, tuple(sessions), self._voxel_m, rest)
 
     def close(self) -> None:
         """Wait until the layers are thinned; raises what that raised."""
-        if self._thread is not None:
-            self._thread.shutdown()
+        self._executor.shutdown()
         if self._thinning is not None:
             self._thinning.result()
 

@@ -7,7 +7,7 @@ ignored; a module recognizes its own earlier sessions, and reports loops to them
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
 
@@ -21,6 +21,7 @@ from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.submaps.graph import LOADED, Edge, PlanarEdge
 from sceneslam.atlas.submaps.own_loops import Path
 from sceneslam.atlas.submaps.run_graph import RunGraph
+from sceneslam.executors import executor
 from sceneslam.motion.model import MotionModel
 from sceneslam.motion.tilt import Tilt
 from sceneslam.scans.key_scan import KeyScanner
@@ -57,7 +58,7 @@ class Mapper:
         self._collector = Collector(rig, known, self._loaded.runs)
         plan = self._loaded.plan()
         self._localizer = MapLocalizer(plan) if len(plan) else None
-        self._thread = ThreadPoolExecutor(1) if is_live else None
+        self._executor = executor("search", is_live=is_live)
         self._search: Future[LocalizationEvent] | None = None
         self._recent: list[PlacedScan] = []
         self._T_map_run: Planar | None = None
@@ -115,8 +116,7 @@ class Mapper:
         """
         own = self._collector
         own.finish()
-        if self._thread is not None:
-            self._thread.shutdown()
+        self._executor.shutdown()
         if not own.submaps:
             return Correction.none()
         stamps_ns = np.array([submap.stamps_ns[0] for submap in own.submaps], np.int64)
@@ -170,19 +170,19 @@ class Mapper:
         return stamp_ns - self._recent[-1].scan.stamp_ns >= _REST_NS
 
     def _localize(self, localizer: MapLocalizer, stamp_ns: int) -> None:
+        self._collect(localizer, stamp_ns)
         if self._search is not None:
-            if not self._search.done():
-                return
-            self._take(self._search.result(), localizer, stamp_ns)
-            self._search = None
-        if not localizer.is_due(self._recent[-1]):
-            outcome = LocalizationEvent.NOTHING
-        elif self._thread is not None:
-            self._search = self._thread.submit(localizer.compare, tuple(self._recent))
             return
+        if localizer.is_due(self._recent[-1]):
+            self._search = self._executor.submit(localizer.compare, tuple(self._recent))
+            self._collect(localizer, stamp_ns)
         else:
-            outcome = localizer.compare(self._recent)
-        self._take(outcome, localizer, stamp_ns)
+            self._take(LocalizationEvent.NOTHING, localizer, stamp_ns)
+
+    def _collect(self, localizer: MapLocalizer, stamp_ns: int) -> None:
+        if self._search is not None and self._search.done():
+            search, self._search = self._search, None
+            self._take(search.result(), localizer, stamp_ns)
 
     def _take(self, outcome: LocalizationEvent, localizer: MapLocalizer, stamp_ns: int) -> None:
         """Process the result of a comparison with the map."""

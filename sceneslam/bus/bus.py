@@ -10,7 +10,6 @@ from typing import Protocol
 
 from statemachine import State, StateMachine
 
-from sceneslam.bus.beside import executor
 from sceneslam.bus.changeover import Candidates, Changeover, Outcome, Plan
 from sceneslam.bus.dead_reckoning import DeadReckoning
 from sceneslam.bus.decision import Action, Decision, Health, Situation, decide
@@ -20,6 +19,7 @@ from sceneslam.bus.events import EventLog
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.runner import Runner
 from sceneslam.bus.watch import Watch
+from sceneslam.executors import executor
 from sceneslam.interfaces import BackEnd, Detector, SlamModule
 from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Observation

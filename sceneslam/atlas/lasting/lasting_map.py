@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from pathlib import Path
 
 from sceneslam.atlas.lasting.map_files import HEAD, load_map_files, save_map_files
 from sceneslam.atlas.lasting.saved_map import SavedMap, forget_contradicted
 from sceneslam.atlas.mapper import Mapper, Note
+from sceneslam.executors import InStep, executor
 from sceneslam.types.errors import ConfigError, InputError, text_of
 
 LOCALIZE, EXTEND, UPDATE = "localize", "extend", "update"
@@ -36,7 +37,7 @@ class LastingMap:
         self.loaded: SavedMap | None = None
         self.faults: list[str] = []
         self._saved_ns: int | None = None
-        self._thread: ThreadPoolExecutor | None = None
+        self._executor: Executor = InStep()
         self._writing: Future[None] | None = None
         try:
             if self._load is not None:
@@ -50,7 +51,7 @@ class LastingMap:
 
     def open(self, *, is_live: bool) -> None:
         """Begin; a live run saves in another thread."""
-        self._thread = ThreadPoolExecutor(1) if is_live else None
+        self._executor = executor("save", is_live=is_live)
 
     def keep(self, stamp_ns: int, mapper: Mapper) -> None:
         """Save if `save_every_s` have passed since the last time."""
@@ -59,10 +60,8 @@ class LastingMap:
         if self._save is None or stamp_ns - self._saved_ns < self._every_ns:
             return
         self._saved_ns = stamp_ns
-        if self._thread is None:
-            self._write(mapper.saved(), mapper.is_found)
-        elif self._writing is None or self._writing.done():
-            self._writing = self._thread.submit(self._write, mapper.saved(), mapper.is_found)
+        if self._writing is None or self._writing.done():
+            self._writing = self._executor.submit(self._write, mapper.saved(), mapper.is_found)
 
     def map_of(self, mapper: Mapper) -> SavedMap:
         """Return the map including the run, as it would be saved."""
@@ -74,8 +73,7 @@ class LastingMap:
             self.faults.append(
                 f"the run was not found in the map {self._load}, its poses are in its own frame"
             )
-        if self._thread is not None:
-            self._thread.shutdown()
+        self._executor.shutdown()
         if self._save is not None:
             saved = mapper.saved()
             self._write(saved, mapper.is_found)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from copy import deepcopy
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
+
+from sceneslam.executors import InStep, executor
 
 from .side_process import SideProcess
 
@@ -25,9 +27,7 @@ def worker_beside(
 
 def thread_beside(name: str) -> Executor:
     """Return an executor that runs functions in another thread, or here."""
-    if _has_spare_core():
-        return ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
-    return _AtOnce()
+    return executor(name, is_live=_has_spare_core())
 
 
 def _has_spare_core() -> bool:
@@ -43,19 +43,7 @@ class Here(Generic[Task, Result]):
 
     def submit(self, task: Task) -> Future[Result]:
         """Return the future of the finished task."""
-        return _AtOnce().submit(self._work, deepcopy(task))
+        return InStep().submit(self._work, deepcopy(task))
 
     def end(self) -> None:
         """Do nothing: no task is pending."""
-
-
-class _AtOnce(Executor):
-    """Runs functions at once."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        done = Future[Any]()
-        try:
-            done.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            done.set_exception(error)
-        return done
