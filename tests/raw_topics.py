@@ -11,7 +11,7 @@ from mcap.writer import CompressionType, Writer
 
 from sceneslam.ros import names
 from sceneslam.ros.encode import Encoder
-from sceneslam.sources.open_recording import open_recording
+from sceneslam.sources.bag.open_recording import open_recording
 
 IMAGE, DEPTH = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"
 _PICTURES = {names.IMAGE: (IMAGE, "rgb8"), names.DEPTH: (DEPTH, "16UC1")}

@@ -11,7 +11,7 @@ from ros_recordings import STAMP_NS, Recorder
 from sceneslam.ros import decode, pixels
 from sceneslam.ros.clouds import cloud
 from sceneslam.ros.encode import Encoder
-from sceneslam.sources.open_recording import open_recording
+from sceneslam.sources.bag.open_recording import open_recording
 from sceneslam.types.errors import InputError
 
 BGR = np.random.default_rng(2).integers(0, 256, (6, 8, 3), dtype=np.uint8)

@@ -11,7 +11,7 @@ from sceneslam.interfaces import Sink
 from sceneslam.ros import names
 from sceneslam.ros.writer import ObservationWriter
 from sceneslam.sinks.mcap import McapSink
-from sceneslam.sources.open_recording import open_recording
+from sceneslam.sources.bag.open_recording import open_recording
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import GridLayer, PointLayer

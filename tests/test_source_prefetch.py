@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from sceneslam.sources.bag.synchronise import Sample, SynchronisedSamples, Synchroniser
 from sceneslam.sources.prefetch import prefetched
-from sceneslam.sources.synchronise import Sample, SynchronisedSamples, Synchroniser
 from sceneslam.types import se3
 from sceneslam.types.rig import Sensor
 

@@ -15,9 +15,9 @@ from test_preflight import CAMERA, write_folder
 from sceneslam.app import run
 from sceneslam.evaluation.summary import summary_lines
 from sceneslam.ros.writer import ObservationWriter
-from sceneslam.sources.bag_frames import FrameTree
+from sceneslam.sources.bag.frames import FrameTree
+from sceneslam.sources.bag.recording import ChunkedRecording
 from sceneslam.sources.ordered import Ordered
-from sceneslam.sources.recording import ChunkedRecording
 from sceneslam.sources.simulator.cache import Cache
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types.errors import ConfigError, InputError

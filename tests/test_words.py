@@ -18,7 +18,7 @@ from sceneslam.app import run
 from sceneslam.config.check import check_node
 from sceneslam.config.files import check_yaml
 from sceneslam.config.words import check_trust, how_to_quote, readable
-from sceneslam.sources.open_recording import open_recording
+from sceneslam.sources.bag.open_recording import open_recording
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.input_files import given_path, read_text

@@ -10,20 +10,20 @@ import numpy as np
 
 from sceneslam.ros import decode
 from sceneslam.ros.pixels import DepthUnits
-from sceneslam.sources.bag_frames import FrameTree
-from sceneslam.sources.bag_observation import PRIMARY, BundleDecoder, Decoded, measured
-from sceneslam.sources.bag_rig import Given, make_rig, picture_size_wh, place, sensor_topics
-from sceneslam.sources.bag_topics import choose_topics, describe
-from sceneslam.sources.bag_truth import BASE, CAMERA, read_truth
+from sceneslam.sources.bag.frames import FrameTree
+from sceneslam.sources.bag.observation import PRIMARY, BundleDecoder, Decoded, measured
+from sceneslam.sources.bag.open_recording import open_recording
+from sceneslam.sources.bag.recording import Message
+from sceneslam.sources.bag.rig import Given, make_rig, picture_size_wh, place, sensor_topics
+from sceneslam.sources.bag.synchronise import Sample, SynchronisedSamples, Synchroniser
+from sceneslam.sources.bag.topics import choose_topics, describe
+from sceneslam.sources.bag.truth import BASE, CAMERA, read_truth
 from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.sources.intrinsics import checked_above_zero, given_intrinsics, given_range_m
-from sceneslam.sources.open_recording import open_recording
 from sceneslam.sources.prefetch import prefetched
-from sceneslam.sources.recording import Message
 from sceneslam.sources.spanned import TimeSpan
 from sceneslam.sources.survey.bag_sample import survey_recording
 from sceneslam.sources.survey.survey import Survey
-from sceneslam.sources.synchronise import Sample, SynchronisedSamples, Synchroniser
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.input_files import given_path
 from sceneslam.types.observation import Observation

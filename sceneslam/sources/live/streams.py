@@ -6,7 +6,7 @@ import threading
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from sceneslam.sources.bag_observation import PRIMARY
+from sceneslam.sources.bag.observation import PRIMARY
 from sceneslam.sources.live.clock import Lined, StampOrder
 from sceneslam.types.rig import Sensor
 from sceneslam.types.run import Event

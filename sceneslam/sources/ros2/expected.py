@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from sceneslam.ros import decode
-from sceneslam.sources.bag_frames import FrameTree
-from sceneslam.sources.bag_topics import TYPES, BagTopics, first
+from sceneslam.sources.bag.frames import FrameTree
+from sceneslam.sources.bag.topics import TYPES, BagTopics, first
 from sceneslam.sources.ros2.live_recording import LiveRecording
 from sceneslam.types.errors import ConfigError
 

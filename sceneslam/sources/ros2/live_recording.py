@@ -11,8 +11,8 @@ from typing import Any
 from sceneslam.ros import names
 from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.ros.transport.transport import Arrival, Publication, Qos, Transport
-from sceneslam.sources.bag_topics import TYPES
-from sceneslam.sources.recording import Message
+from sceneslam.sources.bag.recording import Message
+from sceneslam.sources.bag.topics import TYPES
 
 _LOOK_S = 0.1  # interval of topic discovery
 _MOST_HELD = 400  # messages kept per topic ...

@@ -11,10 +11,11 @@ from sceneslam.ros import decode, names
 from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.ros.pixels import DepthUnits
 from sceneslam.ros.transport.transport import Arrival, Network, Transport, open_transport
-from sceneslam.sources.bag_frames import FrameTree
-from sceneslam.sources.bag_observation import PRIMARY, BundleDecoder, measured
-from sceneslam.sources.bag_rig import Given, make_rig, picture_size_wh, place, sensor_topics
-from sceneslam.sources.bag_topics import NONE, TYPES, choose_topics
+from sceneslam.sources.bag.frames import FrameTree
+from sceneslam.sources.bag.observation import PRIMARY, BundleDecoder, measured
+from sceneslam.sources.bag.rig import Given, make_rig, picture_size_wh, place, sensor_topics
+from sceneslam.sources.bag.synchronise import Sample, SynchronisedSamples, Synchroniser
+from sceneslam.sources.bag.topics import NONE, TYPES, choose_topics
 from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.sources.intrinsics import checked_above_zero, given_intrinsics, given_range_m
 from sceneslam.sources.live.clock import StampOrder
@@ -32,7 +33,6 @@ from sceneslam.sources.ros2.live_recording import LiveRecording
 from sceneslam.sources.ros2.network_watch import NetworkWatch
 from sceneslam.sources.survey.bag_sample import survey_recording
 from sceneslam.sources.survey.survey import Survey
-from sceneslam.sources.synchronise import Sample, SynchronisedSamples, Synchroniser
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor, Wheels

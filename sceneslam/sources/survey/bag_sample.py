@@ -10,7 +10,7 @@ import numpy as np
 from sceneslam.ros import decode
 from sceneslam.ros.clouds import cloud
 from sceneslam.ros.pixels import DepthUnits
-from sceneslam.sources.recording import Message, Recording
+from sceneslam.sources.bag.recording import Message, Recording
 from sceneslam.sources.survey.survey import Stream, Survey
 from sceneslam.types.rig import Sensor
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import IO
 
 from sceneslam.ros.messages import TopicType
-from sceneslam.sources import mcap_records as records
-from sceneslam.sources.recording import (
+from sceneslam.sources.bag import mcap_records as records
+from sceneslam.sources.bag.recording import (
     INDEX_IS_DAMAGED,
     Chunk,
     ChunkContent,

@@ -7,9 +7,8 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
 from sceneslam.ros.messages import TopicType
-from sceneslam.sources import bag_records as records
-from sceneslam.sources.bag_survey import BagSurvey
-from sceneslam.sources.recording import (
+from sceneslam.sources.bag import ros1_records as records
+from sceneslam.sources.bag.recording import (
     INDEX_IS_DAMAGED,
     Chunk,
     ChunkContent,
@@ -18,6 +17,7 @@ from sceneslam.sources.recording import (
     Message,
     cut_off,
 )
+from sceneslam.sources.bag.ros1_survey import BagSurvey
 from sceneslam.types.errors import InputError
 
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from sceneslam.ros import decode
-from sceneslam.sources.bag_frames import FrameTree
-from sceneslam.sources.bag_topics import BagTopics, first
-from sceneslam.sources.recording import Recording
+from sceneslam.sources.bag.frames import FrameTree
+from sceneslam.sources.bag.recording import Recording
+from sceneslam.sources.bag.topics import BagTopics, first
 from sceneslam.types import se3
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform

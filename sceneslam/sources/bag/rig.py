@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from sceneslam.ros import decode, names, pixels
-from sceneslam.sources.bag_frames import FrameTree
-from sceneslam.sources.bag_topics import BagTopics, first
+from sceneslam.sources.bag.frames import FrameTree
+from sceneslam.sources.bag.recording import Recording
+from sceneslam.sources.bag.topics import BagTopics, first
 from sceneslam.sources.intrinsics import Intrinsics
-from sceneslam.sources.recording import Recording
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.rig import Camera, Laser, Lidar, Rig, Sensor, Wheels, optical_to_rep103

@@ -6,8 +6,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from mmap import mmap
 
-from sceneslam.sources import bag_records as records
-from sceneslam.sources.bag_records import BagRecord
+from sceneslam.sources.bag import ros1_records as records
+from sceneslam.sources.bag.ros1_records import BagRecord
 
 _INDEX_RECORD_BYTES, _INDEX_ENTRY_BYTES = 55, 12
 _CONNECTION_BYTES = 8192  # approximate size of a connection record with its message definition

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sceneslam.ros import decode, names
-from sceneslam.sources.recording import Recording
+from sceneslam.sources.bag.recording import Recording
 from sceneslam.types.errors import ConfigError, InputError
 
 _log = logging.getLogger(__name__)

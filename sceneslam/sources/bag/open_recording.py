@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from sceneslam.ros.messages import MessageDecoder, TopicType
-from sceneslam.sources import bag_records, mcap_records
-from sceneslam.sources.bag_file import open_bag
-from sceneslam.sources.mcap_file import open_mcap
-from sceneslam.sources.recording import Message, Recording
+from sceneslam.sources.bag import mcap_records, ros1_records
+from sceneslam.sources.bag.mcap_file import open_mcap
+from sceneslam.sources.bag.recording import Message, Recording
+from sceneslam.sources.bag.ros1_file import open_bag
 from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.input_files import check_regular
 
@@ -33,7 +33,7 @@ def open_recording(path: Path) -> Recording:
         raise InputError(f"recording cannot be read ({text_of(error)}): {path}") from error
     if not start:
         raise InputError(f"recording: the file is empty: {path}")
-    if start.startswith(bag_records.MAGIC):
+    if start.startswith(ros1_records.MAGIC):
         return open_bag(path)
     if start.startswith(mcap_records.MAGIC):
         return open_mcap([path])

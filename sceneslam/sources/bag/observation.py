@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sceneslam.ros import decode
 from sceneslam.ros.clouds import Cloud, cloud
 from sceneslam.ros.pixels import DepthUnits, locked
-from sceneslam.sources.synchronise import Sample, SynchronisedSamples
+from sceneslam.sources.bag.synchronise import Sample, SynchronisedSamples
 from sceneslam.types.errors import InputError
 from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Sensor

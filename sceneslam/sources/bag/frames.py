@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import islice
 
 from sceneslam.ros import decode, names
-from sceneslam.sources.recording import Recording
+from sceneslam.sources.bag.recording import Recording
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.se3 import Transform

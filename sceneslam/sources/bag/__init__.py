@@ -1,0 +1,1 @@
+"""Recordings of ROS messages: their files, topics, sensors and truth."""
