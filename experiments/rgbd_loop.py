@@ -32,7 +32,7 @@ from sceneslam.interfaces import SlamModule, Source
 from sceneslam.modules.slam.rgbd.locate.places import PlaceIndex
 from sceneslam.modules.slam.rgbd.map.keyframes import KeyframeStore
 from sceneslam.modules.slam.rgbd.module import RgbdSlam
-from sceneslam.sources.ordered import Ordered
+from sceneslam.sources.contract.ordered import Ordered
 from sceneslam.types import se3
 from sceneslam.types.maps import PoseGraphLayer
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus

@@ -8,7 +8,7 @@ import pytest
 
 from sceneslam.engine.live import LiveSettings, LiveTally, Spent, run_live
 from sceneslam.engine.mailbox import Mailbox, Waited
-from sceneslam.sources.rising_live import RisingLive
+from sceneslam.sources.contract.rising_live import RisingLive
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import LaserScan, Observation
 

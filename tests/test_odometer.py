@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from test_source_ordered import Listed
 
-from sceneslam.sources.clean import cleaned
+from sceneslam.sources.contract.clean import cleaned
+from sceneslam.sources.contract.ordered import Ordered
 from sceneslam.sources.faults import FaultLog
-from sceneslam.sources.ordered import Ordered
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 

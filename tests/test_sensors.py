@@ -9,7 +9,7 @@ import pytest
 from ros_recordings import make_source
 
 from sceneslam.ros.writer import ObservationWriter
-from sceneslam.sources.clean import cleaned
+from sceneslam.sources.contract.clean import cleaned
 from sceneslam.sources.faults import FaultLog
 from sceneslam.testing import RIG, room_observation
 from sceneslam.types.observation import Observation

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sceneslam.interfaces import Source
-from sceneslam.sources.ordered import Ordered
+from sceneslam.sources.contract.ordered import Ordered
 from sceneslam.sources.spanned import TimeSpan
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation

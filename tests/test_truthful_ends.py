@@ -17,7 +17,7 @@ from sceneslam.evaluation.summary import summary_lines
 from sceneslam.ros.writer import ObservationWriter
 from sceneslam.sources.bag.frames import FrameTree
 from sceneslam.sources.bag.recording import ChunkedRecording
-from sceneslam.sources.ordered import Ordered
+from sceneslam.sources.contract.ordered import Ordered
 from sceneslam.sources.simulator.cache import Cache
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types.errors import ConfigError, InputError

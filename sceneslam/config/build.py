@@ -15,8 +15,8 @@ from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.settings import DETECT_ONLY, LIVE, RunSettings
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.interfaces import Detector, Live, Sink, SlamModule, Source
-from sceneslam.sources.ordered import Ordered
-from sceneslam.sources.rising_live import RisingLive
+from sceneslam.sources.contract.ordered import Ordered
+from sceneslam.sources.contract.rising_live import RisingLive
 from sceneslam.supervision.isolated import IsolatedModule
 from sceneslam.types.errors import ConfigError, ModuleError, text_of
 from sceneslam.types.rig import Rig, Sensor

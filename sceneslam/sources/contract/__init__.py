@@ -1,0 +1,1 @@
+"""What makes any source keep its contract: rising stamps, finite arrays, smooth odometry."""
