@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from decimal import Decimal, InvalidOperation
 from functools import partial
 from pathlib import Path
 
@@ -11,19 +12,20 @@ from numpy.typing import NDArray
 
 from sceneslam.ros.pixels import locked
 from sceneslam.sources.intrinsics import checked_range_m
-from sceneslam.sources.kitti_times import read_times_ns
 from sceneslam.sources.prefetch import prefetched
 from sceneslam.sources.stamped_scans import StampedScans
 from sceneslam.sources.survey.survey import Stream, Survey, spread
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
-from sceneslam.types.input_files import given_folder
+from sceneslam.types.input_files import given_folder, read_text
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Lidar, Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
 _FOLDERS = ("velodyne", "velodyne_points/data", ".")
+_TIMES = ("times.txt", "velodyne_points/timestamps.txt", "timestamps.txt")
+_PERIOD_NS = 100_000_000
 _POINT_BYTES = 16  # float32 x y z reflectance
 _SAMPLES = 3  # scans that are read for a survey
 
@@ -42,7 +44,7 @@ class Kitti(StampedScans):
         self._files = _scan_files(self._folder)
         super().__init__(
             Rig(sensors=frozenset({Sensor.POINTS}), lidar=Lidar(range_m=(low_m, high_m))),
-            read_times_ns(self._folder, len(self._files)),
+            _read_times_ns(self._folder, len(self._files)),
         )
 
     def __iter__(self) -> Iterator[Observation]:
@@ -103,6 +105,36 @@ def _scan_files(folder: Path) -> Sequence[Path]:
         if files:
             return files
     raise InputError(f"no scans, expected velodyne/*.bin or velodyne_points/data/*.bin: {folder}")
+
+
+def _read_times_ns(folder: Path, count: int) -> NDArray[np.int64]:
+    """Return the stamps (N,) [ns] of `count` scans; without a file of times, 10 Hz from zero.
+
+    Raises InputError if the file has another number of lines or an invalid time.
+    """
+    for name in _TIMES:
+        path = folder / name
+        if path.is_file():
+            lines = [line.strip() for line in read_text(path).splitlines()]
+            stamps = [_stamp_ns(line, path) for line in lines if line and line[0] != "#"]
+            if len(stamps) != count:
+                raise InputError(
+                    f"times: expected {count} as there are scans, got {len(stamps)}: {path}"
+                )
+            return np.array(stamps, dtype=np.int64)
+    return np.arange(count, dtype=np.int64) * _PERIOD_NS
+
+
+def _stamp_ns(line: str, path: Path) -> int:
+    """Return the stamp [ns] of a line: seconds, or date and time as in the raw drives (as UTC)."""
+    try:
+        if ":" not in line:
+            return int(Decimal(line).scaleb(9))
+        day_time, _, fraction = line.replace(" ", "T").partition(".")
+        whole = int(np.datetime64(day_time, "s").astype(np.int64))
+        return whole * 10**9 + int((fraction + "0" * 9)[:9])
+    except (InvalidOperation, ValueError, OverflowError) as err:
+        raise InputError(f"times: expected seconds, got {line[:40]!r}: {path}") from err
 
 
 def _read_scan(path: Path) -> NDArray[np.float32] | None:
