@@ -31,6 +31,7 @@ _PARTS = {  # name -> its code, and the tests that guard it
         ["sceneslam/atlas"],
         [
             "tests/test_atlas_limits.py",
+            "tests/test_atlas_places.py",
             "tests/test_atlas_upright.py",
             "tests/test_atlas.py",
             "tests/test_revision.py",

@@ -19,7 +19,7 @@ from sceneslam.types import planar
 from sceneslam.types.planar import Planar
 
 _SPAN_M, _SPAN_SCANS = 6.0, 60  # length of path, and scans, that are compared with the map
-_PERIOD_S, _PERIOD_MAX_S = 0.5, 8.0  # time between two searches; it doubles
+_PERIOD_S, _DOUBLINGS = 0.5, 4  # time between two searches; it doubles, up to 8 s
 _PATIENCE = 8  # after this many failed searches: each takes 0.1 s or more
 _FIX_M, _FIX_S = 0.5, 1.0  # distance and time between comparisons once located
 _AGREE_M, _AGREE_RAD = 0.1, 0.05  # two consecutive searches that agree within this are accepted
@@ -90,7 +90,7 @@ class MapLocalizer:
         match = self._map.recognize(field, None)
         if match is None or match.weak_directions:
             self._guess, self._vain = None, self._vain + 1
-            self._wait(newest, _PERIOD_S * 2.0 ** min(self._vain // _PATIENCE, 4))
+            self._wait(newest, _PERIOD_S * 2.0 ** min(self._vain // _PATIENCE, _DOUBLINGS))
             return LocalizationEvent.NOTHING
         self._wait(newest, _PERIOD_S)
         T_map_run = _run_in_map(match, newest)
@@ -133,7 +133,7 @@ class MapLocalizer:
         self._wait(newest, _FIX_S)
 
     def _wait(self, newest: PlacedScan, period_s: float) -> None:
-        self._next_ns = newest.scan.stamp_ns + round(min(period_s, _PERIOD_MAX_S) * 1e9)
+        self._next_ns = newest.scan.stamp_ns + round(period_s * 1e9)
 
 
 def _query(latest: Sequence[PlacedScan]) -> FloorPlan:

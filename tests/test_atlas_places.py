@@ -1,0 +1,473 @@
+"""Floor plans, and finding one in another, up to their limits.
+
+Plans are drawn as text, the highest y first: `#` wall, `.` free, ` ` unknown; a cell is 0.05 m.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sceneslam.atlas.places import localizer
+from sceneslam.atlas.places.floor_plan import FloorPlan, draw, grid_of, join
+from sceneslam.atlas.places.localizer import LocalizationEvent, MapLocalizer, PlacedScan
+from sceneslam.atlas.places.plan_field import PlanField
+from sceneslam.atlas.places.plan_search import PlanSearch, SearchWindow
+from sceneslam.atlas.places.recognition import Recognizer
+from sceneslam.atlas.places.registration import PlanRegistration, register
+from sceneslam.scans.key_scan import KeyScan
+from sceneslam.types import planar
+
+S = 10**9
+CELL = 0.05
+
+
+def plan_of(*rows, normal=(0.0, 0.0), origin=(0.0, 0.0)):
+    cells = np.array([list(row) for row in reversed(rows)])
+    row, column = np.nonzero(cells == "#")
+    points = CELL * (np.column_stack([column, row]) + 0.5) + origin
+    return FloorPlan(
+        points=points.astype(np.float32),
+        normals=np.tile(np.array(normal, np.float32), (len(points), 1)),
+        free=cells == ".",
+        origin_xy_m=origin,
+    )
+
+
+def text_of(plan):
+    """Draw a plan as `plan_of` reads it, without unknown cells around it."""
+    cells = np.where(plan.free, ".", " ")
+    column, row = plan.cells(plan.points).T
+    cells[row, column] = "#"
+    rows, columns = np.nonzero(cells != " ")
+    cells = cells[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    return ["".join(line) for line in cells[::-1]]
+
+
+def scan_of(*points, origin=(0.0, 0.0)):
+    return KeyScan(
+        stamp_ns=0, points=np.array(points, np.float32).reshape(-1, 2), origin=np.array(origin)
+    )
+
+
+# Drawing.
+
+
+def ray(length_m, y_m=0.025):
+    """A scan of one beam along x."""
+    return scan_of((0.025 + length_m, y_m), origin=(0.025, y_m))
+
+
+def test_cells_up_to_shortly_before_a_wall_are_free():
+    plan = draw([(np.zeros(3), ray(0.5))])
+    assert text_of(plan) == ["......... #"]
+    np.testing.assert_allclose(plan.points, [[0.525, 0.025]])
+    np.testing.assert_allclose(plan.origin_xy_m, [-0.5, -0.5])
+    assert plan.free.shape == (21, 31)  # ten cells around everything
+    turned = draw([(np.array([1.0, 2.0, np.pi / 2]), ray(0.5))])
+    assert text_of(turned) == ["#", " ", *"........."]
+    np.testing.assert_allclose(turned.points, [[0.975, 2.525]])
+    assert not len(draw([(np.zeros(3), scan_of())])) and not len(draw([]))
+
+
+def test_a_wall_is_a_cell_that_enough_beams_hit():
+    still = np.zeros(3)
+    assert len(draw([(still, ray(0.5)), (still, ray(0.6))])) == 2
+    assert len(draw([(still, ray(0.5)), (still, ray(0.6)), (still, ray(0.6))])) == 1  # of 3 scans
+    for passing, walls in ((8, 2), (9, 1)):  # two hits among as many beams that pass
+        scans = [ray(0.5)] * 2 + [ray(1.0)] * passing
+        assert len(draw([(still, scan) for scan in scans])) == walls
+
+
+def test_the_normal_of_a_cell_is_that_of_its_line_towards_the_sensor():
+    wall = np.column_stack([np.full(7, 0.5), 0.06 * np.arange(-3, 4)])
+    centre = np.array([0.525, 0.025])
+
+    def normal(*yaws_rad):
+        """Of one wall that scans saw at one point, from other sides."""
+        poses = [np.array([*(centre - planar.rotation(yaw) @ [0.5, 0]), yaw]) for yaw in yaws_rad]
+        plan = draw([(T, scan_of(wall)) for T in poses])
+        return plan.normals[np.argmin(np.linalg.norm(plan.points - centre, axis=1))]
+
+    np.testing.assert_allclose(normal(0.0), [-1.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(normal(np.pi / 2), [0.0, -1.0], atol=1e-6)
+    np.testing.assert_allclose(normal(0.0, 1.2), [-np.cos(0.6), -np.sin(0.6)], atol=1e-6)
+    np.testing.assert_array_equal(normal(0.0, 1.4), [0.0, 0.0])  # their mean is 0.76 long
+
+
+def test_a_plan_of_half_a_kilometre_is_refused():
+    with pytest.raises(ValueError, match="a floor plan of 1001 m x 1001 m"):
+        draw([(np.zeros(3), scan_of((1000.0, 1000.0)))])
+
+
+def test_joined_plans_lie_at_their_poses_and_a_wall_is_not_free():
+    room = plan_of("#.", "#.", normal=(1.0, 0.0))
+    turned = join([(np.array([1.0, 2.0, np.pi / 2]), room)])
+    assert text_of(turned) == ["..", "##"]
+    np.testing.assert_allclose(turned.normals, [[0.0, 1.0]] * 2, atol=1e-6)
+    np.testing.assert_allclose(np.sort(turned.points[:, 0]), [0.925, 0.975], atol=1e-6)
+    np.testing.assert_allclose(turned.points[:, 1], 2.025, atol=1e-6)
+    again = [(np.zeros(3), room), (np.array([-0.05, 0.0, 0.0]), room)]
+    assert text_of(join(again)) == ["##.", "##."]
+    assert not len(join([])) and not len(join([(np.zeros(3), join([]))]))
+
+
+def test_a_wall_in_later_free_space_is_removed_but_not_at_its_edge():
+    old, new = plan_of("#.#.#"), plan_of(*["....."] * 3)
+    below = np.array([0.0, -0.05, 0.0])
+    placed = [(np.zeros(3), old), (below, new)]
+    assert text_of(join(placed)) == [".....", "#.#.#", "....."]
+    assert text_of(join(placed, newest_wins=True)) == [".....", "#...#", "....."]
+    assert text_of(join(placed[::-1], newest_wins=True)) == [".....", "#.#.#", "....."]
+
+
+def test_the_grid_of_a_plan_has_the_log_odds_of_19_in_20():
+    found = grid_of(plan_of("#. ", ".. "))
+    np.testing.assert_array_equal(found.log_odds, [[-3, -3, 0], [3, -3, 0]])
+    assert found.resolution_m == CELL and found.origin_xy_m == (0.0, 0.0)
+
+
+# The nearest wall.
+
+
+def test_the_nearest_wall_free_and_known_space_are_found_at_any_point():
+    field = PlanField(plan_of("." * 20 + "#" + " " * 9, normal=(-1.0, 0.0), origin=(2.0, 1.0)))
+    wall_x = 2.0 + 20.5 * CELL
+    away_m = np.array([-0.5, -0.21, -0.19, 0.0, 0.19, 0.21, -1.1, -3.0, 40.0])
+    points = np.column_stack([wall_x + away_m, np.full(9, 1.025)])
+    found = field.nearest(points)
+    np.testing.assert_allclose(found.distance_m, np.abs(away_m), atol=1e-6)
+    np.testing.assert_allclose(found.error[:, 0], away_m, atol=1e-6)
+    np.testing.assert_array_equal(found.normals, [[-1.0, 0.0]] * 9)
+    assert found.is_clear.tolist() == [True, True] + [False] * 7
+    assert found.is_known.tolist() == [True] * 5 + [False] * 4
+
+
+def test_the_likelihood_is_one_on_a_wall_and_below_zero_in_free_space():
+    field = PlanField(plan_of("." * 10 + "#" + " " * 10))
+    row = field.likelihood[20, 20:41]
+    np.testing.assert_allclose(field.origin_xy_m, [-1.0, -1.0])
+    assert field.likelihood.shape == (41, 61)
+    np.testing.assert_array_equal(row[:6], -1.0)
+    expected = np.exp(-0.5 * (CELL * np.arange(11) / 0.1) ** 2)
+    np.testing.assert_allclose(row[10:], expected, atol=1e-6)
+    np.testing.assert_allclose(row[6:10], expected[4:0:-1], atol=1e-6)
+
+
+# Registration.
+
+
+def corner_of(count=40, gap_m=0.0):
+    """A plan of two walls that meet at the origin, seen from inside, and free space between."""
+    along = CELL * (np.arange(count) + 0.5) + gap_m
+    near = np.full(count, 0.025)
+    points = np.concatenate([np.column_stack([along, near]), np.column_stack([near, along])])
+    free = np.zeros((count + 1, count + 1), bool)
+    free[1:, 1:] = True
+    return FloorPlan(
+        points=points.astype(np.float32),
+        normals=np.repeat(np.array([[0, 1], [1, 0]], np.float32), count, axis=0),
+        free=free,
+        origin_xy_m=(0.0, 0.0),
+    )
+
+
+def moved(plan, T_new_plan):
+    """Return a plan's walls in another frame."""
+    return replace(
+        plan,
+        points=planar.apply(T_new_plan, plan.points.astype(np.float64)).astype(np.float32),
+        normals=(plan.normals @ planar.rotation(T_new_plan[2]).T).astype(np.float32),
+        free=np.zeros((200, 200), bool),
+        origin_xy_m=(-5.0, -5.0),
+    )
+
+
+def test_walls_are_registered_from_half_a_metre_away_as_certain_as_they_are_long():
+    T_target_query = np.array([0.7, 0.3, 0.5])
+    query = moved(corner_of(), planar.between(T_target_query, np.zeros(3)))
+    start = planar.compose(np.array([0.3, -0.2, 0.1]), T_target_query)
+    found = register(PlanField(query), PlanField(corner_of()), start)
+    np.testing.assert_allclose(found.T_target_query, T_target_query, atol=1e-3)
+    assert (found.weak_directions, found.inlier_ratio, found.known_ratio) == (0, 1.0, 1.0)
+    assert found.conflict_ratio == 0.0 and found.is_verified and not found.is_refuted
+    points, normals = query.points.astype(np.float64), query.normals.astype(np.float64)
+    turns = points[:, 0] * normals[:, 1] - points[:, 1] * normals[:, 0]
+    rows = np.column_stack([normals, turns])
+    one_in = 10.0 * (CELL**2 / 12.0)  # ten cells of a wall have one error, even over a cell
+    x_m, y_m = points.mean(axis=0)
+    from_centre = np.array([[1.0, 0.0, y_m], [0.0, 1.0, -x_m], [0.0, 0.0, 1.0]])
+    common = from_centre @ np.diag([0.005, 0.005, 0.002]) ** 2 @ from_centre.T
+    expected = one_in * np.linalg.inv(rows.T @ rows) + common
+    np.testing.assert_allclose(found.covariance, expected, rtol=0.05, atol=2e-6)
+
+
+def test_of_two_parallel_walls_the_distant_one_weighs_less():
+    wall, off_m = corner_of(60), 0.06
+    points = wall.points.copy()
+    points[1:60:3, 1] -= off_m  # a third of it
+    found = register(PlanField(replace(wall, points=points)), PlanField(wall), np.zeros(3))
+    shifts_m = np.linspace(0.0, off_m, 2001)
+    near, far = ((0.01 / (0.01 + e**2)) ** 2 * e for e in (shifts_m, off_m - shifts_m))
+    expected_m = shifts_m[np.argmin(np.abs(2 * near - far))]
+    np.testing.assert_allclose(found.T_target_query, [0.0, expected_m, 0.0], atol=1e-3)
+
+
+def test_a_bare_wall_leaves_the_motion_along_it_open():
+    both = corner_of()
+    wall = replace(both, points=both.points[:40], normals=both.normals[:40])
+    found = register(PlanField(wall), PlanField(wall), np.array([0.1, 0.05, 0.02]))
+    assert found.weak_directions == 1
+    np.testing.assert_allclose(found.T_target_query, [0.1, 0.0, 0.0], atol=1e-3)
+    assert found.covariance[0, 0] == pytest.approx(25.0, rel=1e-4)  # two submaps are 5 m long
+    points = replace(both, normals=np.zeros_like(both.normals))
+    found = register(PlanField(points), PlanField(both), np.zeros(3))
+    assert found.weak_directions == 3  # points that are on no line have no direction
+
+
+def test_the_quality_of_a_registration_is_counted_in_walls():
+    wall = corner_of()
+    inside = np.array([[1.0 + CELL * (i + 0.5), 1.025] for i in range(16)])
+    beyond = inside - [0.0, 5.0]
+    more = np.concatenate([wall.points, inside, beyond]).astype(np.float32)
+    normals = np.concatenate([wall.normals, np.zeros((32, 2), np.float32)])
+    query = replace(wall, points=more, normals=normals, origin_xy_m=(0.0, -5.0))
+    query = replace(query, free=np.zeros((150, 50), bool))
+    found = register(PlanField(query), PlanField(wall), np.zeros(3))
+    assert found.known_ratio == 96 / 112  # 16 of 80 + 32 lie in space that is unknown
+    assert found.inlier_ratio == 80 / 96 and found.conflict_ratio == 16 / 96
+    back = register(PlanField(wall), PlanField(query), np.zeros(3))
+    assert (back.known_ratio, back.inlier_ratio, back.conflict_ratio) == (1.0, 1.0, 16 / 96)
+
+
+def quality(inlier_ratio=1.0, known_ratio=1.0, conflict_ratio=0.0, weak=0, at=(0.0, 0.0, 0.0)):
+    return PlanRegistration(
+        T_target_query=np.array(at),
+        covariance=np.eye(3),
+        weak_directions=weak,
+        inlier_ratio=inlier_ratio,
+        known_ratio=known_ratio,
+        conflict_ratio=conflict_ratio,
+    )
+
+
+def test_a_fifth_of_the_walls_may_have_moved_and_two_fifths_refute_a_place():
+    for least in (quality(inlier_ratio=0.8), quality(conflict_ratio=0.2)):
+        assert least.is_verified and not least.is_refuted
+    for doubtful in (0.61, 0.79):
+        one, other = quality(inlier_ratio=doubtful), quality(conflict_ratio=1.0 - doubtful)
+        assert not any([one.is_verified, one.is_refuted, other.is_verified, other.is_refuted])
+    assert quality(inlier_ratio=0.59).is_refuted and quality(conflict_ratio=0.41).is_refuted
+
+
+# The search, and the decision.
+
+
+def test_a_search_finds_the_pose_of_a_plan_at_any_heading():
+    search = PlanSearch(PlanField(corner_of()))
+    for yaw in (0.5, -2.0, 3.0):
+        T = np.array([0.7, 0.3, yaw])
+        walls = moved(corner_of(), planar.between(T, np.zeros(3))).points.astype(np.float64)
+        best, *others = search.find(walls, None, score_min=0.3, most=4)
+        off = planar.between(T, best.T_target_query)
+        assert np.hypot(off[0], off[1]) < 0.15 and abs(off[2]) < 0.08
+        scores = [best.score, *(peak.score for peak in others)]
+        assert len(scores) == 4 and scores == sorted(scores, reverse=True)
+        assert scores[0] > 0.9 and all(0.3 <= score < 0.8 for score in scores[1:])
+        found = np.array([peak.T_target_query for peak in (best, *others)])
+        for row, pose in enumerate(found):
+            away = found[:row] - pose
+            apart = np.hypot(away[:, 0], away[:, 1]) > 0.4
+            assert (apart | (np.abs(planar.wrapped(away[:, 2])) > 0.2)).all()
+        assert len(search.find(walls, None, score_min=scores[0] - 0.05, most=4)) == 1
+
+
+def test_a_search_keeps_to_its_window():
+    search = PlanSearch(PlanField(corner_of()))
+    T = np.array([0.7, 0.3, 0.5])
+    walls = moved(corner_of(), planar.between(T, np.zeros(3))).points.astype(np.float64)
+    for away, is_inside in (([0.3, 0.3, 0.1], True), ([0.6, 0.0, 0.0], False), ([0, 0, 1], False)):
+        window = SearchWindow(around=T + away, half_m=0.4, half_rad=0.3)
+        found = search.find(walls, window, score_min=0.8, most=4)
+        assert bool(found) == is_inside
+        for peak in found:
+            off = peak.T_target_query - window.around
+            assert np.abs(off[:2]).max() <= 0.4 and abs(off[2]) <= 0.3 + 0.15
+    twice = np.concatenate([walls, walls])
+    (one,) = search.find(twice, replace(window, around=T), score_min=0.8, most=4)
+    assert one.score == pytest.approx(1.0, abs=1e-6)  # the mean of its walls
+
+
+def recognized(monkeypatch, *found, window=None, **settings):
+    """What is decided of candidates with these qualities."""
+    recognizer = Recognizer(PlanField(corner_of()))
+    monkeypatch.setattr(recognizer, "_candidates", lambda *_: list(found))
+    return recognizer.recognize(PlanField(corner_of()), window, **settings)
+
+
+def test_a_place_is_recognized_if_it_is_known_verified_and_the_only_one(monkeypatch):
+    good, aside = quality(), (2.0, 0.0, 0.0)
+    assert recognized(monkeypatch, good) is good and recognized(monkeypatch) is None
+    assert recognized(monkeypatch, quality(known_ratio=0.6)) is not None
+    assert recognized(monkeypatch, quality(known_ratio=0.59)) is None
+    assert recognized(monkeypatch, quality(known_ratio=0.4), known_min=0.35) is not None
+    assert recognized(monkeypatch, quality(weak=1)) is not None
+    assert recognized(monkeypatch, quality(weak=2)) is None
+    assert recognized(monkeypatch, quality(inlier_ratio=0.79)) is None
+    rival = quality(inlier_ratio=0.86, at=aside)
+    assert recognized(monkeypatch, rival, good) is None
+    assert recognized(monkeypatch, good, quality(inlier_ratio=0.84, at=aside)) is good
+    assert recognized(monkeypatch, good, quality(conflict_ratio=0.3, at=aside)) is None
+    assert recognized(monkeypatch, good, quality(conflict_ratio=0.5, at=aside)) is good
+    assert recognized(monkeypatch, replace(rival, T_target_query=np.zeros(3)), good) is good
+    for at, is_apart in (((0.41, 0, 0), True), ((0.39, 0, 0), False), ((0, 0, 0.21), True)):
+        found = recognized(monkeypatch, good, replace(rival, T_target_query=np.array(at)))
+        assert (found is None) == is_apart
+    assert recognized(monkeypatch, replace(rival, T_target_query=np.array([0, 0, 0.19])), good)
+
+
+def test_two_metres_of_wall_are_recognized_and_less_are_not():
+    target = Recognizer(PlanField(corner_of()))
+    found = [target.recognize(PlanField(corner_of(count)), None) for count in (19, 20)]
+    assert found[0] is None and found[1] is not None
+
+
+# A run in a loaded map.
+
+
+class Scripted:
+    """A recognizer that answers as it is told, and keeps what it was asked."""
+
+    def __init__(self, monkeypatch):
+        self.field, self.answer = PlanField(corner_of()), None
+        monkeypatch.setattr(localizer, "Recognizer", lambda field: self)
+
+    def recognize(self, query, window):
+        self.query, self.window = query, window
+        return self.answer
+
+
+def placed(second, x_m=1.0, y_m=2.0, yaw_rad=0.5):
+    """The scan of one wall, dead ahead, at a pose of the run."""
+    scan = scan_of(*[(0.525, 0.025)] * 2, origin=(0.025, 0.025))
+    return PlacedScan(
+        scan=replace(scan, stamp_ns=round(second * S)), T_run_base=np.array([x_m, y_m, yaw_rad])
+    )
+
+
+def located(scripted, at, run_at=(1.0, 2.0, 0.5)):
+    """A localizer that found the robot at a pose of the map after a second."""
+    own, scripted.answer = MapLocalizer(corner_of()), quality(at=at)
+    assert own.compare([placed(0.0, *run_at)]) is LocalizationEvent.NOTHING
+    assert own.compare([placed(1.0, *run_at)]) is LocalizationEvent.FOUND
+    return own
+
+
+@pytest.mark.parametrize(
+    ("off", "is_found"),
+    [
+        ((0.06, 0.06, 0.04), True),
+        ((-0.09, 0.0, -0.04), True),
+        ((0.11, 0.0, 0.0), False),
+        ((0.0, -0.11, 0.0), False),
+        ((0.0, 0.0, 0.06), False),
+        ((0.0, 0.0, -0.06), False),
+    ],
+)
+def test_a_run_is_located_where_two_searches_in_a_row_agree(monkeypatch, off, is_found):
+    scripted, at = Scripted(monkeypatch), np.array([4.0, 3.0, 1.0])
+    own = MapLocalizer(corner_of())
+    for second, (answer, found) in enumerate(
+        [
+            (quality(at=at), False),
+            (None, False),
+            (quality(at=at), False),
+            (quality(at=at, weak=1), False),
+            (quality(at=at), False),
+            (quality(at=planar.compose(at, np.array(off))), is_found),
+        ]
+    ):
+        scripted.answer = answer
+        expected = LocalizationEvent.FOUND if found else LocalizationEvent.NOTHING
+        assert own.compare([placed(second)]) is expected
+        assert (own.T_map_run is not None) == found and scripted.window is None
+    if is_found:
+        (fix,) = own.fixes
+        assert fix.stamp_ns == 5 * S
+        there = planar.compose(own.T_map_run, placed(5).T_run_base)
+        np.testing.assert_allclose(there, planar.compose(at, np.array(off)), atol=1e-12)
+        np.testing.assert_array_equal(fix.T_map_base, scripted.answer.T_target_query)
+
+
+def test_searches_in_vain_become_rare(monkeypatch):
+    scripted = Scripted(monkeypatch)
+    own, periods_s = MapLocalizer(corner_of()), [0.5] * 7 + [1.0] * 8 + [2.0] * 8 + [4.0] * 8
+    assert own.is_due(placed(0.0))
+    for period_s in [*periods_s, *[8.0] * 20]:
+        own.compare([placed(100.0)])
+        assert own.is_due(placed(100.0 + period_s)) and not own.is_due(placed(99.9 + period_s))
+    scripted.answer = quality()
+    own.compare([placed(100.0)])
+    assert own.is_due(placed(100.5)) and not own.is_due(placed(100.4))
+
+
+def test_a_located_run_is_compared_after_a_second_and_half_a_metre_or_a_radian(monkeypatch):
+    own = located(Scripted(monkeypatch), (4.0, 3.0, 1.0))
+    for moved_by, is_far in (
+        ((0.49, 0.0, 0.9), False), ((0.36, -0.36, 0.0), True), ((0.0, 0.0, -1.01), True),
+        ((0.0, 0.0, 1.01), True), ((-0.51, 0.0, 0.0), True), ((0.0, 0.0, 0.0), False),
+    ):  # fmt: skip
+        there = planar.compose(placed(0).T_run_base, np.array(moved_by))
+        assert own.is_due(placed(2.0, *there)) == is_far
+        assert not own.is_due(placed(1.9, *there))
+
+
+@pytest.mark.parametrize("step", [(3.0, 4.0, 0.0), (0.0, 0.0, -2.0)])
+def test_a_fix_lies_within_what_odometry_drifts(monkeypatch, step):
+    scripted = Scripted(monkeypatch)
+    own = located(scripted, (4.0, 3.0, 1.0))
+    there = planar.compose(placed(0).T_run_base, np.array(step))
+    due = planar.compose(np.array([4.0, 3.0, 1.0]), np.array(step))
+    half_m, half_rad = (0.15 + 0.3, 0.05 + 0.15) if step[0] else (0.15, 0.05 + 0.12)
+    for off, is_fixed in (
+        ([half_m + 0.01, 0, 0], False), ([0, 0, -half_rad - 0.01], False),
+        ([0, half_m - 0.01, half_rad - 0.01], True),
+    ):  # fmt: skip
+        scripted.answer = quality(at=planar.compose(due, np.array(off)))
+        event = own.compare([placed(3.0, *there)])
+        assert event is (LocalizationEvent.FIXED if is_fixed else LocalizationEvent.NOTHING)
+        np.testing.assert_allclose(scripted.window.around, due, atol=1e-12)
+        assert scripted.window.half_m == pytest.approx(half_m)
+        assert scripted.window.half_rad == pytest.approx(half_rad)
+    assert [fix.stamp_ns for fix in own.fixes] == [1 * S, 3 * S]
+    found = planar.compose(own.T_map_run, there)
+    np.testing.assert_allclose(found, scripted.answer.T_target_query, atol=1e-12)
+
+
+def test_a_place_that_is_contradicted_three_times_in_a_row_is_withdrawn(monkeypatch):
+    scripted = Scripted(monkeypatch)
+    own = located(scripted, (1.0, 1.0, 0.0), run_at=(0.0, 0.0, 0.0))  # in front of free space
+    scripted.answer = None
+    unknown, nothing = placed(2.0, -5.0, -5.0, 0.0), LocalizationEvent.NOTHING
+    for scan in (placed(2, 0, 0, 0), placed(3, 0, 0, 0), unknown, placed(4, 0, 0, 0)):
+        assert own.compare([scan]) is nothing and own.T_map_run is not None
+    assert own.compare([placed(5, 0, 0, 0)]) is nothing
+    scripted.answer = quality(at=(1.0, 1.0, 0.0))
+    assert own.compare([placed(6, 0, 0, 0)]) is LocalizationEvent.FIXED
+    scripted.answer = None
+    events = [own.compare([placed(7 + index, 0, 0, 0)]) for index in range(3)]
+    assert events == [nothing, nothing, LocalizationEvent.WITHDRAWN]
+    assert own.T_map_run is None and own.fixes == [] and own.is_due(placed(10, 0, 0, 0))
+    scripted.answer = quality(at=(1.0, 1.0, 0.0))
+    assert own.compare([placed(11, 0, 0, 0)]) is nothing  # a first search
+
+
+@pytest.mark.parametrize(("count", "step_m", "compared"), [(10, 1.0, 7), (70, 0.06, 60)])
+def test_six_metres_or_sixty_scans_are_compared(monkeypatch, count, step_m, compared):
+    scripted = Scripted(monkeypatch)
+    scans = [placed(0.0, 0.0, step_m * index, 0.0) for index in range(count)]
+    MapLocalizer(corner_of()).compare(scans)
+    walls = scripted.query.plan.points
+    assert len(walls) == compared
+    np.testing.assert_allclose(walls[-1], [0.525, 0.025], atol=1e-6)  # in the newest base
+    np.testing.assert_allclose(walls[0], [0.525, 0.025 - step_m * (compared - 1)], atol=1e-5)
