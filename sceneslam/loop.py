@@ -264,7 +264,7 @@ class RunLoop:
             return True
         self._bus.step(observation)
         watch.lap("bus")
-        self._parts.atlas.observe(observation)
+        self._parts.atlas.observe(observation, self._bus.up_base)
         watch.lap("atlas")
         self._observed_ns.append(observation.stamp_ns)
         events = self._log.since(self._events_seen)

@@ -99,7 +99,7 @@ def test_a_loop_between_sessions_puts_right_what_drifted_between_them():
         for step in range(first, last):
             atlas.add_local(stamp(step), se3.inverse(told[first]) @ told[step])
             atlas.add(stamp(step), told[step], "ab"[number % 2])
-            atlas.observe(Observation(stamp_ns=stamp(step)))
+            atlas.observe(Observation(stamp_ns=stamp(step)), None)
     pairs = [(2, 103), (8, 109)]
     loops = LoopLayer(
         stamps_ns=np.array([(stamp(a), stamp(b)) for a, b in pairs]),

@@ -71,7 +71,7 @@ class Drive:
                 stamp_ns, planar.to_transform(T_run_base), name, np.eye(6) * deviation**2
             )
             scan = world.scan(pose, stamp_ns)
-            self.atlas.observe(Observation(stamp_ns=stamp_ns, scan=scan))
+            self.atlas.observe(Observation(stamp_ns=stamp_ns, scan=scan), None)
         for number in range(session + 1):
             self.atlas.close_session(number, MapLayers(), Trajectory.empty())
         self.faults = self.atlas.finish()

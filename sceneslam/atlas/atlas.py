@@ -25,7 +25,7 @@ from sceneslam.types.maps import HybridMap, MapLayers
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.run import BRIDGED, Session, SessionStart
-from sceneslam.types.se3 import Transform
+from sceneslam.types.se3 import Transform, Vector
 from sceneslam.types.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
@@ -74,12 +74,12 @@ class Atlas:
             rig, known=self._path.known_at, note=note, loaded=loaded, is_live=is_live
         )
 
-    def observe(self, observation: Observation) -> None:
-        """Add an observation; its pose must have been added before."""
+    def observe(self, observation: Observation, up_base: Vector | None) -> None:
+        """Add an observation whose pose was added, and the upward direction (3,) in base."""
         if self._mapper is None or self._note is None:
             return
         try:
-            self._mapper.observe(observation)
+            self._mapper.observe(observation, up_base)
             self._lasting.keep(observation.stamp_ns, self._mapper)
         except Exception as error:  # poses continue without a map
             self._give_up(error)

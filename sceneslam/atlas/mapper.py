@@ -22,15 +22,13 @@ from sceneslam.atlas.submaps.graph import LOADED, Edge, PlanarEdge
 from sceneslam.atlas.submaps.own_loops import Path
 from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.executors import executor
-from sceneslam.motion.model import MotionModel
-from sceneslam.motion.tilt import Tilt
 from sceneslam.scans.key_scan import KeyScanner
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation
 from sceneslam.types.planar import Planar
-from sceneslam.types.rig import Rig, Sensor
-from sceneslam.types.se3 import Transform
+from sceneslam.types.rig import Rig
+from sceneslam.types.se3 import Transform, Vector
 
 _REST_NS = 1_000_000_000  # between two searches in the map while the robot stands
 _UNFOUND_NS = 5_000_000_000  # after this time a run reports that it was not located
@@ -54,7 +52,6 @@ class Mapper:
         """Begin. `is_live`: searches in the loaded map run in another thread."""
         self._loaded = loaded if loaded is not None else empty_map()
         self._scanner, self._known, self._note = KeyScanner(rig), known, note
-        self._tilt = Tilt(MotionModel(rig)) if Sensor.GYRO in rig.sensors else None
         self._collector = Collector(rig, known, self._loaded.runs)
         plan = self._loaded.plan()
         self._localizer = MapLocalizer(plan) if len(plan) else None
@@ -83,9 +80,8 @@ class Mapper:
         found = self._T_map_run
         return se3.identity() if found is None else planar.to_transform(found)
 
-    def observe(self, observation: Observation) -> None:
-        """Add an observation with a known pose."""
-        up_base = None if self._tilt is None else self._tilt.observe(observation)
+    def observe(self, observation: Observation, up_base: Vector | None) -> None:
+        """Add an observation with a known pose, and the upward direction (3,) in base."""
         known = self._known(observation.stamp_ns)
         if known is None:
             return

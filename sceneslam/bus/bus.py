@@ -24,6 +24,7 @@ from sceneslam.interfaces import BackEnd, Detector, SlamModule
 from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
+from sceneslam.types.se3 import Vector
 
 _log = logging.getLogger(__name__)
 
@@ -156,6 +157,11 @@ class Bus:
     def beside(self) -> list[str]:
         """Return which modules start or end in another thread now, in words."""
         return [f"{key} {runner.beside}" for key, runner in self.runners.items() if runner.beside]
+
+    @property
+    def up_base(self) -> Vector | None:
+        """Return the upward direction (3,) in base at the newest observation, None if unknown."""
+        return self._reckoning.up_base
 
     @property
     def scene(self) -> str:

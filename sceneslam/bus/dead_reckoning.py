@@ -20,7 +20,7 @@ from sceneslam.motion.tilt import Tilt, upright
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
-from sceneslam.types.se3 import Transform
+from sceneslam.types.se3 import Transform, Vector
 
 
 class DeadReckoning:
@@ -31,6 +31,7 @@ class DeadReckoning:
 
     def __init__(self, policy: Policy, rig: Rig) -> None:
         self._learns = policy.gate is not None and policy.handover != "cold"
+        self.up_base: Vector | None = None  # (3,) upward direction, None: unknown
         self._motion = MotionModel(rig) if Sensor.GYRO in rig.sensors else None
         self._tilt = Tilt(self._motion) if self._motion is not None else None
         self._scales: dict[str, WheelScale] = {}  # by the module that measured it
@@ -42,9 +43,8 @@ class DeadReckoning:
     def correct(self, observation: Observation, module: str) -> Observation:
         """Return the observation for a module, corrected by the calibration so far."""
         turn = self._turn(observation)
-        up_base = None
         if self._tilt is not None and turn is not None:
-            up_base = self._tilt.update(observation, turn)
+            self.up_base = self._tilt.update(observation, turn)
         before, now = self._T_odom_base, observation.T_odom_base
         is_gap, self._is_gap = self._is_gap, now is None
         self._turned_rad = 0.0
@@ -67,8 +67,8 @@ class DeadReckoning:
         T_prev_curr[:3, 3] *= 1.0 if learnt is None else learnt.scale
         assert self._T_corrected_base is not None
         self._T_corrected_base = se3.chained(self._T_corrected_base, T_prev_curr)
-        if up_base is not None:
-            self._T_corrected_base = upright(self._T_corrected_base, up_base)
+        if self.up_base is not None:
+            self._T_corrected_base = upright(self._T_corrected_base, self.up_base)
         self._T_corrected_base.setflags(write=False)
         return replace(observation, T_odom_base=self._T_corrected_base)
 

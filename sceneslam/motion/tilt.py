@@ -13,9 +13,7 @@ from sceneslam.motion.model import MotionModel
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import GRAVITY
-from sceneslam.types.se3 import Transform
-
-Vector = NDArray[np.float64]
+from sceneslam.types.se3 import Transform, Vector
 
 _BY_GRAVITY_S = 5.0  # time constant: accelerating and braking last a second
 _BY_ODOMETRY_S = 10.0  # wheels know no slope; a robot is seldom on one for longer
@@ -58,10 +56,6 @@ class Tilt:
         self._model = model
         self._R_level_base: NDArray[np.float64] | None = None  # (3, 3)
         self._bias_radps = np.zeros(3)  # that the model has not found
-
-    def observe(self, observation: Observation) -> Vector | None:
-        """Return the upward direction (3,) as `update` does; the model predicts the turn here."""
-        return self.update(observation, self._model.predict(observation).T_prev_curr[:3, :3])
 
     def update(self, observation: Observation, turn: NDArray[np.float64]) -> Vector | None:
         """Return the upward direction (3,) in base, None without odometry or a gyro that rested.
