@@ -1,7 +1,9 @@
 """One map of all modules and runs: places recognized, loops closed, maps that last."""
 
 from concurrent.futures import Future
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -194,24 +196,23 @@ def test_a_run_finds_itself_in_a_loaded_map_and_its_poses_lie_in_it(saved, tmp_p
     assert both.runs == 2 and set(both.pieces.tolist()) == {0}
 
 
-class Immediate:
-    """An executor that is never late."""
+class Later(Future):
+    """The result of a call that is made when it is asked for the second time."""
 
-    def __init__(self, _workers):
-        pass
+    def __init__(self, function, *args):
+        super().__init__()
+        self._call, self._asked = partial(function, *args), 0
 
-    def submit(self, function, *args):
-        future = Future()
-        future.set_result(function(*args))
-        return future
-
-    def shutdown(self):
-        pass
+    def done(self):
+        self._asked += 1
+        if self._asked == 2:
+            self.set_result(self._call())
+        return super().done()
 
 
 def test_a_live_run_looks_for_itself_and_saves_beside_its_poses(saved, tmp_path, monkeypatch):
-    for module in ("mapper", "lasting.lasting_map"):
-        monkeypatch.setattr(f"sceneslam.atlas.{module}.ThreadPoolExecutor", Immediate)
+    beside = SimpleNamespace(submit=Later, shutdown=lambda: None)
+    monkeypatch.setattr("sceneslam.executors.ThreadPoolExecutor", lambda *_, **__: beside)
     folder, first = saved
     true = through([(7.3, 0.9), (9.2, 1.0), (9.3, 2.0), (5.2, 2.0), (3.2, 0.9), (5.3, 0.9)])
     live = atlas(load=str(folder), save=str(tmp_path / "map"), save_every_s=2.0)
