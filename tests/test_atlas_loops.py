@@ -1,0 +1,162 @@
+"""Which submaps are compared to close a loop, with what, and where."""
+
+import numpy as np
+import pytest
+from test_atlas_places import CELL, plan_of, quality
+
+from sceneslam.atlas.places.floor_plan import join
+from sceneslam.atlas.submaps import loop_closure
+from sceneslam.atlas.submaps.graph import EdgeKind
+from sceneslam.atlas.submaps.loop_closure import LoopFinder
+from sceneslam.atlas.submaps.submap import Drawing, Submap
+from sceneslam.types import planar
+
+WALL = plan_of("##")
+EMPTY = join([])
+
+
+class Compared:
+    """A recognizer that finds every plan at `off` (3,) from where it is expected."""
+
+    off = np.zeros(3)
+    found = True
+
+    def __init__(self, monkeypatch):
+        self.targets, self.windows, self.known_min = [], [], None
+        monkeypatch.setattr(loop_closure, "Recognizer", self._of)
+
+    def _of(self, field):
+        self.targets.append(field.plan)
+        return self
+
+    def recognize(self, query, window, *, known_min):
+        self.windows.append(window)
+        self.query, self.known_min = query, known_min
+        at = planar.compose(window.around, self.off)
+        return quality(at=at) if self.found else None
+
+
+def submap(session, plan=WALL, run=0):
+    return Submap(
+        run=run,
+        session=session,
+        module="a",
+        stamps_ns=np.zeros(1, np.int64),
+        T_submap_base=np.zeros((1, 3)),
+        drawing=Drawing(plan),
+    )
+
+
+def loops_to(second, sessions, nodes, sigma, *, closed=(), plans=None, runs=None):
+    """Find loops between submaps at nodes, with drift of `sigma` (3,) from one to the next."""
+    plans, runs = plans or [WALL] * len(sessions), runs or [0] * len(sessions)
+    submaps = [submap(*one) for one in zip(sessions, plans, runs, strict=True)]
+    drift = np.cumsum(np.tile(np.array(sigma, float), (len(sessions), 1)), axis=0)
+    finder = LoopFinder(submaps, frozenset(closed))
+    return finder.loops_to(second, np.array(nodes, float), drift)
+
+
+def line(*x_m):
+    return [[x, 0.0, 0.0] for x in x_m]
+
+
+def firsts(*args, **settings):
+    return [loop.first for loop in loops_to(*args, **settings)]
+
+
+SMALL = (0.1, 0.1, 0.01)
+
+
+def test_loops_are_searched_within_three_deviations_of_the_drift_between_their_ends(monkeypatch):
+    compared = Compared(monkeypatch)
+    nodes = [[2.0, 0.0, np.pi / 2], [0.0, 0.0, 0.0], [2.0, 1.0, 0.5]]
+    (loop,) = loops_to(2, [0, 0, 1], nodes, [0.2, 0.3, 0.1])
+    (window,) = compared.windows
+    np.testing.assert_allclose(window.around, [1.0, 0.0, 0.5 - np.pi / 2], atol=1e-12)
+    assert window.half_m == pytest.approx(3.0 * (0.6 + 0.5 * 0.2 * 1.0))
+    assert window.half_rad == pytest.approx(3.0 * 0.2)
+    assert (loop.first, loop.second, loop.kind) == (0, 2, EdgeKind.LOOP)
+    np.testing.assert_allclose(loop.T_first_second, window.around)
+    assert compared.known_min == 0.35
+    loops_to(2, [0, 0, 1], nodes, [0.3, 0.2, 0.1])
+    assert compared.windows[-1].half_m == pytest.approx(window.half_m)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_loop_that_is_found_outside_its_window_is_left_out(monkeypatch, axis):
+    compared = Compared(monkeypatch)
+    half = 0.6 if axis < 2 else 0.06
+    for sign in (1.0, -1.0):
+        for share in (0.99, 1.01):
+            compared.off = sign * share * half * np.eye(3)[axis]
+            assert len(firsts(2, [0, 0, 1], line(0, 0, 0), SMALL)) == (share < 1.0)
+    compared.found = False
+    assert firsts(2, [0, 0, 1], line(0, 0, 0), SMALL) == []
+
+
+def test_the_three_nearest_submaps_that_are_no_neighbours_are_compared(monkeypatch):
+    Compared(monkeypatch)
+    x_m = [0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.0, 0.0, 0.0]
+    assert firsts(11, [0] * 11 + [1], line(*x_m), SMALL) == [9, 6, 3]
+    x_m[2] = 0.0
+    assert firsts(11, [0] * 11 + [1], line(*x_m), SMALL) == [2, 9, 6]
+
+
+def test_a_session_closes_loops_with_itself_unless_its_module_does(monkeypatch):
+    Compared(monkeypatch)
+    nodes = line(*[0] * 6)
+    assert firsts(5, [0] * 6, nodes, SMALL) == [0]  # more than a target's width apart
+    assert firsts(4, [0] * 6, nodes, SMALL) == []
+    assert firsts(5, [0] * 6, nodes, SMALL, closed=[0]) == []
+    assert firsts(5, [0, 0, 1, 1, 1, 1], nodes, SMALL, closed=[1]) == [0]
+    assert firsts(5, [0] * 6, nodes, SMALL, closed=[0], runs=[0, 0, 0, 0, 1, 1]) == [0, 3]
+    for without in (0, 5):
+        plans = [EMPTY if index == without else WALL for index in range(6)]
+        assert firsts(5, [0] * 6, nodes, SMALL, plans=plans) == []
+        assert 0 not in firsts(5, [0, 0, 0, 0, 0, 1], nodes, SMALL, plans=plans)
+
+
+def test_submaps_are_compared_if_they_may_overlap_and_it_may_improve_them(monkeypatch):
+    Compared(monkeypatch)
+
+    def is_compared(x_m, y_m, sigma_m):
+        nodes = [[0, 0, 0], [90, 90, 0], [x_m, y_m, 0]]
+        return firsts(2, [0, 0, 1], nodes, [sigma_m / 2, sigma_m / 2, 0.0]) == [0]
+
+    for sign in (1.0, -1.0):
+        reach_m = 3.0 * 0.5 + CELL  # from the wall's farther point
+        assert is_compared(sign * (reach_m - 0.01), 0.0, 0.5)
+        assert not is_compared(sign * (reach_m + 0.01), 0.0, 0.5)
+        assert is_compared(0.0, sign * 1.49, 0.5) and not is_compared(0.0, sign * 1.51, 0.5)
+    assert is_compared(0.0, 0.0, 0.021) and not is_compared(0.0, 0.0, 0.019)
+    assert is_compared(0.0, 0.0, 4.99) and not is_compared(0.0, 0.0, 5.01)
+
+
+def test_a_target_is_the_plan_of_two_neighbours_on_either_side_in_one_session(monkeypatch):
+    compared = Compared(monkeypatch)
+
+    def around(second, sessions, runs=None):
+        """Return the first target's node, and whose walls it has; nodes are 0.2 m apart."""
+        nodes = [[0.0, 0.2 * index, 1.0] for index in range(len(sessions))]
+        first, *_ = firsts(second, sessions, nodes, SMALL, plans=[plan_of("#")] * 8, runs=runs)
+        walls = [planar.apply(np.array(nodes[first]), compared.targets[0].points)]
+        compared.targets.clear()
+        own = planar.apply(np.array(nodes[0]), plan_of("#").points.astype(np.float64))
+        return first, sorted(np.rint((walls[0] - own)[:, 1] / 0.2).astype(int).tolist())
+
+    assert around(7, [0] * 7 + [1]) == (5, [3, 4, 5, 6])
+    assert around(7, [0] * 5 + [2, 2, 1]) == (5, [5, 6])
+    assert around(7, [0] * 4 + [2, 2, 1, 1]) == (5, [4, 5])
+    assert around(7, [0] * 8) == (2, [0, 1, 2, 3, 4])
+    assert around(7, [0] * 8, runs=[0, 1, 1, 1, 1, 1, 1, 1]) == (2, [1, 2, 3, 4])
+    assert around(4, [0] * 4 + [1] * 4) == (2, [0, 1, 2, 3])
+
+
+def test_a_target_is_made_once_for_all_that_are_compared_with_it(monkeypatch):
+    compared = Compared(monkeypatch)
+    sessions = [0] * 4 + [1] * 16
+    finder = LoopFinder([submap(session) for session in sessions], frozenset([1]))
+    drift = np.cumsum(np.full((20, 3), 0.1), axis=0)
+    for second in range(6, 20):
+        assert len(finder.loops_to(second, np.zeros((20, 3)), drift)) == 2
+    assert len(compared.targets) == 2
