@@ -120,7 +120,7 @@ def _difference(a: Trajectory, b: Trajectory) -> Covariance | None:
         return None
     off = se3.log(se3.inverse(se3.inverse(T_a[0]) @ T_a) @ se3.inverse(T_b[0]) @ T_b)
     noise = np.diff(off, axis=0)  # between poses so near one another that nothing drifts
-    drift = off.T @ off - len(off) / (len(off) - 1) * noise.T @ noise
+    drift = off.T @ off - noise.T @ noise  # the first difference is 0
     values, vectors = np.linalg.eigh(drift / (2.0 * np.minimum(submaps, 1.0)).sum())
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
