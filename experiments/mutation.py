@@ -33,6 +33,8 @@ _PARTS = {  # name -> its code, and the tests that guard it
             "tests/test_atlas_limits.py",
             "tests/test_atlas_places.py",
             "tests/test_atlas_loops.py",
+            "tests/test_atlas_maps.py",
+            "tests/test_atlas_graph.py",
             "tests/test_long_runs.py",
             "tests/test_atlas_upright.py",
             "tests/test_atlas.py",

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneslam.atlas.places import localizer
+from sceneslam.atlas.places import localizer, recognition
 from sceneslam.atlas.places.floor_plan import FloorPlan, draw, grid_of, join
 from sceneslam.atlas.places.localizer import LocalizationEvent, MapLocalizer, PlacedScan
 from sceneslam.atlas.places.plan_field import PlanField
-from sceneslam.atlas.places.plan_search import PlanSearch, SearchWindow
+from sceneslam.atlas.places.plan_search import Peak, PlanSearch, SearchWindow
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.places.registration import PlanRegistration, register
 from sceneslam.scans.key_scan import KeyScan
@@ -225,6 +225,23 @@ def test_a_bare_wall_leaves_the_motion_along_it_open():
     assert found.weak_directions == 3  # points that are on no line have no direction
 
 
+def test_a_wall_that_bends_away_beyond_the_end_of_the_other_does_not_pull():
+    wall = corner_of()
+    beyond_m = CELL * (np.arange(20) + 0.5)
+    bend = np.column_stack([2.0 + beyond_m, 0.025 + 0.15 * beyond_m]).astype(np.float32)
+    normals = np.tile(np.array([[-0.148, 0.989]], np.float32), (20, 1))
+    query = PlanField(
+        replace(
+            wall,
+            points=np.concatenate([wall.points, bend]),
+            normals=np.concatenate([wall.normals, normals]),
+            free=np.zeros((70, 70), bool),
+        )
+    )
+    found = register(query, PlanField(wall), np.array([0.05, -0.05, 0.02]))
+    np.testing.assert_allclose(found.T_target_query, np.zeros(3), atol=2e-3)
+
+
 def test_the_quality_of_a_registration_is_counted_in_walls():
     wall = corner_of()
     inside = np.array([[1.0 + CELL * (i + 0.5), 1.025] for i in range(16)])
@@ -324,6 +341,27 @@ def test_a_place_is_recognized_if_it_is_known_verified_and_the_only_one(monkeypa
         found = recognized(monkeypatch, good, replace(rival, T_target_query=np.array(at)))
         assert (found is None) == is_apart
     assert recognized(monkeypatch, replace(rival, T_target_query=np.array([0, 0, 0.19])), good)
+
+
+def test_the_likely_peaks_are_refined_or_the_prediction_where_it_is_near(monkeypatch):
+    starts, target = [], Recognizer(PlanField(corner_of()))
+
+    def refine(query, field, start):
+        starts.append(start.tolist())
+        return quality(inlier_ratio=0.0, at=start)
+
+    monkeypatch.setattr(recognition, "register", refine)
+    peaks = [Peak(T_target_query=np.full(3, x), score=x) for x in (0.9, 0.541, 0.539, 0.4)]
+    monkeypatch.setattr(target._search, "find", lambda *_, **__: peaks)
+    query, around = PlanField(corner_of()), np.array([1.0, 2.0, 3.0])
+    for half_m, half_rad, is_near in (
+        (0.3, 0.1, True), (0.2, 0.05, True), (0.31, 0.1, False), (0.3, 0.11, False),
+    ):  # fmt: skip
+        starts.clear()
+        target.recognize(query, SearchWindow(around=around, half_m=half_m, half_rad=half_rad))
+        assert starts == ([around.tolist()] if is_near else [[0.9] * 3, [0.541] * 3])
+    starts.clear()
+    assert target.recognize(query, None) is None and len(starts) == 2
 
 
 def test_two_metres_of_wall_are_recognized_and_less_are_not():

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from sceneslam.atlas.atlas import Atlas
+from sceneslam.atlas.budget import Budget
+from sceneslam.atlas.pose_path import OpenSession
 from sceneslam.atlas.rows import Rows
 from sceneslam.bus.events import EventLog
 from sceneslam.engine.slowest import Slowest
@@ -103,6 +105,43 @@ def test_new_ground_beyond_the_limit_is_kept_more_coarsely():
     assert len(fused.points.points) <= 45_000 and list(seen_m) == list(range(9))
     assert len(fused.points.colors_bgr) == len(fused.points.points)
     assert len(fused.landmarks.sightings) == len(fused.landmarks.points)
+
+
+def layers(*x_m, stamp_ns=0):
+    points = np.array([[x, 0.0, 0.0] for x in x_m], np.float32)
+    count = len(points)
+    return MapLayers(
+        points=PointLayer(points=points, colors_bgr=np.full((count, 3), stamp_ns, np.uint8)),
+        landmarks=LandmarkLayer(
+            points=points,
+            first_stamps_ns=stamp_ns + np.arange(count),
+            sightings=stamp_ns + np.arange(count),
+        ),
+    )
+
+
+def test_thinning_keeps_the_first_point_per_module_and_voxel_of_the_map():
+    own = Budget(limit=14, voxel_m=0.1)
+    placed = [("a", 0.0), ("b", 0.0), ("a", 5.0)]
+    given = [layers(0.01, 0.06, 0.31), layers(0.01), layers(-5.0, -4.5, -3.0, stamp_ns=7)]
+    sessions = [
+        OpenSession(module, se3.from_xy_yaw(x_m, 0.0, 0.0), layers=one)
+        for (module, x_m), one in zip(placed, given, strict=True)
+    ]
+    sessions.append(OpenSession("c", se3.identity()))
+    own.open(is_live=False)
+    own.keep(sessions)
+    assert [session.layers for session in sessions[:3]] == given  # 14 points and landmarks
+    sessions[3].layers = MapLayers(points=layers(9.0, 9.01).points)
+    own.keep(sessions)
+    kept = [session.layers for session in sessions]
+    found = [np.rint(100 * one.points.points[:, 0]).tolist() for one in kept]
+    assert found == [[1], [1], [-300], [900]]  # in voxels of 0.8 m: half of the limit
+    assert kept[2].points.colors_bgr.tolist() == [[7] * 3]
+    seen = kept[2].landmarks
+    assert (seen.first_stamps_ns.tolist(), seen.sightings.tolist()) == ([9], [9])
+    assert seen.points[:, 0].tolist() == [-3.0]
+    own.close()
 
 
 def test_point_limit_is_checked():

@@ -1,0 +1,241 @@
+"""What the graph of a run is made of, and what its covariances are."""
+
+import importlib
+import pkgutil
+from dataclasses import fields, is_dataclass
+
+import numpy as np
+import pytest
+from test_atlas_limits import S, at, loop, pitched, run_of
+from test_atlas_maps import WALL, map_of
+from test_atlas_places import quality
+
+import sceneslam.atlas
+from sceneslam.atlas.atlas import Atlas
+from sceneslam.atlas.covariances import PosedPath, calibrated, covariances
+from sceneslam.atlas.lasting.saved_map import empty_map
+from sceneslam.atlas.places.localizer import Fix
+from sceneslam.atlas.submaps import run_graph
+from sceneslam.atlas.submaps.graph import Solved, consistent
+from sceneslam.atlas.submaps.run_graph import RunGraph
+from sceneslam.atlas.uncertainty import WHEELS
+from sceneslam.types import planar, se3
+from sceneslam.types.maps import LoopLayer, MapLayers, PoseGraphLayer
+from sceneslam.types.trajectory import Trajectory
+
+CLAIM = np.diag([4.0, 4.0, 4.0, 1.0, 1.0, 1.0]) * 1e-6
+
+
+class Given:
+    """What the graph is solved with; every loop that is left is accepted."""
+
+    def __init__(self, monkeypatch, *, agreeing=None, found=()):
+        self.found, self.agreeing = found, agreeing
+        monkeypatch.setattr(run_graph, "solve", self._solve)
+        monkeypatch.setattr(run_graph, "LoopFinder", lambda submaps, closed: self)
+        monkeypatch.setattr(run_graph, "consistent", self._consistent)
+
+    def loops_to(self, second, plane, drift):
+        return [edge for edge in self.found if edge.second == second]
+
+    def _consistent(self, loops, nodes, drift):
+        self.measured, self.nodes, self.drift = loops, nodes, drift
+        return list(range(len(loops))) if self.agreeing is None else self.agreeing
+
+    def _solve(self, T_map_node, motions, loops, *, fixed, loose, uprights):
+        self.motions, self.loops, self.uprights = motions, loops, uprights
+        self.fixed, self.loose = list(fixed), loose
+        return Solved(T_map_node=T_map_node, accepted=list(range(len(loops))))
+
+
+def finished(count=18):
+    """A run of so many steps of 0.5 m, one a second: six in a submap."""
+    own = run_of(count)
+    own.finish()
+    return own
+
+
+def solved(own, loaded=None, *, maps=(), fixes=(), T_map_run=None):
+    """Solve, where a module revised all poses by 0.01 m to the left."""
+    graph = RunGraph(own, loaded or empty_map(), lambda ns: at(0.5 * ns / S) @ at(0.0, 0.01))
+    nodes = np.stack(own.T_run_node)
+    return graph.solve(nodes if T_map_run is None else T_map_run @ nodes, maps, fixes, frozenset())
+
+
+def layer(pairs_s, T_from_to):
+    information = np.stack([np.eye(6) * 1e4] * len(pairs_s))
+    return LoopLayer(
+        stamps_ns=np.array(pairs_s) * S, T_from_to=np.stack(T_from_to), information=information
+    )
+
+
+def test_loops_of_modules_lead_from_submap_to_submap(monkeypatch):
+    given, own = Given(monkeypatch), finished()
+    loops = layer([(2, 14), (7, 8), (1, 7)], [at(5.0), at(), at(2.0, 1.0, 0.5)])
+    result = solved(own, maps=[MapLayers(loops=loops)])
+    first, second = given.loops
+    assert [(one.first, one.second) for one in given.loops] == [(0, 2), (0, 1)]  # (7, 8) is in one
+    left = at(0.0, 0.01)  # nodes stay where they were, poses are revised
+    expected = at(1.0) @ left @ at(5.0) @ se3.inverse(at(1.0) @ left)
+    np.testing.assert_allclose(first.T_first_second, expected, atol=1e-12)
+    T_to_node = se3.inverse(at(0.5) @ left)
+    np.testing.assert_allclose(
+        second.T_first_second, at(0.5) @ left @ at(2.0, 1.0, 0.5) @ T_to_node, atol=1e-12
+    )
+    carry = se3.adjoint(se3.inverse(T_to_node))
+    np.testing.assert_allclose(second.covariance, carry @ (1.01e-4 * np.eye(6)) @ carry.T)
+    assert [(one.first, one.second) for one in result.loops] == [(0, 2), (0, 1)]
+
+
+def test_loops_within_a_module_are_motions_of_the_graph(monkeypatch):
+    given, own = Given(monkeypatch), finished()
+    graph = PoseGraphLayer(
+        stamps_ns=np.array([1, 13]) * S,
+        T_world_base=np.stack([at(), at(6.0)]),
+        edges=np.array([[0, 1]]),
+        T_from_to=at(6.0)[None],
+        information=np.eye(6)[None],
+        is_loop=np.array([True]),
+    )
+    solved(own, map_of(WALL), maps=[MapLayers(pose_graph=graph)])
+    ends = [(one.first, one.second) for one in given.motions]
+    assert ends == [(1, 2), (2, 3), (1, 3)] and given.loops == []
+    assert (given.fixed, given.loose) == ([0], 1)
+
+
+def test_one_loop_alone_is_not_believed_unless_the_run_was_located(monkeypatch):
+    given, own = Given(monkeypatch, found=[loop(0, 2, [6, 0, 0])]), finished()
+    assert solved(own).loops == () and given.loops == []
+    given.found = [loop(0, 2, [6, 0, 0]), loop(0, 1, [3, 0, 0])]
+    found = solved(own).loops
+    assert [(one.first, one.second) for one in found] == [(0, 1), (0, 2)]
+    given.agreeing = [1]
+    assert solved(own).loops == ()
+    fix = Fix(stamp_ns=S, match=quality(at=(0.5, 0.0, 0.0)))
+    (one,) = solved(own, map_of(WALL), fixes=[fix]).loops
+    assert (one.first, one.second) == (1, 2)
+    own._level = 0  # a base that does not move on a floor
+    given.agreeing = None
+    assert [edge.second for edge in solved(own, map_of(WALL), fixes=[fix]).loops] == [1]
+
+
+def test_a_fix_leads_from_the_nearest_submap_of_the_loaded_piece(monkeypatch):
+    given, own = Given(monkeypatch), finished()
+    nodes = [[0.0, 0.0, 0.0], [3.0, 0.0, 0.5], [4.2, 0.1, 0.0]]
+    loaded = map_of(WALL, WALL, WALL, nodes=nodes, pieces=[0, 0, 1])
+    there = np.array([4.0, 0.0, 0.25])
+    fixes = [
+        Fix(stamp_ns=1 * S, match=quality(at=(0.5, 0.2, 0.0))),
+        Fix(stamp_ns=2 * S, match=quality(at=(1.0, 0.2, 0.0))),
+        Fix(stamp_ns=8 * S, match=quality(at=there)),
+        Fix(stamp_ns=9 * S, match=quality(at=there)),
+    ]
+    solved(own, loaded, fixes=fixes)
+    assert [(edge.first, edge.second) for edge in given.measured] == [(0, 3), (1, 4)]
+    T_base_node = planar.between(np.array([4.0, 0.01, 0.0]), np.array([3.0, 0.0, 0.0]))
+    due = planar.between(np.array(nodes[1]), planar.compose(there, T_base_node))
+    np.testing.assert_allclose(given.measured[1].T_first_second, due, atol=1e-12)
+    T_node_base = planar.between(T_base_node, np.zeros(3))
+    at_node = planar.propagate(np.eye(3), np.zeros(3), T_base_node, np.zeros((3, 3)))
+    assert T_node_base[0] == pytest.approx(1.0)
+    np.testing.assert_allclose(given.measured[1].covariance, at_node, atol=1e-9)
+    assert given.nodes.shape == (6, 3) and (given.drift[:3] == 0).all()
+    np.testing.assert_array_equal(given.drift[3:], own.drift)
+
+
+def test_the_first_vertical_direction_gives_that_of_the_map(monkeypatch):
+    given, own = Given(monkeypatch), finished()
+    tilts = [0.02, 0.05, 0.06]
+    own.up_node = {node: pitched(0, 0, tilt)[2, :3] for node, tilt in enumerate(tilts)}
+    own.T_run_node[0] = pitched(0, 0, 0.1)
+    solved(own, map_of(WALL))
+    assert [one.node for one in given.uprights] == [1, 2, 3]
+    for one, tilt in zip(given.uprights, tilts, strict=True):  # 0.05 is the sensor's own
+        np.testing.assert_allclose(one.up_node, pitched(0, 0, tilt - 0.05)[2, :3], atol=1e-9)
+        np.testing.assert_allclose(one.up_map, pitched(0, 0, -0.13)[2, :3], atol=1e-9)
+
+
+@pytest.mark.parametrize("apart_m", [0.0, 3.0])
+def test_headings_of_loops_agree_within_their_deviation(apart_m):
+    nodes = np.array([[0, 0, 0], [0, 0, 0], [10, 0, 0], [10 + apart_m, 0, 0]], float)
+    drift = np.zeros((4, 3))
+    drift[3, 2] = 0.02
+    bound = np.sqrt(11.34) * np.hypot(np.sqrt(2) * 0.01, 0.02)
+    for sign in (1.0, -1.0):
+        for share in (0.999, 1.001):
+            second = loop(1, 3, [10 + apart_m, 0, sign * share * bound])
+            both = consistent([second, loop(0, 2, [10, 0, 0])], nodes, drift)
+            assert (len(both) == 2) == (share < 1.0)
+
+
+# Poses.
+
+
+def test_the_first_pose_of_a_stamp_is_what_was_reported_online():
+    atlas = Atlas(voxel_m=0.05)
+    for stamp_ns, x_m in ((1, 0.0), (3, 1.0), (2, 5.0), (3, 6.0), (4, 2.0)):
+        atlas.add(stamp_ns, at(x_m), "a")
+    for found in (atlas.online, atlas.trajectory):
+        assert found.stamps_ns.tolist() == [1, 3, 4]
+        assert found.positions_m[:, 0].tolist() == [0.0, 1.0, 2.0]
+
+
+def path_of(T_map_base, sessions, is_bridged, reported):
+    count = len(T_map_base)
+    return PosedPath(
+        T_map_base=np.stack(T_map_base),
+        sessions=np.array(sessions),
+        is_bridged=np.array(is_bridged),
+        reported=np.stack([reported] * count),
+    )
+
+
+def test_a_bridged_pose_is_as_uncertain_as_the_last_measured_one_and_the_bridge():
+    poses = [at(0.1 * index) for index in range(3)]
+    path = path_of(poses, [0] * 3, [False, True, True], CLAIM)
+    found = covariances(path, loops=[], bridge=WHEELS)
+    per_m, turn = 0.02 * 0.2, 0.01 * 0.2
+    bridge = per_m**2 + (turn * 0.1) ** 2
+    map_drift = CLAIM[0, 0] * 0.2 / 2.5
+    assert found[0, 0, 0] == pytest.approx(CLAIM[0, 0], rel=1e-3)
+    assert found[2, 0, 0] == pytest.approx(CLAIM[0, 0] + map_drift + bridge, rel=1e-3)
+    assert found[2, 5, 5] == pytest.approx(CLAIM[5, 5] * (1.0 + 0.2 / 2.5) + turn**2, rel=1e-3)
+    none = path_of(poses, [0] * 3, [True] * 3, np.full((6, 6), np.nan))
+    assert covariances(none, loops=[], bridge=WHEELS)[0, 0, 0] < 1e-9
+
+
+def test_claims_are_scaled_by_the_drift_between_two_modules_beyond_their_noise():
+    count, off_m = 5, 0.01
+    poses = [at(0.5 * index) for index in range(count)]
+    path = path_of(poses * 2, [0] * count + [1] * count, [False] * 2 * count, CLAIM)
+    away = [at(off_m * index) for index in range(count)]
+    both = [
+        Trajectory(stamps_ns=np.arange(count), T_world_base=np.stack(one))
+        for one in (poses, [T @ off for T, off in zip(poses, away, strict=True)])
+    ]
+    found = calibrated(path, "ab", both).reported
+    steps = np.arange(count)
+    drift = off_m**2 * ((steps**2).sum() - (count - 1))
+    per_submap = drift / (2.0 * np.minimum(steps * 0.5 / 2.5, 1.0).sum())
+    ratio = (per_submap / 4.0 / CLAIM[0, 0] + 3.0) / 6.0
+    np.testing.assert_allclose(found, [CLAIM * ratio] * 2 * count, rtol=1e-3, atol=1e-12)
+
+
+# Values.
+
+
+def test_values_of_the_back_end_are_frozen_and_compared_by_identity():
+    """Arrays cannot be compared by ==; what is not frozen receives poses."""
+    growing, seen = {"OpenSession", "PoseLog", "PosePath"}, 0
+    for module in pkgutil.walk_packages(sceneslam.atlas.__path__, "sceneslam.atlas."):
+        for name, value in vars(importlib.import_module(module.name)).items():
+            if not (isinstance(value, type) and is_dataclass(value)) or name in growing:
+                continue
+            if value.__module__ != module.name:
+                continue
+            assert value.__dataclass_params__.frozen and "__slots__" in vars(value), name
+            assert all(field.kw_only for field in fields(value)), name
+            has_array = any("NDArray" in str(field.type) for field in fields(value))
+            assert not (has_array and value.__dataclass_params__.eq), name
+            seen += 1
+    assert seen > 15

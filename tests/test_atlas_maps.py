@@ -1,0 +1,521 @@
+"""Maps of several runs: what is kept, forgotten, joined, saved, and when."""
+
+import hashlib
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from test_atlas_places import CELL, plan_of, quality, text_of
+
+from sceneslam.atlas import mapper as mapper_of
+from sceneslam.atlas.lasting import lasting_map, merge
+from sceneslam.atlas.lasting.lasting_map import LastingMap
+from sceneslam.atlas.lasting.map_files import HEAD, load_map_files, save_map_files
+from sceneslam.atlas.lasting.merge import join_pieces
+from sceneslam.atlas.lasting.prune import prune
+from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map, forget_contradicted
+from sceneslam.atlas.mapper import Mapper
+from sceneslam.atlas.places.floor_plan import join
+from sceneslam.atlas.places.localizer import LocalizationEvent
+from sceneslam.atlas.submaps.collector import Known
+from sceneslam.atlas.submaps.graph import EdgeKind, PlanarEdge
+from sceneslam.atlas.submaps.submap import Drawing, Submap
+from sceneslam.experiments.one_map.drive import RIG
+from sceneslam.types import planar
+from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.observation import LaserScan, Observation
+
+S = 10**9
+WALL = plan_of("#" * 40)
+
+
+def map_of(*plans, nodes=None, runs=None, pieces=None, edges=()):
+    count = len(plans)
+    return SavedMap(
+        submaps=tuple(
+            Submap(
+                run=0 if runs is None else runs[index],
+                session=index // 2,
+                module="ab"[index % 2],
+                stamps_ns=np.array([index * S, index * S + 1]),
+                T_submap_base=np.array([[0.0, 0.0, 0.0], [0.1, 0.2, 0.3]]),
+                drawing=Drawing(plan),
+            )
+            for index, plan in enumerate(plans)
+        ),
+        T_map_node=np.zeros((count, 3)) if nodes is None else np.array(nodes, float),
+        pieces=np.zeros(count, np.int64) if pieces is None else np.array(pieces),
+        edges=tuple(edges),
+    )
+
+
+def edge(first, second, T_first_second=(1.0, 0.0, 0.0), kind=EdgeKind.MOTION):
+    return PlanarEdge(
+        first=first,
+        second=second,
+        T_first_second=np.array(T_first_second, float),
+        covariance=np.diag([1e-4, 1e-4, 1e-5]),
+        kind=kind,
+    )
+
+
+# What is forgotten.
+
+
+def cross(length=9):
+    half = length // 2
+    bar = " " * half + "#" + " " * half
+    return [bar] * half + ["#" * length] + [bar] * half
+
+
+def test_walls_well_inside_what_the_newest_run_saw_free_are_forgotten():
+    today, old = plan_of(*["....."] * 5), plan_of(*cross(), normal=(1.0, 0.0))
+    at = [-2 * CELL, -2 * CELL, 0.0]
+    left = forget_contradicted(map_of(old, today, nodes=[at, [0, 0, 0]], runs=[0, 1]), 1)
+    kept = left.submaps[0].plan
+    gap = [list(row) for row in cross()]
+    for index in (3, 4, 5):
+        gap[index][4] = gap[4][index] = " "
+    assert text_of(kept) == ["".join(row) for row in gap]
+    assert len(kept.normals) == len(kept.points)
+    assert left.submaps[1].plan is today
+    turned = [8 * CELL, -3 * CELL, np.pi / 2]
+    wide = plan_of(*["." * 7] * 3)
+    left = forget_contradicted(map_of(old, wide, nodes=[turned, [0, 0, 0]], runs=[0, 1]), 1)
+    for index in (2, 6):
+        gap[index][4] = " "
+    for index in (3, 5):
+        gap[4][index] = "#"
+    assert text_of(left.submaps[0].plan) == ["".join(row) for row in gap]
+
+
+def test_nothing_is_forgotten_of_other_pieces_or_far_away():
+    today, old = plan_of(*["....."] * 5), plan_of("###")
+    for node in ([50.0, 0, 0], [-50.0, 0, 0], [0, 50.0, 0], [0, -50.0, 0]):
+        both = map_of(old, today, nodes=[node, [0, 0, 0]], runs=[0, 1])
+        assert len(forget_contradicted(both, 1).submaps[0].plan) == 3
+    node = [CELL, 2 * CELL, 0.0]
+    for pieces, count in (([1, 0], 3), ([1, 1], 0)):
+        both = map_of(old, today, nodes=[node, [0, 0, 0]], runs=[0, 1], pieces=pieces)
+        assert len(forget_contradicted(both, 1).submaps[0].plan) == count
+
+
+def test_what_was_free_is_forgotten_where_the_newest_run_saw_a_wall():
+    old, today = plan_of("....#", "....."), plan_of(*cross(5))
+    at = [-CELL, 0.0, 0.0]
+    left = forget_contradicted(map_of(old, today, nodes=[at, [0, 0, 0]], runs=[0, 1]), 1)
+    assert text_of(left.submaps[0].plan) == ["... #", "... ."]
+    assert text_of(old) == ["....#", "....."]
+
+
+def test_the_plan_of_a_piece_is_that_of_its_submaps_the_newest_last():
+    room, inside = plan_of("#####"), plan_of(*["....."] * 3)
+    nodes = [[0, 0, 0], [0, -CELL, 0], [0, 0, 0]]
+    saved = map_of(room, inside, plan_of("##"), nodes=nodes, pieces=[0, 0, 1])
+    assert text_of(saved.plan()) == [".....", "#...#", "....."]
+    assert text_of(saved.plan(newest_wins=False)) == [".....", "#####", "....."]
+    assert text_of(saved.plan(1)) == ["##"] and not len(saved.plan(2))
+
+
+# What is covered.
+
+
+@pytest.mark.parametrize(
+    ("walls", "away_m", "pieces", "is_covered"),
+    [
+        (40, 0.09, [0, 0], True),
+        (40, -0.09, [0, 0], True),
+        (40, 0.11, [0, 0], False),
+        (37, 0.0, [0, 0], True),  # one is beside it: 95 %
+        (36, 0.0, [0, 0], False),
+        (40, 0.0, [0, 1], False),
+    ],
+)
+def test_a_submap_is_removed_if_later_ones_of_its_piece_cover_its_walls(
+    walls, away_m, pieces, is_covered
+):
+    later = plan_of("#" * walls)
+    nodes = [[1.0, 2.0, 0.5], planar.compose(np.array([1.0, 2.0, 0.5]), np.array([0, away_m, 0]))]
+    saved = map_of(WALL, later, nodes=nodes, pieces=pieces, edges=[edge(0, 1)])
+    thinned = prune(saved)
+    assert len(thinned.submaps) == 1 + (not is_covered)
+    assert thinned.submaps[-1].plan is later and len(thinned.edges) == (not is_covered)
+
+
+def test_a_submap_without_later_walls_stays_and_one_without_walls_goes():
+    empty = join([])
+    assert len(prune(map_of(WALL, empty)).submaps) == 2
+    assert len(prune(map_of(empty, WALL)).submaps) == 1
+    assert len(prune(map_of(WALL, WALL, nodes=[[0, 0, 0], [4.0, 0, 0]])).submaps) == 2
+    assert len(prune(map_of(WALL, WALL, WALL)).submaps) == 1
+
+
+def test_motions_between_kept_submaps_stay_and_loops_to_removed_ones_go():
+    far = [50.0 * index for index in range(4)]
+    nodes = [[far[0], 0, 0], [far[1], 0, 0], [far[2], 0, 0], [far[1], 0, 0]]
+    edges = [edge(0, 1), edge(1, 2), edge(2, 3), edge(0, 2, kind=EdgeKind.LOOP)]
+    edges.append(edge(1, 3, kind=EdgeKind.LOOP))
+    thinned = prune(map_of(WALL, WALL, WALL, WALL, nodes=nodes, edges=edges))
+    found = [(one.first, one.second, one.kind) for one in thinned.edges]
+    motion, loop = EdgeKind.MOTION, EdgeKind.LOOP
+    assert found == [(1, 2, motion), (0, 1, loop), (0, 1, motion)]
+    np.testing.assert_allclose(thinned.edges[-1].T_first_second, [2.0, 0.0, 0.0])
+    np.testing.assert_array_equal(thinned.T_map_node[:, 0], [far[0], far[2], far[1]])
+
+
+# What is joined.
+
+
+class Found:
+    """A recognizer of pieces that finds each plan where it is told."""
+
+    def __init__(self, monkeypatch, answers):
+        self.answers, self.queries = list(answers), []
+        monkeypatch.setattr(merge, "Recognizer", lambda field: self)
+
+    def recognize(self, query, window):
+        assert window is None
+        self.queries.append(query.plan)
+        answer = self.answers.pop(0)
+        return answer and replace(answer, covariance=np.diag([1e-4, 1e-4, 1e-6]))
+
+
+def two_pieces():
+    """Two submaps 10 m apart, and a piece of three that are 1 m apart."""
+    nodes = [[0, 0, 0], [10, 0, 0], [0, 0, 0], [1, 0, 0], [2, 0, 0]]
+    plans = [WALL, WALL, plan_of("#"), plan_of("#"), plan_of("#")]
+    edges = [edge(0, 1, (10, 0, 0)), edge(2, 3), edge(3, 4)]
+    return map_of(*plans, nodes=nodes, pieces=[0, 0, 1, 1, 1], runs=[0, 0, 1, 1, 1], edges=edges)
+
+
+def at(x_m, y_m, weak=0):
+    return quality(at=(x_m, y_m, np.pi / 2), weak=weak)
+
+
+def test_a_piece_is_joined_where_two_of_its_submaps_agree(monkeypatch):
+    saved, found = two_pieces(), Found(monkeypatch, [at(9.0, 5.0), None, at(9.0, 7.0)])
+    joined = join_pieces(saved)
+    assert (joined.joined, joined.apart) == (1, 0)
+    assert joined.map.pieces.tolist() == [0] * 5
+    half = np.pi / 2
+    expected = [[0, 0, 0], [10, 0, 0], [9, 5, half], [9, 6, half], [9, 7, half]]
+    np.testing.assert_allclose(joined.map.T_map_node, expected, atol=1e-6)
+    loops = joined.map.edges[3:]
+    assert [(loop.first, loop.second, loop.kind) for loop in loops] == [
+        (1, 2, EdgeKind.LOOP), (1, 4, EdgeKind.LOOP)
+    ]  # fmt: skip
+    np.testing.assert_allclose(loops[0].T_first_second, [-1.0, 5.0, half], atol=1e-6)
+    around = [np.rint(np.sort(plan.points[:, 0])).tolist() for plan in found.queries]
+    assert around == [[0, 1], [-1, 0, 1], [-1, 0]]
+
+
+@pytest.mark.parametrize(
+    "answers",
+    [
+        [at(9.0, 5.0), None, None],
+        [at(9.0, 5.0), None, at(9.0, 7.0, weak=1)],
+        [at(9.0, 5.0), None, at(9.0, 8.0)],  # they contradict each other
+    ],
+)
+def test_a_piece_stays_apart_without_two_that_agree(monkeypatch, answers):
+    saved, _ = two_pieces(), Found(monkeypatch, answers)
+    joined = join_pieces(saved)
+    assert (joined.joined, joined.apart) == (0, 1)
+    assert joined.map.pieces.tolist() == [0, 0, 1, 1, 1] and joined.map.edges == saved.edges
+
+
+def test_pieces_are_numbered_again_where_one_was_joined(monkeypatch):
+    saved = replace(two_pieces(), pieces=np.array([0, 0, 3, 3, 5]))
+    Found(monkeypatch, [at(9.0, 5.0), at(9.0, 6.0), None])
+    joined = join_pieces(saved)
+    assert (joined.joined, joined.apart) == (1, 1) and joined.map.pieces.tolist() == [0, 0, 0, 0, 1]
+
+
+def test_submaps_of_other_runs_are_no_neighbours(monkeypatch):
+    saved, found = two_pieces(), Found(monkeypatch, [None] * 3)
+    submaps = [*saved.submaps[:4], replace(saved.submaps[4], run=2)]
+    join_pieces(replace(saved, submaps=tuple(submaps)))
+    assert [len(plan) for plan in found.queries] == [2, 2, 1]
+
+
+# Files.
+
+
+def whole_map():
+    nodes = [[0.0, 0.0, 0.0], [1.0, 2.0, 0.5]]
+    plans = plan_of("#..", " .#"), plan_of("#")
+    return map_of(*plans, nodes=nodes, pieces=[0, 2], runs=[0, 1], edges=[edge(0, 1)])
+
+
+def test_a_map_is_loaded_as_it_was_saved(tmp_path):
+    saved = whole_map()
+    save_map_files(saved, tmp_path)
+    found = load_map_files(tmp_path)
+    head = yaml.safe_load((tmp_path / HEAD).read_text())
+    assert [head[key] for key in ("submaps", "edges", "runs", "pieces")] == [2, 1, 2, 2]
+    assert head["modules"] == ["a", "b"] and head["cell_m"] == CELL
+    for one, other in zip(found.submaps, saved.submaps, strict=True):
+        assert (one.run, one.session, one.module) == (other.run, other.session, other.module)
+        np.testing.assert_array_equal(one.stamps_ns, other.stamps_ns)
+        np.testing.assert_array_equal(one.T_submap_base, other.T_submap_base)
+        for name in ("points", "normals", "free", "origin_xy_m"):
+            np.testing.assert_array_equal(getattr(one.plan, name), getattr(other.plan, name))
+    np.testing.assert_array_equal(found.T_map_node, saved.T_map_node)
+    np.testing.assert_array_equal(found.pieces, [0, 2])
+    (one,) = found.edges
+    assert (one.first, one.second, one.kind) == (0, 1, EdgeKind.MOTION)
+    np.testing.assert_array_equal(one.covariance, saved.edges[0].covariance)
+    save_map_files(empty_map(), tmp_path)
+    assert load_map_files(tmp_path).submaps == () and len(list(tmp_path.iterdir())) == 2
+
+
+def with_arrays(folder, harm):
+    """Save a map whose arrays are harmed, under a right checksum."""
+    save_map_files(whole_map(), folder)
+    head = yaml.safe_load((folder / HEAD).read_text())
+    path = folder / head["arrays"]
+    arrays = dict(np.load(path))
+    harm(arrays)
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    path.write_bytes(buffer.getvalue())
+    head["sha256"] = hashlib.sha256(buffer.getvalue()).hexdigest()
+    (folder / HEAD).write_text(yaml.safe_dump(head))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("point", None, "point: missing among the map's arrays"),
+        ("node_run", np.zeros(2), r"node_run: expected <i8 of shape \(N, \), got <f8 \(2,\)"),
+        ("node_run", np.int64(0), r"node_run: expected <i8 .*, got <i8 \(\)"),
+        ("node_pose", np.zeros((2, 4)), r"node_pose: expected <f8 of shape \(N, 3\), got"),
+        ("node_pose", np.full((2, 3), np.nan), "node_pose: expected finite numbers"),
+        ("node_piece", np.zeros(3, np.int64), "node_piece: expected 2 rows, got 3"),
+        ("node_scans", np.array([2, 3]), "the submaps' scans do not add up to 4"),
+        ("node_points", np.array([4, -1]), "the submaps' points do not add up to 3"),
+        ("node_grid_shape", np.array([[9, 3], [1, 1]]), "the submaps' bytes do not add up to 2"),
+        ("edge_nodes", np.array([[0, 2]]), "edge_nodes: expected 0 to 1"),
+        ("edge_nodes", np.array([[-1, 1]]), "edge_nodes: expected 0 to 1"),
+        ("edge_kind", np.array([4]), "edge_kind: expected 0 to 3"),
+        ("node_module", np.array([0, 2]), "modules: expected the names that the submaps refer to"),
+    ],
+)
+def test_arrays_that_do_not_fit_together_are_named(tmp_path, name, value, said):
+    def harm(arrays):
+        arrays.pop(name)
+        if value is not None:
+            arrays[name] = value
+
+    with_arrays(tmp_path, harm)
+    with pytest.raises(InputError, match=said):
+        load_map_files(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("version", 0, "a map of version 0, only version 1 is known"),
+        ("version", "2", "a map of version '2', only version 1 is known"),
+        ("version", 2, "a map of version 2, a newer SceneSLAM wrote it"),
+        ("sha256", None, "sha256: missing, the map's map.yaml is not complete"),
+        ("cell_m", 0.1, "cell_m: got 0.1, allowed: 0.05"),
+        ("modules", "ab", "modules: expected the names"),
+        ("arrays", "../arrays-0.npz", "is not complete, ../arrays-0.npz is missing"),
+    ],
+)
+def test_a_head_that_does_not_fit_is_named(tmp_path, key, value, said):
+    save_map_files(whole_map(), tmp_path / "map")
+    path = tmp_path / "map" / HEAD
+    head = yaml.safe_load(path.read_text())
+    (tmp_path / "arrays-0.npz").write_bytes((path.parent / head["arrays"]).read_bytes())
+    path.write_text(yaml.safe_dump(head | {key: value}))
+    with pytest.raises(InputError, match=said):
+        load_map_files(path.parent)
+    with pytest.raises(InputError, match="there is no map, the folder is missing"):
+        load_map_files(tmp_path / "none")
+
+
+# When a run is saved.
+
+
+class Mapped:
+    """A run with one submap."""
+
+    is_found = True
+
+    def saved(self):
+        return map_of(WALL, edges=[edge(0, 0, kind=EdgeKind.LOOP), edge(0, 0)])
+
+
+def lasting(tmp_path, monkeypatch, *, every_s=2.0):
+    """A map that is saved at intervals, and the times at which it was."""
+    written, own = [], LastingMap(
+        load=None, save=str(tmp_path / "map"), mode="extend", save_every_s=every_s
+    )  # fmt: skip
+    monkeypatch.setattr(lasting_map, "save_map_files", lambda saved, folder: written.append(saved))
+    own.open(is_live=False)
+    return own, written
+
+
+def test_a_map_is_saved_at_intervals_and_at_the_end(tmp_path, monkeypatch):
+    own, written = lasting(tmp_path, monkeypatch)
+    counts = []
+    for second in (5.0, 6.9, 7.0, 8.9, 9.1, 11.0, 11.2):
+        own.keep(round(second * S), Mapped())
+        counts.append(len(written))
+    assert counts == [0, 0, 1, 1, 2, 2, 3]
+    events = []
+    own.finish(Mapped(), 12 * S, lambda *event, **fields: events.append((event, fields)))
+    assert events == [(("map_saved", 12 * S), {"submaps": 1, "loops": 1})] and len(written) == 4
+    assert own.faults == []
+
+
+def test_what_could_not_be_saved_is_told_once(tmp_path, monkeypatch):
+    own, _ = lasting(tmp_path, monkeypatch)
+
+    def fails(*_):
+        raise OSError("no space left")
+
+    monkeypatch.setattr(lasting_map, "save_map_files", fails)
+    for second in (0, 2, 4):
+        own.keep(second * S, Mapped())
+    (fault,) = own.faults
+    assert fault.startswith("the map could not be saved: ") and "no space left" in fault
+
+
+def test_a_run_that_localizes_saves_no_map(tmp_path):
+    save_map_files(whole_map(), tmp_path)
+    with pytest.raises(
+        ConfigError, match="save: got 'other', allowed: null where mode is localize"
+    ):
+        LastingMap(load=str(tmp_path), save="other", mode="localize", save_every_s=1.0)
+    assert len(LastingMap(load=str(tmp_path), save=str(tmp_path), mode="update", save_every_s=1.0)
+               .loaded.submaps) == 2  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("mode", "is_found"), [("update", True), ("update", False), ("extend", True)]
+)
+def test_an_update_forgets_once_the_run_was_located(tmp_path, mode, is_found):
+    save_map_files(map_of(plan_of("###")), tmp_path)
+    own = LastingMap(load=str(tmp_path), save=None, mode=mode, save_every_s=1.0)
+    run = Mapped()
+    run.is_found = is_found
+    nodes = [[CELL, 2 * CELL, 0], [0, 0, 0]]
+    run.saved = lambda: map_of(plan_of("###"), plan_of(*["....."] * 5), nodes=nodes, runs=[0, 1])
+    kept = len(own.map_of(run).submaps[0].plan)
+    assert kept == (0 if mode == "update" and is_found else 3)
+
+
+# When a run looks for itself.
+
+
+class Searched:
+    """A localizer that answers as it is told."""
+
+    def __init__(self, monkeypatch):
+        monkeypatch.setattr(mapper_of, "MapLocalizer", lambda plan: self)
+        self.T_map_run, self.fixes, self.is_late = None, [], False
+        self.answer, self.asked = LocalizationEvent.NOTHING, []
+
+    def is_due(self, placed):
+        return not self.is_late
+
+    def compare(self, latest):
+        self.asked.append([placed.scan.stamp_ns / S for placed in latest])
+        return self.answer
+
+
+SCAN = LaserScan(
+    stamp_ns=0,
+    ranges_m=np.full(20, 2.0, np.float32),
+    angle_min_rad=-1.0,
+    angle_step_rad=0.1,
+    range_min_m=0.1,
+    range_max_m=9.0,
+)
+
+
+def looking(speed_m_s=0.0):
+    """A run with a loaded map, and its events; `observe` takes a second."""
+    events = []
+    own = Mapper(
+        RIG,
+        known=lambda stamp_ns: Known(
+            T_map_base=planar.to_transform(np.array([speed_m_s * stamp_ns / S, 0, 0])),
+            session=0,
+            module="a",
+            covariance=None,
+        ),
+        note=lambda *event, **fields: events.append((*event, fields)),
+        loaded=map_of(WALL, pieces=[0]),
+    )
+
+    def observe(second):
+        stamp_ns = round(second * S)
+        scan = replace(SCAN, stamp_ns=stamp_ns)
+        own.observe(Observation(stamp_ns=stamp_ns, scan=scan), None)
+
+    return own, events, observe
+
+
+def test_a_robot_at_rest_searches_once_a_second_until_it_was_located(monkeypatch):
+    searched = Searched(monkeypatch)
+    own, events, observe = looking()
+    for second in (1.0, 1.5, 1.9, 2.0, 2.5, 3.0):
+        observe(second)
+    assert searched.asked == [[1.0], [1.0, 2.0], [1.0, 2.0, 3.0]]
+    assert not own.is_found and not own.is_placed
+    searched.answer, searched.T_map_run = LocalizationEvent.FOUND, np.array([1.0, 2.0, 0.5])
+    observe(4.0)
+    T_map_run = planar.to_transform(searched.T_map_run)
+    expected = {"after_s": 3.0, "T_map_run": T_map_run.tolist()}
+    assert events == [("relocalized", 4 * S, expected)]
+    assert own.is_found and own.is_placed
+    np.testing.assert_array_equal(own.T_map_run, T_map_run)
+    observe(9.0)
+    assert len(searched.asked) == 4
+
+
+def test_a_run_tells_once_after_five_seconds_that_it_was_not_located(monkeypatch):
+    searched = Searched(monkeypatch)
+    _, events, observe = looking(speed_m_s=1.0)
+    for second in (1.0, 2.0, 5.9, 6.1, 7.0):
+        observe(second)
+    assert events == [("not_relocalized", round(6.1 * S), {"after_s": pytest.approx(5.1)})]
+    searched.answer, searched.T_map_run = LocalizationEvent.WITHDRAWN, None
+    observe(8.0)
+    assert events[1:] == [("relocalization_withdrawn", 8 * S, {"after_s": 7.0})]
+
+
+def test_the_newest_eighty_scans_are_compared_when_it_is_due(monkeypatch):
+    searched = Searched(monkeypatch)
+    _, _, observe = looking(speed_m_s=1.0)
+    searched.is_late = True
+    for second in range(100):
+        observe(second)
+    assert searched.asked == []
+    searched.is_late = False
+    observe(100)
+    assert searched.asked == [list(range(21, 101))]
+
+
+def test_a_run_is_saved_as_a_piece_of_its_own_until_it_was_located(monkeypatch):
+    searched = Searched(monkeypatch)
+    own, _, observe = looking(speed_m_s=1.0)
+    for second in range(60):
+        observe(second)
+    saved = own.saved()
+    assert saved.pieces[0] == 0 and (saved.pieces[1:] == 1).all() and len(saved.pieces) > 5
+    assert [submap.run for submap in saved.submaps[:3]] == [0, 1, 1]
+    assert [(one.first, one.second) for one in saved.edges[:2]] == [(1, 2), (2, 3)]
+    step = saved.T_map_node[2] - saved.T_map_node[1]
+    searched.answer, searched.T_map_run = LocalizationEvent.FOUND, np.array([1.0, 2.0, np.pi / 2])
+    observe(60)
+    saved = own.saved()
+    assert (saved.pieces == 0).all()
+    np.testing.assert_allclose(saved.T_map_node[1], [1.0, 2.0, np.pi / 2], atol=1e-9)
+    np.testing.assert_allclose(saved.T_map_node[2], [1.0, 2.0 + step[0], np.pi / 2], atol=1e-9)
