@@ -84,11 +84,11 @@ def test_a_module_that_stands_still_while_the_robot_drives_is_not_even_believed_
     assert last.turn is DISAGREE
 
 
-def test_a_jump_is_seen_at_once_and_forgiven_when_both_horizons_have_passed_and_the_probation():
+def test_a_jump_is_seen_at_once_and_forgiven_after_the_short_horizon_and_the_probation():
     judgements = judged(jumping(30, 1.0), steps=110)
     first = trusted(judgements).index(True, 30)
     assert not judgements[30].is_trusted and judgements[30].since_ns == 2_000_000_000
-    assert first == 30 + 50 + 10 - 1
+    assert first == 30 + 10 + 10 - 1
     assert all(trusted(judgements)[first:])
 
 
@@ -126,7 +126,7 @@ def test_a_module_back_from_a_loss_where_the_wheels_are_is_trusted_at_once():
 
 def test_a_module_back_from_a_loss_elsewhere_is_not():
     judgements = judged(lost_between(jumping(70, 2.0), 40, 70), steps=140)
-    assert not any(trusted(judgements)[40:100]) and judgements[-1].is_trusted
+    assert not any(trusted(judgements)[40:89]) and all(trusted(judgements)[89:])
 
 
 def test_without_odometry_nothing_is_held_against_a_module():
@@ -209,11 +209,18 @@ def test_wheels_that_begin_to_lie_do_not_cost_a_certain_module_its_trust(lie):
     assert not judgements[-1].wheels_lie
 
 
-@pytest.mark.parametrize("lie", [frozen(40, 90), reversing(40, 80), jumping(40, 1.0)])
+@pytest.mark.parametrize("lie", [frozen(40, 90), reversing(40, 80)])
 def test_a_module_that_begins_to_lie_is_found_however_certain_it_is(lie):
     judgements = witnessed(lie, steps=200)
     assert not any(trusted(judgements)[55:80])
     assert not any(judgement.wheels_lie for judgement in judgements)
+
+
+def test_a_long_slip_of_the_wheels_is_not_held_against_a_module_that_jumps_later():
+    judgements = witnessed(jumping(280, 0.3), odometry=frozen(40, 250), steps=320)
+    assert judgements[249].wheels_lie and not judgements[270].wheels_lie
+    assert trusted(judgements)[279] and not trusted(judgements)[281]
+    assert all(trusted(judgements)[302:])
 
 
 @pytest.mark.parametrize("ratio", [0.7, 1.3])

@@ -8,7 +8,7 @@ wrong scale still measures turns better than wheels (gyrodometry, Borenstein and
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 from enum import Enum
 
@@ -100,6 +100,11 @@ class _Excess:
     distance: float
     turn: float
 
+    @property
+    def largest(self) -> float:
+        """Return the larger of both."""
+        return max(self.distance, self.turn)
+
 
 class Gate:
     """Follows one activation of one module; its output depends on its inputs alone.
@@ -119,7 +124,8 @@ class Gate:
         self._distance_since_ns: int | None = None  # since when the distance has been within bounds
         self._has_jumped = False  # the module has jumped as no robot can, since the two agreed
         self._is_wheels = False  # the wheels were at fault, since the two agreed
-        self._distances = RecentMedian(_USUAL_KEPT, width=1)  # the newest excesses
+        self._is_acute = False  # the shortest horizon shows a disagreement
+        self._distances = _none_yet()  # the newest excesses while wheels were right
         self._usual_excess = 0.0  # their median
         self._usual_m, self._usual_ns = 0.0, 0  # path length and stamp at the newest
 
@@ -185,6 +191,10 @@ class Gate:
     def _judge(self, now: _Sample, deviation_m: float | None) -> Judgement:
         found = self._anchors(now.stamp_ns)
         excesses = [_excess(then, now, self._sigmas, self._wheels) for then in found]
+        if self._is_acute and excesses[0].largest <= 1.0:
+            self._forget_before(found[0])  # the disagreement is over, and was judged
+            found, excesses = found[:1], excesses[:1]
+        self._is_acute = bool(excesses) and excesses[0].largest > 1.0
         distance = max((excess.distance for excess in excesses), default=0.0)
         turn = max((excess.turn for excess in excesses), default=0.0)
         distance = max(distance, self._usual(now, distance) / _USUAL_SIGMAS * self._sigmas)
@@ -194,6 +204,7 @@ class Gate:
             self._has_jumped = self._is_wheels = False  # they belong to another disagreement
         is_wrong = max(distance, turn) > 1.0
         if is_wrong and self._is_wheels_fault(found[-1], now, deviation_m):
+            self._distances, self._usual_excess = _none_yet(), 0.0
             return Judgement(
                 distance=GateVerdict.UNCHECKED,
                 turn=GateVerdict.UNCHECKED,
@@ -272,9 +283,16 @@ class Gate:
             for horizon_ns in self._horizons_ns
         ]
         found = [self._samples[max(index, 0)] for index in indices]
-        old = max(indices[-1], 0)
-        del self._samples[:old], self._stamps_ns[:old]
+        self._forget_before(found[-1])
         return found
+
+    def _forget_before(self, sample: _Sample) -> None:
+        old = bisect_left(self._stamps_ns, sample.stamp_ns)
+        del self._samples[:old], self._stamps_ns[:old]
+
+
+def _none_yet() -> RecentMedian:
+    return RecentMedian(_USUAL_KEPT, width=1)
 
 
 def _turn_verdict(excess: float, is_known: bool) -> GateVerdict:

@@ -147,7 +147,8 @@ class RgbdSlam:
             answer = self._hold(view, fix, prediction)
             if self._mapping.alignment is not None and not view.is_monocular:
                 self._build_anew(view, self._mapping.alignment)
-            return answer
+            if answer is not None:
+                return answer
         if not len(self._map.keyframes) or self._is_unknown(view, prediction):
             return self._start(view, prediction)
         return self._lose(observation, prediction)
@@ -217,11 +218,19 @@ class RgbdSlam:
         is_first, revision = self._observations == 1, self._memory.revision
         return started(view, self._T_local_base, is_first=is_first, revision=revision)
 
-    def _hold(self, view: View, fix: VisualFix, prediction: Prediction) -> Tracking:
-        """Accept a pose, and extend the map if a keyframe is due."""
-        seen = fix.estimate.covariance
+    def _hold(self, view: View, found: VisualFix, prediction: Prediction) -> Tracking | None:
+        """Accept a pose, and extend the map if a keyframe is due; None if the gyro contradicts."""
+        fix, seen = found, found.estimate.covariance
         if prediction.is_measured:
-            fix = led(fix, prediction)
+            fused = led(
+                found,
+                prediction,
+                turn_radps=self._turn_radps(view.observation),
+                duration_s=self._predictor.unmeasured_s(view.observation),
+            )
+            if fused is None:
+                return None
+            fix = fused
         status = self._health.judge(fix.estimate)
         # Over a few frames odometry is more accurate than a pose by few landmarks.
         is_by_odometry = status is TrackingStatus.DEGRADED and prediction.is_measured
@@ -257,6 +266,12 @@ class RgbdSlam:
             view, fix, T_local_base, status=status, covariance=covariance, revision=revision
         )
         return answer if segment is None else placed(answer, self._memory.segments, segment)
+
+    def _turn_radps(self, observation: Observation) -> float | None:
+        """Return the turn rate by the gyro since the last observation, None without one."""
+        duration_s = self._predictor.model.duration_s
+        turn = observation.turn_by_gyro(duration_s)
+        return None if turn is None else float(np.linalg.norm(turn)) / duration_s
 
     def _hold_pose(
         self,

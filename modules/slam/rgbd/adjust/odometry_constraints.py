@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from sceneslam.motion.predictor import Prediction
+from sceneslam.motion.step import UNKNOWN_VELOCITY
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
@@ -20,7 +21,7 @@ from ..locate.localizer import VisualFix
 from ..map.keyframes import Keyframe, OdometryPose, motion_between
 from .pose_constraints import PoseConstraint
 
-_FARTHEST_M = 3.0  # largest distance between two keyframes: odometry over more adds nothing
+_CLOCKS_S = 0.05  # between a camera's and a gyro's stamps
 _SLIP = 3.0  # [sigma] of the distance; beyond, wheels probably slip
 _CORRELATED = 4.0  # images of the same landmarks err alike; 1 and 4 were tried in one hall
 _CHI2 = 16.8  # 99 % of six degrees of freedom
@@ -44,25 +45,34 @@ class OdometryIntegrator:
         return None if is_broken else self._now
 
 
-def led(fix: VisualFix, prediction: Prediction) -> VisualFix:
-    """Return a pose that an image shows, fused with odometry.
+def led(
+    fix: VisualFix, prediction: Prediction, *, turn_radps: float | None, duration_s: float
+) -> VisualFix | None:
+    """Return a pose that an image shows, fused with odometry; None if that contradicts the gyro.
 
-    If image and odometry contradict each other, the image's pose is returned, as wheels may slip.
+    `turn_radps` is the turn rate by the gyro, None without one; `duration_s` is the time since the
+    last pose. A pose that contradicts odometry is fused once more as if wheels slipped, and then as
+    if the clocks of camera and gyro differed.
     """
     found = fix.estimate
     measured = _CORRELATED * found.covariance
     off = se3.log(se3.inverse(prediction.T_local_base) @ found.T_local_base)
-    total = prediction.covariance + measured
-    if off @ np.linalg.solve(total, off) > _CHI2:
-        return fix
-    gain = prediction.covariance @ np.linalg.inv(total)
-    covariance = (np.eye(6) - gain) @ prediction.covariance
-    estimate = replace(
-        found,
-        T_local_base=se3.orthonormal(prediction.T_local_base @ se3.exp(gain @ off)),
-        covariance=0.5 * (covariance + covariance.T),
-    )
-    return replace(fix, estimate=estimate)
+    slip_m, unknown_rad = UNKNOWN_VELOCITY * duration_s
+    late_rad = unknown_rad if turn_radps is None else _CLOCKS_S * turn_radps
+    for slips in ((0.0, 0.0), (slip_m, 0.0), (slip_m, late_rad)):
+        predicted = prediction.covariance + np.diag(np.repeat(slips, 3) ** 2)
+        total = predicted + measured
+        if off @ np.linalg.solve(total, off) > _CHI2:
+            continue
+        gain = predicted @ np.linalg.inv(total)
+        covariance = (np.eye(6) - gain) @ predicted
+        estimate = replace(
+            found,
+            T_local_base=se3.orthonormal(prediction.T_local_base @ se3.exp(gain @ off)),
+            covariance=0.5 * (covariance + covariance.T),
+        )
+        return replace(fix, estimate=estimate)
+    return None
 
 
 def odometry_constraints(
@@ -77,7 +87,7 @@ def odometry_constraints(
     found = []
     for one, other in pairwise(sorted(keyframes)):
         motion = motion_between(keyframes[one], keyframes[other])
-        if motion is None or np.linalg.norm(motion.T_here_there[:3, 3]) > _FARTHEST_M:
+        if motion is None:
             continue
         T_one_other = se3.inverse(T_base_cam) @ motion.T_here_there @ T_base_cam
         seen = se3.inverse(keyframes[one].T_local_base) @ keyframes[other].T_local_base
