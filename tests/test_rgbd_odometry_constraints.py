@@ -54,6 +54,11 @@ def test_odometry_constrains_nothing_beyond_a_gap():
     assert {pair for pair, _ in found} == {(0, 1), (2, 3)}
 
 
+def test_keyframes_that_are_far_apart_are_constrained_too():
+    keys = {k: keyframe for k, keyframe in keyframes(stretches=(0,) * 20).items() if k in (0, 19)}
+    assert {pair for pair, _ in odometry_constraints(keys, CAMERA.T_base_cam)} == {(0, 19)}
+
+
 def test_a_distance_that_the_keyframes_contradict_weighs_next_to_nothing():
     keys = keyframes()
     honest = odometry_constraints(keys, CAMERA.T_base_cam)
@@ -95,11 +100,11 @@ def test_constraints_bring_back_a_scale_that_images_alone_cannot_tell():
     )
 
 
-def found_at(x_m):
-    """Return a pose that an image found, its deviation 2 cm."""
+def found_at(T_local_base):
+    """Return a pose that an image found, its deviation 2 cm and 2 degrees / 1.8."""
     nothing = np.zeros(0, int)
     estimate = PoseEstimate(
-        T_local_base=se3.from_xy_yaw(x_m, 0.0, 0.0),
+        T_local_base=T_local_base,
         covariance=0.02**2 * np.eye(6),
         inliers=nothing > 0,
         depth_inliers=nothing > 0,
@@ -115,16 +120,47 @@ def found_at(x_m):
     )
 
 
+def fused(T_found, *, turn_radps=0.0, duration_s=0.1):
+    """Return the fix at T_found, fused with a prediction of 1 m by wheels, or None."""
+    prediction = Prediction(
+        T_local_base=se3.from_xy_yaw(1.0, 0.0, 0.0), covariance=0.04**2 * np.eye(6), motion=None
+    )
+    return led(found_at(T_found), prediction, turn_radps=turn_radps, duration_s=duration_s)
+
+
 @pytest.mark.parametrize(
     ("found_m", "expected_m"),
-    [(1.1, 1.05), (1.5, 1.5)],
-    ids=["equally certain", "wheels slip"],
+    [(1.1, 1.05), (1.3, 1.0 + 0.3 * 116 / 132), (6.0, None)],
+    ids=["equally certain", "wheels slip", "no robot moves so far"],
 )
-def test_a_pose_is_led_by_odometry_unless_they_contradict(found_m, expected_m):
-    T_predicted, known = se3.from_xy_yaw(1.0, 0.0, 0.0), 0.04**2 * np.eye(6)
-    prediction = Prediction(T_local_base=T_predicted, covariance=known, motion=None)
-    fix = led(found_at(found_m), prediction)
+def test_a_pose_is_fused_with_odometry_and_wheels_that_contradict_it_may_slip(found_m, expected_m):
+    fix = fused(se3.from_xy_yaw(found_m, 0.0, 0.0))
+    if expected_m is None:
+        assert fix is None
+        return
     assert fix.estimate.T_local_base[0, 3] == pytest.approx(expected_m, abs=0.001)
-    is_image_alone = expected_m == found_m
-    expected_m2 = 0.02**2 if is_image_alone else 0.04**2 / 2
-    assert fix.estimate.covariance[1, 1] == pytest.approx(expected_m2)
+    assert fix.estimate.covariance[3, 3] == pytest.approx(0.04**2 / 2)  # turns do not slip
+
+
+@pytest.mark.parametrize(
+    ("turn_radps", "is_taken"),
+    [(0.0, False), (4.0, True), (None, True)],
+    ids=["driving straight", "in a turn, clocks may differ", "without a gyro"],
+)
+def test_a_pose_that_contradicts_the_gyro_is_not_taken(turn_radps, is_taken):
+    T_found = se3.from_xy_yaw(1.0, 0.0, 0.4)
+    assert (fused(T_found, turn_radps=turn_radps, duration_s=0.3) is not None) is is_taken
+
+
+def test_images_that_show_a_turn_by_a_shift_are_corrected_by_the_gyro():
+    fix = found_at(se3.from_xy_yaw(1.0, 0.6, -0.06))  # a wall 10 m ahead looks the same
+    along = np.array([0, 10.0, 0, 0, 0, -1.0])
+    covariance = 0.02**2 * np.eye(6) + 0.02**2 * np.outer(along, along)
+    fix = replace(fix, estimate=replace(fix.estimate, covariance=covariance))
+    prediction = Prediction(
+        T_local_base=se3.from_xy_yaw(1.0, 0.0, 0.0),
+        covariance=np.diag([0.01**2] * 3 + [0.001**2] * 3),
+        motion=None,
+    )
+    found = led(fix, prediction, turn_radps=0.0, duration_s=0.1).estimate.T_local_base
+    assert abs(se3.yaw_rad(found)) < 0.001 and abs(found[1, 3]) < 0.02
