@@ -216,6 +216,11 @@ def test_a_module_that_begins_to_lie_is_found_however_certain_it_is(lie):
     assert not any(judgement.wheels_lie for judgement in judgements)
 
 
+def test_a_small_jump_is_not_held_against_a_module_while_the_wheels_reverse():
+    judgements = witnessed(jumping(70, 0.1), odometry=reversing(40, 90), steps=85)
+    assert all(trusted(judgements)[10:]) and judgements[-1].wheels_lie
+
+
 def test_a_long_slip_of_the_wheels_is_not_held_against_a_module_that_jumps_later():
     judgements = witnessed(jumping(280, 0.3), odometry=frozen(40, 250), steps=320)
     assert judgements[249].wheels_lie and not judgements[270].wheels_lie

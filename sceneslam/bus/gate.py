@@ -124,6 +124,7 @@ class Gate:
         self._distance_since_ns: int | None = None  # since when the distance has been within bounds
         self._has_jumped = False  # the module has jumped as no robot can, since the two agreed
         self._is_wheels = False  # the wheels were at fault, since the two agreed
+        self._wheels_m_s = 0.0  # their largest change of velocity since then
         self._is_acute = False  # the shortest horizon shows a disagreement
         self._distances = _none_yet()  # the newest excesses while wheels were right
         self._usual_excess = 0.0  # their median
@@ -201,7 +202,8 @@ class Gate:
         if self._distance_since_ns is None or max(distance, turn) > 1.0:
             self._distance_since_ns = now.stamp_ns
         elif now.stamp_ns - self._distance_since_ns >= _PROBATION_NS:
-            self._has_jumped = self._is_wheels = False  # they belong to another disagreement
+            # What was found belongs to another disagreement.
+            self._has_jumped, self._is_wheels, self._wheels_m_s = False, False, 0.0
         is_wrong = max(distance, turn) > 1.0
         if is_wrong and self._is_wheels_fault(found[-1], now, deviation_m):
             self._distances, self._usual_excess = _none_yet(), 0.0
@@ -224,16 +226,18 @@ class Gate:
         """Tell whether a disagreement is the wheels' fault, by the robot's inertia.
 
         The one at fault changes its velocity abruptly, as no robot can, and the other does not. If
-        neither did, a module that is more certain than the wheels is right: wheel errors persist.
+        neither did, a module that is more certain than the wheels is right: wheel errors persist,
+        and what the wheels did when they began to err is compared with all that the module does.
         While the module is less certain, what was found last of this disagreement stands.
         """
         wheels_m = _DISTANCE_M + self._wheels.drift_ratio * (now.way_m - then.way_m)
         if deviation_m is not None and deviation_m <= wheels_m and not self._has_jumped:
             by_module, by_wheels = self._jumps(now)
+            self._wheels_m_s = max(self._wheels_m_s, by_wheels)
             # A change of velocity is made of three positions, weighted 1, -2, 1.
             noise_m_s = math.sqrt(6.0) * deviation_m / _STEP_S
             least_m_s = max(_JUMP_M_S, _JUMP_SIGMAS * noise_m_s)
-            self._has_jumped = by_module > max(least_m_s, _JUMP_RATIO * by_wheels)
+            self._has_jumped = by_module > max(least_m_s, _JUMP_RATIO * self._wheels_m_s)
             self._is_wheels = not self._has_jumped
         return self._is_wheels
 
