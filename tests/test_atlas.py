@@ -1,10 +1,13 @@
 """One trajectory and one map, whatever the number of sessions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sceneslam.atlas.atlas import Atlas
-from sceneslam.atlas.save import save_map
+from sceneslam.atlas.save import save_grid, save_map, save_points
+from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.types import se3
 from sceneslam.types.maps import (
     GridLayer,
@@ -152,3 +155,52 @@ def test_saved_landmarks_say_where_they_come_from(tmp_path):
     assert b"property double first_seen_s\nproperty int sightings" in header
     row = np.frombuffer(body, "<f4,<f4,<f4,<f8,<i4,u1")[0]
     assert row.tolist() == (1.0, 2.0, 3.0, 1.5, 7, 0)
+
+
+def test_a_saved_grid_is_black_white_and_grey_at_the_thresholds_it_names(tmp_path):
+    limits = [np.log(0.65 / 0.35), np.log(0.196 / 0.804)]
+    values = [[limits[0] + 0.01, limits[0] - 0.01, 0.0], [limits[1] + 0.01, limits[1] - 0.01, -9.0]]
+    grid = GridLayer(
+        log_odds=np.array(values, np.float32), resolution_m=0.25, origin_xy_m=(-1.5, 2.0)
+    )
+    save_grid(grid, tmp_path / "grid.yaml")
+    pixels = (tmp_path / "grid.pgm").read_bytes().removeprefix(b"P5\n3 2\n255\n")
+    assert list(pixels) == [205, 254, 254, 0, 205, 205]  # the highest y first
+    assert (tmp_path / "grid.yaml").read_text().splitlines() == [
+        "image: grid.pgm",
+        "resolution: 0.25",
+        "origin: [-1.500000, 2.000000, 0.0]",
+        "negate: 0",
+        "occupied_thresh: 0.65",
+        "free_thresh: 0.196",
+    ]
+
+
+def test_points_that_no_module_coloured_are_saved_with_their_module(tmp_path):
+    cloud = PointLayer(points=np.array([[1, 2, 3], [4, 5, 6]], np.float32))
+    hybrid = atlas_of(("b", se3.identity(), MapLayers(points=cloud))).fuse_maps()
+    save_points(replace(hybrid, points=cloud), tmp_path / "points.ply")
+    header, _, body = (tmp_path / "points.ply").read_bytes().partition(b"end_header\n")
+    assert header.decode().splitlines() == [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment module 0 b",
+        "element vertex 2",
+        *(f"property float {axis}" for axis in "xyz"),
+        *(f"property uchar {name}" for name in ("red", "green", "blue", "module")),
+    ]
+    rows = np.frombuffer(body, "<f4,<f4,<f4,u1,u1,u1,u1")
+    assert rows.tolist() == [(1, 2, 3, 0, 0, 0, 0), (4, 5, 6, 0, 0, 0, 0)]
+
+
+def test_a_session_lies_in_the_map_as_the_middle_one_of_its_poses_is_corrected():
+    atlas = Atlas(voxel_m=0.05)
+    for session in range(2):
+        atlas.begin_session("ab"[session], se3.identity())
+        for index in range(4):
+            atlas.add(10 * session + index, se3.from_xy_yaw(index, 0, 0), "ab"[session])
+    shifts = [se3.from_xy_yaw(0.0, 0.1 * index, 0.0) for index in range(4)]
+    atlas._correction = Correction(stamps_ns=np.arange(10, 14), T_new_old=np.stack(shifts))
+    assert [one.T_map_local[1, 3] for one in atlas.sessions] == pytest.approx([0.0, 0.2])
+    np.testing.assert_allclose(atlas.trajectory.positions_m[4:, 1], [0.0, 0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(atlas.online.positions_m[:, 1], np.zeros(8))

@@ -16,7 +16,7 @@ from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.submaps.graph import EdgeKind, PlanarEdge, consistent
 from sceneslam.atlas.submaps.own_loops import closed_loops, recognized_loops
 from sceneslam.atlas.submaps.submap import KeyPose, make_submap, motion_covariance, split
-from sceneslam.atlas.uncertainty import MAPPED, VELOCITY, WHEELS, drifted
+from sceneslam.atlas.uncertainty import GYRO, MAPPED, VELOCITY, WHEELS, drifted
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import GridLayer, LoopLayer, MapLayers, PointLayer, PoseGraphLayer
 from sceneslam.types.rig import Rig, Sensor
@@ -424,3 +424,26 @@ def test_motions_through_a_removed_submap_are_composed_with_their_uncertainty():
     carried = carry @ planar.spatial_covariance(covariances[0]) @ carry.T
     expected = planar.planar_covariance(carried) + covariances[1]
     np.testing.assert_allclose(edge.covariance, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("sensors", "drift"),
+    [
+        ({Sensor.ODOMETRY}, WHEELS),
+        ({Sensor.ODOMETRY, Sensor.GYRO}, GYRO),
+        ({Sensor.GYRO}, VELOCITY),
+        (set(), VELOCITY),
+    ],
+)
+def test_a_bridge_drifts_as_the_sensors_that_measured_it(sensors, drift):
+    def known(stamp_ns):
+        index = stamp_ns // S
+        return Known(T_map_base=at(0.5 * index), session=0, module=BRIDGED, covariance=None)
+
+    own = collector(known, Rig(sensors=frozenset(sensors)))
+    for index in range(12):
+        own.add(index * S, None)
+    own.finish()
+    (motion,) = own.motions
+    poses = [key_pose(index, at(0.5 * index), drift=drift) for index in range(7)]
+    np.testing.assert_allclose(motion.covariance, motion_covariance(poses))

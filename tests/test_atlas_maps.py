@@ -20,7 +20,7 @@ from sceneslam.atlas.mapper import Mapper
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.localizer import LocalizationEvent
 from sceneslam.atlas.submaps.collector import Known
-from sceneslam.atlas.submaps.graph import EdgeKind, PlanarEdge
+from sceneslam.atlas.submaps.graph import LOADED, EdgeKind, PlanarEdge
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.experiments.one_map.drive import RIG
 from sceneslam.types import planar
@@ -519,3 +519,36 @@ def test_a_run_is_saved_as_a_piece_of_its_own_until_it_was_located(monkeypatch):
     assert (saved.pieces == 0).all()
     np.testing.assert_allclose(saved.T_map_node[1], [1.0, 2.0, np.pi / 2], atol=1e-9)
     np.testing.assert_allclose(saved.T_map_node[2], [1.0, 2.0 + step[0], np.pi / 2], atol=1e-9)
+
+
+def test_loops_lead_between_the_first_poses_of_submaps_or_from_the_loaded_map(monkeypatch):
+    Searched(monkeypatch)
+    own, _, observe = looking(speed_m_s=1.0)
+    for second in range(60):
+        observe(second)
+    own._collector.finish()
+    starts_s = [int(submap.stamps_ns[0]) // S for submap in own._collector.submaps]
+    assert starts_s[:3] == [0, 3, 6] and starts_s[-1] == 57
+    own._loops = [edge(0, 3), edge(2, 20, (1, 0, 0), EdgeKind.LOOP)]
+    found = own.loops(np.arange(60) * S)
+    assert [(loop.first, loop.second) for loop in found] == [(LOADED, 6), (3, 57)]
+    np.testing.assert_allclose(found[1].T_first_second, planar.to_transform(np.array([1.0, 0, 0])))
+
+
+@pytest.mark.parametrize("is_placed", [True, False])
+def test_a_located_run_is_corrected_into_the_loaded_map(monkeypatch, is_placed):
+    searched = Searched(monkeypatch)
+    own, events, observe = looking(speed_m_s=1.0)
+    for second in range(20):
+        observe(second)
+    if is_placed:
+        searched.answer, searched.T_map_run = LocalizationEvent.FOUND, np.array([1.0, 2.0, 0.5])
+        observe(20)
+    kept = len(events)
+    path = lambda stamp_ns: planar.to_transform(np.array([stamp_ns / S, 0.0, 0.0]))  # noqa: E731
+    found = own.finish(path, [], frozenset())
+    assert len(found.stamps_ns) == (7 if is_placed else 0) and len(events) == kept
+    stamps_ns = np.arange(20) * S
+    poses = np.stack([path(stamp_ns) for stamp_ns in stamps_ns])
+    np.testing.assert_allclose(found.apply(stamps_ns, poses), own.T_map_run @ poses, atol=1e-9)
+    assert (own.saved().pieces == (0 if is_placed else np.r_[0, [1] * 7])).all()

@@ -202,6 +202,17 @@ def test_walls_are_registered_from_half_a_metre_away_as_certain_as_they_are_long
     np.testing.assert_allclose(found.covariance, expected, rtol=0.05, atol=2e-6)
 
 
+@pytest.mark.parametrize(("across", "weak"), [(4, 0), (2, 1)])
+def test_a_direction_is_held_by_three_of_a_hundred_cells_of_wall(across, weak):
+    wall = corner_of(100)
+    rows = np.r_[0:100, 150 : 150 + across]
+    part = replace(wall, points=wall.points[rows], normals=wall.normals[rows])
+    found = register(PlanField(part), PlanField(part), np.array([0.03, 0.02, 0.0]))
+    assert found.weak_directions == weak
+    expected = [0.0 if weak == 0 else 0.03, 0.0, 0.0]
+    np.testing.assert_allclose(found.T_target_query, expected, atol=2e-3)
+
+
 def test_of_two_parallel_walls_the_distant_one_weighs_less():
     wall, off_m = corner_of(60), 0.06
     points = wall.points.copy()
