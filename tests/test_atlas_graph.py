@@ -121,8 +121,8 @@ def test_one_loop_alone_is_not_believed_unless_the_run_was_located(monkeypatch):
 
 def test_a_fix_leads_from_the_nearest_submap_of_the_loaded_piece(monkeypatch):
     given, own = Given(monkeypatch), finished()
-    nodes = [[0.0, 0.0, 0.0], [3.0, 0.0, 0.5], [4.2, 0.1, 0.0]]
-    loaded = map_of(WALL, WALL, WALL, nodes=nodes, pieces=[0, 0, 1])
+    nodes = [[0.0, 0.0, 0.0], [3.0, 0.0, 0.5], [4.2, 0.1, 0.0], [2.0, 3.0, 0.0]]
+    loaded = map_of(*[WALL] * 4, nodes=nodes, pieces=[0, 0, 1, 0])
     there = np.array([4.0, 0.0, 0.25])
     fixes = [
         Fix(stamp_ns=1 * S, match=quality(at=(0.5, 0.2, 0.0))),
@@ -131,7 +131,7 @@ def test_a_fix_leads_from_the_nearest_submap_of_the_loaded_piece(monkeypatch):
         Fix(stamp_ns=9 * S, match=quality(at=there)),
     ]
     solved(own, loaded, fixes=fixes)
-    assert [(edge.first, edge.second) for edge in given.measured] == [(0, 3), (1, 4)]
+    assert [(edge.first, edge.second) for edge in given.measured] == [(0, 4), (1, 5)]
     T_base_node = planar.between(np.array([4.0, 0.01, 0.0]), np.array([3.0, 0.0, 0.0]))
     due = planar.between(np.array(nodes[1]), planar.compose(there, T_base_node))
     np.testing.assert_allclose(given.measured[1].T_first_second, due, atol=1e-12)
@@ -139,8 +139,8 @@ def test_a_fix_leads_from_the_nearest_submap_of_the_loaded_piece(monkeypatch):
     at_node = planar.propagate(np.eye(3), np.zeros(3), T_base_node, np.zeros((3, 3)))
     assert T_node_base[0] == pytest.approx(1.0)
     np.testing.assert_allclose(given.measured[1].covariance, at_node, atol=1e-9)
-    assert given.nodes.shape == (6, 3) and (given.drift[:3] == 0).all()
-    np.testing.assert_array_equal(given.drift[3:], own.drift)
+    assert given.nodes.shape == (7, 3) and (given.drift[:4] == 0).all()
+    np.testing.assert_array_equal(given.drift[4:], own.drift)
 
 
 def test_the_first_vertical_direction_gives_that_of_the_map(monkeypatch):

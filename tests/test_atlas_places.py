@@ -363,7 +363,10 @@ def test_the_likely_peaks_are_refined_or_the_prediction_where_it_is_near(monkeyp
 
     monkeypatch.setattr(recognition, "register", refine)
     peaks = [Peak(T_target_query=np.full(3, x), score=x) for x in (0.9, 0.541, 0.539, 0.4)]
-    monkeypatch.setattr(target._search, "find", lambda *_, **__: peaks)
+    limits = []
+    monkeypatch.setattr(
+        target._search, "find", lambda *_, **given: (limits.append(given), peaks)[1]
+    )
     query, around = PlanField(corner_of()), np.array([1.0, 2.0, 3.0])
     for half_m, half_rad, is_near in (
         (0.3, 0.1, True), (0.2, 0.05, True), (0.31, 0.1, False), (0.3, 0.11, False),
@@ -373,6 +376,7 @@ def test_the_likely_peaks_are_refined_or_the_prediction_where_it_is_near(monkeyp
         assert starts == ([around.tolist()] if is_near else [[0.9] * 3, [0.541] * 3])
     starts.clear()
     assert target.recognize(query, None) is None and len(starts) == 2
+    assert limits == [{"score_min": 0.3, "most": 24}] * 3
 
 
 def test_two_metres_of_wall_are_recognized_and_less_are_not():

@@ -240,8 +240,8 @@ def _largest_clique(agree: NDArray[np.bool_]) -> list[int]:
             break
         members, others = [start], agree[start].copy()
         while others.any():
-            shared = (agree & others).sum(axis=1) * others
-            chosen = int(np.argmax(np.where(others, shared + 1, 0)))
+            shared = (agree & others).sum(axis=1)
+            chosen = int(np.argmax(np.where(others, shared, -1)))
             members.append(chosen)
             others &= agree[chosen]
         if len(members) > len(best):
