@@ -25,7 +25,14 @@ ROOT = Path(__file__).resolve().parents[1]
 _PARTS = {  # name -> its code, and the tests that guard it
     "detectors": (
         ["modules/detectors"],
-        ["tests/test_detectors.py", "tests/test_detector_rules.py"],
+        [
+            "tests/test_detectors.py",
+            "tests/test_detector_rules.py",
+            "tests/test_detector_features.py",
+            "tests/test_detector_onnx.py",
+            "tests/test_exposure.py",
+            "tests/test_failing_sensor.py",
+        ],
     ),
     "atlas": (
         ["sceneslam/atlas"],

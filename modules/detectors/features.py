@@ -96,11 +96,13 @@ def scan_hold(scan: LaserScan) -> float:
     It is twice the smaller eigenvalue of the mean of n n' over the surfaces' normals n; 0 without
     any.
     """
-    x = scan.ranges_m * np.cos(scan.angles_rad)
-    y = scan.ranges_m * np.sin(scan.angles_rad)
-    along = np.column_stack([x[_SCAN_SPAN:] - x[:-_SCAN_SPAN], y[_SCAN_SPAN:] - y[:-_SCAN_SPAN]])
-    length_m = np.hypot(*along.T)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"):  # beams without a return
+        x = scan.ranges_m * np.cos(scan.angles_rad)
+        y = scan.ranges_m * np.sin(scan.angles_rad)
+        along = np.column_stack(
+            [x[_SCAN_SPAN:] - x[:-_SCAN_SPAN], y[_SCAN_SPAN:] - y[:-_SCAN_SPAN]]
+        )
+        length_m = np.hypot(*along.T)
         on_surface = (length_m > 1e-6) & (length_m < _SCAN_STEP_M)
     if not on_surface.any():
         return 0.0
