@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
+from threading import Thread
 from typing import Any, cast
 
 from hydra import compose
@@ -100,18 +104,26 @@ class _Trials:
                 yield
             return
         context = get_context("spawn")  # libraries with threads do not survive a fork
-        with ProcessPoolExecutor(self._jobs, context) as pool:
+        reader, writer = context.Pipe(duplex=False)
+        with ProcessPoolExecutor(
+            self._jobs, context, initializer=_end_with, initargs=(reader,)
+        ) as pool:
             # An input is rendered once, by the first run that reads it.
             inputs = {
                 _input_of(config): config
                 for (_, config), folder in zip(configs, folders, strict=True)
                 if _finished_by(folder) != provenance(config)
             }
-            for _ in pool.map(_prepare, inputs.values()):
-                pass
-            names = [trial.name for trial, _ in configs]
-            plain = [config for _, config in configs]
-            yield from pool.map(_run_unless_finished, plain, folders, names)
+            try:
+                for _ in pool.map(_prepare, inputs.values()):
+                    pass
+                names = [trial.name for trial, _ in configs]
+                plain = [config for _, config in configs]
+                yield from pool.map(_run_beside, plain, folders, names)
+            except BaseException:
+                writer.close()
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
 
     def _outcome(self, trial: Trial, folder: Path, has_poses: bool) -> TrialResult:
         metrics = json.loads((folder / "metrics.json").read_text())
@@ -143,6 +155,29 @@ class _Trials:
         return {
             name: value for name, value in plain.items() if name not in ("experiment", self._key)
         }
+
+
+def _end_with(reader: Connection) -> None:
+    """Let a process that runs trials end as by SIGTERM when the pipe is closed.
+
+    The experiment closes it when it is stopped, and the operating system when it was killed.
+    """
+
+    def wait() -> None:
+        try:
+            reader.recv()
+        except EOFError:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    Thread(target=wait, name="experiment", daemon=True).start()
+
+
+def _run_beside(config: dict[str, Any], folder: Path, name: str) -> None:
+    """Run a trial; a process whose run is interrupted ends, and takes no other one."""
+    try:
+        _run_unless_finished(config, folder, name)
+    except KeyboardInterrupt:
+        os._exit(1)
 
 
 def _run_unless_finished(config: dict[str, Any], folder: Path, name: str) -> None:

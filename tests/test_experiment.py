@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -19,6 +21,7 @@ from sceneslam.types.experiment import Figure, Relation, Table, Verdict
 
 ROOT = Path(__file__).parents[1]
 AT_LEAST, AT_MOST = Relation.AT_LEAST, Relation.AT_MOST
+WORDS = [sys.executable, "-m", "sceneslam"]
 VINS = "vins_mono_color_imu_with_loop"  # of which a rate is promised
 EXTRINSICS = "home_cafe:\n  imu: [0.2, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]\n"
 
@@ -134,9 +137,8 @@ def test_a_frame_without_extrinsics_is_named(folder):
 
 
 def call(folder, *overrides, name="openloris", out="out"):
-    words = [sys.executable, "-m", "sceneslam", f"+experiment={name}", *overrides]
     return subprocess.run(
-        [*words, f"hydra.run.dir={out}"],
+        [*WORDS, f"+experiment={name}", *overrides, f"hydra.run.dir={out}"],
         cwd=folder,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
@@ -180,6 +182,28 @@ def test_runs_beside_each_other_give_what_runs_in_turn_give_and_go_on_where_they
     done = call(folder, "openloris.path=data", "jobs=2", out="beside")
     assert done.returncode == 0 and first.is_file()
     assert {path: path.stat().st_mtime_ns for path in others} == was
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_the_processes_of_a_stopped_experiment_end_with_it_and_lose_nothing(tmp_path, number):
+    words = ("matrix.stories=[there_and_back]", "matrix.seeds=[0]", "jobs=2")
+    process = subprocess.Popen(
+        [*WORDS, "+experiment=matrix", *words, "source.camera.size_wh=[80,60]"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+    until = time.monotonic() + 200
+    while not any(path.stat().st_size for path in tmp_path.rglob("journal.bin")):
+        assert process.poll() is None and time.monotonic() < until
+        time.sleep(0.1)
+    process.send_signal(number)
+    process.communicate(timeout=60)  # every process has closed the pipe
+    assert process.returncode != 0
+    begun = {path.parent for path in tmp_path.rglob("journal.bin")}
+    saved = {path.parent for path in tmp_path.rglob("trajectory.tum")}
+    assert begun <= saved and len(saved) < 5 and not list(tmp_path.rglob("verdict.json"))
 
 
 @pytest.mark.parametrize(
