@@ -31,7 +31,6 @@ _PARTS = {  # name -> its code, and the tests that guard it
             "tests/test_detector_features.py",
             "tests/test_detector_onnx.py",
             "tests/test_exposure.py",
-            "tests/test_failing_sensor.py",
         ],
     ),
     "atlas": (
