@@ -13,6 +13,7 @@ from sceneslam.modules.detectors.features import (
     scan_return_ratio,
     usable_ratio,
 )
+from sceneslam.modules.detectors.image_features import ImageFeatures
 from sceneslam.modules.detectors.image_health import (
     Flicker,
     Tears,
@@ -213,3 +214,19 @@ def test_a_model_votes_by_softmax_of_its_scaled_features(tmp_path):
     assert vote.likelihoods["Dark"] == pytest.approx(1.0 - share)
     assert learned.decide(5, np.array([np.nan, 1.0])).scene == UNSURE
     assert learned.decide(5, None).scene == UNSURE
+
+
+def test_image_features_are_quantiles_shares_texture_and_colour():
+    values = np.repeat(np.arange(0, 200, 2)[:, None], 100, axis=1)  # each 1 % of the image
+    values[:, 1::2] = values[:, 1::2] + 1
+    values[95:] = 251
+    names = ["q10", "q25", "q50", "q75", "q90", "dark", "white", "gradient", "colour"]
+    found = ImageFeatures(names).get_features(Observation(stamp_ns=0, image_bgr=grey(values)))
+    quantiles = [np.log2((one + 4.0) / 259.0) for one in (19, 49, 99, 149, 179)]
+    np.testing.assert_allclose(found[:5], quantiles, atol=0.01)
+    assert found[5:7] == pytest.approx([0.085, 0.05])
+    assert found[7] == pytest.approx(np.log2(1.0 + 0.95), abs=0.01) and found[8] == 0.0
+    half = np.zeros((4, 4, 3), np.uint8)
+    half[..., 2], half[..., :2] = 200, 100
+    (colour,) = ImageFeatures(["colour"]).get_features(Observation(stamp_ns=0, image_bgr=half))
+    assert colour == pytest.approx(0.5, abs=0.01)
