@@ -84,7 +84,6 @@ def cell(strategy, **values):
         "correct_rate": 1.0,
         "segment_m": 0.1,
         "ate_m": 0.1,
-        "ate_online_m": 0.1,
         "ate_rot_rad": 0.01,
         "length_ratio": 1.0,
         "switches": 2.0,
@@ -124,8 +123,7 @@ def test_every_strategy_is_run_with_every_seed_and_lies_in_the_table(tmp_path):
         speed_m_s = {"a_alone": 1.02, "b_alone": 1.05}.get(trial.name.split("/")[1], 1.03)
         rate = 1.0 if "rewind" in trial.name else 0.5
         metrics = {
-            "ate_rmse_m": 0.1 * (speed_m_s - 1.0),  # loops closed it afterwards
-            "ate_online_m": speed_m_s - 1.0,
+            "ate_rmse_m": speed_m_s - 1.0,
             "ate_rot_rad": 0.0,
             "segment_trans_m": 0.1,
             "length_ratio": speed_m_s,
@@ -157,8 +155,6 @@ def test_every_strategy_is_run_with_every_seed_and_lies_in_the_table(tmp_path):
     assert alone.overrides == ("story=tour", "seed=1", "policy.gate=null", table)
     assert [row[1] for row in verdict.table.rows] == ["a alone", "b alone", "rewind", "oracle"]
     assert verdict.table.rows[2][3] == "100.0 ± 0.0"
-    ours = dict(zip(verdict.table.columns, verdict.table.rows[2], strict=True))
-    assert ours["ATE [cm]"].startswith("0.30") and float(ours["regret"].split()[0]) > 0.0
     assert verdict.table.rows[1][2:4] == ("66.7 ± 33.3", "33.3 ± 16.7")
     assert len((tmp_path / "cells.csv").read_text().splitlines()) == 9
     assert (tmp_path / "paths.png").stat().st_size > 5000

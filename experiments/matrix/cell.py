@@ -28,12 +28,11 @@ class Cell:
     correct_rate: float
     segment_m: float  # error of the motion over a stretch of the path
     ate_m: float
-    ate_online_m: float  # of the poses as reported at the time, before later loops correct them
     ate_rot_rad: float
     length_ratio: float
     switches: float
     false_switches: float
-    regret: float = float("nan")  # ATE online over the oracle's, minus 1
+    regret: float = float("nan")  # ATE over the oracle's, minus 1
 
     @classmethod
     def of(
@@ -53,7 +52,6 @@ class Cell:
             coverage=share * _number(metrics["coverage"]),
             correct_rate=share * _number(metrics["correct_rate"]),
             ate_m=_number(metrics["ate_rmse_m"]),
-            ate_online_m=_number(metrics["ate_online_m"]),
             segment_m=_number(metrics["segment_trans_m"]),
             switches=float(len(metrics["switches"])),
             **{name: _number(metrics[name]) for name in names},
@@ -61,7 +59,7 @@ class Cell:
 
     def beside(self, oracle: Cell) -> Cell:
         """Return the cell with its regret."""
-        return replace(self, regret=self.ate_online_m / oracle.ate_online_m - 1.0)
+        return replace(self, regret=self.ate_m / oracle.ate_m - 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,7 +74,6 @@ class Judge:
     ) -> Cell:
         """Return its numbers; it has a pose wherever it was asked."""
         segments = segment_errors(estimate, truth, _GAP_S, self.segment_m)
-        ate_m = absolute_errors(estimate, truth, _GAP_S).rmse_m
         nan = float("nan")
         return Cell(
             story=story,
@@ -85,8 +82,7 @@ class Judge:
             coverage=1.0,
             correct_rate=correct_rate(estimate, truth, self.limits),
             segment_m=root_mean_square(segments.trans_m),
-            ate_m=ate_m,
-            ate_online_m=ate_m,
+            ate_m=absolute_errors(estimate, truth, _GAP_S).rmse_m,
             ate_rot_rad=nan,
             length_ratio=nan,
             switches=nan,

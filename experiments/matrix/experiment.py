@@ -30,7 +30,6 @@ _COLUMNS = {  # of the table: (field, factor, digits)
     "correct [%]": ("correct_rate", 100.0, 1),
     "error per 10 m [cm]": ("segment_m", 100.0, 2),
     "ATE [cm]": ("ate_m", 100.0, 2),
-    "online [cm]": ("ate_online_m", 100.0, 2),
     "switches": ("switches", 1.0, 1),
     "false": ("false_switches", 1.0, 1),
     "regret": ("regret", 1.0, 2),
@@ -105,7 +104,7 @@ class MatrixExperiment:
         return Trial(name=name, overrides=overrides)
 
     def _oracle(self, group: Mapping[str, TrialResult]) -> Trajectory:
-        alone = [group[name].online for name in self._alone]
+        alone = [group[name].trajectory for name in self._alone]
         best: Trajectory = best_of(alone, _truth(group), self._piece_s)
         return best
 

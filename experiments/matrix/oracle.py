@@ -38,13 +38,12 @@ class _Choice:
 def best_of(modules: Sequence[Trajectory], truth: Trajectory, piece_s: float) -> Trajectory:
     """Return the trajectory of an oracle that knows which module errs least in each piece.
 
-    All modules ran side by side over the whole drive; their poses are those reported at the time,
-    before a graph over several modules corrects them, which no choice of modules can. The drive is
-    cut into pieces of `piece_s`. A piece is one module's estimate. It begins where the piece before
-    it ended, or lies in the module's own frame: as that was put when the module was last chosen, or
-    as its whole path fits the truth best. So a module that recognises a place takes the drift since
-    then back. Of all choices (a beam search) it is the one with the smallest absolute error, and no
-    worse than the best module alone. In a piece that no module covers it knows the true motion.
+    All modules ran side by side over the whole drive, and the drive is cut into pieces of
+    `piece_s`. A piece is one module's estimate. It begins where the piece before it ended, or lies
+    in the module's own frame: as that was put when the module was last chosen, or as its whole path
+    fits the truth best. So a module that recognises a place takes the drift since then back. Of all
+    choices (a beam search) it is the one with the smallest absolute error, and no worse than the
+    best module alone. In a piece that no module covers it knows the true motion.
     """
     stamps_ns = _stamps_ns(truth)
     T_gt_base = interpolated(truth, stamps_ns).T_world_base
