@@ -74,6 +74,7 @@ _LATE_NS = 1_900_000_000  # a disagreement shows within the shortest horizon aft
 _JUMP_M_S = 0.2  # less is noise of the best modules
 _JUMP_SIGMAS = 3.0  # of a module's own noise; every observation is judged
 _JUMP_RATIO = 1.5  # times the other's change of velocity, to be the one that jumped
+_EXPLAINED = 0.5  # least share of a disagreement that the jump that caused it explains
 # Median difference of normal errors: below 0.7 standard deviations; of the larger of two: below 1.
 _USUAL_SIGMAS = 1.5
 _USUAL_STEP_M, _USUAL_STEP_NS = 0.02, 200_000_000  # least spacing of the excesses
@@ -99,6 +100,7 @@ class _Excess:
 
     distance: float
     turn: float
+    apart_m: float  # of points 1 m ahead of base, which move in a turn as well
 
     @property
     def largest(self) -> float:
@@ -124,7 +126,6 @@ class Gate:
         self._distance_since_ns: int | None = None  # since when the distance has been within bounds
         self._has_jumped = False  # the module has jumped as no robot can, since the two agreed
         self._is_wheels = False  # the wheels were at fault, since the two agreed
-        self._wheels_m_s = 0.0  # their largest change of velocity since then
         self._is_acute = False  # the shortest horizon shows a disagreement
         self._distances = _none_yet()  # the newest excesses while wheels were right
         self._usual_excess = 0.0  # their median
@@ -202,10 +203,10 @@ class Gate:
         if self._distance_since_ns is None or max(distance, turn) > 1.0:
             self._distance_since_ns = now.stamp_ns
         elif now.stamp_ns - self._distance_since_ns >= _PROBATION_NS:
-            # What was found belongs to another disagreement.
-            self._has_jumped, self._is_wheels, self._wheels_m_s = False, False, 0.0
+            self._has_jumped = self._is_wheels = False  # they belong to another disagreement
         is_wrong = max(distance, turn) > 1.0
-        if is_wrong and self._is_wheels_fault(found[-1], now, deviation_m):
+        apart_m = max((excess.apart_m for excess in excesses), default=0.0)
+        if is_wrong and self._is_wheels_fault(found[-1], now, apart_m, deviation_m):
             self._distances, self._usual_excess = _none_yet(), 0.0
             return Judgement(
                 distance=GateVerdict.UNCHECKED,
@@ -222,22 +223,24 @@ class Gate:
             since_ns=found[0].stamp_ns if is_wrong else self._distance_since_ns,
         )
 
-    def _is_wheels_fault(self, then: _Sample, now: _Sample, deviation_m: float | None) -> bool:
+    def _is_wheels_fault(
+        self, then: _Sample, now: _Sample, apart_m: float, deviation_m: float | None
+    ) -> bool:
         """Tell whether a disagreement is the wheels' fault, by the robot's inertia.
 
         The one at fault changes its velocity abruptly, as no robot can, and the other does not. If
-        neither did, a module that is more certain than the wheels is right: wheel errors persist,
-        and what the wheels did when they began to err is compared with all that the module does.
+        neither did, a module that is more certain than the wheels is right: wheel errors persist.
+        A jump that is too short to explain the disagreement, of `apart_m`, is none.
         While the module is less certain, what was found last of this disagreement stands.
         """
         wheels_m = _DISTANCE_M + self._wheels.drift_ratio * (now.way_m - then.way_m)
         if deviation_m is not None and deviation_m <= wheels_m and not self._has_jumped:
             by_module, by_wheels = self._jumps(now)
-            self._wheels_m_s = max(self._wheels_m_s, by_wheels)
             # A change of velocity is made of three positions, weighted 1, -2, 1.
             noise_m_s = math.sqrt(6.0) * deviation_m / _STEP_S
             least_m_s = max(_JUMP_M_S, _JUMP_SIGMAS * noise_m_s)
-            self._has_jumped = by_module > max(least_m_s, _JUMP_RATIO * self._wheels_m_s)
+            least_m_s = max(least_m_s, _EXPLAINED * apart_m / _STEP_S)
+            self._has_jumped = by_module > max(least_m_s, _JUMP_RATIO * by_wheels)
             self._is_wheels = not self._has_jumped
         return self._is_wheels
 
@@ -324,6 +327,7 @@ def _excess(then: _Sample, now: _Sample, sigmas: float, wheels: Wheels) -> _Exce
     return _Excess(
         distance=apart_m / bound_m,
         turn=max(apart_rad / (sigmas * deviation_rad), broken),
+        apart_m=apart_m + apart_rad,
     )
 
 
