@@ -25,10 +25,8 @@ RULES = {
 }
 
 
-def detector(rules=RULES, features=FEATURES, hysteresis_ratio=0.0, otherwise="Bright"):
-    found = Rules(
-        features=features, rules=rules, otherwise=otherwise, hysteresis_ratio=hysteresis_ratio
-    )
+def detector(rules=RULES, features=FEATURES, hysteresis_ratio=0.0, otherwise="Bright", **settings):
+    found = Rules(features, rules, otherwise, hysteresis_ratio, **settings)
     found.activate(Rig(sensors=frozenset()))
     return found
 
@@ -145,6 +143,9 @@ def test_corner_holds_a_scan_and_a_bare_wall_does_not():
         ("features", {"features": ["grey_mean", "smell"]}),
         ("features", {"features": []}),
         ("hysteresis_ratio", {"hysteresis_ratio": 1.0}),
+        ("hysteresis_ratio", {"hysteresis_ratio": -0.1}),
+        ("hold_s", {"hold_s": -0.1}),
+        ("hold_s", {"hold_s": np.inf}),
         ("rules", {"rules": {}}),
         ("rules", {"rules": {"dark": None}}),
         ("otherwise", {"otherwise": UNSURE}),
@@ -153,20 +154,38 @@ def test_corner_holds_a_scan_and_a_bare_wall_does_not():
         ("rules.a", {"rules": {"a": {"scene": "Dark", "when": {"depth_ratio": [0, 1]}, "if": {}}}}),
         ("rules.a.when", {"rules": {"a": {"scene": "Dark", "when": {}}}}),
         ("rules.a.when", {"rules": {"a": {"scene": "Dark", "when": {"corner_count": [0, 1]}}}}),
-        (
-            "rules.a.when.grey_mean",
-            {"rules": {"a": {"scene": "Dark", "when": {"grey_mean": [50.0, 20.0]}}}},
-        ),
-        (
-            "rules.a.when.grey_mean",
-            {"rules": {"a": {"scene": "Dark", "when": {"grey_mean": [None, None]}}}},
-        ),
     ],
 )
 def test_impossible_rules_are_refused_by_their_key(key, change):
     with pytest.raises(ConfigError) as caught:
         detector(**change)
     assert caught.value.key == key
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        50.0,
+        None,
+        "ab",
+        {"a": 1.0, "b": 2.0},
+        [],
+        [20.0],
+        [20.0, 50.0, 80.0],
+        [50.0, 20.0],
+        [50.0, 50.0],
+        [None, None],
+        ["a", "c"],
+        [20.0, np.inf],
+        [np.nan, 50.0],
+        [[20.0], 50.0],
+    ],
+)
+def test_limits_are_a_pair_of_finite_rising_numbers_names_or_null(limits):
+    rules = {"a": {"scene": "Dark", "when": {"grey_mean": limits}}}
+    with pytest.raises(ConfigError) as caught:
+        detector(rules=rules, values={"a": 1.0, "b": 2.0})
+    assert caught.value.key == "rules.a.when.grey_mean"
 
 
 def test_rules_share_a_named_value():

@@ -170,10 +170,11 @@ class Rules:
     def _pair(self, key: str, limits: Sequence[Limit]) -> tuple[float, float]:
         """Return [low, high] as numbers; raises ConfigError."""
         is_pair = isinstance(limits, Sequence) and not isinstance(limits, str) and len(limits) == 2
-        known = [self._values.get(x, x) if isinstance(x, str) else x for x in limits or ()]
-        numbers = [one for one in known if one is not None] if is_pair else []
+        pair = limits if is_pair else ()
+        known = [self._values.get(x, x) if isinstance(x, str) else x for x in pair]
+        numbers = [one for one in known if one is not None]
         is_number = all(isinstance(one, int | float) and np.isfinite(one) for one in numbers)
-        if not is_pair or not is_number or sorted(set(numbers)) != numbers or not numbers:
+        if not is_number or sorted(set(numbers)) != numbers or not numbers:
             names = f", or one of values: {', '.join(self._values)}" if self._values else ""
             allowed = f"[low, high], low below high, null for no limit{names}"
             raise ConfigError(key, limits, allowed)
