@@ -29,6 +29,8 @@ _PARTS = {  # name -> its code, and the tests that guard it
             "tests/test_detectors.py",
             "tests/test_detector_rules.py",
             "tests/test_detector_features.py",
+            "tests/test_detector_lens.py",
+            "tests/test_detector_wheel_check.py",
             "tests/test_detector_onnx.py",
             "tests/test_exposure.py",
         ],

@@ -1,4 +1,6 @@
-"""Features of images, depth, scans and wheels: what each number is."""
+"""Features of images, depth and scans: what each number is."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,11 +25,9 @@ from sceneslam.modules.detectors.image_health import (
 )
 from sceneslam.modules.detectors.learned import Learned
 from sceneslam.modules.detectors.silence import Frozen, Silent
-from sceneslam.modules.detectors.wheel_check import WheelCheck
-from sceneslam.testing.floor_plans import Scanner, World, box
-from sceneslam.types import planar
+from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import UNSURE, LaserScan, Observation
-from sceneslam.types.rig import Laser, Rig, Sensor
+from sceneslam.types.rig import Sensor
 
 S = 10**9
 
@@ -74,6 +74,13 @@ def test_depth_noise_is_counted_in_the_middle_of_the_image():
     assert depth_ratio(depth_m) == 1.0 - 2 / 3200
 
 
+def test_depth_noise_differs_from_its_neighbours_by_more_than_a_tenth():
+    for beside_m, count in ((9.0, 0), (8.99, 1), (11.0, 0), (11.01, 1)):
+        depth_m = np.full((20, 20), beside_m, np.float32)
+        depth_m[10, 10] = 10.0
+        assert depth_noise_ratio(depth_m) == pytest.approx(count / 64)
+
+
 def scan_of(ranges_m):
     return LaserScan(
         stamp_ns=0,
@@ -99,6 +106,20 @@ def test_a_wall_holds_one_direction_and_a_corner_both():
     assert scan_hold(scan_of(np.full(401, np.inf))) == 0.0
 
 
+@pytest.mark.parametrize(("radius_m", "hold"), [(0.86, 1.0), (0.87, 0.0)])
+def test_returns_farther_apart_than_30_cm_are_of_different_surfaces(radius_m, hold):
+    # The chord over 4 of 72 beams is 2 r sin(10 degrees); a circle has normals in all directions.
+    scan = LaserScan(
+        stamp_ns=0,
+        ranges_m=np.full(76, radius_m, np.float32),
+        angle_min_rad=0.0,
+        angle_step_rad=2 * np.pi / 72,
+        range_min_m=0.1,
+        range_max_m=9.0,
+    )
+    assert scan_hold(scan) == pytest.approx(hold, abs=1e-5)
+
+
 def edges(blur_px, noise=0.0, width=480):
     """Bars of a twelfth of the width, whose edges are that wide."""
     x = np.arange(width)
@@ -112,6 +133,41 @@ def test_sharpness_is_one_for_steps_and_small_for_edges_out_of_focus():
     assert sharp > 0.9 and 0.2 < blurred < 0.6
     assert sharpness(edges(30, noise=3.0)) == pytest.approx(blurred, abs=0.15)
     assert sharpness(grey(np.full((120, 480), 90))) == 1.0
+
+
+def profile(steps, scale, rows):
+    """Return an image of equal rows with steps {column: height} of grey values, in a scale."""
+    values = np.full(240, 100)
+    for column, height in steps.items():
+        values[column:] += height
+    return grey(np.tile(np.repeat(values, scale), (rows * scale, 1)))
+
+
+@pytest.mark.parametrize("scale", [1, 2, 3])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_sharpness_compares_the_largest_step_within_a_240th_with_that_of_a_40th(scale, sign):
+    # Only over the columns 99 to 105 is the height above 24; the step at 106 is beyond them.
+    steps = {100: sign * 6, 105: sign * 20, 106: sign * -22}
+    assert sharpness(profile(steps, scale, 80)) == pytest.approx(20 / 26)
+    first = {99: sign * -22, 100: sign * 20, 105: sign * 6}
+    assert sharpness(profile(first, scale, 80)) == pytest.approx(20 / 26)
+    halo = {100: sign * 50, 102: sign * -20}
+    assert sharpness(profile(halo, scale, 80)) == 1.0
+
+
+def test_edges_are_above_24_grey_values_in_40_pixels_or_more():
+    steps = {100: 5, 105: 20, 106: -22}  # 25 in one column of each second row
+    assert sharpness(profile(steps, 1, 80)) == pytest.approx(20 / 25)
+    assert sharpness(profile(steps, 1, 78)) == 1.0
+    assert sharpness(profile({100: 4, 105: 20, 106: -22}, 1, 80)) == 1.0
+
+
+def test_sharpness_is_that_of_the_mean_of_three_rows():
+    image = np.full((99, 240), 100)
+    for row in range(3):
+        image[row::3, 100 + 2 * row :] += 72
+    # The mean has three steps of 24 two pixels apart: edges are two or three of them.
+    assert sharpness(grey(image)) == pytest.approx(1 / 2)
 
 
 def look(measure, images, step_s=0.1):
@@ -159,42 +215,6 @@ def test_a_sensor_is_silent_since_its_last_measurement_and_frozen_while_it_repea
         assert look(measure, images, step_s=0.5) == pytest.approx(expected)
 
 
-ROOM = World(box(-2.0, -1.5, 3.0, 2.5), np.random.default_rng(0), Scanner(noise_m=0.005))
-
-
-def wheel_ratio(step, told, count=12):
-    """Return the ratio after a drive of steps (3,), of which the wheels report others."""
-    check = WheelCheck(Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser()))
-    pose = wheels = np.zeros(3)
-    for index in range(count):
-        stamp_ns = round(0.1 * index * S)
-        ratio = check(
-            Observation(
-                stamp_ns=stamp_ns,
-                scan=ROOM.scan(pose, stamp_ns),
-                T_odom_base=planar.to_transform(wheels),
-            )
-        )
-        pose, wheels = planar.compose(pose, np.array(step)), planar.compose(wheels, np.array(told))
-    return ratio
-
-
-@pytest.mark.parametrize(
-    ("step", "told", "ratio"),
-    [
-        ((0.05, 0, 0.03), (0.05, 0, 0.03), 1.0),
-        ((0.0, 0, 0.0), (0.0, 0, 0.0), 1.0),
-        ((0.0, 0, 0.0), (0.08, 0, 0.0), 0.0),
-        ((0.04, 0, 0.0), (0.08, 0, 0.0), 0.5),
-        ((-0.05, 0, 0.0), (0.05, 0, 0.0), -1.0),
-        ((0.06, 0, 0.0), (0.0, 0, 0.0), 10.0),
-        ((0.05, 0, 0.06), (0.1, 0, 0.06), 0.5),
-    ],
-)
-def test_the_ratio_of_true_motion_to_the_wheels_is_measured_by_scans(step, told, ratio):
-    assert wheel_ratio(step, told) == pytest.approx(ratio, abs=0.15)
-
-
 def test_a_model_votes_by_softmax_of_its_scaled_features(tmp_path):
     model = {
         "scenes": ["Bright", "Dark"],
@@ -216,17 +236,40 @@ def test_a_model_votes_by_softmax_of_its_scaled_features(tmp_path):
     assert learned.decide(5, None).scene == UNSURE
 
 
+def image_features(image_bgr, *names):
+    return ImageFeatures(names).get_features(Observation(stamp_ns=0, image_bgr=image_bgr))
+
+
 def test_image_features_are_quantiles_shares_texture_and_colour():
-    values = np.repeat(np.arange(0, 200, 2)[:, None], 100, axis=1)  # each 1 % of the image
-    values[:, 1::2] = values[:, 1::2] + 1
-    values[95:] = 251
-    names = ["q10", "q25", "q50", "q75", "q90", "dark", "white", "gradient", "colour"]
-    found = ImageFeatures(names).get_features(Observation(stamp_ns=0, image_bgr=grey(values)))
-    quantiles = [np.log2((one + 4.0) / 259.0) for one in (19, 49, 99, 149, 179)]
-    np.testing.assert_allclose(found[:5], quantiles, atol=0.01)
-    assert found[5:7] == pytest.approx([0.085, 0.05])
-    assert found[7] == pytest.approx(np.log2(1.0 + 0.95), abs=0.01) and found[8] == 0.0
+    ramp = grey(np.tile(np.arange(256), (100, 1)))  # one column of each grey value
+    percents = np.array([10, 25, 50, 75, 90, 98])
+    levels = np.ceil(256 * percents / 100) - 1  # the first that as many do not exceed
+    found = image_features(ramp, *(f"q{percent}" for percent in percents))
+    np.testing.assert_allclose(found, np.log2((levels + 4) / 259))
+    found = image_features(ramp, "dark", "white", "gradient", "colour")
+    assert found == pytest.approx([17 / 256, 5 / 256, np.log2(1 + 1), 0.0])
+    assert image_features(ramp[:, ::-3], "gradient") == pytest.approx(np.log2(1 + 3))
+    assert image_features(ramp.transpose(1, 0, 2), "gradient") == pytest.approx(0.0)
     half = np.zeros((4, 4, 3), np.uint8)
-    half[..., 2], half[..., :2] = 200, 100
-    (colour,) = ImageFeatures(["colour"]).get_features(Observation(stamp_ns=0, image_bgr=half))
-    assert colour == pytest.approx(0.5, abs=0.01)
+    half[..., 2], half[..., :2] = 255, 51
+    assert image_features(half, "colour") == pytest.approx(0.8)
+
+
+def test_image_features_are_of_a_grid_of_96_rows_or_more():
+    image = np.zeros((300, 192), np.uint8)
+    image[::2, ::2] = 200
+    assert image_features(grey(image), "dark") == pytest.approx(0.0)
+    assert image_features(grey(image[:, :191]), "dark") == pytest.approx(0.75, abs=0.01)
+
+
+def test_image_features_have_known_names_that_differ():
+    for names in ([], ["q51"], ["q50", "q50"]):
+        with pytest.raises(ConfigError) as caught:
+            ImageFeatures(names)
+        assert caught.value.key == "names"
+    features = ImageFeatures(["q50", "depth_ratio"])
+    assert features.requires == (frozenset({Sensor.IMAGE, Sensor.DEPTH}),)
+    observation = Observation(stamp_ns=0, image_bgr=grey([[0]]))
+    assert features.get_features(observation) is None
+    observation = replace(observation, depth_m=np.array([[1.0, 0.0]], np.float32))
+    np.testing.assert_allclose(features.get_features(observation), [np.log2(4 / 259), 0.5])

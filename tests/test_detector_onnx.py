@@ -13,6 +13,7 @@ from sceneslam.config.check import check_keys
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.resolve import resolved
 from sceneslam.interfaces import FeatureDetector
+from sceneslam.modules.detectors.onnx import Onnx
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import UNSURE, Observation
 from sceneslam.types.rig import Rig, Sensor
@@ -92,7 +93,9 @@ def test_probabilities_of_a_network_are_taken_as_they_are(make, network):
         (["detector.scenes.Dark=[attic]"], r"detector\.scenes\.Dark: got 'attic'.*file of labels"),
         (["detector.scenes.Dark=[1]"], r"detector\.scenes: .*no class in two"),
         (["detector.rate_hz=0"], r"detector\.rate_hz: got 0"),
-        (["detector.probability_min=2"], r"detector\.probability_min: got 2"),
+        (["detector.probability_min=1.1"], r"detector\.probability_min: got 1.1"),
+        (["detector.probability_min=-0.1"], r"detector\.probability_min: got -0.1"),
+        (["detector.size_wh=[32,0]"], r"detector\.size_wh: got \[32, 0\]"),
         (["detector.standard_deviation=[1,0,1]"], r"detector\.standard_deviation: got \[1"),
         (["detector.labels=nothing.txt"], "labels not found.*nothing.txt"),
         (["detector.labels=tests/test_detector_onnx.py"], r"detector\.labels: .*3 lines"),
@@ -104,6 +107,22 @@ def test_mistake_is_one_sentence(make, monkeypatch, words, told):
     with pytest.raises((ConfigError, InputError), match=told) as error:
         make(*words)
     assert "\n" not in str(error.value)
+
+
+def test_a_rate_is_finite():
+    with pytest.raises(ConfigError, match="rate_hz: got inf"):
+        Onnx(
+            path="nothing.onnx",
+            scenes={},
+            labels=None,
+            size_wh=SIZE_WH,
+            colour_order="RGB",
+            mean=(0.0, 0.0, 0.0),
+            standard_deviation=(1.0, 1.0, 1.0),
+            output="logits",
+            rate_hz=np.inf,
+            probability_min=0.0,
+        )
 
 
 def test_scenes_have_to_be_given_where_no_preset_does(make):
