@@ -169,6 +169,10 @@ def test_images_are_compared_over_two_seconds_and_a_result_is_valid_as_long():
         drive = Drive()
         drive.turn(image, slightly_brighter(image))
         assert drive.see(None, after_ns=after_ns) == ratio
+    drive = Drive()
+    drive.see(image)
+    drive.see(slightly_brighter(image), 0.1, after_ns=S)
+    assert drive.see(image, 0.1, after_ns=S + 1) == 0.0  # only the first image is 0.15 rad away
 
 
 def test_the_ratio_is_the_median_of_seven_comparisons():
