@@ -230,7 +230,7 @@ class Gate:
 
         The one at fault changes its velocity abruptly, as no robot can, and the other does not. If
         neither did, a module that is more certain than the wheels is right: wheel errors persist.
-        A jump that is too short to explain the disagreement, of `apart_m`, is none.
+        A change of velocity counts if it explains a part of the disagreement of `apart_m` metres.
         While the module is less certain, what was found last of this disagreement stands.
         """
         wheels_m = _DISTANCE_M + self._wheels.drift_ratio * (now.way_m - then.way_m)
@@ -238,8 +238,7 @@ class Gate:
             by_module, by_wheels = self._jumps(now)
             # A change of velocity is made of three positions, weighted 1, -2, 1.
             noise_m_s = math.sqrt(6.0) * deviation_m / _STEP_S
-            least_m_s = max(_JUMP_M_S, _JUMP_SIGMAS * noise_m_s)
-            least_m_s = max(least_m_s, _EXPLAINED * apart_m / _STEP_S)
+            least_m_s = max(_JUMP_M_S, _JUMP_SIGMAS * noise_m_s, _EXPLAINED * apart_m / _STEP_S)
             self._has_jumped = by_module > max(least_m_s, _JUMP_RATIO * by_wheels)
             self._is_wheels = not self._has_jumped
         return self._is_wheels
