@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
-from threading import Thread
 from typing import Any, cast
 
 from hydra import compose
@@ -33,6 +31,7 @@ from sceneslam.detection.run import detect
 from sceneslam.evaluation.verdict import write_verdict
 from sceneslam.evaluation.verdict_page import Asked, Ran, write_verdict_page
 from sceneslam.interfaces import Experiment
+from sceneslam.interrupts import terminate_with
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.experiment import Trial, TrialResult, Verdict
 from sceneslam.types.files import replacing
@@ -105,9 +104,8 @@ class _Trials:
             return
         context = get_context("spawn")  # libraries with threads do not survive a fork
         reader, writer = context.Pipe(duplex=False)
-        with ProcessPoolExecutor(
-            self._jobs, context, initializer=_end_with, initargs=(reader,)
-        ) as pool:
+        pool = ProcessPoolExecutor(self._jobs, context, initializer=_end_with, initargs=(reader,))
+        with reader, writer, pool:
             # An input is rendered once, by the first run that reads it.
             inputs = {
                 _input_of(config): config
@@ -157,19 +155,9 @@ class _Trials:
         }
 
 
-def _end_with(reader: Connection) -> None:
-    """Let a process that runs trials end as by SIGTERM when the pipe is closed.
-
-    The experiment closes it when it is stopped, and the operating system when it was killed.
-    """
-
-    def wait() -> None:
-        try:
-            reader.recv()
-        except EOFError:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    Thread(target=wait, name="experiment", daemon=True).start()
+def _end_with(pipe: Connection) -> None:
+    """Let a process that runs trials end when the experiment closes the pipe or was killed."""
+    terminate_with(os.dup(pipe.fileno()))
 
 
 def _run_beside(config: dict[str, Any], folder: Path, name: str) -> None:

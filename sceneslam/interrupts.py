@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -40,6 +42,17 @@ def uninterrupted() -> Iterator[None]:
     """Delay all three signals until saving is finished."""
     with _handler(signal.SIG_IGN):
         yield
+
+
+def terminate_with(descriptor: int) -> None:
+    """Send SIGTERM to this process when the other end of a pipe is closed, or its process ends."""
+
+    def wait() -> None:
+        while os.read(descriptor, 1):
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=wait, name="parent", daemon=True).start()
 
 
 @contextmanager

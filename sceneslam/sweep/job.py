@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import platform
-import signal
 import sys
-import threading
 import traceback
 from pathlib import Path
 from typing import cast
@@ -22,6 +20,7 @@ from omegaconf import DictConfig
 
 from sceneslam.cli import CONFIG, INCOMPLETE, OK, Ended, carry_out
 from sceneslam.collect.status import State, Status
+from sceneslam.interrupts import terminate_with
 from sceneslam.sweep.plugin import COMPOSED
 
 _STATES = {OK: State.DONE, INCOMPLETE: State.INCOMPLETE}
@@ -30,7 +29,7 @@ _STATES = {OK: State.DONE, INCOMPLETE: State.INCOMPLETE}
 def main() -> None:
     """Run the job of a folder and write its status there."""
     folder = Path(sys.argv[1])
-    threading.Thread(target=_end_with_parent, daemon=True, name="parent").start()
+    terminate_with(0)  # not sys.stdin, whose lock would still be held at the end of the job
     status = Status.read(folder) or Status(state=State.WAITING)
     status.now(State.RUNNING, host=platform.node(), pid=os.getpid()).write(folder)
     state, error = _run(folder)
@@ -67,13 +66,6 @@ def _carried_out(config: DictConfig) -> Ended:
         hydra_context=HydraContext(hydra.config_loader, Callbacks(config)),
     )
     return cast(Ended, done.return_value)
-
-
-def _end_with_parent() -> None:
-    """End when the parent process has ended, which closes standard input."""
-    while os.read(0, 1):  # not sys.stdin, whose lock would still be held at the end of the job
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)
 
 
 if __name__ == "__main__":
