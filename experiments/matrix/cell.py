@@ -32,7 +32,7 @@ class Cell:
     length_ratio: float
     switches: float
     false_switches: float
-    regret: float = float("nan")  # ATE over the oracle's, minus 1
+    regret: float = float("nan")  # segment_m over the oracle's, minus 1
 
     @classmethod
     def of(
@@ -59,7 +59,7 @@ class Cell:
 
     def beside(self, oracle: Cell) -> Cell:
         """Return the cell with its regret."""
-        return replace(self, regret=self.ate_m / oracle.ate_m - 1.0)
+        return replace(self, regret=self.segment_m / oracle.segment_m - 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

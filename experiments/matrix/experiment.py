@@ -28,7 +28,7 @@ ORACLE = "oracle"
 _COLUMNS = {  # of the table: (field, factor, digits)
     "coverage [%]": ("coverage", 100.0, 1),
     "correct [%]": ("correct_rate", 100.0, 1),
-    "error per 10 m [cm]": ("segment_m", 100.0, 2),
+    "error per {segment_m:g} m [cm]": ("segment_m", 100.0, 2),
     "ATE [cm]": ("ate_m", 100.0, 2),
     "switches": ("switches", 1.0, 1),
     "false": ("false_switches", 1.0, 1),
@@ -93,7 +93,7 @@ class MatrixExperiment:
             csv.writer(file, lineterminator="\n").writerows(rows_of(cells))
         return Verdict(
             figures=list(self._promises.figures(cells, self._alone)),
-            table=_table(cells),
+            table=_table(cells, self._judge.segment_m),
             pictures=self._draw(folder, cells, groups[0], oracles[0], outcomes),
         )
 
@@ -105,7 +105,7 @@ class MatrixExperiment:
 
     def _oracle(self, group: Mapping[str, TrialResult]) -> Trajectory:
         alone = [group[name].trajectory for name in self._alone]
-        best: Trajectory = best_of(alone, _truth(group), self._piece_s)
+        best: Trajectory = best_of(alone, _truth(group), self._piece_s, self._judge.segment_m)
         return best
 
     def _cells(
@@ -144,7 +144,7 @@ def _truth(group: Mapping[str, TrialResult]) -> Trajectory:
     return Trajectory.read_tum(first.folder / "groundtruth.tum")
 
 
-def _table(cells: Sequence[Cell]) -> Table:
+def _table(cells: Sequence[Cell], segment_m: float) -> Table:
     """Return the means over the seeds, a row per story and strategy, and of several the spread."""
     means, deviations = mean(cells), deviation(cells)
     has_spread = len({cell.seed for cell in cells}) > 1
@@ -159,4 +159,5 @@ def _table(cells: Sequence[Cell]) -> Table:
         (one.story, one.strategy, *(shown(at, *how) for how in _COLUMNS.values()))
         for at, one in enumerate(means)
     ]
-    return Table(columns=("story", "strategy", *_COLUMNS), rows=rows)
+    columns = [name.format(segment_m=segment_m) for name in _COLUMNS]
+    return Table(columns=("story", "strategy", *columns), rows=rows)

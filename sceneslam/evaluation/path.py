@@ -37,15 +37,20 @@ def segment_errors(
     matches = associate(estimate, truth, max_gap_s)
     T_map_base = estimate.T_world_base[matches.first]
     T_gt_base = truth.T_world_base[matches.second]
-    along_m = _distances_m(T_gt_base[:, :3, 3])
-    ends = np.searchsorted(along_m, along_m + segment_m)
-    starts = np.flatnonzero(ends < len(along_m))
+    ends = segment_ends(T_gt_base, segment_m)
+    starts = np.flatnonzero(ends < len(ends))
     ends = ends[starts]
     T_start_end = se3.inverse(T_map_base[starts]) @ T_map_base[ends]
     T_error = se3.inverse(se3.inverse(T_gt_base[starts]) @ T_gt_base[ends]) @ T_start_end
     return SegmentErrors(
         trans_m=np.linalg.norm(T_error[:, :3, 3], axis=1), rot_rad=se3.rotation_angle_rad(T_error)
     )
+
+
+def segment_ends(T_gt_base: NDArray[np.float64], segment_m: float) -> NDArray[np.int64]:
+    """Return for each pose (N, 4, 4) the first that is `segment_m` farther, N where none is."""
+    along_m = _distances_m(T_gt_base[:, :3, 3])
+    return np.asarray(np.searchsorted(along_m, along_m + segment_m))
 
 
 def length_ratio(estimate: Trajectory, truth: Trajectory, max_gap_s: float) -> float:
