@@ -29,7 +29,6 @@ from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.evaluation.alignment import align
 from sceneslam.evaluation.association import interpolated
 from sceneslam.interfaces import SlamModule, Source
-from sceneslam.modules.slam.rgbd.locate.places import PlaceIndex
 from sceneslam.modules.slam.rgbd.map.keyframes import KeyframeStore
 from sceneslam.modules.slam.rgbd.module import RgbdSlam
 from sceneslam.sources.contract.ordered import Ordered
@@ -37,6 +36,7 @@ from sceneslam.types import se3
 from sceneslam.types.maps import PoseGraphLayer
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.trajectory import Trajectory
+from sceneslam.views.place_index import PlaceIndex
 
 MAX_GAP_S = 0.02
 WRONG_M, WRONG_RAD = 0.3, 0.2  # a loop that is off by more joins two different places

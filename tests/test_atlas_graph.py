@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from test_atlas_limits import S, at, loop, pitched, run_of
 from test_atlas_maps import WALL, map_of
-from test_atlas_places import quality
 
 import sceneslam.atlas
 from sceneslam.atlas.atlas import Atlas
@@ -24,6 +23,12 @@ from sceneslam.types.maps import LoopLayer, MapLayers, PoseGraphLayer
 from sceneslam.types.trajectory import Trajectory
 
 CLAIM = np.diag([4.0, 4.0, 4.0, 1.0, 1.0, 1.0]) * 1e-6
+
+
+def there(x_m, y_m, yaw_rad=0.0):
+    """A fix at a pose of the map."""
+    pose = planar.to_transform(np.array([x_m, y_m, yaw_rad]))
+    return {"T_map_base": pose, "covariance": planar.spatial_covariance(np.eye(3), level=1.0)}
 
 
 class Given:
@@ -111,7 +116,7 @@ def test_one_loop_alone_is_not_believed_unless_the_run_was_located(monkeypatch):
     assert [(one.first, one.second) for one in found] == [(0, 1), (0, 2)]
     given.agreeing = [1]
     assert solved(own).loops == ()
-    fix = Fix(stamp_ns=S, match=quality(at=(0.5, 0.0, 0.0)))
+    fix = Fix(stamp_ns=S, **there(0.5, 0.0))
     (one,) = solved(own, map_of(WALL), fixes=[fix]).loops
     assert (one.first, one.second) == (1, 2)
     own._level = 0  # a base that does not move on a floor
@@ -123,23 +128,25 @@ def test_a_fix_leads_from_the_nearest_submap_of_the_loaded_piece(monkeypatch):
     given, own = Given(monkeypatch), finished()
     nodes = [[0.0, 0.0, 0.0], [3.0, 0.0, 0.5], [4.2, 0.1, 0.0], [2.0, 3.0, 0.0]]
     loaded = map_of(*[WALL] * 4, nodes=nodes, pieces=[0, 0, 1, 0])
-    there = np.array([4.0, 0.0, 0.25])
     fixes = [
-        Fix(stamp_ns=1 * S, match=quality(at=(0.5, 0.2, 0.0))),
-        Fix(stamp_ns=2 * S, match=quality(at=(1.0, 0.2, 0.0))),
-        Fix(stamp_ns=8 * S, match=quality(at=there)),
-        Fix(stamp_ns=9 * S, match=quality(at=there)),
+        Fix(stamp_ns=1 * S, **there(0.5, 0.2)),
+        Fix(stamp_ns=2 * S, **there(1.0, 0.2)),
+        Fix(stamp_ns=8 * S, **there(4.0, 0.0, 0.25)),
+        Fix(stamp_ns=9 * S, **there(4.0, 0.0, 0.25)),
     ]
     solved(own, loaded, fixes=fixes)
-    assert [(edge.first, edge.second) for edge in given.measured] == [(0, 4), (1, 5)]
+    ends = [(edge.first, edge.second) for edge in given.measured]
+    assert ends == [(0, 4), (0, 4), (1, 5), (1, 5)]  # those to one submap weigh as much as one
     T_base_node = planar.between(np.array([4.0, 0.01, 0.0]), np.array([3.0, 0.0, 0.0]))
-    due = planar.between(np.array(nodes[1]), planar.compose(there, T_base_node))
-    np.testing.assert_allclose(given.measured[1].T_first_second, due, atol=1e-12)
+    at_node = planar.compose(np.array([4.0, 0.0, 0.25]), T_base_node)
+    due = planar.to_transform(planar.between(np.array(nodes[1]), at_node))
+    np.testing.assert_allclose(given.measured[2].T_first_second, due, atol=1e-12)
     T_node_base = planar.between(T_base_node, np.zeros(3))
     at_node = planar.propagate(np.eye(3), np.zeros(3), T_base_node, np.zeros((3, 3)))
     assert T_node_base[0] == pytest.approx(1.0)
-    np.testing.assert_allclose(given.measured[1].covariance, at_node, atol=1e-9)
-    assert given.nodes.shape == (7, 3) and (given.drift[:4] == 0).all()
+    measured = planar.planar_covariance(given.measured[2].covariance)
+    np.testing.assert_allclose(measured, 2 * at_node, atol=1e-9)
+    assert given.nodes.shape == (7, 4, 4) and (given.drift[:4] == 0).all()
     np.testing.assert_array_equal(given.drift[4:], own.drift)
 
 
@@ -160,11 +167,11 @@ def test_headings_of_loops_agree_within_their_deviation(apart_m):
     nodes = np.array([[0, 0, 0], [0, 0, 0], [10, 0, 0], [10 + apart_m, 0, 0]], float)
     drift = np.zeros((4, 3))
     drift[3, 2] = 0.02
-    bound = np.sqrt(11.34) * np.hypot(np.sqrt(2) * 0.01, 0.02)
+    bound = np.sqrt(16.81) * np.hypot(np.sqrt(2) * 0.01, 0.02)
     for sign in (1.0, -1.0):
         for share in (0.999, 1.001):
             second = loop(1, 3, [10 + apart_m, 0, sign * share * bound])
-            both = consistent([second, loop(0, 2, [10, 0, 0])], nodes, drift)
+            both = consistent([second, loop(0, 2, [10, 0, 0])], planar.to_transforms(nodes), drift)
             assert (len(both) == 2) == (share < 1.0)
 
 

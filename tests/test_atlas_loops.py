@@ -76,7 +76,7 @@ def test_loops_are_searched_within_three_deviations_of_the_drift_between_their_e
     assert window.half_m == pytest.approx(3.0 * (0.6 + 0.5 * 0.2 * 1.0))
     assert window.half_rad == pytest.approx(3.0 * 0.2)
     assert (loop.first, loop.second, loop.kind) == (0, 2, EdgeKind.LOOP)
-    np.testing.assert_allclose(loop.T_first_second, window.around)
+    np.testing.assert_allclose(planar.from_transform(loop.T_first_second), window.around)
     assert compared.known_min == 0.35
     loops_to(2, [0, 0, 1], nodes, [0.3, 0.2, 0.1])
     assert compared.windows[-1].half_m == pytest.approx(window.half_m)

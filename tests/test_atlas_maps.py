@@ -20,7 +20,7 @@ from sceneslam.atlas.mapper import Mapper
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.localizer import LocalizationEvent
 from sceneslam.atlas.submaps.collector import Known
-from sceneslam.atlas.submaps.graph import LOADED, EdgeKind, PlanarEdge
+from sceneslam.atlas.submaps.graph import LOADED, Edge, EdgeKind, on_floor
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.experiments.one_map.drive import RIG
 from sceneslam.types import planar
@@ -45,18 +45,18 @@ def map_of(*plans, nodes=None, runs=None, pieces=None, edges=()):
             )
             for index, plan in enumerate(plans)
         ),
-        T_map_node=np.zeros((count, 3)) if nodes is None else np.array(nodes, float),
+        T_map_node=planar.to_transforms(np.zeros((count, 3)) if nodes is None else nodes),
         pieces=np.zeros(count, np.int64) if pieces is None else np.array(pieces),
         edges=tuple(edges),
     )
 
 
 def edge(first, second, T_first_second=(1.0, 0.0, 0.0), kind=EdgeKind.MOTION):
-    return PlanarEdge(
+    return Edge(
         first=first,
         second=second,
-        T_first_second=np.array(T_first_second, float),
-        covariance=np.diag([1e-4, 1e-4, 1e-5]),
+        T_first_second=planar.to_transform(np.array(T_first_second, float)),
+        covariance=on_floor(np.diag([1e-4, 1e-4, 1e-5])),
         kind=kind,
     )
 
@@ -161,8 +161,8 @@ def test_motions_between_kept_submaps_stay_and_loops_to_removed_ones_go():
     found = [(one.first, one.second, one.kind) for one in thinned.edges]
     motion, loop = EdgeKind.MOTION, EdgeKind.LOOP
     assert found == [(1, 2, motion), (0, 1, loop), (0, 1, motion)]
-    np.testing.assert_allclose(thinned.edges[-1].T_first_second, [2.0, 0.0, 0.0])
-    np.testing.assert_array_equal(thinned.T_map_node[:, 0], [far[0], far[2], far[1]])
+    np.testing.assert_allclose(thinned.edges[-1].T_first_second[:3, 3], [2.0, 0.0, 0.0])
+    np.testing.assert_array_equal(thinned.plane[:, 0], [far[0], far[2], far[1]])
 
 
 # What is joined.
@@ -201,12 +201,13 @@ def test_a_piece_is_joined_where_two_of_its_submaps_agree(monkeypatch):
     assert joined.map.pieces.tolist() == [0] * 5
     half = np.pi / 2
     expected = [[0, 0, 0], [10, 0, 0], [9, 5, half], [9, 6, half], [9, 7, half]]
-    np.testing.assert_allclose(joined.map.T_map_node, expected, atol=1e-6)
+    np.testing.assert_allclose(joined.map.plane, expected, atol=1e-6)
     loops = joined.map.edges[3:]
     assert [(loop.first, loop.second, loop.kind) for loop in loops] == [
         (1, 2, EdgeKind.LOOP), (1, 4, EdgeKind.LOOP)
     ]  # fmt: skip
-    np.testing.assert_allclose(loops[0].T_first_second, [-1.0, 5.0, half], atol=1e-6)
+    lies = planar.from_transform(loops[0].T_first_second)
+    np.testing.assert_allclose(lies, [-1.0, 5.0, half], atol=1e-6)
     around = [np.rint(np.sort(plan.points[:, 0])).tolist() for plan in found.queries]
     assert around == [[0, 1], [-1, 0, 1], [-1, 0]]
 
@@ -291,8 +292,8 @@ def with_arrays(folder, harm):
         ("point", None, "point: missing among the map's arrays"),
         ("node_run", np.zeros(2), r"node_run: expected <i8 of shape \(N, \), got <f8 \(2,\)"),
         ("node_run", np.int64(0), r"node_run: expected <i8 .*, got <i8 \(\)"),
-        ("node_pose", np.zeros((2, 4)), r"node_pose: expected <f8 of shape \(N, 3\), got"),
-        ("node_pose", np.full((2, 3), np.nan), "node_pose: expected finite numbers"),
+        ("node_pose", np.zeros((2, 3)), r"node_pose: expected <f8 of shape \(N, 4, 4\), got"),
+        ("node_pose", np.full((2, 4, 4), np.nan), "node_pose: expected finite numbers"),
         ("node_piece", np.zeros(3, np.int64), "node_piece: expected 2 rows, got 3"),
         ("node_scans", np.array([2, 3]), "the submaps' scans do not add up to 4"),
         ("node_points", np.array([4, -1]), "the submaps' points do not add up to 3"),
@@ -317,9 +318,9 @@ def test_arrays_that_do_not_fit_together_are_named(tmp_path, name, value, said):
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("version", 0, "a map of version 0, only version 1 is known"),
-        ("version", "2", "a map of version '2', only version 1 is known"),
-        ("version", 2, "a map of version 2, a newer SceneSLAM wrote it"),
+        ("version", 0, "a map of version 0, only version 2 is known"),
+        ("version", "2", "a map of version '2', only version 2 is known"),
+        ("version", 3, "a map of version 3, a newer SceneSLAM wrote it"),
         ("sha256", None, "sha256: missing, the map's map.yaml is not complete"),
         ("cell_m", 0.1, "cell_m: got 0.1, allowed: 0.05"),
         ("modules", "ab", "modules: expected the names"),
@@ -413,19 +414,24 @@ def test_an_update_forgets_once_the_run_was_located(tmp_path, mode, is_found):
 # When a run looks for itself.
 
 
+HERE = planar.to_transform(np.array([1.0, 2.0, 0.5]))
+ASIDE = planar.to_transform(np.array([1.0, 2.0, np.pi / 2]))
+
+
 class Searched:
     """A localizer that answers as it is told."""
 
     def __init__(self, monkeypatch):
-        monkeypatch.setattr(mapper_of, "MapLocalizer", lambda plan: self)
+        monkeypatch.setattr(mapper_of, "MapLocalizer", lambda plan, views: self)
+        self.wants_view = lambda look: False
         self.T_map_run, self.fixes, self.is_late = None, [], False
         self.answer, self.asked = LocalizationEvent.NOTHING, []
 
-    def is_due(self, placed):
+    def is_due(self, look):
         return not self.is_late
 
     def compare(self, latest):
-        self.asked.append([placed.scan.stamp_ns / S for placed in latest])
+        self.asked.append([look.stamp_ns / S for look in latest])
         return self.answer
 
 
@@ -469,13 +475,12 @@ def test_a_robot_at_rest_searches_once_a_second_until_it_was_located(monkeypatch
         observe(second)
     assert searched.asked == [[1.0], [1.0, 2.0], [1.0, 2.0, 3.0]]
     assert not own.is_found and not own.is_placed
-    searched.answer, searched.T_map_run = LocalizationEvent.FOUND, np.array([1.0, 2.0, 0.5])
+    searched.answer, searched.T_map_run = LocalizationEvent.FOUND, HERE
     observe(4.0)
-    T_map_run = planar.to_transform(searched.T_map_run)
-    expected = {"after_s": 3.0, "T_map_run": T_map_run.tolist()}
+    expected = {"after_s": 3.0, "T_map_run": HERE.tolist()}
     assert events == [("relocalized", 4 * S, expected)]
     assert own.is_found and own.is_placed
-    np.testing.assert_array_equal(own.T_map_run, T_map_run)
+    np.testing.assert_array_equal(own.T_map_run, HERE)
     observe(9.0)
     assert len(searched.asked) == 4
 
@@ -512,13 +517,13 @@ def test_a_run_is_saved_as_a_piece_of_its_own_until_it_was_located(monkeypatch):
     assert saved.pieces[0] == 0 and (saved.pieces[1:] == 1).all() and len(saved.pieces) > 5
     assert [submap.run for submap in saved.submaps[:3]] == [0, 1, 1]
     assert [(one.first, one.second) for one in saved.edges[:2]] == [(1, 2), (2, 3)]
-    step = saved.T_map_node[2] - saved.T_map_node[1]
-    searched.answer, searched.T_map_run = LocalizationEvent.FOUND, np.array([1.0, 2.0, np.pi / 2])
+    step = saved.plane[2] - saved.plane[1]
+    searched.answer, searched.T_map_run = LocalizationEvent.FOUND, ASIDE
     observe(60)
     saved = own.saved()
     assert (saved.pieces == 0).all()
-    np.testing.assert_allclose(saved.T_map_node[1], [1.0, 2.0, np.pi / 2], atol=1e-9)
-    np.testing.assert_allclose(saved.T_map_node[2], [1.0, 2.0 + step[0], np.pi / 2], atol=1e-9)
+    np.testing.assert_allclose(saved.plane[1], [1.0, 2.0, np.pi / 2], atol=1e-9)
+    np.testing.assert_allclose(saved.plane[2], [1.0, 2.0 + step[0], np.pi / 2], atol=1e-9)
 
 
 def test_loops_lead_between_the_first_poses_of_submaps_or_from_the_loaded_map(monkeypatch):
@@ -542,7 +547,7 @@ def test_a_located_run_is_corrected_into_the_loaded_map(monkeypatch, is_placed):
     for second in range(20):
         observe(second)
     if is_placed:
-        searched.answer, searched.T_map_run = LocalizationEvent.FOUND, np.array([1.0, 2.0, 0.5])
+        searched.answer, searched.T_map_run = LocalizationEvent.FOUND, HERE
         observe(20)
     kept = len(events)
     path = lambda stamp_ns: planar.to_transform(np.array([stamp_ns / S, 0.0, 0.0]))  # noqa: E731

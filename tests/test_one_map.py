@@ -14,7 +14,7 @@ from sceneslam.atlas.lasting.saved_map import forget_contradicted
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.places.registration import register
-from sceneslam.atlas.submaps.graph import EdgeKind, PlanarEdge, consistent, solve
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind, consistent, on_floor, solve
 from sceneslam.experiments.one_map.drive import Drive, Odometry, map_of, plan_of
 from sceneslam.maps.__main__ import main
 from sceneslam.testing.floor_plans import (
@@ -116,9 +116,12 @@ def ring(count=12, step_m=1.0):
 
 
 def edge_of(first, second, T_first_second, sigma, kind=EdgeKind.LOOP):
-    covariance = np.diag([sigma, sigma, 0.5 * sigma]) ** 2
-    return PlanarEdge(
-        first=first, second=second, T_first_second=T_first_second, covariance=covariance, kind=kind
+    return Edge(
+        first=first,
+        second=second,
+        T_first_second=planar.to_transform(T_first_second),
+        covariance=on_floor(np.diag([sigma, sigma, 0.5 * sigma]) ** 2),
+        kind=kind,
     )
 
 
@@ -126,8 +129,8 @@ def solved(nodes, motions, loops):
     """The solution of a planar graph, and its poses in the plane."""
     result = solve(
         planar.to_transforms(nodes),
-        [edge.spatial for edge in motions],
-        [edge.spatial for edge in loops],
+        motions,
+        loops,
         fixed=(),
         loose=0,
     )
@@ -142,7 +145,11 @@ def test_loops_that_agree_are_believed_and_a_wrong_one_is_not():
     ]
     wrong = edge_of(2, 9, np.array([3.0, 1.0, 1.5]), 0.01)
     drift = np.cumsum(np.full((13, 3), 0.03), axis=0)
-    assert consistent([right[0], wrong, *right[1:]], drifted, drift) == [0, 2, 3]
+    assert consistent([right[0], wrong, *right[1:]], planar.to_transforms(drifted), drift) == [
+        0,
+        2,
+        3,
+    ]
     result, nodes = solved(drifted, motions, right)
     assert result.accepted == [0, 1, 2]
     assert np.abs(nodes[:, :2] - true[:, :2]).max() < 0.1
@@ -316,12 +323,12 @@ def damaged(folder, tmp_path, harm):
         (lambda f, a: (f / HEAD).write_text("a: [\n"), "map.yaml cannot be read"),
         (
             lambda f, a: (f / HEAD).write_text(
-                (f / HEAD).read_text().replace("version: 1", "version: 2")
+                (f / HEAD).read_text().replace("version: 2", "version: 3")
             ),
-            "version 2, a newer SceneSLAM wrote it",
+            "version 3, a newer SceneSLAM wrote it",
         ),
         (
-            lambda f, a: (f / HEAD).write_text("format: sceneslam-map\nversion: 1\n"),
+            lambda f, a: (f / HEAD).write_text("format: sceneslam-map\nversion: 2\n"),
             "arrays: missing, the map's map.yaml is not complete",
         ),
     ],
@@ -370,7 +377,7 @@ def test_two_maps_of_one_place_are_merged(saved, tmp_path, capsys):
     assert main(["merge", str(folder), str(tmp_path / "second"), "--out", str(both)]) == 0
     assert "2 runs" in capsys.readouterr().out
     merged, count = load_map_files(both), len(load_map_files(folder).submaps)
-    off = planar.between(planar.compose(map_of(first), true[0]), merged.T_map_node[count])
+    off = planar.between(planar.compose(map_of(first), true[0]), merged.plane[count])
     assert np.hypot(off[0], off[1]) < 0.03 and abs(off[2]) < 0.01
     assert main(["check", str(both)]) == 0
 

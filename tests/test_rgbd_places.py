@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rgbd_features import random_descriptors
 
-from sceneslam.modules.slam.rgbd.locate.places import PlaceIndex
+from sceneslam.views.place_index import PlaceIndex
 
 
 def seen_again(descriptors, rng, *, flipped_bits=20, share=0.5):

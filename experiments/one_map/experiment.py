@@ -14,11 +14,19 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.lasting.map_files import load_map_files, save_map_files
+from sceneslam.evaluation.association import interpolated
 from sceneslam.experiments.one_map.drive import Drive, Odometry, map_of
-from sceneslam.experiments.one_map.relocalization import Starts, random_starts
+from sceneslam.experiments.one_map.relocalization import (
+    Starts,
+    camera_starts,
+    random_starts,
+    together,
+)
+from sceneslam.sources.simulator.settings import CameraSettings
 from sceneslam.testing.floor_plans import (
     CUPBOARD,
     DEPTH_LIKE,
@@ -36,6 +44,8 @@ from sceneslam.testing.floor_plans import (
 from sceneslam.types import planar, se3
 from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_above, check_least, check_some
+from sceneslam.types.rig import Camera
+from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
 _VOXEL_M = 0.05
@@ -53,6 +63,7 @@ class OneMapExperiment:
         stories: Sequence[str],
         seeds: Sequence[int],
         starts: int,
+        camera_seeds: Sequence[int],
         within_s: float,
         found_min: float,
         error_max_m: float,
@@ -61,11 +72,12 @@ class OneMapExperiment:
         laps: int,
         kills: int,
     ) -> None:
-        check_some(stories=stories, seeds=seeds)
+        check_some(stories=stories, seeds=seeds, camera_seeds=camera_seeds)
         check_least(1, starts=starts, laps=laps, kills=kills)
         check_above(0, within_s=within_s, error_max_m=error_max_m, error_max_deg=error_max_deg)
         self._mapped, self._stories, self._seeds = mapped_story, tuple(stories), tuple(seeds)
         self._starts, self._within_s, self._found_min = starts, within_s, found_min
+        self._camera_seeds = tuple(camera_seeds)
         self._error_max_m, self._error_max_rad = error_max_m, float(np.radians(error_max_deg))
         self._drift_ratio, self._laps, self._kills = drift_ratio, laps, kills
         self._rows: list[list[str | float | None]] = []
@@ -78,6 +90,7 @@ class OneMapExperiment:
             *self._stories_on_a_map(run_trials, maps),
             *self._saved(maps),
             *self._relocalized(),
+            *self._relocalized_by_camera(run_trials, maps),
             *self._alike(),
             *self._updated(maps),
             *self._drifting(),
@@ -101,7 +114,7 @@ class OneMapExperiment:
             )
             for story in self._stories
         ]
-        T_map_gt = se3.inverse(_truth(first).T_world_base[0])
+        T_map_gt = _map_of(first)
         for outcome in run_trials(trials):
             truth, name = _truth(outcome), outcome.trial.overrides[0]
             _, own, true = np.intersect1d(
@@ -136,6 +149,35 @@ class OneMapExperiment:
                 seed=self._seeds[0],
             )
             yield from self._judged(f"{finder} in the map of {mapper}", found)
+
+    def _relocalized_by_camera(self, run_trials: RunTrials, maps: Path) -> Iterator[Figure]:
+        """Start wherever a story saw something, in the map of another story of the same rooms."""
+        every = []
+        for seed in self._camera_seeds:
+            folders = {story: maps / f"{story}_{seed}" for story in (self._mapped, *self._stories)}
+            trials = [
+                Trial(
+                    name=f"views/{story}/{seed}",
+                    overrides=(f"story={story}", f"seed={seed}"),
+                    values={"atlas": {"save": str(folder.resolve())}},
+                )
+                for story, folder in folders.items()
+            ]
+            first, *others = run_trials(trials)
+            saved, T_map_gt = load_map_files(folders[self._mapped]), _map_of(first)
+            for outcome, story in zip(others, self._stories, strict=True):
+                truth = _truth(outcome)
+                found = camera_starts(
+                    saved,
+                    load_map_files(folders[story]),
+                    _camera(outcome),
+                    lambda ns, truth=truth, T=T_map_gt: (
+                        T @ interpolated(truth, np.array([ns])).T_world_base[0]
+                    ),
+                    within_s=self._within_s,
+                )
+                every.append(found)
+        yield from self._judged("camera in the map of camera", together(every))
 
     def _judged(self, name: str, found: Starts) -> Iterator[Figure]:
         self._rows.append([f"{name}: found", found.found_ratio])
@@ -211,6 +253,16 @@ class OneMapExperiment:
 
 def _truth(outcome: TrialResult) -> Trajectory:
     return Trajectory.read_tum(outcome.folder / "groundtruth.tum")
+
+
+def _map_of(outcome: TrialResult) -> Transform:
+    """Return T_map_gt (4, 4): a map begins at the run's first pose."""
+    return se3.inverse(_truth(outcome).T_world_base[0])
+
+
+def _camera(outcome: TrialResult) -> Camera:
+    config = yaml.safe_load((outcome.folder / "config.yaml").read_text())
+    return CameraSettings(**config["source"]["camera"]).camera()
 
 
 def _rmse_m(errors_m: np.ndarray) -> float:

@@ -71,7 +71,12 @@ class Atlas:
         if self._budget is not None:
             self._budget.open(is_live=is_live)
         self._mapper = Mapper(
-            rig, known=self._path.known_at, note=note, loaded=loaded, is_live=is_live
+            rig,
+            known=self._path.known_at,
+            note=note,
+            loaded=loaded,
+            keeps_views=self._lasting.saves,
+            is_live=is_live,
         )
 
     def observe(self, observation: Observation, up_base: Vector | None) -> None:

@@ -15,24 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map
-from sceneslam.atlas.places.localizer import LocalizationEvent, MapLocalizer, PlacedScan
+from sceneslam.atlas.places.localizer import LocalizationEvent, Look, MapLocalizer
+from sceneslam.atlas.places.view_taker import ViewTaker
 from sceneslam.atlas.submaps.collector import Collector, Known
 from sceneslam.atlas.submaps.correction import Correction
-from sceneslam.atlas.submaps.graph import LOADED, Edge, PlanarEdge
+from sceneslam.atlas.submaps.graph import LOADED, Edge
 from sceneslam.atlas.submaps.own_loops import Path
 from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.executors import executor
 from sceneslam.scans.key_scan import KeyScanner
-from sceneslam.types import planar, se3
+from sceneslam.types import se3
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation
-from sceneslam.types.planar import Planar
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform, Vector
+from sceneslam.views.view_finder import ViewFinder
 
 _REST_NS = 1_000_000_000  # between two searches in the map while the robot stands
 _UNFOUND_NS = 5_000_000_000  # after this time a run reports that it was not located
-_RECENT = 80  # newest scans that the localizer gets
+_RECENT = 80  # newest looks that the localizer gets
 
 Note = Callable[..., None]  # event, stamp_ns, and its fields
 
@@ -47,22 +48,26 @@ class Mapper:
         known: Callable[[int], Known | None],
         note: Note,
         loaded: SavedMap | None = None,
+        keeps_views: bool = False,
         is_live: bool = False,
     ) -> None:
-        """Begin. `is_live`: searches in the loaded map run in another thread."""
+        """Begin. `keeps_views`: submaps hold what the camera sees, by which places are recognized.
+
+        `is_live`: searches in the loaded map run in another thread.
+        """
         self._loaded = loaded if loaded is not None else empty_map()
         self._scanner, self._known, self._note = KeyScanner(rig), known, note
         self._collector = Collector(rig, known, self._loaded.runs)
-        plan = self._loaded.plan()
-        self._localizer = MapLocalizer(plan) if len(plan) else None
+        self._views = ViewTaker(rig, is_keeping=keeps_views)
+        self._localizer = self._made_localizer(rig)
         self._executor = executor("search", is_live=is_live)
         self._search: Future[LocalizationEvent] | None = None
-        self._recent: list[PlacedScan] = []
-        self._T_map_run: Planar | None = None
+        self._recent: list[Look] = []
+        self._T_map_run: Transform | None = None
         self._began_ns: int | None = None
         self._has_told = False
-        self._loops: list[PlanarEdge] = []
-        self._T_map_node: NDArray[np.float64] | None = None  # (N, 3) the run's nodes, once solved
+        self._loops: list[Edge] = []
+        self._T_map_node: NDArray[np.float64] | None = None  # (N, 4, 4) the run's, once solved
 
     @property
     def is_placed(self) -> bool:
@@ -77,32 +82,33 @@ class Mapper:
     @property
     def T_map_run(self) -> Transform:
         """Return T_map_run (4, 4) in the loaded map; the identity until the run was located."""
-        found = self._T_map_run
-        return se3.identity() if found is None else planar.to_transform(found)
+        return se3.identity() if self._T_map_run is None else self._T_map_run
 
     def observe(self, observation: Observation, up_base: Vector | None) -> None:
         """Add an observation with a known pose, and the upward direction (3,) in base."""
         known = self._known(observation.stamp_ns)
         if known is None:
             return
+        self._views.move(observation.stamp_ns, known.T_map_base)
         is_step = self._collector.has_moved(known.T_map_base)
-        if not is_step and not self._looks(observation.stamp_ns):
+        look = Look(stamp_ns=observation.stamp_ns, T_run_base=known.T_map_base)
+        if not is_step and not self._looks(look):
             return
         is_level = not is_step or self._collector.step_to(known.T_map_base)
         scan = self._scanner.make(observation) if is_level else None
+        view, is_kept = None, is_step and self._views.is_kept(known.T_map_base)
+        if is_kept or (self._localizer is not None and self._localizer.wants_view(look)):
+            view = self._views.take(observation, known.T_map_base, is_kept=is_kept)
         if is_step:
-            self._collector.add(observation.stamp_ns, scan, up_base)
-        if scan is None:
+            landmarks = view.landmarks if view is not None and is_kept else None
+            self._collector.add(observation.stamp_ns, scan, up_base, landmarks)
+        if scan is None and view is None:
             return
         if self._began_ns is None:
-            self._began_ns = scan.stamp_ns
+            self._began_ns = observation.stamp_ns
         if self._localizer is not None:
-            T_run_base = planar.from_transform(known.T_map_base)
-            self._recent = [
-                *self._recent[1 - _RECENT :],
-                PlacedScan(scan=scan, T_run_base=T_run_base),
-            ]
-            self._localize(self._localizer, scan.stamp_ns)
+            self._recent = [*self._recent[1 - _RECENT :], replace(look, scan=scan, view=view)]
+            self._localize(self._localizer, observation.stamp_ns)
 
     def finish(self, path: Path, maps: Sequence[MapLayers], closed: frozenset[int]) -> Correction:
         """Solve the graph; return the correction of the poses.
@@ -116,13 +122,13 @@ class Mapper:
         if not own.submaps:
             return Correction.none()
         stamps_ns = np.array([submap.stamps_ns[0] for submap in own.submaps], np.int64)
-        old = np.array([path(int(stamp_ns)) for stamp_ns in stamps_ns])
-        own.remeasure(old)
+        own.remeasure(path)
+        old = np.array(own.T_run_node)
         graph = RunGraph(own, self._loaded, path)
         fixes = self._localizer.fixes if self._localizer is not None and self.is_placed else []
         solved = graph.solve(self.T_map_run @ old, maps, fixes, closed)
         self._loops = list(solved.loops)
-        self._T_map_node = planar.from_transforms(solved.T_map_node)
+        self._T_map_node = solved.T_map_node
         for loop in self._loops:
             self._tell(loop)
         if not (self._loops or self._collector.up_node or self.is_placed):
@@ -135,7 +141,7 @@ class Mapper:
         rows = np.searchsorted(stamps_ns[:-1], starts_ns).tolist()
         row_of = [LOADED] * len(self._loaded.submaps) + rows
         return [
-            replace(loop.spatial, first=row_of[loop.first], second=row_of[loop.second])
+            replace(loop, first=row_of[loop.first], second=row_of[loop.second])
             for loop in self._loops
         ]
 
@@ -144,7 +150,7 @@ class Mapper:
         count, pieces = len(self._loaded.submaps), self._loaded.pieces
         own, nodes = self._collector, self._T_map_node
         if nodes is None:
-            nodes = planar.from_transforms([self.T_map_run @ T for T in own.T_run_node])
+            nodes = np.array([self.T_map_run @ T for T in own.T_run_node]).reshape(-1, 4, 4)
         piece = 0 if self.is_found else int(pieces.max(initial=-1)) + 1
         return SavedMap(
             submaps=(*self._loaded.submaps, *own.submaps),
@@ -152,18 +158,27 @@ class Mapper:
             pieces=np.concatenate([pieces, np.full(len(own.submaps), piece, np.int64)]),
             edges=(
                 *self._loaded.edges,
-                *(edge.planar.shifted(count) for edge in own.motions),
+                *(edge.shifted(count) for edge in own.motions),
                 *self._loops,
             ),
         )
 
     # During the run.
 
-    def _looks(self, stamp_ns: int) -> bool:
-        """Tell whether a robot at rest should search the map."""
-        if self.is_found or not self._recent:
+    def _made_localizer(self, rig: Rig) -> MapLocalizer | None:
+        """Return the localizer in the loaded map, None if it shows nothing."""
+        plan, views = self._loaded.plan(), self._loaded.views()
+        finder = None
+        if views and rig.camera is not None:
+            finder = ViewFinder(rig.camera, views)
+        return MapLocalizer(plan, finder) if len(plan) or finder is not None else None
+
+    def _looks(self, look: Look) -> bool:
+        """Tell whether a robot that has not moved by a step should search the map."""
+        if self.is_found or self._localizer is None or not self._recent:
             return False
-        return stamp_ns - self._recent[-1].scan.stamp_ns >= _REST_NS
+        is_rested = look.stamp_ns - self._recent[-1].stamp_ns >= _REST_NS
+        return is_rested or self._localizer.wants_view(look)
 
     def _localize(self, localizer: MapLocalizer, stamp_ns: int) -> None:
         self._collect(localizer, stamp_ns)
@@ -193,7 +208,7 @@ class Mapper:
             self._note("not_relocalized", stamp_ns, after_s=after_s)
             self._has_told = True
 
-    def _tell(self, loop: PlanarEdge) -> None:
+    def _tell(self, loop: Edge) -> None:
         submaps = [*self._loaded.submaps, *self._collector.submaps]
         first, second = submaps[loop.first], submaps[loop.second]
         fields: dict[str, Any] = {"module": second.module, "to_module": first.module}

@@ -7,9 +7,9 @@ import numpy as np
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import CELL_M
 from sceneslam.atlas.submaps.graph import EdgeKind
-from sceneslam.types import planar
+from sceneslam.types import se3
 
-_CHI2_3 = 16.27  # three degrees of freedom, p = 0.001
+_CHI2_6 = 22.46  # six degrees of freedom, p = 0.001
 
 
 def described(saved: SavedMap) -> list[str]:
@@ -27,7 +27,8 @@ def described(saved: SavedMap) -> list[str]:
         lines.append(
             f"piece {piece}: {len(own)} submaps by {', '.join(modules)}; "
             f"{columns * CELL_M:.1f} m x {rows * CELL_M:.1f} m, "
-            f"{plan.free.sum() * CELL_M**2:.1f} m2 free, {len(plan)} wall cells"
+            f"{plan.free.sum() * CELL_M**2:.1f} m2 free, {len(plan)} wall cells, "
+            f"{sum(len(saved.submaps[node].views) for node in own)} views"
         )
     return lines
 
@@ -48,12 +49,12 @@ def flaws(saved: SavedMap) -> list[str]:
         if np.linalg.eigvalsh(edge.covariance).min() <= 0.0:
             found.append(f"{name}: its covariance is not positive")
             continue
-        lies = planar.between(saved.T_map_node[edge.first], saved.T_map_node[edge.second])
-        off = planar.between(edge.T_first_second, lies)
-        if float(off @ np.linalg.solve(edge.covariance, off)) > _CHI2_3:
+        lies = se3.inverse(saved.T_map_node[edge.first]) @ saved.T_map_node[edge.second]
+        off = se3.log(se3.inverse(edge.T_first_second) @ lies)
+        if float(off @ np.linalg.solve(edge.covariance, off)) > _CHI2_6:
             found.append(
-                f"{name}: the submaps lie {np.hypot(off[0], off[1]):.2f} m and "
-                f"{abs(np.degrees(off[2])):.1f} degrees from where it was measured"
+                f"{name}: the submaps lie {np.linalg.norm(off[:3]):.2f} m and "
+                f"{np.degrees(np.linalg.norm(off[3:])):.1f} degrees from where it was measured"
             )
     return found
 

@@ -49,6 +49,11 @@ class LastingMap:
             if foreign:
                 raise ConfigError("save", str(save), "a folder that is empty or holds a map")
 
+    @property
+    def saves(self) -> bool:
+        """Tell whether the run is saved."""
+        return self._save is not None
+
     def open(self, *, is_live: bool) -> None:
         """Begin; a live run saves in another thread."""
         self._executor = executor("save", is_live=is_live)

@@ -19,21 +19,23 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan
-from sceneslam.atlas.submaps.graph import EdgeKind, PlanarEdge
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.files import PART, replacing
+from sceneslam.views.view import Landmarks, PlacedView
 
-HEAD, FORMAT, VERSION = "map.yaml", "sceneslam-map", 1
+HEAD, FORMAT, VERSION = "map.yaml", "sceneslam-map", 2
 _ARRAYS = "arrays-"  # prefix, followed by the start of their checksum
 _SHAPES: Mapping[str, tuple[str, str, tuple[int, ...]]] = {  # name -> dtype, row of, inner shape
     "node_run": ("<i8", "submaps", ()),
     "node_session": ("<i8", "submaps", ()),
     "node_module": ("<i8", "submaps", ()),
     "node_piece": ("<i8", "submaps", ()),
-    "node_pose": ("<f8", "submaps", (3,)),
+    "node_pose": ("<f8", "submaps", (4, 4)),
     "node_scans": ("<i8", "submaps", ()),
     "node_points": ("<i8", "submaps", ()),
+    "node_views": ("<i8", "submaps", ()),
     "node_grid_shape": ("<i8", "submaps", (2,)),
     "node_grid_origin": ("<f8", "submaps", (2,)),
     "scan_stamp_ns": ("<i8", "scans", ()),
@@ -41,9 +43,14 @@ _SHAPES: Mapping[str, tuple[str, str, tuple[int, ...]]] = {  # name -> dtype, ro
     "point": ("<f4", "points", (2,)),
     "normal": ("<f4", "points", (2,)),
     "free_bits": ("|u1", "bytes", ()),
+    "view_stamp_ns": ("<i8", "views", ()),
+    "view_pose": ("<f8", "views", (4, 4)),
+    "view_landmarks": ("<i8", "views", ()),
+    "landmark": ("<f4", "landmarks", (3,)),
+    "descriptor": ("|u1", "landmarks", (32,)),
     "edge_nodes": ("<i8", "edges", (2,)),
-    "edge_motion": ("<f8", "edges", (3,)),
-    "edge_covariance": ("<f8", "edges", (3, 3)),
+    "edge_motion": ("<f8", "edges", (4, 4)),
+    "edge_covariance": ("<f8", "edges", (6, 6)),
     "edge_kind": ("<i8", "edges", ()),
 }
 
@@ -151,7 +158,13 @@ def _check(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
         if counts.setdefault(rows, len(found)) != len(found):
             raise InputError(f"{name}: expected {counts[rows]} rows, got {len(found)}: {path}")
     sizes = -(-arrays["node_grid_shape"].prod(axis=1) // 8)
-    totals = {"scans": arrays["node_scans"], "points": arrays["node_points"], "bytes": sizes}
+    totals = {
+        "scans": arrays["node_scans"],
+        "points": arrays["node_points"],
+        "bytes": sizes,
+        "views": arrays["node_views"],
+        "landmarks": arrays["view_landmarks"],
+    }
     for rows, parts in totals.items():
         if (parts < 0).any() or int(parts.sum()) != counts[rows]:
             raise InputError(f"the submaps' {rows} do not add up to {counts[rows]}: {path}")
@@ -166,6 +179,8 @@ def _arrays(saved: SavedMap, modules: list[str]) -> dict[str, NDArray[Any]]:
     submaps, edges = saved.submaps, saved.edges
     plans = [submap.plan for submap in submaps]
     stamps = [stamp for submap in submaps for stamp in submap.stamps_ns.tolist()]
+    views = [view for submap in submaps for view in submap.views]
+    seen = [view.landmarks for view in views]
     columns: dict[str, Any] = {
         "node_run": [submap.run for submap in submaps],
         "node_session": [submap.session for submap in submaps],
@@ -174,13 +189,19 @@ def _arrays(saved: SavedMap, modules: list[str]) -> dict[str, NDArray[Any]]:
         "node_pose": saved.T_map_node,
         "node_scans": [len(submap.stamps_ns) for submap in submaps],
         "node_points": [len(plan) for plan in plans],
+        "node_views": [len(submap.views) for submap in submaps],
         "node_grid_shape": [plan.free.shape for plan in plans],
         "node_grid_origin": [plan.origin_xy_m for plan in plans],
         "scan_stamp_ns": stamps,
-        "scan_pose": np.concatenate([np.zeros((0, 3)), *(s.T_submap_base for s in submaps)]),
-        "point": np.concatenate([np.zeros((0, 2)), *(plan.points for plan in plans)]),
-        "normal": np.concatenate([np.zeros((0, 2)), *(plan.normals for plan in plans)]),
-        "free_bits": np.concatenate([[], *(np.packbits(plan.free) for plan in plans)]),
+        "scan_pose": _joined([submap.T_submap_base for submap in submaps]),
+        "point": _joined([plan.points for plan in plans]),
+        "normal": _joined([plan.normals for plan in plans]),
+        "free_bits": _joined([np.packbits(plan.free) for plan in plans]),
+        "view_stamp_ns": [view.stamp_ns for view in views],
+        "view_pose": [view.T_submap_base for view in views],
+        "view_landmarks": [len(landmarks.points_base) for landmarks in seen],
+        "landmark": _joined([one.points_base for one in seen]),
+        "descriptor": _joined([one.descriptors for one in seen]),
         "edge_nodes": [(edge.first, edge.second) for edge in edges],
         "edge_motion": [edge.T_first_second for edge in edges],
         "edge_covariance": [edge.covariance for edge in edges],
@@ -190,6 +211,10 @@ def _arrays(saved: SavedMap, modules: list[str]) -> dict[str, NDArray[Any]]:
         name: np.asarray(columns[name], np.dtype(dtype)).reshape(-1, *inner)
         for name, (dtype, _, inner) in _SHAPES.items()
     }
+
+
+def _joined(parts: list[NDArray[Any]]) -> NDArray[Any]:
+    return np.concatenate(parts) if parts else np.zeros(0)
 
 
 def _packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
@@ -211,17 +236,34 @@ def _unpacked(arrays: Mapping[str, NDArray[Any]], modules: list[str]) -> SavedMa
     shapes, scans, points = (
         arrays[name] for name in ("node_grid_shape", "node_scans", "node_points")
     )
-    bits = parts("free_bits", -(-shapes.prod(axis=1) // 8))
+    free_bits = parts("free_bits", -(-shapes.prod(axis=1) // 8))
+    ends = np.cumsum(arrays["node_views"])
+    views = [
+        PlacedView(
+            stamp_ns=stamp_ns,
+            T_submap_base=T,
+            landmarks=Landmarks(points_base=points, descriptors=bits),
+        )
+        for stamp_ns, T, points, bits in zip(
+            arrays["view_stamp_ns"].tolist(),
+            arrays["view_pose"],
+            parts("landmark", arrays["view_landmarks"]),
+            parts("descriptor", arrays["view_landmarks"]),
+            strict=True,
+        )
+    ]
     rows = zip(
         parts("scan_stamp_ns", scans),
         parts("scan_pose", scans),
         parts("point", points),
         parts("normal", points),
-        bits,
+        free_bits,
+        (ends - arrays["node_views"]).tolist(),
+        ends.tolist(),
         strict=True,
     )
     submaps = []
-    for index, (stamps_ns, poses, walls, normals, free) in enumerate(rows):
+    for index, (stamps_ns, poses, walls, normals, free, start, end) in enumerate(rows):
         shape = tuple(shapes[index].tolist())
         x_m, y_m = arrays["node_grid_origin"][index].tolist()
         cells = np.unpackbits(free, count=int(np.prod(shape))).reshape(shape).astype(bool)
@@ -235,10 +277,11 @@ def _unpacked(arrays: Mapping[str, NDArray[Any]], modules: list[str]) -> SavedMa
                 drawing=Drawing(
                     FloorPlan(points=walls, normals=normals, free=cells, origin_xy_m=(x_m, y_m))
                 ),
+                views=tuple(views[start:end]),
             )
         )
     edges = [
-        PlanarEdge(
+        Edge(
             first=int(nodes[0]),
             second=int(nodes[1]),
             T_first_second=motion,

@@ -12,8 +12,8 @@ from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
-from sceneslam.atlas.submaps.graph import EdgeKind, PlanarEdge, consistent, solve
-from sceneslam.types import planar
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind, consistent, on_floor, solve
+from sceneslam.types import planar, se3
 
 _AROUND = 1  # neighbouring submaps on either side that are searched together with one
 _LOOPS_MIN = 2  # agreeing loops, as a single one may come from a similar place
@@ -54,47 +54,40 @@ def _joined(saved: SavedMap, piece: int) -> SavedMap | None:
     """Return the map with a piece joined to the first, None if it is not recognized."""
     own = np.flatnonzero(saved.pieces == piece).tolist()
     loops = _loops(saved, own)
-    drift = np.zeros_like(saved.T_map_node)
+    drift = np.zeros((len(saved.submaps), 3))
     agreeing = [loops[index] for index in consistent(loops, saved.T_map_node, drift)]
     if len(agreeing) < _LOOPS_MIN:
         return None
     nodes = np.array(saved.T_map_node)
     seed = agreeing[0]
-    T_first_piece = planar.compose(
-        planar.compose(nodes[seed.first], seed.T_first_second),
-        planar.between(nodes[seed.second], np.zeros(3)),
-    )
-    for node in own:
-        nodes[node] = planar.compose(T_first_piece, nodes[node])
+    T_first_piece = nodes[seed.first] @ seed.T_first_second @ se3.inverse(nodes[seed.second])
+    nodes[own] = T_first_piece @ nodes[own]
     solved = _solve(saved, nodes, own, agreeing)
     pieces = np.where(saved.pieces == piece, 0, saved.pieces)
     return replace(saved, T_map_node=solved, pieces=pieces, edges=(*saved.edges, *agreeing))
 
 
-def _loops(saved: SavedMap, own: Sequence[int]) -> list[PlanarEdge]:
+def _loops(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
     """Return loops from the first piece to the submaps `own` of another piece."""
-    main = np.flatnonzero(saved.pieces == 0)
+    main, plane = np.flatnonzero(saved.pieces == 0), saved.plane
     target, found = Recognizer(PlanField(saved.plan())), []
     for row, node in enumerate(own):
         around = own[max(row - _AROUND, 0) : row + _AROUND + 1]
         near = [index for index in around if saved.submaps[index].run == saved.submaps[node].run]
-        query = join(
-            [
-                (planar.between(saved.T_map_node[node], saved.T_map_node[i]), saved.submaps[i].plan)
-                for i in near
-            ]
-        )
+        query = join([(planar.between(plane[node], plane[i]), saved.submaps[i].plan) for i in near])
         match = target.recognize(PlanField(query), None) if len(query) else None
         if match is None or match.weak_directions:
             continue
-        away_m = np.linalg.norm(saved.T_map_node[main, :2] - match.T_target_query[:2], axis=1)
+        away_m = np.linalg.norm(plane[main, :2] - match.T_target_query[:2], axis=1)
         first = int(main[np.argmin(away_m)])
         found.append(
-            PlanarEdge(
+            Edge(
                 first=first,
                 second=node,
-                T_first_second=planar.between(saved.T_map_node[first], match.T_target_query),
-                covariance=match.covariance,
+                T_first_second=planar.to_transform(
+                    planar.between(plane[first], match.T_target_query)
+                ),
+                covariance=on_floor(match.covariance),
                 kind=EdgeKind.LOOP,
             )
         )
@@ -102,21 +95,19 @@ def _loops(saved: SavedMap, own: Sequence[int]) -> list[PlanarEdge]:
 
 
 def _solve(
-    saved: SavedMap, nodes: NDArray[np.float64], own: Sequence[int], loops: Sequence[PlanarEdge]
+    saved: SavedMap, nodes: NDArray[np.float64], own: Sequence[int], loops: Sequence[Edge]
 ) -> NDArray[np.float64]:
     """Return the optimised nodes (N, 3); those of the other pieces stay."""
     inside = set(own)
-    motions = [
-        edge.spatial for edge in saved.edges if edge.first in inside and edge.second in inside
-    ]
+    motions = [edge for edge in saved.edges if edge.first in inside and edge.second in inside]
     solved = solve(
-        planar.to_transforms(nodes),
+        nodes,
         motions,
-        [loop.spatial for loop in loops],
+        loops,
         fixed=[node for node in range(len(nodes)) if node not in inside],
         loose=own[0],
     )
-    return planar.from_transforms(solved.T_map_node)
+    return solved.T_map_node
 
 
 def _renumbered(saved: SavedMap) -> SavedMap:

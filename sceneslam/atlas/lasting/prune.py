@@ -7,8 +7,8 @@ import numpy as np
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
-from sceneslam.atlas.submaps.graph import EdgeKind, PlanarEdge
-from sceneslam.types import planar
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind
+from sceneslam.types import planar, se3
 
 _COVERED_RATIO = 0.95  # of a submap's walls, covered by later submaps
 
@@ -38,14 +38,14 @@ def prune(saved: SavedMap) -> SavedMap:
 def _is_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
     plan = saved.submaps[node].plan
     if not len(plan):
-        return True
+        return not saved.submaps[node].views
     low, high = plan.points.min(axis=0), plan.points.max(axis=0)
     reach_m = float(np.linalg.norm(high - low))
-    away_m = np.linalg.norm(saved.T_map_node[others, :2] - saved.T_map_node[node, :2], axis=1)
+    plane = saved.plane
+    away_m = np.linalg.norm(plane[others, :2] - plane[node, :2], axis=1)
     near = [other for other, far_m in zip(others, away_m, strict=True) if far_m <= 2 * reach_m]
     placed = [
-        (planar.between(saved.T_map_node[node], saved.T_map_node[other]), saved.submaps[other].plan)
-        for other in near
+        (planar.between(plane[node], plane[other]), saved.submaps[other].plan) for other in near
     ]
     shown = join(placed)
     if not len(shown):
@@ -54,7 +54,7 @@ def _is_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
     return bool((far_m <= 0.1).mean() >= _COVERED_RATIO)  # two cells
 
 
-def _bridges(saved: SavedMap, kept: set[int]) -> list[PlanarEdge]:
+def _bridges(saved: SavedMap, kept: set[int]) -> list[Edge]:
     """Return the composed motions across removed submaps."""
     onward = {edge.first: edge for edge in saved.edges if edge.kind is not EdgeKind.LOOP}
     found = []
@@ -68,16 +68,12 @@ def _bridges(saved: SavedMap, kept: set[int]) -> list[PlanarEdge]:
     return found
 
 
-def _in_a_row(start: int, edge: PlanarEdge, after: PlanarEdge) -> PlanarEdge:
-    T = after.T_first_second
-    back = planar.turn(-float(T[2]))
-    carry = np.eye(3)
-    carry[:2, 2] = -T[1], T[0]
-    carried = back @ carry @ edge.covariance @ carry.T @ back.T
-    return PlanarEdge(
+def _in_a_row(start: int, edge: Edge, after: Edge) -> Edge:
+    T_back = se3.inverse(after.T_first_second)
+    return Edge(
         first=start,
         second=after.second,
-        T_first_second=planar.compose(edge.T_first_second, T),
-        covariance=carried + after.covariance,
+        T_first_second=edge.T_first_second @ after.T_first_second,
+        covariance=se3.carried(edge.covariance, T_back) + after.covariance,
         kind=max(edge.kind, after.kind),
     )

@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan, join
-from sceneslam.atlas.submaps.graph import PlanarEdge
+from sceneslam.atlas.submaps.graph import Edge
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.types import planar
+from sceneslam.types.se3 import Transform
+from sceneslam.views.view import Landmarks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -19,30 +21,46 @@ class SavedMap:
     """The graph of all runs; nodes of one piece lie in one frame, pieces are not connected."""
 
     submaps: tuple[Submap, ...]
-    T_map_node: NDArray[np.float64]  # (N, 3) [m, m, rad]
+    T_map_node: NDArray[np.float64]  # (N, 4, 4)
     pieces: NDArray[np.int64]  # (N,), piece of every node; 0 is the first
-    edges: tuple[PlanarEdge, ...]
+    edges: tuple[Edge, ...]
 
     @property
     def runs(self) -> int:
         """Return how many runs the map was made from."""
         return 1 + max((submap.run for submap in self.submaps), default=-1)
 
+    @property
+    def plane(self) -> NDArray[np.float64]:
+        """Return the nodes (N, 3) in the plane [m, m, rad]."""
+        return planar.from_transforms(self.T_map_node)
+
     def plan(self, piece: int = 0, *, newest_wins: bool = True) -> FloorPlan:
         """Return the floor plan of a piece, in its frame."""
         placed = [
             (T, submap.plan)
-            for T, submap, own in zip(self.T_map_node, self.submaps, self.pieces, strict=True)
+            for T, submap, own in zip(self.plane, self.submaps, self.pieces, strict=True)
             if own == piece
         ]
         return join(placed, newest_wins=newest_wins)
+
+    def views(self, piece: int = 0) -> list[tuple[Transform, Landmarks]]:
+        """Return what a camera saw in a piece, and the poses (4, 4) it was seen from."""
+        return [
+            (T_map_node @ view.T_submap_base, view.landmarks)
+            for T_map_node, submap, own in zip(
+                self.T_map_node, self.submaps, self.pieces, strict=True
+            )
+            if own == piece
+            for view in submap.views
+        ]
 
     def of(self, keep: Sequence[int]) -> SavedMap:
         """Return the map of the nodes `keep`, with the edges between them."""
         number = {node: index for index, node in enumerate(keep)}
         return SavedMap(
             submaps=tuple(self.submaps[node] for node in keep),
-            T_map_node=self.T_map_node[list(keep)].reshape(-1, 3),
+            T_map_node=self.T_map_node[list(keep)].reshape(-1, 4, 4),
             pieces=self.pieces[list(keep)],
             edges=tuple(
                 replace(edge, first=number[edge.first], second=number[edge.second])
@@ -54,7 +72,9 @@ class SavedMap:
 
 def empty_map() -> SavedMap:
     """Return an empty map."""
-    return SavedMap(submaps=(), T_map_node=np.zeros((0, 3)), pieces=np.zeros(0, np.int64), edges=())
+    return SavedMap(
+        submaps=(), T_map_node=np.zeros((0, 4, 4)), pieces=np.zeros(0, np.int64), edges=()
+    )
 
 
 def forget_contradicted(saved: SavedMap, run: int) -> SavedMap:
@@ -67,12 +87,12 @@ def forget_contradicted(saved: SavedMap, run: int) -> SavedMap:
     if not newest:
         return saved
     piece = int(saved.pieces[newest[0]])
-    today = join([(saved.T_map_node[i], saved.submaps[i].plan) for i in newest])
+    plane = saved.plane
+    today = join([(plane[i], saved.submaps[i].plan) for i in newest])
     submaps = list(saved.submaps)
     for index, submap in enumerate(saved.submaps):
         if submap.run != run and saved.pieces[index] == piece and len(submap.plan):
-            T_today_plan = saved.T_map_node[index]
-            submaps[index] = submap.with_plan(_without(submap.plan, T_today_plan, today))
+            submaps[index] = submap.with_plan(_without(submap.plan, plane[index], today))
     return replace(saved, submaps=tuple(submaps))
 
 

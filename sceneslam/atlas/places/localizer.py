@@ -7,21 +7,27 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import FloorPlan, draw
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.plan_search import SearchWindow
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.places.registration import PlanRegistration, register
+from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.uncertainty import WHEELS
 from sceneslam.scans.key_scan import KeyScan
-from sceneslam.types import planar
+from sceneslam.types import planar, se3
 from sceneslam.types.planar import Planar
+from sceneslam.types.se3 import Transform
+from sceneslam.views.view import LandmarkView
+from sceneslam.views.view_finder import ViewFinder
 
 _SPAN_M, _SPAN_SCANS = 6.0, 60  # length of path, and scans, that are compared with the map
 _PERIOD_S, _DOUBLINGS = 0.5, 4  # time between two searches; it doubles, up to 8 s
 _PATIENCE = 8  # after this many failed searches: each takes 0.1 s or more
-_FIX_M, _FIX_S = 0.5, 1.0  # distance and time between comparisons once located
+_AGAIN_NS = 200_000_000  # between two searches by views, each of which takes 20 ms
+_FIX_M, _FIX_RAD, _FIX_NS = 0.5, 0.3, 10**9  # way, turn and time between comparisons once located
 _AGREE_M, _AGREE_RAD = 0.1, 0.05  # two consecutive searches that agree within this are accepted
 _REACH_M, _REACH_RAD, _SIGMAS = 0.15, 0.05, 3.0  # search window of a fix around the prediction
 _DOUBTS = 3  # consecutive comparisons that contradict the map: the place was wrong
@@ -38,130 +44,177 @@ class LocalizationEvent(Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PlacedScan:
-    """A scan with its pose in the frame of the run."""
+class Look:
+    """What the sensors saw from a pose of the run."""
 
-    scan: KeyScan
-    T_run_base: Planar
+    stamp_ns: int
+    T_run_base: Transform
+    scan: KeyScan | None = None
+    view: LandmarkView | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fix:
-    """The robot's pose in the map by its newest scans."""
+    """The robot's pose in the map by its newest looks."""
 
     stamp_ns: int
-    match: PlanRegistration  # of `base` at the stamp, in the map
-
-    @property
-    def T_map_base(self) -> Planar:
-        """Return T_map_base (3,): x, y [m], yaw [rad]."""
-        return self.match.T_target_query
+    T_map_base: Transform
+    covariance: NDArray[np.float64]  # (6, 6) of se3.log order, base frame
 
 
 class MapLocalizer:
-    """Compares the last metres of a run with a map."""
+    """Compares the last metres of a run with a map: its walls, and what a camera sees in it."""
 
-    def __init__(self, plan: FloorPlan) -> None:
-        self.T_map_run: Planar | None = None  # None until the run was located
+    def __init__(self, plan: FloorPlan, views: ViewFinder | None = None) -> None:
+        """Take the map's walls, and its views if the run has a camera."""
+        self.T_map_run: Transform | None = None  # None until the run was located
         self.fixes: list[Fix] = []
-        self._map = Recognizer(PlanField(plan))
-        self._next_ns = 0
-        self._fixed_at: PlacedScan | None = None
-        self._guess: Planar | None = None  # T_map_run of the last search
+        self._walls, self._views = Recognizer(PlanField(plan)), views
+        self._next_ns = self._next_walls_ns = 0  # of views and of checks, of searches by walls
+        self._fixed_at: Look | None = None
+        self._guess: Transform | None = None  # T_map_run of the last search that found a place
         self._vain = self._doubts = 0
 
-    def is_due(self, placed: PlacedScan) -> bool:
-        """Tell whether it is time to compare at the newest scan."""
-        if placed.scan.stamp_ns < self._next_ns:
-            return False
-        if self.T_map_run is None or self._fixed_at is None:
-            return True
-        away = planar.between(self._fixed_at.T_run_base, placed.T_run_base)
-        return bool(np.hypot(away[0], away[1]) >= _FIX_M or abs(away[2]) >= 1.0)
+    def wants_view(self, newest: Look) -> bool:
+        """Tell whether a view is to be compared at the newest look."""
+        return self._views is not None and self.is_due(newest)
 
-    def compare(self, latest: Sequence[PlacedScan]) -> LocalizationEvent:
-        """Compare the latest scans, oldest first, with the map."""
-        newest, query = latest[-1], _query(latest)
-        if not len(query):
-            return LocalizationEvent.NOTHING
-        field = PlanField(query)
+    def is_due(self, newest: Look) -> bool:
+        """Tell whether it is time to compare at the newest look."""
+        if self.T_map_run is None or self._fixed_at is None:
+            return newest.stamp_ns >= (
+                self._next_walls_ns if self._views is None else self._next_ns
+            )
+        if newest.stamp_ns < self._next_ns:
+            return False
+        away = se3.inverse(self._fixed_at.T_run_base) @ newest.T_run_base
+        is_far = np.linalg.norm(away[:3, 3]) >= _FIX_M
+        return bool(is_far or se3.rotation_angle_rad(away) >= _FIX_RAD)
+
+    def compare(self, latest: Sequence[Look]) -> LocalizationEvent:
+        """Compare the latest looks, oldest first, with the map."""
+        newest = latest[-1]
         if self.T_map_run is not None:
-            return self._check(newest, field)
-        match = self._map.recognize(field, None)
-        if match is None or match.weak_directions:
-            self._guess, self._vain = None, self._vain + 1
-            self._wait(newest, _PERIOD_S * 2.0 ** min(self._vain // _PATIENCE, _DOUBLINGS))
+            return self._check(latest)
+        self._next_ns = newest.stamp_ns + _AGAIN_NS
+        fix = self._by_view(newest)
+        is_due = self._views is None or newest.stamp_ns >= self._next_walls_ns
+        if fix is None and newest.scan is not None and is_due:
+            fix = self._by_walls(latest)
+            if fix is None:
+                self._guess = None
+        if fix is None:
             return LocalizationEvent.NOTHING
-        self._wait(newest, _PERIOD_S)
-        T_map_run = _run_in_map(match, newest)
+        T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
         before, self._guess = self._guess, T_map_run
         if before is None or not _agree(before, T_map_run, newest.T_run_base):
             return LocalizationEvent.NOTHING
-        self._take(newest, match)
+        self._take(newest, fix)
         return LocalizationEvent.FOUND
 
-    def _check(self, newest: PlacedScan, query: PlanField) -> LocalizationEvent:
+    def _by_view(self, newest: Look) -> Fix | None:
+        """Return the pose by what the camera sees."""
+        if self._views is None or newest.view is None:
+            return None
+        seen = self._views.recognize(newest.view)
+        if seen is None:
+            return None
+        return Fix(stamp_ns=newest.stamp_ns, T_map_base=seen.T_map_base, covariance=seen.covariance)
+
+    def _by_walls(self, latest: Sequence[Look]) -> Fix | None:
+        """Return the pose by the walls around the last metres, searched in all of the map."""
+        newest, query = latest[-1], _query(latest)
+        match = self._walls.recognize(PlanField(query), None) if len(query) else None
+        is_found = match is not None and not match.weak_directions
+        self._vain = 0 if is_found else self._vain + 1
+        period_s = _PERIOD_S * 2.0 ** min(self._vain // _PATIENCE, _DOUBLINGS)
+        self._next_walls_ns = newest.stamp_ns + round(period_s * 1e9)
+        return _fix(newest, match) if match is not None and is_found else None
+
+    def _check(self, latest: Sequence[Look]) -> LocalizationEvent:
         """Compare near the predicted pose; repeated contradictions withdraw the localization."""
         assert self.T_map_run is not None and self._fixed_at is not None
-        self._wait(newest, _FIX_S)
-        expected = planar.compose(self.T_map_run, newest.T_run_base)
-        away = planar.between(self._fixed_at.T_run_base, newest.T_run_base)
-        moved_m, turned_rad = float(np.hypot(away[0], away[1])), abs(float(away[2]))
-        turn = WHEELS.rad_per_m * moved_m + WHEELS.rad_per_rad * turned_rad
+        newest = latest[-1]
+        self._next_ns = newest.stamp_ns + _FIX_NS
+        T_map_base = self.T_map_run @ newest.T_run_base
+        away = se3.inverse(self._fixed_at.T_run_base) @ newest.T_run_base
+        moved_m = float(np.linalg.norm(away[:3, 3]))
+        turn_rad = WHEELS.rad_per_m * moved_m
+        turn_rad += WHEELS.rad_per_rad * float(se3.rotation_angle_rad(away))
         window = SearchWindow(
-            around=expected,
+            around=planar.from_transform(T_map_base),
             half_m=_REACH_M + _SIGMAS * WHEELS.per_m * moved_m,
-            half_rad=_REACH_RAD + _SIGMAS * turn,
+            half_rad=_REACH_RAD + _SIGMAS * turn_rad,
         )
-        match = self._map.recognize(query, window)
-        if match is not None and _is_within(match, window):
-            self._take(newest, match)
-            return LocalizationEvent.FIXED
-        there = register(query, self._map.field, expected)
-        is_contradicted = there.known_ratio >= _KNOWN_MIN and not there.is_verified
-        self._doubts = self._doubts + 1 if is_contradicted else 0
+        seen = self._by_view(newest)
+        near, is_contradicted = self._near_walls(latest, window)
+        for fix in (seen, near):
+            if fix is not None and _is_within(fix, T_map_base, window):
+                self._take(newest, fix)
+                return LocalizationEvent.FIXED
+        self._doubts = self._doubts + 1 if is_contradicted or seen is not None else 0
         if self._doubts < _DOUBTS:
             return LocalizationEvent.NOTHING
         self.T_map_run, self._guess, self._fixed_at = None, None, None
         self._doubts, self._vain, self.fixes = 0, 0, []
         return LocalizationEvent.WITHDRAWN
 
-    def _take(self, newest: PlacedScan, match: PlanRegistration) -> None:
-        self.T_map_run, self._fixed_at = _run_in_map(match, newest), newest
-        self.fixes.append(Fix(stamp_ns=newest.scan.stamp_ns, match=match))
+    def _near_walls(self, latest: Sequence[Look], window: SearchWindow) -> tuple[Fix | None, bool]:
+        """Return the pose by the walls in a window, and whether they contradict its centre."""
+        newest, query = latest[-1], _query(latest)
+        if newest.scan is None or not len(query):
+            return None, False
+        field = PlanField(query)
+        match = self._walls.recognize(field, window)
+        there = register(field, self._walls.field, window.around)
+        is_contradicted = there.known_ratio >= _KNOWN_MIN and not there.is_verified
+        return None if match is None else _fix(newest, match), is_contradicted
+
+    def _take(self, newest: Look, fix: Fix) -> None:
+        self.T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
+        self._fixed_at = newest
+        self.fixes.append(fix)
         self._doubts = self._vain = 0
-        self._wait(newest, _FIX_S)
-
-    def _wait(self, newest: PlacedScan, period_s: float) -> None:
-        self._next_ns = newest.scan.stamp_ns + round(period_s * 1e9)
+        self._next_ns = newest.stamp_ns + _FIX_NS
 
 
-def _query(latest: Sequence[PlacedScan]) -> FloorPlan:
-    """Return the plan of the last metres in the frame of base at the newest scan."""
-    newest, length_m = latest[-1], 0.0
+def _query(latest: Sequence[Look]) -> FloorPlan:
+    """Return the plan of the last metres in the frame of base at the newest look."""
+    newest, length_m = planar.from_transform(latest[-1].T_run_base), 0.0
     scans: list[tuple[Planar, KeyScan]] = []
     after = newest
-    for placed in reversed(latest[-_SPAN_SCANS:]):
-        step = planar.between(placed.T_run_base, after.T_run_base)
+    for look in reversed(latest):
+        if look.scan is None:
+            continue
+        T_run_base = planar.from_transform(look.T_run_base)
+        step = planar.between(T_run_base, after)
         length_m += float(np.hypot(step[0], step[1]))
-        if length_m > _SPAN_M:
+        if length_m > _SPAN_M or len(scans) == _SPAN_SCANS:
             break
-        scans.append((planar.between(newest.T_run_base, placed.T_run_base), placed.scan))
-        after = placed
+        scans.append((planar.between(newest, T_run_base), look.scan))
+        after = T_run_base
     return draw(scans)
 
 
-def _run_in_map(match: PlanRegistration, newest: PlacedScan) -> Planar:
-    T_base_run = planar.between(newest.T_run_base, np.zeros(3))
-    return planar.compose(match.T_target_query, T_base_run)
+def _fix(newest: Look, match: PlanRegistration) -> Fix:
+    """Return the pose by walls; height and tilt are as the run has them."""
+    T_run_plane = planar.to_transform(planar.from_transform(newest.T_run_base))
+    T_map_run = planar.to_transform(match.T_target_query) @ se3.inverse(T_run_plane)
+    return Fix(
+        stamp_ns=newest.stamp_ns,
+        T_map_base=T_map_run @ newest.T_run_base,
+        covariance=on_floor(match.covariance),
+    )
 
 
-def _agree(first: Planar, second: Planar, T_run_base: Planar) -> bool:
+def _agree(first: Transform, second: Transform, T_run_base: Transform) -> bool:
     """Tell whether two estimates of T_map_run put the robot in the same place."""
-    off = planar.between(planar.compose(first, T_run_base), planar.compose(second, T_run_base))
-    return bool(np.hypot(off[0], off[1]) <= _AGREE_M and abs(off[2]) <= _AGREE_RAD)
+    off = se3.inverse(first @ T_run_base) @ second @ T_run_base
+    is_near = np.linalg.norm(off[:3, 3]) <= _AGREE_M
+    return bool(is_near and se3.rotation_angle_rad(off) <= _AGREE_RAD)
 
 
-def _is_within(match: PlanRegistration, window: SearchWindow) -> bool:
-    off = planar.between(window.around, match.T_target_query)
-    return bool(np.hypot(off[0], off[1]) <= window.half_m and abs(off[2]) <= window.half_rad)
+def _is_within(fix: Fix, T_map_base: Transform, window: SearchWindow) -> bool:
+    off = se3.inverse(T_map_base) @ fix.T_map_base
+    is_near = np.linalg.norm(off[:3, 3]) <= window.half_m
+    return bool(is_near and se3.rotation_angle_rad(off) <= window.half_rad)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.submaps.graph import Edge, EdgeKind
+from sceneslam.atlas.submaps.own_loops import Path
 from sceneslam.atlas.submaps.submap import (
     STEP_M,
     STEP_RAD,
@@ -25,6 +26,7 @@ from sceneslam.types import planar, se3
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
+from sceneslam.views.view import Landmarks
 
 _SETTLED_NS = 20_000_000_000  # a hand-over does not replace older poses (policy.buffer_s)
 _LEVEL_COS = np.cos(np.radians(3.0))  # at this tilt a wall 4 m away is seen 0.2 m higher or lower
@@ -43,8 +45,8 @@ class Known:
     covariance: NDArray[np.float64] | None  # (6, 6), as the module reported it
 
 
-# Stamp, scan, and the measured vertical direction (3,) in base.
-_Step = tuple[int, KeyScan | None, NDArray[np.float64] | None]
+# Stamp, scan, the measured vertical direction (3,) in base, and landmarks.
+_Step = tuple[int, KeyScan | None, NDArray[np.float64] | None, Landmarks | None]
 
 
 class Collector:
@@ -76,7 +78,8 @@ class Collector:
         if self._last is None:
             return True
         step = se3.inverse(self._last) @ T_run_base
-        return bool(np.hypot(*step[:2, 3]) >= STEP_M or abs(se3.yaw_rad(step)) >= STEP_RAD)
+        is_far = np.linalg.norm(step[:3, 3]) >= STEP_M
+        return bool(is_far or se3.rotation_angle_rad(step) >= STEP_RAD)
 
     def step_to(self, T_run_base: Transform) -> bool:
         """Record a step; return whether the new pose is level, as of a robot on a floor.
@@ -97,13 +100,18 @@ class Collector:
         return is_level
 
     def add(
-        self, stamp_ns: int, scan: KeyScan | None, up_base: NDArray[np.float64] | None = None
+        self,
+        stamp_ns: int,
+        scan: KeyScan | None,
+        up_base: NDArray[np.float64] | None = None,
+        landmarks: Landmarks | None = None,
     ) -> None:
         """Add a step with its scan, and make submaps of steps with final poses.
 
-        `up_base` (3,) is the measured vertical direction, None if unknown.
+        `up_base` (3,) is the measured vertical direction, None if unknown, as are the `landmarks`
+        in view.
         """
-        self._steps.append((stamp_ns, scan, up_base))
+        self._steps.append((stamp_ns, scan, up_base, landmarks))
         settled = bisect_right(self._steps, stamp_ns - _SETTLED_NS, key=lambda each: each[0])
         if 2 * settled > len(self._steps):
             self._cut(settled, is_end=False)
@@ -112,9 +120,23 @@ class Collector:
         """Make submaps of the remaining steps."""
         self._cut(len(self._steps), is_end=True)
 
-    def remeasure(self, poses: NDArray[np.float64]) -> None:
-        """Set the submaps' poses (N, 4, 4) as revised, and the motions between them."""
-        self.T_run_node = list(poses)
+    def remeasure(self, path: Path) -> None:
+        """Set the poses of the submaps and their views as revised, and the motions between them.
+
+        `path` has a pose at every stamp of a step.
+        """
+        poses = [_at(path, int(submap.stamps_ns[0])) for submap in self.submaps]
+        self.submaps = [
+            replace(
+                submap,
+                views=tuple(
+                    replace(view, T_submap_base=se3.inverse(pose) @ _at(path, view.stamp_ns))
+                    for view in submap.views
+                ),
+            )
+            for submap, pose in zip(self.submaps, poses, strict=True)
+        ]
+        self.T_run_node = poses
         self.motions = [
             replace(edge, T_first_second=se3.inverse(poses[edge.first]) @ poses[edge.second])
             for edge in self.motions
@@ -135,7 +157,11 @@ class Collector:
         self._steps = [step for step in self._steps if step[0] > done_ns]
 
     def _posed(
-        self, stamp_ns: int, scan: KeyScan | None, up_base: NDArray[np.float64] | None
+        self,
+        stamp_ns: int,
+        scan: KeyScan | None,
+        up_base: NDArray[np.float64] | None,
+        landmarks: Landmarks | None,
     ) -> KeyPose | None:
         known = self._known(stamp_ns)
         if known is None:
@@ -149,6 +175,7 @@ class Collector:
             drift=self._bridge if known.module == BRIDGED else MAPPED,
             reported=known.covariance,
             up_base=up_base,
+            landmarks=landmarks,
         )
 
     def _append(self, part: list[KeyPose]) -> None:
@@ -177,3 +204,9 @@ class Collector:
             return EdgeKind.HANDOVER
         bridged = sum(each.module == BRIDGED for each in [*self._part, pose])
         return EdgeKind.BRIDGE if 2 * bridged > len(self._part) else EdgeKind.MOTION
+
+
+def _at(path: Path, stamp_ns: int) -> Transform:
+    pose = path(stamp_ns)
+    assert pose is not None, "a step has a pose"
+    return pose

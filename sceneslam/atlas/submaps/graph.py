@@ -10,19 +10,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.types import planar
-from sceneslam.types.planar import Matrix, Planar
+from sceneslam.types import planar, se3
+from sceneslam.types.planar import Matrix
 from sceneslam.types.se3 import Transform
 
-_CHI2_3, _CHI2_6 = 11.34, 16.81  # chi-square with 3 and 6 degrees of freedom, 99th percentile
+_CHI2_6 = 16.81  # chi-square with 6 degrees of freedom, 99th percentile
 _FIXED = np.repeat([1e-4, 1e-5], 3)  # m, rad
 _LOOSE = np.array([10.0, 10.0, 1.0, 0.05, 0.05, 3.0])  # m, rad: any loop moves it
 _FLOOR = np.array([0.05, 0.02, 0.02]) ** 2  # m, rad: height and tilt between places of one floor
+_TILT_RAD = 0.04  # that modules drift in pitch along a corridor, before they are held upright
 _UPRIGHT_RAD = 0.01  # half a degree: of gyro and gravity, and as floors are uneven
 LOADED = -1  # node of a loaded map
 _TO_GTSAM = [3, 4, 5, 0, 1, 2]  # rotation first, and back
@@ -38,54 +39,23 @@ class EdgeKind(IntEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _NodePair:
-    """Two nodes between which a motion was measured."""
+class Edge:
+    """A measured motion between two nodes."""
 
     first: int
     second: int
+    T_first_second: Transform
+    covariance: NDArray[np.float64]  # (6, 6) of se3.log order [m, rad], axes of second
     kind: EdgeKind
 
-    def shifted(self, by: int) -> Self:
+    def shifted(self, by: int) -> Edge:
         """Return the edge with its node numbers increased by `by`."""
         return replace(self, first=self.first + by, second=self.second + by)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Edge(_NodePair):
-    """A measured motion between two nodes."""
-
-    T_first_second: Transform
-    covariance: NDArray[np.float64]  # (6, 6) of se3.log order [m, rad], axes of second
-
-    @property
-    def planar(self) -> PlanarEdge:
-        """Return the motion in the plane."""
-        return PlanarEdge(
-            first=self.first,
-            second=self.second,
-            T_first_second=planar.from_transform(self.T_first_second),
-            covariance=planar.planar_covariance(self.covariance),
-            kind=self.kind,
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PlanarEdge(_NodePair):
-    """A measured motion between two nodes on one floor, as a map keeps it."""
-
-    T_first_second: Planar
-    covariance: Matrix  # (3, 3), axes of second
-
-    @property
-    def spatial(self) -> Edge:
-        """Return the motion in space: neither height nor tilt changes on a floor."""
-        return Edge(
-            first=self.first,
-            second=self.second,
-            T_first_second=planar.to_transform(self.T_first_second),
-            covariance=planar.spatial_covariance(self.covariance, level=_FLOOR),
-            kind=self.kind,
-        )
+def on_floor(covariance: Matrix) -> NDArray[np.float64]:
+    """Return the covariance (6, 6) of a motion on one floor from that in the plane (3, 3)."""
+    return planar.spatial_covariance(covariance, level=_FLOOR)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -198,37 +168,38 @@ def _noise(gtsam: Any, covariance: NDArray[np.float64]) -> Any:
 
 
 def consistent(
-    loops: Sequence[PlanarEdge], T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
+    loops: Sequence[Edge], T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
 ) -> list[int]:
     """Return the indices of the largest set of loops that agree pairwise within the drift.
 
-    `T_map_node` (N, 3) are the estimated nodes [m, m, rad], `drift` (N, 3) the standard deviations
+    `T_map_node` (N, 4, 4) are the estimated nodes, `drift` (N, 3) the standard deviations
     [m, m, rad], summed up along the path to each node.
     """
-    count = len(loops)
-    agree = np.zeros((count, count), bool)
-    for row in range(count):
-        for column in range(row):
-            agree[row, column] = _agree(loops[row], loops[column], T_map_node, drift)
-    agree |= agree.T
-    return _largest_clique(agree)
+    agree = np.zeros((len(loops), len(loops)), bool)
+    for row in range(1, len(loops)):
+        agree[row, :row] = _agree(loops[row], loops[:row], T_map_node, drift)
+    return _largest_clique(agree | agree.T)
 
 
 def _agree(
-    a: PlanarEdge, b: PlanarEdge, T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
-) -> bool:
-    """Tell whether the cycle of a, the path to b's end, b and the path back closes."""
-    T_ends = planar.between(T_map_node[a.second], T_map_node[b.second])
-    T_starts = planar.between(T_map_node[a.first], T_map_node[b.first])
-    around = planar.compose(a.T_first_second, T_ends)
-    straight = planar.compose(T_starts, b.T_first_second)
-    off = planar.between(straight, around)
-    lever_m = float(np.hypot(*T_ends[:2]) + np.hypot(*T_starts[:2]))
-    path = np.abs(drift[a.second] - drift[b.second]) + np.abs(drift[a.first] - drift[b.first])
-    path[:2] += 0.5 * lever_m * path[2]
-    measured = np.sqrt(np.diag(a.covariance) + np.diag(b.covariance))
-    measured[:2] += lever_m * np.sqrt(a.covariance[2, 2])
-    return bool(((off / np.hypot(path, measured)) ** 2).sum() < _CHI2_3)
+    a: Edge, others: Sequence[Edge], T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Tell of each other loop b whether the cycle of a, the path to b's end, b and back closes."""
+    firsts, seconds = np.array([(b.first, b.second) for b in others]).T
+    T_ends = se3.inverse(T_map_node[a.second]) @ T_map_node[seconds]
+    T_starts = se3.inverse(T_map_node[a.first]) @ T_map_node[firsts]
+    T_others = np.array([b.T_first_second for b in others])
+    off = se3.log(se3.inverse(T_starts @ T_others) @ a.T_first_second @ T_ends)
+    drifted = np.abs(drift[a.second] - drift[seconds]) + np.abs(drift[a.first] - drift[firsts])
+    x_m, y_m, yaw_rad = drifted.T
+    lever_m = np.linalg.norm(T_ends[:, :3, 3], axis=1) + np.linalg.norm(T_starts[:, :3, 3], axis=1)
+    tilt_rad = yaw_rad + _TILT_RAD
+    path = np.stack([x_m, y_m, np.maximum(x_m, y_m), tilt_rad, tilt_rad, yaw_rad], axis=1)
+    path[:, :3] += 0.5 * lever_m[:, None] * path[:, [5, 5, 4]]
+    covariance = np.array([b.covariance for b in others])
+    covariance += se3.carried(a.covariance, se3.inverse(T_ends))
+    measured = np.diagonal(covariance, axis1=1, axis2=2)
+    return np.asarray((off**2 / (path**2 + measured)).sum(axis=1) < _CHI2_6)
 
 
 def _largest_clique(agree: NDArray[np.bool_]) -> list[int]:

@@ -11,7 +11,7 @@ from sceneslam.atlas.places.floor_plan import FloorPlan, join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.plan_search import SearchWindow
 from sceneslam.atlas.places.recognition import Recognizer
-from sceneslam.atlas.submaps.graph import EdgeKind, PlanarEdge
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind, on_floor
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.types import planar
 from sceneslam.types.planar import Planar
@@ -35,7 +35,7 @@ class LoopFinder:
 
     def loops_to(
         self, second: int, T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
-    ) -> list[PlanarEdge]:
+    ) -> list[Edge]:
         """Return the verified loops from earlier submaps to one, near the graph's estimate.
 
         `T_map_node` (N, 3) are the estimated nodes [m, m, rad], `drift` (N, 3) the standard
@@ -54,11 +54,11 @@ class LoopFinder:
             if np.hypot(off[0], off[1]) > window.half_m or abs(off[2]) > window.half_rad:
                 continue
             found.append(
-                PlanarEdge(
+                Edge(
                     first=first,
                     second=second,
-                    T_first_second=match.T_target_query,
-                    covariance=match.covariance,
+                    T_first_second=planar.to_transform(match.T_target_query),
+                    covariance=on_floor(match.covariance),
                     kind=EdgeKind.LOOP,
                 )
             )

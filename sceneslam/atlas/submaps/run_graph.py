@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.localizer import Fix
 from sceneslam.atlas.submaps.collector import Collector
-from sceneslam.atlas.submaps.graph import Edge, EdgeKind, PlanarEdge, Upright, consistent, solve
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind, Upright, consistent, solve
 from sceneslam.atlas.submaps.loop_closure import LoopFinder
 from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops, recognized_loops
 from sceneslam.motion.tilt import upright
@@ -25,7 +25,7 @@ class SolvedRun:
     """The run's nodes after optimisation, and the accepted loops."""
 
     T_map_node: NDArray[np.float64]  # (N, 4, 4), as many as the run has submaps
-    loops: tuple[PlanarEdge, ...]  # nodes of the loaded map are counted first
+    loops: tuple[Edge, ...]  # nodes of the loaded map are counted first
 
 
 class RunGraph:
@@ -59,28 +59,22 @@ class RunGraph:
             for second in range(len(own.submaps) if own.is_level else 0)
             for edge in finder.loops_to(second, plane, drift)
         ]
-        loops = [
-            *((edge, edge.spatial) for edge in fixed),
-            *((edge.planar, edge) for edge in recognized),
-            *((edge, edge.spatial) for edge in found),
-        ]
-        nodes = np.concatenate([self._loaded.T_map_node, plane])
-        agreeing = consistent(
-            [edge for edge, _ in loops], nodes, np.concatenate([np.zeros((count, 3)), drift])
-        )
+        loops = [*fixed, *recognized, *found]
+        nodes = np.concatenate([self._loaded.T_map_node, T_map_node])
+        agreeing = consistent(loops, nodes, np.concatenate([np.zeros((count, 3)), drift]))
         if len(agreeing) < 2 and not fixed:
             agreeing = []  # no other loop agrees with it
         solved = solve(
-            np.concatenate([planar.to_transforms(self._loaded.T_map_node), T_map_node]),
+            nodes,
             [edge.shifted(count) for edge in motions],
-            [loops[index][1] for index in agreeing],
+            [loops[index] for index in agreeing],
             fixed=range(count),
             loose=count,
             uprights=self._uprights(T_map_node),
         )
         return SolvedRun(
             T_map_node=solved.T_map_node[count:],
-            loops=tuple(loops[agreeing[index]][0] for index in solved.accepted),
+            loops=tuple(loops[agreeing[index]] for index in solved.accepted),
         )
 
     def _uprights(self, T_map_node: NDArray[np.float64]) -> list[Upright]:
@@ -120,30 +114,32 @@ class RunGraph:
             )
         return found
 
-    def _fix_edges(self, fixes: Sequence[Fix]) -> list[PlanarEdge]:
-        """Return the loops from the loaded map's submaps to the run's, at most one per run submap.
+    def _fix_edges(self, fixes: Sequence[Fix]) -> list[Edge]:
+        """Return the loops from the loaded map's submaps to the run's.
 
-        More would not be independent: fixes in one place share their errors.
+        Those to one submap weigh as much as one: fixes in one place share their errors.
         """
-        edges: dict[int, PlanarEdge] = {}
+        edges: dict[int, list[Edge]] = {}
         for fix in fixes:
             node, pose = self._own.node_at(fix.stamp_ns), self._path(fix.stamp_ns)
-            if pose is not None and node not in edges:
+            if pose is not None:
                 T_base_node = se3.inverse(pose) @ self._own.T_run_node[node]
-                edges[node] = self._fix_edge(fix, node, T_base_node)
-        return list(edges.values())
+                edges.setdefault(node, []).append(self._fix_edge(fix, node, T_base_node))
+        return [
+            replace(edge, covariance=len(same) * edge.covariance)
+            for same in edges.values()
+            for edge in same
+        ]
 
-    def _fix_edge(self, fix: Fix, node: int, T_base_node: Transform) -> PlanarEdge:
+    def _fix_edge(self, fix: Fix, node: int, T_base_node: Transform) -> Edge:
         """Return the loop to a node from the nearest submap of the loaded map."""
         nodes = self._loaded.T_map_node
-        away_m = np.hypot(*(nodes[:, :2] - fix.T_map_base[:2]).T)
+        away_m = np.linalg.norm(nodes[:, :3, 3] - fix.T_map_base[:3, 3], axis=1)
         first = int(np.argmin(np.where(self._loaded.pieces == 0, away_m, np.inf)))
-        T_map_node = planar.compose(fix.T_map_base, planar.from_transform(T_base_node))
-        covariance = planar.spatial_covariance(fix.match.covariance)
-        return PlanarEdge(
+        return Edge(
             first=first,
             second=self._count + node,
-            T_first_second=planar.between(nodes[first], T_map_node),
-            covariance=planar.planar_covariance(se3.carried(covariance, se3.inverse(T_base_node))),
+            T_first_second=se3.inverse(nodes[first]) @ fix.T_map_base @ T_base_node,
+            covariance=se3.carried(fix.covariance, se3.inverse(T_base_node)),
             kind=EdgeKind.LOOP,
         )

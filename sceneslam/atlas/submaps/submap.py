@@ -16,6 +16,7 @@ from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar, se3
 from sceneslam.types.planar import Planar
 from sceneslam.types.se3 import Transform
+from sceneslam.views.view import Landmarks, PlacedView
 
 LENGTH_M = 2.5  # length of path in a submap: by MAPPED it drifts 1 cm
 TURN_RAD = 2 * np.pi  # or this much turning, after which everything around was seen
@@ -35,6 +36,7 @@ class KeyPose:
     drift: Drift  # of the motion from the one before
     reported: Covariance | None  # (6, 6) of T_local_base, as the module reported it
     up_base: NDArray[np.float64] | None = None  # (3,), the measured vertical direction, if known
+    landmarks: Landmarks | None = None  # that the camera saw
 
 
 class Drawing:
@@ -65,6 +67,7 @@ class Submap:
     stamps_ns: NDArray[np.int64]  # (K,) of its poses
     T_submap_base: NDArray[np.float64]  # (K, 3)
     drawing: Drawing  # of its plan
+    views: tuple[PlacedView, ...] = ()
 
     @property
     def plan(self) -> FloorPlan:
@@ -88,6 +91,15 @@ def make_submap(poses: Sequence[KeyPose], run: int) -> Submap:
         stamps_ns=np.array([pose.stamp_ns for pose in poses], np.int64),
         T_submap_base=np.array(T_submap_base),
         drawing=Drawing(scans=[(T, scan) for T, scan in placed if scan is not None]),
+        views=tuple(
+            PlacedView(
+                stamp_ns=pose.stamp_ns,
+                T_submap_base=se3.inverse(first.T_map_base) @ pose.T_map_base,
+                landmarks=pose.landmarks,
+            )
+            for pose in poses
+            if pose.landmarks is not None
+        ),
     )
 
 

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
+from sceneslam.views.place_index import PlaceIndex
 
 from ..map.keyframes import Keyframe
 from ..map.visual_map import VisualMap
 from ..see.features import Features
 from .localizer import VisualFix, VisualLocalizer
-from .places import PlaceIndex
 
 _MIN_FOUND_RATIO = 0.2  # of the expected landmarks, found at least
 _MIN_SURFACE_RATIO = 0.7  # of the surfaces in both depth images, agreeing at least

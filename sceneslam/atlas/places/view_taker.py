@@ -1,0 +1,57 @@
+"""Take views along the path: to be kept in the map, and to be compared with a loaded one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sceneslam.types import se3
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig
+from sceneslam.types.se3 import Transform
+from sceneslam.views.view import LandmarkView, LandmarkViewer
+
+_APART_M, _APART_RAD = 0.3, 0.25  # between two views that are kept: 60 kB per metre of path
+_READOUT_S = 0.03  # of a rolling shutter: in a turn, rows see from different directions
+_SHEAR_MAX_RAD = 0.015  # a degree: of a view that is kept
+
+
+class ViewTaker:
+    """Knows how fast the camera turns, and where views were taken."""
+
+    def __init__(self, rig: Rig, *, is_keeping: bool) -> None:
+        """`is_keeping`: views are kept in the map."""
+        self._viewer, self._is_keeping = LandmarkViewer.of(rig), is_keeping
+        self._T_run_kept: Transform | None = None  # of the last view that was kept
+        self._last: tuple[int, Transform] | None = None  # stamp and pose
+        self._shear_rad = 0.0
+
+    def move(self, stamp_ns: int, T_run_base: Transform) -> None:
+        """Follow the pose (4, 4) of every observation."""
+        if self._viewer is None:
+            return
+        if self._last is not None:
+            turn_rad = float(se3.rotation_angle_rad(se3.inverse(self._last[1]) @ T_run_base))
+            elapsed_s = max(stamp_ns - self._last[0], 1) / 1e9
+            self._shear_rad = turn_rad * _READOUT_S / elapsed_s
+        self._last = stamp_ns, T_run_base
+
+    def is_kept(self, T_run_base: Transform) -> bool:
+        """Tell whether a view from a pose is to be kept."""
+        if self._viewer is None or not self._is_keeping or self._shear_rad > _SHEAR_MAX_RAD:
+            return False
+        if self._T_run_kept is None:
+            return True
+        away = se3.inverse(self._T_run_kept) @ T_run_base
+        is_far = np.linalg.norm(away[:3, 3]) >= _APART_M
+        return bool(is_far or se3.rotation_angle_rad(away) >= _APART_RAD)
+
+    def take(
+        self, observation: Observation, T_run_base: Transform, *, is_kept: bool
+    ) -> LandmarkView | None:
+        """Return the view of an observation, None if it shows too little."""
+        if self._viewer is None:
+            return None
+        view = self._viewer.look(observation, shear_rad=self._shear_rad)
+        if is_kept and view is not None:
+            self._T_run_kept = T_run_base
+        return view

@@ -1,0 +1,166 @@
+"""Find the place of a view among those of a map, and the pose there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.rig import Camera
+from sceneslam.types.se3 import Transform
+from sceneslam.views.place_index import PlaceIndex
+from sceneslam.views.view import Landmarks, LandmarkView
+
+_CLUSTERS, _PER_CLUSTER = 4, 2  # places that are looked at, and views of each
+_CLUSTER_M = 2.0  # views this near show one place
+_RATIO = 0.8  # of the best match's distance to the second's (Lowe, IJCV 2004)
+_ERROR_PX, _SIGMA_PX = 3.0, 1.0  # of a match's ray, at most and usually
+_ITERATIONS, _CONFIDENCE = 300, 0.9999
+_MATCHES_MIN = 25  # right by the pose found; by chance 6 to 8 of 300 are (three of them always)
+_FOUND_MIN = 0.15  # of the landmarks in view
+_SURFACE_MIN = 0.7  # of the matches with depth, within the tolerance
+_SURFACE_M, _SURFACE_RATIO = 0.05, 0.03  # per metre: what depth cameras of 5 m range measure to
+_DEVIATION_MAX_M = 0.03  # of the pose: what agrees within 0.1 m is then no chance
+_NEAR_M = 0.1  # nothing nearer is in view
+_ALIKE = 0.6  # another place with so many of the best one's matches, and nothing is recognized
+_SAME_M, _SAME_RAD = 0.3, 0.15
+_FLOOR = np.repeat([0.01, 0.004], 3) ** 2  # m, rad: of the map's landmarks among each other
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sighting:
+    """The pose of a view in the map."""
+
+    T_map_base: Transform
+    covariance: NDArray[np.float64]  # (6, 6) of se3.log order, base frame
+    matches: int
+
+
+class ViewFinder:
+    """Recognizes views by the landmarks of a map, at any pose.
+
+    Places that look alike are not recognized where the map has both of them.
+    """
+
+    def __init__(self, camera: Camera, placed: Sequence[tuple[Transform, Landmarks]]) -> None:
+        """Take views with their poses T_map_base (4, 4)."""
+        self._camera, self._placed = camera, list(placed)
+        self._index = PlaceIndex()
+        for number, (_, landmarks) in enumerate(self._placed):
+            self._index.insert(number, landmarks.descriptors)
+        self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
+
+    def __len__(self) -> int:
+        return len(self._placed)
+
+    def recognize(self, view: LandmarkView) -> Sighting | None:
+        """Return the pose of a view, None if it shows no place of the map, or two alike."""
+        found = [one for k in self._candidates(view) if (one := self._at(k, view)) is not None]
+        if not found:
+            return None
+        best = max(found, key=lambda one: one.matches)
+        for other in found:
+            if other.matches >= _ALIKE * best.matches and not _is_same(best, other):
+                return None
+        return best
+
+    def _candidates(self, view: LandmarkView) -> list[int]:
+        """Return the most similar views, a few of each of the most similar places."""
+        chosen: list[int] = []
+        clusters: list[tuple[NDArray[np.float64], int]] = []
+        for likeness in self._index.alike(view.descriptors):
+            at = self._placed[likeness.place_id][0][:3, 3]
+            near = next(
+                (k for k, (c, _) in enumerate(clusters) if np.linalg.norm(c - at) < _CLUSTER_M),
+                None,
+            )
+            if near is None:
+                if len(clusters) == _CLUSTERS:
+                    continue
+                clusters.append((at, 0))
+                near = len(clusters) - 1
+            centre, count = clusters[near]
+            if count < _PER_CLUSTER:
+                clusters[near] = centre, count + 1
+                chosen.append(likeness.place_id)
+            if len(chosen) == _CLUSTERS * _PER_CLUSTER:
+                break
+        return chosen
+
+    def _at(self, number: int, view: LandmarkView) -> Sighting | None:
+        """Return the pose by the landmarks of one view of the map."""
+        T_map_seen, landmarks = self._placed[number]
+        pairs = self._matcher.knnMatch(landmarks.descriptors, view.descriptors, k=2)
+        good = [pair[0] for pair in pairs if pair[0].distance < _RATIO * pair[-1].distance]
+        if len(good) < _MATCHES_MIN:
+            return None
+        rows = np.array([match.queryIdx for match in good])
+        columns = np.array([match.trainIdx for match in good])
+        points, rays = landmarks.points_base[rows].astype(float), view.rays[columns].astype(float)
+        error = _ERROR_PX / self._camera.fx
+        is_found, turn, shift, inliers = cv2.solvePnPRansac(
+            points,
+            rays,
+            np.eye(3),
+            None,
+            iterationsCount=_ITERATIONS,
+            reprojectionError=error,
+            confidence=_CONFIDENCE,
+            flags=cv2.SOLVEPNP_AP3P,
+        )
+        if not is_found or inliers is None or len(inliers) < _MATCHES_MIN:
+            return None
+        kept = inliers[:, 0]
+        turn, shift = cv2.solvePnPRefineLM(points[kept], rays[kept], np.eye(3), None, turn, shift)
+        T_cam_seen = se3.identity()
+        T_cam_seen[:3, :3], T_cam_seen[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+        if not self._is_verified(T_cam_seen, landmarks, points[kept], view.depth_m[columns[kept]]):
+            return None
+        covariance = self._covariance(np.asarray(se3.apply(T_cam_seen, points[kept]), np.float64))
+        covariance += view.shear_rad**2 * np.eye(6)  # seen a metre away, a turn is a shift
+        if np.linalg.eigvalsh(covariance[:3, :3])[-1] > _DEVIATION_MAX_M**2:
+            return None
+        T_seen_base = se3.inverse(T_cam_seen) @ se3.inverse(self._camera.T_base_cam)
+        return Sighting(
+            T_map_base=T_map_seen @ T_seen_base, covariance=covariance, matches=len(kept)
+        )
+
+    def _is_verified(
+        self,
+        T_cam_seen: Transform,
+        landmarks: Landmarks,
+        matched: NDArray[np.float64],
+        depth_m: NDArray[np.float32],
+    ) -> bool:
+        """Tell whether most landmarks in view were found, and at the depths (N,) [m] measured."""
+        camera, every = self._camera, se3.apply(T_cam_seen, landmarks.points_base.astype(float))
+        ahead = every[every[:, 2] > _NEAR_M]
+        uv_px = ahead[:, :2] / ahead[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        in_view = ((uv_px >= 0) & (uv_px < camera.size_wh)).all(axis=1)
+        if len(matched) < _FOUND_MIN * in_view.sum():
+            return False
+        z, seen = se3.apply(T_cam_seen, matched)[:, 2], depth_m > 0
+        off_m = np.abs(z - depth_m)[seen]
+        return bool((off_m <= _SURFACE_M + _SURFACE_RATIO * z[seen]).mean() >= _SURFACE_MIN)
+
+    def _covariance(self, points_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the covariance (6, 6) of base from matches at points (N, 3) in the camera."""
+        x, y, z = points_cam.T
+        rays = np.zeros((len(z), 2, 3))
+        rays[:, 0, 0] = rays[:, 1, 1] = 1.0 / z
+        rays[:, 0, 2], rays[:, 1, 2] = -x / z**2, -y / z**2
+        by_pose = np.concatenate([np.tile(-np.eye(3), (len(z), 1, 1)), se3.hat(points_cam)], axis=2)
+        J = (rays @ by_pose).reshape(-1, 6)
+        information = J.T @ J / (_SIGMA_PX / self._camera.fx) ** 2
+        T_base_cam = self._camera.T_base_cam
+        return se3.carried(np.linalg.inv(information), T_base_cam) + np.diag(_FLOOR)
+
+
+def _is_same(one: Sighting, other: Sighting) -> bool:
+    T = se3.inverse(one.T_map_base) @ other.T_map_base
+    is_near = np.linalg.norm(T[:3, 3]) <= _SAME_M
+    return bool(is_near and se3.rotation_angle_rad(T) <= _SAME_RAD)

@@ -1,0 +1,338 @@
+"""Places recognized by what a camera sees: landmarks with descriptors, and the pose among them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_atlas_maps import S, map_of
+
+from sceneslam.atlas.lasting.map_files import load_map_files, save_map_files
+from sceneslam.atlas.mapper import Mapper
+from sceneslam.atlas.places.floor_plan import join
+from sceneslam.atlas.places.localizer import LocalizationEvent, Look, MapLocalizer
+from sceneslam.atlas.places.view_taker import ViewTaker
+from sceneslam.atlas.submaps.collector import Known
+from sceneslam.evaluation.association import interpolated
+from sceneslam.sources.tum_rgbd import TumRgbd
+from sceneslam.types import se3
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Camera, Rig, Sensor
+from sceneslam.views.view import Landmarks, LandmarkView, LandmarkViewer, PlacedView
+from sceneslam.views.view_finder import Sighting, ViewFinder
+
+CAMERA = Camera(size_wh=(640, 480), fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+HERE, ELSEWHERE = se3.from_xy_yaw(2.0, 1.0, 0.4), se3.from_xy_yaw(-9.0, 4.0, 2.0)
+
+
+def place(seed, count=200):
+    """Landmarks of a wall with furniture, 2 to 4 m ahead of base, with random descriptors."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([2.0, -1.2, -0.8], [4.0, 1.2, 0.8], (count, 3))
+    descriptors = rng.integers(0, 256, (count, 32), dtype=np.uint8)
+    return Landmarks(points_base=points.astype(np.float32), descriptors=descriptors)
+
+
+def view_of(landmarks, T_seen_base, *, noise_px=0.5, shown=1.0, farther_m=0.0, shear_rad=0.0):
+    """What the camera sees of a place from a pose in it, and other things."""
+    rng = np.random.default_rng(7)
+    T_cam_seen = se3.inverse(T_seen_base @ CAMERA.T_base_cam)
+    points_cam = se3.apply(T_cam_seen, landmarks.points_base.astype(float))
+    is_shown = rng.random(len(points_cam)) < shown
+    rays = points_cam[:, :2] / points_cam[:, 2:] + rng.normal(0, noise_px / 500.0, (200, 2))
+    descriptors = landmarks.descriptors.copy()
+    descriptors[:, 0] ^= rng.integers(0, 256, len(descriptors), dtype=np.uint8)  # a few bits differ
+    descriptors[~is_shown] = rng.integers(0, 256, ((~is_shown).sum(), 32), dtype=np.uint8)
+    depth_m = (points_cam[:, 2] + farther_m).astype(np.float32)
+    return LandmarkView(
+        stamp_ns=0,
+        rays=rays.astype(np.float32),
+        descriptors=descriptors,
+        depth_m=depth_m,
+        landmarks=landmarks,
+        shear_rad=shear_rad,
+    )
+
+
+def finder(*placed):
+    return ViewFinder(CAMERA, placed)
+
+
+ASIDE = se3.exp(np.array([0.3, -0.2, 0.05, 0.02, -0.03, 0.1]))
+
+
+def test_a_view_is_recognized_with_the_pose_it_was_seen_from():
+    known = finder((HERE, place(1)), (ELSEWHERE, place(2)))
+    assert len(known) == 2
+    for T_map_seen, seed in ((HERE, 1), (ELSEWHERE, 2)):
+        found = known.recognize(view_of(place(seed), ASIDE))
+        off = se3.inverse(T_map_seen @ ASIDE) @ found.T_map_base
+        assert np.linalg.norm(off[:3, 3]) < 0.01 and se3.rotation_angle_rad(off) < 0.003
+        assert found.matches > 150
+        deviations = np.sqrt(np.diag(found.covariance))
+        assert (deviations[:3] >= 0.01).all() and (deviations[:3] < 0.015).all()
+    assert known.recognize(view_of(place(3), ASIDE)) is None
+
+
+def test_two_places_that_look_alike_are_not_recognized():
+    assert (
+        finder((HERE, place(1)), (ELSEWHERE, place(1))).recognize(view_of(place(1), ASIDE)) is None
+    )
+    near = HERE @ se3.exp(np.array([0.01, 0, 0, 0, 0, 0]))  # one place, kept twice
+    assert (
+        finder((HERE, place(1)), (near, place(1))).recognize(view_of(place(1), ASIDE)) is not None
+    )
+
+
+@pytest.mark.parametrize(
+    ("doubtful", "sound"),
+    [
+        ({"shown": 0.1}, {"shown": 0.5}),  # too few matches
+        ({"farther_m": 0.4}, {"farther_m": 0.1}),  # a picture of the place, on another wall
+        ({"shear_rad": 0.03}, {"shear_rad": 0.02}),  # seen in a fast turn
+    ],
+)
+def test_what_is_doubtful_is_not_recognized(doubtful, sound):
+    known = finder((HERE, place(1)))
+    assert known.recognize(view_of(place(1), ASIDE, **doubtful)) is None
+    assert known.recognize(view_of(place(1), ASIDE, **sound)) is not None
+
+
+def test_a_poster_that_hangs_elsewhere_now_is_not_its_old_place():
+    wall, seen = place(1), view_of(place(1), ASIDE)
+    poster = Landmarks(points_base=wall.points_base[:40], descriptors=wall.descriptors[:40])
+    rest = place(2, 600)  # that was around it
+    around = Landmarks(
+        points_base=np.concatenate([poster.points_base, rest.points_base]),
+        descriptors=np.concatenate([poster.descriptors, rest.descriptors]),
+    )
+    assert finder((HERE, poster)).recognize(seen) is not None
+    assert finder((HERE, around)).recognize(seen) is None
+
+
+# What a camera sees.
+
+
+def picture(seed=0):
+    """A wall of grey squares."""
+    rng = np.random.default_rng(seed)
+    squares = rng.integers(0, 256, (24, 32), dtype=np.uint8)
+    return np.repeat(np.kron(squares, np.ones((20, 20), np.uint8))[..., None], 3, axis=2)
+
+
+def seen(image=None, depth_m=2.0):
+    image = picture() if image is None else image
+    depth = np.broadcast_to(np.float32(depth_m), image.shape[:2]).copy()
+    return Observation(stamp_ns=5, image_bgr=image, depth_m=depth)
+
+
+def test_corners_have_their_rays_and_their_points_in_base():
+    view = LandmarkViewer(CAMERA).look(seen(depth_m=2.0))
+    assert view.stamp_ns == 5 and len(view.rays) == len(view.depth_m) == len(view.descriptors) > 100
+    assert (view.depth_m == 2.0).all()
+    points_cam = se3.apply(se3.inverse(CAMERA.T_base_cam), view.landmarks.points_base)
+    np.testing.assert_allclose(points_cam[:, 2], 2.0, rtol=1e-5)
+    np.testing.assert_allclose(points_cam[:, :2], 2.0 * view.rays, atol=1e-5)
+    uv_px = view.rays * 500.0 + [320.0, 240.0]
+    edges = np.abs((uv_px + 0.5) / 20.0 - np.rint((uv_px + 0.5) / 20.0)).max(axis=1)
+    assert np.median(edges) < 0.15  # at the squares' corners, to 3 pixels
+
+
+def test_lenses_bend_no_rays():
+    bent = replace(CAMERA, distortion=(-0.2, 0.05, 0.0, 0.0, 0.0))
+    straight, found = (LandmarkViewer(one).look(seen()) for one in (CAMERA, bent))
+    outer = np.hypot(*straight.rays.T) > 0.5
+    assert outer.sum() > 10
+    assert (np.hypot(*found.rays[outer].T) > 1.03 * np.hypot(*straight.rays[outer].T)).all()
+
+
+def test_what_shows_too_little_is_no_view():
+    viewer = LandmarkViewer(CAMERA)
+    assert viewer.look(seen(np.zeros((480, 640, 3), np.uint8))) is None  # dark
+    assert viewer.look(seen(depth_m=0.0)) is None and viewer.look(seen(depth_m=9.0)) is None
+    assert viewer.look(Observation(stamp_ns=0, image_bgr=picture())) is None
+    assert viewer.look(Observation(stamp_ns=0, depth_m=np.ones((480, 640), np.float32))) is None
+
+
+RIG = Rig(sensors=frozenset({Sensor.IMAGE, Sensor.DEPTH}), camera=CAMERA)
+
+
+def test_only_a_camera_that_measures_depth_takes_views():
+    assert LandmarkViewer.of(RIG) is not None
+    assert LandmarkViewer.of(replace(RIG, sensors=frozenset({Sensor.IMAGE}))) is None
+    assert LandmarkViewer.of(replace(RIG, camera=None)) is None
+    blind = ViewTaker(replace(RIG, camera=None), is_keeping=True)
+    blind.move(0, HERE)
+    assert not blind.is_kept(HERE) and blind.take(seen(), HERE, is_kept=False) is None
+
+
+def test_views_are_kept_a_third_of_a_metre_or_a_quarter_of_a_radian_apart():
+    taker = ViewTaker(RIG, is_keeping=True)
+    assert taker.is_kept(HERE)
+    assert taker.take(seen(np.zeros((480, 640, 3), np.uint8)), HERE, is_kept=True) is None
+    assert taker.is_kept(HERE)  # it was dark
+    taker.take(seen(), HERE, is_kept=True)
+    for away, is_kept in ((0.29, False), (0.31, True)):
+        assert taker.is_kept(HERE @ se3.from_xy_yaw(0.0, away, 0.0)) == is_kept
+    for turn, is_kept in ((0.24, False), (-0.26, True)):
+        assert taker.is_kept(HERE @ se3.from_xy_yaw(0.0, 0.0, turn)) == is_kept
+    taker.take(seen(), ELSEWHERE, is_kept=False)
+    assert not taker.is_kept(HERE)
+    assert not ViewTaker(RIG, is_keeping=False).is_kept(HERE)
+
+
+def test_views_are_not_kept_in_a_fast_turn_and_carry_its_shear():
+    taker = ViewTaker(RIG, is_keeping=True)
+    taker.move(0, HERE)
+    for rate_radps, is_kept in ((0.45, True), (0.55, False)):
+        taker.move(10**9, HERE)
+        after = HERE @ se3.from_xy_yaw(0.0, 0.0, 0.1 * rate_radps)
+        taker.move(11 * 10**8, after)
+        assert taker.is_kept(after) == is_kept
+        found = taker.take(seen(), after, is_kept=False)
+        assert found.shear_rad == pytest.approx(0.03 * rate_radps)
+
+
+# A run that looks for itself by them.
+
+
+class Eyes:
+    """A finder that answers as it is told."""
+
+    def __init__(self):
+        self.answer = None
+
+    def recognize(self, view):
+        return self.answer and Sighting(
+            T_map_base=self.answer[0], covariance=1e-4 * np.eye(6), matches=50
+        )
+
+
+def looking_by(eyes):
+    return MapLocalizer(join([]), eyes)
+
+
+def look(second, T_run_base=HERE):
+    return Look(
+        stamp_ns=round(second * S), T_run_base=T_run_base, view=view_of(place(1), se3.identity())
+    )
+
+
+def test_a_run_is_located_where_two_views_in_a_row_agree():
+    eyes = Eyes()
+    own = looking_by(eyes)
+    assert own.wants_view(look(0.0)) and own.compare([look(0.0)]) is LocalizationEvent.NOTHING
+    assert not own.wants_view(look(0.19)) and own.wants_view(look(0.2))
+    eyes.answer = (ELSEWHERE,)
+    assert own.compare([look(0.2)]) is LocalizationEvent.NOTHING
+    eyes.answer = (ELSEWHERE @ se3.from_xy_yaw(0.11, 0.0, 0.0),)
+    assert own.compare([look(0.4)]) is LocalizationEvent.NOTHING  # elsewhere
+    eyes.answer = (ELSEWHERE @ se3.from_xy_yaw(0.11, 0.0, 0.04),)
+    assert own.compare([look(0.6)]) is LocalizationEvent.FOUND
+    np.testing.assert_allclose(own.T_map_run @ HERE, eyes.answer[0], atol=1e-12)
+    (fix,) = own.fixes
+    assert fix.stamp_ns == round(0.6 * S) and fix.covariance[0, 0] == 1e-4
+
+
+def test_a_located_run_is_fixed_by_views_and_withdrawn_by_three_that_contradict():
+    eyes = Eyes()
+    own = looking_by(eyes)
+    eyes.answer = (ELSEWHERE,)
+    assert [own.compare([look(t)]) for t in (0.0, 0.2)][-1] is LocalizationEvent.FOUND
+    turned = HERE @ se3.from_xy_yaw(0.0, 0.0, 0.31)
+    assert own.is_due(look(1.3, turned)) and not own.is_due(look(1.1, turned))
+    assert not own.is_due(look(1.3, HERE @ se3.from_xy_yaw(0.3, 0.0, 0.29)))
+    eyes.answer = (ELSEWHERE @ se3.from_xy_yaw(0.1, 0.0, 0.31),)
+    assert own.compare([look(2.0, turned)]) is LocalizationEvent.FIXED
+    eyes.answer = None
+    assert own.compare([look(3.0, turned)]) is LocalizationEvent.NOTHING
+    eyes.answer = (ELSEWHERE @ se3.from_xy_yaw(3.0, 0.0, 0.0),)
+    said = [own.compare([look(second, turned)]) for second in (4, 5, 6)]
+    nothing = LocalizationEvent.NOTHING
+    assert said == [nothing, nothing, LocalizationEvent.WITHDRAWN]
+    assert own.T_map_run is None and own.fixes == []
+
+
+def kept_map():
+    return replace(
+        map_of(join([]), join([]), nodes=[[0, 0, 0], [5, 0, 1]], pieces=[0, 1]),
+        submaps=tuple(
+            replace(
+                one,
+                views=(
+                    PlacedView(stamp_ns=7, T_submap_base=HERE, landmarks=place(1)),
+                    PlacedView(stamp_ns=8, T_submap_base=ASIDE, landmarks=place(2, 50)),
+                )[: 2 - number],
+            )
+            for number, one in enumerate(map_of(join([]), join([])).submaps)
+        ),
+    )
+
+
+def test_views_are_saved_with_their_submaps(tmp_path):
+    saved = kept_map()
+    save_map_files(saved, tmp_path)
+    found = load_map_files(tmp_path)
+    assert [len(one.views) for one in found.submaps] == [2, 1]
+    for one, other in zip(found.submaps, saved.submaps, strict=True):
+        for view, kept in zip(one.views, other.views, strict=True):
+            assert view.stamp_ns == kept.stamp_ns
+            np.testing.assert_array_equal(view.T_submap_base, kept.T_submap_base)
+            for name in ("points_base", "descriptors"):
+                expected = getattr(kept.landmarks, name)
+                np.testing.assert_array_equal(getattr(view.landmarks, name), expected)
+    (second,) = found.views(1)
+    np.testing.assert_allclose(second[0], se3.from_xy_yaw(5, 0, 1) @ HERE, atol=1e-12)
+    assert len(found.views(0)) == 2
+
+
+@pytest.mark.parametrize(
+    ("folder", "camera", "scale"),
+    [
+        ("tum_fr1_rpy", dict.fromkeys(("fx", "fy", "cx", "cy", "distortion")), 5000.0),
+        (
+            "7scenes_redkitchen",
+            {"fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0, "distortion": None},
+            1000.0,
+        ),
+    ],
+)
+def test_a_camera_held_by_hand_finds_itself_in_the_map_of_the_first_half(
+    shared_data, folder, camera, scale
+):
+    source = TumRgbd(str(shared_data / folder), camera, scale, [0.3, 8.0], 0.02)
+    truth = source.ground_truth().trajectory
+    observations = list(source)
+    middle, saved, starts, events = len(observations) // 2, None, [], []
+    for part in (observations[:middle], observations[middle : middle + 60]):
+        stamps_ns = np.array([one.stamp_ns for one in part])
+        known = stamps_ns <= truth.stamps_ns[-1]
+        poses = dict(
+            zip(
+                stamps_ns[known].tolist(),
+                interpolated(truth, stamps_ns[known]).T_world_base,
+                strict=True,
+            )
+        )
+        starts.append(poses[part[0].stamp_ns])
+        T_run_gt = se3.inverse(starts[-1])
+        path = lambda ns, poses=poses, T=T_run_gt: T @ poses[ns]  # noqa: E731
+        mapper = Mapper(
+            source.rig,
+            known=lambda ns, path=path: Known(
+                T_map_base=path(ns), session=0, module="a", covariance=None
+            ),
+            note=lambda event, ns, **fields: events.append((event, fields)),
+            loaded=saved,
+            keeps_views=True,
+        )
+        for one in part:
+            if one.stamp_ns in poses:
+                mapper.observe(one, None)
+        located = mapper.T_map_run
+        mapper.finish(path, [], frozenset())
+        saved = mapper.saved()
+    assert [event for event, _ in events[:1]] == ["relocalized"]
+    assert events[0][1]["after_s"] < 1.5
+    off = se3.inverse(se3.inverse(starts[0]) @ starts[1]) @ located
+    assert np.linalg.norm(off[:3, 3]) < 0.035 and se3.rotation_angle_rad(off) < 0.0125
+    assert (saved.pieces == 0).all()
