@@ -15,12 +15,13 @@ from sceneslam.types.se3 import Transform
 from sceneslam.views.place_index import PlaceIndex
 from sceneslam.views.view import Landmarks, LandmarkView
 
-_CLUSTERS, _PER_CLUSTER = 4, 2  # places that are looked at, and views of each
-_CLUSTER_M = 2.0  # views this near show one place
+_LIKE = 40  # most similar views that candidates are taken from
+_PLACES, _PER_PLACE = 4, 2  # that are looked at, and views of each
+_PLACE_M = 2.0  # views this near show one place
 _RATIO = 0.8  # of the best match's distance to the second's (Lowe, IJCV 2004)
 _ERROR_PX, _SIGMA_PX = 3.0, 1.0  # of a match's ray, at most and usually
 _ITERATIONS, _CONFIDENCE = 300, 0.9999
-_MATCHES_MIN = 25  # right by the pose found; by chance 6 to 8 of 300 are (three of them always)
+_MATCHES_MIN = 25  # right by the pose found; by chance hardly more are than the three it is made of
 _FOUND_MIN = 0.15  # of the landmarks in view
 _SURFACE_MIN = 0.7  # of the matches with depth, within the tolerance
 _SURFACE_M, _SURFACE_RATIO = 0.05, 0.03  # per metre: what depth cameras of 5 m range measure to
@@ -70,26 +71,20 @@ class ViewFinder:
 
     def _candidates(self, view: LandmarkView) -> list[int]:
         """Return the most similar views, a few of each of the most similar places."""
-        chosen: list[int] = []
-        clusters: list[tuple[NDArray[np.float64], int]] = []
-        for likeness in self._index.alike(view.descriptors):
-            at = self._placed[likeness.place_id][0][:3, 3]
-            near = next(
-                (k for k, (c, _) in enumerate(clusters) if np.linalg.norm(c - at) < _CLUSTER_M),
-                None,
-            )
-            if near is None:
-                if len(clusters) == _CLUSTERS:
-                    continue
-                clusters.append((at, 0))
-                near = len(clusters) - 1
-            centre, count = clusters[near]
-            if count < _PER_CLUSTER:
-                clusters[near] = centre, count + 1
-                chosen.append(likeness.place_id)
-            if len(chosen) == _CLUSTERS * _PER_CLUSTER:
-                break
-        return chosen
+        places: list[list[int]] = []
+        for likeness in self._index.alike(view.descriptors)[:_LIKE]:
+            number = likeness.place_id
+            same = next((one for one in places if self._is_near(one[0], number)), None)
+            if same is None and len(places) < _PLACES:
+                places.append([number])
+            elif same is not None and len(same) < _PER_PLACE:
+                same.append(number)
+        return [number for place in places for number in place]
+
+    def _is_near(self, one: int, other: int) -> bool:
+        """Tell whether two views of the map show one place."""
+        at, there = (self._placed[number][0][:3, 3] for number in (one, other))
+        return bool(np.linalg.norm(at - there) < _PLACE_M)
 
     def _at(self, number: int, view: LandmarkView) -> Sighting | None:
         """Return the pose by the landmarks of one view of the map."""
