@@ -1,4 +1,4 @@
-"""A loop is rejected if its rotation contradicts that of wheels and gyro."""
+"""A loop is rejected if it contradicts wheels and gyro, or leads to what the map has no more."""
 
 from types import SimpleNamespace
 
@@ -23,9 +23,13 @@ def keyframe(index, *, stretch=0):
     return SimpleNamespace(T_local_base=T_local_base, odometry=odometry, features=None)
 
 
-def loops(off_rad, *, stretch=0):
-    """Return the loops of two keyframes that both recognize an old one, turned by `off_rad`."""
+def loops(off_rad, *, stretch=0, gone=None):
+    """Return the loops of two keyframes that both recognize an old one, turned by `off_rad`.
+
+    The keyframe `gone` is removed from the map between the two.
+    """
     keyframes = {k: keyframe(k, stretch=stretch * (k > 0)) for k in range(3)}
+    keyframes[-1] = keyframes[0]  # of the same place
     graph = PoseGraph()
     for k in keyframes:
         graph.insert(k)
@@ -39,7 +43,9 @@ def loops(off_rad, *, stretch=0):
     detector = LoopDetector(visual_map, SimpleNamespace(recognize=recognize), graph)
     found = []
     for recognized in (1, 2):
-        found = detector.check(Query(keyframe_id=recognized, depth_m=None), 0)
+        found = detector.check(Query(keyframe_id=recognized, depth_m=None), 1 - recognized)
+        if gone in graph:
+            graph.remove(gone)
     return found
 
 
@@ -50,3 +56,8 @@ def loops(off_rad, *, stretch=0):
 )
 def test_loop_turns_as_odometry_measured(off_rad, stretch, count):
     assert len(loops(off_rad, stretch=stretch)) == count
+
+
+@pytest.mark.parametrize(("gone", "count"), [(0, 0), (1, 0), (None, 2)])
+def test_a_loop_is_forgotten_whose_keyframe_was_removed(gone, count):
+    assert len(loops(0.0, gone=gone)) == count

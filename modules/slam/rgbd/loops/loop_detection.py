@@ -82,12 +82,16 @@ class LoopDetector:
         if not self._is_plausible(loop):
             return []
         earlier, self._hypothesis = self._hypothesis, loop
-        if earlier is None or earlier.keyframe_id not in self._graph:
+        if earlier is None or not self._is_there(earlier):
             return []
         if not self._agree(earlier, loop):
             return []
         self._hypothesis = None
         return [earlier, loop]
+
+    def _is_there(self, loop: LoopClosure) -> bool:
+        """Tell whether the map still has both keyframes of a loop."""
+        return loop.edge.start in self._graph and loop.edge.end in self._graph
 
     def is_news(self, loop: LoopClosure) -> bool:
         """Tell whether a loop moves its keyframe by more than its uncertainty."""
