@@ -205,7 +205,7 @@ def store() -> ZoneKind:
         lamps=tuple((x_m, 0.0, 1.2, 0.3) for x_m in (2.0, 6.0, 10.0)),
         power=6.0,
         is_lit=False,
-        slippery=(((3.2, 4.4), (-2.0, 2.0), 0.35), ((6.2, 7.4), (-2.0, 2.0), 0.35)),
+        slippery=tuple(((x_m, x_m + 1.2), (-2.0, 2.0), 0.35) for x_m in (3.2, 6.2, 8.6)),
     )
 
 
