@@ -13,6 +13,7 @@ from sceneslam.atlas.places.localizer import LocalizationEvent, Look, MapLocaliz
 from sceneslam.atlas.places.view_taker import ViewTaker
 from sceneslam.atlas.submaps.collector import Known
 from sceneslam.evaluation.association import interpolated
+from sceneslam.experiments.one_map.relocalization import camera_starts, together
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
@@ -336,3 +337,30 @@ def test_a_camera_held_by_hand_finds_itself_in_the_map_of_the_first_half(
     off = se3.inverse(se3.inverse(starts[0]) @ starts[1]) @ located
     assert np.linalg.norm(off[:3, 3]) < 0.035 and se3.rotation_angle_rad(off) < 0.0125
     assert (saved.pieces == 0).all()
+
+
+def map_with_views(poses, seeds, stamps_s):
+    """A map of one submap, at HERE, that keeps views of places from poses in them."""
+    views = []
+    for T_seen_base, seed, second in zip(poses, seeds, stamps_s, strict=True):
+        points = se3.apply(se3.inverse(T_seen_base), place(seed).points_base)
+        landmarks = Landmarks(points_base=points, descriptors=place(seed).descriptors)
+        T = se3.from_xy_yaw(10.0 * seed, 0.0, 0.0) @ T_seen_base
+        views.append(PlacedView(stamp_ns=second * S, T_submap_base=T, landmarks=landmarks))
+    saved = map_of(join([]), nodes=[[2.0, 1.0, 0.4]])
+    return replace(saved, submaps=(replace(saved.submaps[0], views=tuple(views)),))
+
+
+def test_starts_are_found_in_the_map_of_another_drive():
+    at_places = [se3.identity()] * 3
+    saved = map_with_views(at_places, (1, 2, 3), (0, 1, 2))
+    drive = map_with_views([ASIDE] * 5, (1, 1, 2, 9, 2), (0, 1, 2, 3, 9))
+    poses = {view.stamp_ns: HERE @ view.T_submap_base for view in drive.submaps[0].views}
+    found = camera_starts(saved, drive, CAMERA, poses.__getitem__, within_s=3.0)
+    # The first two see two known places within 3 s, the others one at most.
+    assert (found.count, found.found, found.wrong) == (5, 2, 0)
+    assert found.worst_m < 0.01 and found.found_ratio == 0.4
+    moved = {stamp_ns: se3.from_xy_yaw(1.0, 0.0, 0.0) @ T for stamp_ns, T in poses.items()}
+    assert camera_starts(saved, drive, CAMERA, moved.__getitem__, within_s=3.0).wrong == 2
+    both = together([found, found])
+    assert (both.count, both.found, both.found_ratio) == (10, 4, 0.4)
