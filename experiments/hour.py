@@ -16,7 +16,7 @@ import sys
 import time
 from pathlib import Path
 
-LAP_S, HOUR_S, PART_S = 43.7, 3600.0, 600.0
+LAP_S, HOUR_S, PART_S = 43.7, 3600.0, 600.0  # a lap of there_and_back
 RATE_HZ = 10.0
 OVERRIDES = [
     "+scenario=there_and_back",

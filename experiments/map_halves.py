@@ -72,7 +72,7 @@ def main() -> None:
     )
     joined_m, whole_m = (absolute_errors(one, truth, GAP_S).rmse_m for one in (joined, parts[2]))
     modules = [word.partition("=")[2] for word in overrides if word.startswith("slam@slam.only")]
-    row = [folder.name, (modules or ["rgbd"])[0], f"{found_s[0]:.1f}" if found_s else "-"]
+    row = [folder.name, ["rgbd", *modules][-1], f"{found_s[0]:.1f}" if found_s else "-"]
     row += [f"{1e3 * joined_m:.1f}", f"{1e3 * whole_m:.1f}", f"{joined_m / whole_m:.2f}"]
     csv.writer(sys.stdout, lineterminator="\n").writerows([HEAD, row])
 

@@ -293,6 +293,7 @@ def with_arrays(folder, harm):
         ("node_run", np.zeros(2), r"node_run: expected <i8 of shape \(N, \), got <f8 \(2,\)"),
         ("node_run", np.int64(0), r"node_run: expected <i8 .*, got <i8 \(\)"),
         ("node_pose", np.zeros((2, 3)), r"node_pose: expected <f8 of shape \(N, 4, 4\), got"),
+        ("node_pose", np.zeros((2, 4, 4)), "node_pose: expected rotations and translations"),
         ("node_pose", np.full((2, 4, 4), np.nan), "node_pose: expected finite numbers"),
         ("node_piece", np.zeros(3, np.int64), "node_piece: expected 2 rows, got 3"),
         ("node_scans", np.array([2, 3]), "the submaps' scans do not add up to 4"),

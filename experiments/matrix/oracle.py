@@ -1,4 +1,4 @@
-"""The oracle: the best choice of one module per piece of the drive, made with the truth in hand."""
+"""The oracle: the best choice of one module per piece of the drive, knowing the true trajectory."""
 
 from __future__ import annotations
 
@@ -70,8 +70,8 @@ def _poses(module: Trajectory, stamps_ns: NDArray[np.int64]) -> NDArray[np.float
         return poses
     following = np.clip(np.searchsorted(module.stamps_ns, stamps_ns), 1, len(module) - 1)
     is_inside = (stamps_ns >= module.stamps_ns[0]) & (stamps_ns <= module.stamps_ns[-1])
-    is_told = is_inside & (np.diff(module.stamps_ns)[following - 1] < _GAP_NS)
-    poses[is_told] = interpolated(module, stamps_ns[is_told]).T_world_base
+    is_covered = is_inside & (np.diff(module.stamps_ns)[following - 1] < _GAP_NS)
+    poses[is_covered] = interpolated(module, stamps_ns[is_covered]).T_world_base
     return poses
 
 

@@ -1,7 +1,7 @@
 """The back end of a run: submaps, localization in a loaded map, and the final pose graph.
 
-The graph is spatial. Places are recognized by floor plans, so that scans which are not level are
-ignored; a module recognizes its own earlier sessions, and reports loops to them.
+The graph is spatial. Places are recognized by floor plans of level scans, and in a loaded map by
+what a camera sees; a module recognizes its own earlier sessions, and reports loops to them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from sceneslam.views.view_finder import ViewFinder
 
 _REST_NS = 1_000_000_000  # between two searches in the map while the robot stands
 _UNFOUND_NS = 5_000_000_000  # after this time a run reports that it was not located
-_RECENT = 80  # newest looks that the localizer gets
+_RECENT = 80  # newest looks with a scan that the localizer gets
 
 Note = Callable[..., None]  # event, stamp_ns, and its fields
 
@@ -62,7 +62,8 @@ class Mapper:
         self._localizer = self._made_localizer(rig)
         self._executor = executor("search", is_live=is_live)
         self._search: Future[LocalizationEvent] | None = None
-        self._recent: list[Look] = []
+        self._recent: list[Look] = []  # with a scan
+        self._is_level = True  # at the last step
         self._T_map_run: Transform | None = None
         self._began_ns: int | None = None
         self._has_told = False
@@ -77,7 +78,7 @@ class Mapper:
     @property
     def is_found(self) -> bool:
         """Tell whether the run was located in the loaded map, or no map was loaded."""
-        return self._localizer is None or self.is_placed
+        return self.is_placed or not self._loaded.submaps
 
     @property
     def T_map_run(self) -> Transform:
@@ -89,26 +90,32 @@ class Mapper:
         known = self._known(observation.stamp_ns)
         if known is None:
             return
-        self._views.move(observation.stamp_ns, known.T_map_base)
+        stamp_ns, localizer = observation.stamp_ns, self._localizer
+        self._views.move(stamp_ns, known.T_map_base)
+        if localizer is not None:
+            self._collect(localizer, stamp_ns)
+        look = Look(stamp_ns=stamp_ns, T_run_base=known.T_map_base)
         is_step = self._collector.has_moved(known.T_map_base)
-        look = Look(stamp_ns=observation.stamp_ns, T_run_base=known.T_map_base)
-        if not is_step and not self._looks(look):
+        is_scanned = is_step or self._rests(stamp_ns)
+        is_viewed = localizer is not None and self._search is None and localizer.wants_view(look)
+        if not (is_scanned or is_viewed):
             return
-        is_level = not is_step or self._collector.step_to(known.T_map_base)
-        scan = self._scanner.make(observation) if is_level else None
+        if is_step:
+            self._is_level = self._collector.step_to(known.T_map_base)
+        scan = self._scanner.make(observation) if is_scanned and self._is_level else None
         view, is_kept = None, is_step and self._views.is_kept(known.T_map_base)
-        if is_kept or (self._localizer is not None and self._localizer.wants_view(look)):
+        if is_kept or is_viewed:
             view = self._views.take(observation, known.T_map_base, is_kept=is_kept)
         if is_step:
             landmarks = view.landmarks if view is not None and is_kept else None
-            self._collector.add(observation.stamp_ns, scan, up_base, landmarks)
+            self._collector.add(stamp_ns, scan, up_base, landmarks)
         if scan is None and view is None:
             return
         if self._began_ns is None:
-            self._began_ns = observation.stamp_ns
-        if self._localizer is not None:
-            self._recent = [*self._recent[1 - _RECENT :], replace(look, scan=scan, view=view)]
-            self._localize(self._localizer, observation.stamp_ns)
+            self._began_ns = stamp_ns
+        if localizer is not None:
+            look = replace(look, scan=scan, view=view if is_viewed else None)
+            self._localize(localizer, look)
 
     def finish(self, path: Path, maps: Sequence[MapLayers], closed: frozenset[int]) -> Correction:
         """Solve the graph; return the correction of the poses.
@@ -169,26 +176,28 @@ class Mapper:
         """Return the localizer in the loaded map, None if it shows nothing."""
         plan, views = self._loaded.plan(), self._loaded.views()
         finder = None
-        if views and rig.camera is not None:
+        if views and rig.camera is not None and self._views.can_look:
             finder = ViewFinder(rig.camera, views)
         return MapLocalizer(plan, finder) if len(plan) or finder is not None else None
 
-    def _looks(self, look: Look) -> bool:
-        """Tell whether a robot that has not moved by a step should search the map."""
-        if self.is_found or self._localizer is None or not self._recent:
+    def _rests(self, stamp_ns: int) -> bool:
+        """Tell whether a robot at rest should search the map."""
+        if self.is_found or not self._recent:
             return False
-        is_rested = look.stamp_ns - self._recent[-1].stamp_ns >= _REST_NS
-        return is_rested or self._localizer.wants_view(look)
+        return stamp_ns - self._recent[-1].stamp_ns >= _REST_NS
 
-    def _localize(self, localizer: MapLocalizer, stamp_ns: int) -> None:
-        self._collect(localizer, stamp_ns)
+    def _localize(self, localizer: MapLocalizer, look: Look) -> None:
+        """Compare a look with the map, if it is time and no search is running."""
+        latest = [*self._recent[1 - _RECENT :], look]
+        if look.scan is not None:
+            self._recent = latest
         if self._search is not None:
             return
-        if localizer.is_due(self._recent[-1]):
-            self._search = self._executor.submit(localizer.compare, tuple(self._recent))
-            self._collect(localizer, stamp_ns)
+        if look.view is not None or (look.scan is not None and localizer.is_due(look)):
+            self._search = self._executor.submit(localizer.compare, tuple(latest))
+            self._collect(localizer, look.stamp_ns)
         else:
-            self._take(LocalizationEvent.NOTHING, localizer, stamp_ns)
+            self._take(LocalizationEvent.NOTHING, localizer, look.stamp_ns)
 
     def _collect(self, localizer: MapLocalizer, stamp_ns: int) -> None:
         if self._search is not None and self._search.done():

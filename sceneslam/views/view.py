@@ -15,7 +15,7 @@ from sceneslam.types.se3 import Transform
 
 _FEATURES = 500  # per image
 _FAST_MIN = 10  # least contrast of a corner
-FEWEST = 40  # located features of a view; with fewer no place is recognized
+_FEWEST = 40  # located features of a view; with fewer no place is recognized
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -33,7 +33,7 @@ class LandmarkView:
     stamp_ns: int
     rays: NDArray[np.float32]  # (N, 2): x / z and y / z in the camera frame, undistorted
     descriptors: NDArray[np.uint8]  # (N, 32)
-    depth_m: NDArray[np.float32]  # (N,), along the optical axis, 0 where none was measured
+    depth_m: NDArray[np.float32]  # (N,), along the optical axis, 0 = missing
     landmarks: Landmarks  # of the features with a depth
     shear_rad: float = 0.0  # between its first and last row, by the camera's turn
 
@@ -48,7 +48,7 @@ class PlacedView:
 
 
 class LandmarkViewer:
-    """Makes views of observations; None of one that shows too little."""
+    """Makes views of observations."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
@@ -62,13 +62,18 @@ class LandmarkViewer:
         return cls(rig.camera)
 
     def look(self, observation: Observation, *, shear_rad: float = 0.0) -> LandmarkView | None:
-        """Return the view of an observation."""
+        """Return the view of an observation.
+
+        None with too few features, without image or depth, or of another size than the camera's.
+        """
         image, depth_m, camera = observation.image_bgr, observation.depth_m, self._camera
         if image is None or depth_m is None:
             return None
-        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        if image.shape[1::-1] != tuple(camera.size_wh) or image.shape[:2] != depth_m.shape:
+            return None
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         corners, found = self._orb.detectAndCompute(grey, None)
-        if len(corners) < FEWEST:
+        if len(corners) < _FEWEST:
             return None
         descriptors = np.asarray(found, np.uint8)
         uv_px = np.array([corner.pt for corner in corners])
@@ -77,7 +82,7 @@ class LandmarkViewer:
         z = np.where(camera.measures(z), z, np.float32(0.0))
         rays = cv2.undistortPoints(uv_px[:, None], camera.K, np.array(camera.distortion))[:, 0]
         seen = np.flatnonzero(z)
-        if len(seen) < FEWEST:
+        if len(seen) < _FEWEST:
             return None
         points_cam = np.column_stack([rays[seen], np.ones(len(seen))]) * z[seen, None]
         points_base = se3.apply(camera.T_base_cam, points_cam)

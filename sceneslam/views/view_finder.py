@@ -24,7 +24,7 @@ _ITERATIONS, _CONFIDENCE = 300, 0.9999
 _MATCHES_MIN = 25  # right by the pose found; by chance hardly more are than the three it is made of
 _FOUND_MIN = 0.15  # of the landmarks in view
 _SURFACE_MIN = 0.7  # of the matches with depth, within the tolerance
-_SURFACE_M, _SURFACE_RATIO = 0.05, 0.03  # per metre: what depth cameras of 5 m range measure to
+_SURFACE_M, _SURFACE_RATIO = 0.05, 0.03  # 5 cm and 3 % of the depth: structured light at 5 m
 _DEVIATION_MAX_M = 0.03  # of the pose: what agrees within 0.1 m is then no chance
 _NEAR_M = 0.1  # nothing nearer is in view
 _ALIKE = 0.6  # another place with so many of the best one's matches, and nothing is recognized
@@ -55,12 +55,21 @@ class ViewFinder:
             self._index.insert(number, landmarks.descriptors)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
 
-    def __len__(self) -> int:
-        return len(self._placed)
+    def recognize(self, view: LandmarkView, around: Transform | None = None) -> Sighting | None:
+        """Return the pose of a view, None if it shows no place of the map, or two alike.
 
-    def recognize(self, view: LandmarkView) -> Sighting | None:
-        """Return the pose of a view, None if it shows no place of the map, or two alike."""
-        found = [one for k in self._candidates(view) if (one := self._at(k, view)) is not None]
+        With `around` (4, 4), T_map_base as it is expected, only what was seen near it counts.
+        """
+        near = None
+        if around is not None:
+            near = [
+                number
+                for number, (T_map_seen, _) in enumerate(self._placed)
+                if np.linalg.norm(T_map_seen[:3, 3] - around[:3, 3]) < _PLACE_M
+            ]
+        found = [
+            one for k in self._candidates(view, near) if (one := self._at(k, view)) is not None
+        ]
         if not found:
             return None
         best = max(found, key=lambda one: one.matches)
@@ -69,10 +78,10 @@ class ViewFinder:
                 return None
         return best
 
-    def _candidates(self, view: LandmarkView) -> list[int]:
+    def _candidates(self, view: LandmarkView, near: list[int] | None) -> list[int]:
         """Return the most similar views, a few of each of the most similar places."""
         places: list[list[int]] = []
-        for likeness in self._index.alike(view.descriptors)[:_LIKE]:
+        for likeness in self._index.alike(view.descriptors, near)[:_LIKE]:
             number = likeness.place_id
             same = next((one for one in places if self._is_near(one[0], number)), None)
             if same is None and len(places) < _PLACES:
@@ -91,10 +100,11 @@ class ViewFinder:
         T_map_seen, landmarks = self._placed[number]
         pairs = self._matcher.knnMatch(landmarks.descriptors, view.descriptors, k=2)
         good = [pair[0] for pair in pairs if pair[0].distance < _RATIO * pair[-1].distance]
-        if len(good) < _MATCHES_MIN:
+        best = {match.trainIdx: match for match in sorted(good, key=lambda one: -one.distance)}
+        if len(best) < _MATCHES_MIN:
             return None
-        rows = np.array([match.queryIdx for match in good])
-        columns = np.array([match.trainIdx for match in good])
+        rows = np.array([match.queryIdx for match in best.values()])
+        columns = np.array(list(best))
         points, rays = landmarks.points_base[rows].astype(float), view.rays[columns].astype(float)
         error = _ERROR_PX / self._camera.fx
         is_found, turn, shift, inliers = cv2.solvePnPRansac(
@@ -139,6 +149,8 @@ class ViewFinder:
         if len(matched) < _FOUND_MIN * in_view.sum():
             return False
         z, seen = se3.apply(T_cam_seen, matched)[:, 2], depth_m > 0
+        if not seen.any():
+            return False
         off_m = np.abs(z - depth_m)[seen]
         return bool((off_m <= _SURFACE_M + _SURFACE_RATIO * z[seen]).mean() >= _SURFACE_MIN)
 
@@ -150,7 +162,7 @@ class ViewFinder:
         rays[:, 0, 2], rays[:, 1, 2] = -x / z**2, -y / z**2
         by_pose = np.concatenate([np.tile(-np.eye(3), (len(z), 1, 1)), se3.hat(points_cam)], axis=2)
         J = (rays @ by_pose).reshape(-1, 6)
-        information = J.T @ J / (_SIGMA_PX / self._camera.fx) ** 2
+        information = J.T @ J / (_SIGMA_PX / self._camera.fx) ** 2 + np.eye(6)
         T_base_cam = self._camera.T_base_cam
         return se3.carried(np.linalg.inv(information), T_base_cam) + np.diag(_FLOOR)
 

@@ -26,6 +26,7 @@ from sceneslam.types.files import PART, replacing
 from sceneslam.views.view import Landmarks, PlacedView
 
 HEAD, FORMAT, VERSION = "map.yaml", "sceneslam-map", 2
+_ROUNDING = 1e-6  # of a rotation that was composed of many
 _ARRAYS = "arrays-"  # prefix, followed by the start of their checksum
 _SHAPES: Mapping[str, tuple[str, str, tuple[int, ...]]] = {  # name -> dtype, row of, inner shape
     "node_run": ("<i8", "submaps", ()),
@@ -155,6 +156,8 @@ def _check(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
             )
         if not np.isfinite(found).all():
             raise InputError(f"{name}: expected finite numbers: {path}")
+        if inner == (4, 4) and not _are_rigid(found):
+            raise InputError(f"{name}: expected rotations and translations: {path}")
         if counts.setdefault(rows, len(found)) != len(found):
             raise InputError(f"{name}: expected {counts[rows]} rows, got {len(found)}: {path}")
     sizes = -(-arrays["node_grid_shape"].prod(axis=1) // 8)
@@ -173,6 +176,14 @@ def _check(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
         raise InputError(f"edge_nodes: expected 0 to {counts['submaps'] - 1}: {path}")
     if not np.isin(kinds, [kind.value for kind in EdgeKind]).all():
         raise InputError(f"edge_kind: expected 0 to {max(EdgeKind)}: {path}")
+
+
+def _are_rigid(poses: NDArray[Any]) -> bool:
+    """Tell whether matrices (N, 4, 4) are rotations with translations."""
+    rotations = poses[:, :3, :3]
+    gram = rotations @ rotations.transpose(0, 2, 1)
+    is_straight = np.abs(gram - np.eye(3)).max(initial=0.0) < _ROUNDING
+    return bool(is_straight and (poses[:, 3] == [0.0, 0.0, 0.0, 1.0]).all())
 
 
 def _arrays(saved: SavedMap, modules: list[str]) -> dict[str, NDArray[Any]]:

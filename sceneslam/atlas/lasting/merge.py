@@ -13,7 +13,7 @@ from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.submaps.graph import Edge, EdgeKind, consistent, on_floor, solve
-from sceneslam.types import planar, se3
+from sceneslam.types import planar
 
 _AROUND = 1  # neighbouring submaps on either side that are searched together with one
 _LOOPS_MIN = 2  # agreeing loops, as a single one may come from a similar place
@@ -60,8 +60,10 @@ def _joined(saved: SavedMap, piece: int) -> SavedMap | None:
         return None
     nodes = np.array(saved.T_map_node)
     seed = agreeing[0]
-    T_first_piece = nodes[seed.first] @ seed.T_first_second @ se3.inverse(nodes[seed.second])
-    nodes[own] = T_first_piece @ nodes[own]
+    plane = saved.plane
+    at_seed = planar.compose(plane[seed.first], planar.from_transform(seed.T_first_second))
+    T_first_piece = planar.compose(at_seed, planar.between(plane[seed.second], np.zeros(3)))
+    nodes[own] = planar.to_transform(T_first_piece) @ nodes[own]
     solved = _solve(saved, nodes, own, agreeing)
     pieces = np.where(saved.pieces == piece, 0, saved.pieces)
     return replace(saved, T_map_node=solved, pieces=pieces, edges=(*saved.edges, *agreeing))
@@ -70,7 +72,10 @@ def _joined(saved: SavedMap, piece: int) -> SavedMap | None:
 def _loops(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
     """Return loops from the first piece to the submaps `own` of another piece."""
     main, plane = np.flatnonzero(saved.pieces == 0), saved.plane
-    target, found = Recognizer(PlanField(saved.plan())), []
+    walls = saved.plan()
+    if not len(walls):
+        return []
+    target, found = Recognizer(PlanField(walls)), []
     for row, node in enumerate(own):
         around = own[max(row - _AROUND, 0) : row + _AROUND + 1]
         near = [index for index in around if saved.submaps[index].run == saved.submaps[node].run]
@@ -97,7 +102,7 @@ def _loops(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
 def _solve(
     saved: SavedMap, nodes: NDArray[np.float64], own: Sequence[int], loops: Sequence[Edge]
 ) -> NDArray[np.float64]:
-    """Return the optimised nodes (N, 3); those of the other pieces stay."""
+    """Return the optimised nodes (N, 4, 4); those of the other pieces stay."""
     inside = set(own)
     motions = [edge for edge in saved.edges if edge.first in inside and edge.second in inside]
     solved = solve(

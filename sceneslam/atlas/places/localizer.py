@@ -26,8 +26,12 @@ from sceneslam.views.view_finder import ViewFinder
 _SPAN_M, _SPAN_SCANS = 6.0, 60  # length of path, and scans, that are compared with the map
 _PERIOD_S, _DOUBLINGS = 0.5, 4  # time between two searches; it doubles, up to 8 s
 _PATIENCE = 8  # after this many failed searches: each takes 0.1 s or more
-_AGAIN_NS = 200_000_000  # between two searches by views, each of which takes 20 ms
-_FIX_M, _FIX_RAD, _FIX_NS = 0.5, 0.3, 10**9  # way, turn and time between comparisons once located
+_AGAIN_NS = 200_000_000  # between two searches by views; each takes 20 ms in a map of 50 views
+_FIX_M, _FIX_RAD, _FIX_NS = (
+    0.5,
+    0.3,
+    10**9,
+)  # distance, turn and time between comparisons once located
 _AGREE_M, _AGREE_RAD = 0.1, 0.05  # two consecutive searches that agree within this are accepted
 _REACH_M, _REACH_RAD, _SIGMAS = 0.15, 0.05, 3.0  # search window of a fix around the prediction
 _DOUBTS = 3  # consecutive comparisons that contradict the map: the place was wrong
@@ -60,83 +64,107 @@ class Fix:
     stamp_ns: int
     T_map_base: Transform
     covariance: NDArray[np.float64]  # (6, 6) of se3.log order, base frame
+    is_by_view: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Guess:
+    """A place that one search found."""
+
+    T_map_run: Transform
+    is_by_view: bool
 
 
 class MapLocalizer:
     """Compares the last metres of a run with a map: its walls, and what a camera sees in it."""
 
     def __init__(self, plan: FloorPlan, views: ViewFinder | None = None) -> None:
-        """Take the map's walls, and its views if the run has a camera."""
+        """Take the map's walls, and its views if the run has a camera with depth."""
         self.T_map_run: Transform | None = None  # None until the run was located
         self.fixes: list[Fix] = []
-        self._walls, self._views = Recognizer(PlanField(plan)), views
-        self._next_ns = self._next_walls_ns = 0  # of views and of checks, of searches by walls
+        self._walls = Recognizer(PlanField(plan)) if len(plan) else None
+        self._views = views
+        self._next_walls_ns = self._next_view_ns = 0
         self._fixed_at: Look | None = None
-        self._guess: Transform | None = None  # T_map_run of the last search that found a place
+        self._guess: _Guess | None = None  # of the last search that found a place
         self._vain = self._doubts = 0
 
-    def wants_view(self, newest: Look) -> bool:
-        """Tell whether a view is to be compared at the newest look."""
-        return self._views is not None and self.is_due(newest)
-
     def is_due(self, newest: Look) -> bool:
-        """Tell whether it is time to compare at the newest look."""
-        if self.T_map_run is None or self._fixed_at is None:
-            return newest.stamp_ns >= (
-                self._next_walls_ns if self._views is None else self._next_ns
-            )
-        if newest.stamp_ns < self._next_ns:
-            return False
-        away = se3.inverse(self._fixed_at.T_run_base) @ newest.T_run_base
-        is_far = np.linalg.norm(away[:3, 3]) >= _FIX_M
-        return bool(is_far or se3.rotation_angle_rad(away) >= _FIX_RAD)
+        """Tell whether it is time to compare the walls at the newest look."""
+        return self._walls is not None and self._is_time(newest, self._next_walls_ns)
+
+    def wants_view(self, newest: Look) -> bool:
+        """Tell whether it is time to compare a view at the newest look."""
+        return self._views is not None and self._is_time(newest, self._next_view_ns)
 
     def compare(self, latest: Sequence[Look]) -> LocalizationEvent:
         """Compare the latest looks, oldest first, with the map."""
         newest = latest[-1]
         if self.T_map_run is not None:
-            return self._check(latest)
-        self._next_ns = newest.stamp_ns + _AGAIN_NS
-        fix = self._by_view(newest)
-        is_due = self._views is None or newest.stamp_ns >= self._next_walls_ns
-        if fix is None and newest.scan is not None and is_due:
+            return self._check(latest, self.T_map_run @ newest.T_run_base)
+        fix = self._by_view(newest, None)
+        if fix is None and self._compares_walls(newest):
             fix = self._by_walls(latest)
-            if fix is None:
-                self._guess = None
         if fix is None:
             return LocalizationEvent.NOTHING
         T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
-        before, self._guess = self._guess, T_map_run
-        if before is None or not _agree(before, T_map_run, newest.T_run_base):
+        before, self._guess = self._guess, _Guess(T_map_run=T_map_run, is_by_view=fix.is_by_view)
+        if before is None or not _agree(before.T_map_run, T_map_run, newest.T_run_base):
             return LocalizationEvent.NOTHING
         self._take(newest, fix)
         return LocalizationEvent.FOUND
 
-    def _by_view(self, newest: Look) -> Fix | None:
-        """Return the pose by what the camera sees."""
+    def _is_time(self, newest: Look, next_ns: int) -> bool:
+        """Tell whether the time has come, and a located robot has moved since its last fix."""
+        fixed_at = self._fixed_at  # live, another thread may change it
+        if newest.stamp_ns < next_ns or fixed_at is None:
+            return newest.stamp_ns >= next_ns
+        away = se3.inverse(fixed_at.T_run_base) @ newest.T_run_base
+        is_far = np.linalg.norm(away[:3, 3]) >= _FIX_M
+        return bool(is_far or se3.rotation_angle_rad(away) >= _FIX_RAD)
+
+    def _compares_walls(self, newest: Look) -> bool:
+        """Tell whether walls are compared; a look with a view may come before it is time."""
+        if newest.scan is None or self._walls is None:
+            return False
+        return newest.view is None or self.is_due(newest)
+
+    def _by_view(self, newest: Look, around: Transform | None) -> Fix | None:
+        """Return the pose by what the camera sees; near a pose (4, 4) first, if one is given."""
         if self._views is None or newest.view is None:
             return None
-        seen = self._views.recognize(newest.view)
+        self._next_view_ns = newest.stamp_ns + (_AGAIN_NS if around is None else _FIX_NS)
+        seen = None if around is None else self._views.recognize(newest.view, around)
+        if seen is None:
+            seen = self._views.recognize(newest.view)
         if seen is None:
             return None
-        return Fix(stamp_ns=newest.stamp_ns, T_map_base=seen.T_map_base, covariance=seen.covariance)
+        return Fix(
+            stamp_ns=newest.stamp_ns,
+            T_map_base=seen.T_map_base,
+            covariance=seen.covariance,
+            is_by_view=True,
+        )
 
     def _by_walls(self, latest: Sequence[Look]) -> Fix | None:
         """Return the pose by the walls around the last metres, searched in all of the map."""
+        assert self._walls is not None
         newest, query = latest[-1], _query(latest)
         match = self._walls.recognize(PlanField(query), None) if len(query) else None
         is_found = match is not None and not match.weak_directions
         self._vain = 0 if is_found else self._vain + 1
         period_s = _PERIOD_S * 2.0 ** min(self._vain // _PATIENCE, _DOUBLINGS)
         self._next_walls_ns = newest.stamp_ns + round(period_s * 1e9)
-        return _fix(newest, match) if match is not None and is_found else None
+        if match is None or not is_found:
+            if self._guess is not None and not self._guess.is_by_view:
+                self._guess = None  # two searches by walls have to agree in a row
+            return None
+        return _fix(newest, newest.T_run_base, match)
 
-    def _check(self, latest: Sequence[Look]) -> LocalizationEvent:
+    def _check(self, latest: Sequence[Look], T_map_base: Transform) -> LocalizationEvent:
         """Compare near the predicted pose; repeated contradictions withdraw the localization."""
-        assert self.T_map_run is not None and self._fixed_at is not None
+        assert self._fixed_at is not None
         newest = latest[-1]
-        self._next_ns = newest.stamp_ns + _FIX_NS
-        T_map_base = self.T_map_run @ newest.T_run_base
         away = se3.inverse(self._fixed_at.T_run_base) @ newest.T_run_base
         moved_m = float(np.linalg.norm(away[:3, 3]))
         turn_rad = WHEELS.rad_per_m * moved_m
@@ -146,36 +174,46 @@ class MapLocalizer:
             half_m=_REACH_M + _SIGMAS * WHEELS.per_m * moved_m,
             half_rad=_REACH_RAD + _SIGMAS * turn_rad,
         )
-        seen = self._by_view(newest)
-        near, is_contradicted = self._near_walls(latest, window)
-        for fix in (seen, near):
-            if fix is not None and _is_within(fix, T_map_base, window):
-                self._take(newest, fix)
-                return LocalizationEvent.FIXED
-        self._doubts = self._doubts + 1 if is_contradicted or seen is not None else 0
+        fix, is_contradicted = self._by_view(newest, T_map_base), False
+        if fix is not None and not _is_within(fix, T_map_base, window):
+            fix, is_contradicted = None, True
+        if fix is None and self._compares_walls(newest):
+            fix, by_walls = self._near_walls(latest, T_map_base, window)
+            is_contradicted |= by_walls
+        if fix is not None:
+            self._take(newest, fix)
+            return LocalizationEvent.FIXED
+        self._doubts = self._doubts + 1 if is_contradicted else 0
         if self._doubts < _DOUBTS:
             return LocalizationEvent.NOTHING
         self.T_map_run, self._guess, self._fixed_at = None, None, None
         self._doubts, self._vain, self.fixes = 0, 0, []
         return LocalizationEvent.WITHDRAWN
 
-    def _near_walls(self, latest: Sequence[Look], window: SearchWindow) -> tuple[Fix | None, bool]:
+    def _near_walls(
+        self, latest: Sequence[Look], T_map_base: Transform, window: SearchWindow
+    ) -> tuple[Fix | None, bool]:
         """Return the pose by the walls in a window, and whether they contradict its centre."""
+        assert self._walls is not None
         newest, query = latest[-1], _query(latest)
-        if newest.scan is None or not len(query):
+        self._next_walls_ns = newest.stamp_ns + _FIX_NS
+        if not len(query):
             return None, False
         field = PlanField(query)
         match = self._walls.recognize(field, window)
+        if match is not None:
+            fix = _fix(newest, T_map_base, match)
+            if _is_within(fix, T_map_base, window):
+                return fix, False
         there = register(field, self._walls.field, window.around)
-        is_contradicted = there.known_ratio >= _KNOWN_MIN and not there.is_verified
-        return None if match is None else _fix(newest, match), is_contradicted
+        return None, there.known_ratio >= _KNOWN_MIN and not there.is_verified
 
     def _take(self, newest: Look, fix: Fix) -> None:
         self.T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
         self._fixed_at = newest
         self.fixes.append(fix)
         self._doubts = self._vain = 0
-        self._next_ns = newest.stamp_ns + _FIX_NS
+        self._next_walls_ns = self._next_view_ns = newest.stamp_ns + _FIX_NS
 
 
 def _query(latest: Sequence[Look]) -> FloorPlan:
@@ -196,13 +234,12 @@ def _query(latest: Sequence[Look]) -> FloorPlan:
     return draw(scans)
 
 
-def _fix(newest: Look, match: PlanRegistration) -> Fix:
-    """Return the pose by walls; height and tilt are as the run has them."""
-    T_run_plane = planar.to_transform(planar.from_transform(newest.T_run_base))
-    T_map_run = planar.to_transform(match.T_target_query) @ se3.inverse(T_run_plane)
+def _fix(newest: Look, T_base: Transform, match: PlanRegistration) -> Fix:
+    """Return the pose by walls; height and tilt are those of T_base (4, 4), as it is estimated."""
+    T_plane = planar.to_transform(planar.from_transform(T_base))
     return Fix(
         stamp_ns=newest.stamp_ns,
-        T_map_base=T_map_run @ newest.T_run_base,
+        T_map_base=planar.to_transform(match.T_target_query) @ se3.inverse(T_plane) @ T_base,
         covariance=on_floor(match.covariance),
     )
 

@@ -25,6 +25,11 @@ class ViewTaker:
         self._last: tuple[int, Transform] | None = None  # stamp and pose
         self._shear_rad = 0.0
 
+    @property
+    def can_look(self) -> bool:
+        """Tell whether there is a camera that measures depth."""
+        return self._viewer is not None
+
     def move(self, stamp_ns: int, T_run_base: Transform) -> None:
         """Follow the pose (4, 4) of every observation."""
         if self._viewer is None:
@@ -48,7 +53,7 @@ class ViewTaker:
     def take(
         self, observation: Observation, T_run_base: Transform, *, is_kept: bool
     ) -> LandmarkView | None:
-        """Return the view of an observation, None if it shows too little."""
+        """Return the view of an observation; None with too few features, or without a sensor."""
         if self._viewer is None:
             return None
         view = self._viewer.look(observation, shear_rad=self._shear_rad)

@@ -115,9 +115,9 @@ class RunGraph:
         return found
 
     def _fix_edges(self, fixes: Sequence[Fix]) -> list[Edge]:
-        """Return the loops from the loaded map's submaps to the run's.
+        """Return the loops from the loaded map's submaps to the run's, one per run submap.
 
-        Those to one submap weigh as much as one: fixes in one place share their errors.
+        It is the mean of all its fixes, and as certain as one: they share their errors.
         """
         edges: dict[int, list[Edge]] = {}
         for fix in fixes:
@@ -125,11 +125,27 @@ class RunGraph:
             if pose is not None:
                 T_base_node = se3.inverse(pose) @ self._own.T_run_node[node]
                 edges.setdefault(node, []).append(self._fix_edge(fix, node, T_base_node))
-        return [
-            replace(edge, covariance=len(same) * edge.covariance)
-            for same in edges.values()
-            for edge in same
+        return [self._mean(same) for same in edges.values()]
+
+    def _mean(self, edges: Sequence[Edge]) -> Edge:
+        """Return the mean of loops to one submap, weighted by their information."""
+        nodes, start = self._loaded.T_map_node, edges[0]
+        offs = [
+            se3.log(
+                se3.inverse(nodes[start.first] @ start.T_first_second)
+                @ nodes[edge.first]
+                @ edge.T_first_second
+            )
+            for edge in edges
         ]
+        weights = np.linalg.inv([edge.covariance for edge in edges])
+        spread = np.linalg.inv(weights.sum(axis=0))
+        off = spread @ np.einsum("nij,nj->i", weights, np.array(offs))
+        return replace(
+            start,
+            T_first_second=start.T_first_second @ se3.exp(off),
+            covariance=len(edges) * spread,
+        )
 
     def _fix_edge(self, fix: Fix, node: int, T_base_node: Transform) -> Edge:
         """Return the loop to a node from the nearest submap of the loaded map."""

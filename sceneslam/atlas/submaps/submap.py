@@ -59,7 +59,7 @@ class Drawing:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Submap:
-    """A node of the graph; its frame is base, level, at its first pose."""
+    """A node of the graph. Its frame is base at its first pose; the plan lies level in it."""
 
     run: int  # index of the run, by age, in a saved map
     session: int
