@@ -7,6 +7,7 @@ import pytest
 from test_atlas_maps import S, map_of
 
 from sceneslam.atlas.lasting.map_files import load_map_files, save_map_files
+from sceneslam.atlas.lasting.prune import prune
 from sceneslam.atlas.mapper import Mapper
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.localizer import LocalizationEvent, Look, MapLocalizer
@@ -14,6 +15,7 @@ from sceneslam.atlas.places.view_taker import ViewTaker
 from sceneslam.atlas.submaps.collector import Known
 from sceneslam.evaluation.association import interpolated
 from sceneslam.experiments.one_map.relocalization import camera_starts, together
+from sceneslam.scans.key_scan import KeyScan
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
@@ -363,3 +365,58 @@ def test_starts_are_found_in_the_map_of_another_drive():
     assert camera_starts(saved, drive, CAMERA, moved.__getitem__, within_s=3.0).wrong == 2
     both = together([found, found])
     assert (both.count, both.found, both.found_ratio) == (10, 4, 0.4)
+
+
+def test_a_map_of_views_alone_serves_robots_that_see_walls_too():
+    eyes = Eyes()
+    own = looking_by(eyes)
+    scan = KeyScan(stamp_ns=0, points=np.ones((5, 2), np.float32), origin=np.zeros(2))
+    seen_too = [replace(look(second), scan=scan) for second in (0.0, 0.2, 2.0, 4.0)]
+    assert not own.is_due(seen_too[0])
+    eyes.answer = (ELSEWHERE,)
+    said = [own.compare([one]) for one in (*seen_too[:3], replace(seen_too[3], view=None))]
+    nothing, found, fixed = list(LocalizationEvent)[:3]
+    assert said == [nothing, found, fixed, nothing]
+
+
+def test_a_robot_without_a_camera_is_not_found_in_a_map_of_views_alone():
+    rig = Rig(sensors=frozenset({Sensor.ODOMETRY}))
+    mapper = Mapper(rig, known=lambda ns: None, note=lambda *_, **__: None, loaded=kept_map())
+    assert not mapper.is_found
+    assert Mapper(rig, known=lambda ns: None, note=lambda *_, **__: None).is_found
+
+
+@pytest.mark.parametrize(("away_m", "turn_rad", "left"), [(0.4, 0.3, 1), (0.6, 0, 2), (0, 0.5, 2)])
+def test_a_submap_goes_when_a_later_one_has_a_view_near_each_of_its(away_m, turn_rad, left):
+    view = kept_map().submaps[1].views[0]
+    beside = replace(
+        view, T_submap_base=view.T_submap_base @ se3.from_xy_yaw(0.0, away_m, turn_rad)
+    )
+    empty = map_of(join([]), join([]))
+    submaps = [
+        replace(one, views=(seen,)) for one, seen in zip(empty.submaps, (view, beside), strict=True)
+    ]
+    assert len(prune(replace(empty, submaps=tuple(submaps))).submaps) == left
+    assert len(prune(replace(empty, submaps=(submaps[0], empty.submaps[1]))).submaps) == 2
+
+
+def test_a_loaded_map_is_searched_near_the_expected_pose_first():
+    """Where the run was located, a place far away that looks the same is no contradiction."""
+    known = finder((HERE, place(1)), (ELSEWHERE, place(1)))
+    view = view_of(place(1), ASIDE)
+    assert known.recognize(view) is None
+    found = known.recognize(view, ELSEWHERE)
+    off = se3.inverse(ELSEWHERE @ ASIDE) @ found.T_map_base
+    assert np.linalg.norm(off[:3, 3]) < 0.01
+    assert known.recognize(view, se3.from_xy_yaw(50.0, 0.0, 0.0)) is None
+
+
+@pytest.mark.parametrize(
+    "sizes", [((240, 320), (240, 320)), ((480, 640), (240, 320)), ((480, 640), (960, 1280))]
+)
+def test_images_and_depths_of_other_sizes_give_no_view(sizes):
+    image = np.resize(picture(), (*sizes[0], 3))
+    observation = Observation(
+        stamp_ns=0, image_bgr=image, depth_m=np.full(sizes[1], 2.0, np.float32)
+    )
+    assert LandmarkViewer(CAMERA).look(observation) is None
