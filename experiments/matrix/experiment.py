@@ -104,8 +104,9 @@ class MatrixExperiment:
         return Trial(name=name, overrides=overrides)
 
     def _oracle(self, group: Mapping[str, TrialResult]) -> Trajectory:
-        alone = [group[name].trajectory for name in self._alone]
-        best: Trajectory = best_of(alone, _truth(group), self._piece_s, self._judge.segment_m)
+        alone = [group[name] for name in self._alone]
+        estimates = [one for run in alone for one in (run.online, run.trajectory)]
+        best: Trajectory = best_of(estimates, _truth(group), self._piece_s, self._judge.segment_m)
         return best
 
     def _cells(

@@ -14,28 +14,29 @@ from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
 
 _STEP_S = 0.2  # the drive is looked at so often
-_GAP_NS = 5 * 10**8  # a module without a pose for so long has none there
+_GAP_NS = 5 * 10**8  # an estimate without a pose for so long has none there
 _BEAM = 256  # choices that are followed at a time
 
 
 def best_of(
-    modules: Sequence[Trajectory], truth: Trajectory, piece_s: float, segment_m: float
+    estimates: Sequence[Trajectory], truth: Trajectory, piece_s: float, segment_m: float
 ) -> Trajectory:
-    """Return the trajectory of an oracle that knows how far each module errs in each piece.
+    """Return the trajectory of an oracle that knows how far each estimate errs in each piece.
 
-    All modules ran side by side over the whole drive, and the drive is cut into pieces of
-    `piece_s`. The motion of a piece is one module's, from where the piece before it ended. Of all
+    The modules ran side by side over the whole drive; the estimates are what they reported online
+    and at the end. The drive is cut into pieces of `piece_s`. The motion of a piece is that of one
+    estimate, from where the piece before it ended. Of all
     choices (a beam search) it is the one whose error over segments of `segment_m` is smallest, in
-    the root mean square. In a piece that no module covers it knows the true motion.
+    the root mean square. In a piece that none covers it knows the true motion.
     """
     stamps_ns = _stamps_ns(truth)
     true = interpolated(truth, stamps_ns).T_world_base
-    modules_poses = [_poses(module, stamps_ns) for module in modules]
+    known = [_poses(estimate, stamps_ns) for estimate in estimates]
     ends = segment_ends(true, segment_m)
     poses = se3.identity()[None, None]  # (choices, poses so far, 4, 4)
     cost_m2 = np.zeros(1)  # of all segments that have ended
     for piece in _pieces(len(stamps_ns), piece_s):
-        motions = [_motion(one[piece]) for one in [*modules_poses, true]]
+        motions = [_motion(one[piece]) for one in [*known, true]]
         offered = [motion for motion in motions[:-1] if not np.isnan(motion).any()] or motions[-1:]
         poses = np.concatenate([_continued(poses, motion) for motion in offered])
         cost_m2 = np.tile(cost_m2, len(offered))
@@ -63,15 +64,15 @@ def _pieces(count: int, piece_s: float) -> Iterator[slice]:
         yield slice(first, last + 1)
 
 
-def _poses(module: Trajectory, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return a module's poses (N, 4, 4), NaN where it has none."""
+def _poses(estimate: Trajectory, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return an estimate's poses (N, 4, 4), NaN where it has none."""
     poses = np.full((len(stamps_ns), 4, 4), np.nan)
-    if len(module) < 2:
+    if len(estimate) < 2:
         return poses
-    following = np.clip(np.searchsorted(module.stamps_ns, stamps_ns), 1, len(module) - 1)
-    is_inside = (stamps_ns >= module.stamps_ns[0]) & (stamps_ns <= module.stamps_ns[-1])
-    is_covered = is_inside & (np.diff(module.stamps_ns)[following - 1] < _GAP_NS)
-    poses[is_covered] = interpolated(module, stamps_ns[is_covered]).T_world_base
+    following = np.clip(np.searchsorted(estimate.stamps_ns, stamps_ns), 1, len(estimate) - 1)
+    is_inside = (stamps_ns >= estimate.stamps_ns[0]) & (stamps_ns <= estimate.stamps_ns[-1])
+    is_covered = is_inside & (np.diff(estimate.stamps_ns)[following - 1] < _GAP_NS)
+    poses[is_covered] = interpolated(estimate, stamps_ns[is_covered]).T_world_base
     return poses
 
 
