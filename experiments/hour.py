@@ -3,7 +3,8 @@
     python experiments/hour.py FOLDER [OVERRIDES]
 
 A round trip is repeated for an hour of the recording's clock; the run takes what it takes. CPU time
-and memory are those of all its processes. The results of the run lie in FOLDER.
+and memory are those of all its processes. The results of the run lie in FOLDER, its progress beside
+it.
 """
 
 from __future__ import annotations
@@ -54,16 +55,16 @@ def cost(pid: int) -> tuple[float, float]:
 def main() -> None:
     """Run, and print a row per ten minutes."""
     folder, overrides = Path(sys.argv[1]), sys.argv[2:]
-    folder.mkdir(parents=True, exist_ok=True)
+    progress = folder.with_name(f"{folder.name}.progress")
     command = [sys.executable, "-m", "sceneslam", *OVERRIDES, f"hydra.run.dir={folder}", *overrides]
     table = csv.writer(sys.stdout, lineterminator="\n")
     table.writerow(HEAD)
     per_part, part, last, peak_mb = round(PART_S * RATE_HZ), 0, (0, 0.0), 0.0
-    with (folder / "progress.txt").open("wb") as log:
+    with progress.open("wb") as log:
         run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=log)
         while run.poll() is None:
             time.sleep(0.5)
-            counts = _DONE.findall((folder / "progress.txt").read_bytes()[-400:])
+            counts = _DONE.findall(progress.read_bytes()[-400:])
             try:
                 cpu_s, memory_mb = cost(run.pid)
             except (FileNotFoundError, ProcessLookupError):
