@@ -205,16 +205,18 @@ def _agree(
 def _largest_clique(agree: NDArray[np.bool_]) -> list[int]:
     """Return the members of the largest clique, grown greedily from every node in turn."""
     best: list[int] = []
-    order = np.argsort(-agree.sum(axis=1), kind="stable").tolist()
-    for start in order:
-        if agree[start].sum() + 1 <= len(best):
+    degrees = agree.sum(axis=1)
+    for start in np.argsort(-degrees, kind="stable").tolist():
+        if degrees[start] + 1 <= len(best):
             break
         members, others = [start], agree[start].copy()
+        shared = agree[:, others].sum(axis=1)  # neighbours among the others
         while others.any():
-            shared = (agree & others).sum(axis=1)
             chosen = int(np.argmax(np.where(others, shared, -1)))
             members.append(chosen)
+            gone = others & ~agree[chosen]
             others &= agree[chosen]
+            shared -= agree[:, gone].sum(axis=1)
         if len(members) > len(best):
             best = members
     return sorted(best)
