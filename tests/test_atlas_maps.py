@@ -9,23 +9,17 @@ import pytest
 import yaml
 from test_atlas_places import CELL, plan_of, quality, text_of
 
-from sceneslam.atlas import mapper as mapper_of
 from sceneslam.atlas.lasting import lasting_map, merge
 from sceneslam.atlas.lasting.lasting_map import LastingMap
 from sceneslam.atlas.lasting.map_files import HEAD, load_map_files, save_map_files
 from sceneslam.atlas.lasting.merge import join_pieces
 from sceneslam.atlas.lasting.prune import prune
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map, forget_contradicted
-from sceneslam.atlas.mapper import Mapper
 from sceneslam.atlas.places.floor_plan import join
-from sceneslam.atlas.places.localizer import LocalizationEvent
-from sceneslam.atlas.submaps.collector import Known
-from sceneslam.atlas.submaps.graph import LOADED, Edge, EdgeKind, on_floor
+from sceneslam.atlas.submaps.graph import Edge, EdgeKind, on_floor
 from sceneslam.atlas.submaps.submap import Drawing, Submap
-from sceneslam.experiments.one_map.drive import RIG
 from sceneslam.types import planar
 from sceneslam.types.errors import ConfigError, InputError
-from sceneslam.types.observation import LaserScan, Observation
 
 S = 10**9
 WALL = plan_of("#" * 40)
@@ -410,151 +404,3 @@ def test_an_update_forgets_once_the_run_was_located(tmp_path, mode, is_found):
     run.saved = lambda: map_of(plan_of("###"), plan_of(*["....."] * 5), nodes=nodes, runs=[0, 1])
     kept = len(own.map_of(run).submaps[0].plan)
     assert kept == (0 if mode == "update" and is_found else 3)
-
-
-# When a run looks for itself.
-
-
-HERE = planar.to_transform(np.array([1.0, 2.0, 0.5]))
-ASIDE = planar.to_transform(np.array([1.0, 2.0, np.pi / 2]))
-
-
-class Searched:
-    """A localizer that answers as it is told."""
-
-    def __init__(self, monkeypatch):
-        monkeypatch.setattr(mapper_of, "MapLocalizer", lambda plan, views: self)
-        self.wants_view = lambda look: False
-        self.T_map_run, self.fixes, self.is_late = None, [], False
-        self.answer, self.asked = LocalizationEvent.NOTHING, []
-
-    def is_due(self, look):
-        return not self.is_late
-
-    def compare(self, latest):
-        self.asked.append([look.stamp_ns / S for look in latest])
-        return self.answer
-
-
-SCAN = LaserScan(
-    stamp_ns=0,
-    ranges_m=np.full(20, 2.0, np.float32),
-    angle_min_rad=-1.0,
-    angle_step_rad=0.1,
-    range_min_m=0.1,
-    range_max_m=9.0,
-)
-
-
-def looking(speed_m_s=0.0):
-    """A run with a loaded map, and its events; `observe` takes a second."""
-    events = []
-    own = Mapper(
-        RIG,
-        known=lambda stamp_ns: Known(
-            T_map_base=planar.to_transform(np.array([speed_m_s * stamp_ns / S, 0, 0])),
-            session=0,
-            module="a",
-            covariance=None,
-        ),
-        note=lambda *event, **fields: events.append((*event, fields)),
-        loaded=map_of(WALL, pieces=[0]),
-    )
-
-    def observe(second):
-        stamp_ns = round(second * S)
-        scan = replace(SCAN, stamp_ns=stamp_ns)
-        own.observe(Observation(stamp_ns=stamp_ns, scan=scan), None)
-
-    return own, events, observe
-
-
-def test_a_robot_at_rest_searches_once_a_second_until_it_was_located(monkeypatch):
-    searched = Searched(monkeypatch)
-    own, events, observe = looking()
-    for second in (1.0, 1.5, 1.9, 2.0, 2.5, 3.0):
-        observe(second)
-    assert searched.asked == [[1.0], [1.0, 2.0], [1.0, 2.0, 3.0]]
-    assert not own.is_found and not own.is_placed
-    searched.answer, searched.T_map_run = LocalizationEvent.FOUND, HERE
-    observe(4.0)
-    expected = {"after_s": 3.0, "T_map_run": HERE.tolist()}
-    assert events == [("relocalized", 4 * S, expected)]
-    assert own.is_found and own.is_placed
-    np.testing.assert_array_equal(own.T_map_run, HERE)
-    observe(9.0)
-    assert len(searched.asked) == 4
-
-
-def test_a_run_tells_once_after_five_seconds_that_it_was_not_located(monkeypatch):
-    searched = Searched(monkeypatch)
-    _, events, observe = looking(speed_m_s=1.0)
-    for second in (1.0, 2.0, 5.9, 6.1, 7.0):
-        observe(second)
-    assert events == [("not_relocalized", round(6.1 * S), {"after_s": pytest.approx(5.1)})]
-    searched.answer, searched.T_map_run = LocalizationEvent.WITHDRAWN, None
-    observe(8.0)
-    assert events[1:] == [("relocalization_withdrawn", 8 * S, {"after_s": 7.0})]
-
-
-def test_the_newest_eighty_scans_are_compared_when_it_is_due(monkeypatch):
-    searched = Searched(monkeypatch)
-    _, _, observe = looking(speed_m_s=1.0)
-    searched.is_late = True
-    for second in range(100):
-        observe(second)
-    assert searched.asked == []
-    searched.is_late = False
-    observe(100)
-    assert searched.asked == [list(range(21, 101))]
-
-
-def test_a_run_is_saved_as_a_piece_of_its_own_until_it_was_located(monkeypatch):
-    searched = Searched(monkeypatch)
-    own, _, observe = looking(speed_m_s=1.0)
-    for second in range(60):
-        observe(second)
-    saved = own.saved()
-    assert saved.pieces[0] == 0 and (saved.pieces[1:] == 1).all() and len(saved.pieces) > 5
-    assert [submap.run for submap in saved.submaps[:3]] == [0, 1, 1]
-    assert [(one.first, one.second) for one in saved.edges[:2]] == [(1, 2), (2, 3)]
-    step = saved.plane[2] - saved.plane[1]
-    searched.answer, searched.T_map_run = LocalizationEvent.FOUND, ASIDE
-    observe(60)
-    saved = own.saved()
-    assert (saved.pieces == 0).all()
-    np.testing.assert_allclose(saved.plane[1], [1.0, 2.0, np.pi / 2], atol=1e-9)
-    np.testing.assert_allclose(saved.plane[2], [1.0, 2.0 + step[0], np.pi / 2], atol=1e-9)
-
-
-def test_loops_lead_between_the_first_poses_of_submaps_or_from_the_loaded_map(monkeypatch):
-    Searched(monkeypatch)
-    own, _, observe = looking(speed_m_s=1.0)
-    for second in range(60):
-        observe(second)
-    own._collector.finish()
-    starts_s = [int(submap.stamps_ns[0]) // S for submap in own._collector.submaps]
-    assert starts_s[:3] == [0, 3, 6] and starts_s[-1] == 57
-    own._loops = [edge(0, 3), edge(2, 20, (1, 0, 0), EdgeKind.LOOP)]
-    found = own.loops(np.arange(60) * S)
-    assert [(loop.first, loop.second) for loop in found] == [(LOADED, 6), (3, 57)]
-    np.testing.assert_allclose(found[1].T_first_second, planar.to_transform(np.array([1.0, 0, 0])))
-
-
-@pytest.mark.parametrize("is_placed", [True, False])
-def test_a_located_run_is_corrected_into_the_loaded_map(monkeypatch, is_placed):
-    searched = Searched(monkeypatch)
-    own, events, observe = looking(speed_m_s=1.0)
-    for second in range(20):
-        observe(second)
-    if is_placed:
-        searched.answer, searched.T_map_run = LocalizationEvent.FOUND, HERE
-        observe(20)
-    kept = len(events)
-    path = lambda stamp_ns: planar.to_transform(np.array([stamp_ns / S, 0.0, 0.0]))  # noqa: E731
-    found = own.finish(path, [], frozenset())
-    assert len(found.stamps_ns) == (7 if is_placed else 0) and len(events) == kept
-    stamps_ns = np.arange(20) * S
-    poses = np.stack([path(stamp_ns) for stamp_ns in stamps_ns])
-    np.testing.assert_allclose(found.apply(stamps_ns, poses), own.T_map_run @ poses, atol=1e-9)
-    assert (own.saved().pieces == (0 if is_placed else np.r_[0, [1] * 7])).all()

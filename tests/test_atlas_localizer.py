@@ -1,0 +1,164 @@
+"""A run in a loaded map: where it is found by its walls, kept, and withdrawn."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_atlas_places import S, corner_of, quality, scan_of
+
+from sceneslam.atlas.places import localizer
+from sceneslam.atlas.places.localizer import LocalizationEvent, Look, MapLocalizer
+from sceneslam.atlas.places.plan_field import PlanField
+from sceneslam.types import planar
+
+
+class Scripted:
+    """A recognizer that answers as it is told, and keeps what it was asked."""
+
+    def __init__(self, monkeypatch):
+        self.field, self.answer = PlanField(corner_of()), None
+        monkeypatch.setattr(localizer, "Recognizer", lambda field: self)
+
+    def recognize(self, query, window):
+        self.query, self.window = query, window
+        return self.answer
+
+
+def placed(second, x_m=1.0, y_m=2.0, yaw_rad=0.5):
+    """The scan of one wall, dead ahead, at a pose of the run."""
+    scan = scan_of(*[(0.525, 0.025)] * 2, origin=(0.025, 0.025))
+    stamp_ns = round(second * S)
+    return Look(
+        stamp_ns=stamp_ns,
+        T_run_base=planar.to_transform(np.array([x_m, y_m, yaw_rad])),
+        scan=replace(scan, stamp_ns=stamp_ns),
+    )
+
+
+RUN_AT = np.array([1.0, 2.0, 0.5])  # where `placed` is
+
+
+def in_map(T_map_run, at):
+    """The pose in the map of one in the run, in the plane."""
+    return planar.from_transform(T_map_run @ planar.to_transform(np.array(at)))
+
+
+def located(scripted, at, run_at=(1.0, 2.0, 0.5)):
+    """A localizer that found the robot at a pose of the map after a second."""
+    own, scripted.answer = MapLocalizer(corner_of()), quality(at=at)
+    assert own.compare([placed(0.0, *run_at)]) is LocalizationEvent.NOTHING
+    assert own.compare([placed(1.0, *run_at)]) is LocalizationEvent.FOUND
+    return own
+
+
+@pytest.mark.parametrize(
+    ("off", "is_found"),
+    [
+        ((0.06, 0.06, 0.04), True),
+        ((-0.09, 0.0, -0.04), True),
+        ((0.11, 0.0, 0.0), False),
+        ((0.0, -0.11, 0.0), False),
+        ((0.0, 0.0, 0.06), False),
+        ((0.0, 0.0, -0.06), False),
+    ],
+)
+def test_a_run_is_located_where_two_searches_in_a_row_agree(monkeypatch, off, is_found):
+    scripted, at = Scripted(monkeypatch), np.array([4.0, 3.0, 1.0])
+    own = MapLocalizer(corner_of())
+    for second, (answer, found) in enumerate(
+        [
+            (quality(at=at), False),
+            (None, False),
+            (quality(at=at), False),
+            (quality(at=at, weak=1), False),
+            (quality(at=at), False),
+            (quality(at=planar.compose(at, np.array(off))), is_found),
+        ]
+    ):
+        scripted.answer = answer
+        expected = LocalizationEvent.FOUND if found else LocalizationEvent.NOTHING
+        assert own.compare([placed(second)]) is expected
+        assert (own.T_map_run is not None) == found and scripted.window is None
+    if is_found:
+        (fix,) = own.fixes
+        assert fix.stamp_ns == 5 * S
+        there = in_map(own.T_map_run, RUN_AT)
+        np.testing.assert_allclose(there, planar.compose(at, np.array(off)), atol=1e-12)
+        due = planar.to_transform(scripted.answer.T_target_query)
+        np.testing.assert_allclose(fix.T_map_base, due, atol=1e-12)
+
+
+def test_searches_in_vain_become_rare(monkeypatch):
+    scripted = Scripted(monkeypatch)
+    own, periods_s = MapLocalizer(corner_of()), [0.5] * 7 + [1.0] * 8 + [2.0] * 8 + [4.0] * 8
+    assert own.is_due(placed(0.0))
+    for period_s in [*periods_s, *[8.0] * 20]:
+        own.compare([placed(100.0)])
+        assert own.is_due(placed(100.0 + period_s)) and not own.is_due(placed(99.9 + period_s))
+    scripted.answer = quality()
+    own.compare([placed(100.0)])
+    assert own.is_due(placed(100.5)) and not own.is_due(placed(100.4))
+
+
+def test_a_located_run_is_compared_after_a_second_and_half_a_metre_or_a_third_of_a_radian(
+    monkeypatch,
+):
+    own = located(Scripted(monkeypatch), (4.0, 3.0, 1.0))
+    for moved_by, is_far in (
+        ((0.49, 0.0, 0.29), False), ((0.36, -0.36, 0.0), True), ((0.0, 0.0, -0.31), True),
+        ((0.0, 0.0, 0.31), True), ((-0.51, 0.0, 0.0), True), ((0.0, 0.0, 0.0), False),
+    ):  # fmt: skip
+        there = planar.compose(RUN_AT, np.array(moved_by))
+        assert own.is_due(placed(2.0, *there)) == is_far
+        assert not own.is_due(placed(1.9, *there))
+
+
+@pytest.mark.parametrize("step", [(3.0, 4.0, 0.0), (0.0, 0.0, -2.0)])
+def test_a_fix_lies_within_what_odometry_drifts(monkeypatch, step):
+    scripted = Scripted(monkeypatch)
+    own = located(scripted, (4.0, 3.0, 1.0))
+    there = planar.compose(RUN_AT, np.array(step))
+    due = planar.compose(np.array([4.0, 3.0, 1.0]), np.array(step))
+    half_m, half_rad = (0.15 + 0.3, 0.05 + 0.15) if step[0] else (0.15, 0.05 + 0.12)
+    for off, is_fixed in (
+        ([half_m + 0.01, 0, 0], False), ([0, 0, -half_rad - 0.01], False),
+        ([0, half_m - 0.01, half_rad - 0.01], True),
+    ):  # fmt: skip
+        scripted.answer = quality(at=planar.compose(due, np.array(off)))
+        event = own.compare([placed(3.0, *there)])
+        assert event is (LocalizationEvent.FIXED if is_fixed else LocalizationEvent.NOTHING)
+        np.testing.assert_allclose(scripted.window.around, due, atol=1e-12)
+        assert scripted.window.half_m == pytest.approx(half_m)
+        assert scripted.window.half_rad == pytest.approx(half_rad)
+    assert [fix.stamp_ns for fix in own.fixes] == [1 * S, 3 * S]
+    found = in_map(own.T_map_run, there)
+    np.testing.assert_allclose(found, scripted.answer.T_target_query, atol=1e-12)
+
+
+def test_a_place_that_is_contradicted_three_times_in_a_row_is_withdrawn(monkeypatch):
+    scripted = Scripted(monkeypatch)
+    own = located(scripted, (1.0, 1.0, 0.0), run_at=(0.0, 0.0, 0.0))  # in front of free space
+    scripted.answer = None
+    unknown, nothing = placed(2.0, -5.0, -5.0, 0.0), LocalizationEvent.NOTHING
+    for scan in (placed(2, 0, 0, 0), placed(3, 0, 0, 0), unknown, placed(4, 0, 0, 0)):
+        assert own.compare([scan]) is nothing and own.T_map_run is not None
+    assert own.compare([placed(5, 0, 0, 0)]) is nothing
+    scripted.answer = quality(at=(1.0, 1.0, 0.0))
+    assert own.compare([placed(6, 0, 0, 0)]) is LocalizationEvent.FIXED
+    scripted.answer = None
+    events = [own.compare([placed(7 + index, 0, 0, 0)]) for index in range(3)]
+    assert events == [nothing, nothing, LocalizationEvent.WITHDRAWN]
+    assert own.T_map_run is None and own.fixes == [] and own.is_due(placed(10, 0, 0, 0))
+    scripted.answer = quality(at=(1.0, 1.0, 0.0))
+    assert own.compare([placed(11, 0, 0, 0)]) is nothing  # a first search
+
+
+@pytest.mark.parametrize(("count", "step_m", "compared"), [(10, 1.0, 7), (70, 0.06, 60)])
+def test_six_metres_or_sixty_scans_are_compared(monkeypatch, count, step_m, compared):
+    scripted = Scripted(monkeypatch)
+    scans = [placed(0.0, 0.0, step_m * index, 0.0) for index in range(count)]
+    MapLocalizer(corner_of()).compare(scans)
+    walls = scripted.query.plan.points
+    assert len(walls) == compared
+    np.testing.assert_allclose(walls[-1], [0.525, 0.025], atol=1e-6)  # in the newest base
+    np.testing.assert_allclose(walls[0], [0.525, 0.025 - step_m * (compared - 1)], atol=1e-5)
