@@ -29,6 +29,7 @@ from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform, Vector
+from sceneslam.views.view import Landmarks
 from sceneslam.views.view_finder import ViewFinder
 
 _REST_NS = 1_000_000_000  # between two searches in the map while the robot stands
@@ -58,8 +59,9 @@ class Mapper:
         self._loaded = loaded if loaded is not None else empty_map()
         self._scanner, self._known, self._note = KeyScanner(rig), known, note
         self._collector = Collector(rig, known, self._loaded.runs)
-        self._views = ViewTaker(rig, is_keeping=keeps_views)
-        self._localizer = self._made_localizer(rig)
+        views = self._loaded.views()
+        self._views = ViewTaker(rig, is_keeping=keeps_views, is_comparing=bool(views))
+        self._localizer = self._made_localizer(rig, views)
         self._executor = executor("search", is_live=is_live)
         self._search: Future[LocalizationEvent] | None = None
         self._recent: list[Look] = []  # with a scan
@@ -172,10 +174,11 @@ class Mapper:
 
     # During the run.
 
-    def _made_localizer(self, rig: Rig) -> MapLocalizer | None:
+    def _made_localizer(
+        self, rig: Rig, views: Sequence[tuple[Transform, Landmarks]]
+    ) -> MapLocalizer | None:
         """Return the localizer in the loaded map, None if it shows nothing."""
-        plan, views = self._loaded.plan(), self._loaded.views()
-        finder = None
+        plan, finder = self._loaded.plan(), None
         if views and rig.camera is not None and self._views.can_look:
             finder = ViewFinder(rig.camera, views)
         return MapLocalizer(plan, finder) if len(plan) or finder is not None else None

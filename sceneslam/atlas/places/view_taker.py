@@ -18,9 +18,10 @@ _SHEAR_MAX_RAD = 0.015  # a degree: of a view that is kept
 class ViewTaker:
     """Knows how fast the camera turns, and where views were taken."""
 
-    def __init__(self, rig: Rig, *, is_keeping: bool) -> None:
-        """`is_keeping`: views are kept in the map."""
-        self._viewer, self._is_keeping = LandmarkViewer.of(rig), is_keeping
+    def __init__(self, rig: Rig, *, is_keeping: bool, is_comparing: bool = False) -> None:
+        """`is_keeping`: views are kept in the map; `is_comparing`: with those of a loaded one."""
+        self._viewer = LandmarkViewer.of(rig) if is_keeping or is_comparing else None
+        self._is_keeping = is_keeping
         self._T_run_kept: Transform | None = None  # of the last view that was kept
         self._last: tuple[int, Transform] | None = None  # stamp and pose
         self._shear_rad = 0.0
