@@ -25,9 +25,9 @@ def best_of(
 
     The modules ran side by side over the whole drive; the estimates are what they reported online
     and at the end. The drive is cut into pieces of `piece_s`. The motion of a piece is that of one
-    estimate, from where the piece before it ended. Of all
-    choices (a beam search) it is the one whose error over segments of `segment_m` is smallest, in
-    the root mean square. In a piece that none covers it knows the true motion.
+    estimate, from where the piece before it ended. Of all choices (a beam search) it is the one
+    whose error over segments of `segment_m` is smallest, in the root mean square. In a piece that
+    none covers it knows the true motion.
     """
     stamps_ns = _stamps_ns(truth)
     true = interpolated(truth, stamps_ns).T_world_base

@@ -76,6 +76,12 @@ def rotation_angle_rad(T_a_b: Transform) -> NDArray[np.float64]:
     return np.asarray(np.arctan2(sine, cosine))
 
 
+def is_within(T_a_b: Transform, shift_m: float, turn_rad: float) -> bool:
+    """Tell whether a transform (4, 4) shifts and turns by no more than this."""
+    is_near = np.linalg.norm(T_a_b[:3, 3]) <= shift_m
+    return bool(is_near and rotation_angle_rad(T_a_b) <= turn_rad)
+
+
 def hat(v: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the (..., 3, 3) matrices whose products with x are the cross products v x x."""
     cross = np.zeros((*v.shape, 3))

@@ -168,6 +168,4 @@ class ViewFinder:
 
 
 def _is_same(one: Sighting, other: Sighting) -> bool:
-    T = se3.inverse(one.T_map_base) @ other.T_map_base
-    is_near = np.linalg.norm(T[:3, 3]) <= _SAME_M
-    return bool(is_near and se3.rotation_angle_rad(T) <= _SAME_RAD)
+    return se3.is_within(se3.inverse(one.T_map_base) @ other.T_map_base, _SAME_M, _SAME_RAD)

@@ -27,11 +27,8 @@ _SPAN_M, _SPAN_SCANS = 6.0, 60  # length of path, and scans, that are compared w
 _PERIOD_S, _DOUBLINGS = 0.5, 4  # time between two searches; it doubles, up to 8 s
 _PATIENCE = 8  # after this many failed searches: each takes 0.1 s or more
 _AGAIN_NS = 200_000_000  # between two searches by views; each takes 20 ms in a map of 50 views
-_FIX_M, _FIX_RAD, _FIX_NS = (
-    0.5,
-    0.3,
-    10**9,
-)  # distance, turn and time between comparisons once located
+_FIX_M, _FIX_RAD = 0.5, 0.3  # distance or turn between two comparisons once located ...
+_FIX_NS = 10**9  # ... and time
 _AGREE_M, _AGREE_RAD = 0.1, 0.05  # two consecutive searches that agree within this are accepted
 _REACH_M, _REACH_RAD, _SIGMAS = 0.15, 0.05, 3.0  # search window of a fix around the prediction
 _DOUBTS = 3  # consecutive comparisons that contradict the map: the place was wrong
@@ -247,11 +244,9 @@ def _fix(newest: Look, T_base: Transform, match: PlanRegistration) -> Fix:
 def _agree(first: Transform, second: Transform, T_run_base: Transform) -> bool:
     """Tell whether two estimates of T_map_run put the robot in the same place."""
     off = se3.inverse(first @ T_run_base) @ second @ T_run_base
-    is_near = np.linalg.norm(off[:3, 3]) <= _AGREE_M
-    return bool(is_near and se3.rotation_angle_rad(off) <= _AGREE_RAD)
+    return se3.is_within(off, _AGREE_M, _AGREE_RAD)
 
 
 def _is_within(fix: Fix, T_map_base: Transform, window: SearchWindow) -> bool:
     off = se3.inverse(T_map_base) @ fix.T_map_base
-    is_near = np.linalg.norm(off[:3, 3]) <= window.half_m
-    return bool(is_near and se3.rotation_angle_rad(off) <= window.half_rad)
+    return se3.is_within(off, window.half_m, window.half_rad)

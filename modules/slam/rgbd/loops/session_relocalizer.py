@@ -122,7 +122,7 @@ class SessionRelocalizer:
             self._add(loop, query)
             return None
         earlier, self._hypothesis = self._hypothesis, loop
-        if earlier is None or not _is_small(
+        if earlier is None or not se3.is_within(
             se3.inverse(earlier.T_new_old) @ loop.T_new_old, _SAME_M, _SAME_RAD
         ):
             return None
@@ -176,7 +176,7 @@ class SessionRelocalizer:
             elapsed_s = max(0.0, (view.observation.stamp_ns - past.end_ns) * 1e-9)
             drift_m = _DRIFT_M + _DRIFT_M_PER_S * elapsed_s
             drift_rad = _DRIFT_RAD + _DRIFT_RAD_PER_S * elapsed_s
-            if not _is_small(T_error, drift_m, drift_rad):
+            if not se3.is_within(T_error, drift_m, drift_rad):
                 return None
             keyframe = past.visual_map.keyframes[seen.keyframe_id]
             floor = np.repeat([_KEYFRAME_M**2, _KEYFRAME_RAD**2], 3)
@@ -187,8 +187,3 @@ class SessionRelocalizer:
                 T_new_old=se3.inverse(T_map_local) @ T_map_base @ se3.inverse(query.T_local_base),
             )
         return None
-
-
-def _is_small(T_a_b: Transform, shift_m: float, turn_rad: float) -> bool:
-    is_near = np.linalg.norm(T_a_b[:3, 3]) <= shift_m
-    return bool(is_near and se3.rotation_angle_rad(T_a_b) <= turn_rad)
