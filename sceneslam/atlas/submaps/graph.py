@@ -25,6 +25,7 @@ _LOOSE = np.array([10.0, 10.0, 1.0, 0.05, 0.05, 3.0])  # m, rad: any loop moves 
 _FLOOR = np.array([0.05, 0.02, 0.02]) ** 2  # m, rad: height and tilt between places of one floor
 _TILT_RAD = 0.04  # that modules drift in pitch along a corridor, before gravity corrects them
 _UPRIGHT_RAD = 0.01  # half a degree: of gyro and gravity, and as floors are uneven
+_VAIN = 50  # starts in a row without a larger clique
 LOADED = -1  # node of a loaded map
 _TO_GTSAM = [3, 4, 5, 0, 1, 2]  # rotation first, and back
 
@@ -203,12 +204,17 @@ def _agree(
 
 
 def _largest_clique(agree: NDArray[np.bool_]) -> list[int]:
-    """Return the members of the largest clique, grown greedily from every node in turn."""
+    """Return the members of the largest clique that is grown greedily, the best connected first.
+
+    It is grown from nodes that the largest so far does not hold, as most loops agree.
+    """
     best: list[int] = []
-    degrees = agree.sum(axis=1)
+    degrees, vain = agree.sum(axis=1), 0
     for start in np.argsort(-degrees, kind="stable").tolist():
-        if degrees[start] + 1 <= len(best):
+        if degrees[start] + 1 <= len(best) or vain == _VAIN:
             break
+        if start in best:
+            continue
         members, others = [start], agree[start].copy()
         shared = agree[:, others].sum(axis=1)  # neighbours among the others
         while others.any():
@@ -217,6 +223,7 @@ def _largest_clique(agree: NDArray[np.bool_]) -> list[int]:
             gone = others & ~agree[chosen]
             others &= agree[chosen]
             shared -= agree[:, gone].sum(axis=1)
+        vain += 1
         if len(members) > len(best):
-            best = members
+            best, vain = members, 0
     return sorted(best)
