@@ -13,8 +13,8 @@ _CANDIDATES = 24  # that are refined, at most,
 _LIKELY_RATIO = (
     0.6  # with this share of the best score; a second match has 0.85, less a cell of 0.15 m
 )
-_RIVAL_RATIO = 0.85  # a second place with this share of the best score is equally likely
 _POINTS_MIN = 40  # 2 m of wall: less is not distinctive
+_RIVAL_RATIO = 0.15  # a second place is as likely unless the best explains so much more, or 2 m
 _KNOWN_MIN = 0.6  # share of the walls in known space of the target
 _NEAR_M, _NEAR_RAD = 0.3, 0.1  # a window this small needs no search: the refinement converges
 
@@ -44,11 +44,12 @@ class Recognizer:
         if not verified:
             return None
         best = max(verified, key=_worth)
+        lead = min(_RIVAL_RATIO * _worth(best), _POINTS_MIN / len(query.plan))
         rivals = [
             one
             for one in found
             if is_apart(one.T_target_query, best.T_target_query)
-            and one.inlier_ratio * one.known_ratio >= _RIVAL_RATIO * _worth(best)
+            and _worth(one) >= _worth(best) - lead
             and not one.is_refuted
         ]
         return None if rivals else best
