@@ -82,10 +82,9 @@ def test_a_run_is_located_where_two_searches_in_a_row_agree(monkeypatch, off, is
     if is_found:
         (fix,) = own.fixes
         assert fix.stamp_ns == 5 * S
-        there = in_map(own.T_map_run, RUN_AT)
-        np.testing.assert_allclose(there, planar.compose(at, np.array(off)), atol=1e-12)
-        due = planar.to_transform(scripted.answer.T_target_query)
-        np.testing.assert_allclose(fix.T_map_base, due, atol=1e-12)
+        middle = planar.compose(at, 0.5 * np.array(off))  # as both searches are equally certain
+        np.testing.assert_allclose(in_map(own.T_map_run, RUN_AT), middle, atol=1e-3)
+        np.testing.assert_allclose(fix.T_map_base, planar.to_transform(middle), atol=1e-3)
 
 
 def test_searches_in_vain_become_rare(monkeypatch):

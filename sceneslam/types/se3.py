@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,6 +143,19 @@ def carried(covariance: NDArray[np.floating], T_a_b: Transform) -> NDArray[np.fl
     """Return the covariances (..., 6, 6) of a frame a that is rigidly connected to b, from b's."""
     carry = adjoint(T_a_b)
     return np.asarray(carry @ covariance @ np.swapaxes(carry, -1, -2))
+
+
+def mean(
+    T_a_b: Sequence[Transform], covariances: Sequence[NDArray[np.float64]]
+) -> tuple[Transform, NDArray[np.float64]]:
+    """Return the mean of poses (4, 4), weighted by their information, and its covariance (6, 6).
+
+    Covariances are of `log` order, in b's axes; the poses are near each other.
+    """
+    offs = log(inverse(T_a_b[0]) @ np.array(T_a_b))
+    weights = np.linalg.inv(covariances)
+    spread = np.linalg.inv(weights.sum(axis=0))
+    return T_a_b[0] @ exp(spread @ np.einsum("nij,nj->i", weights, offs)), spread
 
 
 def interpolate(T_w_0: Transform, T_w_1: Transform, ratio: float) -> Transform:

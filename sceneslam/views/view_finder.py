@@ -21,14 +21,17 @@ _PLACE_M = 2.0  # views this near show one place
 _RATIO = 0.8  # of the best match's distance to the second's (Lowe, IJCV 2004)
 _ERROR_PX, _SIGMA_PX = 3.0, 1.0  # of a match's ray, at most and usually
 _ITERATIONS, _CONFIDENCE = 300, 0.9999
+_GUIDED_PX = 9.0  # from where a pose by one view of the map expects a landmark of the others
+_SAME_BITS = 50  # descriptors that differ in more show two corners (Mur-Artal et al., T-RO 2015)
 _MATCHES_MIN = 25  # right by the pose found; by chance hardly more are than the three it is made of
 _FOUND_MIN = 0.15  # of the landmarks in view
 _SURFACE_MIN = 0.7  # of the matches with depth, within the tolerance
 _SURFACE_M, _SURFACE_RATIO = 0.05, 0.03  # 5 cm and 3 % of the depth: structured light at 5 m
-_DEVIATION_MAX_M = 0.03  # of the pose: what agrees within 0.1 m is then no chance
+_DEVIATION_MAX_M, _DEVIATION_MAX_RAD = 0.03, 0.015  # of the pose: what agrees within 0.1 m ...
 _NEAR_M = 0.1  # nothing nearer is in view
 _ALIKE = 0.6  # another place with so many of the best one's matches, and nothing is recognized
 _SAME_M, _SAME_RAD = 0.3, 0.15
+_ROUNDS = 2  # of the pose by all views: which matches are right depends on it
 _FLOOR = np.repeat([0.01, 0.004], 3) ** 2  # m, rad: of the map's landmarks among each other
 
 
@@ -62,21 +65,18 @@ class ViewFinder:
         """
         near = None
         if around is not None:
-            near = [
-                number
-                for number, (T_map_seen, _) in enumerate(self._placed)
-                if np.linalg.norm(T_map_seen[:3, 3] - around[:3, 3]) < _PLACE_M
-            ]
-        found = [
-            one for k in self._candidates(view, near) if (one := self._at(k, view)) is not None
-        ]
+            near = self._near(around)
+        found = {
+            k: one for k in self._candidates(view, near) if (one := self._at(k, view)) is not None
+        }
         if not found:
             return None
-        best = max(found, key=lambda one: one.matches)
-        for other in found:
+        number = max(found, key=lambda k: found[k].matches)
+        best = found[number]
+        for other in found.values():
             if other.matches >= _ALIKE * best.matches and not _is_same(best, other):
                 return None
-        return best
+        return self._refined(view, best, self._near(self._placed[number][0]))
 
     def _candidates(self, view: LandmarkView, near: list[int] | None) -> list[int]:
         """Return the most similar views, a few of each of the most similar places."""
@@ -120,18 +120,79 @@ class ViewFinder:
         if not is_found or inliers is None or len(inliers) < _MATCHES_MIN:
             return None
         kept = inliers[:, 0]
-        turn, shift = cv2.solvePnPRefineLM(points[kept], rays[kept], np.eye(3), None, turn, shift)
-        T_cam_seen = se3.identity()
-        T_cam_seen[:3, :3], T_cam_seen[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+        T_cam_seen = _optimised(points[kept], rays[kept], turn, shift)
         if not self._is_verified(T_cam_seen, landmarks, points[kept], view.depth_m[columns[kept]]):
             return None
-        covariance = self._covariance(np.asarray(se3.apply(T_cam_seen, points[kept]), np.float64))
+        return self._sighting(T_map_seen, T_cam_seen, points[kept], view)
+
+    def _refined(self, view: LandmarkView, rough: Sighting, near: Sequence[int]) -> Sighting | None:
+        """Return the pose by the landmarks of all views `near` it; None if it is uncertain."""
+        T_map_base, camera = rough.T_map_base, self._camera
+        T_base_seen = [se3.inverse(T_map_base) @ self._placed[number][0] for number in near]
+        seen = [self._placed[number][1] for number in near]
+        every = np.concatenate(
+            [
+                se3.apply(T, landmarks.points_base.astype(float))
+                for T, landmarks in zip(T_base_seen, seen, strict=True)
+            ]
+        )
+        points_cam = se3.apply(se3.inverse(camera.T_base_cam), every)
+        ahead = np.flatnonzero(points_cam[:, 2] > _NEAR_M)
+        due = (points_cam[ahead, :2] / points_cam[ahead, 2:]).astype(np.float32)
+        is_near = np.abs(due[:, None] - view.rays).max(axis=2) <= _GUIDED_PX / camera.fx
+        matches = self._matcher.match(
+            np.concatenate([landmarks.descriptors for landmarks in seen])[ahead],
+            view.descriptors,
+            is_near.astype(np.uint8),
+        )
+        good = [match for match in matches if match.distance <= _SAME_BITS]
+        rows = ahead[[match.queryIdx for match in good]]
+        columns, owner = np.unique([match.trainIdx for match in good], return_inverse=True)
+        counts = np.bincount(owner, minlength=len(columns))
+        points = np.stack(
+            [np.bincount(owner, every[rows, axis]) / counts for axis in range(3)], axis=1
+        )
+        rays = view.rays[columns].astype(float)
+        T_cam_base = se3.inverse(camera.T_base_cam)
+        for _ in range(_ROUNDS):
+            at = se3.apply(T_cam_base, points)
+            off = np.linalg.norm(at[:, :2] / at[:, 2:] - rays, axis=1)
+            kept = (at[:, 2] > _NEAR_M) & (off <= _ERROR_PX / camera.fx)
+            if kept.sum() < _MATCHES_MIN:
+                return None
+            turn, shift = cv2.Rodrigues(T_cam_base[:3, :3])[0], T_cam_base[:3, 3:]
+            T_cam_base = _optimised(points[kept], rays[kept], turn, shift)
+        found = self._sighting(T_map_base, T_cam_base, points[kept], view)
+        deviations = np.sqrt(
+            [
+                np.linalg.eigvalsh(block)[-1]
+                for block in (found.covariance[:3, :3], found.covariance[3:, 3:])
+            ]
+        )
+        is_certain = (deviations <= [_DEVIATION_MAX_M, _DEVIATION_MAX_RAD]).all()
+        return found if is_certain else None
+
+    def _near(self, T_map_base: Transform) -> list[int]:
+        """Return the views of the map that were taken near a pose (4, 4)."""
+        return [
+            number
+            for number, (T_map_seen, _) in enumerate(self._placed)
+            if np.linalg.norm(T_map_seen[:3, 3] - T_map_base[:3, 3]) < _PLACE_M
+        ]
+
+    def _sighting(
+        self,
+        T_map_seen: Transform,
+        T_cam_seen: Transform,
+        points: NDArray[np.float64],
+        view: LandmarkView,
+    ) -> Sighting:
+        """Return the pose T_cam_seen (4, 4) of the camera, by points (N, 3), in the map."""
+        covariance = self._covariance(np.asarray(se3.apply(T_cam_seen, points), np.float64))
         covariance += view.shear_rad**2 * np.eye(6)  # seen a metre away, a turn is a shift
-        if np.linalg.eigvalsh(covariance[:3, :3])[-1] > _DEVIATION_MAX_M**2:
-            return None
         T_seen_base = se3.inverse(T_cam_seen) @ se3.inverse(self._camera.T_base_cam)
         return Sighting(
-            T_map_base=T_map_seen @ T_seen_base, covariance=covariance, matches=len(kept)
+            T_map_base=T_map_seen @ T_seen_base, covariance=covariance, matches=len(points)
         )
 
     def _is_verified(
@@ -169,3 +230,21 @@ class ViewFinder:
 
 def _is_same(one: Sighting, other: Sighting) -> bool:
     return se3.is_within(se3.inverse(one.T_map_base) @ other.T_map_base, _SAME_M, _SAME_RAD)
+
+
+def _deviation(covariance: NDArray[np.float64]) -> float:
+    """Return the standard deviation in the least certain direction of a covariance (3, 3)."""
+    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+
+
+def _optimised(
+    points: NDArray[np.float64],
+    rays: NDArray[np.float64],
+    turn: cv2.typing.MatLike,
+    shift: cv2.typing.MatLike,
+) -> Transform:
+    """Return the pose (4, 4) of points (N, 3) in a camera that best fits their rays (N, 2)."""
+    turn, shift = cv2.solvePnPRefineLM(points, rays, np.eye(3), None, turn, shift)
+    T = se3.identity()
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+    return T

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -69,7 +69,7 @@ class _Guess:
     """A place that one search found."""
 
     T_map_run: Transform
-    is_by_view: bool
+    fix: Fix
 
 
 class MapLocalizer:
@@ -105,10 +105,10 @@ class MapLocalizer:
         if fix is None:
             return LocalizationEvent.NOTHING
         T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
-        before, self._guess = self._guess, _Guess(T_map_run=T_map_run, is_by_view=fix.is_by_view)
+        before, self._guess = self._guess, _Guess(T_map_run=T_map_run, fix=fix)
         if before is None or not _agree(before.T_map_run, T_map_run, newest.T_run_base):
             return LocalizationEvent.NOTHING
-        self._take(newest, fix)
+        self._take(newest, _mean(fix, before, newest))
         return LocalizationEvent.FOUND
 
     def _is_time(self, newest: Look, next_ns: int) -> bool:
@@ -153,7 +153,7 @@ class MapLocalizer:
         period_s = _PERIOD_S * 2.0 ** min(self._vain // _PATIENCE, _DOUBLINGS)
         self._next_walls_ns = newest.stamp_ns + round(period_s * 1e9)
         if match is None or not is_found:
-            if self._guess is not None and not self._guess.is_by_view:
+            if self._guess is not None and not self._guess.fix.is_by_view:
                 self._guess = None  # two searches by walls have to agree in a row
             return None
         return _fix(newest, newest.T_run_base, match)
@@ -245,6 +245,15 @@ def _agree(first: Transform, second: Transform, T_run_base: Transform) -> bool:
     """Tell whether two estimates of T_map_run put the robot in the same place."""
     off = se3.inverse(first @ T_run_base) @ second @ T_run_base
     return se3.is_within(off, _AGREE_M, _AGREE_RAD)
+
+
+def _mean(fix: Fix, before: _Guess, newest: Look) -> Fix:
+    """Return the mean of the newest pose and that of an earlier search, carried on by the run."""
+    T_before = before.T_map_run @ newest.T_run_base
+    T_then_now = se3.inverse(before.fix.T_map_base) @ T_before
+    carried = se3.carried(before.fix.covariance, se3.inverse(T_then_now))
+    mean, spread = se3.mean([fix.T_map_base, T_before], [fix.covariance, carried])
+    return replace(fix, T_map_base=mean, covariance=2.0 * spread)
 
 
 def _is_within(fix: Fix, T_map_base: Transform, window: SearchWindow) -> bool:

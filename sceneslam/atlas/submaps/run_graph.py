@@ -130,20 +130,13 @@ class RunGraph:
     def _mean(self, edges: Sequence[Edge]) -> Edge:
         """Return the mean of loops to one submap, weighted by their information."""
         nodes, start = self._loaded.T_map_node, edges[0]
-        offs = [
-            se3.log(
-                se3.inverse(nodes[start.first] @ start.T_first_second)
-                @ nodes[edge.first]
-                @ edge.T_first_second
-            )
-            for edge in edges
-        ]
-        weights = np.linalg.inv([edge.covariance for edge in edges])
-        spread = np.linalg.inv(weights.sum(axis=0))
-        off = spread @ np.einsum("nij,nj->i", weights, np.array(offs))
+        mean, spread = se3.mean(
+            [nodes[edge.first] @ edge.T_first_second for edge in edges],
+            [edge.covariance for edge in edges],
+        )
         return replace(
             start,
-            T_first_second=start.T_first_second @ se3.exp(off),
+            T_first_second=se3.inverse(nodes[start.first]) @ mean,
             covariance=len(edges) * spread,
         )
 
