@@ -14,12 +14,13 @@ from sceneslam.atlas.places.localizer import LocalizationEvent, Look, MapLocaliz
 from sceneslam.atlas.places.view_taker import ViewTaker
 from sceneslam.atlas.submaps.collector import Known
 from sceneslam.evaluation.association import interpolated
-from sceneslam.experiments.one_map.relocalization import camera_starts, together
+from sceneslam.experiments.one_map.relocalization import StoryStarts, together
 from sceneslam.scans.key_scan import KeyScan
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
 from sceneslam.views.view import Landmarks, LandmarkView, LandmarkViewer, PlacedView
 from sceneslam.views.view_finder import Sighting, ViewFinder
 
@@ -41,13 +42,13 @@ def view_of(landmarks, T_seen_base, *, noise_px=0.5, shown=1.0, farther_m=0.0, s
     T_cam_seen = se3.inverse(T_seen_base @ CAMERA.T_base_cam)
     points_cam = se3.apply(T_cam_seen, landmarks.points_base.astype(float))
     is_shown = rng.random(len(points_cam)) < shown
-    rays = points_cam[:, :2] / points_cam[:, 2:] + rng.normal(0, noise_px / 500.0, (len(points_cam), 2))
+    rays = points_cam[:, :2] / points_cam[:, 2:]
+    rays += rng.normal(0, noise_px / 500.0, rays.shape)
     descriptors = landmarks.descriptors.copy()
     descriptors[:, 0] ^= rng.integers(0, 256, len(descriptors), dtype=np.uint8)  # a few bits differ
     descriptors[~is_shown] = rng.integers(0, 256, ((~is_shown).sum(), 32), dtype=np.uint8)
     depth_m = (points_cam[:, 2] + farther_m).astype(np.float32)
     return LandmarkView(
-        stamp_ns=0,
         rays=rays.astype(np.float32),
         descriptors=descriptors,
         depth_m=depth_m,
@@ -156,7 +157,7 @@ def seen(image=None, depth_m=2.0):
 
 def test_corners_have_their_rays_and_their_points_in_base():
     view = LandmarkViewer(CAMERA).look(seen(depth_m=2.0))
-    assert view.stamp_ns == 5 and len(view.rays) == len(view.depth_m) == len(view.descriptors) > 100
+    assert len(view.rays) == len(view.depth_m) == len(view.descriptors) > 100
     assert (view.depth_m == 2.0).all()
     points_cam = se3.apply(se3.inverse(CAMERA.T_base_cam), view.landmarks.points_base)
     np.testing.assert_allclose(points_cam[:, 2], 2.0, rtol=1e-5)
@@ -369,31 +370,33 @@ def test_a_camera_held_by_hand_finds_itself_in_the_map_of_the_first_half(
     assert (saved.pieces == 0).all()
 
 
-def map_with_views(poses, seeds, stamps_s):
-    """A map of one submap, at HERE, that keeps views of places from poses in them."""
-    views = []
-    for T_seen_base, seed, second in zip(poses, seeds, stamps_s, strict=True):
-        points = se3.apply(se3.inverse(T_seen_base), place(seed).points_base)
-        landmarks = Landmarks(points_base=points, descriptors=place(seed).descriptors)
-        T = se3.from_xy_yaw(10.0 * seed, 0.0, 0.0) @ T_seen_base
-        views.append(PlacedView(stamp_ns=second * S, T_submap_base=T, landmarks=landmarks))
+def test_starts_in_a_story_are_found_in_the_map_of_another():
+    view = LandmarkViewer(CAMERA).look(seen())
+    kept = PlacedView(stamp_ns=0, T_submap_base=ASIDE, landmarks=view.landmarks)
     saved = map_of(join([]), nodes=[[2.0, 1.0, 0.4]])
-    return replace(saved, submaps=(replace(saved.submaps[0], views=tuple(views)),))
+    saved = replace(saved, submaps=(replace(saved.submaps[0], views=(kept,)),))
+    stamps_ns = np.arange(100) * S // 10
+    online = Trajectory(stamps_ns=stamps_ns, T_world_base=np.tile(ELSEWHERE, (100, 1, 1)))
 
+    def started(off, drive):
+        starts = StoryStarts(
+            saved, RIG, online, lambda _: HERE @ ASIDE @ off, count=20, within_s=2.0, seed=0
+        )
+        for observation in drive:
+            starts.observe(observation)
+        return starts
 
-def test_starts_are_found_in_the_map_of_another_drive():
-    at_places = [se3.identity()] * 3
-    saved = map_with_views(at_places, (1, 2, 3), (0, 1, 2))
-    drive = map_with_views([ASIDE] * 5, (1, 1, 2, 9, 2), (0, 1, 2, 3, 9))
-    poses = {view.stamp_ns: HERE @ view.T_submap_base for view in drive.submaps[0].views}
-    found = camera_starts(saved, drive, CAMERA, poses.__getitem__, within_s=3.0)
-    # The first two see two known places within 3 s, the others one at most.
-    assert (found.count, found.found, found.wrong) == (5, 2, 0)
-    assert found.worst_m < 0.01 and found.found_ratio == 0.4
-    moved = {stamp_ns: se3.from_xy_yaw(1.0, 0.0, 0.0) @ T for stamp_ns, T in poses.items()}
-    assert camera_starts(saved, drive, CAMERA, moved.__getitem__, within_s=3.0).wrong == 2
-    both = together([found, found])
-    assert (both.count, both.found, both.found_ratio) == (10, 4, 0.4)
+    # Lit for 4 s: later starts are in the dark, and never found.
+    lit, dark = seen(), seen(np.zeros((480, 640, 3), np.uint8))
+    drive = [replace(lit if ns < 4 * S else dark, stamp_ns=int(ns)) for ns in stamps_ns]
+    starts = started(se3.identity(), drive)
+    bright, unlit = (starts.found(is_lit=is_lit) for is_lit in (True, False))
+    assert bright.count + unlit.count == 20 and unlit.count > 5 and unlit.found == 0
+    assert bright.found_ratio > 0.8 and bright.wrong == 0 and bright.worst_m < 0.001
+    wrong = started(se3.from_xy_yaw(1.0, 0.0, 0.0), drive).found(is_lit=True)
+    assert wrong.wrong == wrong.found == bright.found and wrong.found_ratio == 0.0
+    both = together([bright, unlit])
+    assert (both.count, both.found) == (20, bright.found)
 
 
 def test_a_map_of_views_alone_serves_robots_that_see_walls_too():

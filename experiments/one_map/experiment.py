@@ -18,15 +18,17 @@ import yaml
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.lasting.map_files import load_map_files, save_map_files
+from sceneslam.atlas.lasting.saved_map import SavedMap
+from sceneslam.config.build import make_source
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.evaluation.association import interpolated
 from sceneslam.experiments.one_map.drive import Drive, Odometry, map_of
 from sceneslam.experiments.one_map.relocalization import (
     Starts,
-    camera_starts,
+    StoryStarts,
     random_starts,
     together,
 )
-from sceneslam.sources.simulator.settings import CameraSettings
 from sceneslam.testing.floor_plans import (
     CUPBOARD,
     DEPTH_LIKE,
@@ -44,7 +46,6 @@ from sceneslam.testing.floor_plans import (
 from sceneslam.types import planar, se3
 from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_above, check_least, check_some
-from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
@@ -63,7 +64,7 @@ class OneMapExperiment:
         stories: Sequence[str],
         seeds: Sequence[int],
         starts: int,
-        camera_seeds: Sequence[int],
+        story_seeds: Sequence[int],
         within_s: float,
         found_min: float,
         error_max_m: float,
@@ -72,12 +73,12 @@ class OneMapExperiment:
         laps: int,
         kills: int,
     ) -> None:
-        check_some(stories=stories, seeds=seeds, camera_seeds=camera_seeds)
+        check_some(stories=stories, seeds=seeds, story_seeds=story_seeds)
         check_least(1, starts=starts, laps=laps, kills=kills)
         check_above(0, within_s=within_s, error_max_m=error_max_m, error_max_deg=error_max_deg)
         self._mapped, self._stories, self._seeds = mapped_story, tuple(stories), tuple(seeds)
         self._starts, self._within_s, self._found_min = starts, within_s, found_min
-        self._camera_seeds = tuple(camera_seeds)
+        self._story_seeds = tuple(story_seeds)
         self._error_max_m, self._error_max_rad = error_max_m, float(np.radians(error_max_deg))
         self._drift_ratio, self._laps, self._kills = drift_ratio, laps, kills
         self._rows: list[list[str | float | None]] = []
@@ -90,7 +91,7 @@ class OneMapExperiment:
             *self._stories_on_a_map(run_trials, maps),
             *self._saved(maps),
             *self._relocalized(),
-            *self._relocalized_by_camera(run_trials, maps),
+            *self._relocalized_in_stories(run_trials, maps),
             *self._alike(),
             *self._updated(maps),
             *self._drifting(),
@@ -150,34 +151,45 @@ class OneMapExperiment:
             )
             yield from self._judged(f"{finder} in the map of {mapper}", found)
 
-    def _relocalized_by_camera(self, run_trials: RunTrials, maps: Path) -> Iterator[Figure]:
-        """Start wherever a story saw something, in the map of another story of the same rooms."""
+    def _relocalized_in_stories(self, run_trials: RunTrials, maps: Path) -> Iterator[Figure]:
+        """Start anywhere in a story, in the map of another story of the same rooms."""
         every = []
-        for seed in self._camera_seeds:
-            folders = {story: maps / f"{story}_{seed}" for story in (self._mapped, *self._stories)}
+        for seed in self._story_seeds:
+            folder = maps / f"{self._mapped}_{seed}"
+            saves = {self._mapped: {"atlas": {"save": str(folder.resolve())}}}
             trials = [
                 Trial(
-                    name=f"views/{story}/{seed}",
+                    name=f"starts/{story}/{seed}",
                     overrides=(f"story={story}", f"seed={seed}"),
-                    values={"atlas": {"save": str(folder.resolve())}},
+                    values=saves.get(story, {}),
                 )
-                for story, folder in folders.items()
+                for story in (self._mapped, *self._stories)
             ]
             first, *others = run_trials(trials)
-            saved, T_map_gt = load_map_files(folders[self._mapped]), _map_of(first)
-            for outcome, story in zip(others, self._stories, strict=True):
-                truth = _truth(outcome)
-                found = camera_starts(
-                    saved,
-                    load_map_files(folders[story]),
-                    _camera(outcome),
-                    lambda ns, truth=truth, T=T_map_gt: (
-                        T @ interpolated(truth, np.array([ns])).T_world_base[0]
-                    ),
-                    within_s=self._within_s,
-                )
-                every.append(found)
-        yield from self._judged("camera in the map of camera", together(every))
+            saved, T_map_gt = load_map_files(folder), _map_of(first)
+            every += [self._started(saved, T_map_gt, outcome, seed) for outcome in others]
+        for light, is_lit in (("the light", True), ("the dark", False)):
+            found = together([starts.found(is_lit=is_lit) for starts in every])
+            yield from self._judged(f"story in the map of {self._mapped}, in {light}", found)
+
+    def _started(
+        self, saved: SavedMap, T_map_gt: Transform, outcome: TrialResult, seed: int
+    ) -> StoryStarts:
+        """Drive a story again, and start all over in it."""
+        config = yaml.safe_load((outcome.folder / "config.yaml").read_text())
+        source, truth = make_source(config, ComponentBuilder(config)), _truth(outcome)
+        starts = StoryStarts(
+            saved,
+            source.rig,
+            outcome.online,
+            lambda ns: T_map_gt @ interpolated(truth, np.array([ns])).T_world_base[0],
+            count=self._starts,
+            within_s=self._within_s,
+            seed=seed,
+        )
+        for observation in source:
+            starts.observe(observation)
+        return starts
 
     def _judged(self, name: str, found: Starts) -> Iterator[Figure]:
         self._rows.append([f"{name}: found", found.found_ratio])
@@ -258,11 +270,6 @@ def _truth(outcome: TrialResult) -> Trajectory:
 def _map_of(outcome: TrialResult) -> Transform:
     """Return T_map_gt (4, 4): a map begins at the run's first pose."""
     return se3.inverse(_truth(outcome).T_world_base[0])
-
-
-def _camera(outcome: TrialResult) -> Camera:
-    config = yaml.safe_load((outcome.folder / "config.yaml").read_text())
-    return CameraSettings(**config["source"]["camera"]).camera()
 
 
 def _rmse_m(errors_m: np.ndarray) -> float:

@@ -4,24 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 
 from sceneslam.atlas.lasting.saved_map import SavedMap
-from sceneslam.atlas.places.floor_plan import FloorPlan, join
+from sceneslam.atlas.mapper import Mapper
+from sceneslam.atlas.places.floor_plan import FloorPlan
 from sceneslam.atlas.places.localizer import LocalizationEvent, Look, MapLocalizer
+from sceneslam.atlas.submaps.collector import Known
 from sceneslam.experiments.one_map.drive import key_scan, plan_of
 from sceneslam.testing.floor_plans import FLAT_TOUR, Scanner, Wall, World, through
 from sceneslam.types import planar, se3
+from sceneslam.types.observation import Observation
 from sceneslam.types.planar import Planar
-from sceneslam.types.rig import Camera
+from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
-from sceneslam.views.view import LandmarkView, PlacedView
-from sceneslam.views.view_finder import ViewFinder
+from sceneslam.types.trajectory import Trajectory
 
 _STEP_M, _STEP_RAD, _STEP_S = 0.1, 0.2, 0.2  # half a metre, or a radian, per second
 _WRONG_M, _WRONG_RAD = 0.5, 0.2
 _CLEAR_M = 0.35  # a robot keeps so far from walls
+_LIT_GREY = 80.0  # mean of an image in the light: the detector's threshold
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,80 +68,106 @@ def random_starts(
     rng = np.random.default_rng(seed)
     true = through(FLAT_TOUR)
     plan = plan_of(World(walls, rng, mapper), true)
-    world, errors, wrong = World(walls, rng, finder), [], 0
-    for _ in range(count):
-        off = _start(plan, world, true[0], within_s)
-        if off is None:
-            continue
-        distance_m, angle_rad = float(np.hypot(off[0], off[1])), abs(float(off[2]))
-        if distance_m > _WRONG_M or angle_rad > _WRONG_RAD:
-            wrong += 1
-        else:
-            errors.append([distance_m, angle_rad])
-    return _starts(count, errors, wrong)
+    world = World(walls, rng, finder)
+    offs = [_start(plan, world, true[0], within_s) for _ in range(count)]
+    return _starts(
+        count, [(float(np.hypot(*off[:2])), abs(float(off[2]))) for off in offs if off is not None]
+    )
 
 
-def camera_starts(
-    saved: SavedMap,
-    drive: SavedMap,
-    camera: Camera,
-    due: Callable[[int], Transform],
-    *,
-    within_s: float,
-) -> Starts:
-    """Start at every view that a drive kept, and look for it in another run's map by views alone.
+class StoryStarts:
+    """Starts at random instants of a story, in the map of another, with all that it measured.
 
-    `due` returns the true T_map_base (4, 4) at a stamp [ns] of the drive.
+    Poses are those of the run, as reported then, seen from the start.
     """
-    finder = ViewFinder(camera, saved.views())
-    looks = [
-        Look(
-            stamp_ns=view.stamp_ns,
-            T_run_base=T_node @ view.T_submap_base,
-            view=_seen_again(view, camera),
+
+    def __init__(
+        self,
+        saved: SavedMap,
+        rig: Rig,
+        online: Trajectory,
+        due: Callable[[int], Transform],
+        *,
+        count: int,
+        within_s: float,
+        seed: int,
+    ) -> None:
+        """Draw the starts. `due` returns the true T_map_base (4, 4) at a stamp [ns]."""
+        self._saved, self._rig, self._due = saved, rig, due
+        self._within_ns = round(within_s * 1e9)
+        self._poses = dict(zip(online.stamps_ns.tolist(), online.T_world_base, strict=True))
+        late = online.stamps_ns[-1] - self._within_ns
+        drawn = np.random.default_rng(seed).choice(
+            online.stamps_ns[online.stamps_ns <= late], count
         )
-        for T_node, submap in zip(drive.T_map_node, drive.submaps, strict=True)
-        for view in submap.views
-    ]
-    errors, wrong = [], 0
-    for number, first in enumerate(looks):
-        localizer = MapLocalizer(join([]), finder)
-        for look in looks[number:]:
-            if look.stamp_ns - first.stamp_ns > round(within_s * 1e9):
-                break
-            if localizer.compare([look]) is LocalizationEvent.FOUND:
-                assert localizer.T_map_run is not None
-                off = se3.inverse(due(look.stamp_ns)) @ localizer.T_map_run @ look.T_run_base
-                distance_m = float(np.linalg.norm(off[:3, 3]))
-                angle_rad = float(se3.rotation_angle_rad(off))
-                if distance_m > _WRONG_M or angle_rad > _WRONG_RAD:
-                    wrong += 1
-                else:
-                    errors.append([distance_m, angle_rad])
-                break
-    return _starts(len(looks), errors, wrong)
+        self._waiting = sorted(drawn.tolist(), reverse=True)
+        self._under_way: list[_Start] = []
+        self._ended: list[_Start] = []
+
+    def observe(self, observation: Observation) -> None:
+        """Take the next observation of the story."""
+        stamp_ns = observation.stamp_ns
+        pose = self._poses.get(stamp_ns)
+        if pose is None:
+            return
+        while self._waiting and self._waiting[-1] <= stamp_ns:
+            self._waiting.pop()
+            self._under_way.append(_Start(self._saved, self._rig, pose, observation))
+        for start in self._under_way:
+            start.observe(observation, pose, self._due)
+        is_over = [
+            start.off is not None or stamp_ns - start.begun_ns >= self._within_ns
+            for start in self._under_way
+        ]
+        self._ended += compress(self._under_way, is_over)
+        self._under_way = [
+            start for start, over in zip(self._under_way, is_over, strict=True) if not over
+        ]
+
+    def found(self, *, is_lit: bool) -> Starts:
+        """Return what became of the starts in the light, or in the dark."""
+        ended = [start for start in self._ended if start.is_lit is is_lit]
+        return _starts(len(ended), [start.off for start in ended if start.off is not None])
 
 
-def _seen_again(view: PlacedView, camera: Camera) -> LandmarkView:
-    """Return what the camera saw when a view was kept."""
-    points_cam = se3.apply(
-        se3.inverse(camera.T_base_cam), view.landmarks.points_base.astype(np.float64)
-    )
-    return LandmarkView(
-        stamp_ns=view.stamp_ns,
-        rays=(points_cam[:, :2] / points_cam[:, 2:]).astype(np.float32),
-        descriptors=view.landmarks.descriptors,
-        depth_m=points_cam[:, 2].astype(np.float32),
-        landmarks=view.landmarks,
-    )
+class _Start:
+    """One start, and by how much it was found beside the truth."""
+
+    def __init__(
+        self, saved: SavedMap, rig: Rig, T_online_start: Transform, first: Observation
+    ) -> None:
+        self.begun_ns, self._T_online_start = first.stamp_ns, T_online_start
+        self.is_lit = first.image_bgr is not None and float(first.image_bgr.mean()) >= _LIT_GREY
+        self.off: tuple[float, float] | None = None  # m, rad
+        self._T_start_base = se3.identity()
+        self._mapper = Mapper(rig, known=self._known, note=_unheard, loaded=saved)
+
+    def observe(
+        self, observation: Observation, T_online_base: Transform, due: Callable[[int], Transform]
+    ) -> None:
+        self._T_start_base = se3.inverse(self._T_online_start) @ T_online_base
+        self._mapper.observe(observation, None)
+        if self._mapper.is_placed:
+            T_map_base = self._mapper.T_map_run @ self._T_start_base
+            off = se3.inverse(due(observation.stamp_ns)) @ T_map_base
+            self.off = float(np.linalg.norm(off[:3, 3])), float(se3.rotation_angle_rad(off))
+
+    def _known(self, _: int) -> Known:
+        return Known(T_map_base=self._T_start_base, session=0, module="run", covariance=None)
 
 
-def _starts(count: int, errors: list[list[float]], wrong: int) -> Starts:
-    worst = np.max(errors, axis=0, initial=0.0) if errors else np.zeros(2)
+def _unheard(*_: object, **__: object) -> None:
+    """Take no notice of an event."""
+
+
+def _starts(count: int, offs: Sequence[tuple[float, float]]) -> Starts:
+    """Return the starts, of which some were found with these errors [m, rad]."""
+    right = [off for off in offs if off[0] <= _WRONG_M and off[1] <= _WRONG_RAD]
+    worst = np.max(right, axis=0) if right else np.zeros(2)
     return Starts(
         count=count,
-        found=len(errors) + wrong,
-        wrong=wrong,
+        found=len(offs),
+        wrong=len(offs) - len(right),
         worst_m=float(worst[0]),
         worst_rad=float(worst[1]),
     )

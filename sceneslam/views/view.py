@@ -30,7 +30,6 @@ class Landmarks:
 class LandmarkView:
     """The features of one image."""
 
-    stamp_ns: int
     rays: NDArray[np.float32]  # (N, 2): x / z and y / z in the camera frame, undistorted
     descriptors: NDArray[np.uint8]  # (N, 32)
     depth_m: NDArray[np.float32]  # (N,), along the optical axis, 0 = missing
@@ -87,7 +86,6 @@ class LandmarkViewer:
         points_cam = np.column_stack([rays[seen], np.ones(len(seen))]) * z[seen, None]
         points_base = se3.apply(camera.T_base_cam, points_cam)
         return LandmarkView(
-            stamp_ns=observation.stamp_ns,
             rays=rays.astype(np.float32),
             descriptors=descriptors,
             depth_m=z,
