@@ -21,8 +21,9 @@ from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
+from sceneslam.views.placed_views import Sighting
 from sceneslam.views.view import Landmarks, LandmarkView, LandmarkViewer, PlacedView
-from sceneslam.views.view_finder import Sighting, ViewFinder
+from sceneslam.views.view_finder import ViewFinder
 
 CAMERA = Camera(size_wh=(640, 480), fx=500.0, fy=500.0, cx=320.0, cy=240.0)
 HERE, ELSEWHERE = se3.from_xy_yaw(2.0, 1.0, 0.4), se3.from_xy_yaw(-9.0, 4.0, 2.0)

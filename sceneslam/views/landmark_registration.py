@@ -1,0 +1,58 @@
+"""The motion between two views by the landmarks of both, whatever cameras saw them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.se3 import Transform
+from sceneslam.views.placed_views import Sighting, matches
+from sceneslam.views.view import Landmarks
+
+_SAMPLES = 300  # of three matches each: one is right with 99.9 % if three of ten matches are
+_MATCHES_MIN = (
+    25  # right by the motion found; by chance hardly more are than the three it is made of
+)
+_SIGMA_M, _SIGMA_RATIO = 0.017, 0.01  # of a landmark, and of its distance: structured light
+_SIGMAS = 3.0
+_ROUNDS = 3  # of the motion by all matches that are right: which ones are depends on it
+_FLOOR = np.repeat([0.01, 0.004], 3) ** 2  # m, rad: of landmarks among each other
+
+
+def register(T_map_first: Transform, first: Landmarks, second: Landmarks) -> Sighting | None:
+    """Return where the second view was taken in the map of the first, None if too few agree."""
+    rows, columns = matches(first.descriptors, second.descriptors)
+    if len(rows) < _MATCHES_MIN:
+        return None
+    a, b = first.points_base[rows].astype(float), second.points_base[columns].astype(float)
+    far_m = np.maximum(np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1))
+    sigma_m = _SIGMA_M + _SIGMA_RATIO * far_m
+    triples = np.random.default_rng(0).integers(0, len(a), (_SAMPLES, 3))
+    tried = _rigid(a[triples], b[triples])
+    counts = [np.sum(_off_m(T, a, b) <= _SIGMAS * sigma_m) for T in tried]
+    T = tried[int(np.argmax(counts))]
+    for _ in range(_ROUNDS):
+        kept = _off_m(T, a, b) <= _SIGMAS * sigma_m
+        if kept.sum() < _MATCHES_MIN:
+            return None
+        T = _rigid(a[kept][None], b[kept][None])[0]
+    by_motion = np.concatenate([np.tile(np.eye(3), (kept.sum(), 1, 1)), -se3.hat(b[kept])], axis=2)
+    weighted = by_motion / sigma_m[kept, None, None]
+    covariance = np.linalg.inv(np.einsum("nki,nkj->ij", weighted, weighted)) + np.diag(_FLOOR)
+    found = Sighting(T_map_base=T_map_first @ T, covariance=covariance, matches=int(kept.sum()))
+    return found if found.is_certain else None
+
+
+def _rigid(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return T_a_b (K, 4, 4) of K sets of points (K, N, 3) (Umeyama, PAMI 1991, without scale)."""
+    mean_a, mean_b = a.mean(axis=1, keepdims=True), b.mean(axis=1, keepdims=True)
+    u, _, vt = np.linalg.svd(np.swapaxes(a - mean_a, 1, 2) @ (b - mean_b))
+    u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
+    turn = u @ vt
+    shift = mean_a[:, 0] - np.einsum("kij,kj->ki", turn, mean_b[:, 0])
+    return se3.from_parts(turn, shift)
+
+
+def _off_m(T_a_b: Transform, a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.linalg.norm(se3.apply(T_a_b, b) - a, axis=1))

@@ -1,0 +1,105 @@
+"""Views at their poses in a map: which of them resemble another view, and which one it shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.se3 import Transform
+from sceneslam.views.place_index import PlaceIndex
+from sceneslam.views.view import Landmarks
+
+_LIKE = 40  # most similar views that candidates are taken from
+_PLACES, _PER_PLACE = 4, 2  # that are looked at, and views of each
+_PLACE_M = 2.0  # views this near show one place
+_RATIO = 0.8  # of the best match's distance to the second's (Lowe, IJCV 2004)
+_ALIKE = 0.6  # another place with so many of the best one's matches, and nothing is recognized
+_SAME_M, _SAME_RAD = 0.3, 0.15
+_DEVIATION_MAX_M, _DEVIATION_MAX_RAD = 0.03, 0.015  # of a pose: what agrees within 0.1 m ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sighting:
+    """The pose of a view in the map."""
+
+    T_map_base: Transform
+    covariance: NDArray[np.float64]  # (6, 6) of se3.log order, base frame
+    matches: int
+
+    @property
+    def is_certain(self) -> bool:
+        """Tell whether another sighting that agrees is no chance."""
+        shift, turn = self.covariance[:3, :3], self.covariance[3:, 3:]
+        is_near = np.linalg.eigvalsh(shift)[-1] <= _DEVIATION_MAX_M**2
+        return bool(is_near and np.linalg.eigvalsh(turn)[-1] <= _DEVIATION_MAX_RAD**2)
+
+
+class PlacedViews:
+    """Landmarks of views, with their poses T_map_base (4, 4)."""
+
+    def __init__(self, placed: Sequence[tuple[Transform, Landmarks]]) -> None:
+        self._placed = list(placed)
+        self._index = PlaceIndex()
+        for number, (_, landmarks) in enumerate(self._placed):
+            self._index.insert(number, landmarks.descriptors)
+
+    def __getitem__(self, number: int) -> tuple[Transform, Landmarks]:
+        return self._placed[number]
+
+    def near(self, T_map_base: Transform) -> list[int]:
+        """Return the views that were taken near a pose (4, 4)."""
+        at = T_map_base[:3, 3]
+        return [
+            number
+            for number, (T_map_seen, _) in enumerate(self._placed)
+            if np.linalg.norm(T_map_seen[:3, 3] - at) < _PLACE_M
+        ]
+
+    def alike(
+        self, descriptors: NDArray[np.uint8], among: Sequence[int] | None = None
+    ) -> list[int]:
+        """Return the most similar views, a few of each of the most similar places."""
+        places: list[list[int]] = []
+        for likeness in self._index.alike(descriptors, among)[:_LIKE]:
+            number = likeness.place_id
+            same = next((one for one in places if self._is_near(one[0], number)), None)
+            if same is None and len(places) < _PLACES:
+                places.append([number])
+            elif same is not None and len(same) < _PER_PLACE:
+                same.append(number)
+        return [number for place in places for number in place]
+
+    def _is_near(self, one: int, other: int) -> bool:
+        """Tell whether two views show one place."""
+        at, there = (self._placed[number][0][:3, 3] for number in (one, other))
+        return bool(np.linalg.norm(at - there) < _PLACE_M)
+
+
+def only_place(found: Mapping[int, Sighting]) -> int | None:
+    """Return the view with the most matches, None if another one puts the camera elsewhere."""
+    if not found:
+        return None
+    number = max(found, key=lambda k: found[k].matches)
+    best = found[number]
+    for other in found.values():
+        off = se3.inverse(best.T_map_base) @ other.T_map_base
+        is_same = se3.is_within(off, _SAME_M, _SAME_RAD)
+        if other.matches >= _ALIKE * best.matches and not is_same:
+            return None
+    return number
+
+
+def matches(
+    first: NDArray[np.uint8], second: NDArray[np.uint8]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the rows of two sets of descriptors (N, 32) that look like the same corners."""
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(first, second, k=2)
+    good = [pair[0] for pair in pairs if pair[0].distance < _RATIO * pair[-1].distance]
+    best = {match.trainIdx: match for match in sorted(good, key=lambda one: -one.distance)}
+    rows = np.array([match.queryIdx for match in best.values()], np.int64)
+    return rows, np.array(list(best), np.int64)
