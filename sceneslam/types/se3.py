@@ -20,10 +20,9 @@ def identity() -> Transform:
 
 
 def from_parts(rotation: NDArray[np.float64], translation_m: NDArray[np.float64]) -> Transform:
-    """Return T from a (3, 3) rotation and a (3,) translation [m]."""
-    T_a_b = np.eye(4)
-    T_a_b[:3, :3] = rotation
-    T_a_b[:3, 3] = translation_m
+    """Return T (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3) [m]."""
+    T_a_b = np.zeros((*rotation.shape[:-2], 4, 4))
+    T_a_b[..., :3, :3], T_a_b[..., :3, 3], T_a_b[..., 3, 3] = rotation, translation_m, 1.0
     return T_a_b
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
-from sceneslam.views.placed_views import Sighting, matches
+from sceneslam.views.placed_views import PlacedViews, Sighting, matches, only_place
 from sceneslam.views.view import Landmarks
 
 _SAMPLES = 300  # of three matches each: one is right with 99.9 % if three of ten matches are
@@ -18,6 +18,17 @@ _SIGMA_M, _SIGMA_RATIO = 0.017, 0.01  # of a landmark, and of its distance: stru
 _SIGMAS = 3.0
 _ROUNDS = 3  # of the motion by all matches that are right: which ones are depends on it
 _FLOOR = np.repeat([0.01, 0.004], 3) ** 2  # m, rad: of landmarks among each other
+
+
+def recognize(known: PlacedViews, landmarks: Landmarks) -> Sighting | None:
+    """Return where a view was taken in a map, None if it shows no place of it, or two alike."""
+    found = {
+        number: one
+        for number in known.alike(landmarks.descriptors)
+        if (one := register(*known[number], landmarks)) is not None
+    }
+    number = only_place(found)
+    return None if number is None else found[number]
 
 
 def register(T_map_first: Transform, first: Landmarks, second: Landmarks) -> Sighting | None:

@@ -13,7 +13,10 @@ from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.submaps.graph import Edge, EdgeKind, consistent, on_floor, solve
-from sceneslam.types import planar
+from sceneslam.types import planar, se3
+from sceneslam.types.se3 import Transform
+from sceneslam.views.landmark_registration import recognize
+from sceneslam.views.placed_views import PlacedViews
 
 _AROUND = 1  # neighbouring submaps on either side that are searched together with one
 _LOOPS_MIN = 2  # agreeing loops, as a single one may come from a similar place
@@ -53,26 +56,23 @@ def join_pieces(saved: SavedMap) -> Joined:
 def _joined(saved: SavedMap, piece: int) -> SavedMap | None:
     """Return the map with a piece joined to the first, None if it is not recognized."""
     own = np.flatnonzero(saved.pieces == piece).tolist()
-    loops = _loops(saved, own)
+    loops = [*_loops_by_walls(saved, own), *_loops_by_views(saved, own)]
     drift = np.zeros((len(saved.submaps), 3))
     agreeing = [loops[index] for index in consistent(loops, saved.T_map_node, drift)]
     if len(agreeing) < _LOOPS_MIN:
         return None
     nodes = np.array(saved.T_map_node)
     seed = agreeing[0]
-    plane = saved.plane
-    at_seed = planar.compose(plane[seed.first], planar.from_transform(seed.T_first_second))
-    T_first_piece = planar.compose(at_seed, planar.between(plane[seed.second], np.zeros(3)))
-    nodes[own] = planar.to_transform(T_first_piece) @ nodes[own]
+    at_seed = nodes[seed.first] @ seed.T_first_second
+    nodes[own] = at_seed @ se3.inverse(nodes[seed.second]) @ nodes[own]
     solved = _solve(saved, nodes, own, agreeing)
     pieces = np.where(saved.pieces == piece, 0, saved.pieces)
     return replace(saved, T_map_node=solved, pieces=pieces, edges=(*saved.edges, *agreeing))
 
 
-def _loops(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
-    """Return loops from the first piece to the submaps `own` of another piece."""
-    main, plane = np.flatnonzero(saved.pieces == 0), saved.plane
-    walls = saved.plan()
+def _loops_by_walls(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
+    """Return loops from the first piece to the submaps `own` of another piece, by their walls."""
+    plane, walls = saved.plane, saved.plan()
     if not len(walls):
         return []
     target, found = Recognizer(PlanField(walls)), []
@@ -81,22 +81,42 @@ def _loops(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
         near = [index for index in around if saved.submaps[index].run == saved.submaps[node].run]
         query = join([(planar.between(plane[node], plane[i]), saved.submaps[i].plan) for i in near])
         match = target.recognize(PlanField(query), None) if len(query) else None
-        if match is None or match.weak_directions:
-            continue
-        away_m = np.linalg.norm(plane[main, :2] - match.T_target_query[:2], axis=1)
-        first = int(main[np.argmin(away_m)])
-        found.append(
-            Edge(
-                first=first,
-                second=node,
-                T_first_second=planar.to_transform(
-                    planar.between(plane[first], match.T_target_query)
-                ),
-                covariance=on_floor(match.covariance),
-                kind=EdgeKind.LOOP,
-            )
-        )
+        if match is not None and not match.weak_directions:
+            T_map_node = planar.to_transform(match.T_target_query)
+            found.append(_edge_to(saved, node, T_map_node, on_floor(match.covariance)))
     return found
+
+
+def _loops_by_views(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
+    """Return the same by what a camera saw, a loop per view that was recognized."""
+    known = PlacedViews(saved.views())
+    return [
+        _edge_to(
+            saved,
+            node,
+            seen.T_map_base @ se3.inverse(view.T_submap_base),
+            se3.carried(seen.covariance, view.T_submap_base),
+        )
+        for node in own
+        for view in saved.submaps[node].views
+        if (seen := recognize(known, view.landmarks)) is not None
+    ]
+
+
+def _edge_to(
+    saved: SavedMap, node: int, T_map_node: Transform, covariance: NDArray[np.float64]
+) -> Edge:
+    """Return the loop to a node at T_map_node (4, 4) from the first piece's nearest one."""
+    main = np.flatnonzero(saved.pieces == 0)
+    away_m = np.linalg.norm(saved.T_map_node[main, :3, 3] - T_map_node[:3, 3], axis=1)
+    first = int(main[np.argmin(away_m)])
+    return Edge(
+        first=first,
+        second=node,
+        T_first_second=se3.inverse(saved.T_map_node[first]) @ T_map_node,
+        covariance=covariance,
+        kind=EdgeKind.LOOP,
+    )
 
 
 def _solve(

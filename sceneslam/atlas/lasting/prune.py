@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sceneslam.atlas.lasting.saved_map import SavedMap
+from sceneslam.atlas.lasting.saved_map import SavedMap, are_covered
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.submaps.graph import Edge, EdgeKind
 from sceneslam.types import planar, se3
 
-_VIEW_M, _VIEW_RAD = 0.5, 0.4  # from a view that shows the same
 _COVERED_RATIO = 0.95  # of a submap's walls, covered by later submaps
 
 
@@ -43,20 +41,9 @@ def _is_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
 
 def _are_views_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
     """Tell whether each view of a submap has one of the others near it."""
-    later = [_seen_from(saved, other) for other in others if saved.submaps[other].views]
-    own = _seen_from(saved, node)
-    if not len(own) or not later:
-        return not len(own)
-    T_own_later = se3.inverse(own)[:, None] @ np.concatenate(later)[None]
-    is_near = np.linalg.norm(T_own_later[..., :3, 3], axis=-1) <= _VIEW_M
-    is_near &= se3.rotation_angle_rad(T_own_later) <= _VIEW_RAD
-    return bool(is_near.any(axis=1).all())
-
-
-def _seen_from(saved: SavedMap, node: int) -> NDArray[np.float64]:
-    """Return the poses (N, 4, 4) that the views of a submap were seen from."""
-    T_submap_base = [view.T_submap_base for view in saved.submaps[node].views]
-    return np.asarray(saved.T_map_node[node] @ np.array(T_submap_base).reshape(-1, 4, 4))
+    own = saved.seen_from(node)
+    later = [np.zeros((0, 4, 4)), *(saved.seen_from(other) for other in others)]
+    return bool(are_covered(own, np.concatenate(later)).all())
 
 
 def _are_walls_covered(saved: SavedMap, node: int, others: list[int]) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,11 @@ from numpy.typing import NDArray
 from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan, join
 from sceneslam.atlas.submaps.graph import Edge
 from sceneslam.atlas.submaps.submap import Submap
-from sceneslam.types import planar
+from sceneslam.types import planar, se3
 from sceneslam.types.se3 import Transform
 from sceneslam.views.view import Landmarks
+
+_VIEW_M, _VIEW_RAD = 0.5, 0.4  # from a view that shows the same
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,6 +58,11 @@ class SavedMap:
             for view in submap.views
         ]
 
+    def seen_from(self, node: int) -> NDArray[np.float64]:
+        """Return the poses (N, 4, 4) in the map that the views of a submap were seen from."""
+        T_submap_base = [view.T_submap_base for view in self.submaps[node].views]
+        return np.asarray(self.T_map_node[node] @ np.array(T_submap_base).reshape(-1, 4, 4))
+
     def of(self, keep: Sequence[int]) -> SavedMap:
         """Return the map of the nodes `keep`, with the edges between them."""
         number = {node: index for index, node in enumerate(keep)}
@@ -81,7 +89,7 @@ def forget_contradicted(saved: SavedMap, run: int) -> SavedMap:
     """Return the map without walls of earlier runs that stand where `run` saw free space.
 
     Likewise free cells of earlier runs are removed where this run saw a wall. Within one cell, the
-    registration's accuracy, nothing is removed.
+    registration's accuracy, nothing is removed. Earlier views go where this run has one nearby.
     """
     newest = [index for index, submap in enumerate(saved.submaps) if submap.run == run]
     if not newest:
@@ -89,11 +97,24 @@ def forget_contradicted(saved: SavedMap, run: int) -> SavedMap:
     piece = int(saved.pieces[newest[0]])
     plane = saved.plane
     today = join([(plane[i], saved.submaps[i].plan) for i in newest])
+    views_today = np.concatenate([saved.seen_from(index) for index in newest])
     submaps = list(saved.submaps)
     for index, submap in enumerate(saved.submaps):
-        if submap.run != run and saved.pieces[index] == piece and len(submap.plan):
-            submaps[index] = submap.with_plan(_without(submap.plan, plane[index], today))
+        if submap.run == run or saved.pieces[index] != piece:
+            continue
+        if len(submap.plan):
+            submap = submap.with_plan(_without(submap.plan, plane[index], today))
+        is_old = are_covered(saved.seen_from(index), views_today)
+        views = tuple(compress(submap.views, ~is_old))
+        submaps[index] = replace(submap, views=views)
     return replace(saved, submaps=tuple(submaps))
+
+
+def are_covered(views: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell of each view, by its pose (N, 4, 4), whether one of the others shows the same."""
+    off = se3.inverse(views)[:, None] @ others[None]
+    is_near = np.linalg.norm(off[..., :3, 3], axis=-1) <= _VIEW_M
+    return np.asarray((is_near & (se3.rotation_angle_rad(off) <= _VIEW_RAD)).any(axis=1))
 
 
 def _without(plan: FloorPlan, T_today_plan: planar.Planar, today: FloorPlan) -> FloorPlan:

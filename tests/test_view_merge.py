@@ -1,0 +1,97 @@
+"""Maps joined by what cameras saw, and views that later ones replace."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_atlas_maps import map_of
+from test_views import ELSEWHERE, HERE, place
+
+from sceneslam.atlas.lasting.merge import join_pieces
+from sceneslam.atlas.lasting.saved_map import forget_contradicted
+from sceneslam.atlas.places.floor_plan import join
+from sceneslam.types import se3
+from sceneslam.views.landmark_registration import recognize, register
+from sceneslam.views.placed_views import PlacedViews
+from sceneslam.views.view import Landmarks, PlacedView
+
+TILTED = se3.exp(np.array([0.2, -0.1, 0.3, 0.05, -0.1, 0.3]))
+
+
+def seen_from(T_place_base, seed, *, noise_m=0.0, wrong=0.0):
+    """The landmarks of a place as seen from a pose in it; a share of them lies elsewhere."""
+    rng, true = np.random.default_rng(seed + 50), place(seed)
+    points = se3.apply(se3.inverse(T_place_base), true.points_base.astype(float))
+    points += rng.normal(0, noise_m, points.shape)
+    is_wrong = rng.random(len(points)) < wrong
+    points[is_wrong] = rng.uniform(-3, 3, (is_wrong.sum(), 3))
+    return Landmarks(points_base=points.astype(np.float32), descriptors=true.descriptors)
+
+
+@pytest.mark.parametrize(("noise_m", "wrong", "off_m"), [(0, 0, 1e-6), (0.02, 0.5, 0.02)])
+def test_two_views_are_registered_by_their_landmarks(noise_m, wrong, off_m):
+    other = seen_from(TILTED, 1, noise_m=noise_m, wrong=wrong)
+    found = register(HERE, place(1), other)
+    off = se3.log(se3.inverse(HERE @ TILTED) @ found.T_map_base)
+    assert np.linalg.norm(off[:3]) < off_m and found.matches > (1 - wrong) * 170
+    assert off @ np.linalg.solve(found.covariance, off) < 16.8  # 99 % of six
+    assert register(HERE, place(1), seen_from(TILTED, 2)) is None
+    assert register(HERE, place(1), seen_from(TILTED, 1, wrong=0.95)) is None
+
+
+def test_places_that_look_alike_are_not_recognized():
+    other = seen_from(TILTED, 1)
+    known = PlacedViews([(HERE, place(1)), (ELSEWHERE, place(2))])
+    np.testing.assert_allclose(recognize(known, other).T_map_base, HERE @ TILTED, atol=1e-5)
+    assert recognize(PlacedViews([(HERE, place(1)), (ELSEWHERE, place(1))]), other) is None
+    assert recognize(PlacedViews([]), other) is None
+
+
+def viewed(saved, *views):
+    """The map with these (pose in the submap, landmarks) as the views of its submaps."""
+    return replace(
+        saved,
+        submaps=tuple(
+            replace(
+                submap,
+                views=tuple(
+                    PlacedView(stamp_ns=number, T_submap_base=T, landmarks=landmarks)
+                    for number, (T, landmarks) in enumerate(own)
+                ),
+            )
+            for submap, own in zip(saved.submaps, views, strict=True)
+        ),
+    )
+
+
+def test_pieces_are_joined_by_two_views_that_agree():
+    flat, aside = join([]), se3.from_xy_yaw(1.0, 0.5, 0.3)
+    saved = map_of(flat, flat, nodes=[[2, 1, 0.4], [0, 0, 0]], pieces=[0, 1], runs=[0, 1])
+    first = [(se3.identity(), place(1)), (aside, place(2))]
+    T_first_second = TILTED  # of the submaps; it was held by hand
+    second = [
+        (se3.identity(), seen_from(T_first_second, 1)),
+        (se3.identity(), seen_from(se3.inverse(aside) @ T_first_second, 2)),
+    ]
+    joined = join_pieces(viewed(saved, first, second))
+    assert (joined.joined, joined.apart) == (1, 0) and (joined.map.pieces == 0).all()
+    expected = saved.T_map_node[0] @ T_first_second
+    np.testing.assert_allclose(joined.map.T_map_node[1], expected, atol=0.01)
+    alone = join_pieces(viewed(saved, first, second[:1]))
+    assert (alone.joined, alone.apart) == (0, 1)
+    contradicting = [second[0], (aside, second[1][1])]
+    assert join_pieces(viewed(saved, first, contradicting)).joined == 0
+
+
+def test_a_view_goes_where_the_newest_run_has_one_nearby():
+    flat = join([])
+    saved = map_of(flat, flat, nodes=[[2, 1, 0.4], [0, 0, 0]], runs=[0, 1])
+    at = saved.T_map_node[0]
+    poses = [se3.identity(), se3.from_xy_yaw(0.4, 0, 0.3), se3.from_xy_yaw(0.6, 0, 0), TILTED]
+    poses += [se3.from_xy_yaw(0, 0, 0.5)]
+    old = [(T, place(number)) for number, T in enumerate(poses)]
+    left = forget_contradicted(viewed(saved, old, [(at, place(9))]), 1)
+    assert [view.stamp_ns for view in left.submaps[0].views] == [2, 4]
+    assert len(left.submaps[1].views) == 1
+    kept = forget_contradicted(viewed(saved, old, []), 1)
+    assert len(kept.submaps[0].views) == 5
