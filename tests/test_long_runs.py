@@ -89,17 +89,17 @@ def drive(atlas, clouds, *, is_live=False):
 
 @pytest.mark.parametrize("is_live", [False, True])
 def test_what_was_seen_before_is_not_kept_again_beyond_the_limit(is_live):
-    atlas = Atlas(voxel_m=0.01, point_limit=45_000)
+    atlas = Atlas(voxel_m=0.01, budget_mb=1.0)
     fused = drive(atlas, [cloud()] * 9, is_live=is_live)
     assert len(fused.points.points) == 10_000
     held = sum(len(session.layers.points.points) for session in atlas._sessions)
     assert len(atlas._sessions[0].layers.points.points) == 10_000
     if not is_live:  # in another thread it may be done a session later
-        assert held <= 45_000
+        assert held * 15 <= 1e6
 
 
 def test_new_ground_beyond_the_limit_is_kept_more_coarsely():
-    atlas = Atlas(voxel_m=0.01, point_limit=45_000)
+    atlas = Atlas(voxel_m=0.01, budget_mb=1.0)
     fused = drive(atlas, [cloud(shift_m) for shift_m in range(9)])
     seen_m = np.unique(np.floor(fused.points.points[:, 0]))
     assert len(fused.points.points) <= 45_000 and list(seen_m) == list(range(9))
@@ -121,7 +121,7 @@ def layers(*x_m, stamp_ns=0):
 
 
 def test_thinning_keeps_the_first_point_per_module_and_voxel_of_the_map():
-    own = Budget(limit=14, voxel_m=0.1)
+    own = Budget(limit_mb=301e-6, voxel_m=0.1)
     placed = [("a", 0.0), ("b", 0.0), ("a", 5.0)]
     given = [layers(0.01, 0.06, 0.31), layers(0.01), layers(-5.0, -4.5, -3.0, stamp_ns=7)]
     sessions = [
@@ -131,7 +131,9 @@ def test_thinning_keeps_the_first_point_per_module_and_voxel_of_the_map():
     sessions.append(OpenSession("c", se3.identity()))
     own.open(is_live=False)
     own.keep(sessions)
-    assert [session.layers for session in sessions[:3]] == given  # 14 points and landmarks
+    assert [
+        session.layers for session in sessions[:3]
+    ] == given  # 7 points of 15 bytes and 7 landmarks of 28
     sessions[3].layers = MapLayers(points=layers(9.0, 9.01).points)
     own.keep(sessions)
     kept = [session.layers for session in sessions]
@@ -144,9 +146,9 @@ def test_thinning_keeps_the_first_point_per_module_and_voxel_of_the_map():
     own.close()
 
 
-def test_point_limit_is_checked():
-    with pytest.raises(ConfigError, match="point_limit"):
-        Atlas(voxel_m=0.01, point_limit=0)
+def test_the_budget_is_checked():
+    with pytest.raises(ConfigError, match="budget_mb"):
+        Atlas(voxel_m=0.01, budget_mb=0.0)
 
 
 def test_ten_slowest_poses_are_kept_the_slowest_first():

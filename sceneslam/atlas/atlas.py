@@ -42,13 +42,13 @@ class Atlas:
         save: str | None = None,
         mode: str = EXTEND,
         save_every_s: float = 60.0,
-        point_limit: int | None = None,
+        budget_mb: float | None = None,
     ) -> None:
         if not 0 < voxel_m < float("inf"):
             raise ConfigError("voxel_m", voxel_m, "metres above 0")
-        if point_limit is not None and not point_limit >= 1:
-            raise ConfigError("point_limit", point_limit, "null (no limit), or 1 or more")
-        self._budget = None if point_limit is None else Budget(limit=point_limit, voxel_m=voxel_m)
+        if budget_mb is not None and not budget_mb > 0:
+            raise ConfigError("budget_mb", budget_mb, "null (no limit), or above 0")
+        self._budget = None if budget_mb is None else Budget(limit_mb=budget_mb, voxel_m=voxel_m)
         self._lasting = LastingMap(load=load, save=save, mode=mode, save_every_s=save_every_s)
         self._mapper: Mapper | None = None  # None while only poses are given
         self._note: Note | None = None

@@ -1,10 +1,10 @@
-"""Limit the points that closed sessions keep, so that a run of hours in one place needs no more."""
+"""Limit the memory of closed sessions' maps, so that a run of hours in one place needs no more."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from sceneslam.atlas.fusion import one_per_voxel
 from sceneslam.atlas.pose_path import OpenSession
 from sceneslam.executors import InStep, executor
 from sceneslam.types import se3
-from sceneslam.types.maps import LandmarkLayer, PointLayer
+from sceneslam.types.maps import LandmarkLayer, MapLayers, PointLayer
 
 _REST = 0.5  # share of the limit that is left by thinning, so that it is not due at every session
 
@@ -21,14 +21,14 @@ Layer = PointLayer | LandmarkLayer
 
 
 class Budget:
-    """Thins clouds and landmarks to one per module and voxel once there are more than `limit`.
+    """Thins clouds and landmarks to one per module and voxel once they need more than `limit_mb`.
 
     Where that is not enough, as in a large building, the voxels grow. Sessions lie where they were
     placed during the run; their points stay in their own frames, so that later corrections apply.
     """
 
-    def __init__(self, *, limit: int, voxel_m: float) -> None:
-        self._limit, self._voxel_m = limit, voxel_m
+    def __init__(self, *, limit_mb: float, voxel_m: float) -> None:
+        self._limit, self._voxel_m = limit_mb * 1e6, voxel_m  # bytes
         self._executor: Executor = InStep()
         self._thinning: Future[None] | None = None
 
@@ -37,11 +37,11 @@ class Budget:
         self._executor = executor("budget", is_live=is_live)
 
     def keep(self, sessions: Sequence[OpenSession]) -> None:
-        """Thin the sessions' layers if there are too many points in all."""
-        if sum(_count(session) for session in sessions) <= self._limit:
+        """Thin the sessions' layers if they need too much in all."""
+        if sum(_bytes(session.layers) for session in sessions) <= self._limit:
             return
         if self._thinning is None or self._thinning.done():
-            rest = round(_REST * self._limit)
+            rest = _REST * self._limit
             self._thinning = self._executor.submit(thin, tuple(sessions), self._voxel_m, rest)
 
     def close(self) -> None:
@@ -51,8 +51,8 @@ class Budget:
             self._thinning.result()
 
 
-def thin(sessions: Sequence[OpenSession], voxel_m: float, most: int) -> None:
-    """Leave one point per module and voxel, the first; double the voxel until `most` are left."""
+def thin(sessions: Sequence[OpenSession], voxel_m: float, most: float) -> None:
+    """Leave one point per module and voxel, the first; double the voxel down to `most` bytes."""
     layers = [session.layers for session in sessions]  # a session that is closed meanwhile is kept
     modules = list(dict.fromkeys(session.module for session in sessions))
     owners = [modules.index(session.module) for session in sessions]
@@ -60,25 +60,30 @@ def thin(sessions: Sequence[OpenSession], voxel_m: float, most: int) -> None:
     while True:
         points = _kept([one.points for one in layers], owners, poses, voxel_m)
         landmarks = _kept([one.landmarks for one in layers], owners, poses, voxel_m)
-        if sum(len(rows) for rows in (*points, *landmarks)) <= most:
+        left = [_of(*one) for one in zip(layers, points, landmarks, strict=True)]
+        if sum(_bytes(one) for one in left) <= most:
             break
         voxel_m *= 2.0
-    for session, before, rows, marks in zip(sessions, layers, points, landmarks, strict=True):
-        if before.points is not None:
-            colors = before.points.colors_bgr
-            cloud = PointLayer(
-                points=before.points.points[rows],
-                colors_bgr=None if colors is None else colors[rows],
-            )
-            session.layers = replace(session.layers, points=cloud)
-        if before.landmarks is not None:
-            seen = before.landmarks
-            layer = LandmarkLayer(
-                points=seen.points[marks],
-                first_stamps_ns=seen.first_stamps_ns[marks],
-                sightings=seen.sightings[marks],
-            )
-            session.layers = replace(session.layers, landmarks=layer)
+    for session, before, after in zip(sessions, layers, left, strict=True):
+        if before.points is not None or before.landmarks is not None:
+            session.layers = replace(session.layers, points=after.points, landmarks=after.landmarks)
+
+
+def _of(layers: MapLayers, rows: NDArray[np.intp], marks: NDArray[np.intp]) -> MapLayers:
+    """Return layers with these rows of their points and landmarks."""
+    points, landmarks = layers.points, layers.landmarks
+    if points is not None:
+        colors = points.colors_bgr
+        points = PointLayer(
+            points=points.points[rows], colors_bgr=None if colors is None else colors[rows]
+        )
+    if landmarks is not None:
+        landmarks = LandmarkLayer(
+            points=landmarks.points[marks],
+            first_stamps_ns=landmarks.first_stamps_ns[marks],
+            sightings=landmarks.sightings[marks],
+        )
+    return replace(layers, points=points, landmarks=landmarks)
 
 
 def _kept(
@@ -98,7 +103,8 @@ def _kept(
     return [rows - (end - count) for rows, end, count in zip(parts, ends, counts, strict=True)]
 
 
-def _count(session: OpenSession) -> int:
-    layers = session.layers
+def _bytes(layers: MapLayers) -> int:
+    """Return what the points and landmarks need."""
     held = [one for one in (layers.points, layers.landmarks) if one is not None]
-    return sum(len(one.points) for one in held)
+    arrays = [getattr(one, each.name) for one in held for each in fields(one)]
+    return sum(array.nbytes for array in arrays if array is not None)
