@@ -13,10 +13,11 @@ from sceneslam.atlas.pose_path import trajectory_of
 from sceneslam.atlas.rows import Rows
 from sceneslam.atlas.submaps.collector import Collector, Known
 from sceneslam.atlas.submaps.correction import Correction
-from sceneslam.atlas.submaps.graph import Edge, EdgeKind, consistent, on_floor
+from sceneslam.atlas.submaps.graph import consistent, on_floor
 from sceneslam.atlas.submaps.own_loops import closed_loops, recognized_loops
 from sceneslam.atlas.submaps.submap import KeyPose, make_submap, motion_covariance, split
 from sceneslam.atlas.uncertainty import GYRO, MAPPED, VELOCITY, WHEELS, drifted
+from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import GridLayer, LoopLayer, MapLayers, PointLayer, PoseGraphLayer
 from sceneslam.types.rig import Rig, Sensor

@@ -6,9 +6,9 @@ from test_atlas_places import CELL, plan_of, quality
 
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.submaps import loop_closure
-from sceneslam.atlas.submaps.graph import EdgeKind
 from sceneslam.atlas.submaps.loop_closure import LoopFinder
 from sceneslam.atlas.submaps.submap import Drawing, Submap
+from sceneslam.graphs.edge import EdgeKind
 from sceneslam.types import planar
 
 WALL = plan_of("##")

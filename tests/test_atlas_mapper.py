@@ -10,8 +10,9 @@ from sceneslam.atlas import mapper as mapper_of
 from sceneslam.atlas.mapper import Mapper
 from sceneslam.atlas.places.localizer import LocalizationEvent
 from sceneslam.atlas.submaps.collector import Known
-from sceneslam.atlas.submaps.graph import LOADED, EdgeKind
+from sceneslam.atlas.submaps.graph import LOADED
 from sceneslam.experiments.one_map.drive import RIG
+from sceneslam.graphs.edge import EdgeKind
 from sceneslam.types import planar
 from sceneslam.types.observation import LaserScan, Observation
 

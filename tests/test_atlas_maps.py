@@ -16,8 +16,9 @@ from sceneslam.atlas.lasting.merge import join_pieces
 from sceneslam.atlas.lasting.prune import prune
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map, forget_contradicted
 from sceneslam.atlas.places.floor_plan import join
-from sceneslam.atlas.submaps.graph import Edge, EdgeKind, on_floor
+from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.submaps.submap import Drawing, Submap
+from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar
 from sceneslam.types.errors import ConfigError, InputError
 

@@ -14,8 +14,9 @@ from sceneslam.atlas.lasting.saved_map import forget_contradicted
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.places.registration import register
-from sceneslam.atlas.submaps.graph import Edge, EdgeKind, consistent, on_floor, solve
+from sceneslam.atlas.submaps.graph import consistent, on_floor, solve
 from sceneslam.experiments.one_map.drive import Drive, Odometry, map_of, plan_of
+from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.maps.__main__ import main
 from sceneslam.testing.floor_plans import (
     CUPBOARD,

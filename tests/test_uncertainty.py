@@ -6,7 +6,7 @@ from driving import drive, events
 from fakes import ExactModule
 
 from sceneslam.atlas.covariances import PosedPath, calibrated, covariances
-from sceneslam.atlas.submaps.graph import LOADED, Edge, EdgeKind
+from sceneslam.atlas.submaps.graph import LOADED
 from sceneslam.atlas.submaps.submap import LENGTH_M
 from sceneslam.atlas.uncertainty import (
     MAPPED,
@@ -16,6 +16,7 @@ from sceneslam.atlas.uncertainty import (
     write_covariances,
 )
 from sceneslam.bus.handover_log import log_uncertainty
+from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
 

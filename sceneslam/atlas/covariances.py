@@ -14,9 +14,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.atlas.submaps.graph import LOADED, Edge, marginals
+from sceneslam.atlas.submaps.graph import LOADED, marginals
 from sceneslam.atlas.submaps.submap import LENGTH_M, TURN_RAD
 from sceneslam.atlas.uncertainty import MAPPED, Covariance, Drift, drifted
+from sceneslam.graphs.edge import Edge
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
 

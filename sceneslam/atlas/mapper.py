@@ -19,10 +19,11 @@ from sceneslam.atlas.places.localizer import LocalizationEvent, Look, MapLocaliz
 from sceneslam.atlas.places.view_taker import ViewTaker
 from sceneslam.atlas.submaps.collector import Collector, Known
 from sceneslam.atlas.submaps.correction import Correction
-from sceneslam.atlas.submaps.graph import LOADED, Edge
+from sceneslam.atlas.submaps.graph import LOADED
 from sceneslam.atlas.submaps.own_loops import Path
 from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.executors import executor
+from sceneslam.graphs.edge import Edge
 from sceneslam.scans.key_scan import KeyScanner
 from sceneslam.types import se3
 from sceneslam.types.maps import MapLayers

@@ -9,7 +9,7 @@ import numpy as np
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import grid_of
 from sceneslam.atlas.save import save_grid, save_pose_graph
-from sceneslam.atlas.submaps.graph import EdgeKind
+from sceneslam.graphs.edge import EdgeKind
 from sceneslam.types.maps import PoseGraphLayer
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import CELL_M
-from sceneslam.atlas.submaps.graph import EdgeKind
+from sceneslam.graphs.edge import EdgeKind
 from sceneslam.types import se3
 
 _CHI2_6 = 22.46  # six degrees of freedom, p = 0.001

@@ -6,33 +6,20 @@ Levenberg-Marquardt in gtsam is used, as there are few keyframes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from sceneslam.graphs.edge import Edge, EdgeKind
+from sceneslam.graphs.factors import fit
 from sceneslam.types import se3
-from sceneslam.types.se3 import Transform
 
 from ..surfaces.registration import CameraPrior, register, samples_of
-from ..surfaces.surface import Doubles
 from .keyframe_map import KeyframeMap
 
 _MATCHED_MIN_RATIO = 0.5
 _OVERLAP_MIN_RATIO = 0.25
 _PARTNERS_MAX = 8
 _HUBER_SIGMAS = 3.0
-_LOOSE = 10.0  # information [1/m^2, 1/rad^2] of the edges by tracking
-_GTSAM_ORDER = [3, 4, 5, 0, 1, 2]  # rotation first
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RegistrationEdge:
-    """The measured pose of a keyframe relative to another."""
-
-    first: int
-    second: int
-    T_first_second: Transform
-    information: Doubles  # (6, 6) of se3.log order, second's cam
+_LOOSE = 10.0  # information [1/m^2, 1/rad^2] of tracking, and of each edge
 
 
 class DepthPoseGraph:
@@ -40,7 +27,7 @@ class DepthPoseGraph:
 
     def __init__(self, keyframes: KeyframeMap, *, weak_ratio: float) -> None:
         self._map, self._weak_ratio = keyframes, weak_ratio
-        self._edges: list[RegistrationEdge] = []
+        self._edges: list[Edge] = []
         self._waiting: list[tuple[int, int]] = []
         self.is_fresh = False  # there are new edges since the last optimisation
 
@@ -72,38 +59,23 @@ class DepthPoseGraph:
 
     def solve(self) -> None:
         """Optimise the keyframes' poses; the first is fixed."""
-        import gtsam
-
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        poses = {index: one.T_local_cam for index, one in enumerate(self._map.keyframes)}
+        solved = fit(poses, self._edges, held=0, huber_sigmas=_HUBER_SIGMAS)
         for index, keyframe in enumerate(self._map.keyframes):
-            values.insert(index, gtsam.Pose3(keyframe.T_local_cam))
-        fixed = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
-        graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), fixed))
-        robust = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER_SIGMAS)
-        for edge in self._edges:
-            ordered = edge.information[np.ix_(_GTSAM_ORDER, _GTSAM_ORDER)] + _LOOSE * np.eye(6)
-            noise = gtsam.noiseModel.Gaussian.Information(ordered)
-            graph.add(
-                gtsam.BetweenFactorPose3(
-                    edge.first,
-                    edge.second,
-                    gtsam.Pose3(edge.T_first_second),
-                    gtsam.noiseModel.Robust.Create(robust, noise),
-                )
-            )
-        solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-        for index, keyframe in enumerate(self._map.keyframes):
-            keyframe.move(np.array(solved.atPose3(index).matrix()))
+            keyframe.move(solved[index])
         self.is_fresh = False
 
-    def _chain(self, index: int) -> RegistrationEdge:
+    def _chain(self, index: int) -> Edge:
         """Return the weak edge by tracking, for directions without another constraint."""
         before, this = self._map[index - 1], self._map[index]
-        return RegistrationEdge(
-            index - 1, index, before.T_cam_local @ this.T_local_cam, np.zeros((6, 6))
+        return Edge(
+            first=index - 1,
+            second=index,
+            T_first_second=before.T_cam_local @ this.T_local_cam,
+            covariance=np.eye(6) / _LOOSE,
         )
 
-    def _register(self, first: int, second: int) -> RegistrationEdge | None:
+    def _register(self, first: int, second: int) -> Edge | None:
         known, other = self._map[first], self._map[second]
         grid = self._map.grid
         guess = CameraPrior(other.T_local_cam, _LOOSE * np.eye(6))
@@ -112,4 +84,10 @@ class DepthPoseGraph:
         if found is None or found.matched_ratio < _MATCHED_MIN_RATIO:
             return None
         T_first_second = se3.inverse(known.T_local_cam) @ found.T_local_cam
-        return RegistrationEdge(first, second, T_first_second, found.information)
+        return Edge(
+            first=first,
+            second=second,
+            T_first_second=T_first_second,
+            covariance=np.asarray(np.linalg.inv(found.information + _LOOSE * np.eye(6))),
+            kind=EdgeKind.LOOP,
+        )

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan
-from sceneslam.atlas.submaps.graph import Edge, EdgeKind
 from sceneslam.atlas.submaps.submap import Drawing, Submap
+from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.files import PART, replacing
 from sceneslam.views.view import Landmarks, PlacedView

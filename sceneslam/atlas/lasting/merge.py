@@ -12,7 +12,8 @@ from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
-from sceneslam.atlas.submaps.graph import Edge, EdgeKind, consistent, on_floor, solve
+from sceneslam.atlas.submaps.graph import consistent, on_floor, solve
+from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar, se3
 from sceneslam.types.se3 import Transform
 from sceneslam.views.landmark_registration import recognize

@@ -7,8 +7,8 @@ import numpy as np
 from sceneslam.atlas.lasting.saved_map import SavedMap, are_covered
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
-from sceneslam.atlas.submaps.graph import Edge, EdgeKind
-from sceneslam.types import planar, se3
+from sceneslam.graphs.edge import Edge, EdgeKind
+from sceneslam.types import planar
 
 _COVERED_RATIO = 0.95  # of a submap's walls, covered by later submaps
 
@@ -73,18 +73,7 @@ def _bridges(saved: SavedMap, kept: set[int]) -> list[Edge]:
         edge, passed = onward.get(start), False
         while edge is not None and edge.second not in kept:
             after = onward.get(edge.second)
-            edge, passed = None if after is None else _in_a_row(start, edge, after), True
+            edge, passed = None if after is None else edge.then(after), True
         if edge is not None and passed:
             found.append(edge)
     return found
-
-
-def _in_a_row(start: int, edge: Edge, after: Edge) -> Edge:
-    T_back = se3.inverse(after.T_first_second)
-    return Edge(
-        first=start,
-        second=after.second,
-        T_first_second=edge.T_first_second @ after.T_first_second,
-        covariance=se3.carried(edge.covariance, T_back) + after.covariance,
-        kind=max(edge.kind, after.kind),
-    )

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan, join
-from sceneslam.atlas.submaps.graph import Edge
 from sceneslam.atlas.submaps.submap import Submap
+from sceneslam.graphs.edge import Edge
 from sceneslam.types import planar, se3
 from sceneslam.types.se3 import Transform
 from sceneslam.views.view import Landmarks

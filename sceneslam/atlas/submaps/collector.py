@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.atlas.submaps.graph import Edge, EdgeKind
 from sceneslam.atlas.submaps.own_loops import Path
 from sceneslam.atlas.submaps.submap import (
     STEP_M,
@@ -21,6 +20,7 @@ from sceneslam.atlas.submaps.submap import (
     split,
 )
 from sceneslam.atlas.uncertainty import GYRO, MAPPED, VELOCITY, WHEELS
+from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar, se3
 from sceneslam.types.rig import Rig, Sensor

@@ -8,16 +8,15 @@ graduated non-convexity (Yang et al., RA-L 2020), which can still reject each of
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from enum import IntEnum
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.graphs.edge import Edge
+from sceneslam.graphs.factors import TO_GTSAM, factor_of, noise_of
 from sceneslam.types import planar, se3
 from sceneslam.types.planar import Matrix
-from sceneslam.types.se3 import Transform
 
 _CHI2_6 = 16.81  # chi-square with 6 degrees of freedom, 99th percentile
 _FIXED = np.repeat([1e-4, 1e-5], 3)  # m, rad
@@ -27,31 +26,6 @@ _TILT_RAD = 0.04  # that modules drift in pitch along a corridor, before gravity
 _UPRIGHT_RAD = 0.01  # half a degree: of gyro and gravity, and as floors are uneven
 _VAIN = 50  # starts in a row without a larger clique
 LOADED = -1  # node of a loaded map
-_TO_GTSAM = [3, 4, 5, 0, 1, 2]  # rotation first, and back
-
-
-class EdgeKind(IntEnum):
-    """The source of an edge."""
-
-    MOTION = 0  # by one module
-    BRIDGE = 1  # by wheels, gyro or constant velocity
-    HANDOVER = 2  # from one module to the next, over observations that both processed
-    LOOP = 3  # a revisited place
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Edge:
-    """A measured motion between two nodes."""
-
-    first: int
-    second: int
-    T_first_second: Transform
-    covariance: NDArray[np.float64]  # (6, 6) of se3.log order [m, rad], axes of second
-    kind: EdgeKind
-
-    def shifted(self, by: int) -> Edge:
-        """Return the edge with its node numbers increased by `by`."""
-        return replace(self, first=self.first + by, second=self.second + by)
 
 
 def on_floor(covariance: Matrix) -> NDArray[np.float64]:
@@ -99,20 +73,20 @@ def solve(
     poses = [gtsam.Pose3(T) for T in T_map_node]
     for number, pose in enumerate(poses):
         values.insert(number, pose)
-    noise = gtsam.noiseModel.Diagonal.Sigmas(_FIXED[_TO_GTSAM])
+    noise = gtsam.noiseModel.Diagonal.Sigmas(_FIXED[TO_GTSAM])
     for number in fixed:
         graph.add(gtsam.PriorFactorPose3(number, poses[number], noise))
-    slack = gtsam.noiseModel.Diagonal.Sigmas((_LOOSE if len(fixed) else _FIXED)[_TO_GTSAM])
+    slack = gtsam.noiseModel.Diagonal.Sigmas((_LOOSE if len(fixed) else _FIXED)[TO_GTSAM])
     graph.add(gtsam.PriorFactorPose3(loose, poses[loose], slack))
     for edge in motions:
-        graph.add(_factor(gtsam, edge))
+        graph.add(factor_of(edge))
     tilt = gtsam.noiseModel.Isotropic.Sigma(2, _UPRIGHT_RAD)
     for one in uprights:
         directions = gtsam.Unit3(one.up_map), tilt, gtsam.Unit3(one.up_node)
         graph.add(gtsam.AttitudeFactorPose3(one.node, *directions))
     trusted = list(range(graph.size()))
     for edge in loops:
-        graph.add(_factor(gtsam, edge))
+        graph.add(factor_of(edge))
     parameters = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
     parameters.setKnownInliers(trusted)
     optimizer = gtsam.GncLMOptimizer(graph, values, parameters)
@@ -144,7 +118,7 @@ def marginals(
     for node, pose in nodes.items():
         values.insert(node, pose)
     for (first, second), covariance in measured:
-        noise = _noise(gtsam, covariance)
+        noise = noise_of(covariance)
         if first == LOADED:
             graph.add(gtsam.PriorFactorPose3(second, nodes[second], noise))
         else:
@@ -154,18 +128,8 @@ def marginals(
     parameters.setFactorization("QR")  # of the square root: deviations may differ by 1e5
     solved = gtsam.ISAM2(parameters)
     solved.update(graph, values)
-    back = np.ix_(_TO_GTSAM, _TO_GTSAM)
+    back = np.ix_(TO_GTSAM, TO_GTSAM)
     return {node: solved.marginalCovariance(node)[back] for node in nodes}
-
-
-def _factor(gtsam: Any, edge: Edge) -> Any:
-    return gtsam.BetweenFactorPose3(
-        edge.first, edge.second, gtsam.Pose3(edge.T_first_second), _noise(gtsam, edge.covariance)
-    )
-
-
-def _noise(gtsam: Any, covariance: NDArray[np.float64]) -> Any:
-    return gtsam.noiseModel.Gaussian.Covariance(covariance[np.ix_(_TO_GTSAM, _TO_GTSAM)])
 
 
 def consistent(

@@ -11,8 +11,9 @@ from sceneslam.atlas.places.floor_plan import FloorPlan, join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.plan_search import SearchWindow
 from sceneslam.atlas.places.recognition import Recognizer
-from sceneslam.atlas.submaps.graph import Edge, EdgeKind, on_floor
+from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.submaps.submap import Submap
+from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar
 from sceneslam.types.planar import Planar
 

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.localizer import Fix
 from sceneslam.atlas.submaps.collector import Collector
-from sceneslam.atlas.submaps.graph import Edge, EdgeKind, Upright, consistent, solve
+from sceneslam.atlas.submaps.graph import Upright, consistent, solve
 from sceneslam.atlas.submaps.loop_closure import LoopFinder
 from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops, recognized_loops
+from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.motion.tilt import upright
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import MapLayers

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future
 
+from sceneslam.graphs.factors import fit
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
@@ -13,9 +14,10 @@ from ..map.visual_map import VisualMap
 from ..see.cores import thread_beside
 from .loop_detection import LoopClosure, LoopDetector, Query
 from .loop_fusion import fuse_duplicates
-from .pose_graph import PoseGraph, solve
+from .pose_graph import PoseGraph
 
 _MERGE_IMAGES = 10  # after which a merge is due; a repeatable one waits for the worker
+_HUBER_SIGMAS = 1.345  # 95 % efficiency relative to least squares, without outliers
 _QUEUE = 3  # keyframes waiting for a query; older ones are dropped
 
 Poses = Mapping[int, Transform]
@@ -102,9 +104,9 @@ class VisualLoopCloser:
         segment = self._graph.connected(loop.keyframe_id)
         poses = self._poses()
         T_new_old = loop.T_local_base @ se3.inverse(poses[loop.keyframe_id])
-        if loop.edge.start in segment:
+        if loop.edge.first in segment:
             return {}
-        other = self._graph.connected(loop.edge.start)
+        other = self._graph.connected(loop.edge.first)
         if min(segment) < min(other):  # the older one stays
             segment, T_new_old = other, se3.inverse(T_new_old)
         return {k: T_new_old @ poses[k] for k in segment}
@@ -113,10 +115,12 @@ class VisualLoopCloser:
         """Start solving the part of the graph with the loops; `met`: poses of a moved segment."""
         part = self._graph.connected(loops[0].keyframe_id)
         self._before = {k: T for k, T in self._poses().items() if k in part}
-        edges = [edge for edge in self._graph.edges if edge.start in part]
+        edges = [edge for edge in self._graph.edges if edge.first in part]
         self._loops, self._images_left = loops, _MERGE_IMAGES
         first_guess = {**self._before, **met}
-        self._solution = self._worker.submit(solve, first_guess, edges, held=min(part))
+        self._solution = self._worker.submit(
+            fit, first_guess, edges, held=min(part), huber_sigmas=_HUBER_SIGMAS
+        )
 
     def _merge(self, solution: Future[dict[int, Transform]]) -> dict[int, Transform]:
         """Move the keyframes; newer ones move with the keyframe that they are connected to."""
@@ -138,8 +142,8 @@ class VisualLoopCloser:
 
     def _fuse(self, loops: list[LoopClosure]) -> None:
         for loop in loops:
-            if loop.edge.start in self._graph and loop.edge.end in self._graph:
-                fuse_duplicates(self._map, old=loop.edge.start, new=loop.edge.end)
+            if loop.edge.first in self._graph and loop.edge.second in self._graph:
+                fuse_duplicates(self._map, old=loop.edge.first, new=loop.edge.second)
 
     def _poses(self) -> dict[int, Transform]:
         keyframes = self._map.keyframes

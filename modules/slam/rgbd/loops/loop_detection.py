@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
 from ..locate.recognition import PlaceRecognizer, Recognition
 from ..map.keyframes import motion_between
 from ..map.visual_map import VisualMap
-from .pose_graph import KeyframeEdge, PoseGraph, motion_covariance
+from .pose_graph import PoseGraph, motion_covariance
 
 _RECENT = 5  # newest keyframes, which are never loop candidates
 _OUTSTANDING = 2.0  # sigmas above the similarity of unrelated keyframes
@@ -37,13 +38,13 @@ class Query:
 class LoopClosure:
     """A loop: the edge from an old to a new keyframe, and the new one's pose by it."""
 
-    edge: KeyframeEdge
+    edge: Edge
     T_local_base: Transform  # of the new keyframe, by the old part of the map
 
     @property
     def keyframe_id(self) -> int:
         """Return the new keyframe."""
-        return self.edge.end
+        return self.edge.second
 
 
 class LoopDetector:
@@ -91,7 +92,7 @@ class LoopDetector:
 
     def _is_there(self, loop: LoopClosure) -> bool:
         """Tell whether the map still has both keyframes of a loop."""
-        return loop.edge.start in self._graph and loop.edge.end in self._graph
+        return loop.edge.first in self._graph and loop.edge.second in self._graph
 
     def is_news(self, loop: LoopClosure) -> bool:
         """Tell whether a loop moves its keyframe by more than its uncertainty."""
@@ -102,14 +103,14 @@ class LoopDetector:
     def _is_plausible(self, loop: LoopClosure) -> bool:
         """Tell whether drift explains what a loop differs by from odometry's turn and the path."""
         edge, covariance = loop.edge, loop.edge.covariance
-        old, new = (self._map.keyframes[k] for k in (edge.start, edge.end))
+        old, new = (self._map.keyframes[k] for k in (edge.first, edge.second))
         motion = motion_between(old, new)
         if motion is not None:
-            off = se3.log(se3.inverse(motion.T_here_there) @ edge.T_start_end)[3:]
+            off = se3.log(se3.inverse(motion.T_here_there) @ edge.T_first_second)[3:]
             spread = covariance[3:, 3:] + _ALIKE * motion.variance[1] * np.eye(3)
             if float(off @ np.linalg.solve(spread, off)) > _CHI2_TURN:
                 return False
-        way = self._graph.way(edge.start, edge.end)
+        way = self._graph.way(edge.first, edge.second)
         if way is None:
             return True
         T_error = se3.inverse(new.T_local_base) @ loop.T_local_base
@@ -125,12 +126,12 @@ class LoopDetector:
         T_old = self._map.keyframes[seen.keyframe_id].T_local_base
         T_local_base = seen.fix.estimate.T_local_base
         T_start_end = se3.inverse(T_old) @ T_local_base
-        edge = KeyframeEdge(
-            start=seen.keyframe_id,
-            end=keyframe_id,
-            T_start_end=T_start_end,
+        edge = Edge(
+            first=seen.keyframe_id,
+            second=keyframe_id,
+            T_first_second=T_start_end,
             covariance=motion_covariance(T_start_end, seen.fix.estimate.covariance),
-            is_loop=True,
+            kind=EdgeKind.LOOP,
         )
         return LoopClosure(edge=edge, T_local_base=T_local_base)
 

@@ -2,53 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.graphs.edge import Edge
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
 _MODEL_ERROR_RATIO = 0.03  # of a motion: model errors, mainly by wrong intrinsics
-_HUBER_SIGMAS = 1.345  # 95 % efficiency relative to least squares, without outliers
-_HELD_SIGMA = 1e-6  # [m] and [rad] of the fixed pose
-_ROTATION_FIRST = [3, 4, 5, 0, 1, 2]  # gtsam's order
 _RADIAN_M = 1.0  # metres that a radian counts in the length of a path
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class KeyframeEdge:
-    """A measured motion from one keyframe to another."""
-
-    start: int
-    end: int
-    T_start_end: Transform
-    covariance: NDArray[np.float64]  # (6, 6), of se3.log order, in the frame of the end
-    is_loop: bool = False
-
-    def turned(self) -> KeyframeEdge:
-        """Return the measurement inverted, from the end to the start."""
-        return KeyframeEdge(
-            start=self.end,
-            end=self.start,
-            T_start_end=se3.inverse(self.T_start_end),
-            covariance=se3.carried(self.covariance, self.T_start_end),
-            is_loop=self.is_loop,
-        )
-
-    def then(self, after: KeyframeEdge) -> KeyframeEdge:
-        """Return the composition of this edge and one that begins at its end."""
-        carried = se3.carried(self.covariance, se3.inverse(after.T_start_end))
-        return KeyframeEdge(
-            start=self.start,
-            end=after.end,
-            T_start_end=self.T_start_end @ after.T_start_end,
-            covariance=carried + after.covariance,
-            is_loop=self.is_loop or after.is_loop,
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +32,7 @@ class PoseGraph:
     """Keyframes by id, and the edges between them."""
 
     def __init__(self) -> None:
-        self._edges: dict[int, dict[int, KeyframeEdge]] = {}  # stored at both ends, beginning there
+        self._edges: dict[int, dict[int, Edge]] = {}  # stored at both ends, beginning there
 
     def __contains__(self, keyframe_id: int) -> bool:
         return keyframe_id in self._edges
@@ -77,24 +43,24 @@ class PoseGraph:
         return list(self._edges)
 
     @property
-    def edges(self) -> list[KeyframeEdge]:
+    def edges(self) -> list[Edge]:
         """Return every edge once, from the lower to the higher id."""
-        return [e for near in self._edges.values() for e in near.values() if e.start < e.end]
+        return [e for near in self._edges.values() for e in near.values() if e.first < e.second]
 
     def insert(self, keyframe_id: int) -> None:
         """Add a keyframe without edges."""
         self._edges[keyframe_id] = {}
 
-    def connect(self, edge: KeyframeEdge) -> None:
+    def connect(self, edge: Edge) -> None:
         """Add an edge between two keyframes; it replaces an existing one."""
-        self._edges[edge.start][edge.end] = edge
-        self._edges[edge.end][edge.start] = edge.turned()
+        self._edges[edge.first][edge.second] = edge
+        self._edges[edge.second][edge.first] = edge.turned()
 
     def neighbours(self, keyframe_id: int) -> list[int]:
         """Return the ids of the keyframes connected by an edge."""
         return list(self._edges[keyframe_id])
 
-    def remove(self, keyframe_id: int) -> KeyframeEdge | None:
+    def remove(self, keyframe_id: int) -> Edge | None:
         """Remove a keyframe; its most certain neighbour takes over the other edges.
 
         Returns the edge from that neighbour to the keyframe, None without neighbours.
@@ -107,7 +73,7 @@ class PoseGraph:
         heir = min(near.values(), key=lambda edge: float(np.trace(edge.covariance)))
         to_gone = heir.turned()
         for other, edge in near.items():
-            if other != heir.end and other not in self._edges[heir.end]:
+            if other != heir.second and other not in self._edges[heir.second]:
                 self.connect(to_gone.then(edge))
         return to_gone
 
@@ -115,8 +81,8 @@ class PoseGraph:
         """Set all edges but loops from the keyframes' adjusted poses."""
         for edge in self.edges:
             if not edge.is_loop:
-                T_start_end = se3.inverse(T_local_base[edge.start]) @ T_local_base[edge.end]
-                self.connect(_moved(edge, T_start_end))
+                T_first_second = se3.inverse(T_local_base[edge.first]) @ T_local_base[edge.second]
+                self.connect(replace(edge, T_first_second=T_first_second))
 
     def connected(self, keyframe_id: int) -> set[int]:
         """Return the keyframes that are connected to this one, including itself."""
@@ -150,7 +116,7 @@ class PoseGraph:
         T_end_here, here = se3.identity(), end
         while before[here] != here:
             edge = self._edges[here][before[here]]
-            step = edge.T_start_end
+            step = edge.T_first_second
             variances += np.diag(edge.covariance)
             length_m += float(np.linalg.norm(step[:3, 3]))
             turned_rad += float(se3.rotation_angle_rad(step))
@@ -165,49 +131,19 @@ class PoseGraph:
         )
 
 
-def solve(
-    T_local_base: Mapping[int, Transform], edges: Iterable[KeyframeEdge], *, held: int
-) -> dict[int, Transform]:
-    """Return the poses (4, 4) that best fit the edges (Levenberg-Marquardt, Huber on loops).
-
-    `held` is the id of the fixed pose.
-    """
-    import gtsam
-
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for keyframe_id, T in T_local_base.items():
-        values.insert(keyframe_id, gtsam.Pose3(T))
-    for edge in edges:
-        covariance = edge.covariance[np.ix_(_ROTATION_FIRST, _ROTATION_FIRST)]
-        noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Covariance(covariance)
-        if edge.is_loop:
-            huber = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER_SIGMAS)
-            noise = gtsam.noiseModel.Robust.Create(huber, noise)
-        T_start_end = gtsam.Pose3(edge.T_start_end)
-        graph.add(gtsam.BetweenFactorPose3(edge.start, edge.end, T_start_end, noise))
-    stays = gtsam.noiseModel.Isotropic.Sigma(6, _HELD_SIGMA)
-    graph.add(gtsam.PriorFactorPose3(held, gtsam.Pose3(T_local_base[held]), stays))
-    found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    return {keyframe_id: found.atPose3(keyframe_id).matrix() for keyframe_id in T_local_base}
-
-
-def motion_covariance(T_start_end: Transform, measured: NDArray[np.float64]) -> NDArray[np.float64]:
+def motion_covariance(
+    T_first_second: Transform, measured: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return a measured covariance (6, 6) plus model errors in proportion to the motion.
 
     Works on stacks (..., 4, 4) too.
     """
-    moved2 = (T_start_end[..., :3, 3] ** 2).sum(axis=-1)
-    turned2 = se3.rotation_angle_rad(T_start_end) ** 2
+    moved2 = (T_first_second[..., :3, 3] ** 2).sum(axis=-1)
+    turned2 = se3.rotation_angle_rad(T_first_second) ** 2
     variances = _MODEL_ERROR_RATIO**2 * np.stack([moved2, turned2], axis=-1)
     return np.asarray(measured + variances.repeat(3, axis=-1)[..., None] * np.eye(6))
 
 
-def _moved(edge: KeyframeEdge, T_start_end: Transform) -> KeyframeEdge:
-    return KeyframeEdge(
-        start=edge.start, end=edge.end, T_start_end=T_start_end, covariance=edge.covariance
-    )
-
-
-def _length(edge: KeyframeEdge) -> float:
-    T = edge.T_start_end
+def _length(edge: Edge) -> float:
+    T = edge.T_first_second
     return float(np.linalg.norm(T[:3, 3]) + _RADIAN_M * se3.rotation_angle_rad(T))

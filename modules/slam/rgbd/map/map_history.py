@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.graphs.edge import Edge
 from sceneslam.types import se3
 from sceneslam.types.maps import LandmarkLayer, PoseGraphLayer
 from sceneslam.types.se3 import Transform
@@ -16,7 +17,7 @@ from ..locate.localizer import VisualFix, VisualLocalizer
 from ..locate.recognition import PlaceRecognizer
 from ..loops.loop_closing import VisualLoopCloser
 from ..loops.loop_detection import LoopDetector, Query
-from ..loops.pose_graph import KeyframeEdge, PoseGraph, motion_covariance
+from ..loops.pose_graph import PoseGraph, motion_covariance
 from ..loops.session_relocalizer import SessionRelocalizer
 from ..see.rectifying_extractor import RectifyingExtractor
 from .frame_log import FrameLog, joined, moved
@@ -142,8 +143,8 @@ class MapHistory:
         return PoseGraphLayer(
             stamps_ns=np.array([k.stamp_ns for k in keyframes]),
             T_world_base=np.stack([k.T_local_base for k in keyframes]),
-            edges=np.array([(rows[e.start], rows[e.end]) for e in edges], int).reshape(-1, 2),
-            T_from_to=np.array([e.T_start_end for e in edges]).reshape(-1, 4, 4),
+            edges=np.array([(rows[e.first], rows[e.second]) for e in edges], int).reshape(-1, 2),
+            T_from_to=np.array([e.T_first_second for e in edges]).reshape(-1, 4, 4),
             information=np.array([np.linalg.inv(e.covariance) for e in edges]).reshape(-1, 6, 6),
             is_loop=np.array([e.is_loop for e in edges], bool),
         )
@@ -182,7 +183,7 @@ class MapHistory:
         keyframe_id, T_keyframe_base = self._frames.newest
         return np.asarray(self._keyframes[keyframe_id].T_local_base @ T_keyframe_base)
 
-    def _edges(self, keyframe_id: int, fix: VisualFix | None) -> list[KeyframeEdge]:
+    def _edges(self, keyframe_id: int, fix: VisualFix | None) -> list[Edge]:
         """Return the edges to the keyframes against which a new keyframe's pose was measured.
 
         A landmark belongs to the keyframe that saw it first; the edge to each such keyframe gets
@@ -198,8 +199,8 @@ class MapHistory:
             motion = motion_between(earlier[last], self._map.keyframes[keyframe_id])
             covariance = _GUESSED_VARIANCE * np.eye(6) if motion is None else motion.covariance
             return [
-                KeyframeEdge(
-                    start=last, end=keyframe_id, T_start_end=T_last_new, covariance=covariance
+                Edge(
+                    first=last, second=keyframe_id, T_first_second=T_last_new, covariance=covariance
                 )
             ]
         counts = self._origins(fix.landmark_ids)
@@ -228,17 +229,15 @@ class MapHistory:
         for keyframe_id in sorted(set(self._keyframes) - set(self._map.keyframes.ids)):
             edge = self._graph.remove(keyframe_id)
             if edge is not None:
-                gone, heir = self._keyframes[keyframe_id], self._keyframes[edge.start]
+                gone, heir = self._keyframes[keyframe_id], self._keyframes[edge.first]
                 T_heir_gone = se3.inverse(heir.T_local_base) @ gone.T_local_base
-                self._frames.hand_over(keyframe_id, edge.start, T_heir_gone)
-                self.segments.replace(keyframe_id, edge.start)
-                self.reference = edge.start if self.reference == keyframe_id else self.reference
+                self._frames.hand_over(keyframe_id, edge.first, T_heir_gone)
+                self.segments.replace(keyframe_id, edge.first)
+                self.reference = edge.first if self.reference == keyframe_id else self.reference
             del self._keyframes[keyframe_id]
             self.recognizer.places.remove(keyframe_id)
 
 
-def _edge(
-    start: int, end: int, T_start_end: Transform, covariance: NDArray[np.float64]
-) -> KeyframeEdge:
+def _edge(start: int, end: int, T_start_end: Transform, covariance: NDArray[np.float64]) -> Edge:
     covariance = motion_covariance(T_start_end, covariance)
-    return KeyframeEdge(start=start, end=end, T_start_end=T_start_end, covariance=covariance)
+    return Edge(first=start, second=end, T_first_second=T_start_end, covariance=covariance)

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.graphs.edge import Edge
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
-from ..loops.pose_graph import KeyframeEdge, PoseGraph
+from ..loops.pose_graph import PoseGraph
 
 _WALK_M_PER_S, _TURN_RAD_PER_S = 1.0, 1.0  # standard deviations of a lost camera's motion
 
@@ -66,8 +67,6 @@ class Segments:
         if guess is None:
             return None
         T_start_base = se3.inverse(guess.T_local_base) @ T_local_base
-        begun = KeyframeEdge(
-            start=0, end=1, T_start_end=se3.identity(), covariance=guess.covariance
-        )
-        way = KeyframeEdge(start=1, end=2, T_start_end=T_start_base, covariance=measured)
+        begun = Edge(first=0, second=1, T_first_second=se3.identity(), covariance=guess.covariance)
+        way = Edge(first=1, second=2, T_first_second=T_start_base, covariance=measured)
         return begun.then(way).covariance
