@@ -20,7 +20,7 @@ _PLACE_M = 2.0  # views this near show one place
 _RATIO = 0.8  # of the best match's distance to the second's (Lowe, IJCV 2004)
 _ALIKE = 0.6  # another place with so many of the best one's matches, and nothing is recognized
 _SAME_M, _SAME_RAD = 0.3, 0.15
-_DEVIATION_MAX_M, _DEVIATION_MAX_RAD = 0.03, 0.015  # of a pose: what agrees within 0.1 m ...
+_DEVIATION_MAX_M, _DEVIATION_MAX_RAD = 0.03, 0.03  # of a pose: what agrees within 0.1 m ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -52,7 +52,8 @@ class ViewFinder:
         number = only_place(found)
         if number is None:
             return None
-        return self._refined(view, found[number], self._map.near(self._map[number][0]))
+        best = self._refined(view, found[number], self._map.near(self._map[number][0]))
+        return best if best.is_certain else None
 
     def _at(self, number: int, view: LandmarkView) -> Sighting | None:
         """Return the pose by the landmarks of one view of the map."""
@@ -80,8 +81,8 @@ class ViewFinder:
             return None
         return self._sighting(T_map_seen, T_cam_seen, points[kept], view)
 
-    def _refined(self, view: LandmarkView, rough: Sighting, near: Sequence[int]) -> Sighting | None:
-        """Return the pose by the landmarks of all views `near` it; None if it is uncertain."""
+    def _refined(self, view: LandmarkView, rough: Sighting, near: Sequence[int]) -> Sighting:
+        """Return the pose by the landmarks of all views `near` it, if these are more."""
         T_map_base, camera = rough.T_map_base, self._camera
         T_base_seen = [se3.inverse(T_map_base) @ self._map[number][0] for number in near]
         seen = [self._map[number][1] for number in near]
@@ -113,12 +114,11 @@ class ViewFinder:
             at = se3.apply(T_cam_base, points)
             off = np.linalg.norm(at[:, :2] / at[:, 2:] - rays, axis=1)
             kept = (at[:, 2] > _NEAR_M) & (off <= _ERROR_PX / camera.fx)
-            if kept.sum() < _MATCHES_MIN:
-                return None
+            if kept.sum() < rough.matches:
+                return rough
             turn, shift = cv2.Rodrigues(T_cam_base[:3, :3])[0], T_cam_base[:3, 3:]
             T_cam_base = _optimised(points[kept], rays[kept], turn, shift)
-        found = self._sighting(T_map_base, T_cam_base, points[kept], view)
-        return found if found.is_certain else None
+        return self._sighting(T_map_base, T_cam_base, points[kept], view)
 
     def _sighting(
         self,
