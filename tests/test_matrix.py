@@ -1,6 +1,7 @@
 """The experiment `matrix`: its oracle, its promises, and its sweep of the detector."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from told_runs import Told, teller
 
 from sceneslam.evaluation.accuracy import root_mean_square
 from sceneslam.evaluation.path import segment_errors
-from sceneslam.experiments.matrix.cell import Cell
+from sceneslam.experiments.matrix.cell import Cell, regret_of
 from sceneslam.experiments.matrix.experiment import MatrixExperiment
 from sceneslam.experiments.matrix.oracle import best_of
 from sceneslam.experiments.matrix.promises import Promises
@@ -89,11 +90,11 @@ def cell(strategy, **values):
         ({}, {}, []),
         ({"correct_rate": 0.98}, {}, ["tour: Correct Rate, rewind"]),
         ({}, {"correct_rate": 0.81}, ["tour: Correct Rate, bright alone"]),
-        ({"regret": 0.3}, {}, ["rewind: regret, mean over stories"]),
+        ({"regret": 0.3}, {}, ["rewind: regret over all stories"]),
         ({}, {"regret": -0.01}, ["least regret of any strategy, any seed"]),
         ({}, {"regret": -0.01, "coverage": 0.5}, []),
         ({"false_switches": 1.0}, {}, ["rewind: false switches, any seed"]),
-        ({"regret": NAN}, {}, ["rewind: regret, mean over stories"]),
+        ({"regret": NAN}, {}, ["rewind: regret over all stories"]),
     ],
 )
 def test_a_promise_fails_when_it_is_broken(ours, alone, failed):
@@ -103,6 +104,18 @@ def test_a_promise_fails_when_it_is_broken(ours, alone, failed):
     cells = [cell("bright alone", **{"correct_rate": 0.5} | alone), cell("rewind", **ours)]
     figures = list(promises.figures(cells, ["bright alone"]))
     assert [figure.name for figure in figures if not figure.holds] == failed
+
+
+def test_regret_is_of_the_errors_of_all_stories_together():
+    small, large = (
+        replace(cell("rewind", segment_m=error_m, regret=regret), story=story)
+        for story, error_m, regret in (("a", 0.001, -0.5), ("b", 0.1, 0.25))
+    )
+    assert regret_of([small, large]) == pytest.approx(0.101 / 0.082 - 1.0)
+    promises = Promises(judged="rewind", regret_max=0.25)
+    alone = replace(cell("alone"), story="a"), replace(cell("alone"), story="b")
+    figures = list(promises.figures([small, large, *alone], ["alone"]))
+    assert all(figure.holds for figure in figures)
 
 
 def test_every_strategy_is_run_with_every_seed_and_lies_in_the_table(tmp_path):

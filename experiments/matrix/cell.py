@@ -57,6 +57,11 @@ class Cell:
             **{name: _number(metrics[name]) for name in names},
         )
 
+    @property
+    def oracle_m(self) -> float:
+        """Return the oracle's `segment_m` in the same drive."""
+        return self.segment_m / (1.0 + self.regret)
+
     def beside(self, oracle: Cell) -> Cell:
         """Return the cell with its regret."""
         return replace(self, regret=self.segment_m / oracle.segment_m - 1.0)
@@ -89,6 +94,14 @@ class Judge:
             false_switches=nan,
             regret=0.0,
         )
+
+
+def regret_of(cells: Sequence[Cell]) -> float:
+    """Return the regret over several drives: their errors together over the oracle's, minus 1.
+
+    Of drives with errors of millimetres the ratio is noise; here every millimetre counts alike.
+    """
+    return sum(cell.segment_m for cell in cells) / sum(cell.oracle_m for cell in cells) - 1.0
 
 
 def mean(cells: Sequence[Cell]) -> list[Cell]:
