@@ -52,7 +52,7 @@ def _merge(options: argparse.Namespace) -> int:
     print("\n".join([*described(result.map), f"map  {options.out}"]))
     if result.apart:
         print(
-            f"error: {result.apart} pieces were not recognized in the first and stay apart",
+            f"error: pieces that were not recognized in the first and stay apart: {result.apart}",
             file=sys.stderr,
         )
     return INCOMPLETE if result.apart else OK

@@ -16,8 +16,8 @@ def described(saved: SavedMap) -> list[str]:
     """Return the map's contents, a line per piece."""
     loops = sum(edge.kind is EdgeKind.LOOP for edge in saved.edges)
     lines = [
-        f"{len(saved.submaps)} submaps of {saved.runs} runs, {len(saved.edges)} edges, "
-        f"{loops} of them loops"
+        f"submaps: {len(saved.submaps)}, runs: {saved.runs}, "
+        f"edges: {len(saved.edges)}, of them loops: {loops}"
     ]
     for piece in np.unique(saved.pieces).tolist():
         own = np.flatnonzero(saved.pieces == piece).tolist()
@@ -25,10 +25,10 @@ def described(saved: SavedMap) -> list[str]:
         modules = sorted({saved.submaps[node].module or "(bridged)" for node in own})
         rows, columns = plan.free.shape
         lines.append(
-            f"piece {piece}: {len(own)} submaps by {', '.join(modules)}; "
+            f"piece {piece}: submaps: {len(own)}, by {', '.join(modules)}; "
             f"{columns * CELL_M:.1f} m x {rows * CELL_M:.1f} m, "
-            f"{plan.free.sum() * CELL_M**2:.1f} m2 free, {len(plan)} wall cells, "
-            f"{sum(len(saved.submaps[node].views) for node in own)} views"
+            f"free: {plan.free.sum() * CELL_M**2:.1f} m2, wall cells: {len(plan)}, "
+            f"views: {sum(len(saved.submaps[node].views) for node in own)}"
         )
     return lines
 

@@ -52,13 +52,10 @@ class PlacedViews:
         return self._placed[number]
 
     def near(self, T_map_base: Transform) -> list[int]:
-        """Return the views that were taken near a pose (4, 4)."""
-        at = T_map_base[:3, 3]
-        return [
-            number
-            for number, (T_map_seen, _) in enumerate(self._placed)
-            if np.linalg.norm(T_map_seen[:3, 3] - at) < _PLACE_M
-        ]
+        """Return the views that were taken near a pose (4, 4), the nearest first."""
+        away_m = [np.linalg.norm((T - T_map_base)[:3, 3]) for T, _ in self._placed]
+        nearest = np.argsort(away_m, kind="stable").tolist()
+        return [number for number in nearest if away_m[number] < _PLACE_M]
 
     def alike(
         self, descriptors: NDArray[np.uint8], among: Sequence[int] | None = None

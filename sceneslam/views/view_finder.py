@@ -23,6 +23,7 @@ _FOUND_MIN = 0.15  # of the landmarks in view
 _SURFACE_MIN = 0.7  # of the matches with depth, within the tolerance
 _SURFACE_M, _SURFACE_RATIO = 0.05, 0.03  # 5 cm and 3 % of the depth: structured light at 5 m
 _NEAR_M = 0.1  # nothing nearer is in view
+_TOGETHER = 12  # views of a place by which a pose is measured: 5,000 landmarks
 _ROUNDS = 2  # of the pose by all views: which matches are right depends on it
 _FLOOR = np.repeat([0.01, 0.004], 3) ** 2  # m, rad: of the map's landmarks among each other
 
@@ -52,7 +53,8 @@ class ViewFinder:
         number = only_place(found)
         if number is None:
             return None
-        best = self._refined(view, found[number], self._map.near(self._map[number][0]))
+        together = self._map.near(self._map[number][0])[:_TOGETHER]
+        best = self._refined(view, found[number], together)
         return best if best.is_certain else None
 
     def _at(self, number: int, view: LandmarkView) -> Sighting | None:
@@ -102,8 +104,9 @@ class ViewFinder:
             is_near.astype(np.uint8),
         )
         good = [match for match in guided if match.distance <= _SAME_BITS]
-        rows = ahead[[match.queryIdx for match in good]]
-        columns, owner = np.unique([match.trainIdx for match in good], return_inverse=True)
+        rows = ahead[np.array([match.queryIdx for match in good], np.int64)]
+        seen_as = np.array([match.trainIdx for match in good], np.int64)
+        columns, owner = np.unique(seen_as, return_inverse=True)
         counts = np.bincount(owner, minlength=len(columns))
         points = np.stack(
             [np.bincount(owner, every[rows, axis]) / counts for axis in range(3)], axis=1
