@@ -80,3 +80,14 @@ def test_no_rounding_adds_up_in_a_chain():
     off = [np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max() for T in (chain, product)]
     assert off[0] < 1e-11 < 1e-9 < off[1]
     assert chain == pytest.approx(product, abs=1e-6)
+
+
+def test_a_mean_of_poses_is_weighted_by_information_and_as_certain_as_one_of_them():
+    first, off = se3.from_xy_yaw(1.0, 2.0, 0.5), np.array([0.03, -0.06, 0.0, 0.0, 0.0, 0.09])
+    covariances = [np.eye(6), 0.5 * np.eye(6)]
+    mean, covariance = se3.mean([first, first @ se3.exp(off)], covariances)
+    np.testing.assert_allclose(mean, first @ se3.exp(2 / 3 * off), atol=1e-12)
+    np.testing.assert_allclose(covariance, 2 / 3 * np.eye(6), atol=1e-12)
+    same, covariance = se3.mean([first] * 3, [np.eye(6)] * 3)
+    np.testing.assert_allclose(same, first, atol=1e-12)
+    np.testing.assert_allclose(covariance, np.eye(6), atol=1e-12)

@@ -14,13 +14,11 @@ from sceneslam.atlas.places.localizer import LocalizationEvent, Look, MapLocaliz
 from sceneslam.atlas.places.view_taker import ViewTaker
 from sceneslam.atlas.submaps.collector import Known
 from sceneslam.evaluation.association import interpolated
-from sceneslam.experiments.one_map.relocalization import StoryStarts, together
 from sceneslam.scans.key_scan import KeyScan
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
-from sceneslam.types.trajectory import Trajectory
 from sceneslam.views.placed_views import Sighting
 from sceneslam.views.view import Landmarks, LandmarkView, LandmarkViewer, PlacedView
 from sceneslam.views.view_finder import ViewFinder
@@ -369,35 +367,6 @@ def test_a_camera_held_by_hand_finds_itself_in_the_map_of_the_first_half(
     off = se3.inverse(se3.inverse(starts[0]) @ starts[1]) @ located
     assert np.linalg.norm(off[:3, 3]) < 0.035 and se3.rotation_angle_rad(off) < 0.03
     assert (saved.pieces == 0).all()
-
-
-def test_starts_in_a_story_are_found_in_the_map_of_another():
-    view = LandmarkViewer(CAMERA).look(seen())
-    kept = PlacedView(stamp_ns=0, T_submap_base=ASIDE, landmarks=view.landmarks)
-    saved = map_of(join([]), nodes=[[2.0, 1.0, 0.4]])
-    saved = replace(saved, submaps=(replace(saved.submaps[0], views=(kept,)),))
-    stamps_ns = np.arange(100) * S // 10
-    online = Trajectory(stamps_ns=stamps_ns, T_world_base=np.tile(ELSEWHERE, (100, 1, 1)))
-
-    def started(off, drive):
-        starts = StoryStarts(
-            saved, RIG, online, lambda _: HERE @ ASIDE @ off, count=20, within_s=2.0, seed=0
-        )
-        for observation in drive:
-            starts.observe(observation)
-        return starts
-
-    # Lit for 4 s: later starts are in the dark, and never found.
-    lit, dark = seen(), seen(np.zeros((480, 640, 3), np.uint8))
-    drive = [replace(lit if ns < 4 * S else dark, stamp_ns=int(ns)) for ns in stamps_ns]
-    starts = started(se3.identity(), drive)
-    bright, unlit = (starts.found(is_lit=is_lit) for is_lit in (True, False))
-    assert bright.count + unlit.count == 20 and unlit.count > 5 and unlit.found == 0
-    assert bright.found_ratio > 0.8 and bright.wrong == 0 and bright.worst_m < 0.001
-    wrong = started(se3.from_xy_yaw(1.0, 0.0, 0.0), drive).found(is_lit=True)
-    assert wrong.wrong == wrong.found == bright.found and wrong.found_ratio == 0.0
-    both = together([bright, unlit])
-    assert (both.count, both.found) == (20, bright.found)
 
 
 def test_a_map_of_views_alone_serves_robots_that_see_walls_too():

@@ -149,12 +149,13 @@ def mean(
 ) -> tuple[Transform, NDArray[np.float64]]:
     """Return the mean of poses (4, 4), weighted by their information, and its covariance (6, 6).
 
-    Covariances are of `log` order, in b's axes; the poses are near each other.
+    It is as certain as one of them, since they share their errors. Covariances are of `log` order,
+    in b's axes; the poses are near each other.
     """
     offs = log(inverse(T_a_b[0]) @ np.array(T_a_b))
     weights = np.linalg.inv(covariances)
     spread = np.linalg.inv(weights.sum(axis=0))
-    return T_a_b[0] @ exp(spread @ np.einsum("nij,nj->i", weights, offs)), spread
+    return T_a_b[0] @ exp(spread @ np.einsum("nij,nj->i", weights, offs)), len(T_a_b) * spread
 
 
 def interpolate(T_w_0: Transform, T_w_1: Transform, ratio: float) -> Transform:

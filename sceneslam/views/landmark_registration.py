@@ -7,34 +7,27 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
-from sceneslam.views.placed_views import PlacedViews, Sighting, matches, only_place
+from sceneslam.views.placed_views import FLOOR, MATCHES_MIN, PlacedViews, Sighting, matches
 from sceneslam.views.view import Landmarks
 
 _SAMPLES = 300  # of three matches each: one is right with 99.9 % if three of ten matches are
-_MATCHES_MIN = (
-    25  # right by the motion found; by chance hardly more are than the three it is made of
-)
 _SIGMA_M, _SIGMA_RATIO = 0.017, 0.01  # of a landmark, and of its distance: structured light
 _SIGMAS = 3.0
 _ROUNDS = 3  # of the motion by all matches that are right: which ones are depends on it
-_FLOOR = np.repeat([0.01, 0.004], 3) ** 2  # m, rad: of landmarks among each other
 
 
 def recognize(known: PlacedViews, landmarks: Landmarks) -> Sighting | None:
     """Return where a view was taken in a map, None if it shows no place of it, or two alike."""
-    found = {
-        number: one
-        for number in known.alike(landmarks.descriptors)
-        if (one := register(*known[number], landmarks)) is not None
-    }
-    number = only_place(found)
-    return None if number is None else found[number]
+    found = known.recognize(
+        landmarks.descriptors, lambda number: register(*known[number], landmarks)
+    )
+    return None if found is None else found[1]
 
 
 def register(T_map_first: Transform, first: Landmarks, second: Landmarks) -> Sighting | None:
     """Return where the second view was taken in the map of the first, None if too few agree."""
     rows, columns = matches(first.descriptors, second.descriptors)
-    if len(rows) < _MATCHES_MIN:
+    if len(rows) < MATCHES_MIN:
         return None
     a, b = first.points_base[rows].astype(float), second.points_base[columns].astype(float)
     far_m = np.maximum(np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1))
@@ -45,12 +38,12 @@ def register(T_map_first: Transform, first: Landmarks, second: Landmarks) -> Sig
     T = tried[int(np.argmax(counts))]
     for _ in range(_ROUNDS):
         kept = _off_m(T, a, b) <= _SIGMAS * sigma_m
-        if kept.sum() < _MATCHES_MIN:
+        if kept.sum() < MATCHES_MIN:
             return None
         T = _rigid(a[kept][None], b[kept][None])[0]
     by_motion = np.concatenate([np.tile(np.eye(3), (kept.sum(), 1, 1)), -se3.hat(b[kept])], axis=2)
     weighted = by_motion / sigma_m[kept, None, None]
-    covariance = np.linalg.inv(np.einsum("nki,nkj->ij", weighted, weighted)) + np.diag(_FLOOR)
+    covariance = np.linalg.inv(np.einsum("nki,nkj->ij", weighted, weighted)) + FLOOR
     found = Sighting(T_map_base=T_map_first @ T, covariance=covariance, matches=int(kept.sum()))
     return found if found.is_certain else None
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -20,7 +20,9 @@ _PLACE_M = 2.0  # views this near show one place
 _RATIO = 0.8  # of the best match's distance to the second's (Lowe, IJCV 2004)
 _ALIKE = 0.6  # another place with so many of the best one's matches, and nothing is recognized
 _SAME_M, _SAME_RAD = 0.3, 0.15
-_DEVIATION_MAX_M, _DEVIATION_MAX_RAD = 0.03, 0.03  # of a pose: what agrees within 0.1 m ...
+_DEVIATION_MAX_M, _DEVIATION_MAX_RAD = 0.03, 0.03  # of a pose: two that agree are no chance
+MATCHES_MIN = 25  # right by the pose found; by chance hardly more are than the three it is made of
+FLOOR = np.diag(np.repeat([0.01, 0.004], 3) ** 2)  # m, rad: of the map's landmarks among each other
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -57,9 +59,32 @@ class PlacedViews:
         nearest = np.argsort(away_m, kind="stable").tolist()
         return [number for number in nearest if away_m[number] < _PLACE_M]
 
-    def alike(
-        self, descriptors: NDArray[np.uint8], among: Sequence[int] | None = None
-    ) -> list[int]:
+    def recognize(
+        self,
+        descriptors: NDArray[np.uint8],
+        seen_at: Callable[[int], Sighting | None],
+        among: Sequence[int] | None = None,
+    ) -> tuple[int, Sighting] | None:
+        """Return the view that shows the same place, with the pose that `seen_at` gives for it.
+
+        None if there is none, or if another one puts the camera elsewhere.
+        """
+        found = [
+            (number, one)
+            for number in self._alike(descriptors, among)
+            if (one := seen_at(number)) is not None
+        ]
+        if not found:
+            return None
+        number, best = max(found, key=lambda pair: pair[1].matches)
+        for _, other in found:
+            off = se3.inverse(best.T_map_base) @ other.T_map_base
+            is_same = se3.is_within(off, _SAME_M, _SAME_RAD)
+            if other.matches >= _ALIKE * best.matches and not is_same:
+                return None
+        return number, best
+
+    def _alike(self, descriptors: NDArray[np.uint8], among: Sequence[int] | None) -> list[int]:
         """Return the most similar views, a few of each of the most similar places."""
         places: list[list[int]] = []
         for likeness in self._index.alike(descriptors, among)[:_LIKE]:
@@ -75,20 +100,6 @@ class PlacedViews:
         """Tell whether two views show one place."""
         at, there = (self._placed[number][0][:3, 3] for number in (one, other))
         return bool(np.linalg.norm(at - there) < _PLACE_M)
-
-
-def only_place(found: Mapping[int, Sighting]) -> int | None:
-    """Return the view with the most matches, None if another one puts the camera elsewhere."""
-    if not found:
-        return None
-    number = max(found, key=lambda k: found[k].matches)
-    best = found[number]
-    for other in found.values():
-        off = se3.inverse(best.T_map_base) @ other.T_map_base
-        is_same = se3.is_within(off, _SAME_M, _SAME_RAD)
-        if other.matches >= _ALIKE * best.matches and not is_same:
-            return None
-    return number
 
 
 def matches(

@@ -11,21 +11,19 @@ from numpy.typing import NDArray
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
-from sceneslam.views.placed_views import PlacedViews, Sighting, matches, only_place
+from sceneslam.views.placed_views import FLOOR, MATCHES_MIN, PlacedViews, Sighting, matches
 from sceneslam.views.view import Landmarks, LandmarkView
 
 _ERROR_PX, _SIGMA_PX = 3.0, 1.0  # of a match's ray, at most and usually
 _ITERATIONS, _CONFIDENCE = 300, 0.9999
 _GUIDED_PX = 9.0  # from where a pose by one view of the map expects a landmark of the others
 _SAME_BITS = 50  # descriptors that differ in more show two corners (Mur-Artal et al., T-RO 2015)
-_MATCHES_MIN = 25  # right by the pose found; by chance hardly more are than the three it is made of
 _FOUND_MIN = 0.15  # of the landmarks in view
 _SURFACE_MIN = 0.7  # of the matches with depth, within the tolerance
 _SURFACE_M, _SURFACE_RATIO = 0.05, 0.03  # 5 cm and 3 % of the depth: structured light at 5 m
 _NEAR_M = 0.1  # nothing nearer is in view
 _TOGETHER = 12  # views of a place by which a pose is measured: 5,000 landmarks
 _ROUNDS = 2  # of the pose by all views: which matches are right depends on it
-_FLOOR = np.repeat([0.01, 0.004], 3) ** 2  # m, rad: of the map's landmarks among each other
 
 
 class ViewFinder:
@@ -45,23 +43,21 @@ class ViewFinder:
         With `around` (4, 4), T_map_base as it is expected, only what was seen near it counts.
         """
         near = None if around is None else self._map.near(around)
-        found = {
-            number: one
-            for number in self._map.alike(view.descriptors, near)
-            if (one := self._at(number, view)) is not None
-        }
-        number = only_place(found)
-        if number is None:
+        found = self._map.recognize(
+            view.descriptors, lambda number: self._at(number, view), among=near
+        )
+        if found is None:
             return None
+        number, rough = found
         together = self._map.near(self._map[number][0])[:_TOGETHER]
-        best = self._refined(view, found[number], together)
+        best = self._refined(view, rough, together)
         return best if best.is_certain else None
 
     def _at(self, number: int, view: LandmarkView) -> Sighting | None:
         """Return the pose by the landmarks of one view of the map."""
         T_map_seen, landmarks = self._map[number]
         rows, columns = matches(landmarks.descriptors, view.descriptors)
-        if len(rows) < _MATCHES_MIN:
+        if len(rows) < MATCHES_MIN:
             return None
         points, rays = landmarks.points_base[rows].astype(float), view.rays[columns].astype(float)
         error = _ERROR_PX / self._camera.fx
@@ -75,7 +71,7 @@ class ViewFinder:
             confidence=_CONFIDENCE,
             flags=cv2.SOLVEPNP_AP3P,
         )
-        if not is_found or inliers is None or len(inliers) < _MATCHES_MIN:
+        if not is_found or inliers is None or len(inliers) < MATCHES_MIN:
             return None
         kept = inliers[:, 0]
         T_cam_seen = _optimised(points[kept], rays[kept], turn, shift)
@@ -85,7 +81,26 @@ class ViewFinder:
 
     def _refined(self, view: LandmarkView, rough: Sighting, near: Sequence[int]) -> Sighting:
         """Return the pose by the landmarks of all views `near` it, if these are more."""
-        T_map_base, camera = rough.T_map_base, self._camera
+        points, rays = self._guided(view, rough.T_map_base, near)
+        T_cam_base = se3.inverse(self._camera.T_base_cam)
+        for _ in range(_ROUNDS):
+            at = se3.apply(T_cam_base, points)
+            off = np.linalg.norm(at[:, :2] / at[:, 2:] - rays, axis=1)
+            kept = (at[:, 2] > _NEAR_M) & (off <= _ERROR_PX / self._camera.fx)
+            if kept.sum() < rough.matches:
+                return rough
+            turn, shift = cv2.Rodrigues(T_cam_base[:3, :3])[0], T_cam_base[:3, 3:]
+            T_cam_base = _optimised(points[kept], rays[kept], turn, shift)
+        return self._sighting(rough.T_map_base, T_cam_base, points[kept], view)
+
+    def _guided(
+        self, view: LandmarkView, T_map_base: Transform, near: Sequence[int]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the landmarks (N, 3) of views `near`, in base, that a view shows where expected.
+
+        And their rays (N, 2) there; a corner that several landmarks fit is at their mean.
+        """
+        camera = self._camera
         T_base_seen = [se3.inverse(T_map_base) @ self._map[number][0] for number in near]
         seen = [self._map[number][1] for number in near]
         every = np.concatenate(
@@ -111,17 +126,7 @@ class ViewFinder:
         points = np.stack(
             [np.bincount(owner, every[rows, axis]) / counts for axis in range(3)], axis=1
         )
-        rays = view.rays[columns].astype(float)
-        T_cam_base = se3.inverse(camera.T_base_cam)
-        for _ in range(_ROUNDS):
-            at = se3.apply(T_cam_base, points)
-            off = np.linalg.norm(at[:, :2] / at[:, 2:] - rays, axis=1)
-            kept = (at[:, 2] > _NEAR_M) & (off <= _ERROR_PX / camera.fx)
-            if kept.sum() < rough.matches:
-                return rough
-            turn, shift = cv2.Rodrigues(T_cam_base[:3, :3])[0], T_cam_base[:3, 3:]
-            T_cam_base = _optimised(points[kept], rays[kept], turn, shift)
-        return self._sighting(T_map_base, T_cam_base, points[kept], view)
+        return points, view.rays[columns].astype(float)
 
     def _sighting(
         self,
@@ -168,7 +173,7 @@ class ViewFinder:
         J = (rays @ by_pose).reshape(-1, 6)
         information = J.T @ J / (_SIGMA_PX / self._camera.fx) ** 2 + np.eye(6)
         T_base_cam = self._camera.T_base_cam
-        return se3.carried(np.linalg.inv(information), T_base_cam) + np.diag(_FLOOR)
+        return se3.carried(np.linalg.inv(information), T_base_cam) + FLOOR
 
 
 def _optimised(

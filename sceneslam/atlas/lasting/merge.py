@@ -108,9 +108,7 @@ def _edge_to(
     saved: SavedMap, node: int, T_map_node: Transform, covariance: NDArray[np.float64]
 ) -> Edge:
     """Return the loop to a node at T_map_node (4, 4) from the first piece's nearest one."""
-    main = np.flatnonzero(saved.pieces == 0)
-    away_m = np.linalg.norm(saved.T_map_node[main, :3, 3] - T_map_node[:3, 3], axis=1)
-    first = int(main[np.argmin(away_m)])
+    first = saved.nearest(T_map_node)
     return Edge(
         first=first,
         second=node,

@@ -252,8 +252,8 @@ def _mean(fix: Fix, before: _Guess, newest: Look) -> Fix:
     T_before = before.T_map_run @ newest.T_run_base
     T_then_now = se3.inverse(before.fix.T_map_base) @ T_before
     carried = se3.carried(before.fix.covariance, se3.inverse(T_then_now))
-    mean, spread = se3.mean([fix.T_map_base, T_before], [fix.covariance, carried])
-    return replace(fix, T_map_base=mean, covariance=2.0 * spread)
+    mean, covariance = se3.mean([fix.T_map_base, T_before], [fix.covariance, carried])
+    return replace(fix, T_map_base=mean, covariance=covariance)
 
 
 def _is_within(fix: Fix, T_map_base: Transform, window: SearchWindow) -> bool:

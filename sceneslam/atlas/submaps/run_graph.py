@@ -131,21 +131,19 @@ class RunGraph:
     def _mean(self, edges: Sequence[Edge]) -> Edge:
         """Return the mean of loops to one submap, weighted by their information."""
         nodes, start = self._loaded.T_map_node, edges[0]
-        mean, spread = se3.mean(
+        mean, covariance = se3.mean(
             [nodes[edge.first] @ edge.T_first_second for edge in edges],
             [edge.covariance for edge in edges],
         )
         return replace(
             start,
             T_first_second=se3.inverse(nodes[start.first]) @ mean,
-            covariance=len(edges) * spread,
+            covariance=covariance,
         )
 
     def _fix_edge(self, fix: Fix, node: int, T_base_node: Transform) -> Edge:
         """Return the loop to a node from the nearest submap of the loaded map."""
-        nodes = self._loaded.T_map_node
-        away_m = np.linalg.norm(nodes[:, :3, 3] - fix.T_map_base[:3, 3], axis=1)
-        first = int(np.argmin(np.where(self._loaded.pieces == 0, away_m, np.inf)))
+        nodes, first = self._loaded.T_map_node, self._loaded.nearest(fix.T_map_base)
         return Edge(
             first=first,
             second=self._count + node,

@@ -125,12 +125,12 @@ class LoopDetector:
     def _loop(self, keyframe_id: int, seen: Recognition) -> LoopClosure:
         T_old = self._map.keyframes[seen.keyframe_id].T_local_base
         T_local_base = seen.fix.estimate.T_local_base
-        T_start_end = se3.inverse(T_old) @ T_local_base
+        T_first_second = se3.inverse(T_old) @ T_local_base
         edge = Edge(
             first=seen.keyframe_id,
             second=keyframe_id,
-            T_first_second=T_start_end,
-            covariance=motion_covariance(T_start_end, seen.fix.estimate.covariance),
+            T_first_second=T_first_second,
+            covariance=motion_covariance(T_first_second, seen.fix.estimate.covariance),
             kind=EdgeKind.LOOP,
         )
         return LoopClosure(edge=edge, T_local_base=T_local_base)

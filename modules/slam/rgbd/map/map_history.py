@@ -238,6 +238,8 @@ class MapHistory:
             self.recognizer.places.remove(keyframe_id)
 
 
-def _edge(start: int, end: int, T_start_end: Transform, covariance: NDArray[np.float64]) -> Edge:
-    covariance = motion_covariance(T_start_end, covariance)
-    return Edge(first=start, second=end, T_first_second=T_start_end, covariance=covariance)
+def _edge(
+    first: int, second: int, T_first_second: Transform, covariance: NDArray[np.float64]
+) -> Edge:
+    covariance = motion_covariance(T_first_second, covariance)
+    return Edge(first=first, second=second, T_first_second=T_first_second, covariance=covariance)
