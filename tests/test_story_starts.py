@@ -1,4 +1,4 @@
-"""Starts at random instants of a story, in the map of another: found where they are, or not at all."""
+"""Starts at random instants of a story, in the map of another: found there, or not at all."""
 
 from dataclasses import replace
 
