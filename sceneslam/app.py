@@ -91,6 +91,7 @@ def _begin(config: Mapping[str, Any], parts: RunParts, folder: Path, title: str)
         has_report=parts.run.report,
         value_label=parts.detector.quantity,
         faults=[],
+        source=parts.source,
     )
 
 

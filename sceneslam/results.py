@@ -10,11 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sceneslam.atlas.save import save_map
 from sceneslam.atlas.uncertainty import write_covariances
 from sceneslam.evaluation.metrics import Metrics, evaluate, write_metrics
 from sceneslam.evaluation.report import write_report
 from sceneslam.evaluation.settings import EvaluationSettings
+from sceneslam.sources.logged import Logged
 from sceneslam.types.errors import text_of
 from sceneslam.types.run import RunResult
 from sceneslam.types.trajectory import Trajectory
@@ -35,22 +39,22 @@ class Results:
     has_report: bool
     value_label: str  # of the detector's votes, for the figures
     faults: list[str]  # errors of the run, for the report
+    source: object  # if it is Logged, the files of trajectories have its stamps
 
     def save_trajectories(self, result: RunResult) -> None:
         """Write the trajectories first, as they are the most important result."""
         folder = self.folder
         with self._noting("the trajectory"):
-            result.trajectory.write_tum(folder / "trajectory.tum")
+            self._write_tum(result.trajectory, "trajectory.tum")
         with self._noting("the other trajectories"):
-            result.online.write_tum(folder / "trajectory_online.tum")
+            self._write_tum(result.online, "trajectory_online.tum")
             for session in result.sessions:
                 name = f"trajectory_{session.index}_{session.module}.tum"
-                session.trajectory.write_tum(folder / name)
-            write_covariances(
-                folder / "trajectory_covariance.txt",
-                result.trajectory.stamps_ns,
-                result.covariances,
-            )
+                self._write_tum(session.trajectory, name)
+            stamps_ns = self._logged_ns(result.trajectory)
+            order = np.argsort(stamps_ns, kind="stable")
+            path = folder / "trajectory_covariance.txt"
+            write_covariances(path, stamps_ns[order], result.covariances[order])
 
     def save_rest(
         self,
@@ -78,6 +82,13 @@ class Results:
             with self._noting("the report"):
                 self._write_report(result, truth, metrics, reference)
         return metrics
+
+    def _write_tum(self, trajectory: Trajectory, name: str) -> None:
+        trajectory.stamped(self._logged_ns(trajectory)).write_tum(self.folder / name)
+
+    def _logged_ns(self, trajectory: Trajectory) -> NDArray[np.int64]:
+        stamps_ns = trajectory.stamps_ns
+        return self.source.logged_ns(stamps_ns) if isinstance(self.source, Logged) else stamps_ns
 
     def _write_report(
         self,

@@ -21,6 +21,7 @@ from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.provenance import provenance
 from sceneslam.evaluation.metrics import Metrics
 from sceneslam.evaluation.settings import EvaluationSettings
+from sceneslam.interfaces import Source
 from sceneslam.results import Results
 from sceneslam.storage.journal import JOURNAL, Kept, read_journal
 from sceneslam.types.errors import InputError, SceneSlamError, text_of
@@ -60,7 +61,7 @@ def recover(folder: Path) -> Recovered:
         missing.append(f"the last {kept.torn_bytes} bytes of {JOURNAL}, which are torn")
     events = _events(folder, missing)
     with chdir(kept.head.began_in) if Path(kept.head.began_in).is_dir() else nullcontext():
-        truth = _truth(config, builder, missing)
+        source, truth = _source(config, builder, missing)
         versions = provenance(config)
     results = Results(
         folder=folder,
@@ -71,6 +72,7 @@ def recover(folder: Path) -> Recovered:
         has_report=bool((config.get("run") or {}).get("report", True)),
         value_label=kept.head.value_label,
         faults=[_sentence(atlas, kept), *(f"recovered without {what}" for what in missing)],
+        source=source,
     )
     told_before = len(results.faults)
     result = _result(atlas, kept, events)
@@ -146,16 +148,19 @@ def _events(folder: Path, missing: list[str]) -> list[Event]:
     return events
 
 
-def _truth(
+def _source(
     config: Mapping[str, Any], builder: ComponentBuilder, missing: list[str]
-) -> GroundTruth | None:
+) -> tuple[Source | None, GroundTruth | None]:
+    """Return the recording and its ground truth."""
+    source = None
     try:
-        return make_source(config, builder).ground_truth()
+        source = make_source(config, builder)
+        return source, source.ground_truth()
     except SceneSlamError as error:
         missing.append(f"the ground truth: {error}")
     except Exception as error:  # any exception of a reader, if the recording has changed
         missing.append(f"the ground truth: {text_of(error)}")
-    return None
+    return source, None
 
 
 def _sentence(atlas: Atlas, kept: Kept) -> str:

@@ -10,9 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.ros.pixels import locked
-from sceneslam.sources.carmen_lines import FLASER, ROBOTLASER, ScanLine, parse_scan, stamp_of
+from sceneslam.sources.carmen_lines import (
+    FLASER,
+    ROBOTLASER,
+    ScanLine,
+    parse_scan,
+    position_of,
+    stamp_of,
+)
 from sceneslam.sources.intrinsics import checked_above_zero
-from sceneslam.sources.rising import rising_order, rising_stamps
+from sceneslam.sources.rising import measured_stamps, rising_stamps
 from sceneslam.sources.stamped_scans import StampedScans
 from sceneslam.sources.survey.survey import Stream, Survey, spread
 from sceneslam.types import se3
@@ -23,7 +30,7 @@ from sceneslam.types.rig import Laser, Rig, Sensor, Wheels
 from sceneslam.types.truth import GroundTruth
 
 _LOG = logging.getLogger(__name__)
-_LATE_MAX_S = 2.0  # messages are out of order by less; a clock that is set jumps farther
+_LATE_MAX_S = 2.0  # stamps are out of order by less; a clock that is set jumps farther
 _AXLE_M = 0.05  # a log does not say where the laser is above the axle: some centimetres off
 _SAMPLES = 20  # scans that are read for a survey
 _OFFSET = b"robot_frontlaser_offset"
@@ -32,10 +39,14 @@ _OFFSET = b"robot_frontlaser_offset"
 class Carmen(StampedScans):
     """Gives one observation per FLASER or ROBOTLASER1 line, stamped by its `ipc_timestamp`.
 
-    Odometry is that of the line; ODOM and RLASER lines are not used. Scans come in the order of
-    their stamps, which can differ from the order of the lines: relations refer to scans by stamp.
-    Where the clock was set back or a stamp is missing, the log's order is kept and the stamps are
-    made to rise. Ranges of `range_max_m` [m] and beyond count as no return.
+    Odometry is that of the line; ODOM and RLASER lines are not used. Ranges of `range_max_m` [m]
+    and beyond count as no return.
+
+    Logs are stamped when a computer receives a scan, some late, in bursts and out of order.
+    Observations come in the order in which the wheels' path is the shorter one, the lines' or the
+    stamps', at the estimated times of measurement; `logged_ns` returns the log's stamps, by which
+    relations refer to scans. Where the clock was set back or a stamp is missing, these are made to
+    rise first.
     """
 
     def __init__(self, path: str, range_max_m: float, wheels: Mapping[str, float] | None) -> None:
@@ -46,9 +57,18 @@ class Carmen(StampedScans):
         if first is None:
             raise InputError(f"no scans, expected FLASER or ROBOTLASER1 lines: {path}")
         logged_ns = np.array([stamp_of(line) for line in self._lines], dtype=np.int64)
-        order = rising_order(logged_ns, late_max_ns=round(_LATE_MAX_S * 1e9))
+        order = np.argsort(logged_ns, kind="stable")
+        late_ns = (np.maximum.accumulate(logged_ns) - logged_ns).max()
+        if late_ns > _LATE_MAX_S * 1e9:  # the clock was set
+            self._logged_ns, order = rising_stamps(logged_ns), np.arange(len(logged_ns))
+        else:
+            self._logged_ns = np.empty_like(logged_ns)
+            self._logged_ns[order] = rising_stamps(logged_ns[order])
+        self._warn_of_changed(np.flatnonzero(self._logged_ns != logged_ns))
+        if late_ns > 0 and _path_m(self._lines) <= _path_m([self._lines[at] for at in order]):
+            order = np.arange(len(logged_ns))
         self._lines = [self._lines[place] for place in order]
-        stamps_ns = rising_stamps(logged_ns[order])
+        self._logged_ns = self._logged_ns[order]
         T_base_laser = se3.from_xy_yaw(self._offset_m(), 0.0, 0.0)
         if first.T_base_laser is not None:
             T_base_laser = first.T_base_laser
@@ -57,8 +77,7 @@ class Carmen(StampedScans):
             laser=Laser(T_base_laser=T_base_laser),
             wheels=Wheels.given({"axle_m": _AXLE_M, **(wheels or {})}),
         )
-        super().__init__(rig, stamps_ns)
-        self._warn_of_changed(np.flatnonzero(stamps_ns != logged_ns[order]))
+        super().__init__(rig, measured_stamps(self._logged_ns))
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the scans by rising stamp."""
@@ -91,6 +110,11 @@ class Carmen(StampedScans):
             T_odom_base=[scan.T_odom_base for _, scan in whole],
         )
 
+    def logged_ns(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the log's stamps (N,) of the scans at `stamps_ns` (N,)."""
+        at = np.searchsorted(self._stamps_ns, stamps_ns).clip(max=len(self._stamps_ns) - 1)
+        return np.where(self._stamps_ns[at] == stamps_ns, self._logged_ns[at], stamps_ns)
+
     def ground_truth(self) -> GroundTruth | None:
         """Return None: a log holds no ground truth (relations are files of the evaluation)."""
         return None
@@ -121,7 +145,7 @@ class Carmen(StampedScans):
                 "stamps between their neighbours': %s",
                 len(changed),
                 len(self._lines),
-                self._stamps_ns[changed[0]] * 1e-9,
+                self._logged_ns[changed[0]] * 1e-9,
                 self._path,
             )
 
@@ -142,3 +166,9 @@ class Carmen(StampedScans):
                     except ValueError:
                         return 0.0
         return 0.0
+
+
+def _path_m(lines: Sequence[bytes]) -> float:
+    """Return the length [m] of the wheels' path over scan lines in this order."""
+    positions_m = np.array([position_of(line) for line in lines])
+    return float(np.nansum(np.linalg.norm(np.diff(positions_m, axis=0), axis=1)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,6 +44,16 @@ def stamp_of(line: bytes) -> int:
         return int(whole) * 10**9 + int((fraction + b"0" * 9)[:9])
     except ValueError:
         return 0
+
+
+def position_of(line: bytes) -> tuple[float, float]:
+    """Return the wheels' position [m] in a line, NaN if invalid."""
+    after = 6 if line.startswith(FLASER) else 11  # words from there to the end of the line
+    words = line.rsplit(maxsplit=after)[1:3]
+    try:
+        return float(words[0]), float(words[1])
+    except (ValueError, IndexError):
+        return math.nan, math.nan
 
 
 def _is_finite(scan: ScanLine) -> bool:

@@ -1,11 +1,16 @@
-"""Correction of stamps that do not rise, in a sequence of known order."""
+"""Correction of stamps of receipt: of those that do not rise, and of those that come in bursts."""
 
 from __future__ import annotations
 
 from bisect import bisect_left
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+
+_SPAN = 200  # scans over which the period is measured: bursts average out
+_BACKLOG = 20  # scans that wait at most until they are stamped: 3.3 s in Intel's log
+_CLOSEST = 0.1  # of the period: so far apart are any two scans
 
 
 def longest_rising(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -26,14 +31,6 @@ def longest_rising(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.array(kept[::-1], dtype=np.int64)
 
 
-def rising_order(stamps_ns: NDArray[np.int64], *, late_max_ns: int) -> NDArray[np.int64]:
-    """Return indices (N,) sorted by stamp; unsorted if one is late by more than `late_max_ns`."""
-    behind_ns = np.maximum.accumulate(stamps_ns) - stamps_ns
-    if behind_ns.max(initial=0) > late_max_ns:
-        return np.arange(len(stamps_ns))
-    return np.argsort(stamps_ns, kind="stable")
-
-
 def rising_stamps(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return rising stamps (N,): those out of order are interpolated between neighbours.
 
@@ -52,3 +49,27 @@ def rising_stamps(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     rising[:first] = stamps_ns[first] - (first - places[:first]) * 1_000_000
     rising[last + 1 :] = stamps_ns[last] + (places[last + 1 :] - last) * 1_000_000
     return rising
+
+
+def measured_stamps(received_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return rising times of measurement (N,) of scans, by their stamps of receipt in their order.
+
+    A scanner turns at a constant rate, while a busy computer stamps its scans too late and in
+    bursts, but never too early: a scan was measured no later than any of the next `_BACKLOG` was
+    received, less the period for each scan between (after Olson, "A passive solution to the sensor
+    synchronization problem", IROS 2010, with the count of scans as the sensor's clock).
+    """
+    count = len(received_ns)
+    if count < 2:
+        return received_ns
+    span = min(_SPAN, count - 1)
+    period_ns = max(
+        float(np.median(received_ns[span:] - received_ns[:-span])) / span, 1.0 / _CLOSEST
+    )
+    regular_ns = np.rint(np.arange(count) * period_ns).astype(np.int64)
+    late_ns = received_ns - regular_ns
+    padded = np.pad(late_ns, (0, _BACKLOG), constant_values=np.iinfo(np.int64).max)
+    least_ns = sliding_window_view(padded, _BACKLOG + 1).min(axis=1)
+    spaced_ns = np.rint(np.arange(count) * _CLOSEST * period_ns).astype(np.int64)
+    apart_ns = np.maximum.accumulate(least_ns + regular_ns - spaced_ns)
+    return np.asarray(apart_ns + spaced_ns)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sceneslam.interfaces import Live, LiveFeed, Source
+from sceneslam.sources.logged import Logged
 from sceneslam.sources.spanned import Spanned, TimeSpan
 from sceneslam.sources.survey.survey import Survey, Surveyed
 from sceneslam.types.rig import Rig
 
 
 class Wrapped:
-    """Passes on rig, length, faults, live feed and time span of its source."""
+    """Passes on rig, length, faults, live feed, time span and logged stamps of its source."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
@@ -44,6 +48,11 @@ class Wrapped:
     def survey(self) -> Survey | None:
         """Return the source's survey, None if unknown; effects are not included."""
         return self._source.survey() if isinstance(self._source, Surveyed) else None
+
+    def logged_ns(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the recording's stamps (N,) of observations with `stamps_ns` (N,)."""
+        source = self._source
+        return source.logged_ns(stamps_ns) if isinstance(source, Logged) else stamps_ns
 
     def start_ns(self) -> int | None:
         """Return the stamp of the first observation, None where there is none."""

@@ -66,6 +66,11 @@ class Trajectory:
         T_world_base = se3.from_quat_xyzw(values[:, :3], values[:, 3:])
         return cls(stamps_ns=np.array(stamps_ns)[order], T_world_base=T_world_base[order])
 
+    def stamped(self, stamps_ns: NDArray[np.int64]) -> Trajectory:
+        """Return the same poses with other stamps (N,), sorted by them."""
+        order = np.argsort(stamps_ns, kind="stable")
+        return Trajectory(stamps_ns=stamps_ns[order], T_world_base=self.T_world_base[order])
+
     def write_tum(self, path: Path) -> None:
         """Write the poses as a TUM file (stamps with nine decimals)."""
         quats_xyzw = se3.to_quat_xyzw(self.T_world_base) if len(self) else np.zeros((0, 4))
