@@ -152,6 +152,13 @@ class FakeSource:
         return GroundTruth(trajectory=trajectory, scenes=scenes)
 
 
+class LateStamps(FakeSource):
+    """A recording that stamped every other observation late, so that their order is another one."""
+
+    def logged_ns(self, stamps_ns):
+        return stamps_ns + 3 * PERIOD_NS * (stamps_ns // PERIOD_NS % 2)
+
+
 class InterruptedModule(ExactModule):
     """Presses Ctrl-C at an index."""
 

@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from configured import config
+from fakes import LateStamps
 
 from sceneslam.app import run
+from sceneslam.atlas.uncertainty import read_covariances
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.trajectory import Trajectory
 
@@ -43,6 +45,19 @@ def test_two_runs_give_identical_trajectories_and_events(tmp_path):
         return [line for line in lines if json.loads(line)["event"] != "cost"]
 
     assert decisions("one") == decisions("two")
+
+
+def test_trajectories_have_the_stamps_of_the_recording(tmp_path):
+    run(config(), tmp_path / "exact")
+    run(config(source___target_="fakes.LateStamps"), tmp_path / "late")
+    for name in ("trajectory.tum", "trajectory_online.tum"):
+        exact, late = (Trajectory.read_tum(tmp_path / one / name) for one in ("exact", "late"))
+        logged_ns = LateStamps(100, 40).logged_ns(exact.stamps_ns)
+        order = np.argsort(logged_ns)
+        np.testing.assert_array_equal(late.stamps_ns, logged_ns[order])
+        np.testing.assert_array_equal(late.T_world_base, exact.T_world_base[order])
+    path = tmp_path / "late" / "trajectory_covariance.txt"
+    np.testing.assert_array_equal(read_covariances(path)[0], late.stamps_ns)
 
 
 def test_input_that_breaks_off_leaves_what_was_computed(tmp_path):
