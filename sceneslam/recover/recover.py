@@ -157,9 +157,9 @@ def _source(
         source = make_source(config, builder)
         return source, source.ground_truth()
     except SceneSlamError as error:
-        missing.append(f"the ground truth: {error}")
+        missing.append(f"the ground truth and the stamps of the recording: {error}")
     except Exception as error:  # any exception of a reader, if the recording has changed
-        missing.append(f"the ground truth: {text_of(error)}")
+        missing.append(f"the ground truth and the stamps of the recording: {text_of(error)}")
     return source, None
 
 
