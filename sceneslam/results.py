@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sceneslam.atlas.save import save_map
 from sceneslam.atlas.uncertainty import write_covariances
 from sceneslam.evaluation.metrics import Metrics, evaluate, write_metrics
 from sceneslam.evaluation.report import write_report
 from sceneslam.evaluation.settings import EvaluationSettings
-from sceneslam.sources.logged import Logged
+from sceneslam.interfaces import Source
+from sceneslam.sources.wrapped import logged_ns
 from sceneslam.types.errors import text_of
 from sceneslam.types.run import RunResult
 from sceneslam.types.trajectory import Trajectory
@@ -39,7 +39,7 @@ class Results:
     has_report: bool
     value_label: str  # of the detector's votes, for the figures
     faults: list[str]  # errors of the run, for the report
-    source: object  # if it is Logged, the files of trajectories have its stamps
+    source: Source | None  # if it is Logged, the files of trajectories have its stamps
 
     def save_trajectories(self, result: RunResult) -> None:
         """Write the trajectories first, as they are the most important result."""
@@ -51,7 +51,7 @@ class Results:
             for session in result.sessions:
                 name = f"trajectory_{session.index}_{session.module}.tum"
                 self._write_tum(session.trajectory, name)
-            stamps_ns = self._logged_ns(result.trajectory)
+            stamps_ns = logged_ns(self.source, result.trajectory.stamps_ns)
             order = np.argsort(stamps_ns, kind="stable")
             path = folder / "trajectory_covariance.txt"
             write_covariances(path, stamps_ns[order], result.covariances[order])
@@ -84,11 +84,8 @@ class Results:
         return metrics
 
     def _write_tum(self, trajectory: Trajectory, name: str) -> None:
-        trajectory.stamped(self._logged_ns(trajectory)).write_tum(self.folder / name)
-
-    def _logged_ns(self, trajectory: Trajectory) -> NDArray[np.int64]:
-        stamps_ns = trajectory.stamps_ns
-        return self.source.logged_ns(stamps_ns) if isinstance(self.source, Logged) else stamps_ns
+        stamps_ns = logged_ns(self.source, trajectory.stamps_ns)
+        trajectory.stamped(stamps_ns).write_tum(self.folder / name)
 
     def _write_report(
         self,

@@ -152,14 +152,14 @@ def _source(
     config: Mapping[str, Any], builder: ComponentBuilder, missing: list[str]
 ) -> tuple[Source | None, GroundTruth | None]:
     """Return the recording and its ground truth."""
-    source = None
+    source, lost = None, "the ground truth and the stamps of the recording"
     try:
-        source = make_source(config, builder)
+        source, lost = make_source(config, builder), "the ground truth"
         return source, source.ground_truth()
     except SceneSlamError as error:
-        missing.append(f"the ground truth and the stamps of the recording: {error}")
+        missing.append(f"{lost}: {error}")
     except Exception as error:  # any exception of a reader, if the recording has changed
-        missing.append(f"the ground truth and the stamps of the recording: {text_of(error)}")
+        missing.append(f"{lost}: {text_of(error)}")
     return source, None
 
 

@@ -57,18 +57,11 @@ class Carmen(StampedScans):
         if first is None:
             raise InputError(f"no scans, expected FLASER or ROBOTLASER1 lines: {path}")
         logged_ns = np.array([stamp_of(line) for line in self._lines], dtype=np.int64)
-        order = np.argsort(logged_ns, kind="stable")
-        late_ns = (np.maximum.accumulate(logged_ns) - logged_ns).max()
-        if late_ns > _LATE_MAX_S * 1e9:  # the clock was set
-            self._logged_ns, order = rising_stamps(logged_ns), np.arange(len(logged_ns))
-        else:
-            self._logged_ns = np.empty_like(logged_ns)
-            self._logged_ns[order] = rising_stamps(logged_ns[order])
-        self._warn_of_changed(np.flatnonzero(self._logged_ns != logged_ns))
-        if late_ns > 0 and _path_m(self._lines) <= _path_m([self._lines[at] for at in order]):
-            order = np.arange(len(logged_ns))
+        distinct_ns = _distinct_stamps(logged_ns)
+        self._warn_of_changed(np.flatnonzero(distinct_ns != logged_ns), distinct_ns)
+        order = _driven_order(self._lines, distinct_ns)
         self._lines = [self._lines[place] for place in order]
-        self._logged_ns = self._logged_ns[order]
+        self._logged_ns = distinct_ns[order]
         T_base_laser = se3.from_xy_yaw(self._offset_m(), 0.0, 0.0)
         if first.T_base_laser is not None:
             T_base_laser = first.T_base_laser
@@ -82,10 +75,11 @@ class Carmen(StampedScans):
     def __iter__(self) -> Iterator[Observation]:
         """Yield the scans by rising stamp."""
         self._faults.clear()
-        for line, stamp_ns in zip(self._lines, self._stamps_ns.tolist(), strict=True):
+        stamps_ns = zip(self._stamps_ns.tolist(), self._logged_ns.tolist(), strict=True)
+        for line, (stamp_ns, logged_ns) in zip(self._lines, stamps_ns, strict=True):
             scan = parse_scan(line)
             if scan is None:
-                self._faults.add("scan line is invalid", f"{stamp_ns * 1e-9:.3f} s: {self._path}")
+                self._faults.add("scan line is invalid", f"{logged_ns * 1e-9:.3f} s: {self._path}")
             else:
                 yield self._observation(scan, stamp_ns)
 
@@ -137,7 +131,7 @@ class Carmen(StampedScans):
             T_odom_base=locked(scan.T_odom_base),
         )
 
-    def _warn_of_changed(self, changed: NDArray[np.int64]) -> None:
+    def _warn_of_changed(self, changed: NDArray[np.int64], stamps_ns: NDArray[np.int64]) -> None:
         """Log stamps that were corrected; no data are lost, so this is not a fault."""
         if len(changed):
             _LOG.warning(
@@ -145,7 +139,7 @@ class Carmen(StampedScans):
                 "stamps between their neighbours': %s",
                 len(changed),
                 len(self._lines),
-                self._logged_ns[changed[0]] * 1e-9,
+                stamps_ns[changed[0]] * 1e-9,
                 self._path,
             )
 
@@ -168,7 +162,22 @@ class Carmen(StampedScans):
         return 0.0
 
 
-def _path_m(lines: Sequence[bytes]) -> float:
-    """Return the length [m] of the wheels' path over scan lines in this order."""
+def _distinct_stamps(logged_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return a stamp of its own for each line (N,); rising by line where the clock was set."""
+    late_ns = (np.maximum.accumulate(logged_ns) - logged_ns).max()
+    was_set = late_ns > _LATE_MAX_S * 1e9
+    order = np.arange(len(logged_ns)) if was_set else np.argsort(logged_ns, kind="stable")
+    distinct_ns = np.empty_like(logged_ns)
+    distinct_ns[order] = rising_stamps(logged_ns[order])
+    return distinct_ns
+
+
+def _driven_order(lines: Sequence[bytes], stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the order (N,) of the lines or of the stamps, where the wheels' path is shorter."""
     positions_m = np.array([position_of(line) for line in lines])
-    return float(np.nansum(np.linalg.norm(np.diff(positions_m, axis=0), axis=1)))
+    orders = np.arange(len(lines)), np.argsort(stamps_ns)
+
+    def path_m(order: NDArray[np.int64]) -> float:
+        return float(np.nansum(np.linalg.norm(np.diff(positions_m[order], axis=0), axis=1)))
+
+    return min(orders, key=path_m)

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.interfaces import Live, LiveFeed, Source
-from sceneslam.sources.logged import Logged
+from sceneslam.interfaces import Live, LiveFeed, Logged, Source
 from sceneslam.sources.spanned import Spanned, TimeSpan
 from sceneslam.sources.survey.survey import Survey, Surveyed
 from sceneslam.types.rig import Rig
@@ -51,8 +50,7 @@ class Wrapped:
 
     def logged_ns(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the recording's stamps (N,) of observations with `stamps_ns` (N,)."""
-        source = self._source
-        return source.logged_ns(stamps_ns) if isinstance(source, Logged) else stamps_ns
+        return logged_ns(self._source, stamps_ns)
 
     def start_ns(self) -> int | None:
         """Return the stamp of the first observation, None where there is none."""
@@ -60,3 +58,8 @@ class Wrapped:
             return self.span.start_ns
         first = next(iter(self._source), None)
         return None if first is None else first.stamp_ns
+
+
+def logged_ns(source: Source | None, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the stamps (N,) that a recording itself has for observations with `stamps_ns`."""
+    return source.logged_ns(stamps_ns) if isinstance(source, Logged) else stamps_ns

@@ -67,7 +67,7 @@ class PlacedViews:
     ) -> tuple[int, Sighting] | None:
         """Return the view that shows the same place, with the pose that `seen_at` gives for it.
 
-        None if there is none, or if another one puts the camera elsewhere.
+        None if no view shows it, or if two views show different places about equally well.
         """
         found = [
             (number, one)
