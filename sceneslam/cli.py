@@ -206,7 +206,8 @@ def _reference(config: DictConfig) -> dict[str, Any]:
     if not isinstance(config.reference, DictConfig):
         raise ConfigError("reference", config.reference, allowed)
     try:
-        other = OmegaConf.merge(config, config.reference, {"reference": None})
+        own = {"reference": None, "atlas": {"save": None}}  # the map that is saved is the run's
+        other = OmegaConf.merge(config, config.reference, own)
     except OmegaConfBaseException as error:
         key = f"reference.{getattr(error, 'full_key', '') or ''}".rstrip(".")
         raise ConfigError(key, OmegaConf.to_container(config.reference), allowed) from error

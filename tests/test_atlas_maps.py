@@ -11,7 +11,7 @@ from test_atlas_places import CELL, plan_of, quality, text_of
 
 from sceneslam.atlas.lasting import lasting_map, merge
 from sceneslam.atlas.lasting.lasting_map import LastingMap
-from sceneslam.atlas.lasting.map_files import HEAD, load_map_files, save_map_files
+from sceneslam.atlas.lasting.map_files import HEAD, OLD, load_map_files, save_map_files
 from sceneslam.atlas.lasting.merge import join_pieces
 from sceneslam.atlas.lasting.prune import prune
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map, forget_contradicted
@@ -19,6 +19,7 @@ from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.graphs.edge import Edge, EdgeKind
+from sceneslam.maps.inspect import flaws
 from sceneslam.types import planar
 from sceneslam.types.errors import ConfigError, InputError
 
@@ -44,6 +45,9 @@ def map_of(*plans, nodes=None, runs=None, pieces=None, edges=()):
         pieces=np.zeros(count, np.int64) if pieces is None else np.array(pieces),
         edges=tuple(edges),
     )
+
+
+LOOP, KINDS = EdgeKind.LOOP, (EdgeKind.MOTION, EdgeKind.LOOP)
 
 
 def edge(first, second, T_first_second=(1.0, 0.0, 0.0), kind=EdgeKind.MOTION):
@@ -147,7 +151,7 @@ def test_a_submap_without_later_walls_stays_and_one_without_walls_goes():
     assert len(prune(map_of(WALL, WALL, WALL)).submaps) == 1
 
 
-def test_motions_between_kept_submaps_stay_and_loops_to_removed_ones_go():
+def test_motions_and_loops_through_removed_submaps_are_composed():
     far = [50.0 * index for index in range(4)]
     nodes = [[far[0], 0, 0], [far[1], 0, 0], [far[2], 0, 0], [far[1], 0, 0]]
     edges = [edge(0, 1), edge(1, 2), edge(2, 3), edge(0, 2, kind=EdgeKind.LOOP)]
@@ -156,8 +160,23 @@ def test_motions_between_kept_submaps_stay_and_loops_to_removed_ones_go():
     found = [(one.first, one.second, one.kind) for one in thinned.edges]
     motion, loop = EdgeKind.MOTION, EdgeKind.LOOP
     assert found == [(1, 2, motion), (0, 1, loop), (0, 1, motion)]
-    np.testing.assert_allclose(thinned.edges[-1].T_first_second[:3, 3], [2.0, 0.0, 0.0])
+    np.testing.assert_allclose(thinned.edges[2].T_first_second[:3, 3], [2.0, 0.0, 0.0])
     np.testing.assert_array_equal(thinned.plane[:, 0], [far[0], far[2], far[1]])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_what_was_connected_stays_so_whatever_is_removed(seed):
+    """Half of the submaps lie where later ones do; edges are a random tree, and some loops."""
+    rng = np.random.default_rng(seed)
+    nodes = [[50.0 * (index % 5), 0, 0] for index in range(10)]
+    ends = [(int(rng.integers(index)), index) for index in range(1, 10)]
+    edges = [edge(*pair, kind=KINDS[rng.integers(2)]) for pair in ends]
+    edges += [edge(*sorted(rng.choice(10, 2, False).tolist()), kind=LOOP) for _ in range(4)]
+    for number, one in enumerate(edges):
+        motion = planar.between(np.array(nodes[one.first]), np.array(nodes[one.second]))
+        edges[number] = replace(one, T_first_second=planar.to_transform(motion))
+    thinned = prune(map_of(*[WALL] * 10, nodes=nodes, edges=edges))
+    assert len(thinned.submaps) == 5 and flaws(thinned) == []
 
 
 # What is joined.
@@ -263,7 +282,7 @@ def test_a_map_is_loaded_as_it_was_saved(tmp_path):
     (one,) = found.edges
     assert (one.first, one.second, one.kind) == (0, 1, EdgeKind.MOTION)
     np.testing.assert_array_equal(one.covariance, saved.edges[0].covariance)
-    save_map_files(empty_map(), tmp_path)
+    save_map_files(empty_map(), tmp_path, known=head["sha256"])
     assert load_map_files(tmp_path).submaps == () and len(list(tmp_path.iterdir())) == 2
 
 
@@ -335,13 +354,70 @@ def test_a_head_that_does_not_fit_is_named(tmp_path, key, value, said):
         load_map_files(tmp_path / "none")
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("node_module", [-1, 0]),
+        ("node_run", [-1, 0]),
+        ("node_piece", [1, 2]),
+        ("node_scans", [0, 4]),
+        ("point", 1e9),
+        ("edge_covariance", 0.0),
+    ],
+)
+def test_numbers_that_no_map_has_are_named(tmp_path, name, value):
+    def harm(arrays):
+        arrays[name] = np.broadcast_to(np.array(value, arrays[name].dtype), arrays[name].shape)
+
+    with_arrays(tmp_path, harm)
+    with pytest.raises(InputError, match=f"{name}: expected"):
+        load_map_files(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["[" * 20_000, "image: office.pgm\n", ""])
+def test_a_head_of_another_program_is_no_map_and_is_not_replaced(tmp_path, text):
+    (tmp_path / HEAD).write_text(text)
+    with pytest.raises(InputError, match=HEAD):
+        load_map_files(tmp_path)
+    with pytest.raises(InputError, match=f"{HEAD} is in"):
+        save_map_files(whole_map(), tmp_path)
+    with pytest.raises(ConfigError, match="save"):
+        LastingMap(load=None, save=str(tmp_path), mode="extend", save_every_s=1.0)
+    assert (tmp_path / HEAD).read_text() == text
+
+
+def test_what_a_killed_writer_left_is_no_obstacle(tmp_path):
+    (tmp_path / "arrays-0123.npz").write_bytes(b"")
+    (tmp_path / f"{HEAD}.part").write_text("format:")
+    save_map_files(whole_map(), tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize("path", ["file", "file/below", "x" * 300])
+def test_a_place_where_no_map_can_be_is_named_before_the_run(tmp_path, path):
+    (tmp_path / "file").write_text("")
+    for key in ("save", "load"):
+        given = {"save": None, "load": None, key: str(tmp_path / path)}
+        with pytest.raises(ConfigError, match=key):
+            LastingMap(**given, mode="extend", save_every_s=1.0)
+
+
+def test_a_map_that_another_run_saved_is_kept(tmp_path):
+    old, new = whole_map(), map_of(WALL)
+    save_map_files(old, tmp_path)
+    save_map_files(new, tmp_path)
+    assert len(load_map_files(tmp_path).submaps) == 1
+    (tmp_path / OLD).replace(tmp_path / HEAD)
+    assert len(load_map_files(tmp_path).submaps) == len(old.submaps)
+
+
 # When a run is saved.
 
 
 class Mapped:
     """A run with one submap."""
 
-    is_found = True
+    is_found = was_found = has_submaps = True
 
     def saved(self):
         return map_of(WALL, edges=[edge(0, 0, kind=EdgeKind.LOOP), edge(0, 0)])
@@ -352,9 +428,48 @@ def lasting(tmp_path, monkeypatch, *, every_s=2.0):
     written, own = [], LastingMap(
         load=None, save=str(tmp_path / "map"), mode="extend", save_every_s=every_s
     )  # fmt: skip
-    monkeypatch.setattr(lasting_map, "save_map_files", lambda saved, folder: written.append(saved))
+
+    def save(saved, folder, *, known):
+        written.append(saved)
+        return "seal"
+
+    monkeypatch.setattr(lasting_map, "save_map_files", save)
     own.open(is_live=False)
     return own, written
+
+
+def test_a_run_without_a_submap_replaces_no_map(tmp_path):
+    class Begun(Mapped):
+        has_submaps = False
+
+        def saved(self):
+            return empty_map()
+
+    save_map_files(whole_map(), tmp_path / "map")
+    own = LastingMap(load=None, save=str(tmp_path / "map"), mode="extend", save_every_s=1.0)
+    own.open(is_live=False)
+    for second in range(5):
+        own.keep(second * S, Begun())
+    own.finish(Begun(), 5 * S, lambda *_, **__: None)
+    assert len(load_map_files(tmp_path / "map").submaps) == 2
+    assert own.faults == [f"the run has nothing to save, the map that was in {tmp_path}/map stays"]
+
+
+def test_runs_that_share_a_map_are_told_and_nothing_is_lost(tmp_path):
+    folder = str(tmp_path)
+    save_map_files(whole_map(), tmp_path)
+    one, other = (
+        LastingMap(load=folder, save=folder, mode="extend", save_every_s=1.0) for _ in range(2)
+    )
+    one.finish(Mapped(), 0, lambda *_, **__: None)
+    later = Mapped()
+    later.saved = lambda: map_of(WALL, WALL, WALL)
+    other.finish(later, 0, lambda *_, **__: None)
+    assert one.faults == [] and len(load_map_files(tmp_path).submaps) == 3
+    (tmp_path / OLD).replace(tmp_path / HEAD)
+    assert len(load_map_files(tmp_path).submaps) == 1
+    (fault,) = other.faults
+    assert "another run saved its map meanwhile" in fault and OLD in fault
 
 
 def test_a_map_is_saved_at_intervals_and_at_the_end(tmp_path, monkeypatch):
@@ -373,7 +488,7 @@ def test_a_map_is_saved_at_intervals_and_at_the_end(tmp_path, monkeypatch):
 def test_what_could_not_be_saved_is_told_once(tmp_path, monkeypatch):
     own, _ = lasting(tmp_path, monkeypatch)
 
-    def fails(*_):
+    def fails(*_, **__):
         raise OSError("no space left")
 
     monkeypatch.setattr(lasting_map, "save_map_files", fails)

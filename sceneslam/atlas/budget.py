@@ -52,16 +52,22 @@ class Budget:
 
 
 def thin(sessions: Sequence[OpenSession], voxel_m: float, most: float) -> None:
-    """Leave one point per module and voxel, the first; double the voxel down to `most` bytes."""
+    """Leave one point per module and voxel, the first; double the voxel down to `most` bytes.
+
+    At the least a few points per module are left.
+    """
     layers = [session.layers for session in sessions]  # a session that is closed meanwhile is kept
     modules = list(dict.fromkeys(session.module for session in sessions))
     owners = [modules.index(session.module) for session in sessions]
     poses = [session.T_map_local for session in sessions]
+    clouds = [cloud for one in layers for cloud in (one.points, one.landmarks) if cloud is not None]
+    reach_m = max((float(np.abs(cloud.points).max(initial=0.0)) for cloud in clouds), default=0.0)
+    reach_m += max(float(np.linalg.norm(T[:3, 3])) for T in poses)
     while True:
         points = _kept([one.points for one in layers], owners, poses, voxel_m)
         landmarks = _kept([one.landmarks for one in layers], owners, poses, voxel_m)
         left = [_of(*one) for one in zip(layers, points, landmarks, strict=True)]
-        if sum(_bytes(one) for one in left) <= most:
+        if sum(_bytes(one) for one in left) <= most or voxel_m > 2.0 * reach_m:
             break
         voxel_m *= 2.0
     for session, before, after in zip(sessions, layers, left, strict=True):

@@ -7,13 +7,18 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from sceneslam.atlas.lasting.map_files import load_map_files, save_map_files
+from sceneslam.atlas.lasting.map_files import (
+    HEAD,
+    check_map_folder,
+    load_map_files,
+    save_map_files,
+)
 from sceneslam.atlas.lasting.merge import join_pieces, side_by_side
 from sceneslam.atlas.lasting.prune import prune
 from sceneslam.maps.export import export
 from sceneslam.maps.inspect import described, flaws
 from sceneslam.streams import secure_streams
-from sceneslam.types.errors import SceneSlamError, text_of
+from sceneslam.types.errors import InputError, SceneSlamError, text_of
 
 OK, INCOMPLETE, UNUSABLE = 0, 1, 2
 
@@ -44,6 +49,7 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _merge(options: argparse.Namespace) -> int:
+    check_map_folder(options.out)
     saved = load_map_files(options.map)
     for other in options.others:
         saved = side_by_side(saved, load_map_files(other))
@@ -52,13 +58,14 @@ def _merge(options: argparse.Namespace) -> int:
     print("\n".join([*described(result.map), f"map  {options.out}"]))
     if result.apart:
         print(
-            f"error: pieces that were not recognized in the first and stay apart: {result.apart}",
+            f"error: pieces that were not recognized in another and stay apart: {result.apart}",
             file=sys.stderr,
         )
     return INCOMPLETE if result.apart else OK
 
 
 def _prune(options: argparse.Namespace) -> int:
+    check_map_folder(options.out)
     saved = load_map_files(options.map)
     thinned = prune(saved)
     save_map_files(thinned, options.out)
@@ -68,6 +75,8 @@ def _prune(options: argparse.Namespace) -> int:
 
 
 def _export(options: argparse.Namespace) -> int:
+    if (options.out / HEAD).exists():
+        raise InputError(f"a map is saved in a folder of its own, choose another: {options.out}")
     for path in export(load_map_files(options.map), options.out):
         print(path)
     return OK

@@ -20,7 +20,7 @@ def export(saved: SavedMap, folder: Path) -> list[Path]:
     grid, graph = folder / "grid.yaml", folder / "pose_graph.g2o"
     save_grid(grid_of(main.plan()), grid)
     save_pose_graph(_graph(main), graph)
-    return [grid, graph]
+    return [grid, grid.with_suffix(".pgm"), graph, graph.with_suffix(".tum")]
 
 
 def _graph(saved: SavedMap) -> PoseGraphLayer:

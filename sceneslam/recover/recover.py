@@ -57,6 +57,8 @@ def recover(folder: Path) -> Recovered:
     atlas = builder.make("atlas", Atlas)
     kept = read_journal(folder / JOURNAL, _Retold(atlas))
     missing = list(_NEVER_KEPT)
+    if (config.get("atlas") or {}).get("load"):
+        missing.append("its place in the map that was loaded: poses are in the run's own frame")
     if kept.torn_bytes:
         missing.append(f"the last {kept.torn_bytes} bytes of {JOURNAL}, which are torn")
     events = _events(folder, missing)

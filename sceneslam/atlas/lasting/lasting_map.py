@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 from concurrent.futures import Executor, Future
 from pathlib import Path
 
-from sceneslam.atlas.lasting.map_files import HEAD, load_map_files, save_map_files
+from sceneslam.atlas.lasting.map_files import (
+    OLD,
+    check_map_folder,
+    load_map_files,
+    save_map_files,
+    seal_of,
+)
 from sceneslam.atlas.lasting.saved_map import SavedMap, forget_contradicted
 from sceneslam.atlas.mapper import Mapper, Note
 from sceneslam.executors import InStep, executor
 from sceneslam.types.errors import ConfigError, InputError, text_of
+
+_log = logging.getLogger(__name__)
 
 LOCALIZE, EXTEND, UPDATE = "localize", "extend", "update"
 
@@ -32,22 +41,26 @@ class LastingMap:
         if not save_every_s > 0:
             raise ConfigError("save_every_s", save_every_s, "seconds above 0")
         self._mode, self._every_ns = mode, round(save_every_s * 1e9)
-        self._save = None if save is None else Path(save).resolve()
-        self._load = None if load is None else Path(load).resolve()
+        self._save, self._load = _folder(save), _folder(load)
         self.loaded: SavedMap | None = None
         self.faults: list[str] = []
         self._saved_ns: int | None = None
         self._executor: Executor = InStep()
         self._writing: Future[None] | None = None
+        self._seal: str | None = None  # of the map that this run takes the place of
         try:
             if self._load is not None:
                 self.loaded = load_map_files(self._load)
-        except InputError as error:
-            raise ConfigError("load", str(load), f"the folder of a saved map ({error})") from error
-        if self._save is not None and self._save.is_dir():
-            foreign = any(self._save.iterdir()) and not (self._save / HEAD).is_file()
-            if foreign:
-                raise ConfigError("save", str(save), "a folder that is empty or holds a map")
+                self._seal = seal_of(self._load) if self._load == self._save else None
+        except (InputError, OSError) as error:
+            allowed = f"the folder of a saved map ({text_of(error)})"
+            raise ConfigError("load", str(load), allowed) from error
+        try:
+            if self._save is not None:
+                check_map_folder(self._save)
+        except (InputError, OSError) as error:
+            allowed = f"a folder that is empty or holds a map ({text_of(error)})"
+            raise ConfigError("save", str(save), allowed) from error
 
     @property
     def saves(self) -> bool:
@@ -65,7 +78,8 @@ class LastingMap:
         if self._save is None or stamp_ns - self._saved_ns < self._every_ns:
             return
         self._saved_ns = stamp_ns
-        if self._writing is None or self._writing.done():
+        is_writing = self._writing is not None and not self._writing.done()
+        if mapper.has_submaps and not is_writing:  # else there is nothing new
             self._writing = self._executor.submit(self._write, mapper.saved(), mapper.is_found)
 
     def map_of(self, mapper: Mapper) -> SavedMap:
@@ -75,12 +89,17 @@ class LastingMap:
     def finish(self, mapper: Mapper, stamp_ns: int, note: Note) -> None:
         """Save at the end, and report if the run was not located in the loaded map."""
         if self._load is not None and not mapper.is_found:
+            what = "was found, but its walls contradict" if mapper.was_found else "was not found in"
             self.faults.append(
-                f"the run was not found in the map {self._load}, its poses are in its own frame"
+                f"the run {what} the map {self._load}, its poses are in its own frame"
             )
         self._executor.shutdown()
-        if self._save is not None:
-            saved = mapper.saved()
+        saved = mapper.saved()
+        if self._save is None:
+            return
+        if not saved.submaps and seal_of(self._save) is not None:
+            self._fault(f"the run has nothing to save, the map that was in {self._save} stays")
+        else:
             self._write(saved, mapper.is_found)
             note("map_saved", stamp_ns, submaps=len(saved.submaps), loops=_loops(saved))
 
@@ -92,11 +111,27 @@ class LastingMap:
     def _write(self, saved: SavedMap, is_found: bool) -> None:
         assert self._save is not None
         try:
-            save_map_files(self._updated(saved, is_found), self._save)
+            before = seal_of(self._save)
+            updated = self._updated(saved, is_found)
+            seal = save_map_files(updated, self._save, known=self._seal)
         except (OSError, InputError) as error:
-            fault = f"the map could not be saved: {text_of(error)}"
-            if fault not in self.faults:
-                self.faults.append(fault)
+            self._fault(f"the map could not be saved: {text_of(error)}")
+            return
+        if before not in (None, self._seal, seal):
+            kept = f"the map that was in {self._save} is kept, its head is {OLD} there"
+            if self._seal is None:
+                _log.warning(kept)
+            else:
+                self._fault(f"another run saved its map meanwhile: {kept}")
+        self._seal = seal
+
+    def _fault(self, fault: str) -> None:
+        if fault not in self.faults:
+            self.faults.append(fault)
+
+
+def _folder(path: str | None) -> Path | None:
+    return None if path is None else Path(path).expanduser().resolve()
 
 
 def _loops(saved: SavedMap) -> int:

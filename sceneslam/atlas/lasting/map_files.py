@@ -1,15 +1,19 @@
 """Write and read a saved map: a YAML with the name and checksum of one file of arrays.
 
 `docs/map.md` documents the format. The arrays are written first, under a new name; the YAML that
-names them is replaced atomically. If the process is killed meanwhile, the old map remains.
+names them is replaced atomically. If the process is killed meanwhile, the old map remains. The
+folder is locked while it is read or written, so that runs may share it.
 """
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import io
+import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +30,8 @@ from sceneslam.types.files import PART, replacing
 from sceneslam.views.view import Landmarks, PlacedView
 
 HEAD, FORMAT, VERSION = "map.yaml", "sceneslam-map", 2
+OLD = "map.old.yaml"  # the head of a map that another one took the place of
+_FAR_M = 1e5  # no building is so large
 _ROUNDING = 1e-6  # of a rotation that was composed of many
 _ARRAYS = "arrays-"  # prefix, followed by the start of their checksum
 _SHAPES: Mapping[str, tuple[str, str, tuple[int, ...]]] = {  # name -> dtype, row of, inner shape
@@ -56,75 +62,149 @@ _SHAPES: Mapping[str, tuple[str, str, tuple[int, ...]]] = {  # name -> dtype, ro
 }
 
 
-def save_map_files(saved: SavedMap, folder: Path) -> None:
-    """Write the map into its own folder; the same map gives the same bytes.
-
-    Raises InputError if the folder holds something else, OSError if it cannot be written.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
+def check_map_folder(folder: Path) -> None:
+    """Raise InputError if a map cannot be saved in a folder: it holds something else."""
+    if not folder.is_dir():
+        there = next(path for path in (folder, *folder.parents) if os.path.lexists(path))
+        if not there.is_dir():
+            raise InputError(f"there is a file in the place of a folder: {there}")
+        if not os.access(there, os.W_OK | os.X_OK):
+            raise InputError(f"the folder may not be written: {there}")
+        return
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"the folder may not be written: {folder}")
     others = [path for path in folder.iterdir() if not _is_ours(path)]
     if others:
         raise InputError(f"a map is saved in a folder of its own, {others[0].name} is in: {folder}")
+
+
+def save_map_files(saved: SavedMap, folder: Path, *, known: str | None = None) -> str:
+    """Write the map into its own folder; the same map gives the same bytes. Return its checksum.
+
+    `known` is the checksum of the map that this one takes the place of. A map that has another one
+    is kept: its head is copied to OLD. Raises InputError if the folder holds something else,
+    OSError if it cannot be written.
+    """
+    check_map_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
     modules = sorted({submap.module for submap in saved.submaps})
     data = _packed(_arrays(saved, modules))
     seal = hashlib.sha256(data).hexdigest()
     name = f"{_ARRAYS}{seal[:16]}.npz"
-    with replacing(folder / name, "wb") as file:
-        file.write(data)
     head = {
         "format": FORMAT,
         "version": VERSION,
         "arrays": name,
         "sha256": seal,
         "cell_m": CELL_M,
-        "submaps": len(saved.submaps),
-        "edges": len(saved.edges),
-        "runs": saved.runs,
-        "pieces": len(np.unique(saved.pieces)),
+        **_counts(saved),
         "modules": modules,
     }
-    with replacing(folder / HEAD) as file:
-        yaml.safe_dump(head, file, sort_keys=False)
-    for path in folder.iterdir():
-        if _is_ours(path) and path.name not in (HEAD, name):
-            path.unlink()
+    with _locked(folder, fcntl.LOCK_EX):
+        with replacing(folder / name, "wb") as file:
+            file.write(data)
+        if seal_of(folder) not in (None, known, seal):
+            with replacing(folder / OLD) as file:
+                file.write((folder / HEAD).read_text())
+        with replacing(folder / HEAD) as file:
+            yaml.safe_dump(head, file, sort_keys=False)
+        kept = {HEAD, OLD, name, _arrays_of(folder / OLD)}
+        for path in folder.iterdir():
+            if path.name not in kept:
+                path.unlink()
+    return seal
+
+
+def seal_of(folder: Path) -> str | None:
+    """Return the checksum of the map in a folder, None without a map."""
+    with suppress(InputError):
+        return str(_read_head(folder)["sha256"])
+    return None
+
+
+def _arrays_of(path: Path) -> str | None:
+    """Return the name of the arrays of the map with a head, None without one."""
+    with suppress(OSError, ValueError, yaml.YAMLError, AttributeError):
+        return str(yaml.safe_load(path.read_text()).get("arrays"))
+    return None
+
+
+@contextmanager
+def _locked(folder: Path, kind: int) -> Iterator[None]:
+    """Hold a lock on a folder, where its file system has locks."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(handle, kind)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _counts(saved: SavedMap) -> dict[str, int]:
+    return {
+        "submaps": len(saved.submaps),
+        "edges": len(saved.edges),
+        "runs": len({submap.run for submap in saved.submaps}),
+        "pieces": len(np.unique(saved.pieces)),
+    }
 
 
 def load_map_files(folder: Path) -> SavedMap:
     """Return the map of a folder; raises InputError that says what is wrong with it."""
-    head = _read_head(folder)
-    path = folder / str(head["arrays"])
-    if path.parent != folder or not path.is_file():
-        raise InputError(f"the map is not complete, {head['arrays']} is missing: {folder}")
-    data = path.read_bytes()
+    if not folder.is_dir():
+        raise InputError(f"there is no map, the folder is missing: {folder}")
+    try:
+        with _locked(folder, fcntl.LOCK_SH):
+            head = _read_head(folder)
+            path = folder / str(head["arrays"])
+            if path.parent != folder or not path.is_file():
+                raise InputError(f"the map is not complete, {head['arrays']} is missing: {folder}")
+            data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"the map cannot be read ({text_of(error)}): {folder}") from error
     if hashlib.sha256(data).hexdigest() != head["sha256"]:
         raise InputError(f"the map is damaged, its checksum is another: {path}")
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-    except (ValueError, OSError, zipfile.BadZipFile, KeyError) as error:
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
         raise InputError(f"the map's arrays cannot be read ({text_of(error)}): {path}") from error
     _check(arrays, path)
     modules = head.get("modules")
     if not isinstance(modules, list) or arrays["node_module"].max(initial=-1) >= len(modules):
         raise InputError(f"modules: expected the names that the submaps refer to: {folder / HEAD}")
-    return _unpacked(arrays, [str(module) for module in modules])
+    saved = _unpacked(arrays, [str(module) for module in modules])
+    for key, count in _counts(saved).items():
+        if head.get(key) != count:
+            raise InputError(
+                f"{key}: got {head.get(key)!r}, the arrays have {count}: {folder / HEAD}"
+            )
+    return saved
 
 
 def _is_ours(path: Path) -> bool:
+    """Tell whether a file is a map's; a head may also be that of another program."""
     name = path.name.removesuffix(PART)
-    return name == HEAD or (name.startswith(_ARRAYS) and name.endswith(".npz"))
+    if name.startswith(_ARRAYS):
+        return name.endswith(".npz")
+    return name in (HEAD, OLD) and (path.name != name or _is_head(path))
+
+
+def _is_head(path: Path) -> bool:
+    with suppress(OSError, ValueError, RecursionError, yaml.YAMLError):
+        head = yaml.safe_load(path.read_text())
+        return isinstance(head, dict) and head.get("format") == FORMAT
+    return False
 
 
 def _read_head(folder: Path) -> dict[str, Any]:
     path = folder / HEAD
-    if not folder.is_dir():
-        raise InputError(f"there is no map, the folder is missing: {folder}")
     if not path.is_file():
         raise InputError(f"not a map, it has no {HEAD}: {folder}")
     try:
         head = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, ValueError, OSError) as error:
+    except (yaml.YAMLError, ValueError, OSError, RecursionError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"the map's {HEAD} cannot be read ({reason}): {path}") from error
     if not isinstance(head, dict) or head.get("format") != FORMAT:
@@ -160,6 +240,18 @@ def _check(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
             raise InputError(f"{name}: expected rotations and translations: {path}")
         if counts.setdefault(rows, len(found)) != len(found):
             raise InputError(f"{name}: expected {counts[rows]} rows, got {len(found)}: {path}")
+    for name in ("node_run", "node_session", "node_module", "node_piece", "node_grid_shape"):
+        if (arrays[name] < 0).any():
+            raise InputError(f"{name}: expected 0 or more: {path}")
+    for name in ("node_pose", "node_grid_origin", "scan_pose", "point", "view_pose", "landmark"):
+        if np.abs(arrays[name]).max(initial=0.0) > _FAR_M:
+            raise InputError(f"{name}: expected at most {_FAR_M:g} m: {path}")
+    if counts["submaps"] and arrays["node_piece"].min() != 0:
+        raise InputError(f"node_piece: expected a submap in piece 0: {path}")
+    if (arrays["node_scans"] == 0).any():
+        raise InputError(f"node_scans: expected a scan in every submap: {path}")
+    if len(arrays["edge_covariance"]) and not _are_positive(arrays["edge_covariance"]):
+        raise InputError(f"edge_covariance: expected positive definite matrices: {path}")
     sizes = -(-arrays["node_grid_shape"].prod(axis=1) // 8)
     totals = {
         "scans": arrays["node_scans"],
@@ -184,6 +276,13 @@ def _are_rigid(poses: NDArray[Any]) -> bool:
     gram = rotations @ rotations.transpose(0, 2, 1)
     is_straight = np.abs(gram - np.eye(3)).max(initial=0.0) < _ROUNDING
     return bool(is_straight and (poses[:, 3] == [0.0, 0.0, 0.0, 1.0]).all())
+
+
+def _are_positive(covariances: NDArray[Any]) -> bool:
+    """Tell whether matrices (N, 6, 6) are symmetric and positive definite."""
+    turned = covariances.transpose(0, 2, 1)
+    is_symmetric = np.abs(covariances - turned).max() <= _ROUNDING * np.abs(covariances).max()
+    return bool(is_symmetric and (np.linalg.eigvalsh(covariances) > 0.0).all())
 
 
 def _arrays(saved: SavedMap, modules: list[str]) -> dict[str, NDArray[Any]]:

@@ -25,11 +25,11 @@ _LOOPS_MIN = 2  # agreeing loops, as a single one may come from a similar place
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Joined:
-    """The map after joining pieces to its first piece."""
+    """The map after joining its pieces."""
 
     map: SavedMap
     joined: int
-    apart: int  # pieces that stay separate: fewer than two submaps were recognized
+    apart: int  # pieces beside the first: fewer than two submaps were recognized
 
 
 def side_by_side(first: SavedMap, second: SavedMap) -> SavedMap:
@@ -45,19 +45,23 @@ def side_by_side(first: SavedMap, second: SavedMap) -> SavedMap:
 
 
 def join_pieces(saved: SavedMap) -> Joined:
-    """Return the map with every recognized piece joined to the first."""
-    joined = apart = 0
-    for piece in np.unique(saved.pieces[saved.pieces > 0]).tolist():
-        found = _joined(saved, piece)
-        joined, apart = joined + (found is not None), apart + (found is None)
-        saved = saved if found is None else found
-    return Joined(map=_renumbered(saved), joined=joined, apart=apart)
+    """Return the map with every piece joined to the first one in which it is recognized."""
+    joined, target = 0, 0
+    while target <= saved.pieces.max(initial=-1):
+        found = None
+        for piece in range(target + 1, int(saved.pieces.max()) + 1):
+            found = _joined(saved, target, piece)
+            if found is not None:
+                saved, joined = _renumbered(found), joined + 1
+                break  # what is larger now may show pieces that were not recognized before
+        target += found is None
+    return Joined(map=saved, joined=joined, apart=max(target - 1, 0))
 
 
-def _joined(saved: SavedMap, piece: int) -> SavedMap | None:
-    """Return the map with a piece joined to the first, None if it is not recognized."""
+def _joined(saved: SavedMap, target: int, piece: int) -> SavedMap | None:
+    """Return the map with a piece joined to another, None if it is not recognized there."""
     own = np.flatnonzero(saved.pieces == piece).tolist()
-    loops = [*_loops_by_walls(saved, own), *_loops_by_views(saved, own)]
+    loops = [*_loops_by_walls(saved, target, own), *_loops_by_views(saved, target, own)]
     drift = np.zeros((len(saved.submaps), 3))
     agreeing = [loops[index] for index in consistent(loops, saved.T_map_node, drift)]
     if len(agreeing) < _LOOPS_MIN:
@@ -67,13 +71,13 @@ def _joined(saved: SavedMap, piece: int) -> SavedMap | None:
     at_seed = nodes[seed.first] @ seed.T_first_second
     nodes[own] = at_seed @ se3.inverse(nodes[seed.second]) @ nodes[own]
     solved = _solve(saved, nodes, own, agreeing)
-    pieces = np.where(saved.pieces == piece, 0, saved.pieces)
+    pieces = np.where(saved.pieces == piece, target, saved.pieces)
     return replace(saved, T_map_node=solved, pieces=pieces, edges=(*saved.edges, *agreeing))
 
 
-def _loops_by_walls(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
-    """Return loops from the first piece to the submaps `own` of another piece, by their walls."""
-    plane, walls = saved.plane, saved.plan()
+def _loops_by_walls(saved: SavedMap, piece: int, own: Sequence[int]) -> list[Edge]:
+    """Return loops from a piece to the submaps `own` of another piece, by their walls."""
+    plane, walls = saved.plane, saved.plan(piece)
     if not len(walls):
         return []
     target, found = Recognizer(PlanField(walls)), []
@@ -84,16 +88,17 @@ def _loops_by_walls(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
         match = target.recognize(PlanField(query), None) if len(query) else None
         if match is not None and not match.weak_directions:
             T_map_node = planar.to_transform(match.T_target_query)
-            found.append(_edge_to(saved, node, T_map_node, on_floor(match.covariance)))
+            found.append(_edge_to(saved, piece, node, T_map_node, on_floor(match.covariance)))
     return found
 
 
-def _loops_by_views(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
+def _loops_by_views(saved: SavedMap, piece: int, own: Sequence[int]) -> list[Edge]:
     """Return the same by what a camera saw, a loop per view that was recognized."""
-    known = PlacedViews(saved.views())
+    known = PlacedViews(saved.views(piece))
     return [
         _edge_to(
             saved,
+            piece,
             node,
             seen.T_map_base @ se3.inverse(view.T_submap_base),
             se3.carried(seen.covariance, view.T_submap_base),
@@ -105,10 +110,14 @@ def _loops_by_views(saved: SavedMap, own: Sequence[int]) -> list[Edge]:
 
 
 def _edge_to(
-    saved: SavedMap, node: int, T_map_node: Transform, covariance: NDArray[np.float64]
+    saved: SavedMap,
+    piece: int,
+    node: int,
+    T_map_node: Transform,
+    covariance: NDArray[np.float64],
 ) -> Edge:
-    """Return the loop to a node at T_map_node (4, 4) from the first piece's nearest one."""
-    first = saved.nearest(T_map_node)
+    """Return the loop to a node at T_map_node (4, 4) from a piece's nearest one."""
+    first = saved.nearest(T_map_node, piece)
     return Edge(
         first=first,
         second=node,

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
 from sceneslam.atlas.lasting.saved_map import SavedMap, are_covered
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
-from sceneslam.graphs.edge import Edge, EdgeKind
+from sceneslam.graphs.edge import Edge
 from sceneslam.types import planar
 
 _COVERED_RATIO = 0.95  # of a submap's walls, covered by later submaps
@@ -16,7 +19,7 @@ _COVERED_RATIO = 0.95  # of a submap's walls, covered by later submaps
 def prune(saved: SavedMap) -> SavedMap:
     """Return the map without submaps whose walls are covered by later ones of their piece.
 
-    The newest stay. Motions through removed submaps are composed; loops to them are removed.
+    The newest stay. Motions and loops through removed submaps are composed.
     """
     kept = list(range(len(saved.submaps)))
     for node in range(len(saved.submaps)):
@@ -25,14 +28,10 @@ def prune(saved: SavedMap) -> SavedMap:
         ]
         if others and _is_covered(saved, node, others):
             kept.remove(node)
-    bridges = _bridges(saved, set(kept))
-    thinned = SavedMap(
-        submaps=saved.submaps,
-        T_map_node=saved.T_map_node,
-        pieces=saved.pieces,
-        edges=(*saved.edges, *bridges),
-    )
-    return thinned.of(kept)
+    edges = list(saved.edges)
+    for node in sorted(set(range(len(saved.submaps))) - set(kept)):
+        edges = _without(edges, node)
+    return replace(saved, edges=tuple(edges)).of(kept)
 
 
 def _is_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
@@ -65,15 +64,19 @@ def _are_walls_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
     return bool((far_m <= 0.1).mean() >= _COVERED_RATIO)  # two cells
 
 
-def _bridges(saved: SavedMap, kept: set[int]) -> list[Edge]:
-    """Return the composed motions across removed submaps."""
-    onward = {edge.first: edge for edge in saved.edges if edge.kind is not EdgeKind.LOOP}
-    found = []
-    for start in sorted(kept):
-        edge, passed = onward.get(start), False
-        while edge is not None and edge.second not in kept:
-            after = onward.get(edge.second)
-            edge, passed = None if after is None else edge.then(after), True
-        if edge is not None and passed:
-            found.append(edge)
-    return found
+def _without(edges: Sequence[Edge], node: int) -> list[Edge]:
+    """Return the edges without a node; those to it are composed, so that its neighbours connect.
+
+    All its neighbours are linked with the one whose edge is the most certain, a motion if possible.
+    """
+    ends = [edge for edge in edges if node in (edge.first, edge.second)]
+    left = [edge for edge in edges if node not in (edge.first, edge.second)]
+    own = [edge if edge.first == node else edge.turned() for edge in ends]
+    own.sort(key=lambda edge: (edge.is_loop, float(np.trace(edge.covariance))))
+    for edge in own[1:]:
+        bridge = own[0].turned().then(edge)
+        pair = {bridge.first, bridge.second}
+        same = [one for one in left if {one.first, one.second} == pair]
+        if len(pair) == 2 and all(one.is_loop and not bridge.is_loop for one in same):
+            left.append(bridge if bridge.first < bridge.second else bridge.turned())
+    return left

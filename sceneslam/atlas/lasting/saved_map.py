@@ -58,10 +58,10 @@ class SavedMap:
             for view in submap.views
         ]
 
-    def nearest(self, T_map_base: Transform) -> int:
-        """Return the first piece's submap that begins nearest to a pose (4, 4)."""
+    def nearest(self, T_map_base: Transform, piece: int = 0) -> int:
+        """Return the submap of a piece that begins nearest to a pose (4, 4)."""
         away_m = np.linalg.norm((self.T_map_node - T_map_base)[:, :3, 3], axis=1)
-        return int(np.argmin(np.where(self.pieces == 0, away_m, np.inf)))
+        return int(np.argmin(np.where(self.pieces == piece, away_m, np.inf)))
 
     def seen_from(self, node: int) -> NDArray[np.float64]:
         """Return the poses (N, 4, 4) in the map that the views of a submap were seen from."""

@@ -203,7 +203,7 @@ class MapLocalizer:
             if _is_within(fix, T_map_base, window):
                 return fix, False
         there = register(field, self._walls.field, window.around)
-        return None, there.known_ratio >= _KNOWN_MIN and not there.is_verified
+        return None, there.known_ratio >= _KNOWN_MIN and there.is_refuted
 
     def _take(self, newest: Look, fix: Fix) -> None:
         self.T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
