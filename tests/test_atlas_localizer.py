@@ -152,6 +152,21 @@ def test_a_place_that_is_contradicted_three_times_in_a_row_is_withdrawn(monkeypa
     assert own.compare([placed(11, 0, 0, 0)]) is nothing  # a first search
 
 
+def test_walls_that_are_neither_right_nor_refuted_are_no_contradiction(monkeypatch):
+    scripted = Scripted(monkeypatch)
+    own = located(scripted, (1.0, 1.0, 0.0), run_at=(0.0, 0.0, 0.0))
+    scripted.answer = None
+    for inlier_ratio, event in (
+        (0.65, LocalizationEvent.NOTHING),
+        (0.5, LocalizationEvent.WITHDRAWN),
+    ):
+        there = quality(inlier_ratio=inlier_ratio)
+        monkeypatch.setattr(localizer, "register", lambda *_, there=there: there)
+        for index in range(3):
+            found = own.compare([placed(10 * inlier_ratio + index, 0, 0, 0)])
+        assert found is event
+
+
 @pytest.mark.parametrize(("count", "step_m", "compared"), [(10, 1.0, 7), (70, 0.06, 60)])
 def test_six_metres_or_sixty_scans_are_compared(monkeypatch, count, step_m, compared):
     scripted = Scripted(monkeypatch)

@@ -248,6 +248,16 @@ def test_pieces_are_numbered_again_where_one_was_joined(monkeypatch):
     assert (joined.joined, joined.apart) == (1, 1) and joined.map.pieces.tolist() == [0, 0, 0, 0, 1]
 
 
+def test_pieces_are_joined_with_each_other_where_the_first_shows_neither(monkeypatch):
+    saved = replace(two_pieces(), pieces=np.array([0, 2, 2, 7, 7]))
+    Found(monkeypatch, [None] * 4 + [at(9.0, 5.0), at(9.0, 6.0)])
+    joined = join_pieces(saved)
+    assert (joined.joined, joined.apart) == (1, 1) and joined.map.pieces.tolist() == [0, 1, 1, 1, 1]
+    Found(monkeypatch, [None] * 9)
+    joined = join_pieces(saved)
+    assert (joined.joined, joined.apart) == (0, 2) and joined.map.pieces.tolist() == [0, 1, 1, 2, 2]
+
+
 def test_submaps_of_other_runs_are_no_neighbours(monkeypatch):
     saved, found = two_pieces(), Found(monkeypatch, [None] * 3)
     submaps = [*saved.submaps[:4], replace(saved.submaps[4], run=2)]

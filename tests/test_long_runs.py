@@ -145,6 +145,11 @@ def test_thinning_keeps_the_first_point_per_module_and_voxel_of_the_map():
     own.close()
 
 
+def test_a_budget_that_holds_nothing_leaves_a_few_points():
+    fused = drive(Atlas(voxel_m=0.01, budget_mb=1e-9), [cloud(shift_m) for shift_m in range(9)])
+    assert 0 < len(fused.points.points) <= 8 * 9
+
+
 def test_the_budget_is_checked():
     with pytest.raises(ConfigError, match="budget_mb"):
         Atlas(voxel_m=0.01, budget_mb=0.0)

@@ -46,7 +46,7 @@ def side_by_side(first: SavedMap, second: SavedMap) -> SavedMap:
 
 def join_pieces(saved: SavedMap) -> Joined:
     """Return the map with every piece joined to the first one in which it is recognized."""
-    joined, target = 0, 0
+    saved, joined, target = _renumbered(saved), 0, 0
     while target <= saved.pieces.max(initial=-1):
         found = None
         for piece in range(target + 1, int(saved.pieces.max()) + 1):
