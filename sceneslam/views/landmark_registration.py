@@ -7,12 +7,18 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
-from sceneslam.views.placed_views import FLOOR, MATCHES_MIN, PlacedViews, Sighting, matches
+from sceneslam.views.placed_views import (
+    FLOOR,
+    MATCHES_MIN,
+    SIGMAS,
+    PlacedViews,
+    Sighting,
+    landmark_noise_m,
+    matches,
+)
 from sceneslam.views.view import Landmarks
 
 _SAMPLES = 300  # of three matches each: one is right with 99.9 % if three of ten matches are
-_SIGMA_M, _SIGMA_RATIO = 0.017, 0.01  # of a landmark, and of its distance: structured light
-_SIGMAS = 3.0
 _ROUNDS = 3  # of the motion by all matches that are right: which ones are depends on it
 
 
@@ -31,13 +37,13 @@ def register(T_map_first: Transform, first: Landmarks, second: Landmarks) -> Sig
         return None
     a, b = first.points_base[rows].astype(float), second.points_base[columns].astype(float)
     far_m = np.maximum(np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1))
-    sigma_m = _SIGMA_M + _SIGMA_RATIO * far_m
+    sigma_m = landmark_noise_m(far_m)
     triples = np.random.default_rng(0).integers(0, len(a), (_SAMPLES, 3))
     tried = _rigid(a[triples], b[triples])
-    counts = [np.sum(_off_m(T, a, b) <= _SIGMAS * sigma_m) for T in tried]
+    counts = [np.sum(_off_m(T, a, b) <= SIGMAS * sigma_m) for T in tried]
     T = tried[int(np.argmax(counts))]
     for _ in range(_ROUNDS):
-        kept = _off_m(T, a, b) <= _SIGMAS * sigma_m
+        kept = _off_m(T, a, b) <= SIGMAS * sigma_m
         if kept.sum() < MATCHES_MIN:
             return None
         T = _rigid(a[kept][None], b[kept][None])[0]

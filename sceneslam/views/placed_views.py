@@ -21,6 +21,8 @@ _RATIO = 0.8  # of the best match's distance to the second's (Lowe, IJCV 2004)
 _ALIKE = 0.6  # another place with so many of the best one's matches, and nothing is recognized
 _SAME_M, _SAME_RAD = 0.3, 0.15
 _DEVIATION_MAX_M, _DEVIATION_MAX_RAD = 0.03, 0.03  # of a pose: two that agree are no chance
+_NOISE_M, _NOISE_RATIO = 0.017, 0.01  # of a landmark, and of its distance: structured light
+SIGMAS = 3.0  # by which two measurements of a landmark differ, at most
 MATCHES_MIN = 25  # right by the pose found; by chance hardly more are than the three it is made of
 FLOOR = np.diag(np.repeat([0.01, 0.004], 3) ** 2)  # m, rad: of the map's landmarks among each other
 
@@ -100,6 +102,11 @@ class PlacedViews:
         """Tell whether two views show one place."""
         at, there = (self._placed[number][0][:3, 3] for number in (one, other))
         return bool(np.linalg.norm(at - there) < _PLACE_M)
+
+
+def landmark_noise_m(far_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the standard deviations [m] of landmarks at distances [m]."""
+    return _NOISE_M + _NOISE_RATIO * far_m
 
 
 def matches(

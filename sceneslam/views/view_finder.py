@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,11 +13,20 @@ from numpy.typing import NDArray
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
-from sceneslam.views.placed_views import FLOOR, MATCHES_MIN, PlacedViews, Sighting, matches
+from sceneslam.views.placed_views import (
+    FLOOR,
+    MATCHES_MIN,
+    SIGMAS,
+    PlacedViews,
+    Sighting,
+    landmark_noise_m,
+    matches,
+)
 from sceneslam.views.view import Landmarks, LandmarkView
 
 _ERROR_PX, _SIGMA_PX = 3.0, 1.0  # of a match's ray, at most and usually
 _ITERATIONS, _CONFIDENCE = 300, 0.9999
+_STEPS = 4  # of Gauss-Newton, from a pose that the rays fit already
 _GUIDED_PX = 9.0  # from where a pose by one view of the map expects a landmark of the others
 _SAME_BITS = 50  # descriptors that differ in more show two corners (Mur-Artal et al., T-RO 2015)
 _FOUND_MIN = 0.15  # of the landmarks in view
@@ -24,6 +35,18 @@ _SURFACE_M, _SURFACE_RATIO = 0.05, 0.03  # 5 cm and 3 % of the depth: structured
 _NEAR_M = 0.1  # nothing nearer is in view
 _TOGETHER = 12  # views of a place by which a pose is measured: 5,000 landmarks
 _ROUNDS = 2  # of the pose by all views: which matches are right depends on it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Matched:
+    """Landmarks of the map, and how a view shows them."""
+
+    points: NDArray[np.float64]  # (N, 3) [m]
+    rays: NDArray[np.float64]  # (N, 2)
+    depth_m: NDArray[np.float64]  # (N,), 0 = missing
+
+    def __getitem__(self, rows: NDArray[Any]) -> _Matched:
+        return _Matched(points=self.points[rows], rays=self.rays[rows], depth_m=self.depth_m[rows])
 
 
 class ViewFinder:
@@ -59,11 +82,15 @@ class ViewFinder:
         rows, columns = matches(landmarks.descriptors, view.descriptors)
         if len(rows) < MATCHES_MIN:
             return None
-        points, rays = landmarks.points_base[rows].astype(float), view.rays[columns].astype(float)
+        found = _Matched(
+            points=landmarks.points_base[rows].astype(float),
+            rays=view.rays[columns].astype(float),
+            depth_m=view.depth_m[columns].astype(float),
+        )
         error = _ERROR_PX / self._camera.fx
         is_found, turn, shift, inliers = cv2.solvePnPRansac(
-            points,
-            rays,
+            found.points,
+            found.rays,
             np.eye(3),
             None,
             iterationsCount=_ITERATIONS,
@@ -73,32 +100,31 @@ class ViewFinder:
         )
         if not is_found or inliers is None or len(inliers) < MATCHES_MIN:
             return None
-        kept = inliers[:, 0]
-        T_cam_seen = _optimised(points[kept], rays[kept], turn, shift)
-        if not self._is_verified(T_cam_seen, landmarks, points[kept], view.depth_m[columns[kept]]):
+        found = found[inliers[:, 0]]
+        rough = np.eye(4)
+        rough[:3, :3], rough[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+        T_cam_seen = self._optimised(rough, found)
+        if not self._is_verified(T_cam_seen, landmarks, found):
             return None
-        return self._sighting(T_map_seen, T_cam_seen, points[kept], view)
+        return self._sighting(T_map_seen, T_cam_seen, found, view)
 
     def _refined(self, view: LandmarkView, rough: Sighting, near: Sequence[int]) -> Sighting:
         """Return the pose by the landmarks of all views `near` it, if these are more."""
-        points, rays = self._guided(view, rough.T_map_base, near)
+        found = self._guided(view, rough.T_map_base, near)
         T_cam_base = se3.inverse(self._camera.T_base_cam)
         for _ in range(_ROUNDS):
-            at = se3.apply(T_cam_base, points)
-            off = np.linalg.norm(at[:, :2] / at[:, 2:] - rays, axis=1)
+            at = se3.apply(T_cam_base, found.points)
+            off = np.linalg.norm(at[:, :2] / at[:, 2:] - found.rays, axis=1)
             kept = (at[:, 2] > _NEAR_M) & (off <= _ERROR_PX / self._camera.fx)
             if kept.sum() < rough.matches:
                 return rough
-            turn, shift = cv2.Rodrigues(T_cam_base[:3, :3])[0], T_cam_base[:3, 3:]
-            T_cam_base = _optimised(points[kept], rays[kept], turn, shift)
-        return self._sighting(rough.T_map_base, T_cam_base, points[kept], view)
+            T_cam_base = self._optimised(T_cam_base, found[kept])
+        return self._sighting(rough.T_map_base, T_cam_base, found[kept], view)
 
-    def _guided(
-        self, view: LandmarkView, T_map_base: Transform, near: Sequence[int]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the landmarks (N, 3) of views `near`, in base, that a view shows where expected.
+    def _guided(self, view: LandmarkView, T_map_base: Transform, near: Sequence[int]) -> _Matched:
+        """Return the landmarks of views `near`, in base, that a view shows where expected.
 
-        And their rays (N, 2) there; a corner that several landmarks fit is at their mean.
+        A corner that several landmarks fit is at their mean.
         """
         camera = self._camera
         T_base_seen = [se3.inverse(T_map_base) @ self._map[number][0] for number in near]
@@ -126,64 +152,64 @@ class ViewFinder:
         points = np.stack(
             [np.bincount(owner, every[rows, axis]) / counts for axis in range(3)], axis=1
         )
-        return points, view.rays[columns].astype(float)
+        return _Matched(
+            points=points,
+            rays=view.rays[columns].astype(float),
+            depth_m=view.depth_m[columns].astype(float),
+        )
 
     def _sighting(
-        self,
-        T_map_seen: Transform,
-        T_cam_seen: Transform,
-        points: NDArray[np.float64],
-        view: LandmarkView,
+        self, T_map_seen: Transform, T_cam_seen: Transform, found: _Matched, view: LandmarkView
     ) -> Sighting:
-        """Return the pose T_cam_seen (4, 4) of the camera, by points (N, 3), in the map."""
-        covariance = self._covariance(np.asarray(se3.apply(T_cam_seen, points), np.float64))
+        """Return the pose T_cam_seen (4, 4) of the camera, by landmarks, in the map."""
+        information, _ = self._equations(T_cam_seen, found)
+        covariance = se3.carried(np.linalg.inv(information), self._camera.T_base_cam) + FLOOR
         covariance += view.shear_rad**2 * np.eye(6)  # seen a metre away, a turn is a shift
         T_seen_base = se3.inverse(T_cam_seen) @ se3.inverse(self._camera.T_base_cam)
         return Sighting(
-            T_map_base=T_map_seen @ T_seen_base, covariance=covariance, matches=len(points)
+            T_map_base=T_map_seen @ T_seen_base, covariance=covariance, matches=len(found.points)
         )
 
-    def _is_verified(
-        self,
-        T_cam_seen: Transform,
-        landmarks: Landmarks,
-        matched: NDArray[np.float64],
-        depth_m: NDArray[np.float32],
-    ) -> bool:
-        """Tell whether most landmarks in view were found, and at the depths (N,) [m] measured."""
+    def _is_verified(self, T_cam_seen: Transform, landmarks: Landmarks, found: _Matched) -> bool:
+        """Tell whether most landmarks in view were found, and at the depths measured."""
         camera, every = self._camera, se3.apply(T_cam_seen, landmarks.points_base.astype(float))
         ahead = every[every[:, 2] > _NEAR_M]
         uv_px = ahead[:, :2] / ahead[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         in_view = ((uv_px >= 0) & (uv_px < camera.size_wh)).all(axis=1)
-        if len(matched) < _FOUND_MIN * in_view.sum():
+        if len(found.points) < _FOUND_MIN * in_view.sum():
             return False
-        z, seen = se3.apply(T_cam_seen, matched)[:, 2], depth_m > 0
+        z, seen = se3.apply(T_cam_seen, found.points)[:, 2], found.depth_m > 0
         if not seen.any():
             return False
-        off_m = np.abs(z - depth_m)[seen]
+        off_m = np.abs(z - found.depth_m)[seen]
         return bool((off_m <= _SURFACE_M + _SURFACE_RATIO * z[seen]).mean() >= _SURFACE_MIN)
 
-    def _covariance(self, points_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the covariance (6, 6) of base from matches at points (N, 3) in the camera."""
-        x, y, z = points_cam.T
-        rays = np.zeros((len(z), 2, 3))
-        rays[:, 0, 0] = rays[:, 1, 1] = 1.0 / z
-        rays[:, 0, 2], rays[:, 1, 2] = -x / z**2, -y / z**2
-        by_pose = np.concatenate([np.tile(-np.eye(3), (len(z), 1, 1)), se3.hat(points_cam)], axis=2)
-        J = (rays @ by_pose).reshape(-1, 6)
-        information = J.T @ J / (_SIGMA_PX / self._camera.fx) ** 2 + np.eye(6)
-        T_base_cam = self._camera.T_base_cam
-        return se3.carried(np.linalg.inv(information), T_base_cam) + FLOOR
+    def _optimised(self, T_cam_seen: Transform, found: _Matched) -> Transform:
+        """Return the pose (4, 4) that best fits the rays and depths of landmarks."""
+        for _ in range(_STEPS):
+            information, gradient = self._equations(T_cam_seen, found)
+            step = np.asarray(-np.linalg.solve(information, gradient), np.float64)
+            T_cam_seen = se3.exp(step) @ T_cam_seen
+        return T_cam_seen
 
+    def _equations(
+        self, T_cam_seen: Transform, found: _Matched
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the information (6, 6) and the gradient (6,) of a pose, in the camera's axes.
 
-def _optimised(
-    points: NDArray[np.float64],
-    rays: NDArray[np.float64],
-    turn: cv2.typing.MatLike,
-    shift: cv2.typing.MatLike,
-) -> Transform:
-    """Return the pose (4, 4) of points (N, 3) in a camera that best fits their rays (N, 2)."""
-    turn, shift = cv2.solvePnPRefineLM(points, rays, np.eye(3), None, turn, shift)
-    T = se3.identity()
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
-    return T
+        A depth that is far off does not count: corners lie on edges.
+        """
+        at = np.asarray(se3.apply(T_cam_seen, found.points), np.float64)
+        x, y, z = at.T
+        by_point = np.zeros((len(z), 3, 3))
+        by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0 / z
+        by_point[:, 0, 2], by_point[:, 1, 2], by_point[:, 2, 2] = -x / z**2, -y / z**2, 1.0
+        by_pose = np.concatenate([np.tile(np.eye(3), (len(z), 1, 1)), -se3.hat(at)], axis=2)
+        residual = np.column_stack([at[:, :2] / at[:, 2:] - found.rays, z - found.depth_m])
+        sigma_m = landmark_noise_m(z)
+        is_near = (found.depth_m > 0) & (np.abs(residual[:, 2]) <= SIGMAS * sigma_m)
+        weight = np.full((len(z), 3), (self._camera.fx / _SIGMA_PX) ** 2)
+        weight[:, 2] = np.where(is_near, sigma_m**-2, 0.0)
+        J = (by_point @ by_pose).reshape(-1, 6)
+        weighted = J.T * weight.ravel()
+        return weighted @ J + np.eye(6), weighted @ residual.ravel()
