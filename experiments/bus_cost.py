@@ -120,9 +120,7 @@ def measure(policy: Policy) -> tuple[float, float]:
 
 
 def _dead_reckoning() -> Odometry:
-    return Odometry(
-        use_gyro=False,
-    )
+    return Odometry()
 
 
 def main() -> None:

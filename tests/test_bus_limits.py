@@ -329,7 +329,10 @@ def test_only_the_uncertainty_along_the_motion_hides_the_scale_of_wheels(along_m
     R = se3.from_xy_yaw(0.0, 0.0, np.pi / 6)[:3, :3]
     covariance = np.eye(6) * 1e-6
     covariance[:3, :3] = R @ np.diag([along_m**2, across_m**2, across_m**2]) @ R.T
-    scale, hold = WheelScale(), SimpleNamespace(is_trusted=True, is_revised=False, is_asked=True)
+    scale, hold = (
+        WheelScale(deviation=0.02, limit=0.03),
+        SimpleNamespace(is_trusted=True, is_revised=False, is_asked=True),
+    )
     hold.inliers, hold.covariance = 100, covariance
     for index in range(161):
         ahead = R @ [0.05 * index, 0.0, 0.0]

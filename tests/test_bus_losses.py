@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from driving import assert_exact, dark_from, drive, events
+from driving import GATE, assert_exact, dark_from, drive, events
 from fakes import PERIOD_NS, ExactModule, observation, true_pose
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -42,6 +42,25 @@ def test_slow_sensor_is_not_a_lost_module():
     modules = {"bright": Slow(), "dark": ExactModule()}
     _, atlas, log, _ = drive(modules, lost_patience_s=0.3, feed=feed)
     assert len(events(log, "decision")) == 1 and len(atlas.trajectory) == 100
+    assert_exact(atlas)
+
+
+@pytest.mark.parametrize("wheels", ["frozen", "missing"])
+def test_fallback_comes_at_once_where_no_wheels_bridge(wheels):
+    """Wheels that lie bridge as little as wheels that are not there."""
+
+    class Certain(ExactModule):
+        def track(self, observation):
+            return replace(super().track(observation), covariance=1e-6 * np.eye(6))
+
+    def feed(index):
+        frozen = true_pose(min(index, 40) * PERIOD_NS)
+        return replace(observation(index), T_odom_base=frozen if wheels == "frozen" else None)
+
+    modules = {"bright": Certain(lost=range(70, 1000)), "dark": Certain()}
+    _, atlas, log, _ = drive(modules, feed=feed, gate=GATE, lost_patience_s=1.0)
+    decision = events(log, "decision")[1]
+    assert decision["reason"] == "lost" and decision["stamp_ns"] == 71 * PERIOD_NS
     assert_exact(atlas)
 
 

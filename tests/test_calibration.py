@@ -52,9 +52,17 @@ def hold_at(x_m, *, is_trusted=True, deviation_m=0.003, is_revised=False, inlier
     )
 
 
+def scale():
+    return WheelScale(deviation=0.02, limit=0.03)
+
+
 def drive(wheels=1.02, *, metres=8, slip_at=None, learner=None, module=1.0, **told):
     """Return what a straight drive teaches of wheels that tell `wheels` times the way."""
-    learner, hold, slipped_m = learner or WheelScale(), SimpleNamespace(), 0.0
+    learner, hold, slipped_m = (
+        learner or scale(),
+        SimpleNamespace(),
+        0.0,
+    )
     for index in range(metres * 20 + 1):
         slipped_m += 0.3 if index == slip_at else 0.0
         T_odom_base = se3.from_xy_yaw(wheels * 0.05 * index + slipped_m, 0.0, 0.0)
@@ -68,13 +76,13 @@ def test_wheels_that_tell_too_much_are_corrected():
 
 
 def test_module_that_is_wrong_takes_the_wheels_three_per_cent_along_and_no_longer_than_itself():
-    learner = WheelScale()
+    learner = scale()
     assert drive(1.0, metres=40, learner=learner, module=0.94) == pytest.approx(0.97)
     assert drive(1.0, metres=40, learner=learner) == pytest.approx(1.0, abs=0.004)
 
 
 def test_wheels_that_change_are_followed():
-    learner = WheelScale()
+    learner = scale()
     drive(1.0, metres=100, learner=learner)
     assert drive(1.025, metres=100, learner=learner) == pytest.approx(1 / 1.025, abs=0.005)
 
@@ -133,7 +141,7 @@ def test_wheel_that_spins_teaches_no_scale():
 
 def test_other_activation_begins_anew():
     """Two modules' local frames have nothing in common, though the second begins nearby."""
-    wheels = WheelScale()
+    wheels = scale()
     holds = [hold_at(0.0), hold_at(0.0)]
     for index in range(41):
         hold = holds[index >= 5]
@@ -143,7 +151,7 @@ def test_other_activation_begins_anew():
 
 
 def test_module_whose_sensor_speaks_more_seldom_teaches_too():
-    wheels, hold = WheelScale(), SimpleNamespace()
+    wheels, hold = scale(), SimpleNamespace()
     for index in range(161):
         told = hold_at(0.05 * index, is_asked=index % 3 == 0, is_trusted=index % 3 == 0)
         hold.__dict__.update(told.__dict__)
@@ -153,7 +161,7 @@ def test_module_whose_sensor_speaks_more_seldom_teaches_too():
 
 def test_arcs_teach_nothing():
     """Wheels that turn too much cut every chord."""
-    wheels, hold = WheelScale(), hold_at(0.0)
+    wheels, hold = scale(), hold_at(0.0)
     T_odom, T_true = se3.identity(), se3.identity()
     for _ in range(400):
         hold.T_local_base = T_true

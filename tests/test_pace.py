@@ -56,6 +56,22 @@ def test_poses_in_between_are_the_modules_where_odometry_slips():
     assert errors[41] < slip_m / 2 and errors.max() < slip_m
 
 
+def test_poses_in_between_are_the_modules_where_one_observation_has_nothing_for_it():
+    """The image of 43 is missing, so that the module is given nothing between 40 and 44."""
+
+    def feed(index):
+        return replace(slipping(index), image_bgr=None) if index == 43 else slipping(index)
+
+    _, atlas, _, _ = drive(
+        {"bright": ExactModule(), "dark": ExactModule()},
+        feed=feed,
+        catch_up=EVERY_THIRD,
+        **SWITCHED,
+    )
+    assert atlas.pose_modules[40:62] == ("bright", *["dark"] * 21)
+    assert errors_m(atlas.trajectory)[41:44].max() < 0.01
+
+
 @pytest.mark.parametrize("limit", [2, 5])
 def test_spared_observations_do_not_count_in_live_mode(limit):
     """21 observations wait for the new module, of which it is given 7."""

@@ -122,7 +122,7 @@ def test_killed_job_takes_nobody_along_and_is_resumed(folder, capsys):
 
 
 def test_stopped_sweep_goes_on_where_it_was_by_the_same_command(folder):
-    jobs = (*SLOW, "slam.only.use_gyro=true,false", "hydra.sweep.dir=out")
+    jobs = (*SLOW, "policy.buffer_s=11,12", "hydra.sweep.dir=out")
     process = start(folder, *jobs)
     wait_for(folder / "out" / "0", State.RUNNING)
     process.send_signal(signal.SIGTERM)
@@ -147,7 +147,7 @@ def test_running_sweep_does_not_see_later_edits(folder):
     mine = folder / "mine" / "policy" / "mine.yaml"
     mine.parent.mkdir(parents=True)
     mine.write_text("defaults: [default]\nretry_s: 0.25\n")
-    words = ("--config-dir", "mine", *SLOW, "policy=mine", "slam.only.use_gyro=true,false")
+    words = ("--config-dir", "mine", *SLOW, "policy=mine", "policy.buffer_s=11,12")
     process = start(folder, *words, "hydra.sweep.dir=out")
     wait_for(folder / "out" / "0", State.RUNNING)
     mine.write_text("defaults: [default]\nretry_s: 0.75\n")

@@ -50,9 +50,7 @@ def run_case(seed: int, limits: Limits) -> Case:
     kind, moment, _ = plan(seed)
     before = _open_files()
     sentence, late_s, harm = "", 0.0, []
-    healthy = Odometry(
-        use_gyro=False,
-    )
+    healthy = Odometry()
     healthy.activate(RIG)
     # -S -I: without site packages it starts in a third of the time
     command = [sys.executable, "-S", "-I", str(PROGRAM), str(seed)]

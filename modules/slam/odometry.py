@@ -1,13 +1,15 @@
-"""The `odometry` SLAM module: dead reckoning by the source's odometry, without a map."""
+"""The `odometry` SLAM module: dead reckoning by odometry, without a map.
+
+In a run, the odometry of an observation has the gyro's turn already (`bus/dead_reckoning.py`).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.motion.model import MotionModel
 from sceneslam.types import se3
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
@@ -19,25 +21,21 @@ _DEVIATION_MIN = 1e-4  # m and rad: smallest standard deviation
 
 @dataclass(kw_only=True, eq=False)
 class Odometry:
-    """Dead reckoning; the settings are described in `conf/slam/odometry.yaml`."""
+    """Dead reckoning, without settings."""
 
-    use_gyro: bool
-    _motion: MotionModel = field(init=False)
     _wheels: Wheels = field(init=False)
     _T_odom_base: se3.Transform | None = field(default=None, init=False)  # last odometry
-    _is_gap: bool = field(default=False, init=False)  # odometry is missing since then
     _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
     _covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)), init=False)
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return odometry; the gyro is used when present."""
+        """Return odometry."""
         return (frozenset({Sensor.ODOMETRY}),)
 
     def activate(self, rig: Rig) -> None:
         """Start a session: `local` is at the next observation with odometry."""
-        self._motion, self._wheels = MotionModel(rig), rig.wheels
-        self._T_odom_base, self._is_gap = None, False
+        self._wheels, self._T_odom_base = rig.wheels, None
         self._T_local_base = se3.identity()
         self._covariance = np.eye(6) * _DEVIATION_MIN**2
 
@@ -52,19 +50,12 @@ class Odometry:
 
         After a gap, the motion over the gap is that of odometry.
         """
-        if not self.use_gyro:
-            observation = replace(observation, gyro_base=None)
-        yaw_rad = se3.yaw_rad(self._motion.predict(observation).T_prev_curr)
         before, T_odom_base = self._T_odom_base, observation.T_odom_base
         if T_odom_base is None or not np.isfinite(T_odom_base).all():
-            self._is_gap = True
             return self._answer(observation, TrackingStatus.LOST)
         if before is not None:
-            T_prev_curr = se3.inverse(before) @ T_odom_base
-            if not self._is_gap:  # after a gap the gyro is not used
-                T_prev_curr = se3.with_yaw(T_prev_curr, yaw_rad)
-            self._move(T_prev_curr)
-        self._T_odom_base, self._is_gap = T_odom_base, False
+            self._move(se3.inverse(before) @ T_odom_base)
+        self._T_odom_base = T_odom_base
         return self._answer(observation, TrackingStatus.TRACKING)
 
     def get_trajectory(self) -> Trajectory:

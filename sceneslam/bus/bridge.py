@@ -20,7 +20,7 @@ class Bridge:
         self._T_odom_base: Transform | None = None
         self._stamp_ns = 0
         self._before: tuple[int, Transform] | None = None  # the pose before the last known one
-        self._known: tuple[int, Transform] | None = None  # the last pose that a module measured
+        self._known: tuple[int, Transform] | None = None  # the last pose by a module or by odometry
 
     @property
     def T_map_base(self) -> Transform:
@@ -36,7 +36,7 @@ class Bridge:
     def update(
         self, observation: Observation, T_map_base: Transform, *, is_jump: bool = False
     ) -> None:
-        """Add a pose T_local_base measured by a module.
+        """Add a pose T_map_base (4, 4) measured by a module.
 
         `is_jump`: the pose jumped by a correction, so that no velocity is derived from it.
         """
@@ -79,7 +79,7 @@ class Bridge:
         return self._T_map_base
 
     def _note(self, stamp_ns: int, T_map_base: Transform) -> None:
-        """Add a measured pose, and compute the velocity from it."""
+        """Add a pose that is known, from which velocities are computed."""
         if self._known is not None and self._known[0] < stamp_ns:
             self._before = self._known  # at a hand-over two modules give a pose at the same stamp
         self._known = (stamp_ns, T_map_base)

@@ -299,7 +299,7 @@ class Bus:
             health=health,
             unheld_since_ns=hold.unheld_since_ns or 0,
             held_ns=hold.held_ns,
-            is_blind=health is Health.LOST and observation.T_odom_base is None,
+            is_blind=health is Health.LOST and (observation.T_odom_base is None or hold.wheels_lie),
             choices=self._candidates.of(scene),
             served_choices=self._candidates.of(self.scene),
             tried=self._candidates.tried,

@@ -22,6 +22,8 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform, Vector
 
+_OF_GATE = 0.5  # share of what the gate accepts, by which the odometry is corrected at most
+
 
 class DeadReckoning:
     """Corrects the odometry and gyro of one observation after the other.
@@ -31,6 +33,8 @@ class DeadReckoning:
 
     def __init__(self, policy: Policy, rig: Rig) -> None:
         self._learns = policy.gate is not None and policy.handover != "cold"
+        self._drift = rig.wheels.drift_ratio
+        self._limit = _OF_GATE * self._drift * (policy.gate.sigmas if policy.gate else 0.0)
         self.up_base: Vector | None = None  # (3,) upward direction, None: unknown
         self._motion = MotionModel(rig) if Sensor.GYRO in rig.sensors else None
         self._tilt = Tilt(self._motion) if self._motion is not None else None
@@ -75,7 +79,8 @@ class DeadReckoning:
     def learn(self, hold: Hold, module: str) -> None:
         """Update the wheels' scale by the distance that the active module measured."""
         if self._learns and module:
-            scale = self._scales.setdefault(module, WheelScale())
+            new = WheelScale(deviation=self._drift, limit=self._limit)
+            scale = self._scales.setdefault(module, new)
             scale.learn(hold, self._T_odom_base, self._turned_rad)
 
     def close(self, stamp_ns: int, log: EventLog) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -38,7 +39,7 @@ class Handover:
         ] = []  # after the anchor, or from it if no module gave its pose
         self.tracked: list[Tracking] = []  # its answers from the anchor on, while it tracks
         self._pace, self._memory = pace, memory
-        self._spared = 0  # observations skipped since the last that the module was given
+        self._has_spared = False  # observations were skipped since the last answer
         self._given_ns = anchor.stamp_ns  # the last that it was given and tracked
         self._began_ns, self._done_ns = anchor.stamp_ns, anchor.stamp_ns - 1
         self._reported: Transform | None = None  # the pose of the moment before, as known then
@@ -121,7 +122,7 @@ class Handover:
         is_sure = session.is_placed and session.hold.is_held
         if is_sure and not is_newest and self._pace.spares(moment.observation):
             self._pace.spare(moment.observation)
-            self._spared += 1
+            self._has_spared = True
             self._remember(moment, session.skip(moment.observation, motion))
             return False
         self._ask(moment, motion)
@@ -139,17 +140,16 @@ class Handover:
         found = session.advance(given, by_velocity=True, T_prev_curr=motion)
         if session.fault is not None:
             raise session.fault
-        spared, self._spared = self._spared, 0
         if session.tracking is not None:
             if not was_placed:
                 self.tracked = []
                 self._first_cost_ns = self._cost_ns + perf_counter_ns() - self._since_ns
             self.tracked.append(session.tracking)
             assert found.T_map_base is not None
-            if spared and T_map_told is not None and not session.hold.is_revised:
+            if self._has_spared and T_map_told is not None and not session.hold.is_revised:
                 T_told_base = se3.inverse(T_map_told) @ found.T_map_base
-                self._bend(spared, session.tracking, T_told_base)
-            self._given_ns = moment.stamp_ns
+                self._bend(session.tracking, T_told_base)
+            self._has_spared, self._given_ns = False, moment.stamp_ns
         self._remember(moment, replace(found, observation=moment.observation))
 
     def _motion_to(self, moment: BufferedObservation) -> Transform | None:
@@ -163,15 +163,15 @@ class Handover:
         if moment is not self.anchor or moment.module == BRIDGED:
             self.trail.append(found)
 
-    def _bend(self, count: int, tracking: Tracking, T_told_base: Transform) -> None:
-        """Distribute the drift of the trail's last `count` poses, bridged by odometry.
+    def _bend(self, tracking: Tracking, T_told_base: Transform) -> None:
+        """Distribute the drift of the trail since the module's last answer, which odometry bridged.
 
-        They lie between two poses of the module. `T_told_base` (4, 4) is the module's pose now, in
-        the frame of the pose that odometry led to.
+        `T_told_base` (4, 4) is the module's pose now, in the frame of the pose that odometry led
+        to.
         """
         xi, given_s = se3.log(T_told_base), (tracking.stamp_ns - self._given_ns) / 1e9
-        for index in range(-count, 0):
-            moment = self.trail[index]
+        first = bisect_right(self.trail, self._given_ns, key=lambda each: each.stamp_ns)
+        for index, moment in enumerate(self.trail[first:], first):
             share = (moment.stamp_ns - self._given_ns) / 1e9 / given_s
             self.trail[index] = replace(
                 moment,

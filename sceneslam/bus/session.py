@@ -61,6 +61,7 @@ class ModuleSession:
 
     def skip(self, observation: Observation, T_prev_curr: Transform | None) -> BufferedObservation:
         """Return an observation with a bridged pose; it is not given to the module."""
+        self.fault, self.tracking = None, None
         self.hold.spare(observation)
         return self._bridged(observation, True, T_prev_curr)
 

@@ -18,8 +18,6 @@ from sceneslam.motion.distance_error import DistanceError
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
-_UNKNOWN = 0.02  # standard deviation of the scale before the first measurement
-_LIMIT = 0.03  # largest difference from 1: half of what the gate accepts, which uses this odometry
 _DRIFT = 0.002  # standard deviation of the change between spans: tyres wear, floors change
 _SPAN_M = 0.5  # distance between two poses that are compared
 _TURN_MAX_RAD = 0.3  # largest turn between them: an arc is longer than its chord
@@ -37,17 +35,21 @@ class _Mark:
 
 
 class WheelScale:
-    """Estimates the scale of the wheels' distances from one module."""
+    """Estimates the scale of the wheels' distances from one module.
 
-    def __init__(self) -> None:
-        self._error = DistanceError(_UNKNOWN, drift=_DRIFT)
+    `deviation` is its standard deviation before the first measurement, `limit` its largest
+    difference from 1.
+    """
+
+    def __init__(self, *, deviation: float, limit: float) -> None:
+        self._error, self._limit = DistanceError(deviation, drift=_DRIFT), limit
         self._mark: _Mark | None = None
         self._turned_rad = 0.0  # sum since the mark
 
     @property
     def scale(self) -> float:
         """Return the true distance per metre of odometry."""
-        return 1.0 + min(max(self._error.ratio, -_LIMIT), _LIMIT)
+        return 1.0 + min(max(self._error.ratio, -self._limit), self._limit)
 
     @property
     def variance(self) -> float:
@@ -55,7 +57,7 @@ class WheelScale:
         return self._error.variance
 
     def learn(self, hold: Hold, T_odom_base: Transform | None, turned_rad: float) -> None:
-        """Compare uncorrected odometry (4, 4) and its yaw [rad] with the module's pose."""
+        """Compare uncorrected odometry (4, 4) and its turn [rad] with the module's pose."""
         self._turned_rad += turned_rad
         if not hold.is_asked or T_odom_base is None:
             return  # one of them has a lower rate
