@@ -19,7 +19,7 @@ from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from numpy.typing import NDArray
 
-from sceneslam.bus.gate import Gate, GateSettings, GateVerdict, Judgement
+from sceneslam.bus.gate import Gate, GateSettings, Judgement
 from sceneslam.config.resolve import resolved
 from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.evaluation.correctness import CorrectLimits, correct_rate
@@ -34,8 +34,7 @@ from sceneslam.types.trajectory import Trajectory
 RULES = ("never trusted", "always trusted", "both as one", "gate")
 FACTORS = (0.5, 1.0, 2.0)  # of the bounds
 DRIFTS = (0.0, 1.0)  # [deg/m] added to the odometry
-TRUSTED = Judgement(distance=GateVerdict.UNCHECKED, turn=GateVerdict.UNCHECKED)
-REFUSED = Judgement(distance=GateVerdict.DISAGREE, turn=GateVerdict.DISAGREE)
+TRUSTED, REFUSED = Judgement(is_trusted=True), Judgement(is_trusted=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -134,7 +133,7 @@ def _drive(
         T_prev_curr = se3.inverse(wheels[index - 1]) @ wheels[index]
         if judgement.is_trusted and module is not None:
             T_prev_curr, trusted = module, trusted + 1
-        elif rule == "gate" and judgement.turn is GateVerdict.AGREE and module is not None:
+        elif rule == "gate" and judgement.turn_agrees and module is not None:
             T_prev_curr = se3.with_yaw(T_prev_curr, se3.yaw_rad(module))
         T_map_base.append(T_map_base[-1] @ T_prev_curr)
     driven = Trajectory(stamps_ns=odometry.stamps_ns, T_world_base=np.stack(T_map_base))

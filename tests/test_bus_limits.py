@@ -14,7 +14,7 @@ from sceneslam.bus.changeover import Candidates
 from sceneslam.bus.covariance_monitor import CovarianceMonitor
 from sceneslam.bus.decision import Action, Health, Situation, StandbyTrial, decide
 from sceneslam.bus.events import EventLog
-from sceneslam.bus.gate import Gate, GateSettings, GateVerdict
+from sceneslam.bus.gate import Gate, GateSettings, Judgement
 from sceneslam.bus.handover_log import log_uncertainty
 from sceneslam.bus.hold import Hold
 from sceneslam.bus.recent import RecentMedian
@@ -233,41 +233,37 @@ def judged(T_local_base, T_odom_base, *, after_ns=S // 2, wheels=WHEELS):
     return gate.update(after_ns, T_local_base=T_local_base, T_odom_base=T_odom_base)
 
 
-def test_the_bound_of_a_distance_grows_with_the_distance():
-    for way_m, apart_m in ((0.0, 0.05), (1.0, 0.12), (4.0, 0.4)):
-        found = judged(se3.from_xy_yaw(way_m + apart_m, 0.0, 0.0), se3.from_xy_yaw(way_m, 0.0, 0.0))
-        assert found.distance_excess == pytest.approx(apart_m / (SIGMAS * (0.03 + 0.02 * way_m)))
-        # No wrong scale explains half of the distance: then the turn is wrong, too.
-        assert found.turn_excess == pytest.approx(apart_m / (SIGMAS * 0.03 + 0.5 * way_m))
+@pytest.mark.parametrize(("share", "is_wrong"), [(0.999, False), (1.001, True)])
+@pytest.mark.parametrize("way_m", [0.0, 1.0, 4.0])
+def test_the_bound_of_a_distance_grows_with_the_distance(way_m, share, is_wrong):
+    apart_m = share * SIGMAS * (0.03 + 0.02 * way_m)
+    told = se3.from_xy_yaw(way_m, 0.0, 0.0)
+    found = judged(se3.from_xy_yaw(way_m + apart_m, 0.0, 0.0), told)
+    assert found.is_wrong is is_wrong
+    # No wrong scale explains half of the distance: then the turn is wrong, too.
+    apart_m = share * (SIGMAS * 0.03 + 0.5 * way_m)
+    found = judged(se3.from_xy_yaw(way_m + apart_m, 0.0, 0.0), told)
+    assert found.turn_agrees is not is_wrong
 
 
-def test_the_bound_of_a_turn_grows_with_turn_and_distance():
-    for way_m, turn_rad, apart_rad in ((0.0, 0.0, 0.03), (0.0, 0.5, 0.06), (2.0, 0.5, 0.1)):
-        found = judged(
-            se3.from_xy_yaw(way_m, 0.0, turn_rad + apart_rad), se3.from_xy_yaw(way_m, 0.0, turn_rad)
-        )
-        bound_rad = SIGMAS * (0.0175 + 0.02 * turn_rad + 0.01 * way_m)
-        assert found.turn_excess == pytest.approx(apart_rad / bound_rad)
-        assert found.distance_excess == pytest.approx(0.0, abs=1e-9)
-
-
-def test_a_motion_as_far_apart_as_the_bound_is_no_disagreement():
-    bound_m = SIGMAS * 0.03
-    for share, verdict in ((0.999, GateVerdict.PROBATION), (1.001, GateVerdict.DISAGREE)):
-        found = judged(se3.from_xy_yaw(share * bound_m, 0.0, 0.0), np.eye(4))
-        assert found.distance is verdict
+@pytest.mark.parametrize(("share", "is_wrong"), [(0.999, False), (1.001, True)])
+@pytest.mark.parametrize(("way_m", "turn_rad"), [(0.0, 0.0), (0.0, 0.5), (2.0, 0.5)])
+def test_the_bound_of_a_turn_grows_with_turn_and_distance(way_m, turn_rad, share, is_wrong):
+    apart_rad = share * SIGMAS * (0.0175 + 0.02 * turn_rad + 0.01 * way_m)
+    found = judged(
+        se3.from_xy_yaw(way_m, 0.0, turn_rad + apart_rad), se3.from_xy_yaw(way_m, 0.0, turn_rad)
+    )
+    assert found.is_wrong is is_wrong and found.turn_agrees is not is_wrong
 
 
 def test_probation_ends_after_one_second():
-    for after_ns, verdict in ((S - 1, GateVerdict.PROBATION), (S, GateVerdict.AGREE)):
+    for after_ns, is_trusted in ((S - 1, False), (S, True)):
         found = judged(np.eye(4), np.eye(4), after_ns=after_ns)
-        assert found.distance is verdict and found.turn is GateVerdict.AGREE
+        assert found.is_trusted is is_trusted and found.turn_agrees and not found.is_wrong
 
 
-def test_a_motion_that_nothing_checks_is_off_by_nothing():
-    found = judged(np.eye(4), None)
-    assert found.distance is GateVerdict.UNCHECKED and found.since_ns is None
-    assert found.distance_excess == found.turn_excess == 0.0 and not found.wheels_lie
+def test_a_motion_that_nothing_checks_is_trusted():
+    assert judged(np.eye(4), None) == Judgement(is_trusted=True)
 
 
 class Seen:

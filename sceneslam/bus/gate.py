@@ -8,9 +8,8 @@ wrong scale still measures turns better than wheels (gyrodometry, Borenstein and
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +19,6 @@ from sceneslam.types import se3
 from sceneslam.types.ranges import check_above
 from sceneslam.types.rig import Wheels
 from sceneslam.types.se3 import Transform
-
-
-class GateVerdict(Enum):
-    """Result of the comparison of a module's motion with the independent motion."""
-
-    AGREE = "agree"
-    DISAGREE = "disagree"
-    PROBATION = "probation"  # no disagreement, but not for long enough yet
-    UNCHECKED = "unchecked"  # there is no independent motion
 
 
 @dataclass(slots=True, kw_only=True)
@@ -50,17 +40,11 @@ class GateSettings:
 class Judgement:
     """How far a module's motion is trusted at one observation."""
 
-    distance: GateVerdict
-    turn: GateVerdict
-    distance_excess: float = 0.0  # the largest difference over its bound; above 1 is too much
-    turn_excess: float = 0.0
-    since_ns: int | None = None  # since when the module was right, or may have been wrong
+    is_trusted: bool  # its pose may be used: it has agreed for long enough, or nothing checks it
+    is_wrong: bool = False  # it differs by more than the bounds
+    since_ns: int | None = None  # then: since when it may have been wrong
+    turn_agrees: bool = False  # its turn is within the bounds, and so better than the wheels'
     wheels_lie: bool = False  # they disagree with a module that is certain and moves plausibly
-
-    @property
-    def is_trusted(self) -> bool:
-        """Tell whether the module's pose may be used."""
-        return self.distance in _GOOD and self.turn in _GOOD
 
 
 _HORIZONS_S = (1.0, 5.0)  # over each: a jump shows in the shorter, a slow slide in the longer
@@ -79,19 +63,20 @@ _EXPLAINED = 0.5  # least share of a disagreement that the jump that caused it e
 _USUAL_SIGMAS = 1.5
 _USUAL_STEP_M, _USUAL_STEP_NS = 0.02, 200_000_000  # least spacing of the excesses
 _USUAL_MIN, _USUAL_KEPT = 100, 150  # 20 to 30 s of driving: a short fault is no wrong scale
-_GOOD = (GateVerdict.AGREE, GateVerdict.UNCHECKED)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class _Sample:
     stamp_ns: int
-    R_local_odom: NDArray[np.float64]  # (3, 3), constant while both rotate alike
-    position_local: NDArray[np.float64]  # (3,) [m]
-    position_odom: NDArray[np.float64]  # (3,) [m]
-    ahead_local: NDArray[np.float64]  # (3,) [m], 1 m ahead of base, so that it also moves in a turn
-    ahead_odom: NDArray[np.float64]  # (3,) [m]
+    T_local_base: Transform
+    T_odom_base: Transform
     way_m: float  # distance driven until then
     turn_rad: float  # turned until then
+
+    @property
+    def R_local_odom(self) -> NDArray[np.float64]:
+        """Return the rotation (3, 3) between the frames, constant while both rotate alike."""
+        return np.asarray(self.T_local_base[:3, :3] @ self.T_odom_base[:3, :3].T)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,9 +104,7 @@ class Gate:
         self._sigmas, self._wheels = settings.sigmas, wheels
         self._horizons_ns = [round(horizon_s * 1e9) for horizon_s in _HORIZONS_S]
         self._samples: list[_Sample] = []  # by rising stamp, back to the longest horizon
-        self._stamps_ns: list[int] = []  # the samples' stamps
         self._T_odom_base: Transform | None = None
-        self._held: tuple[Transform, Transform] | None = None  # T_local_base, T_odom_base then
         self._way_m, self._turn_rad = 0.0, 0.0
         self._distance_since_ns: int | None = None  # since when the distance has been within bounds
         self._has_jumped = False  # the module has jumped as no robot can, since the two agreed
@@ -147,48 +130,35 @@ class Gate:
         without motion. `deviation_m`: standard deviation of the module's position, None if unknown.
         """
         if T_odom_base is None:
-            return Judgement(distance=GateVerdict.UNCHECKED, turn=GateVerdict.UNCHECKED)
+            return Judgement(is_trusted=True)
         T_odom_prev, self._T_odom_base = self._T_odom_base, T_odom_base
         if T_odom_prev is not None:
             self._way_m += _norm(T_odom_base[:3, 3] - T_odom_prev[:3, 3])
             self._turn_rad += _angle_rad(T_odom_base[:3, :3] - T_odom_prev[:3, :3])
         if T_local_base is None:
-            return Judgement(distance=GateVerdict.PROBATION, turn=GateVerdict.PROBATION)
-        if is_revised and self._held is not None:
-            self._move_past(T_local_base, T_odom_base, *self._held)
+            return Judgement(is_trusted=False)
+        if is_revised and self._samples:
+            self._move_past(self._samples[-1], T_local_base, T_odom_base)
         now = _Sample(
             stamp_ns=stamp_ns,
-            R_local_odom=T_local_base[:3, :3] @ T_odom_base[:3, :3].T,
-            position_local=T_local_base[:3, 3],
-            position_odom=T_odom_base[:3, 3],
-            ahead_local=T_local_base[:3, 3] + T_local_base[:3, 0],
-            ahead_odom=T_odom_base[:3, 3] + T_odom_base[:3, 0],
+            T_local_base=T_local_base,
+            T_odom_base=T_odom_base,
             way_m=self._way_m,
             turn_rad=self._turn_rad,
         )
-        self._held = (T_local_base, T_odom_base)
         judgement = self._judge(now, deviation_m)
         self._samples.append(now)
-        self._stamps_ns.append(stamp_ns)
         return judgement
 
-    def _move_past(
-        self,
-        T_local_base: Transform,
-        T_odom_base: Transform,
-        T_local_then: Transform,
-        T_odom_then: Transform,
-    ) -> None:
+    def _move_past(self, last: _Sample, T_local_base: Transform, T_odom_base: Transform) -> None:
         """Move the samples by the module's correction of its past.
 
         Since the last sample the robot moved as odometry measured.
         """
-        T_local_old = T_local_then @ se3.inverse(T_odom_then) @ T_odom_base
+        T_local_old = last.T_local_base @ se3.inverse(last.T_odom_base) @ T_odom_base
         T_new_old = T_local_base @ se3.inverse(T_local_old)
         for sample in self._samples:
-            sample.R_local_odom = T_new_old[:3, :3] @ sample.R_local_odom
-            sample.position_local = T_new_old[:3, :3] @ sample.position_local + T_new_old[:3, 3]
-            sample.ahead_local = T_new_old[:3, :3] @ sample.ahead_local + T_new_old[:3, 3]
+            sample.T_local_base = T_new_old @ sample.T_local_base
 
     def _judge(self, now: _Sample, deviation_m: float | None) -> Judgement:
         found = self._anchors(now.stamp_ns)
@@ -208,19 +178,15 @@ class Gate:
         apart_m = max((excess.apart_m for excess in excesses), default=0.0)
         if is_wrong and self._is_wheels_fault(found[-1], now, apart_m, deviation_m):
             self._distances, self._usual_excess = _none_yet(), 0.0
-            return Judgement(
-                distance=GateVerdict.UNCHECKED,
-                turn=GateVerdict.UNCHECKED,
-                distance_excess=distance,
-                turn_excess=turn,
-                wheels_lie=True,
-            )
+            return Judgement(is_trusted=True, wheels_lie=True)
+        is_long = now.stamp_ns - self._distance_since_ns >= _PROBATION_NS
+        # There is no probation for turns: a module that was wrong and is within the bounds again
+        # turns correctly, and the wheels' turn would be worse meanwhile.
         return Judgement(
-            distance=self._verdict(distance, self._distance_since_ns, now, bool(found)),
-            turn=_turn_verdict(turn, bool(found)),
-            distance_excess=distance,
-            turn_excess=turn,
-            since_ns=found[0].stamp_ns if is_wrong else self._distance_since_ns,
+            is_trusted=bool(found) and not is_wrong and is_long,
+            is_wrong=is_wrong,
+            since_ns=found[0].stamp_ns if is_wrong else None,
+            turn_agrees=bool(found) and turn <= 1.0,
         )
 
     def _is_wheels_fault(
@@ -245,15 +211,14 @@ class Gate:
 
     def _jumps(self, now: _Sample) -> tuple[float, float]:
         """Return the largest recent changes of velocity [m/s]: the module's, the wheels'."""
-        first = bisect_right(self._stamps_ns, now.stamp_ns - _LATE_NS)
-        late = [*self._samples[first:], now]
+        late = [*self._samples[self._until(now.stamp_ns - _LATE_NS) :], now]
         times_s = np.array([(sample.stamp_ns - now.stamp_ns) / 1e9 for sample in late])
         before = np.searchsorted(times_s, times_s - _STEP_S, side="right") - 1
+        is_known = before >= 0
+        elapsed_s = (times_s - times_s[before])[is_known, None]
         found = []
-        for name in ("ahead_local", "ahead_odom"):
-            points = np.array([getattr(sample, name) for sample in late])
-            is_known = before >= 0
-            elapsed_s = (times_s - times_s[before])[is_known, None]
+        for poses in ([one.T_local_base for one in late], [one.T_odom_base for one in late]):
+            points = np.array([T[:3, 3] + T[:3, 0] for T in poses])
             velocities = np.full_like(points, np.nan)
             velocities[is_known] = (points - points[before])[is_known] / elapsed_s
             changes = np.linalg.norm(velocities - velocities[before], axis=1)[is_known]
@@ -271,12 +236,6 @@ class Gate:
                 self._usual_excess = float(self._distances.median[0])
         return self._usual_excess
 
-    def _verdict(self, excess: float, since_ns: int, now: _Sample, is_known: bool) -> GateVerdict:
-        if excess > 1.0:
-            return GateVerdict.DISAGREE
-        is_long = now.stamp_ns - since_ns >= _PROBATION_NS
-        return GateVerdict.AGREE if is_known and is_long else GateVerdict.PROBATION
-
     def _anchors(self, stamp_ns: int) -> list[_Sample]:
         """Return, per horizon, the newest sample before it, or the oldest while it is not filled.
 
@@ -284,40 +243,32 @@ class Gate:
         """
         if not self._samples:
             return []
-        indices = [
-            bisect_right(self._stamps_ns, stamp_ns - horizon_ns) - 1
+        found = [
+            self._samples[max(self._until(stamp_ns - horizon_ns) - 1, 0)]
             for horizon_ns in self._horizons_ns
         ]
-        found = [self._samples[max(index, 0)] for index in indices]
         self._forget_before(found[-1])
         return found
 
+    def _until(self, stamp_ns: int) -> int:
+        """Return how many samples there are until a stamp."""
+        return bisect_right(self._samples, stamp_ns, key=lambda sample: sample.stamp_ns)
+
     def _forget_before(self, sample: _Sample) -> None:
-        old = bisect_left(self._stamps_ns, sample.stamp_ns)
-        del self._samples[:old], self._stamps_ns[:old]
+        del self._samples[: self._until(sample.stamp_ns - 1)]
 
 
 def _none_yet() -> RecentMedian:
     return RecentMedian(_USUAL_KEPT, width=1)
 
 
-def _turn_verdict(excess: float, is_known: bool) -> GateVerdict:
-    """Return whether the module's turn is trusted; within bounds it is better than the wheels'.
-
-    There is no probation for turns: a module that was wrong and is within the bounds again turns
-    correctly, and the wheels' turn would be worse meanwhile.
-    """
-    if excess > 1.0:
-        return GateVerdict.DISAGREE
-    return GateVerdict.AGREE if is_known else GateVerdict.PROBATION
-
-
 def _excess(then: _Sample, now: _Sample, sigmas: float, wheels: Wheels) -> _Excess:
     """Return the differences of the module's motion from the odometry's, divided by the bounds."""
-    moved_local = now.position_local - then.position_local
-    moved_odom = now.position_odom - then.position_odom
-    apart_m = _norm(moved_local - then.R_local_odom @ moved_odom)
-    apart_rad = _angle_rad(now.R_local_odom - then.R_local_odom)
+    moved_local = now.T_local_base[:3, 3] - then.T_local_base[:3, 3]
+    moved_odom = now.T_odom_base[:3, 3] - then.T_odom_base[:3, 3]
+    R_local_odom = then.R_local_odom
+    apart_m = _norm(moved_local - R_local_odom @ moved_odom)
+    apart_rad = _angle_rad(now.R_local_odom - R_local_odom)
     way_m, turned_rad = now.way_m - then.way_m, now.turn_rad - then.turn_rad
     floor_m = sigmas * _DISTANCE_M
     bound_m = floor_m + sigmas * wheels.drift_ratio * way_m

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sceneslam.bus.covariance_monitor import CovarianceMonitor
 from sceneslam.bus.decision import Health
-from sceneslam.bus.gate import Gate, GateSettings, GateVerdict
+from sceneslam.bus.gate import Gate, GateSettings
 from sceneslam.bus.runner import Runner
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
@@ -117,14 +117,14 @@ class Hold:
         )
         if T_local_base is not None:
             self.wheels_lie = judgement.wheels_lie
-        if GateVerdict.DISAGREE in (judgement.distance, judgement.turn):
+        if judgement.is_wrong:
             self.suspect_since_ns = None if self.is_suspect else judgement.since_ns
             self.is_suspect = True
         elif judgement.is_trusted:
             self.is_suspect, self.suspect_since_ns = False, None
         if self.is_revised:
             self._agreed = None  # its earlier pose is not comparable with its corrected ones
-        if judgement.turn is GateVerdict.AGREE and T_local_base is not None:
+        if judgement.turn_agrees and T_local_base is not None:
             assert observation.T_odom_base is not None
             now = (T_local_base, observation.T_odom_base)
             if self._agreed is not None and T_odom_prev is not None:
