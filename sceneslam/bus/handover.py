@@ -136,7 +136,7 @@ class Handover:
             given = self._pace.give(given)
         else:
             self._pace.spare(given)
-        T_map_told = session.bridge.copy().predict(given, by_velocity=False)
+        T_map_told = session.told(given, motion)
         found = session.advance(given, by_velocity=True, T_prev_curr=motion)
         if session.fault is not None:
             raise session.fault
