@@ -11,13 +11,12 @@ from fakes import PERIOD_NS, ExactModule, ScriptedDetector, observation
 
 from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.changeover import Candidates
-from sceneslam.bus.covariance_monitor import CovarianceMonitor
 from sceneslam.bus.decision import Action, Health, Situation, StandbyTrial, decide
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.gate import Gate, GateSettings, Judgement
 from sceneslam.bus.handover_log import log_uncertainty
 from sceneslam.bus.hold import Hold
-from sceneslam.bus.recent import RecentMedian
+from sceneslam.bus.recent import CovarianceMonitor, RecentMedian
 from sceneslam.bus.scene_filter import WindowFilter
 from sceneslam.bus.watch import Watch
 from sceneslam.bus.wheel_scale import WheelScale

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.bus.covariance_monitor import CovarianceMonitor
 from sceneslam.bus.decision import Health
 from sceneslam.bus.gate import Gate, GateSettings
+from sceneslam.bus.recent import CovarianceMonitor
 from sceneslam.bus.runner import Runner
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
