@@ -7,12 +7,12 @@ log alone (`python -m sceneslam.decisions RUN`).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
+from enum import StrEnum
 
 from sceneslam.bus.policy import Policy
 
 
-class Health(Enum):
+class Health(StrEnum):
     """How reliable the active module's pose is."""
 
     HELD = "held"
@@ -22,7 +22,7 @@ class Health(Enum):
     FAILED = "failed"  # it violated its contract and was stopped
 
 
-class StandbyTrial(Enum):
+class StandbyTrial(StrEnum):
     """State of the scene's first choice, on standby beside the fallback that runs in its place."""
 
     NONE = "none"
@@ -51,7 +51,7 @@ class Situation:
     may_return: bool  # a failed module will return: the run may go on without any
 
 
-class Action(Enum):
+class Action(StrEnum):
     """What to do with the active module."""
 
     GO_ON = "go on"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
 from dataclasses import asdict, fields, replace
-from enum import Enum
 from operator import attrgetter
 from typing import Any
 
@@ -29,9 +29,7 @@ class DecisionLog:
         is_known, self._last = facts == self._last, facts
         if is_known and verdict == GO_ON:
             return
-        values = {key: _plain(value) for key, value in asdict(now).items() if key != "stamp_ns"}
-        verdict_fields = {key: _plain(value) for key, value in asdict(verdict).items()}
-        self._log.add("situation", now.stamp_ns, **values, verdict=verdict_fields)
+        self._log.add("situation", **_in_json(now), verdict=_in_json(verdict))
 
 
 def decide_again(events: Iterable[Event], policy: Policy) -> list[str]:
@@ -46,7 +44,7 @@ def decide_again(events: Iterable[Event], policy: Policy) -> list[str]:
         kind, stamp_ns = event["event"], event["stamp_ns"]
         if kind == "vote":
             if pending is not None and now is not None:
-                wrong += _check(policy, replace(now, stamp_ns=pending), _plain(asdict(GO_ON)))
+                wrong += _check(policy, replace(now, stamp_ns=pending), _in_json(GO_ON))
             pending = stamp_ns if state == "run" else None
         elif kind == "situation":
             now, pending = _situation(event), None
@@ -57,7 +55,7 @@ def decide_again(events: Iterable[Event], policy: Policy) -> list[str]:
 
 
 def _check(policy: Policy, now: Situation, logged: Any) -> list[str]:
-    verdict = _plain(asdict(decide(policy, now)))
+    verdict = _in_json(decide(policy, now))
     if verdict == logged:
         return []
     return [f"at {now.stamp_ns}: logged {logged['action']}, decided {verdict['action']}"]
@@ -70,12 +68,7 @@ def _situation(event: Event) -> Situation:
     return Situation(**values | {"tried": frozenset(values["tried"])})
 
 
-def _plain(value: Any) -> Any:
-    """Return a value in its JSON form."""
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, Enum):
-        return value.value
-    if isinstance(value, frozenset):
-        return sorted(value)
-    return list(value) if isinstance(value, tuple) else value
+def _in_json(record: Situation | Decision) -> dict[str, Any]:
+    """Return a record in its JSON form."""
+    form: dict[str, Any] = json.loads(json.dumps(asdict(record), default=sorted))
+    return form
