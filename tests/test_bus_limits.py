@@ -328,10 +328,11 @@ def test_only_the_uncertainty_along_the_motion_hides_the_scale_of_wheels(along_m
         WheelScale(deviation=0.02, limit=0.03),
         SimpleNamespace(is_trusted=True, is_revised=False, is_asked=True),
     )
-    hold.inliers, hold.covariance = 100, covariance
+    known = {"status": TrackingStatus.TRACKING, "covariance": covariance, "inliers": 100}
     for index in range(161):
         ahead = R @ [0.05 * index, 0.0, 0.0]
-        hold.T_local_base = se3.from_xy_yaw(*ahead[:2], 0.0)
+        T_local_base = se3.from_xy_yaw(*ahead[:2], 0.0)
+        hold.tracking = Tracking(stamp_ns=index, T_local_base=T_local_base, **known)
         scale.learn(hold, se3.from_xy_yaw(*(1.02 * ahead[:2]), 0.0), 0.0)
     expected = 1 / 1.02 if is_learnt else 1.0
     assert scale.scale == pytest.approx(expected, abs=0.004)

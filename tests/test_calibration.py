@@ -13,7 +13,7 @@ from sceneslam.bus.dead_reckoning import DeadReckoning
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.wheel_scale import WheelScale
 from sceneslam.types import se3
-from sceneslam.types.observation import Observation
+from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
 
 PERIOD_NS = 40_000_000
@@ -41,14 +41,22 @@ def test_bias_that_is_learnt_late_is_taken_off_once(bias):
     assert abs(headings[-1] - headings[1500]) < 0.35 * bias
 
 
-def hold_at(x_m, *, is_trusted=True, deviation_m=0.003, is_revised=False, inliers=100, **more):
-    return SimpleNamespace(
-        T_local_base=se3.from_xy_yaw(x_m, 0.0, 0.0),
-        is_trusted=is_trusted,
-        is_revised=is_revised,
+def tracked(T_local_base, *, deviation_m=0.003, inliers=100):
+    return Tracking(
+        stamp_ns=0,
+        T_local_base=T_local_base,
+        status=TrackingStatus.TRACKING,
         covariance=None if deviation_m is None else np.eye(6) * deviation_m**2,
         inliers=inliers,
-        is_asked=more.get("is_asked", True),
+    )
+
+
+def hold_at(x_m, *, is_trusted=True, is_revised=False, is_asked=True, **known):
+    return SimpleNamespace(
+        tracking=tracked(se3.from_xy_yaw(x_m, 0.0, 0.0), **known),
+        is_trusted=is_trusted,
+        is_revised=is_revised,
+        is_asked=is_asked,
     )
 
 
@@ -145,7 +153,8 @@ def test_other_activation_begins_anew():
     holds = [hold_at(0.0), hold_at(0.0)]
     for index in range(41):
         hold = holds[index >= 5]
-        hold.T_local_base = se3.from_xy_yaw(0.05 * index - (0.03 if index >= 5 else 0.0), 0.0, 0.0)
+        x_m = 0.05 * index - (0.03 if index >= 5 else 0.0)
+        hold.tracking = tracked(se3.from_xy_yaw(x_m, 0.0, 0.0))
         wheels.learn(hold, se3.from_xy_yaw(0.05 * index, 0.0, 0.0), 0.0)
     assert wheels.scale == pytest.approx(1.0, abs=1e-12)
 
@@ -164,7 +173,7 @@ def test_arcs_teach_nothing():
     wheels, hold = scale(), hold_at(0.0)
     T_odom, T_true = se3.identity(), se3.identity()
     for _ in range(400):
-        hold.T_local_base = T_true
+        hold.tracking = tracked(T_true)
         wheels.learn(hold, T_odom, 0.06)
         T_odom = T_odom @ se3.from_xy_yaw(0.02, 0.0, 0.06)
         T_true = T_true @ se3.from_xy_yaw(0.02, 0.0, 0.03)
@@ -176,7 +185,7 @@ def test_what_was_learnt_is_in_the_log_once():
     for index in range(300):
         x_m = 0.05 * max(index - 60, 0)
         reckoning.correct(seen(index, 1.02 * x_m, BIAS), "one")
-        hold.T_local_base = se3.from_xy_yaw(x_m, 0.0, 0.0)
+        hold.tracking = tracked(se3.from_xy_yaw(x_m, 0.0, 0.0))
         reckoning.learn(hold, "one")
     reckoning.close(1, log)
     reckoning.close(2, log)
@@ -189,7 +198,7 @@ def test_unwatched_module_teaches_no_scale():
     reckoning, hold = DeadReckoning(policy(gate=None), RIG), hold_at(0.0)
     for index in range(100):
         last = reckoning.correct(seen(index, 1.02 * 0.05 * index, np.zeros(3)), "")
-        hold.T_local_base = se3.from_xy_yaw(0.05 * index, 0.0, 0.0)
+        hold.tracking = tracked(se3.from_xy_yaw(0.05 * index, 0.0, 0.0))
         reckoning.learn(hold, "one")
     assert last.T_odom_base[0, 3] == pytest.approx(1.02 * 0.05 * 99)
 

@@ -29,14 +29,12 @@ class Hold:
         self.is_trusted = False  # another module may start from its last pose
         self.wheels_lie = False  # by the module's motion and the robot's inertia
         self.is_asked = False  # it was given the last observation
-        self.inliers = 0  # measurements that agreed with its last pose
+        self.tracking: Tracking | None = None  # its answer to that, if usable
         self.is_revised = False  # its last pose jumped because it corrected its past
         self.unheld_since_ns: int | None = None
         self.held_since_ns: int | None = None
         self.held_ns = 0  # how long it had tracked without a break before that
         self.turn: NDArray[np.float64] | None = None  # its last (3, 3) rotation, if trusted
-        self.covariance: NDArray[np.float64] | None = None  # (6, 6) of its pose, if usable
-        self.T_local_base: Transform | None = None  # at the last observation, if it reported one
         self._T_odom_prev: Transform | None = None
         self._agreed: tuple[Transform, Transform] | None = None  # local, odom, as turns last agreed
         self._gate = Gate(gate, wheels or Wheels()) if gate is not None else None
@@ -61,7 +59,7 @@ class Hold:
 
     def ask(self, runner: Runner, observation: Observation) -> Tracking | None:
         """Return a module's answer if its pose may be used; raises ModuleError as the runner."""
-        self.is_trusted, self.covariance = False, None
+        self.is_trusted, self.tracking = False, None
         self.is_asked = runner.can_use(observation)
         if not self.is_asked:
             self._judge(observation, None)
@@ -76,7 +74,7 @@ class Hold:
         if is_lost or self.is_suspect:
             self._lose(tracking.stamp_ns)
             return None
-        self.covariance = tracking.covariance
+        self.tracking = tracking
         is_usual = self._covariances.is_usual(tracking.covariance)
         self.is_trusted = is_usual and is_tracking
         self.unheld_since_ns = None
@@ -86,14 +84,13 @@ class Hold:
 
     def spare(self, observation: Observation) -> None:
         """Record an observation that was skipped while the module catches up."""
-        self.is_trusted, self.covariance, self.is_asked = False, None, False
+        self.is_trusted, self.tracking, self.is_asked = False, None, False
         self._judge(observation, None)
 
     def _feed(self, tracking: Tracking) -> None:
         if self._fed_ns is not None:
             self._period_ns = tracking.stamp_ns - self._fed_ns
         self._fed_ns, self.status = tracking.stamp_ns, tracking.status
-        self.inliers = tracking.inliers
         self.is_revised = tracking.revision != self._revision
         self._revision = tracking.revision
 
@@ -104,7 +101,7 @@ class Hold:
         covariance: NDArray[np.float64] | None = None,
     ) -> None:
         """Compare the module's motion with the odometry's."""
-        self.T_local_base, self.turn = T_local_base, None
+        self.turn = None
         T_odom_prev, self._T_odom_prev = self._T_odom_prev, observation.T_odom_base
         if self._gate is None:
             return

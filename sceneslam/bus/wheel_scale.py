@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sceneslam.bus.hold import Hold
 from sceneslam.motion.distance_error import DistanceError
 from sceneslam.types import se3
+from sceneslam.types.observation import Tracking
 from sceneslam.types.se3 import Transform
 
 _DRIFT = 0.002  # standard deviation of the change between spans: tyres wear, floors change
@@ -29,9 +30,8 @@ class _Mark:
     """Where a span begins."""
 
     hold: Hold
-    T_local_base: Transform
+    tracking: Tracking  # the module's answer there, with a covariance
     T_odom_base: Transform
-    covariance: NDArray[np.float64]  # (6, 6), of T_local_base
 
 
 class WheelScale:
@@ -80,25 +80,25 @@ class WheelScale:
 
 def _here(hold: Hold, T_odom_base: Transform) -> _Mark | None:
     """Return the current pose as a span's end, None unless the module measured it."""
-    is_known = hold.is_trusted and hold.inliers > 0 and not hold.is_revised
-    if not is_known or hold.covariance is None or hold.T_local_base is None:
+    tracking = hold.tracking
+    if tracking is None or not hold.is_trusted or hold.is_revised:
         return None
-    return _Mark(
-        hold=hold,
-        T_local_base=hold.T_local_base,
-        T_odom_base=T_odom_base,
-        covariance=hold.covariance,
-    )
+    if tracking.inliers <= 0 or tracking.covariance is None:
+        return None
+    return _Mark(hold=hold, tracking=tracking, T_odom_base=T_odom_base)
 
 
 def _measured(mark: _Mark, here: _Mark) -> tuple[float, float]:
     """Return the length [m] of the module's motion, and the variance along it of both its ends."""
-    way = _way(mark.T_local_base, here.T_local_base)
+    then, now = mark.tracking, here.tracking
+    assert then.covariance is not None and now.covariance is not None
+    way = _way(then.T_local_base, now.T_local_base)
     way_m = float(np.linalg.norm(way))
     ahead = way / max(way_m, 1e-9)
-    ahead_here = here.T_local_base[:3, :3].T @ mark.T_local_base[:3, :3] @ ahead
+    ahead_here = now.T_local_base[:3, :3].T @ then.T_local_base[:3, :3] @ ahead
     variance_m2 = sum(
-        float(u @ end.covariance[:3, :3] @ u) for u, end in ((ahead, mark), (ahead_here, here))
+        float(u @ covariance[:3, :3] @ u)
+        for u, covariance in ((ahead, then.covariance), (ahead_here, now.covariance))
     )
     return way_m, variance_m2
 
