@@ -129,6 +129,7 @@ class Bus:
             candidates=self._candidates,
             estimator=self._estimator,
             policy=policy,
+            rig=rig,
             log=log,
             catch_up_steps=catch_up_steps,
         )

@@ -15,6 +15,7 @@ from sceneslam.bus.policy import Policy
 from sceneslam.bus.runner import Runner
 from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig
 
 _log = logging.getLogger(__name__)
 _TRIAL_NS = 1_000_000_000  # the first choice tracks this long on standby before it takes over again
@@ -113,11 +114,12 @@ class Changeover:
         candidates: Candidates,
         estimator: Estimator,
         policy: Policy,
+        rig: Rig,
         log: EventLog,
         catch_up_steps: int | None,
     ) -> None:
         self._runners, self._candidates, self._estimator = runners, candidates, estimator
-        self._policy, self._log, self._limit = policy, log, catch_up_steps
+        self._policy, self._rig, self._log, self._limit = policy, rig, log, catch_up_steps
         self._run_began_ns: int | None = None
         self._plan: Plan | None = None
         self._queue: list[str] = []
@@ -219,7 +221,7 @@ class Changeover:
         if self._trial is not None and self._trial.key == key:
             attempt, self._trial = self._trial, None
             if attempt.handover is not None:
-                self._estimator.settle(attempt.handover)
+                attempt.handover.settle()
             return attempt
         ready_ns = self._ready_ns(key, stamp_ns)
         if self._policy.handover == "cold" and ready_ns > stamp_ns:
@@ -255,7 +257,7 @@ class Changeover:
             runner = self._runners[attempt.key]
             if not attempt.is_begun:
                 attempt.is_begun = True
-                self._estimator.start(runner, self._scene)
+                runner.start(self._rig, self._scene)
             if runner.has_started():
                 attempt.handover = self._estimator.begin(runner, since_ns, is_trial=is_trial)
         return attempt.handover

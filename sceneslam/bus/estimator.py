@@ -95,10 +95,6 @@ class Estimator:
         if session.fault is not None:
             raise session.fault
 
-    def start(self, runner: Runner, scene: str) -> None:
-        """Begin to activate a module that is to take over."""
-        runner.start(self._rig, scene)
-
     def begin(self, runner: Runner, since_ns: int | None, *, is_trial: bool = False) -> Handover:
         """Begin to hand over to a module that has started.
 
@@ -112,16 +108,12 @@ class Estimator:
         pace = Pace(self._policy.catch_up)
         return Handover(session, self._memory, anchor=anchor, pace=pace)
 
-    def settle(self, handover: Handover) -> None:
-        """Place a module that was on trial at the current pose; its earlier poses are not used."""
-        handover.settle(self._memory.newest)
-
     def accept(self, handover: Handover) -> None:
         """Make a module that has caught up the active one, and shut the old one down."""
         old, placed, bridge = self.active, self._placed, self._session.bridge
         self._session, self._placed, self._told = handover.session, [], None
         self._session.bridge = bridge
-        if handover.is_placed:
+        if handover.session.is_placed:
             self._rewrite(handover)
         now_ns = self._memory.newest.stamp_ns
         self._tell(now_ns)

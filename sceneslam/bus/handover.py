@@ -48,11 +48,6 @@ class Handover:
         self._first_cost_ns = 0  # the same until the first pose
 
     @property
-    def is_placed(self) -> bool:
-        """Tell whether the module has a place in the map."""
-        return self.session.is_placed
-
-    @property
     def is_lost(self) -> bool:
         """Tell whether the module's last answer was not usable."""
         hold = self.session.hold
@@ -91,12 +86,12 @@ class Handover:
                 given += self._go_on_to(moment)
         return True
 
-    def settle(self, anchor: BufferedObservation) -> None:
-        """Place the module, which has caught up, at the pose of the given observation.
+    def settle(self) -> None:
+        """Place the module, which has caught up, at the pose of the newest observation.
 
         Its earlier observations belong to its trial, not to the hand-over.
         """
-        last = self.tracked[-1]
+        last, anchor = self.tracked[-1], self._memory.newest
         self._began_ns, self._cost_ns = anchor.stamp_ns, 0
         self.anchor, self.trail, self.tracked = anchor, [], [last]
         bridge = self.session.bridge = anchor.bridge.copy()
