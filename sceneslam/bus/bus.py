@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from array import array
 from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter_ns
@@ -25,8 +24,6 @@ from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Vector
-
-_log = logging.getLogger(__name__)
 
 
 class Guards(Protocol):
@@ -282,7 +279,7 @@ class Bus:
         try:
             self._estimator.track(observation, by_velocity=self._has_other())
         except ModuleError as error:
-            self._fault(observation.stamp_ns, str(error))
+            self._log.add_fault(observation.stamp_ns, str(error))
 
     def _has_other(self) -> bool:
         """Tell whether another module could take over, or the failed one could return."""
@@ -315,7 +312,7 @@ class Bus:
         try:
             self._estimator.active.set_scene(self.scene)
         except ModuleError as error:
-            self._fault(stamp_ns, str(error))
+            self._log.add_fault(stamp_ns, str(error))
 
     def _send(self, event: str, stamp_ns: int) -> None:
         """Send an event to the machine and log the state it leads to."""
@@ -323,10 +320,6 @@ class Bus:
         self._machine.send(event)
         self._state = self._machine.state
         self._log.add("state", stamp_ns, **{"from": source, "to": self._state}, reason=event)
-
-    def _fault(self, stamp_ns: int, what: str) -> None:
-        _log.warning(what)
-        self._log.add("fault", stamp_ns, what=what)
 
     def _spent_ns(self) -> int:
         """Return what all modules have cost so far."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -17,7 +16,6 @@ from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 
-_log = logging.getLogger(__name__)
 _TRIAL_NS = 1_000_000_000  # the first choice tracks this long on standby before it takes over again
 _DOUBLINGS = 3  # how often the time until the first choice is tried again doubles
 
@@ -179,7 +177,7 @@ class Changeover:
         try:
             self._trial.handover.runner.submit(observation)
         except ModuleError as error:
-            self._fault(observation.stamp_ns, str(error))
+            self._log.add_fault(observation.stamp_ns, str(error))
             self._end_trial()
 
     def try_on(self, stamp_ns: int) -> None:
@@ -193,7 +191,7 @@ class Changeover:
                 return
             handover.advance(None)
         except ModuleError as error:
-            self._fault(stamp_ns, str(error))
+            self._log.add_fault(stamp_ns, str(error))
             self._end_trial()
             return
         is_given_time = stamp_ns - trial.ready_ns < self._policy.retry_s * 1e9  # it may need motion
@@ -239,7 +237,7 @@ class Changeover:
             if handover is None or not handover.advance(self._limit):
                 return None
         except ModuleError as error:
-            self._fault(stamp_ns, str(error))
+            self._log.add_fault(stamp_ns, str(error))
             return self._refuse(runner, stamp_ns, "failed")
         if handover.is_lost and self._can_refuse():
             return self._refuse(runner, stamp_ns, "lost")
@@ -302,7 +300,3 @@ class Changeover:
         if self._policy.handover == "warm":
             return max(stamp_ns, self._run_began_ns + startup_ns)  # loaded when the run began
         return stamp_ns + startup_ns
-
-    def _fault(self, stamp_ns: int, what: str) -> None:
-        _log.warning(what)
-        self._log.add("fault", stamp_ns, what=what)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import zlib
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from typing import Any
 from sceneslam.types.files import LogFile
 from sceneslam.types.run import Event
 
+_log = logging.getLogger(__name__)
 _PACK = 512  # events that are compressed at a time: a vote takes 30 bytes then
 
 
@@ -54,6 +56,11 @@ class EventLog:
         self._newest.append(line)
         if event != "vote":
             self.flush()
+
+    def add_fault(self, stamp_ns: int, what: str) -> None:
+        """Record what failed, and warn of it."""
+        _log.warning(what)
+        self.add("fault", stamp_ns, what=what)
 
     def flush(self) -> None:
         """Write pending events to disk; if that fails, they stay in memory."""

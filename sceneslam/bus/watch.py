@@ -79,9 +79,7 @@ class Watch:
             raise
         except BaseException as error:
             self.is_working = False
-            what = f"the detector failed: {text_of(error)}"
-            _log.warning(what)
-            self._log.add("fault", observation.stamp_ns, what=what)
+            self._log.add_fault(observation.stamp_ns, f"the detector failed: {text_of(error)}")
         self.spent_us.append((perf_counter_ns() - began_ns) / 1e3)
         if vote is None:
             return
