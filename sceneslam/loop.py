@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from sceneslam.atlas.save import save_map
 from sceneslam.bus.bus import Bus
-from sceneslam.bus.handover_log import log_uncertainty
+from sceneslam.bus.events import log_uncertainty
 from sceneslam.config.build import RunParts
 from sceneslam.config.settings import LIVE
 from sceneslam.engine.live import LiveTally, Spent, run_live

@@ -12,9 +12,8 @@ from fakes import PERIOD_NS, ExactModule, ScriptedDetector, observation
 from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.changeover import Candidates
 from sceneslam.bus.decision import Action, Health, Situation, StandbyTrial, decide
-from sceneslam.bus.events import EventLog
+from sceneslam.bus.events import EventLog, log_uncertainty
 from sceneslam.bus.gate import Gate, GateSettings, Judgement
-from sceneslam.bus.handover_log import log_uncertainty
 from sceneslam.bus.hold import Hold
 from sceneslam.bus.recent import CovarianceMonitor, RecentMedian
 from sceneslam.bus.scene_filter import WindowFilter

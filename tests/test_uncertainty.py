@@ -15,7 +15,7 @@ from sceneslam.atlas.uncertainty import (
     read_covariances,
     write_covariances,
 )
-from sceneslam.bus.handover_log import log_uncertainty
+from sceneslam.bus.events import log_uncertainty
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory

@@ -6,12 +6,15 @@ import json
 import logging
 import math
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sceneslam.types.files import LogFile
-from sceneslam.types.run import Event
+from sceneslam.types.run import Event, SessionStart
 
 _log = logging.getLogger(__name__)
 _PACK = 512  # events that are compressed at a time: a vote takes 30 bytes then
@@ -87,6 +90,26 @@ class EventLog:
         oldest, self._newest = self._newest[:_PACK], self._newest[_PACK:]
         self._written -= _PACK
         self._packed.append(zlib.compress(json.dumps(oldest).encode()))
+
+
+def log_uncertainty(
+    log: EventLog, starts: Iterable[SessionStart], covariances: NDArray[np.float64]
+) -> None:
+    """Log the standard deviations of the pose where each session begins, as known at the end.
+
+    `covariances` (N, 6, 6) are those of the trajectory's poses, in `base`, translation first.
+    """
+    for start in starts:
+        covariance = covariances[start.row]
+        log.add(
+            "uncertainty",
+            start.stamp_ns,
+            session=start.session,
+            module=start.module,
+            deviation_m=float(np.sqrt(np.trace(covariance[:3, :3]))),
+            deviation_rad=float(np.sqrt(np.trace(covariance[3:, 3:]))),
+            covariance=covariance.tolist(),
+        )
 
 
 def _unpacked(pack: bytes) -> list[Event]:
