@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.motion.step import UNKNOWN_VELOCITY, Step, still
+from sceneslam.motion.motion import UNKNOWN_VELOCITY, Step, still
 from sceneslam.motion.trust import NoiseRatio, student_cost
 from sceneslam.types import se3
 

@@ -30,11 +30,6 @@ class Pipeline:
         self._stamps_ns: list[int] = []
         self._poses: list[se3.Transform] = []
 
-    @property
-    def T_local_base(self) -> se3.Transform:
-        """Return the last reported pose (4, 4)."""
-        return self._T_local_base
-
     def note(self, observation: Observation) -> None:
         """Record an observation that was given to the program."""
         T_odom_base = observation.T_odom_base

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from sceneslam.motion.distance_error import DistanceError
 from sceneslam.motion.inertia import Inertia
-from sceneslam.motion.motion import BELIEVED, Motion, motion_of
-from sceneslam.motion.step import Step, still
+from sceneslam.motion.motion import BELIEVED, Motion, Step, motion_of, still
 from sceneslam.motion.trust import LieDetector, NoiseRatio, evidence_of_a_lie
 from sceneslam.motion.turn_errors import TurnErrors
 from sceneslam.types import se3

@@ -1,4 +1,4 @@
-"""A motion of the base, with the alternatives if wheels or inertia are wrong."""
+"""Motions by one source, and the base's motion with the alternatives if a source is wrong."""
 
 from __future__ import annotations
 
@@ -8,12 +8,40 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.motion.step import UNKNOWN_VELOCITY, Step
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
+UNKNOWN_VELOCITY = np.array([1.0, 2.0])  # m/s, rad/s: standard deviation of an unknown velocity
 BELIEVED = 0.5  # wheels are not used if they are wrong with this probability
 _RARE = 0.003  # least probability of an alternative: one scan in 300
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Step:
+    """A motion by one source. Pairs (2,) hold the distance, then the turn."""
+
+    T: Transform
+    variance: NDArray[np.float64]  # (2,) [m^2, rad^2]
+    amounts: NDArray[np.float64]  # (2,) [m, rad]: the variance of the noise grows with these
+    causes: NDArray[np.float64]  # (3,) [m, rad, s]: the turn's systematic error grows with these
+
+    def then(self, step: Step) -> Step:
+        """Return this step followed by another."""
+        return Step(
+            T=self.T @ step.T,
+            variance=self.variance + step.variance,
+            amounts=self.amounts + step.amounts,
+            causes=self.causes + step.causes,
+        )
+
+    def turned(self, turn: NDArray[np.float64], noise_rad: float, duration_s: float) -> Step:
+        """Return the step with its turn replaced by the gyro's rotation vector (3,) [rad]."""
+        return Step(
+            T=se3.from_parts(se3.so3_exp(turn), self.T[:3, 3]),
+            variance=np.array([self.variance[0], noise_rad**2]),
+            amounts=np.array([self.amounts[0], 0.0]),
+            causes=np.array([0.0, 0.0, duration_s]),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,6 +94,11 @@ class Motion:
             np.clip(p @ is_wrong / p.sum(), 1e-9, 1 - 1e-9) for p in (probabilities, before)
         )
         return np.asarray(np.log(after / (1.0 - after)) - np.log(before / (1.0 - before)))
+
+
+def still() -> Step:
+    """Return the step without motion."""
+    return Step(T=se3.identity(), variance=np.zeros(2), amounts=np.zeros(2), causes=np.zeros(3))
 
 
 def motion_of(

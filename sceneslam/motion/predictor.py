@@ -46,14 +46,9 @@ class Predictor:
         self.T_local_base = se3.identity()  # of the last observation, measured or predicted
         self.covariance = np.eye(6) * _FIRST_DEVIATION**2
         self.T_local_measured = se3.identity()  # the last that was measured
+        self.is_lost = False  # the motion to the last observation is unknown
         self._measured_ns: int | None = None
-        self._is_lost = False
         self._alone = np.zeros((6, 6))  # the sensor's own covariance of the last measured pose
-
-    @property
-    def is_lost(self) -> bool:
-        """Tell whether the motion to the last observation is unknown."""
-        return self._is_lost
 
     def predict(self, observation: Observation) -> Prediction:
         """Return the predicted pose of the base at an observation."""
@@ -83,7 +78,7 @@ class Predictor:
         `information` (6, 6) is that of the sensor alone, without the prediction; it calibrates the
         motion model. None: the pose was not measured directly, and the model is not calibrated.
         """
-        if information is None or self._is_lost or self._measured_ns is None:
+        if information is None or self.is_lost or self._measured_ns is None:
             self.model.skip()
             alone = covariance
         else:
@@ -93,7 +88,7 @@ class Predictor:
             self.model.learn(T_before_now, alone + carried)
         self.T_local_base = self.T_local_measured = T_local_base
         self.covariance, self._alone = covariance, alone
-        self._measured_ns, self._is_lost = observation.stamp_ns, False
+        self._measured_ns, self.is_lost = observation.stamp_ns, False
 
     def coast(self, prediction: Prediction) -> None:
         """Continue from a prediction; the last measured velocity is kept."""
@@ -106,7 +101,7 @@ class Predictor:
         if not prediction.is_measured:
             self.T_local_base = se3.from_parts(rotation, position)
         self.model.slow_down()
-        self._is_lost = True
+        self.is_lost = True
 
     def bridge(
         self, observation: Observation, prediction: Prediction, *, can_coast: bool

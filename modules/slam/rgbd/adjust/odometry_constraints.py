@@ -12,8 +12,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from sceneslam.motion.motion import UNKNOWN_VELOCITY
 from sceneslam.motion.predictor import Prediction
-from sceneslam.motion.step import UNKNOWN_VELOCITY
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
