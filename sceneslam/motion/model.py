@@ -9,7 +9,6 @@ a module is not calibrated by that module.
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
 
 import numpy as np
@@ -53,21 +52,15 @@ class MotionModel:
         self._silent_s = 0.0  # time since then
         self._gap: Transform | None = None  # predicted motion since then; None: no gap
         self._since_s = 0.0  # since the last measured motion
-        self._since_wheels: Step | None = still()
+        self._since_wheels: Step | None = still()  # None: the wheels did not cover all of it
         self._since_guess = still()
         self._is_weighed = False  # the sensor weighs the sources itself, and may clear the wheels
         self._is_followed = True  # `stop` was not called since then
-        self._is_measured = True  # the wheels covered all motion since then
 
     @property
     def noise_ratios(self) -> NDArray[np.float64]:
         """Return the estimated standard deviations (2,) of wheels: after 1 m [m], 1 rad [rad]."""
         return np.array([noise.ratio for noise in self._noise])
-
-    @property
-    def missed_per_metre(self) -> float:
-        """Return the estimated error of the wheels' distance per metre."""
-        return self._distance.ratio
 
     @property
     def lying(self) -> NDArray[np.float64]:
@@ -88,10 +81,6 @@ class MotionModel:
     def velocity(self) -> NDArray[np.float64]:
         """Return the base's twist (6,) [m/s, rad/s] in se3.log order, 0 if unknown."""
         return self._inertia.velocity
-
-    def copy(self) -> MotionModel:
-        """Return an independent copy with the same state."""
-        return copy.deepcopy(self)
 
     def predict(self, observation: Observation) -> Motion:
         """Return the motion from the last observation to this one, which becomes the last."""
@@ -117,7 +106,13 @@ class MotionModel:
             noise_rad = self._turns.gyro_bias_deviation * duration_s + self._gyro.noise_rad
             guess = guess.turned(turn, noise_rad, duration_s)
             if wheels is not None and gap is None:
-                self._compare(turn, wheels, duration_s)
+                self._turns.compare(
+                    turn,
+                    se3.yaw_rad(wheels.T),
+                    causes=wheels.causes,
+                    variance=float(wheels.variance[1]),
+                    duration_s=duration_s,
+                )
                 wheels = wheels.turned(turn, noise_rad, duration_s)
         if self._is_weighed and wheels is not None and gap is None:
             evidence = self._inertia.evidence(wheels, guess, duration_s)
@@ -134,7 +129,7 @@ class MotionModel:
             guess,
             self._inertia.anywhere(guess, duration_s),
             lying=self.lying,
-            is_measured=self._is_measured,
+            is_measured=self._since_wheels is not None,
         )
         if self._gap is not None:
             self._gap = self._gap @ motion.T_prev_curr
@@ -223,7 +218,7 @@ class MotionModel:
         """Reset velocity and odometry: the base is no longer tracked."""
         self.slow_down()
         self._forget()
-        self._is_measured, self._is_followed = False, False
+        self._since_wheels, self._is_followed = None, False
 
     def slow_down(self) -> None:
         """Reset the velocity only."""
@@ -234,7 +229,6 @@ class MotionModel:
         if self._gap is not None:
             self._T_odom_base, self._gap = None, None
         self._since_s, self._since_wheels, self._since_guess = 0.0, still(), still()
-        self._is_measured = True
 
     def _take_odometry(self, observation: Observation, duration_s: float) -> Step | None:
         """Return the motion since the last odometry, None if it is missing now or was before."""
@@ -242,7 +236,7 @@ class MotionModel:
         T_before, T_odom_base = self._T_odom_base, _finite(observation.T_odom_base)
         if T_odom_base is None:
             if T_before is None:
-                self._since_wheels, self._is_measured = None, False
+                self._since_wheels = None
             elif self._gap is None:
                 self._gap = se3.identity()
             return None
@@ -250,7 +244,7 @@ class MotionModel:
         if T_before is not None:
             step = self._by_wheels(se3.inverse(T_before) @ T_odom_base, self._silent_s)
         if step is None:
-            self._since_wheels, self._is_measured = None, False
+            self._since_wheels = None
         self._T_odom_base, self._gap, self._silent_s = T_odom_base, None, 0.0
         return step
 
@@ -276,15 +270,6 @@ class MotionModel:
             variance=self.noise_ratios**2 * amounts + self._floors**2 + swung,
             amounts=amounts,
             causes=np.array([forward_m, yaw_rad, 0.0]),
-        )
-
-    def _compare(self, turn: NDArray[np.float64], wheels: Step, duration_s: float) -> None:
-        self._turns.compare(
-            turn,
-            se3.yaw_rad(wheels.T),
-            causes=wheels.causes,
-            variance=float(wheels.variance[1]),
-            duration_s=duration_s,
         )
 
 
