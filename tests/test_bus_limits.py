@@ -179,7 +179,7 @@ def test_constant_velocity_ends_at_its_horizon_and_keeps_the_twist():
         return replace(observation(0, has_odometry=False), stamp_ns=stamp_ns)
 
     T_step = se3.exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.2]))
-    bridge = Bridge(velocity_horizon_s=0.5, uses_odometry=True)
+    bridge = Bridge(is_active=True)
     bridge.update(at(S), se3.identity())
     bridge.update(at(S + S // 5), T_step)
     end_ns = S + S // 5 + S // 2

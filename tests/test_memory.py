@@ -17,7 +17,7 @@ def moment(index, *, is_trusted=True, has_pose=True):
         observation=replace(observation(index), image_bgr=image),
         T_map_base=se3.identity() if has_pose else None,
         module="a",
-        bridge=Bridge(velocity_horizon_s=0.5, uses_odometry=True),
+        bridge=Bridge(is_active=True),
         turn=None,
         covariance=None,
         is_trusted=is_trusted,

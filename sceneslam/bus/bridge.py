@@ -9,13 +9,15 @@ from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
+_VELOCITY_S = 0.5  # a robot without measurements is assumed to keep its velocity this long
+
 
 class Bridge:
-    """Predicts T_map_base from the last known pose on."""
+    """Predicts T_map_base from the last known pose on; if not `is_active`, only keeps that pose."""
 
-    def __init__(self, *, velocity_horizon_s: float, uses_odometry: bool) -> None:
-        self._uses_odometry = uses_odometry
-        self._horizon_ns = round(velocity_horizon_s * 1e9)
+    def __init__(self, *, is_active: bool) -> None:
+        self._is_active = is_active
+        self._horizon_ns = round(_VELOCITY_S * 1e9) if is_active else 0
         self._T_map_base: Transform | None = None
         self._T_odom_base: Transform | None = None
         self._stamp_ns = 0
@@ -59,13 +61,13 @@ class Bridge:
         used only with `by_velocity`, and within the horizon after the last measured pose.
         """
         if self._T_map_base is None:
-            if not self._uses_odometry or observation.T_odom_base is None:
+            if not self._is_active or observation.T_odom_base is None:
                 return None
             self._move(observation, se3.identity())  # the map begins where odometry does
         if observation.stamp_ns == self._stamp_ns:
             return self._T_map_base
         T_odom_prev, T_odom_curr = self._T_odom_base, observation.T_odom_base
-        if self._uses_odometry and T_odom_prev is not None and T_odom_curr is not None:
+        if self._is_active and T_odom_prev is not None and T_odom_curr is not None:
             T_prev_curr = se3.inverse(T_odom_prev) @ T_odom_curr
             if turn is not None:
                 # Roll and pitch stay the wheels': a module's tilt error would appear as a climb.

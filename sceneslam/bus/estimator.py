@@ -25,8 +25,6 @@ from sceneslam.types.rig import Rig
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
 
-_VELOCITY_S = 0.5  # a robot without measurements is assumed to keep its velocity this long
-
 
 @dataclass(frozen=True, slots=True)
 class _Ending:
@@ -44,9 +42,7 @@ class Estimator:
     ) -> None:
         self._policy, self._rig, self._back_end, self._log = policy, rig, back_end, log
         # The paper's (cold) hand-over uses a module's last pose and nothing after it.
-        is_bridged = policy.handover != "cold"
-        horizon_s = _VELOCITY_S if is_bridged else 0.0
-        bridge = Bridge(velocity_horizon_s=horizon_s, uses_odometry=is_bridged)
+        bridge = Bridge(is_active=policy.handover != "cold")
         self._session = ModuleSession(None, self._new_hold(), bridge)
         self._memory = ObservationBuffer(
             span_s=policy.buffer_s if policy.handover == "rewind" else 0.0,
