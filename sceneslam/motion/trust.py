@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
 
+_DOUBT = 10.0  # weight of the prior of a noise, in comparisons
+_MEMORY = 200.0  # comparisons in its posterior, about
 _STUDENT = 4.0  # degrees of freedom: an error of 5 standard deviations has weight 1/6
 _HONEST_S, _LYING_S = 300.0, 5.0  # mean durations of correct and of wrong odometry
 _EVIDENCE_MAX = 3.0  # log-likelihood ratio of one comparison; consecutive ones correlate
@@ -27,13 +29,11 @@ class NoiseRatio:
     """
 
     ratio: float
-    doubt: float = 10.0  # weight of the prior, in comparisons
-    memory: float = 200.0  # comparisons in the posterior, about
     _square: float = field(init=False)
-    _count: float = field(init=False)
+    _count: float = field(default=_DOUBT, init=False)
 
     def __post_init__(self) -> None:
-        self._square, self._count = self.ratio**2, self.doubt
+        self._square = self.ratio**2
 
     def learn(
         self, missed: float, amount: float, *, floor: float, variance: float, share: float
@@ -49,7 +49,7 @@ class NoiseRatio:
         part = moved / noise  # share of the noise that is caused by motion
         square = part**2 * square + part * (1.0 - part) * noise
         weight = share * gain * part
-        kept = 1.0 - weight / self.memory
+        kept = 1.0 - weight / _MEMORY
         total = kept * self._count + weight
         self._square = (kept * self._count * self._square + weight * square / amount) / total
         self._count = total
