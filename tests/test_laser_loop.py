@@ -225,6 +225,15 @@ def test_pose_graph_of_the_map_holds_every_keyframe_and_edge():
     assert (np.linalg.eigvalsh(graph.information) > 0).all()
 
 
+def test_loops_that_are_left_to_the_atlas_make_no_graph():
+    module = LaserSlam(**(settings() | {"close_loops": False}))
+    module.activate(Rig(sensors=frozenset({Sensor.SCAN}), laser=Laser()))
+    for observation in drive(room(), loop_path(20), rng=np.random.default_rng(1)):
+        module.track(observation)
+    layers = module.get_map()
+    assert layers.pose_graph is None and layers.grid is not None
+
+
 def test_scan_that_comes_twice_leaves_the_revised_poses_finite():
     path = loop_path(60)
     observations = drive(room(), path, odometry=path, rng=np.random.default_rng(4))

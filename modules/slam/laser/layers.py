@@ -20,9 +20,9 @@ _LEVEL_DEVIATION = 0.01  # m and rad: standard deviation of z, roll and pitch on
 
 
 def map_layers(
-    keyframes: ScanKeyframes, edges: Sequence[ScanEdge], *, resolution_m: float
+    keyframes: ScanKeyframes, edges: Sequence[ScanEdge] | None, *, resolution_m: float
 ) -> MapLayers:
-    """Return the grid, points and pose graph of the keyframes, in `local`."""
+    """Return grid, points and pose graph of the keyframes, in `local`; edges None: no graph."""
     reader = keyframes.reader
     grid = OccupancyGrid(resolution_m)
     clouds = [np.zeros((0, 2))]
@@ -36,7 +36,7 @@ def map_layers(
     return MapLayers(
         points=PointLayer(points=cloud),
         grid=grid.layer(),
-        pose_graph=_graph(keyframes, edges),
+        pose_graph=None if edges is None else _graph(keyframes, edges),
     )
 
 

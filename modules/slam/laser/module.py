@@ -131,12 +131,15 @@ class LaserSlam:
         return self._front_end.history.trajectory()
 
     def get_map(self) -> MapLayers:
-        """Return the grid and points of all keyframes, and their pose graph, in `local`."""
+        """Return the grid and points of all keyframes, in `local`, and the pose graph.
+
+        There is none without `close_loops`: then the atlas closes the loops, at the end.
+        """
         if self._front_end is None:
             return MapLayers()
         return map_layers(
             self._front_end.keyframes,
-            self._front_end.back_end.graph.edges,
+            self._front_end.back_end.graph.edges if self.close_loops else None,
             resolution_m=self.resolution_m,
         )
 
