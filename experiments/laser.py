@@ -14,7 +14,7 @@ import cProfile
 import pstats
 import sys
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
@@ -66,6 +66,19 @@ def seen_by_less(observations: Iterable[Observation], fov_deg: float, range_m: f
         yield replace(observation, scan=replace(observation.scan, ranges_m=ranges_m))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Log:
+    """A log with the relations that its poses are compared with."""
+
+    source: Carmen
+    relations: Relations
+
+    def errors(self, trajectory: Trajectory) -> dict[str, float]:
+        """Return the errors of a trajectory; relations name scans by the log's own stamps."""
+        stamps_ns = self.source.logged_ns(trajectory.stamps_ns)
+        return relation_errors(trajectory.stamped(stamps_ns), self.relations)
+
+
 class Run:
     """One pass of the laser module over a log."""
 
@@ -85,11 +98,10 @@ class Run:
         self.map = self.module.get_map()
         self.cpu_s = process_time() - began_s
 
-    def row(self, name: str, relations: Relations, mirror_ns: int = 0) -> str:
+    def row(self, name: str, log: Log, mirror_ns: int = 0) -> str:
         """Return a line of the table."""
         revised, online = (
-            relation_errors(unmirrored(one, mirror_ns), relations)
-            for one in (self.revised, self.online)
+            log.errors(unmirrored(one, mirror_ns)) for one in (self.revised, self.online)
         )
         span_s = np.ptp(self.online.stamps_ns) * 1e-9
         costs = np.array(self.costs_ms)
@@ -125,25 +137,24 @@ def draw(grid: GridLayer, path: Path) -> None:
     cv2.imwrite(str(path), half, [cv2.IMWRITE_PNG_COMPRESSION, 9, cv2.IMWRITE_PNG_BILEVEL, 0])
 
 
-def compare(source: Carmen, relations: Relations) -> None:
+def compare(log: Log) -> None:
     """Print odometry, the laser without loops, and with them; and what memory it took."""
-    observations = list(source)
-    odometry = relation_errors(
+    source, observations = log.source, list(log.source)
+    odometry = log.errors(
         Trajectory(
             stamps_ns=np.array([one.stamp_ns for one in observations]),
             T_world_base=np.stack([one.T_odom_base for one in observations]),
-        ),
-        relations,
+        )
     )
     print(f"{HEAD}\n|---|---|---|---|---|---|")
     print(
         f"| wheel odometry | {spread(odometry, 'trans', 'm')} "
         f"| {spread(odometry, 'rot', 'deg')} | | | |"
     )
-    print(Run(source.rig, observations, close_loops=False).row("no loops", relations))
+    print(Run(source.rig, observations, close_loops=False).row("no loops", log))
     before_mb = getrusage(RUSAGE_SELF).ru_maxrss / 1e3
     run = Run(source.rig, observations)
-    print(run.row("with loops", relations))
+    print(run.row("with loops", log))
     graph = run.map.pose_graph
     print(
         f"\n{odometry['matched']} of {odometry['total']} relations matched; "
@@ -153,26 +164,26 @@ def compare(source: Carmen, relations: Relations) -> None:
     )
 
 
-def harder(source: Carmen, relations: Relations) -> None:
+def harder(log: Log) -> None:
     """Print how the module does where it sees less, or the same from the other end."""
-    observations = list(source)
+    source, observations = log.source, list(log.source)
     last_ns = observations[-1].stamp_ns
     print(f"{HEAD}\n|---|---|---|---|---|---|")
-    print(Run(source.rig, observations[::3]).row("every third scan", relations), flush=True)
-    print(Run(source.rig, backwards(observations)).row("backwards", relations, last_ns), flush=True)
+    print(Run(source.rig, observations[::3]).row("every third scan", log), flush=True)
+    print(Run(source.rig, backwards(observations)).row("backwards", log, last_ns), flush=True)
     for fov_deg, range_m in ((90, 8), (57, 4)):
         view = seen_by_less(observations, fov_deg, range_m)
-        print(Run(source.rig, view).row(f"{fov_deg} deg, {range_m} m", relations), flush=True)
+        print(Run(source.rig, view).row(f"{fov_deg} deg, {range_m} m", log), flush=True)
 
 
 def main() -> None:
     """Run one of the commands above."""
     cv2.setNumThreads(1)
-    log, relations_path, *words = sys.argv[1:]
-    source = Carmen(**{**settings("source/carmen.yaml"), "path": log})
-    relations = Relations.read(Path(relations_path))
+    path, relations, *words = sys.argv[1:]
+    source = Carmen(**{**settings("source/carmen.yaml"), "path": path})
+    log = Log(source=source, relations=Relations.read(Path(relations)))
     if words == ["harder"]:
-        harder(source, relations)
+        harder(log)
     elif words == ["profile"]:
         with cProfile.Profile() as profile:
             Run(source.rig, islice(source, 4000))
@@ -182,7 +193,7 @@ def main() -> None:
             grid = Run(source.rig, source, close_loops=closes).map.grid
             draw(grid, Path(words[1]) / f"{name}.png")
     else:
-        compare(source, relations)
+        compare(log)
 
 
 if __name__ == "__main__":
