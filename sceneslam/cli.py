@@ -206,7 +206,10 @@ def _reference(config: DictConfig) -> dict[str, Any]:
     if not isinstance(config.reference, DictConfig):
         raise ConfigError("reference", config.reference, allowed)
     try:
-        own = {"reference": None, "atlas": {"save": None}}  # the map that is saved is the run's
+        own: dict[str, Any] = {"reference": None}
+        if OmegaConf.select(config, "atlas.save") is not None:
+            save = OmegaConf.select(config.reference, "atlas.save")  # not the run's
+            own["atlas"] = {"save": save}
         other = OmegaConf.merge(config, config.reference, own)
     except OmegaConfBaseException as error:
         key = f"reference.{getattr(error, 'full_key', '') or ''}".rstrip(".")

@@ -11,7 +11,13 @@ from test_atlas_places import CELL, plan_of, quality, text_of
 
 from sceneslam.atlas.lasting import lasting_map, merge
 from sceneslam.atlas.lasting.lasting_map import LastingMap
-from sceneslam.atlas.lasting.map_files import HEAD, OLD, load_map_files, save_map_files
+from sceneslam.atlas.lasting.map_files import (
+    HEAD,
+    OLD,
+    SavedFiles,
+    load_map_files,
+    save_map_files,
+)
 from sceneslam.atlas.lasting.merge import join_pieces
 from sceneslam.atlas.lasting.prune import prune
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map, forget_contradicted
@@ -22,6 +28,7 @@ from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.maps.inspect import flaws
 from sceneslam.types import planar
 from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.files import MARK, owned
 
 S = 10**9
 WALL = plan_of("#" * 40)
@@ -248,9 +255,19 @@ def test_pieces_are_numbered_again_where_one_was_joined(monkeypatch):
     assert (joined.joined, joined.apart) == (1, 1) and joined.map.pieces.tolist() == [0, 0, 0, 0, 1]
 
 
+def test_what_was_joined_is_looked_for_again(monkeypatch):
+    """The first shows one submap of either piece: two agree when they are one piece."""
+    saved = replace(two_pieces(), pieces=np.array([0, 1, 1, 2, 2]))
+    apart = [None] * 4
+    each = [at(9.0, 5.0), at(9.0, 6.0)]
+    Found(monkeypatch, [*apart, *each, *[at(20.0, 5.0 + index) for index in range(4)]])
+    joined = join_pieces(saved)
+    assert (joined.joined, joined.apart) == (2, 0) and joined.map.pieces.tolist() == [0] * 5
+
+
 def test_pieces_are_joined_with_each_other_where_the_first_shows_neither(monkeypatch):
     saved = replace(two_pieces(), pieces=np.array([0, 2, 2, 7, 7]))
-    Found(monkeypatch, [None] * 4 + [at(9.0, 5.0), at(9.0, 6.0)])
+    Found(monkeypatch, [None] * 4 + [at(9.0, 5.0), at(9.0, 6.0)] + [None] * 4)
     joined = join_pieces(saved)
     assert (joined.joined, joined.apart) == (1, 1) and joined.map.pieces.tolist() == [0, 1, 1, 1, 1]
     Found(monkeypatch, [None] * 9)
@@ -412,13 +429,25 @@ def test_a_place_where_no_map_can_be_is_named_before_the_run(tmp_path, path):
             LastingMap(**given, mode="extend", save_every_s=1.0)
 
 
-def test_a_map_that_another_run_saved_is_kept(tmp_path):
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_map_that_another_run_saved_is_kept(tmp_path, version):
     old, new = whole_map(), map_of(WALL)
-    save_map_files(old, tmp_path)
-    save_map_files(new, tmp_path)
+    first = save_map_files(old, tmp_path)
+    head = (tmp_path / HEAD).read_text()
+    (tmp_path / HEAD).write_text(head.replace("version: 2", f"version: {version}"))
+    assert save_map_files(new, tmp_path).displaced == first.seal
+    assert first.displaced is None and f"version: {version}" in (tmp_path / OLD).read_text()
+    (tmp_path / OLD).write_text(head)
     assert len(load_map_files(tmp_path).submaps) == 1
     (tmp_path / OLD).replace(tmp_path / HEAD)
     assert len(load_map_files(tmp_path).submaps) == len(old.submaps)
+
+
+def test_a_map_in_the_folder_of_a_run_is_not_the_runs(tmp_path):
+    """The next run there removes what the one before wrote, but no map."""
+    (tmp_path / MARK).write_text("{}\n")
+    save_map_files(whole_map(), tmp_path / "world")
+    assert owned(tmp_path) == []
 
 
 # When a run is saved.
@@ -441,7 +470,7 @@ def lasting(tmp_path, monkeypatch, *, every_s=2.0):
 
     def save(saved, folder, *, known):
         written.append(saved)
-        return "seal"
+        return SavedFiles(seal="seal", displaced=None)
 
     monkeypatch.setattr(lasting_map, "save_map_files", save)
     own.open(is_live=False)

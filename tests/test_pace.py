@@ -72,6 +72,19 @@ def test_poses_in_between_are_the_modules_where_one_observation_has_nothing_for_
     assert errors_m(atlas.trajectory)[41:44].max() < 0.01
 
 
+def test_poses_where_the_module_was_lost_stay_bridged():
+    """It is asked at 46, and at every observation until it tracks again at 56."""
+    _, atlas, _, _ = drive(
+        {"bright": ExactModule(), "dark": ExactModule(lost=range(44, 56))},
+        feed=slipping,
+        catch_up=EVERY_THIRD,
+        **SWITCHED,
+    )
+    keys = atlas.pose_modules
+    assert keys[41:46] == ("dark",) * 5 and keys[46:56] == (BRIDGED,) * 10
+    assert keys[56:62] == ("dark",) * 6 and errors_m(atlas.trajectory)[41:56].max() < 0.1
+
+
 @pytest.mark.parametrize("limit", [2, 5])
 def test_spared_observations_do_not_count_in_live_mode(limit):
     """21 observations wait for the new module, of which it is given 7."""

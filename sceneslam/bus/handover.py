@@ -39,7 +39,7 @@ class Handover:
         ] = []  # after the anchor, or from it if no module gave its pose
         self.tracked: list[Tracking] = []  # its answers from the anchor on, while it tracks
         self._pace, self._memory = pace, memory
-        self._has_spared = False  # observations were skipped since the last answer
+        self._spared_ns: list[int] = []  # of observations skipped since it tracked
         self._given_ns = anchor.stamp_ns  # the last that it was given and tracked
         self._began_ns, self._done_ns = anchor.stamp_ns, anchor.stamp_ns - 1
         self._reported: Transform | None = None  # the pose of the moment before, as known then
@@ -117,7 +117,7 @@ class Handover:
         is_sure = session.is_placed and session.hold.is_held
         if is_sure and not is_newest and self._pace.spares(moment.observation):
             self._pace.spare(moment.observation)
-            self._has_spared = True
+            self._spared_ns.append(moment.stamp_ns)
             self._remember(moment, session.skip(moment.observation, motion))
             return False
         self._ask(moment, motion)
@@ -131,7 +131,10 @@ class Handover:
             given = self._pace.give(given)
         else:
             self._pace.spare(given)
-        T_map_told = session.told(given, motion)
+            if self._spared_ns:
+                self._spared_ns.append(given.stamp_ns)
+        has_spared = was_placed and bool(self._spared_ns)
+        T_map_told = session.told(given, motion) if has_spared else None
         found = session.advance(given, by_velocity=True, T_prev_curr=motion)
         if session.fault is not None:
             raise session.fault
@@ -141,10 +144,10 @@ class Handover:
                 self._first_cost_ns = self._cost_ns + perf_counter_ns() - self._since_ns
             self.tracked.append(session.tracking)
             assert found.T_map_base is not None
-            if self._has_spared and T_map_told is not None and not session.hold.is_revised:
+            if T_map_told is not None and not session.hold.is_revised:
                 T_told_base = se3.inverse(T_map_told) @ found.T_map_base
                 self._bend(session.tracking, T_told_base)
-            self._has_spared, self._given_ns = False, moment.stamp_ns
+            self._spared_ns, self._given_ns = [], moment.stamp_ns
         self._remember(moment, replace(found, observation=moment.observation))
 
     def _motion_to(self, moment: BufferedObservation) -> Transform | None:
@@ -162,15 +165,13 @@ class Handover:
         """Distribute the drift of the trail since the module's last answer, which odometry bridged.
 
         `T_told_base` (4, 4) is the module's pose now, in the frame of the pose that odometry led
-        to.
+        to. What it was not asked about has its key; where it was lost, poses stay bridged.
         """
         xi, given_s = se3.log(T_told_base), (tracking.stamp_ns - self._given_ns) / 1e9
         first = bisect_right(self.trail, self._given_ns, key=lambda each: each.stamp_ns)
         for index, moment in enumerate(self.trail[first:], first):
             share = (moment.stamp_ns - self._given_ns) / 1e9 / given_s
-            self.trail[index] = replace(
-                moment,
-                T_map_base=moment.bridge.follow(moment.observation, se3.exp(share * xi)),
-                module=self.runner.key,
-                covariance=tracking.covariance,
-            )
+            bent = moment.bridge.follow(moment.observation, se3.exp(share * xi))
+            moment = self.trail[index] = replace(moment, T_map_base=bent)
+            if moment.stamp_ns in self._spared_ns:
+                moment.module, moment.covariance = self.runner.key, tracking.covariance

@@ -23,7 +23,15 @@ def replacing(path: Path, mode: str = "w", **options: Any) -> Iterator[IO[Any]]:
     `mode` and `options` are those of `open`. Raises FileExistsError as `own` does.
     """
     own(path)
-    part = part_of(path)
+    part_of(path)
+    with whole(path, mode, **options) as file:
+        yield file
+
+
+@contextmanager
+def whole(path: Path, mode: str = "w", **options: Any) -> Iterator[IO[Any]]:
+    """Open a file as `replacing` does, but one that outlasts the run, and is not listed."""
+    part = path.with_name(path.name + PART)
     try:
         with part.open(mode, **options) as file:
             yield file

@@ -9,7 +9,7 @@ from pathlib import Path
 from sceneslam.atlas.lasting.map_files import (
     OLD,
     check_map_folder,
-    load_map_files,
+    read_map_files,
     save_map_files,
     seal_of,
 )
@@ -46,12 +46,12 @@ class LastingMap:
         self.faults: list[str] = []
         self._saved_ns: int | None = None
         self._executor: Executor = InStep()
-        self._writing: Future[None] | None = None
+        self._writing: Future[bool] | None = None
         self._seal: str | None = None  # of the map that this run takes the place of
         try:
             if self._load is not None:
-                self.loaded = load_map_files(self._load)
-                self._seal = seal_of(self._load) if self._load == self._save else None
+                self.loaded, seal = read_map_files(self._load)
+                self._seal = seal if self._load == self._save else None
         except (InputError, OSError) as error:
             allowed = f"the folder of a saved map ({text_of(error)})"
             raise ConfigError("load", str(load), allowed) from error
@@ -89,18 +89,17 @@ class LastingMap:
     def finish(self, mapper: Mapper, stamp_ns: int, note: Note) -> None:
         """Save at the end, and report if the run was not located in the loaded map."""
         if self._load is not None and not mapper.is_found:
-            what = "was found, but its walls contradict" if mapper.was_found else "was not found in"
+            what = "was found in, and contradicted by," if mapper.was_found else "was not found in"
             self.faults.append(
                 f"the run {what} the map {self._load}, its poses are in its own frame"
             )
         self._executor.shutdown()
-        saved = mapper.saved()
         if self._save is None:
             return
+        saved = mapper.saved()
         if not saved.submaps and seal_of(self._save) is not None:
             self._fault(f"the run has nothing to save, the map that was in {self._save} stays")
-        else:
-            self._write(saved, mapper.is_found)
+        elif self._write(saved, mapper.is_found):
             note("map_saved", stamp_ns, submaps=len(saved.submaps), loops=_loops(saved))
 
     def _updated(self, saved: SavedMap, is_found: bool) -> SavedMap:
@@ -108,22 +107,22 @@ class LastingMap:
             return forget_contradicted(saved, self.loaded.runs)
         return saved
 
-    def _write(self, saved: SavedMap, is_found: bool) -> None:
+    def _write(self, saved: SavedMap, is_found: bool) -> bool:
+        """Save a map; return whether it was possible."""
         assert self._save is not None
         try:
-            before = seal_of(self._save)
-            updated = self._updated(saved, is_found)
-            seal = save_map_files(updated, self._save, known=self._seal)
+            files = save_map_files(self._updated(saved, is_found), self._save, known=self._seal)
         except (OSError, InputError) as error:
             self._fault(f"the map could not be saved: {text_of(error)}")
-            return
-        if before not in (None, self._seal, seal):
+            return False
+        if files.displaced is not None:
             kept = f"the map that was in {self._save} is kept, its head is {OLD} there"
             if self._seal is None:
                 _log.warning(kept)
             else:
                 self._fault(f"another run saved its map meanwhile: {kept}")
-        self._seal = seal
+        self._seal = files.seal
+        return True
 
     def _fault(self, fault: str) -> None:
         if fault not in self.faults:

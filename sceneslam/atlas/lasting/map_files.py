@@ -14,6 +14,7 @@ import os
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types.errors import InputError, text_of
-from sceneslam.types.files import PART, replacing
+from sceneslam.types.files import PART, whole
 from sceneslam.views.view import Landmarks, PlacedView
 
 HEAD, FORMAT, VERSION = "map.yaml", "sceneslam-map", 2
@@ -78,12 +79,19 @@ def check_map_folder(folder: Path) -> None:
         raise InputError(f"a map is saved in a folder of its own, {others[0].name} is in: {folder}")
 
 
-def save_map_files(saved: SavedMap, folder: Path, *, known: str | None = None) -> str:
-    """Write the map into its own folder; the same map gives the same bytes. Return its checksum.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SavedFiles:
+    """What became of a folder in which a map was saved."""
 
-    `known` is the checksum of the map that this one takes the place of. A map that has another one
-    is kept: its head is copied to OLD. Raises InputError if the folder holds something else,
-    OSError if it cannot be written.
+    seal: str  # checksum of the map
+    displaced: str | None  # that of another map, which is kept: its head was copied to OLD
+
+
+def save_map_files(saved: SavedMap, folder: Path, *, known: str | None = None) -> SavedFiles:
+    """Write the map into its own folder; the same map gives the same bytes.
+
+    `known` is the checksum of the map that this one takes the place of; any other is kept. Raises
+    InputError if the folder holds something else, OSError if it cannot be written.
     """
     check_map_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -97,36 +105,42 @@ def save_map_files(saved: SavedMap, folder: Path, *, known: str | None = None) -
         "arrays": name,
         "sha256": seal,
         "cell_m": CELL_M,
-        **_counts(saved),
+        "submaps": len(saved.submaps),
+        "edges": len(saved.edges),
+        "runs": len({submap.run for submap in saved.submaps}),
+        "pieces": len(np.unique(saved.pieces)),
         "modules": modules,
     }
     with _locked(folder, fcntl.LOCK_EX):
-        with replacing(folder / name, "wb") as file:
+        before = seal_of(folder)
+        displaced = None if before in (known, seal) else before
+        with whole(folder / name, "wb") as file:
             file.write(data)
-        if seal_of(folder) not in (None, known, seal):
-            with replacing(folder / OLD) as file:
+        if displaced is not None:
+            with whole(folder / OLD) as file:
                 file.write((folder / HEAD).read_text())
-        with replacing(folder / HEAD) as file:
+        with whole(folder / HEAD) as file:
             yaml.safe_dump(head, file, sort_keys=False)
-        kept = {HEAD, OLD, name, _arrays_of(folder / OLD)}
+        kept = {HEAD, OLD, name, _head(folder / OLD).get("arrays")}
         for path in folder.iterdir():
-            if path.name not in kept:
+            if _is_ours(path) and path.name not in kept:
                 path.unlink()
-    return seal
+    return SavedFiles(seal=seal, displaced=displaced)
 
 
 def seal_of(folder: Path) -> str | None:
-    """Return the checksum of the map in a folder, None without a map."""
-    with suppress(InputError):
-        return str(_read_head(folder)["sha256"])
-    return None
+    """Return the checksum of the map in a folder, of whatever version, None without a map."""
+    seal = _head(folder / HEAD).get("sha256")
+    return None if seal is None else str(seal)
 
 
-def _arrays_of(path: Path) -> str | None:
-    """Return the name of the arrays of the map with a head, None without one."""
-    with suppress(OSError, ValueError, yaml.YAMLError, AttributeError):
-        return str(yaml.safe_load(path.read_text()).get("arrays"))
-    return None
+def _head(path: Path) -> dict[str, Any]:
+    """Return a map's head, empty for a file that is none."""
+    with suppress(OSError, ValueError, RecursionError, yaml.YAMLError):
+        head = yaml.safe_load(path.read_text())
+        if isinstance(head, dict) and head.get("format") == FORMAT:
+            return head
+    return {}
 
 
 @contextmanager
@@ -141,17 +155,13 @@ def _locked(folder: Path, kind: int) -> Iterator[None]:
         os.close(handle)
 
 
-def _counts(saved: SavedMap) -> dict[str, int]:
-    return {
-        "submaps": len(saved.submaps),
-        "edges": len(saved.edges),
-        "runs": len({submap.run for submap in saved.submaps}),
-        "pieces": len(np.unique(saved.pieces)),
-    }
-
-
 def load_map_files(folder: Path) -> SavedMap:
     """Return the map of a folder; raises InputError that says what is wrong with it."""
+    return read_map_files(folder)[0]
+
+
+def read_map_files(folder: Path) -> tuple[SavedMap, str]:
+    """Return the map of a folder with its checksum; raises InputError as `load_map_files` does."""
     if not folder.is_dir():
         raise InputError(f"there is no map, the folder is missing: {folder}")
     try:
@@ -175,12 +185,13 @@ def load_map_files(folder: Path) -> SavedMap:
     if not isinstance(modules, list) or arrays["node_module"].max(initial=-1) >= len(modules):
         raise InputError(f"modules: expected the names that the submaps refer to: {folder / HEAD}")
     saved = _unpacked(arrays, [str(module) for module in modules])
-    for key, count in _counts(saved).items():
+    counts = {"submaps": len(saved.submaps), "edges": len(saved.edges)}
+    for key, count in counts.items():
         if head.get(key) != count:
             raise InputError(
                 f"{key}: got {head.get(key)!r}, the arrays have {count}: {folder / HEAD}"
             )
-    return saved
+    return saved, str(head["sha256"])
 
 
 def _is_ours(path: Path) -> bool:
@@ -188,14 +199,7 @@ def _is_ours(path: Path) -> bool:
     name = path.name.removesuffix(PART)
     if name.startswith(_ARRAYS):
         return name.endswith(".npz")
-    return name in (HEAD, OLD) and (path.name != name or _is_head(path))
-
-
-def _is_head(path: Path) -> bool:
-    with suppress(OSError, ValueError, RecursionError, yaml.YAMLError):
-        head = yaml.safe_load(path.read_text())
-        return isinstance(head, dict) and head.get("format") == FORMAT
-    return False
+    return name in (HEAD, OLD) and (path.name != name or bool(_head(path)))
 
 
 def _read_head(folder: Path) -> dict[str, Any]:

@@ -53,8 +53,8 @@ def join_pieces(saved: SavedMap) -> Joined:
             found = _joined(saved, target, piece)
             if found is not None:
                 saved, joined = _renumbered(found), joined + 1
-                break  # what is larger now may show pieces that were not recognized before
-        target += found is None
+                break
+        target = target + 1 if found is None else 0  # what is larger now may be recognized
     return Joined(map=saved, joined=joined, apart=max(target - 1, 0))
 
 
