@@ -69,7 +69,8 @@ class Mapper:
         self._is_level = True  # at the last step
         self._T_map_run: Transform | None = None
         self._began_ns: int | None = None
-        self._has_told = self._was_found = False
+        self._has_told = False
+        self.was_found = False  # the run was located in the loaded map, at any time
         self._loops: list[Edge] = []
         self._T_map_node: NDArray[np.float64] | None = None  # (N, 4, 4) the run's, once solved
 
@@ -77,11 +78,6 @@ class Mapper:
     def is_placed(self) -> bool:
         """Tell whether the run was located in a loaded map."""
         return self._T_map_run is not None
-
-    @property
-    def was_found(self) -> bool:
-        """Tell whether the run was located in the loaded map at any time."""
-        return self._was_found
 
     @property
     def has_submaps(self) -> bool:
@@ -224,7 +220,7 @@ class Mapper:
         after_s = (stamp_ns - self._began_ns) / 1e9
         self._T_map_run = localizer.T_map_run
         if outcome is LocalizationEvent.FOUND:
-            self._was_found = True
+            self.was_found = True
             self._note(outcome.value, stamp_ns, after_s=after_s, T_map_run=self.T_map_run.tolist())
         elif outcome is LocalizationEvent.WITHDRAWN:
             self._note(outcome.value, stamp_ns, after_s=after_s)

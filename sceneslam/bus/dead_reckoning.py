@@ -79,9 +79,9 @@ class DeadReckoning:
     def learn(self, hold: Hold, module: str) -> None:
         """Update the wheels' scale by the distance that the active module measured."""
         if self._learns and module:
-            new = WheelScale(deviation=self._drift, limit=self._limit)
-            scale = self._scales.setdefault(module, new)
-            scale.learn(hold, self._T_odom_base, self._turned_rad)
+            if module not in self._scales:
+                self._scales[module] = WheelScale(deviation=self._drift, limit=self._limit)
+            self._scales[module].learn(hold, self._T_odom_base, self._turned_rad)
 
     def close(self, stamp_ns: int, log: EventLog) -> None:
         """Log the calibration, if there is one. May be called twice."""

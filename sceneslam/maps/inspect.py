@@ -16,7 +16,7 @@ def described(saved: SavedMap) -> list[str]:
     """Return the map's contents, a line per piece."""
     loops = sum(edge.kind is EdgeKind.LOOP for edge in saved.edges)
     lines = [
-        f"submaps: {len(saved.submaps)}, runs: {len({one.run for one in saved.submaps})}, "
+        f"submaps: {len(saved.submaps)}, runs: {saved.run_count}, "
         f"edges: {len(saved.edges)}, of them loops: {loops}"
     ]
     for piece in np.unique(saved.pieces).tolist():

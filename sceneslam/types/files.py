@@ -23,7 +23,7 @@ def replacing(path: Path, mode: str = "w", **options: Any) -> Iterator[IO[Any]]:
     `mode` and `options` are those of `open`. Raises FileExistsError as `own` does.
     """
     own(path)
-    part_of(path)
+    own(path.with_name(path.name + PART))
     with whole(path, mode, **options) as file:
         yield file
 

@@ -45,6 +45,17 @@ class _Matched:
     rays: NDArray[np.float64]  # (N, 2)
     depth_m: NDArray[np.float64]  # (N,), 0 = missing
 
+    @classmethod
+    def of(
+        cls, points: NDArray[np.floating], view: LandmarkView, columns: NDArray[np.int64]
+    ) -> _Matched:
+        """Return points (N, 3) that are the features `columns` (N,) of a view."""
+        return cls(
+            points=points.astype(float),
+            rays=view.rays[columns].astype(float),
+            depth_m=view.depth_m[columns].astype(float),
+        )
+
     def __getitem__(self, rows: NDArray[Any]) -> _Matched:
         return _Matched(points=self.points[rows], rays=self.rays[rows], depth_m=self.depth_m[rows])
 
@@ -82,11 +93,7 @@ class ViewFinder:
         rows, columns = matches(landmarks.descriptors, view.descriptors)
         if len(rows) < MATCHES_MIN:
             return None
-        found = _Matched(
-            points=landmarks.points_base[rows].astype(float),
-            rays=view.rays[columns].astype(float),
-            depth_m=view.depth_m[columns].astype(float),
-        )
+        found = _Matched.of(landmarks.points_base[rows], view, columns)
         error = _ERROR_PX / self._camera.fx
         is_found, turn, shift, inliers = cv2.solvePnPRansac(
             found.points,
@@ -152,11 +159,7 @@ class ViewFinder:
         points = np.stack(
             [np.bincount(owner, every[rows, axis]) / counts for axis in range(3)], axis=1
         )
-        return _Matched(
-            points=points,
-            rays=view.rays[columns].astype(float),
-            depth_m=view.depth_m[columns].astype(float),
-        )
+        return _Matched.of(points, view, columns)
 
     def _sighting(
         self, T_map_seen: Transform, T_cam_seen: Transform, found: _Matched, view: LandmarkView

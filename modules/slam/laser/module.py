@@ -133,7 +133,7 @@ class LaserSlam:
     def get_map(self) -> MapLayers:
         """Return the grid and points of all keyframes, in `local`, and the pose graph.
 
-        There is none without `close_loops`: then the atlas closes the loops, at the end.
+        Without `close_loops` the graph is missing: then the atlas closes the loops, at the end.
         """
         if self._front_end is None:
             return MapLayers()

@@ -107,7 +107,7 @@ def save_map_files(saved: SavedMap, folder: Path, *, known: str | None = None) -
         "cell_m": CELL_M,
         "submaps": len(saved.submaps),
         "edges": len(saved.edges),
-        "runs": len({submap.run for submap in saved.submaps}),
+        "runs": saved.run_count,
         "pieces": len(np.unique(saved.pieces)),
         "modules": modules,
     }
@@ -135,7 +135,7 @@ def seal_of(folder: Path) -> str | None:
 
 
 def _head(path: Path) -> dict[str, Any]:
-    """Return a map's head, empty for a file that is none."""
+    """Return a map's head, empty if the file is not one."""
     with suppress(OSError, ValueError, RecursionError, yaml.YAMLError):
         head = yaml.safe_load(path.read_text())
         if isinstance(head, dict) and head.get("format") == FORMAT:

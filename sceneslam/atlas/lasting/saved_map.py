@@ -34,6 +34,11 @@ class SavedMap:
         return 1 + max((submap.run for submap in self.submaps), default=-1)
 
     @property
+    def run_count(self) -> int:
+        """Return how many of these runs have submaps left."""
+        return len({submap.run for submap in self.submaps})
+
+    @property
     def plane(self) -> NDArray[np.float64]:
         """Return the nodes (N, 3) in the plane [m, m, rad]."""
         return planar.from_transforms(self.T_map_node)
