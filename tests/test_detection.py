@@ -148,6 +148,13 @@ def test_modules_are_not_built_by_a_run_without_slam(config, tmp_path):
         run(config("+scenario=bright_to_dark", "run=detect_only"), tmp_path)
 
 
+@pytest.mark.parametrize("key", ["atlas.load", "atlas.save"])
+def test_map_is_refused_by_a_run_without_slam(config, tmp_path, key):
+    with pytest.raises(ConfigError, match=rf"{key}: got 'map', allowed: null where run\.mode is"):
+        detect(config(*TINY, "run=detect_only", f"{key}=map"), tmp_path / "alone")
+    assert list(tmp_path.iterdir()) == []
+
+
 def swept(cache, folder, *words):
     command = [sys.executable, "-m", "sceneslam", "-m", *TINY, "run=detect_only", *words]
     done = subprocess.run(

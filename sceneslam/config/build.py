@@ -98,6 +98,15 @@ def check_detector(config: Mapping[str, Any], detector: Detector, rig: Rig) -> N
     _check_sensors("detector", config["detector"], detector.requires, rig)
 
 
+def check_no_map(config: Mapping[str, Any]) -> None:
+    """Raise ConfigError if a run without SLAM, which makes no map, is to load or save one."""
+    atlas = _group(config, "atlas")
+    for name in ("load", "save"):
+        if atlas.get(name) is not None:
+            allowed = f"null where run.mode is {DETECT_ONLY}: no map is loaded or saved"
+            raise ConfigError(f"atlas.{name}", atlas[name], allowed)
+
+
 def _check_mode(run: RunSettings, source: Source) -> None:
     """Raise ConfigError if a live source is run in another mode than `live`."""
     if run.mode != LIVE and isinstance(source, Live) and source.live is not None:

@@ -12,7 +12,7 @@ from sceneslam.bus.events import EventLog
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.scene_filter import ConfirmedScene
 from sceneslam.bus.watch import log_vote
-from sceneslam.config.build import check_detector, make_source
+from sceneslam.config.build import check_detector, check_no_map, make_source
 from sceneslam.config.check import check_keys
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.provenance import save_config
@@ -43,6 +43,7 @@ class Watched:
 def watch(config: Mapping[str, Any]) -> Watched:
     """Return the features for a configuration; raises ConfigError or InputError."""
     check_keys(config)
+    check_no_map(config)
     builder = ComponentBuilder(config)
     run = builder.make("run", RunSettings)
     detector = builder.make("detector", FeatureDetector)
