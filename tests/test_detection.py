@@ -106,7 +106,7 @@ def test_recording_is_read_once_for_all_settings(config, tmp_path, cache, monkey
     words = (*TINY, "run=detect_only")
     detect(config(*words), tmp_path)
     monkeypatch.setattr("sceneslam.detection.recall.measure", None)  # a second time fails
-    detect(config(*words, "detector.threshold=60"), tmp_path)
+    detect(config(*words, "detector.threshold=60", "run.progress=true"), tmp_path)
     with pytest.raises(TypeError):
         detect(config(*words, "run.max_observations=50"), tmp_path)  # other images
 

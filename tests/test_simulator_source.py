@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
+from sceneslam.config.resolve import resolved
 from sceneslam.interfaces import Source
 from sceneslam.sources.simulator import source as module
 from sceneslam.sources.simulator.source import Simulator
@@ -130,6 +132,16 @@ def test_a_second_source_reads_the_cached_file(tmp_path: Path) -> None:
     before = file.stat().st_mtime_ns
     list(make(tmp_path, duration_s=0.1))
     assert file.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("progress", [True, False])
+def test_rendering_shows_a_bar_where_the_run_shows_its_progress(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], progress: bool
+) -> None:
+    with initialize_config_module("sceneslam.conf", version_base="1.3"):
+        config = resolved(compose("config", overrides=[f"run.progress={str(progress).lower()}"]))
+    list(make(tmp_path, duration_s=0.1, progress=config["source"]["progress"]))
+    assert ("rendering bright_to_dark" in capsys.readouterr().err) is progress
 
 
 def test_a_damaged_cache_file_is_rendered_anew(

@@ -18,6 +18,7 @@ from sceneslam.detection.features import RecordingFeatures, measure
 from sceneslam.interfaces import FeatureDetector, Source
 
 _CACHE = "~/.cache/sceneslam"
+_WITHOUT_EFFECT = ("progress", "workers")  # keys of a source that do not change its images
 
 
 def recall(
@@ -47,7 +48,7 @@ def _path(config: Mapping[str, Any], detector: FeatureDetector) -> Path:
     source = config["source"]
     node = config["detector"]
     depends_on = {
-        "source": {name: value for name, value in source.items() if name != "workers"},
+        "source": {name: value for name, value in source.items() if name not in _WITHOUT_EFFECT},
         "effects": config.get("effects"),
         "detector": {name: node.get(name) for name in ("_target_", *detector.feature_settings)},
         "max_observations": config["run"].get("max_observations"),

@@ -46,8 +46,8 @@ class Simulator:
 
     `lights` keeps the rooms' lamps on or off, against the story; `laser` switches the scanner on,
     `wheels` the encoders; `order` is a seed for the order of the building's rooms; `duration_s`
-    ends the story early. The same arguments give the same bytes, with any number of `workers`
-    (processes; null: one per core).
+    ends the story early; `progress` shows a bar while it renders. The same arguments give the same
+    bytes, with any number of `workers` (processes; null: one per core).
     """
 
     def __init__(
@@ -66,6 +66,7 @@ class Simulator:
         exposure: dict[str, Any],
         cache_dir: str,
         workers: int | None,
+        progress: bool,
     ) -> None:
         _require("story", story, f"one of {', '.join(stories.NAMES)}", story in stories.NAMES)
         _require("lights", lights, f"one of {', '.join(_LIGHTS)}", lights in _LIGHTS)
@@ -85,6 +86,7 @@ class Simulator:
         self._laser, self._wheels = laser, wheels
         self._cache_dir = Path(cache_dir)
         self._workers = workers or os.cpu_count() or 1
+        self._progress = progress
         self._reader: RosBag | None = None
 
     @property
@@ -185,14 +187,17 @@ class Simulator:
             greys = meter(shot, self.length)
             shot = replace(shot, exposures=follow(greys, self._exposure, shot.rate_hz))
         frames = render(shot, self.length, self._workers)
-        label = f"rendering {self._story_name}"
+        bar = tqdm(
+            frames,
+            desc=f"rendering {self._story_name}",
+            total=self.length,
+            unit="frame",
+            mininterval=0.5,
+            disable=not self._progress,
+        )
         writer = ros_writer.ObservationWriter(path, rig=self.rig, image_format="jpeg")
         try:
-            self._write(
-                writer,
-                shot,
-                tqdm(frames, desc=label, total=self.length, unit="frame", mininterval=0.5),
-            )
+            self._write(writer, shot, bar)
         finally:
             frames.close()
             writer.close()
