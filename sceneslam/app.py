@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from sceneslam.config.build import RunParts, build
 from sceneslam.config.provenance import save_config
 from sceneslam.evaluation.metrics import Metrics
 from sceneslam.evaluation.summary import summary_lines
-from sceneslam.interrupts import termination_as_interrupt, uninterrupted
+from sceneslam.interrupts import StopRequests, stop_requests
 from sceneslam.loop import RunLoop
 from sceneslam.results import Results
 from sceneslam.storage.folder import RunFolder, give_back
@@ -24,6 +25,12 @@ from sceneslam.types.errors import ConfigError, SceneSlamError, text_of
 from sceneslam.types.maps import HybridMap
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
+
+_log = logging.getLogger(__name__)
+_ANSWER = (
+    "the results are being saved; Ctrl-C again ends the run without them "
+    "(its poses are kept for python -m sceneslam.recover %s)"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -38,6 +45,7 @@ class Finished:
     truth: GroundTruth | None
     faults: tuple[str, ...]  # errors of the input, or why the run ended early
     is_interrupted: bool  # by Ctrl-C or SIGTERM
+    is_stop_requested: bool  # by one of them, also while the results were saved
 
     def __repr__(self) -> str:
         """Return the run in a few lines, as the command line prints it."""
@@ -55,7 +63,8 @@ def run(
     """Run a resolved configuration and write its folder; `say` receives the survey's warnings.
 
     Raises ConfigError or InputError if nothing could be run. The reason for an early end (Ctrl-C,
-    damaged input, no module left) is in `faults`, and all results so far are saved.
+    damaged input, no module left) is in `faults`, and all results so far are saved. Raises
+    KeyboardInterrupt if Ctrl-C is pressed twice while they are saved; the journal remains then.
     """
     _reclaim()
     with closing(build(config)) as parts:
@@ -69,10 +78,15 @@ def run(
             except SceneSlamError:
                 give_back(folder)
                 raise
-            with termination_as_interrupt():
-                loop.run()
-                with uninterrupted():
-                    return _end(loop, results, reference)
+            with stop_requests(lambda: _log.warning(_ANSWER, folder)) as requests:
+                with suppress(KeyboardInterrupt):  # after the last observation
+                    loop.run()
+                    requests.end_run()
+                try:
+                    return _end(loop, results, reference, requests)
+                except KeyboardInterrupt:
+                    loop.close(is_saved=False)
+                    raise KeyboardInterrupt(_unsaved(folder)) from None
 
 
 def _begin(config: Mapping[str, Any], parts: RunParts, folder: Path, title: str) -> Results:
@@ -95,7 +109,9 @@ def _begin(config: Mapping[str, Any], parts: RunParts, folder: Path, title: str)
     )
 
 
-def _end(loop: RunLoop, results: Results, reference: Trajectory | None) -> Finished:
+def _end(
+    loop: RunLoop, results: Results, reference: Trajectory | None, requests: StopRequests
+) -> Finished:
     """Write the results, the trajectories before anything else."""
     loop.finish()
     faults = len(results.faults)
@@ -114,7 +130,17 @@ def _end(loop: RunLoop, results: Results, reference: Trajectory | None) -> Finis
         truth=loop.truth,
         faults=tuple(results.faults),
         is_interrupted=loop.is_interrupted,
+        is_stop_requested=loop.is_interrupted or requests.is_any,
     )
+
+
+def _unsaved(folder: Path) -> str:
+    """Return a sentence on what there is of a run whose saving was ended."""
+    if (folder / "trajectory.tum").exists():
+        left = f"the trajectory is in {folder}, not all of the rest is"
+    else:
+        left = f"python -m sceneslam.recover {folder} restores the poses"
+    return f"stopped while the results were being saved; {left}"
 
 
 def _reclaim() -> None:

@@ -160,8 +160,8 @@ def carry_out(config: DictConfig) -> Ended:
         print(f"error: {error}", file=sys.stderr)
         give_back(folder)
         return Ended(code=UNUSABLE, errors=(str(error),))
-    except KeyboardInterrupt:
-        print("error: stopped before the first observation", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"error: {str(stop) or 'stopped before the first observation'}", file=sys.stderr)
         raise
     errors = (*finished.faults, *finished.metrics["shortfalls"])
     for sentence in errors:

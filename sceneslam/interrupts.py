@@ -1,4 +1,4 @@
-"""Handling of Ctrl-C, SIGTERM and SIGHUP: each ends a run, and none interrupts saving."""
+"""Handling of Ctrl-C, SIGTERM and SIGHUP: each ends a run; a second Ctrl-C also ends its saving."""
 
 from __future__ import annotations
 
@@ -12,18 +12,46 @@ from typing import Any
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
+class StopRequests:
+    """Requests to stop a run: Ctrl-C, SIGTERM, and SIGHUP (a closed terminal).
+
+    The first one raises KeyboardInterrupt, which ends the run, unless it is over already. From
+    then on its results are saved: the next Ctrl-C calls `answer`, each after that raises
+    KeyboardInterrupt. SIGTERM and SIGHUP change nothing there, since who sends them waits.
+    """
+
+    def __init__(self, answer: Callable[[], None]) -> None:
+        self._answer = answer
+        self._is_run_over = self._is_answered = False
+        self.is_any = False
+
+    def end_run(self) -> None:
+        """Let no first request interrupt what follows."""
+        self._is_run_over = True
+
+    def handle(self, number: int, frame: object) -> None:
+        """Handle a signal; called by the interpreter."""
+        self.is_any = True
+        if not self._is_run_over:
+            self._is_run_over = True
+            raise KeyboardInterrupt
+        if number != signal.SIGINT:
+            return
+        if self._is_answered:
+            raise KeyboardInterrupt
+        self._is_answered = True
+        self._answer()
+
+
 @contextmanager
-def termination_as_interrupt() -> Iterator[None]:
-    """Let SIGTERM, and SIGHUP (a closed terminal), end a run as Ctrl-C does.
+def stop_requests(answer: Callable[[], None]) -> Iterator[StopRequests]:
+    """Handle all three signals as requests to stop.
 
     SIGINT is handled also if a shell's `&` ignores it; SIGHUP is not if `nohup` ignores it.
     """
-
-    def interrupt(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
-    with _handler(interrupt):
-        yield
+    requests = StopRequests(answer)
+    with _handler(requests.handle):
+        yield requests
 
 
 @contextmanager
@@ -34,13 +62,6 @@ def termination_noted(note: Callable[[], None]) -> Iterator[None]:
         note()
 
     with _handler(handle):
-        yield
-
-
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Delay all three signals until saving is finished."""
-    with _handler(signal.SIG_IGN):
         yield
 
 

@@ -266,6 +266,17 @@ class Killer(ClosedSink):
         self._left -= 1
 
 
+class Presser(IdleSink):
+    """Presses Ctrl-C when it is closed, which is while the results are saved."""
+
+    def __init__(self, times):
+        self._times = times
+
+    def close(self):
+        for _ in range(self._times):
+            signal.raise_signal(signal.SIGINT)
+
+
 class Waiter(ClosedSink):
     """Waits at an observation until a pipe is closed."""
 

@@ -1,0 +1,131 @@
+"""Ctrl-C, SIGTERM and SIGHUP while a run ends and its results are saved."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from configured import config
+from tqdm import tqdm
+
+from sceneslam.app import run
+from sceneslam.atlas.atlas import Atlas
+from sceneslam.bus.bus import Bus
+from sceneslam.interrupts import StopRequests
+from sceneslam.keeping import Keeping
+from sceneslam.recover.recover import recover
+from sceneslam.results import Results
+from sceneslam.types.trajectory import Trajectory
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def pressing(monkeypatch):
+    """Send signals to this process when the run is at a step for the first time."""
+
+    def press(owner, step, *numbers):
+        before, left = getattr(owner, step), [*numbers]
+
+        def pressed(*given, **named):
+            while left:
+                signal.raise_signal(left.pop(0))
+            return before(*given, **named)
+
+        monkeypatch.setattr(owner, step, pressed)
+
+    return press
+
+
+def answer_count(caplog):
+    return sum("results are being saved" in one.getMessage() for one in caplog.records)
+
+
+SAVING = [(Bus, "close"), (Atlas, "finish"), (Results, "save_rest")]
+
+
+@pytest.mark.parametrize(("owner", "step"), SAVING)
+def test_ctrl_c_while_results_are_saved_is_answered_and_costs_none(
+    tmp_path, pressing, caplog, owner, step
+):
+    pressing(owner, step, signal.SIGINT)
+    finished = run(config(run__report=False), tmp_path)
+    assert answer_count(caplog) == 1 and str(tmp_path) in caplog.text
+    assert finished.faults == () and len(finished.trajectory) == 100
+    assert not finished.is_interrupted and finished.is_stop_requested
+    assert (tmp_path / "map" / "points.ply").exists()
+    assert not (tmp_path / "journal.bin").exists()
+
+
+@pytest.mark.parametrize(("owner", "step"), SAVING)
+def test_second_ctrl_c_while_results_are_saved_ends_the_run_and_recover_has_the_poses(
+    tmp_path, pressing, owner, step
+):
+    before = signal.getsignal(signal.SIGINT)
+    pressing(owner, step, signal.SIGINT, signal.SIGINT)
+    is_there = step == "save_rest"
+    left = "the trajectory is in" if is_there else r"python -m sceneslam\.recover"
+    with pytest.raises(KeyboardInterrupt, match=left):
+        run(config(run__report=False), tmp_path)
+    assert signal.getsignal(signal.SIGINT) == before
+    assert not (tmp_path / "metrics.json").exists() and not (tmp_path / "reserve.bin").exists()
+    assert (tmp_path / "trajectory.tum").exists() is is_there
+    assert recover(tmp_path).faults == ()
+    assert len(Trajectory.read_tum(tmp_path / "trajectory.tum")) == 100
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_saving_is_ended_by_no_other_signal(tmp_path, pressing, caplog, number):
+    pressing(Atlas, "finish", number, number, signal.SIGINT, number)
+    finished = run(config(run__report=False), tmp_path)
+    assert answer_count(caplog) == 1 and finished.is_stop_requested
+    assert finished.faults == () and len(finished.trajectory) == 100
+
+
+def test_ctrl_c_pressed_twice_ends_the_run_once_and_saves_it(tmp_path, pressing, caplog):
+    pressing(Keeping, "keep", signal.SIGINT)  # which ends the run
+    pressing(tqdm, "close", signal.SIGINT)  # while that is being ended
+    finished = run(config(run__report=False), tmp_path)
+    assert finished.is_interrupted and answer_count(caplog) == 1
+    assert len(Trajectory.read_tum(tmp_path / "trajectory.tum")) == 1
+
+
+def test_ctrl_c_that_ends_what_hangs_at_the_end_of_a_run_costs_no_result(tmp_path, pressing):
+    pressing(Keeping, "keep", signal.SIGINT)
+    pressing(tqdm, "close", signal.SIGINT, signal.SIGINT)
+    finished = run(config(run__report=False), tmp_path)
+    assert finished.is_interrupted
+    assert len(Trajectory.read_tum(tmp_path / "trajectory.tum")) == 1
+
+
+def test_ctrl_c_after_the_last_observation_costs_no_result(tmp_path, pressing):
+    pressing(StopRequests, "end_run", signal.SIGINT)
+    finished = run(config(run__report=False), tmp_path)
+    assert finished.is_stop_requested and len(finished.trajectory) == 100
+    assert not (tmp_path / "journal.bin").exists()
+
+
+def pressed(folder, times, *overrides):
+    """Run a command with Ctrl-C pressed while its results are saved."""
+    sink = f"+sinks.presser={{_target_:fakes.Presser,times:{times}}}"
+    words = ["+scenario=single", "source=mcap", "source.path=room.mcap", "run.report=false"]
+    words += ["slam@slam.only=odometry", "allow_targets=[fakes]", "hydra.run.dir=out", sink]
+    return subprocess.run(
+        [sys.executable, "-m", "sceneslam", *words, *overrides],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_command_answers_ctrl_c_while_it_saves(folder, times):
+    done = pressed(folder, times)
+    assert done.stderr.count("the results are being saved") == 1
+    assert ("error: stopped while the results" in done.stderr) is (times == 2)
+    assert "Traceback" not in done.stderr and done.returncode == times - 1
+    assert (folder / "out" / "metrics.json").exists() is (times == 1)
