@@ -196,6 +196,8 @@ def _run(config: DictConfig, folder: Path) -> Finished:
         if finished.faults:
             faults = tuple(f"reference: {fault}" for fault in finished.faults)
             return replace(finished, faults=faults)
+        if finished.is_stop_requested:
+            raise KeyboardInterrupt
         reference = finished.trajectory
     return run(resolved(config), folder, title=title, reference=reference, say=_say_before)
 

@@ -175,16 +175,19 @@ def _run_unless_finished(config: dict[str, Any], folder: Path, name: str) -> Non
         return
     (folder / _END).unlink(missing_ok=True)
     faults: tuple[str, ...] = ()
+    is_stop_requested = False
     if config["run"]["mode"] == DETECT_ONLY:
         detect(config, folder)
     else:
         finished = run(config, folder, title=name)
         if finished.is_interrupted:
-            raise KeyboardInterrupt
-        faults = finished.faults
+            raise KeyboardInterrupt(f"stopped during the trial {name}")
+        faults, is_stop_requested = finished.faults, finished.is_stop_requested
     end = {"made_by": made_by, "faults": faults}
     with replacing(folder / _END) as file:
         file.write(json.dumps(end, indent=2))
+    if is_stop_requested:
+        raise KeyboardInterrupt(f"stopped after the trial {name}")
 
 
 def _prepare(config: dict[str, Any]) -> None:

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from sceneslam.app import run
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.bus.bus import Bus
+from sceneslam.experiment import _run_unless_finished
 from sceneslam.interrupts import StopRequests
 from sceneslam.keeping import Keeping
 from sceneslam.recover.recover import recover
@@ -107,6 +108,17 @@ def test_ctrl_c_after_the_last_observation_costs_no_result(tmp_path, pressing):
     assert not (tmp_path / "journal.bin").exists()
 
 
+def test_trial_that_was_saved_is_kept_but_no_other_trial_follows_ctrl_c(tmp_path, pressing):
+    settings, folder = config(run__report=False), tmp_path / "trial"
+    pressing(Results, "save_rest", signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt, match="after the trial"):
+        _run_unless_finished(settings, folder, "trial")
+    assert (folder / "finished.json").exists()
+    written_ns = (folder / "trajectory.tum").stat().st_mtime_ns
+    _run_unless_finished(settings, folder, "trial")
+    assert (folder / "trajectory.tum").stat().st_mtime_ns == written_ns
+
+
 def pressed(folder, times, *overrides):
     """Run a command with Ctrl-C pressed while its results are saved."""
     sink = f"+sinks.presser={{_target_:fakes.Presser,times:{times}}}"
@@ -129,3 +141,10 @@ def test_command_answers_ctrl_c_while_it_saves(folder, times):
     assert ("error: stopped while the results" in done.stderr) is (times == 2)
     assert "Traceback" not in done.stderr and done.returncode == times - 1
     assert (folder / "out" / "metrics.json").exists() is (times == 1)
+
+
+def test_ctrl_c_while_the_reference_is_saved_is_before_the_run_itself(folder):
+    done = pressed(folder, 1, "reference={seed:1}")
+    assert done.returncode == 1 and "stopped before the first observation" in done.stderr
+    assert (folder / "out" / "reference" / "metrics.json").exists()
+    assert not (folder / "out" / "trajectory.tum").exists()
