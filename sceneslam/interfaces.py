@@ -212,6 +212,19 @@ class SlamModule(Protocol):
 
 
 @runtime_checkable
+class ClosesLoops(Protocol):
+    """A SLAM module that may recognize places in its own map, and correct its poses itself.
+
+    Of all others the atlas closes the loops.
+    """
+
+    @property
+    def closes_loops(self) -> bool:
+        """Tell whether it does."""
+        ...
+
+
+@runtime_checkable
 class PipelinedSlam(Protocol):
     """A SLAM system whose poses come later than their observations.
 

@@ -24,7 +24,7 @@ from sceneslam.engine.open_sinks import OpenSinks
 from sceneslam.engine.slowest import Stopwatch
 from sceneslam.engine.steering import Operator, SteeredDetector
 from sceneslam.executors import executor
-from sceneslam.interfaces import Live, LiveFeed
+from sceneslam.interfaces import ClosesLoops, Live, LiveFeed, SlamModule
 from sceneslam.keeping import Keeping
 from sceneslam.moments import Moments
 from sceneslam.results import Results
@@ -81,7 +81,8 @@ class RunLoop:
             catch_up_steps=parts.run.catch_up_steps,
             is_live=is_live,
         )
-        parts.atlas.open(parts.rig, self._log.add, is_live=parts.run.mode == LIVE)
+        closing = [key for key, module in parts.modules.items() if _closes_loops(module)]
+        parts.atlas.open(parts.rig, self._log.add, closing=closing, is_live=is_live)
         self._sinks = OpenSinks(self.faults)
         try:
             self._sinks.open(parts.sinks, parts.rig, results.folder)
@@ -328,3 +329,7 @@ class RunLoop:
         said = f"no pose: module {names} was lost from the first observation on"
         said = f"{said}; {self._tally.words()}"
         return f"{said}. Most likely: {'; '.join(self._warnings)}" if self._warnings else said
+
+
+def _closes_loops(module: SlamModule) -> bool:
+    return isinstance(module, ClosesLoops) and module.closes_loops

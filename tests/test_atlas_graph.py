@@ -63,7 +63,7 @@ def finished(count=18):
 def solved(own, loaded=None, *, maps=(), fixes=(), T_map_run=None):
     """Solve, where a module revised all poses by 0.01 m to the left."""
     graph = RunGraph(own, loaded or empty_map(), lambda ns: at(0.5 * ns / S) @ at(0.0, 0.01))
-    nodes = np.stack(own.T_run_node)
+    nodes = np.stack(own.chain.T_run_node)
     return graph.solve(nodes if T_map_run is None else T_map_run @ nodes, maps, fixes, frozenset())
 
 
@@ -145,7 +145,7 @@ def test_a_fix_leads_from_the_nearest_submap_of_the_loaded_piece(monkeypatch):
     measured = planar.planar_covariance(given.measured[1].covariance)
     np.testing.assert_allclose(measured, at_node, atol=1e-9)
     assert given.nodes.shape == (7, 4, 4) and (given.drift[:4] == 0).all()
-    np.testing.assert_array_equal(given.drift[4:], own.drift)
+    np.testing.assert_array_equal(given.drift[4:], own.chain.drift)
 
 
 def test_fixes_of_one_submap_are_one_loop_their_mean(monkeypatch):
@@ -161,8 +161,8 @@ def test_fixes_of_one_submap_are_one_loop_their_mean(monkeypatch):
 def test_the_first_vertical_direction_gives_that_of_the_map(monkeypatch):
     given, own = Given(monkeypatch), finished()
     tilts = [0.02, 0.05, 0.06]
-    own.up_node = {node: pitched(0, 0, tilt)[2, :3] for node, tilt in enumerate(tilts)}
-    own.T_run_node[0] = pitched(0, 0, 0.1)
+    own.chain.up_node = {node: pitched(0, 0, tilt)[2, :3] for node, tilt in enumerate(tilts)}
+    own.chain.T_run_node[0] = pitched(0, 0, 0.1)
     solved(own, map_of(WALL))
     assert [one.node for one in given.uprights] == [1, 2, 3]
     for one, tilt in zip(given.uprights, tilts, strict=True):  # 0.05 is the sensor's own

@@ -174,14 +174,14 @@ def test_submaps_are_made_of_steps_that_no_handover_replaces_any_more():
 def test_motions_lead_from_submap_to_submap_and_their_deviations_add_up():
     own = run_of(12)
     own.finish()
-    (motion,) = own.motions
+    (motion,) = own.chain.motions
     assert (motion.first, motion.second, motion.kind) == (0, 1, EdgeKind.MOTION)
     np.testing.assert_allclose(motion.T_first_second, at(3.0), atol=1e-12)
-    np.testing.assert_array_equal(own.drift[0], np.zeros(3))
+    np.testing.assert_array_equal(own.chain.drift[0], np.zeros(3))
     expected = np.sqrt(np.diag(planar.planar_covariance(motion.covariance)))
-    np.testing.assert_allclose(own.drift[1], expected)
+    np.testing.assert_allclose(own.chain.drift[1], expected)
     own.remeasure(lambda stamp_ns: at(1.0 + 2 / 3 * stamp_ns / S))
-    np.testing.assert_allclose(own.motions[0].T_first_second, at(4.0), atol=1e-12)
+    np.testing.assert_allclose(own.chain.motions[0].T_first_second, at(4.0), atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -190,7 +190,7 @@ def test_motions_lead_from_submap_to_submap_and_their_deviations_add_up():
 def test_a_motion_that_is_bridged_for_more_than_half_is_a_bridge(bridged, kind):
     own = run_of(7, module=lambda i: BRIDGED if i in bridged else "a")
     own.finish()
-    assert own.motions[0].kind is kind
+    assert own.chain.motions[0].kind is kind
     other = run_of(8, session=lambda i: i // 4)
     other.finish()
     assert [edge.kind for edge in other.motions] == [EdgeKind.HANDOVER]
@@ -372,12 +372,12 @@ def test_rows_grow_are_cut_and_are_read_back():
 def a_map(count=3, *, runs=(0, 0, 1)):
     own = run_of(6 * count)
     own.finish()
-    submaps = tuple(replace(one, run=runs[i]) for i, one in enumerate(own.submaps))
+    submaps = tuple(replace(one, run=runs[i]) for i, one in enumerate(own.chain.submaps))
     return SavedMap(
         submaps=submaps,
-        T_map_node=np.array(own.T_run_node),
+        T_map_node=np.array(own.chain.T_run_node),
         pieces=np.array([0, 0, 1]),
-        edges=tuple(own.motions),
+        edges=tuple(own.chain.motions),
     )
 
 
@@ -439,6 +439,6 @@ def test_a_bridge_drifts_as_the_sensors_that_measured_it(sensors, drift):
     for index in range(12):
         own.add(index * S, None)
     own.finish()
-    (motion,) = own.motions
+    (motion,) = own.chain.motions
     poses = [key_pose(index, at(0.5 * index), drift=drift) for index in range(7)]
     np.testing.assert_allclose(motion.covariance, motion_covariance(poses))

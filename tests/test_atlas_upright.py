@@ -25,7 +25,7 @@ def test_submaps_stand_upright_however_the_sensor_is_mounted(askew_rad):
         own.step_to(T)
         own.add(index * S, None, pitched(0.0, 0.0, askew_rad)[:3, 2])
     own.finish()
-    nodes = np.stack(own.T_run_node)
+    nodes = np.stack(own.chain.T_run_node)
     graph = RunGraph(own, empty_map(), lambda ns: poses[ns // S])
     solved = graph.solve(nodes, [], [], frozenset()).T_map_node
     assert nodes[-1, 2, 2] < np.cos(0.03)

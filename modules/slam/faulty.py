@@ -12,7 +12,7 @@ from time import sleep
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.interfaces import SlamModule
+from sceneslam.interfaces import ClosesLoops, SlamModule
 from sceneslam.types import se3
 from sceneslam.types.fault_plan import FaultPlan
 from sceneslam.types.maps import MapLayers
@@ -58,6 +58,11 @@ class FaultyModule:
         )
         self._silent_until_ns: int | None = None
         self._T_wrong_local = se3.identity()
+
+    @property
+    def closes_loops(self) -> bool:
+        """Tell whether the module closes loops itself."""
+        return isinstance(self._module, ClosesLoops) and self._module.closes_loops
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sceneslam.interfaces import PipelinedSlam
+from sceneslam.interfaces import ClosesLoops, PipelinedSlam
 from sceneslam.motion.late import Pipeline
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
@@ -26,6 +26,11 @@ class Pipelined:
         check_least(0, late_max_s=late_max_s)
         self._system, self._late_max_s = system, late_max_s
         self._pipeline, self._revision = Pipeline(late_max_s), 0
+
+    @property
+    def closes_loops(self) -> bool:
+        """Tell whether the system closes loops itself."""
+        return isinstance(self._system, ClosesLoops) and self._system.closes_loops
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Collection
 from dataclasses import replace
 from functools import partial
 
@@ -55,6 +56,7 @@ class Atlas:
         self._correction: Correction | None = None
         self._voxel_m = voxel_m
         self._sessions: list[OpenSession] = []
+        self._closing: frozenset[str] = frozenset()  # modules that close loops themselves
         self._online = PoseLog()  # as reported at the time
         self._path = PosePath()  # after corrections
         self._journal: TrajectoryLog | None = None
@@ -63,8 +65,14 @@ class Atlas:
         """Write every further call to a log; repeating these calls gives the same atlas."""
         self._journal = journal
 
-    def open(self, rig: Rig, note: Note, *, is_live: bool = False) -> None:
-        """Prepare for observations; `note` receives events, such as recognized places and loops."""
+    def open(
+        self, rig: Rig, note: Note, *, closing: Collection[str] = (), is_live: bool = False
+    ) -> None:
+        """Prepare for observations; `note` receives events, such as recognized places and loops.
+
+        `closing` are the modules that close loops themselves.
+        """
+        self._closing = frozenset(closing)
         self._note = note
         loaded = self._lasting.loaded
         self._lasting.open(is_live=is_live)
@@ -74,6 +82,7 @@ class Atlas:
             rig,
             known=self._path.known_at,
             note=note,
+            is_closed=self._closes_loops,
             loaded=loaded,
             keeps_views=self._lasting.saves,
             is_live=is_live,
@@ -109,15 +118,8 @@ class Atlas:
         assert self._mapper is not None and self._note is not None
         revised = self._revise().T_map_base
         at = partial(self._revised_at, revised)
-        self._correction = self._mapper.finish(
-            at,
-            [session.layers for session in self._sessions],
-            frozenset(
-                number
-                for number, session in enumerate(self._sessions)
-                if session.layers.pose_graph is not None
-            ),
-        )
+        layers = [session.layers for session in self._sessions]
+        self._correction = self._mapper.finish(at, layers)
         self._lasting.finish(self._mapper, self._path.stamps_ns[-1], self._note)
 
     def _give_up(self, error: Exception) -> None:
@@ -162,6 +164,8 @@ class Atlas:
         if self._journal is not None:
             self._journal.add_rewind(stamp_ns)
         self._path.cut(stamp_ns)
+        if self._mapper is not None:
+            self._mapper.rewind(stamp_ns)
 
     def close_session(self, session: int, layers: MapLayers, revised: Trajectory) -> None:
         """Add the final map of a session, and its revised poses T_local_base (4, 4) [m].
@@ -269,10 +273,8 @@ class Atlas:
         return replace(fused, grid=grid_of(self._lasting.map_of(self._mapper).plan()))
 
     def _in_map(self, T_run_base: Transform) -> Transform:
-        """Return a pose in the frame of the loaded map as soon as the run was located in it."""
-        if self._mapper is None or not self._mapper.is_placed:
-            return T_run_base
-        return np.asarray(self._mapper.T_map_run @ T_run_base)
+        """Return a pose as loops correct it, or in a loaded map if the run was located there."""
+        return T_run_base if self._mapper is None else self._mapper.T_map_run @ T_run_base
 
     def _placed(self) -> list[Transform]:
         """Return T_map_local of every session, corrected as the middle one of its poses."""
@@ -286,6 +288,9 @@ class Atlas:
                 stamp_ns = np.array([self._path.stamps_ns[rows[len(rows) // 2]]], np.int64)
                 placed[session] = self._correction.apply(stamp_ns, T_map_local[None])[0]
         return placed
+
+    def _closes_loops(self, session: int) -> bool:
+        return session >= 0 and self._sessions[session].module in self._closing
 
     def _revised_at(self, revised: NDArray[np.float64], stamp_ns: int) -> Transform | None:
         row = self._path.row_at(stamp_ns)

@@ -1,4 +1,4 @@
-"""The back end of a run: submaps, localization in a loaded map, and the final pose graph.
+"""The back end of a run: submaps, their pose graph, and localization in a loaded map.
 
 The graph is spatial. Places are recognized by floor plans of level scans, and in a loaded map by
 what a camera sees; a module recognizes its own earlier sessions, and reports loops to them.
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,11 +18,12 @@ from numpy.typing import NDArray
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map
 from sceneslam.atlas.places.localizer import LocalizationEvent, Look, MapLocalizer
 from sceneslam.atlas.places.view_taker import ViewTaker
+from sceneslam.atlas.submaps.chain import Chain
 from sceneslam.atlas.submaps.collector import Collector, Known
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.submaps.graph import LOADED
 from sceneslam.atlas.submaps.own_loops import Path
-from sceneslam.atlas.submaps.run_graph import RunGraph
+from sceneslam.atlas.submaps.run_graph import RunGraph, SolvedRun
 from sceneslam.executors import executor
 from sceneslam.graphs.edge import Edge
 from sceneslam.scans.key_scan import KeyScanner
@@ -41,7 +43,7 @@ Note = Callable[..., None]  # event, stamp_ns, and its fields
 
 
 class Mapper:
-    """Takes observations after their poses; `finish` solves the graph."""
+    """Takes observations after their poses; closes loops while the run goes on, and at its end."""
 
     def __init__(
         self,
@@ -50,12 +52,14 @@ class Mapper:
         known: Callable[[int], Known | None],
         note: Note,
         loaded: SavedMap | None = None,
+        is_closed: Callable[[int], bool] = lambda session: False,
         keeps_views: bool = False,
         is_live: bool = False,
     ) -> None:
         """Begin. `keeps_views`: submaps hold what the camera sees, by which places are recognized.
 
-        `is_live`: searches in the loaded map run in another thread.
+        `is_closed` tells in which sessions modules close loops themselves. `is_live`: searches run
+        in another thread.
         """
         self._loaded = loaded if loaded is not None else empty_map()
         self._scanner, self._known, self._note = KeyScanner(rig), known, note
@@ -71,8 +75,13 @@ class Mapper:
         self._began_ns: int | None = None
         self._has_told = False
         self.was_found = False  # the run was located in the loaded map, at any time
-        self._loops: list[Edge] = []
-        self._T_map_node: NDArray[np.float64] | None = None  # (N, 4, 4) the run's, once solved
+        self._graph = RunGraph(self._loaded, is_closed)
+        self._solving: tuple[Chain, Future[SolvedRun]] | None = None
+        self._kept = 0  # submaps that are as they were given to the graph
+        self._solved = SolvedRun.nothing()
+        self._T_new_old = se3.identity()  # correction of the newest pose, by loops of the run
+        self._is_over = False
+        self._told: set[tuple[int, int]] = set()  # loops
 
     @property
     def is_placed(self) -> bool:
@@ -82,7 +91,7 @@ class Mapper:
     @property
     def has_submaps(self) -> bool:
         """Tell whether the run has submaps, so that there is something to save."""
-        return bool(self._collector.submaps)
+        return bool(len(self._collector.chain))
 
     @property
     def is_found(self) -> bool:
@@ -91,8 +100,18 @@ class Mapper:
 
     @property
     def T_map_run(self) -> Transform:
-        """Return T_map_run (4, 4) in the loaded map; the identity until the run was located."""
-        return se3.identity() if self._T_map_run is None else self._T_map_run
+        """Return T_map_run (4, 4) for the newest pose: in the loaded map, or as loops corrected it.
+
+        The identity until the run was located or has closed a loop.
+        """
+        return self._T_new_old if self._T_map_run is None else self._T_map_run
+
+    def rewind(self, stamp_ns: int) -> None:
+        """Remove what was made of poses from a stamp on: they are replaced."""
+        self._collector.rewind(stamp_ns)
+        kept = len(self._collector.chain)
+        if kept < self._kept:
+            self._kept, self._solved = kept, self._solved.cut(kept, len(self._loaded.submaps))
 
     def observe(self, observation: Observation, up_base: Vector | None) -> None:
         """Add an observation with a known pose, and the upward direction (3,) in base."""
@@ -101,6 +120,7 @@ class Mapper:
             return
         stamp_ns, localizer = observation.stamp_ns, self._localizer
         self._views.move(stamp_ns, known.T_map_base)
+        self._collect_loops()
         if localizer is not None:
             self._collect(localizer, stamp_ns)
         look = Look(stamp_ns=stamp_ns, T_run_base=known.T_map_base)
@@ -118,6 +138,7 @@ class Mapper:
         if is_step:
             landmarks = view.landmarks if view is not None and is_kept else None
             self._collector.add(stamp_ns, scan, up_base, landmarks)
+            self._close_loops()
         if scan is None and view is None:
             return
         if self._began_ns is None:
@@ -126,60 +147,94 @@ class Mapper:
             look = replace(look, scan=scan, view=view if is_viewed else None)
             self._localize(localizer, look)
 
-    def finish(self, path: Path, maps: Sequence[MapLayers], closed: frozenset[int]) -> Correction:
+    def finish(self, path: Path, maps: Sequence[MapLayers]) -> Correction:
         """Solve the graph; return the correction of the poses.
 
-        `path` is revised by the modules, `maps` are theirs, with their own loops; `closed` are the
-        sessions whose modules close loops themselves.
+        `path` is revised by the modules, `maps` are theirs, with their own loops.
         """
-        own = self._collector
-        own.finish()
+        self._collector.finish()
         self._executor.shutdown()
-        if not own.submaps:
+        chain = self._collector.chain
+        if not len(chain):
             return Correction.none()
-        stamps_ns = np.array([submap.stamps_ns[0] for submap in own.submaps], np.int64)
-        own.remeasure(path)
-        old = np.array(own.T_run_node)
-        graph = RunGraph(own, self._loaded, path)
-        fixes = self._localizer.fixes if self._localizer is not None and self.is_placed else []
-        solved = graph.solve(self.T_map_run @ old, maps, fixes, closed)
-        self._loops = list(solved.loops)
-        self._T_map_node = solved.T_map_node
-        for loop in self._loops:
-            self._tell(loop)
-        if not (self._loops or self._collector.up_node or self.is_placed):
+        chain.remeasure(path)
+        self._graph.forget(self._kept)
+        old = np.array(chain.T_run_node)
+        self._solved = self._graph.finish(
+            chain,
+            old if self._T_map_run is None else self._T_map_run @ old,
+            path,
+            maps,
+            self._localizer.fixes if self._localizer is not None and self.is_placed else [],
+            is_level=self._collector.is_level,
+        )
+        self._is_over = True
+        self._tell_loops()
+        if not (self._solved.loops or chain.up_node or self.is_placed):
             return Correction.none()
-        return Correction(stamps_ns=stamps_ns, T_new_old=solved.T_map_node @ se3.inverse(old))
+        return Correction(
+            stamps_ns=np.array([submap.stamps_ns[0] for submap in chain.submaps], np.int64),
+            T_new_old=self._solved.T_map_node @ se3.inverse(old),
+        )
 
     def loops(self, stamps_ns: NDArray[np.int64]) -> list[Edge]:
         """Return the accepted loops between rows of the path with these stamps (N,)."""
-        starts_ns = [submap.stamps_ns[0] for submap in self._collector.submaps]
+        starts_ns = [submap.stamps_ns[0] for submap in self._collector.chain.submaps]
         rows = np.searchsorted(stamps_ns[:-1], starts_ns).tolist()
         row_of = [LOADED] * len(self._loaded.submaps) + rows
         return [
             replace(loop, first=row_of[loop.first], second=row_of[loop.second])
-            for loop in self._loops
+            for loop in self._solved.loops
         ]
 
     def saved(self) -> SavedMap:
         """Return the loaded map with this run in it: a separate piece if it was not located."""
         count, pieces = len(self._loaded.submaps), self._loaded.pieces
-        own, nodes = self._collector, self._T_map_node
-        if nodes is None:
-            nodes = np.array([self.T_map_run @ T for T in own.T_run_node]).reshape(-1, 4, 4)
+        own = self._collector.chain
+        nodes = [*self._known_nodes()]
+        nodes += [self.T_map_run @ T for T in own.T_run_node[len(nodes) :]]
         piece = 0 if self.is_found else int(pieces.max(initial=-1)) + 1
         return SavedMap(
             submaps=(*self._loaded.submaps, *own.submaps),
-            T_map_node=np.concatenate([self._loaded.T_map_node, nodes]),
+            T_map_node=np.concatenate([self._loaded.T_map_node, np.reshape(nodes, (-1, 4, 4))]),
             pieces=np.concatenate([pieces, np.full(len(own.submaps), piece, np.int64)]),
             edges=(
                 *self._loaded.edges,
                 *(edge.shifted(count) for edge in own.motions),
-                *self._loops,
+                *self._solved.loops,
             ),
         )
 
     # During the run.
+
+    def _close_loops(self) -> None:
+        """Give the submaps that are complete to the graph, if it is not busy."""
+        chain = self._collector.chain
+        if self._solving is not None or len(chain) == self._kept:
+            return
+        self._graph.forget(self._kept)
+        self._kept, chain = len(chain), chain.copy()
+        extend = partial(self._graph.extend, chain, is_level=self._collector.is_level)
+        self._solving = chain, self._executor.submit(extend)
+        self._collect_loops()
+
+    def _collect_loops(self) -> None:
+        """Take the solution of the graph, if there is a new one."""
+        if self._solving is None or not self._solving[1].done():
+            return
+        (chain, solving), self._solving = self._solving, None
+        solved = solving.result()
+        if len(chain) > self._kept:
+            return  # poses were replaced meanwhile
+        self._solved = solved
+        self._T_new_old = solved.T_map_node[-1] @ se3.inverse(chain.T_run_node[-1])
+        self._tell_loops()
+
+    def _known_nodes(self) -> NDArray[np.float64]:
+        """Return the nodes (N, 4, 4) that were solved, in the map that the run is in."""
+        if self.is_placed and not self._is_over:  # nodes were solved in the run's own frame
+            return np.zeros((0, 4, 4))
+        return self._solved.T_map_node
 
     def _made_localizer(
         self, rig: Rig, views: Sequence[tuple[Transform, Landmarks]]
@@ -228,10 +283,16 @@ class Mapper:
             self._note("not_relocalized", stamp_ns, after_s=after_s)
             self._has_told = True
 
-    def _tell(self, loop: Edge) -> None:
-        submaps = [*self._loaded.submaps, *self._collector.submaps]
-        first, second = submaps[loop.first], submaps[loop.second]
-        fields: dict[str, Any] = {"module": second.module, "to_module": first.module}
-        fields |= {"to_ns": int(first.stamps_ns[0])}
-        fields |= {"in_loaded_map": loop.first < len(self._loaded.submaps)}
-        self._note("loop", int(second.stamps_ns[0]), **fields)
+    def _tell_loops(self) -> None:
+        """Report the loops that are new."""
+        submaps = [*self._loaded.submaps, *self._collector.chain.submaps]
+        for loop in self._solved.loops:
+            ends = loop.first, loop.second
+            if ends in self._told:
+                continue
+            self._told.add(ends)
+            first, second = (submaps[node] for node in ends)
+            fields: dict[str, Any] = {"module": second.module, "to_module": first.module}
+            fields |= {"to_ns": int(first.stamps_ns[0])}
+            fields |= {"in_loaded_map": loop.first < len(self._loaded.submaps)}
+            self._note("loop", int(second.stamps_ns[0]), **fields)

@@ -39,6 +39,7 @@ class IsolatedModule(Restarted):
         super().__init__(limits)
         self._name, self._make = name, make
         self._requires: tuple[frozenset[Sensor], ...] | None = None
+        self._closes_loops = False
         self._process: Process | None = None
         self._start()
 
@@ -49,6 +50,13 @@ class IsolatedModule(Restarted):
             self._await_built()
         assert self._requires is not None
         return self._requires
+
+    @property
+    def closes_loops(self) -> bool:
+        """Tell whether the module closes loops itself."""
+        if self._requires is None:
+            self._await_built()
+        return self._closes_loops
 
     def activate(self, rig: Rig) -> None:
         """Start a session, in a new process if the last one died; may wait for a restart."""
@@ -124,7 +132,8 @@ class IsolatedModule(Restarted):
 
     def _await_built(self) -> None:
         if not self._is_greeted:
-            self._requires = self._answer(self._limits.start_deadline_s)
+            built = self._answer(self._limits.start_deadline_s)
+            self._requires, self._closes_loops = built
             self._is_greeted = True
 
     def _call(self, deadline_s: float, method: str, *arguments: object) -> Any:

@@ -13,6 +13,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
+from sceneslam.interfaces import ClosesLoops
 from sceneslam.supervision.messages import LogLine, Reply, Request
 from sceneslam.supervision.transport import Channel
 from sceneslam.types.errors import ModuleError
@@ -40,12 +41,13 @@ class Worker:
         return Reply(number=request.number, value=value, log=self._log.take())
 
     def build(self, make: Callable[[], Any], log_level: int, memory_limit_mb: int) -> Any:
-        """Build the module; return its `requires`."""
+        """Build the module; return its `requires`, and whether it closes loops."""
         logging.getLogger().setLevel(log_level)
         limit_bytes = memory_limit_mb << 20
         resource.setrlimit(resource.RLIMIT_DATA, (limit_bytes, limit_bytes))
         self._module = make()
-        return self._module.requires
+        module = self._module
+        return module.requires, isinstance(module, ClosesLoops) and module.closes_loops
 
     def _call(self, request: Request) -> Any:
         owner = self if request.method == "build" else self._module

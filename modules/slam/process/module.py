@@ -34,12 +34,21 @@ class ProcessSlam(Restarted):
     run is started at once, so that it is loaded before it is needed.
     """
 
-    def __init__(self, *, command: Command, late_max_s: float, limits: Limits) -> None:
+    def __init__(
+        self,
+        *,
+        command: Command,
+        late_max_s: float,
+        limits: Limits,
+        closes_loops: bool = True,
+    ) -> None:
+        """Start the program; without `closes_loops` the atlas closes the loops of its poses."""
         if not command or shutil.which(command[0]) is None:
             raise ConfigError("command", command, "a program that can be run, and its arguments")
         if not 0 <= late_max_s < np.inf:
             raise ConfigError("late_max_s", late_max_s, "seconds, 0 or more")
         super().__init__(limits)
+        self.closes_loops = closes_loops
         self._command, self._late_max_s = command, late_max_s
         self._requires: tuple[frozenset[Sensor], ...] | None = None
         self._program: Program | None = None

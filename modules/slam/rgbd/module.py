@@ -91,6 +91,11 @@ class RgbdSlam:
         self._T_local_base = se3.identity()
 
     @property
+    def closes_loops(self) -> bool:
+        """Return True: it recognizes places by what is in its images."""
+        return True
+
+    @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
         """Return the sensor sets: colour with any sensor that gives the scale."""
         scales = (Sensor.DEPTH, Sensor.ODOMETRY)

@@ -1,28 +1,26 @@
-"""Collect the poses and scans of a run, and group them into submaps once the poses are final."""
+"""Collect the poses and scans of a run, and group them into submaps."""
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.atlas.submaps.own_loops import Path
+from sceneslam.atlas.submaps.chain import Chain
 from sceneslam.atlas.submaps.submap import (
     STEP_M,
     STEP_RAD,
     KeyPose,
-    Submap,
+    OpenSubmap,
     make_submap,
     motion_covariance,
-    split,
 )
 from sceneslam.atlas.uncertainty import GYRO, MAPPED, VELOCITY, WHEELS
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.scans.key_scan import KeyScan
-from sceneslam.types import planar, se3
+from sceneslam.types import se3
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
@@ -54,16 +52,13 @@ class Collector:
 
     def __init__(self, rig: Rig, known: Callable[[int], Known | None], run: int) -> None:
         """Begin; `known` returns the current estimate of the pose at a stamp."""
-        self.submaps: list[Submap] = []
-        self.T_run_node: list[Transform] = []
-        self.motions: list[Edge] = []
-        self.up_node: dict[int, NDArray[np.float64]] = {}  # vertical directions (3,), by submap
-        self.drift = [np.zeros(3)]  # per submap: summed standard deviations [m, m, rad]
+        self.chain = Chain()
         self._known, self._run = known, run
         wheels = GYRO if Sensor.GYRO in rig.sensors else WHEELS
         self._bridge = wheels if Sensor.ODOMETRY in rig.sensors else VELOCITY
-        self._steps: list[_Step] = []  # not yet in a submap
-        self._part: list[KeyPose] = []  # of the newest submap
+        self._open = OpenSubmap()
+        self._recent: list[list[KeyPose]] = []  # of the newest submaps, oldest first
+        self._waiting: list[_Step] = []  # for their poses
         self._last: Transform | None = None  # pose of the last step
         self._up = np.zeros(3)  # of the base, the mean over the last steps
         self._level = self._count = 0
@@ -106,55 +101,52 @@ class Collector:
         up_base: NDArray[np.float64] | None = None,
         landmarks: Landmarks | None = None,
     ) -> None:
-        """Add a step with its scan, and make submaps of steps with final poses.
+        """Add a step with its scan; that completes the submap before, if it is long enough.
 
         `up_base` (3,) is the measured vertical direction, None if unknown, as are the `landmarks`
         in view.
         """
-        self._steps.append((stamp_ns, scan, up_base, landmarks))
-        settled = bisect_right(self._steps, stamp_ns - _SETTLED_NS, key=lambda each: each[0])
-        if 2 * settled > len(self._steps):
-            self._cut(settled, is_end=False)
+        self._waiting.append((stamp_ns, scan, up_base, landmarks))
+        self._take()
+
+    def rewind(self, stamp_ns: int) -> None:
+        """Remove the submaps with poses from a stamp on; their steps wait for new poses."""
+        parts = [*self._recent, self._open.poses]
+        kept = sum(bool(part) and part[-1].stamp_ns < stamp_ns for part in parts)
+        if len(self._recent) < len(self.chain):
+            kept = max(kept, 1)  # older ones stay as they are
+        if kept == len(parts):
+            return
+        gone = [pose for part in parts[kept:] for pose in part]
+        steps = [(pose.stamp_ns, pose.scan, pose.up_base, pose.landmarks) for pose in gone]
+        self._waiting = [*steps, *self._waiting]
+        self.chain.cut(len(self.chain) - (len(self._recent) - kept))
+        del self._recent[kept:]
+        self._open = OpenSubmap()
 
     def finish(self) -> None:
-        """Make submaps of the remaining steps."""
-        self._cut(len(self._steps), is_end=True)
+        """Complete the newest submap."""
+        self._take()
+        if self._open.poses:
+            self._complete()
 
-    def remeasure(self, path: Path) -> None:
-        """Set the poses of the submaps and their views as revised, and the motions between them.
+    def _take(self) -> None:
+        """Add the waiting steps that have poses."""
+        steps, self._waiting = self._waiting, []
+        for step in steps:
+            pose = self._posed(*step)
+            if pose is not None and not self._open.take(pose):
+                self._complete()
+                self._open.take(pose)
 
-        `path` has a pose at every stamp of a step.
-        """
-        poses = [_at(path, int(submap.stamps_ns[0])) for submap in self.submaps]
-        self.submaps = [
-            replace(
-                submap,
-                views=tuple(
-                    replace(view, T_submap_base=se3.inverse(pose) @ _at(path, view.stamp_ns))
-                    for view in submap.views
-                ),
-            )
-            for submap, pose in zip(self.submaps, poses, strict=True)
-        ]
-        self.T_run_node = poses
-        self.motions = [
-            replace(edge, T_first_second=se3.inverse(poses[edge.first]) @ poses[edge.second])
-            for edge in self.motions
-        ]
-
-    def node_at(self, stamp_ns: int) -> int:
-        """Return the index of the submap at a stamp, or of the last before it."""
-        starts = [int(submap.stamps_ns[0]) for submap in self.submaps]
-        return max(bisect_right(starts, stamp_ns) - 1, 0)
-
-    def _cut(self, count: int, *, is_end: bool) -> None:
-        """Make submaps of the oldest steps; the last may still grow, unless `is_end`."""
-        poses = [pose for step in self._steps[:count] if (pose := self._posed(*step)) is not None]
-        parts = split(poses)
-        for part in parts if is_end else parts[:-1]:
-            self._append(part)
-        done_ns = -1 if not self._part else self._part[-1].stamp_ns
-        self._steps = [step for step in self._steps if step[0] > done_ns]
+    def _complete(self) -> None:
+        """Make a submap of the open one."""
+        part, self._open = self._open.poses, OpenSubmap()
+        self._append(part)
+        settled_ns = part[-1].stamp_ns - _SETTLED_NS
+        while len(self._recent) > 1 and self._recent[0][-1].stamp_ns < settled_ns:
+            del self._recent[0]
+        self._recent.append(part)
 
     def _posed(
         self,
@@ -179,34 +171,24 @@ class Collector:
         )
 
     def _append(self, part: list[KeyPose]) -> None:
-        if self._part:
-            covariance = motion_covariance([*self._part, part[0]])
-            self.motions.append(
-                Edge(
-                    first=len(self.submaps) - 1,
-                    second=len(self.submaps),
-                    T_first_second=se3.inverse(self._part[0].T_map_base) @ part[0].T_map_base,
-                    covariance=covariance,
-                    kind=self._kind(part[0]),
-                )
+        chain, motion = self.chain, None
+        if self._recent:
+            before = self._recent[-1]
+            motion = Edge(
+                first=len(chain) - 1,
+                second=len(chain),
+                T_first_second=se3.inverse(before[0].T_map_base) @ part[0].T_map_base,
+                covariance=motion_covariance([*before, part[0]]),
+                kind=_kind(before, part[0]),
             )
-            deviations = np.sqrt(np.diag(planar.planar_covariance(covariance)))
-            self.drift.append(self.drift[-1] + deviations)
         if part[0].up_base is not None:
-            self.up_node[len(self.submaps)] = part[0].up_base
-        self.submaps.append(make_submap(part, self._run))
-        self.T_run_node.append(part[0].T_map_base)
-        self._part = part
-
-    def _kind(self, pose: KeyPose) -> EdgeKind:
-        """Return which source measured the motion from the newest submap to a pose."""
-        if self._part[0].session != pose.session:
-            return EdgeKind.HANDOVER
-        bridged = sum(each.module == BRIDGED for each in [*self._part, pose])
-        return EdgeKind.BRIDGE if 2 * bridged > len(self._part) else EdgeKind.MOTION
+            chain.up_node[len(chain)] = part[0].up_base
+        chain.append(make_submap(part, self._run), part[0].T_map_base, motion)
 
 
-def _at(path: Path, stamp_ns: int) -> Transform:
-    pose = path(stamp_ns)
-    assert pose is not None, "a step has a pose"
-    return pose
+def _kind(part: list[KeyPose], pose: KeyPose) -> EdgeKind:
+    """Return which source measured the motion from a submap to the pose after it."""
+    if part[0].session != pose.session:
+        return EdgeKind.HANDOVER
+    bridged = sum(each.module == BRIDGED for each in [*part, pose])
+    return EdgeKind.BRIDGE if 2 * bridged > len(part) else EdgeKind.MOTION

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from heapq import heappop, heappush
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ _FLOOR = np.array([0.05, 0.02, 0.02]) ** 2  # m, rad: height and tilt between pl
 _TILT_RAD = 0.04  # that modules drift in pitch along a corridor, before gravity corrects them
 _UPRIGHT_RAD = 0.01  # half a degree: of gyro and gravity, and as floors are uneven
 _VAIN = 50  # starts in a row without a larger clique
+_LEVER_M = 2.5  # at this distance a turn moves walls: it makes deviations of turns comparable
 LOADED = -1  # node of a loaded map
 
 
@@ -132,18 +134,73 @@ def marginals(
     return {node: solved.marginalCovariance(node)[back] for node in nodes}
 
 
+def deviations_to(node: int, edges: Sequence[Edge]) -> NDArray[np.float64]:
+    """Return the standard deviations (N, 3) [m, m, rad] of the motions from all nodes to one.
+
+    They add up along the most certain path (Dijkstra), as drift is systematic. Node N - 1 is the
+    newest of the edges'; without a path they are infinite.
+    """
+    links: list[list[tuple[int, list[float]]]]
+    links = [[] for _ in range(1 + max((edge.second for edge in edges), default=node))]
+    for edge in edges:
+        step = np.sqrt(np.diag(planar.planar_covariance(edge.covariance))).tolist()
+        links[edge.first].append((edge.second, step))
+        links[edge.second].append((edge.first, step))
+    summed = np.full((len(links), 3), np.inf)
+    waiting = [(0.0, node, 0.0, 0.0, 0.0)]
+    while waiting:
+        far, here, *deviation = heappop(waiting)
+        if np.isfinite(summed[here, 0]):
+            continue
+        summed[here] = deviation
+        x_m, y_m, yaw_rad = deviation
+        for there, (dx_m, dy_m, turn_rad) in links[here]:
+            length = far + dx_m + dy_m + _LEVER_M * turn_rad
+            heappush(waiting, (length, there, x_m + dx_m, y_m + dy_m, yaw_rad + turn_rad))
+    return summed
+
+
+class Agreement:
+    """Tells which loops agree pairwise within the drift; loops are added as they are found."""
+
+    def __init__(self) -> None:
+        self.loops: list[Edge] = []
+        self._agree = np.zeros((0, 0), bool)
+
+    def add(
+        self, loops: Sequence[Edge], T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
+    ) -> None:
+        """Compare loops with all others.
+
+        `T_map_node` (N, 4, 4) are the estimated nodes, `drift` (N, 3) the standard deviations
+        [m, m, rad], summed up along the path to each node.
+        """
+        count = len(self.loops)
+        self.loops = [*self.loops, *loops]
+        agree = np.zeros((len(self.loops), len(self.loops)), bool)
+        agree[:count, :count] = self._agree
+        for row in range(max(count, 1), len(self.loops)):
+            agree[row, :row] = _agree(self.loops[row], self.loops[:row], T_map_node, drift)
+            agree[:row, row] = agree[row, :row]
+        self._agree = agree
+
+    def cut(self, count: int) -> None:
+        """Leave the loops between the first `count` nodes."""
+        kept = [row for row, loop in enumerate(self.loops) if loop.second < count]
+        self.loops, self._agree = [self.loops[row] for row in kept], self._agree[np.ix_(kept, kept)]
+
+    def largest(self) -> list[int]:
+        """Return the indices of the largest set of loops that agree pairwise."""
+        return _largest_clique(self._agree)
+
+
 def consistent(
     loops: Sequence[Edge], T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
 ) -> list[int]:
-    """Return the indices of the largest set of loops that agree pairwise within the drift.
-
-    `T_map_node` (N, 4, 4) are the estimated nodes, `drift` (N, 3) the standard deviations
-    [m, m, rad], summed up along the path to each node.
-    """
-    agree = np.zeros((len(loops), len(loops)), bool)
-    for row in range(1, len(loops)):
-        agree[row, :row] = _agree(loops[row], loops[:row], T_map_node, drift)
-    return _largest_clique(agree | agree.T)
+    """Return the indices of the largest set of loops that agree pairwise, as in `Agreement`."""
+    agreement = Agreement()
+    agreement.add(loops, T_map_node, drift)
+    return agreement.largest()
 
 
 def _agree(

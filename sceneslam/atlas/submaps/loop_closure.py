@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,27 +27,35 @@ _CACHED = 8  # targets
 
 
 class LoopFinder:
-    """Measures the motion between submaps of different sessions."""
+    """Measures the motion between submaps of different sessions, and of one if it is open."""
 
-    def __init__(self, submaps: Sequence[Submap], closed: frozenset[int]) -> None:
-        """Set all submaps; in the sessions `closed`, modules close loops themselves."""
-        self._submaps, self._closed = submaps, closed
+    def __init__(self, is_closed: Callable[[int], bool]) -> None:
+        """Set which sessions are closed: there, modules close loops themselves."""
+        self._is_closed = is_closed
         self._targets: dict[tuple[int, int], Recognizer] = {}
 
+    def forget(self) -> None:
+        """Forget the submaps; they were replaced."""
+        self._targets.clear()
+
     def loops_to(
-        self, second: int, T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
+        self,
+        second: int,
+        submaps: Sequence[Submap],
+        T_map_node: NDArray[np.float64],
+        sigma: NDArray[np.float64],
     ) -> list[Edge]:
         """Return the verified loops from earlier submaps to one, near the graph's estimate.
 
-        `T_map_node` (N, 3) are the estimated nodes [m, m, rad], `drift` (N, 3) the standard
-        deviations summed up to each of them [m, m, rad].
+        `T_map_node` (N, 3) are the estimated nodes [m, m, rad], `sigma` (N, 3) the standard
+        deviations [m, m, rad] of the motion from each of them to this one.
         """
         query: PlanField | None = None
         found = []
-        for first in self._candidates(second, T_map_node, drift):
-            query = query or PlanField(self._submaps[second].plan)
-            window = _window(first, second, T_map_node, drift)
-            target = self._target(first, second, T_map_node)
+        for first in self._candidates(second, submaps, T_map_node, sigma):
+            query = query or PlanField(submaps[second].plan)
+            window = _window(T_map_node[first], T_map_node[second], sigma[first])
+            target = self._target(first, second, submaps, T_map_node)
             match = target.recognize(query, window, known_min=_KNOWN_MIN)
             if match is None:
                 continue
@@ -66,17 +74,21 @@ class LoopFinder:
         return found
 
     def _candidates(
-        self, second: int, T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
+        self,
+        second: int,
+        submaps: Sequence[Submap],
+        T_map_node: NDArray[np.float64],
+        sigma: NDArray[np.float64],
     ) -> list[int]:
         """Return the nearest submaps that may overlap; no two of them are neighbours."""
         near: list[tuple[float, int]] = []
         for first in range(second - 1):
-            if not self._may_close(first, second):
+            if not self._may_close(second - first, submaps[first], submaps[second]):
                 continue
-            window = _window(first, second, T_map_node, drift)
+            window = _window(T_map_node[first], T_map_node[second], sigma[first])
             if window.half_m < _SIGMAS * _GAIN_M or window.half_m > _HALF_MAX_M:
                 continue
-            gap_m = _gap_m(self._submaps[first].plan, self._submaps[second].plan, window.around)
+            gap_m = _gap_m(submaps[first].plan, submaps[second].plan, window.around)
             if gap_m <= window.half_m:
                 near.append((float(np.hypot(*window.around[:2])), first))
         chosen: list[int] = []
@@ -85,36 +97,38 @@ class LoopFinder:
                 chosen.append(first)
         return chosen
 
-    def _may_close(self, first: int, second: int) -> bool:
-        a, b = self._submaps[first], self._submaps[second]
-        if (a.run, a.session) != (b.run, b.session):
-            return bool(len(a.plan) and len(b.plan))
-        is_apart = second - first > 2 * _NEIGHBOURS
-        return a.session not in self._closed and is_apart and bool(len(a.plan) and len(b.plan))
+    def _may_close(self, apart: int, a: Submap, b: Submap) -> bool:
+        """Tell whether a loop may lead from `a` to `b`, that many submaps later."""
+        if not (len(a.plan) and len(b.plan)):
+            return False
+        is_one = (a.run, a.session) == (b.run, b.session)
+        return not is_one or (apart > 2 * _NEIGHBOURS and not self._is_closed(a.session))
 
-    def _target(self, first: int, second: int, T_map_node: NDArray[np.float64]) -> Recognizer:
+    def _target(
+        self,
+        first: int,
+        second: int,
+        submaps: Sequence[Submap],
+        T_map_node: NDArray[np.float64],
+    ) -> Recognizer:
         """Return a recognizer for the plan around `first`, of its session, older than `second`."""
         end = min(first + _NEIGHBOURS + 1, second)
         if (first, end) not in self._targets:
             while len(self._targets) >= _CACHED:
                 del self._targets[next(iter(self._targets))]
-            own = self._submaps[first]
+            own = submaps[first]
             around = range(max(first - _NEIGHBOURS, 0), end)
             placed = [
-                (planar.between(T_map_node[first], T_map_node[index]), self._submaps[index].plan)
+                (planar.between(T_map_node[first], T_map_node[index]), submaps[index].plan)
                 for index in around
-                if (self._submaps[index].run, self._submaps[index].session)
-                == (own.run, own.session)
+                if (submaps[index].run, submaps[index].session) == (own.run, own.session)
             ]
             self._targets[first, end] = Recognizer(PlanField(join(placed)))
         return self._targets[first, end]
 
 
-def _window(
-    first: int, second: int, T_map_node: NDArray[np.float64], drift: NDArray[np.float64]
-) -> SearchWindow:
-    around = planar.between(T_map_node[first], T_map_node[second])
-    sigma = np.abs(drift[second] - drift[first])
+def _window(T_map_first: Planar, T_map_second: Planar, sigma: NDArray[np.float64]) -> SearchWindow:
+    around = planar.between(T_map_first, T_map_second)
     half_m = _SIGMAS * float(max(sigma[0], sigma[1]) + 0.5 * sigma[2] * np.hypot(*around[:2]))
     return SearchWindow(around=around, half_m=half_m, half_rad=_SIGMAS * float(sigma[2]))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.localizer import Fix
-from sceneslam.atlas.submaps.collector import Collector
-from sceneslam.atlas.submaps.graph import Upright, consistent, solve
+from sceneslam.atlas.submaps.chain import Chain
+from sceneslam.atlas.submaps.graph import Agreement, Upright, consistent, deviations_to, solve
 from sceneslam.atlas.submaps.loop_closure import LoopFinder
 from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops, recognized_loops
 from sceneslam.graphs.edge import Edge, EdgeKind
@@ -28,39 +28,84 @@ class SolvedRun:
     T_map_node: NDArray[np.float64]  # (N, 4, 4), as many as the run has submaps
     loops: tuple[Edge, ...]  # nodes of the loaded map are counted first
 
+    @classmethod
+    def nothing(cls) -> SolvedRun:
+        """Return the solution without nodes."""
+        return cls(T_map_node=np.zeros((0, 4, 4)), loops=())
+
+    def cut(self, count: int, loaded: int) -> SolvedRun:
+        """Return the solution of the first `count` nodes, counted after those that were loaded."""
+        return SolvedRun(
+            T_map_node=self.T_map_node[:count],
+            loops=tuple(loop for loop in self.loops if loop.second < loaded + count),
+        )
+
 
 class RunGraph:
-    """Joins the submaps of a run, at their revised poses, with a loaded map."""
+    """Joins the submaps of a run, while it goes on and at its end, there with a loaded map."""
 
-    def __init__(self, own: Collector, loaded: SavedMap, path: Path) -> None:
-        """Take the finished submaps of a run; `path` are its poses as revised by the modules."""
-        self._own, self._loaded, self._path = own, loaded, path
-        self._count = len(loaded.submaps)
+    def __init__(self, loaded: SavedMap, is_closed: Callable[[int], bool]) -> None:
+        """Begin without submaps; `is_closed` tells in which sessions modules close loops."""
+        self._loaded, self._count = loaded, len(loaded.submaps)
+        self._finder = LoopFinder(is_closed)
+        self._searched = 0  # submaps to which loops were searched
+        self._found = Agreement()  # loops between submaps of the run
+        self._agreed: list[Edge] = []  # of these, used in the last solution
+        self._accepted: list[Edge] = []  # of these, not rejected by it
+        self._T_map_node = np.zeros((0, 4, 4))  # the last solution
 
-    def solve(
+    def forget(self, count: int) -> None:
+        """Forget all submaps but the first `count`: others took their place."""
+        if count >= len(self._T_map_node):
+            return
+        self._searched, self._T_map_node = min(self._searched, count), self._T_map_node[:count]
+        self._found.cut(count)
+        self._accepted = [edge for edge in self._accepted if edge.second < count]
+        self._finder.forget()
+
+    def extend(self, chain: Chain, *, is_level: bool) -> SolvedRun:
+        """Look for loops to the submaps of a run that are new; solve without the loaded map."""
+        self._place(chain)
+        self._search(chain, is_level=is_level)
+        agreeing = self._agreeing()
+        if agreeing != self._agreed:
+            self._agreed = agreeing
+            solved = solve(
+                self._T_map_node,
+                chain.motions,
+                agreeing,
+                fixed=(),
+                loose=0,
+                uprights=_uprights(chain, self._T_map_node, 0),
+            )
+            self._T_map_node = solved.T_map_node
+            self._accepted = [agreeing[index] for index in solved.accepted]
+        loops = tuple(edge.shifted(self._count) for edge in self._accepted)
+        return SolvedRun(T_map_node=self._T_map_node, loops=loops)
+
+    def finish(
         self,
+        chain: Chain,
         T_map_node: NDArray[np.float64],
+        path: Path,
         maps: Sequence[MapLayers],
         fixes: Sequence[Fix],
-        closed: frozenset[int],
+        *,
+        is_level: bool,
     ) -> SolvedRun:
-        """Find the loops and solve, from the initial nodes (N, 4, 4) of the run.
+        """Solve the whole graph, from the initial nodes (N, 4, 4) of the run.
 
-        `maps` are those of the modules, with their own loops, `fixes` the places where the run was
-        located in the loaded map, `closed` the sessions whose modules close loops themselves.
+        `path` are the poses as revised by the modules, `maps` theirs, with their own loops, `fixes`
+        the places where the run was located in the loaded map.
         """
-        own, count = self._own, self._count
-        motions = [*own.motions, *self._edges_of(closed_loops(maps))]
-        plane, drift = planar.from_transforms(T_map_node), np.array(own.drift)
-        fixed = self._fix_edges(fixes)
-        recognized = [edge.shifted(count) for edge in self._edges_of(recognized_loops(maps))]
-        finder = LoopFinder(own.submaps, closed)
-        found = [
-            edge.shifted(count)
-            for second in range(len(own.submaps) if own.is_level else 0)
-            for edge in finder.loops_to(second, plane, drift)
-        ]
-        loops = [*fixed, *recognized, *found]
+        count, ends = self._count, _Ends(chain, path)
+        motions = [*chain.motions, *ends.edges_of(closed_loops(maps))]
+        drift = np.array(chain.drift)
+        fixed = self._fix_edges(fixes, ends)
+        recognized = [edge.shifted(count) for edge in ends.edges_of(recognized_loops(maps))]
+        self._place(chain)
+        self._search(chain, is_level=is_level)
+        loops = [*fixed, *recognized, *(edge.shifted(count) for edge in self._found.loops)]
         nodes = np.concatenate([self._loaded.T_map_node, T_map_node])
         agreeing = consistent(loops, nodes, np.concatenate([np.zeros((count, 3)), drift]))
         if len(agreeing) < 2 and not fixed:
@@ -71,61 +116,51 @@ class RunGraph:
             [loops[index] for index in agreeing],
             fixed=range(count),
             loose=count,
-            uprights=self._uprights(T_map_node),
+            uprights=_uprights(chain, T_map_node, count),
         )
         return SolvedRun(
             T_map_node=solved.T_map_node[count:],
             loops=tuple(loops[agreeing[index]] for index in solved.accepted),
         )
 
-    def _uprights(self, T_map_node: NDArray[np.float64]) -> list[Upright]:
-        """Return the vertical directions; the first one gives that of the map.
+    def _agreeing(self) -> list[Edge]:
+        """Return the loops that agree with each other; one alone is not believed."""
+        agreeing = self._found.largest()
+        return [self._found.loops[index] for index in agreeing] if len(agreeing) > 1 else []
 
-        Base is level most of the time: a sensor that is mounted askew has the same tilt everywhere.
-        """
-        nodes, measured = list(self._own.up_node), list(self._own.up_node.values())
-        if not measured:
-            return []
-        askew = upright(se3.identity(), np.median(measured, axis=0))[:3, :3]
-        ups = [askew @ up_base for up_base in measured]
-        up_map = T_map_node[nodes[0], :3, :3] @ ups[0]
-        return [
-            Upright(node=self._count + node, up_node=up, up_map=up_map)
-            for node, up in zip(nodes, ups, strict=True)
-        ]
+    def _place(self, chain: Chain) -> None:
+        """Place the new submaps by the motions to them."""
+        nodes = list(self._T_map_node)
+        for T_run_node in chain.T_run_node[len(nodes) :]:
+            before = len(nodes) - 1
+            if nodes:
+                T_run_node = nodes[-1] @ se3.inverse(chain.T_run_node[before]) @ T_run_node
+            nodes.append(T_run_node)
+        self._T_map_node = np.array(nodes).reshape(-1, 4, 4)
 
-    def _edges_of(self, loops: Sequence[OwnLoop]) -> list[Edge]:
-        """Return a module's own loops as edges between submaps, without those within one."""
-        found = []
-        for loop in loops:
-            first, second = (self._own.node_at(ns) for ns in (loop.from_ns, loop.to_ns))
-            start, end = self._path(loop.from_ns), self._path(loop.to_ns)
-            if start is None or end is None or first == second:
-                continue
-            T_first_from = se3.inverse(self._own.T_run_node[first]) @ start
-            T_to_second = se3.inverse(end) @ self._own.T_run_node[second]
-            found.append(
-                Edge(
-                    first=first,
-                    second=second,
-                    T_first_second=T_first_from @ loop.T_from_to @ T_to_second,
-                    covariance=se3.carried(loop.covariance, se3.inverse(T_to_second)),
-                    kind=EdgeKind.LOOP,
-                )
-            )
-        return found
+    def _search(self, chain: Chain, *, is_level: bool) -> None:
+        """Look for loops to the submaps that were not searched yet."""
+        plane = planar.from_transforms(self._T_map_node)
+        while is_level and self._searched < len(chain):
+            second, self._searched = self._searched, self._searched + 1
+            sigma = deviations_to(second, [*chain.motions[:second], *self._accepted])
+            loops = self._finder.loops_to(second, chain.submaps, plane, sigma)
+            if loops:
+                self._found.add(loops, np.array(chain.T_run_node), np.array(chain.drift))
 
-    def _fix_edges(self, fixes: Sequence[Fix]) -> list[Edge]:
+    def _fix_edges(self, fixes: Sequence[Fix], ends: _Ends) -> list[Edge]:
         """Return the loops from the loaded map's submaps to the run's, one per run submap.
 
         It is the mean of all its fixes, and as certain as one: they share their errors.
         """
         edges: dict[int, list[Edge]] = {}
         for fix in fixes:
-            node, pose = self._own.node_at(fix.stamp_ns), self._path(fix.stamp_ns)
-            if pose is not None:
-                T_base_node = se3.inverse(pose) @ self._own.T_run_node[node]
-                edges.setdefault(node, []).append(self._fix_edge(fix, node, T_base_node))
+            found = ends.of(fix.stamp_ns)
+            if found is not None:
+                node, T_node_base = found
+                edges.setdefault(node, []).append(
+                    self._fix_edge(fix, node, se3.inverse(T_node_base))
+                )
         return [self._mean(same) for same in edges.values()]
 
     def _mean(self, edges: Sequence[Edge]) -> Edge:
@@ -151,3 +186,54 @@ class RunGraph:
             covariance=se3.carried(fix.covariance, se3.inverse(T_base_node)),
             kind=EdgeKind.LOOP,
         )
+
+
+class _Ends:
+    """Finds the submap of a stamp, and base in it."""
+
+    def __init__(self, chain: Chain, path: Path) -> None:
+        self._chain, self._path = chain, path
+
+    def of(self, stamp_ns: int) -> tuple[int, Transform] | None:
+        """Return the node and T_node_base (4, 4), None without a pose."""
+        node, T_run_base = self._chain.node_at(stamp_ns), self._path(stamp_ns)
+        if T_run_base is None:
+            return None
+        return node, se3.inverse(self._chain.T_run_node[node]) @ T_run_base
+
+    def edges_of(self, loops: Sequence[OwnLoop]) -> list[Edge]:
+        """Return a module's own loops as edges between submaps, without those within one."""
+        found = []
+        for loop in loops:
+            start, end = self.of(loop.from_ns), self.of(loop.to_ns)
+            if start is None or end is None or start[0] == end[0]:
+                continue
+            (first, T_first_from), (second, T_second_to) = start, end
+            found.append(
+                Edge(
+                    first=first,
+                    second=second,
+                    T_first_second=T_first_from @ loop.T_from_to @ se3.inverse(T_second_to),
+                    covariance=se3.carried(loop.covariance, T_second_to),
+                    kind=EdgeKind.LOOP,
+                )
+            )
+        return found
+
+
+def _uprights(chain: Chain, T_map_node: NDArray[np.float64], count: int) -> list[Upright]:
+    """Return the vertical directions; the first one gives that of the map.
+
+    Base is level most of the time: a sensor that is mounted askew has the same tilt everywhere.
+    `count` is the number of nodes before those of the run.
+    """
+    nodes, measured = list(chain.up_node), list(chain.up_node.values())
+    if not measured:
+        return []
+    askew = upright(se3.identity(), np.median(measured, axis=0))[:3, :3]
+    ups = [askew @ up_base for up_base in measured]
+    up_map = T_map_node[nodes[0], :3, :3] @ ups[0]
+    return [
+        Upright(node=count + node, up_node=up, up_map=up_map)
+        for node, up in zip(nodes, ups, strict=True)
+    ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from threading import Lock
 
@@ -103,21 +103,26 @@ def make_submap(poses: Sequence[KeyPose], run: int) -> Submap:
     )
 
 
-def split(poses: Sequence[KeyPose]) -> list[list[KeyPose]]:
-    """Group the poses into submaps of one session, up to LENGTH_M and TURN_RAD each."""
-    parts: list[list[KeyPose]] = []
-    length_m = turn_rad = 0.0
-    for pose in poses:
-        if parts and parts[-1][-1].session == pose.session:
-            step = _planar(parts[-1][-1], pose)
-            length_m += float(np.hypot(step[0], step[1]))
-            turn_rad += abs(float(step[2]))
-            if length_m <= LENGTH_M and turn_rad <= TURN_RAD:
-                parts[-1].append(pose)
-                continue
-        parts.append([pose])
-        length_m = turn_rad = 0.0
-    return parts
+@dataclass(slots=True, eq=False)
+class OpenSubmap:
+    """The poses of a submap that grows, of one session, up to LENGTH_M and TURN_RAD."""
+
+    poses: list[KeyPose] = field(default_factory=list)
+    _length_m: float = 0.0
+    _turn_rad: float = 0.0
+
+    def take(self, pose: KeyPose) -> bool:
+        """Add a pose if it belongs to the submap; return whether it does."""
+        if self.poses:
+            if self.poses[-1].session != pose.session:
+                return False
+            step = _planar(self.poses[-1], pose)
+            self._length_m += float(np.hypot(step[0], step[1]))
+            self._turn_rad += abs(float(step[2]))
+            if self._length_m > LENGTH_M or self._turn_rad > TURN_RAD:
+                return False
+        self.poses.append(pose)
+        return True
 
 
 def motion_covariance(poses: Sequence[KeyPose]) -> Covariance:

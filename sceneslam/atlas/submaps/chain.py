@@ -1,0 +1,89 @@
+"""The submaps of a run in their order, and the motions from each to the next."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.atlas.submaps.own_loops import Path
+from sceneslam.atlas.submaps.submap import Submap
+from sceneslam.graphs.edge import Edge
+from sceneslam.types import planar, se3
+from sceneslam.types.se3 import Transform
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class Chain:
+    """Grows by one submap at a time; node i is submap i."""
+
+    submaps: list[Submap] = field(default_factory=list)
+    T_run_node: list[Transform] = field(default_factory=list)
+    motions: list[Edge] = field(default_factory=list)
+    drift: list[NDArray[np.float64]] = field(default_factory=list)  # deviations [m, m, rad], summed
+    up_node: dict[int, NDArray[np.float64]] = field(default_factory=dict)  # vertical (3,), if known
+
+    def __len__(self) -> int:
+        return len(self.submaps)
+
+    def append(self, submap: Submap, T_run_node: Transform, motion: Edge | None) -> None:
+        """Add a submap with the motion to it, None for the first."""
+        self.submaps.append(submap)
+        self.T_run_node.append(T_run_node)
+        if motion is None:
+            self.drift.append(np.zeros(3))
+            return
+        self.motions.append(motion)
+        deviations = np.sqrt(np.diag(planar.planar_covariance(motion.covariance)))
+        self.drift.append(self.drift[-1] + deviations)
+
+    def cut(self, count: int) -> None:
+        """Leave the first `count` submaps."""
+        del self.submaps[count:], self.T_run_node[count:], self.drift[count:]
+        del self.motions[max(count - 1, 0) :]
+        self.up_node = {node: up for node, up in self.up_node.items() if node < count}
+
+    def copy(self) -> Chain:
+        """Return the chain as it is now."""
+        return Chain(
+            submaps=list(self.submaps),
+            T_run_node=list(self.T_run_node),
+            motions=list(self.motions),
+            drift=list(self.drift),
+            up_node=dict(self.up_node),
+        )
+
+    def node_at(self, stamp_ns: int) -> int:
+        """Return the index of the submap at a stamp, or of the last before it."""
+        after = bisect_right(self.submaps, stamp_ns, key=lambda submap: int(submap.stamps_ns[0]))
+        return max(after - 1, 0)
+
+    def remeasure(self, path: Path) -> None:
+        """Set the poses of the submaps and their views as revised, and the motions between them.
+
+        `path` has a pose at every stamp of a submap.
+        """
+        poses = [_at(path, int(submap.stamps_ns[0])) for submap in self.submaps]
+        self.submaps = [
+            replace(
+                submap,
+                views=tuple(
+                    replace(view, T_submap_base=se3.inverse(pose) @ _at(path, view.stamp_ns))
+                    for view in submap.views
+                ),
+            )
+            for submap, pose in zip(self.submaps, poses, strict=True)
+        ]
+        self.T_run_node = poses
+        self.motions = [
+            replace(edge, T_first_second=se3.inverse(poses[edge.first]) @ poses[edge.second])
+            for edge in self.motions
+        ]
+
+
+def _at(path: Path, stamp_ns: int) -> Transform:
+    pose = path(stamp_ns)
+    assert pose is not None, "a step has a pose"
+    return pose
