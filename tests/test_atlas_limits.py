@@ -15,7 +15,7 @@ from sceneslam.atlas.submaps.collector import Collector, Known
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.submaps.graph import consistent, on_floor
 from sceneslam.atlas.submaps.own_loops import closed_loops, recognized_loops
-from sceneslam.atlas.submaps.submap import KeyPose, make_submap, motion_covariance, split
+from sceneslam.atlas.submaps.submap import KeyPose, OpenSubmap, make_submap, motion_covariance
 from sceneslam.atlas.uncertainty import GYRO, MAPPED, VELOCITY, WHEELS, drifted
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar, se3
@@ -128,6 +128,16 @@ def test_a_base_whose_steps_are_mostly_level_moves_on_a_floor():
     assert own.is_level  # 6 of 12
 
 
+def split(poses):
+    """Group poses into submaps, each of which takes as many as it can."""
+    parts = [OpenSubmap()]
+    for pose in poses:
+        if not parts[-1].take(pose):
+            parts.append(OpenSubmap())
+            assert parts[-1].take(pose)
+    return [part.poses for part in parts]
+
+
 def test_a_submap_ends_after_its_length_its_turn_and_its_session():
     ahead = [key_pose(index, at(0.25 * index)) for index in range(25)]
     assert [len(part) for part in split(ahead)] == [11, 11, 3]
@@ -160,15 +170,16 @@ def run_of(count, *, module=lambda i: "a", session=lambda i: 0, step_s=1):
     return own
 
 
-def test_submaps_are_made_of_steps_that_no_handover_replaces_any_more():
-    assert len(run_of(39).submaps) == 0  # 19 of 39 steps are 20 s old
-    half = run_of(41)  # 21 of 41
-    assert [len(one.stamps_ns) for one in half.submaps] == [6, 6, 6]
-    assert half.submaps[-1].stamps_ns[-1] == 17 * S
-    half.finish()
-    assert [len(one.stamps_ns) for one in half.submaps] == [6] * 6 + [5]
-    assert half.node_at(0) == 0 and half.node_at(-5) == 0
-    assert [half.node_at(index * S) for index in (5, 6, 35, 36, 99)] == [0, 1, 5, 6, 6]
+def test_a_submap_is_complete_as_soon_as_the_next_step_is_beyond_it():
+    assert [len(run_of(count).chain) for count in (6, 7, 12, 13)] == [0, 1, 1, 2]
+    own = run_of(41)
+    assert [len(one.stamps_ns) for one in own.chain.submaps] == [6] * 6
+    assert own.chain.submaps[-1].stamps_ns[-1] == 35 * S
+    own.finish()
+    assert [len(one.stamps_ns) for one in own.chain.submaps] == [6] * 6 + [5]
+    node_at = own.chain.node_at
+    assert node_at(0) == 0 and node_at(-5) == 0
+    assert [node_at(index * S) for index in (5, 6, 35, 36, 99)] == [0, 1, 5, 6, 6]
 
 
 def test_motions_lead_from_submap_to_submap_and_their_deviations_add_up():
@@ -180,7 +191,7 @@ def test_motions_lead_from_submap_to_submap_and_their_deviations_add_up():
     np.testing.assert_array_equal(own.chain.drift[0], np.zeros(3))
     expected = np.sqrt(np.diag(planar.planar_covariance(motion.covariance)))
     np.testing.assert_allclose(own.chain.drift[1], expected)
-    own.remeasure(lambda stamp_ns: at(1.0 + 2 / 3 * stamp_ns / S))
+    own.chain.remeasure(lambda stamp_ns: at(1.0 + 2 / 3 * stamp_ns / S))
     np.testing.assert_allclose(own.chain.motions[0].T_first_second, at(4.0), atol=1e-12)
 
 
@@ -193,7 +204,7 @@ def test_a_motion_that_is_bridged_for_more_than_half_is_a_bridge(bridged, kind):
     assert own.chain.motions[0].kind is kind
     other = run_of(8, session=lambda i: i // 4)
     other.finish()
-    assert [edge.kind for edge in other.motions] == [EdgeKind.HANDOVER]
+    assert [edge.kind for edge in other.chain.motions] == [EdgeKind.HANDOVER]
 
 
 # Loops.

@@ -51,9 +51,9 @@ def loops_to(second, sessions, nodes, sigma, *, closed=(), plans=None, runs=None
     """Find loops between submaps at nodes, with drift of `sigma` (3,) from one to the next."""
     plans, runs = plans or [WALL] * len(sessions), runs or [0] * len(sessions)
     submaps = [submap(*one) for one in zip(sessions, plans, runs, strict=True)]
-    drift = np.cumsum(np.tile(np.array(sigma, float), (len(sessions), 1)), axis=0)
-    finder = LoopFinder(submaps, frozenset(closed))
-    return finder.loops_to(second, np.array(nodes, float), drift)
+    steps = np.abs(second - np.arange(len(sessions)))[:, None]
+    finder = LoopFinder(lambda session: session in closed)
+    return finder.loops_to(second, submaps, np.array(nodes, float), steps * np.array(sigma))
 
 
 def line(*x_m):
@@ -155,8 +155,12 @@ def test_a_target_is_the_plan_of_two_neighbours_on_either_side_in_one_session(mo
 def test_a_target_is_made_once_for_all_that_are_compared_with_it(monkeypatch):
     compared = Compared(monkeypatch)
     sessions = [0] * 4 + [1] * 16
-    finder = LoopFinder([submap(session) for session in sessions], frozenset([1]))
-    drift = np.cumsum(np.full((20, 3), 0.1), axis=0)
+    submaps = [submap(session) for session in sessions]
+    finder = LoopFinder(lambda session: session == 1)
+    sigma, nodes = np.full((20, 3), 0.1), np.zeros((20, 3))
     for second in range(6, 20):
-        assert len(finder.loops_to(second, np.zeros((20, 3)), drift)) == 2
+        assert len(finder.loops_to(second, submaps, nodes, sigma)) == 2
     assert len(compared.targets) == 2
+    finder.forget()  # submaps were replaced
+    assert len(finder.loops_to(19, submaps, nodes, sigma)) == 2
+    assert len(compared.targets) == 4

@@ -134,9 +134,10 @@ def test_loops_lead_between_the_first_poses_of_submaps_or_from_the_loaded_map(mo
     for second in range(60):
         observe(second)
     own._collector.finish()
-    starts_s = [int(submap.stamps_ns[0]) // S for submap in own._collector.submaps]
+    starts_s = [int(submap.stamps_ns[0]) // S for submap in own._collector.chain.submaps]
     assert starts_s[:3] == [0, 3, 6] and starts_s[-1] == 57
-    own._loops = [edge(0, 3), edge(2, 20, (1, 0, 0), EdgeKind.LOOP)]
+    loops = edge(0, 3), edge(2, 20, (1, 0, 0), EdgeKind.LOOP)
+    own._solved = replace(own._solved, loops=loops)
     found = own.loops(np.arange(60) * S)
     assert [(loop.first, loop.second) for loop in found] == [(LOADED, 6), (3, 57)]
     np.testing.assert_allclose(found[1].T_first_second, planar.to_transform(np.array([1.0, 0, 0])))
@@ -153,7 +154,7 @@ def test_a_located_run_is_corrected_into_the_loaded_map(monkeypatch, is_placed):
         observe(20)
     kept = len(events)
     path = lambda stamp_ns: planar.to_transform(np.array([stamp_ns / S, 0.0, 0.0]))  # noqa: E731
-    found = own.finish(path, [], frozenset())
+    found = own.finish(path, [])
     assert len(found.stamps_ns) == (7 if is_placed else 0) and len(events) == kept
     stamps_ns = np.arange(20) * S
     poses = np.stack([path(stamp_ns) for stamp_ns in stamps_ns])

@@ -360,7 +360,7 @@ def test_a_camera_held_by_hand_finds_itself_in_the_map_of_the_first_half(
             if one.stamp_ns in poses:
                 mapper.observe(one, None)
         located = mapper.T_map_run
-        mapper.finish(path, [], frozenset())
+        mapper.finish(path, [])
         saved = mapper.saved()
     assert [event for event, _ in events[:1]] == ["relocalized"]
     assert events[0][1]["after_s"] < 3.2  # 3.07 with a hand that turns fast, 0.2
