@@ -81,7 +81,7 @@ class Mapper:
         self._solved = SolvedRun.nothing()
         self._T_new_old = se3.identity()  # correction of the newest pose, by loops of the run
         self._is_over = False
-        self._told: set[tuple[int, int]] = set()  # loops
+        self._told: set[tuple[int, int, int]] = set()  # loops, by their run and stamps
 
     @property
     def is_placed(self) -> bool:
@@ -154,6 +154,7 @@ class Mapper:
         """
         self._collector.finish()
         self._executor.shutdown()
+        self._collect_loops()
         chain = self._collector.chain
         if not len(chain):
             return Correction.none()
@@ -226,8 +227,9 @@ class Mapper:
         solved = solving.result()
         if len(chain) > self._kept:
             return  # poses were replaced meanwhile
-        self._solved = solved
-        self._T_new_old = solved.T_map_node[-1] @ se3.inverse(chain.T_run_node[-1])
+        self._solved, self._T_new_old = solved, se3.identity()
+        if solved.loops:
+            self._T_new_old = solved.T_map_node[-1] @ se3.inverse(chain.T_run_node[-1])
         self._tell_loops()
 
     def _known_nodes(self) -> NDArray[np.float64]:
@@ -287,12 +289,12 @@ class Mapper:
         """Report the loops that are new."""
         submaps = [*self._loaded.submaps, *self._collector.chain.submaps]
         for loop in self._solved.loops:
-            ends = loop.first, loop.second
+            first, second = submaps[loop.first], submaps[loop.second]
+            ends = first.run, int(first.stamps_ns[0]), int(second.stamps_ns[0])
             if ends in self._told:
                 continue
             self._told.add(ends)
-            first, second = (submaps[node] for node in ends)
             fields: dict[str, Any] = {"module": second.module, "to_module": first.module}
-            fields |= {"to_ns": int(first.stamps_ns[0])}
+            fields |= {"to_ns": ends[1]}
             fields |= {"in_loaded_map": loop.first < len(self._loaded.submaps)}
-            self._note("loop", int(second.stamps_ns[0]), **fields)
+            self._note("loop", ends[2], **fields)

@@ -110,14 +110,19 @@ class Collector:
         self._take()
 
     def rewind(self, stamp_ns: int) -> None:
-        """Remove the submaps with poses from a stamp on; their steps wait for new poses."""
-        parts = [*self._recent, self._open.poses]
-        kept = sum(bool(part) and part[-1].stamp_ns < stamp_ns for part in parts)
+        """Remove the submaps with poses from a stamp on; their steps wait for new poses.
+
+        The first pose after a submap completed it: the submap is removed with that pose.
+        """
+        growing = self._open.poses
+        if growing and growing[-1].stamp_ns < stamp_ns:
+            return
+        firsts_ns = [part[0].stamp_ns for part in [*self._recent, growing] if part]
+        firsts_ns += [step[0] for step in self._waiting[:1]]
+        kept = sum(ns < stamp_ns for ns in firsts_ns[1 : len(self._recent) + 1])
         if len(self._recent) < len(self.chain):
             kept = max(kept, 1)  # older ones stay as they are
-        if kept == len(parts):
-            return
-        gone = [pose for part in parts[kept:] for pose in part]
+        gone = [pose for part in [*self._recent[kept:], growing] for pose in part]
         steps = [(pose.stamp_ns, pose.scan, pose.up_base, pose.landmarks) for pose in gone]
         self._waiting = [*steps, *self._waiting]
         self.chain.cut(len(self.chain) - (len(self._recent) - kept))
@@ -144,7 +149,7 @@ class Collector:
         part, self._open = self._open.poses, OpenSubmap()
         self._append(part)
         settled_ns = part[-1].stamp_ns - _SETTLED_NS
-        while len(self._recent) > 1 and self._recent[0][-1].stamp_ns < settled_ns:
+        while len(self._recent) > 1 and self._recent[1][-1].stamp_ns < settled_ns:
             del self._recent[0]
         self._recent.append(part)
 
