@@ -2,10 +2,12 @@
 
 import importlib
 import pkgutil
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from test_atlas_limits import S, at, loop, pitched, run_of
 from test_atlas_maps import WALL, map_of
 
@@ -15,8 +17,8 @@ from sceneslam.atlas.covariances import PosedPath, calibrated, covariances
 from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.atlas.places.localizer import Fix
 from sceneslam.atlas.submaps import run_graph
-from sceneslam.atlas.submaps.graph import Solved, consistent
-from sceneslam.atlas.submaps.run_graph import RunGraph
+from sceneslam.atlas.submaps.graph import Agreement, Solved, consistent, deviations_to, solve
+from sceneslam.atlas.submaps.run_graph import RunGraph, SolvedRun
 from sceneslam.atlas.uncertainty import WHEELS
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import LoopLayer, MapLayers, PoseGraphLayer
@@ -188,6 +190,190 @@ def test_headings_of_loops_agree_within_their_deviation(apart_m):
             second = loop(1, 3, [10 + apart_m, 0, sign * share * bound])
             both = consistent([second, loop(0, 2, [10, 0, 0])], planar.to_transforms(nodes), drift)
             assert (len(both) == 2) == (share < 1.0)
+
+
+# Loops that are found while the run goes on.
+
+
+class Searched(Given):
+    """Loops are found to the submaps that they lead to; the graph is solved in earnest."""
+
+    def __init__(self, monkeypatch, found):
+        self.found, self.asked, self.sigma, self.forgotten, self.solved = found, [], {}, 0, 0
+        monkeypatch.setattr(run_graph, "LoopFinder", lambda is_closed: self)
+        monkeypatch.setattr(run_graph, "solve", self._solve)
+
+    def loops_to(self, second, submaps, plane, sigma):
+        self.asked.append(second)
+        self.plane, self.sigma[second] = plane, sigma
+        return super().loops_to(second, submaps, plane, sigma)
+
+    def forget(self):
+        self.forgotten += 1
+
+    def _solve(self, *args, **settings):
+        self.solved += 1
+        return solve(*args, **settings)
+
+
+def off(first, second, aside_m=0.02):
+    """A loop between two nodes 3 m apart each, `aside_m` off where the motions lead."""
+    return loop(first, second, [3.0 * (second - first), aside_m, 0.0], sigma=0.01)
+
+
+def grown(own, count):
+    chain = own.chain.copy()
+    chain.cut(count)
+    return chain
+
+
+def test_loops_are_searched_once_to_each_submap_and_believed_when_two_agree(monkeypatch):
+    searched, own = Searched(monkeypatch, [off(0, 5), off(0, 6)]), finished(48)
+    graph = RunGraph(map_of(WALL, WALL), lambda session: False)
+    alone = graph.extend(grown(own, 6), is_level=True)
+    assert alone.loops == () and searched.solved == 0 and searched.asked == [0, 1, 2, 3, 4, 5]
+    np.testing.assert_allclose(alone.T_map_node, own.chain.T_run_node[:6], atol=1e-12)
+    both = graph.extend(grown(own, 7), is_level=True)
+    assert [(one.first, one.second) for one in both.loops] == [(2, 7), (2, 8)]
+    assert searched.asked[6:] == [6] and searched.solved == 1
+    aside_m = both.T_map_node[:, 1, 3]
+    assert aside_m[0] == pytest.approx(0.0, abs=1e-6) and 0.01 < aside_m[5] < 0.02
+    after = graph.extend(own.chain, is_level=True)  # nothing is found to the eighth
+    assert searched.asked[7:] == [7] and searched.solved == 1 and len(after.loops) == 2
+    np.testing.assert_array_equal(after.T_map_node[:7], both.T_map_node)
+    step = own.chain.motions[6].T_first_second
+    np.testing.assert_allclose(after.T_map_node[7], both.T_map_node[6] @ step, atol=1e-12)
+    np.testing.assert_allclose(searched.plane[7], planar.from_transform(after.T_map_node[7]))
+
+
+def test_a_base_that_is_not_level_searches_no_loops_until_it_is(monkeypatch):
+    searched, own = Searched(monkeypatch, [off(0, 5), off(0, 6)]), finished(48)
+    graph = RunGraph(empty_map(), lambda session: False)
+    assert graph.extend(grown(own, 7), is_level=False).loops == () and searched.asked == []
+    assert len(graph.extend(own.chain, is_level=True).loops) == 2
+    assert searched.asked == list(range(8))
+
+
+def test_after_a_loop_the_next_search_goes_along_it(monkeypatch):
+    searched, own = Searched(monkeypatch, [off(0, 5), off(0, 6)]), finished(54)
+    graph = RunGraph(empty_map(), lambda session: False)
+    for count in (7, 9):
+        found = graph.extend(grown(own, count), is_level=True)
+    drift = np.array(own.chain.drift)
+    np.testing.assert_allclose(searched.sigma[5], drift[5] - drift[:6], atol=1e-12)
+    loops = [one.shifted(0) for one in found.loops]
+    for second in (7, 8):
+        expected = deviations_to(second, [*own.chain.motions[:second], *loops])
+        np.testing.assert_array_equal(searched.sigma[second], expected)
+        assert (searched.sigma[second][0] < 0.5 * drift[second]).all()
+
+
+def test_forgotten_submaps_take_their_loops_with_them_and_are_searched_again(monkeypatch):
+    searched, own = Searched(monkeypatch, [off(0, 5), off(0, 6), off(0, 7)]), finished(48)
+    graph = RunGraph(empty_map(), lambda session: False)
+    assert len(graph.extend(own.chain, is_level=True).loops) == 3
+    graph.forget(8)
+    assert searched.forgotten == 0  # there are no others
+    graph.forget(7)
+    assert searched.forgotten == 1
+    searched.found = searched.found[:2]
+    again = graph.extend(own.chain, is_level=True)
+    assert [(one.first, one.second) for one in again.loops] == [(0, 5), (0, 6)]
+    assert searched.asked[8:] == [7]
+    fresh = RunGraph(empty_map(), lambda session: False).extend(own.chain, is_level=True)
+    np.testing.assert_allclose(again.T_map_node, fresh.T_map_node, atol=1e-6)
+
+
+def test_nodes_return_to_where_motions_lead_when_no_loop_is_left(monkeypatch):
+    searched, own = Searched(monkeypatch, [off(0, 5), off(0, 6)]), finished(48)
+    graph = RunGraph(empty_map(), lambda session: False)
+    bent = graph.extend(own.chain, is_level=True).T_map_node
+    assert np.abs(bent[:6, 1, 3]).max() > 0.01
+    graph.forget(6)
+    searched.found = []
+    straight = graph.extend(own.chain, is_level=True)
+    assert straight.loops == ()
+    np.testing.assert_array_equal(straight.T_map_node, own.chain.T_run_node)
+
+
+def test_a_solution_is_cut_with_its_loops():
+    loops = tuple(loop(*ends, [1.0, 0.0, 0.0]) for ends in ((0, 4), (2, 5), (3, 6)))
+    found = SolvedRun(T_map_node=np.tile(np.eye(4), (5, 1, 1)), loops=loops).cut(3, loaded=3)
+    assert len(found.T_map_node) == 3 and found.loops == loops[:2]
+
+
+def links(seed):
+    """Some nodes with random edges between them, which may leave some apart."""
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 7))
+    edges = []
+    for _ in range(int(rng.integers(0, 10)) if count > 1 else 0):
+        first, second = sorted(rng.choice(count, 2, replace=False).tolist())
+        one = loop(first, second, [1.0, 0.0, 0.0])
+        sigmas = rng.uniform(0.01, 1.0, 3)
+        covariance = planar.spatial_covariance(np.diag(sigmas**2), level=np.ones(3))
+        edges.append(replace(one, covariance=covariance))
+    return count, edges
+
+
+def sigmas_of(edge):
+    return np.sqrt(np.diag(planar.planar_covariance(edge.covariance)))
+
+
+def shortest(start, end, edges, passed=()):
+    """Return the deviations along the most certain of all paths, one after the other."""
+    if start == end:
+        return np.zeros(3)
+    found = [np.full(3, np.inf)]
+    for one in edges:
+        for here, there in ((one.first, one.second), (one.second, one.first)):
+            if here == start and there not in passed:
+                rest = shortest(there, end, edges, (*passed, start))
+                found.append(sigmas_of(one) + rest)
+    return min(found, key=lambda sigma: sigma @ [1.0, 1.0, 2.5])
+
+
+@given(st.integers(0, 10**6))
+def test_deviations_add_up_along_the_most_certain_path(seed):
+    count, edges = links(seed)
+    for node in range(count):
+        found = deviations_to(node, edges)
+        assert len(found) > node and (found[node] == 0).all()
+        for other in range(len(found)):
+            expected = shortest(other, node, edges)
+            np.testing.assert_allclose(found[other], expected, atol=1e-12)
+
+
+def test_deviations_to_a_node_without_a_path_are_infinite():
+    found = deviations_to(3, [loop(0, 1, [1.0, 0.0, 0.0])])
+    np.testing.assert_array_equal(found, [[np.inf] * 3] * 3 + [[0.0] * 3])
+    np.testing.assert_array_equal(deviations_to(0, []), np.zeros((1, 3)))
+
+
+_NODES = 12
+
+
+@given(st.integers(0, 10**6), st.integers(0, _NODES))
+def test_loops_that_are_compared_as_they_are_found_agree_as_all_at_once(seed, kept):
+    rng = np.random.default_rng(seed)
+    plane = np.cumsum(rng.normal(0.0, 1.0, (_NODES, 3)), axis=0)
+    nodes, drift = planar.to_transforms(plane), np.cumsum(rng.uniform(0, 0.05, (_NODES, 3)), axis=0)
+    loops = []
+    for _ in range(10):
+        first, second = sorted(rng.choice(_NODES, 2, replace=False).tolist())
+        away = rng.choice([0.0, 0.0, 0.3, 3.0]) * rng.normal(0.0, 1.0, 3)
+        loops.append(loop(first, second, planar.between(plane[first], plane[second]) + away))
+    agreement, rest = Agreement(), list(loops)
+    while rest:
+        count = int(rng.integers(1, 4))
+        agreement.add(rest[:count], nodes, drift)
+        rest = rest[count:]
+    assert agreement.loops == loops and agreement.largest() == consistent(loops, nodes, drift)
+    left = [one for one in loops if one.second < kept]
+    agreement.cut(kept)
+    assert agreement.loops == left and agreement.largest() == consistent(left, nodes, drift)
+    agreement.add(loops[:3], nodes, drift)
+    assert agreement.largest() == consistent([*left, *loops[:3]], nodes, drift)
 
 
 # Poses.

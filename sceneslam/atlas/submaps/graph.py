@@ -138,10 +138,10 @@ def deviations_to(node: int, edges: Sequence[Edge]) -> NDArray[np.float64]:
     """Return the standard deviations (N, 3) [m, m, rad] of the motions from all nodes to one.
 
     They add up along the most certain path (Dijkstra), as drift is systematic. Node N - 1 is the
-    newest of the edges'; without a path they are infinite.
+    newest of all; without a path they are infinite.
     """
     links: list[list[tuple[int, list[float]]]]
-    links = [[] for _ in range(1 + max((edge.second for edge in edges), default=node))]
+    links = [[] for _ in range(1 + max([node, *(edge.second for edge in edges)]))]
     for edge in edges:
         step = np.sqrt(np.diag(planar.planar_covariance(edge.covariance))).tolist()
         links[edge.first].append((edge.second, step))

@@ -70,13 +70,15 @@ class RunGraph:
         agreeing = self._agreeing()
         if agreeing != self._agreed:
             self._agreed = agreeing
+            # Without loops nothing is solved: nodes are where the motions lead.
+            start = self._T_map_node if agreeing else np.array(chain.T_run_node)
             solved = solve(
-                self._T_map_node,
+                start,
                 chain.motions,
                 agreeing,
                 fixed=(),
                 loose=0,
-                uprights=_uprights(chain, self._T_map_node, 0),
+                uprights=_uprights(chain, start, 0),
             )
             self._T_map_node = solved.T_map_node
             self._accepted = [agreeing[index] for index in solved.accepted]
