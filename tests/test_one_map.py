@@ -174,11 +174,98 @@ def test_loops_between_modules_take_out_what_odometry_drifts():
     odometry = Odometry(scale=0.01, turn_rad_per_m=0.003)
     drive = Drive(atlas()).go(world(flat()), true, odometry=odometry, sessions=4)
     assert len(drive.of_kind("loop")) >= 3
-    reckoned = drive.atlas._path.poses  # as measured, without any correction
+    before, after = reckoned_errors_m(drive, true), drive.errors_m(true, map_of(true))
+    assert rms(after) < rms(before) / 3
+
+
+def rms(errors_m):
+    return float(np.sqrt((errors_m**2).mean()))
+
+
+def reckoned_errors_m(drive, true):
+    """The errors of the poses as they were given to the atlas, without any correction."""
     due = np.array([planar.compose(map_of(true), pose) for pose in true])
-    before = np.linalg.norm(np.asarray(reckoned)[:, :2, 3] - due[:, :2], axis=1)
-    after = drive.errors_m(true, map_of(true))
-    assert np.sqrt((after**2).mean()) < np.sqrt((before**2).mean()) / 3
+    return np.linalg.norm(np.asarray(drive.atlas._path.poses)[:, :2, 3] - due[:, :2], axis=1)
+
+
+class Watched(Atlas):
+    """Knows how many poses it had at each event; `closing` modules close loops themselves."""
+
+    def __init__(self, closing=()):
+        super().__init__(voxel_m=0.05)
+        self._closing_too, self.poses_at_loops, self.is_over = closing, [], False
+
+    def open(self, rig, note, *, closing=(), is_live=False):
+        def watch(event, stamp_ns, **fields):
+            if event == "loop" and not self.is_over:
+                self.poses_at_loops.append(len(self.online))
+            note(event, stamp_ns, **fields)
+
+        super().open(rig, watch, closing=self._closing_too, is_live=is_live)
+
+    def finish(self):
+        self.is_over = True
+        return super().finish()
+
+
+def drive_twice_round(atlas, **settings):
+    """Drive through the flat twice, by odometry that drifts; return the drive and true poses."""
+    true = np.concatenate([through(FLAT_TOUR), through(FLAT_TOUR)])
+    odometry = Odometry(scale=0.01, turn_rad_per_m=0.003)
+    return Drive(atlas, **settings).go(world(flat()), true, odometry=odometry), true
+
+
+@pytest.fixture(scope="module")
+def twice_round():
+    return drive_twice_round(Watched())
+
+
+def test_loops_are_reported_while_the_run_goes_on_and_each_of_them_once(twice_round):
+    drive, true = twice_round
+    loops = [(one["to_ns"], one["stamp_ns"]) for one in drive.of_kind("loop")]
+    assert drive.faults == [] and len(set(loops)) == len(loops) >= 6
+    early = drive.atlas.poses_at_loops
+    assert len(early) >= 4 and early[0] < 0.8 * len(true) and early == sorted(early)
+    ends_ns = drive.atlas.online.stamps_ns[np.array(early) - 1]
+    starts_ns = [stamp_ns for _, stamp_ns in loops[: len(early)]]
+    assert (ends_ns > starts_ns).all()  # a submap is complete before loops lead to it
+
+
+def test_the_newest_pose_is_corrected_as_soon_as_a_loop_closed(twice_round):
+    drive, true = twice_round
+    closed = drive.atlas.poses_at_loops[0]
+    reckoned = reckoned_errors_m(drive, true)
+    online = drive.errors_m(true, map_of(true), is_online=True)
+    np.testing.assert_allclose(online[:closed], reckoned[:closed], atol=1e-12)
+    assert rms(online[closed:]) < rms(reckoned[closed:]) / 2
+
+
+def test_two_equal_runs_close_the_same_loops_to_the_bit(twice_round):
+    (one, _), (other, _) = twice_round, drive_twice_round(Watched())
+    assert one.events == other.events
+    for a, b in (
+        (one.atlas.online, other.atlas.online),
+        (one.atlas.trajectory, other.atlas.trajectory),
+    ):
+        np.testing.assert_array_equal(a.stamps_ns, b.stamps_ns)
+        np.testing.assert_array_equal(a.T_world_base, b.T_world_base)
+
+
+def test_a_module_that_closes_loops_gets_none_within_its_sessions():
+    drive, _ = drive_twice_round(Watched(closing=["module_0"]))
+    assert drive.of_kind("loop") == []
+    np.testing.assert_array_equal(
+        drive.atlas.trajectory.T_world_base, drive.atlas.online.T_world_base
+    )
+    np.testing.assert_array_equal(drive.atlas.online.T_world_base, drive.atlas._path.poses)
+
+
+def test_a_live_search_that_fails_leaves_the_poses_and_is_named(monkeypatch):
+    monkeypatch.setattr("sceneslam.atlas.submaps.run_graph.deviations_to", lambda *_: 1 / 0)
+    drive = Drive(atlas(), is_live=True).go(world(flat()), through(FLAT_TOUR[:3]))
+    (fault,) = drive.faults
+    assert "goes on without submaps" in fault and "division by zero" in fault
+    assert len(drive.atlas.online) == len(drive.atlas.trajectory) == len(through(FLAT_TOUR[:3]))
 
 
 def test_a_run_without_loops_stays_as_it_was_to_the_bit():
