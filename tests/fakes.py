@@ -119,6 +119,14 @@ class ExactModule:
         self.shutdowns += 1
 
 
+class ClosingModule(ExactModule):
+    """Says that it closes loops itself, if it is told to say so."""
+
+    def __init__(self, closes_loops=True):
+        super().__init__()
+        self.closes_loops = closes_loops
+
+
 class FakeSource:
     """A drive of `steps` observations with exact truth; it can break half-way."""
 

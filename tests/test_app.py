@@ -13,6 +13,7 @@ from configured import config
 from fakes import LateStamps
 
 from sceneslam.app import run
+from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.uncertainty import read_covariances
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.trajectory import Trajectory
@@ -45,6 +46,20 @@ def test_two_runs_give_identical_trajectories_and_events(tmp_path):
         return [line for line in lines if json.loads(line)["event"] != "cost"]
 
     assert decisions("one") == decisions("two")
+
+
+@pytest.mark.parametrize("isolation", ["inline", "process"])
+def test_the_atlas_knows_which_modules_close_loops_themselves(tmp_path, monkeypatch, isolation):
+    told, opened = [], Atlas.open
+
+    def watched(atlas, rig, note, *, closing, is_live):
+        told.append(list(closing))
+        opened(atlas, rig, note, closing=closing, is_live=is_live)
+
+    monkeypatch.setattr(Atlas, "open", watched)
+    dark = {"_target_": "fakes.ClosingModule"}
+    assert run(config(slam__dark=dark, run__isolation=isolation), tmp_path).faults == ()
+    assert told == [["dark"]]
 
 
 def test_trajectories_have_the_stamps_of_the_recording(tmp_path):

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from fakes import RIG, ExactModule, FakeSource, observation
+from fakes import RIG, ClosingModule, ExactModule, FakeSource, observation
 
 from sceneslam.interfaces import SlamModule, Source
 from sceneslam.modules.slam.faulty import FaultyModule
@@ -49,6 +49,13 @@ def test_without_faults_nothing_is_changed(record):
         answer, expected = faulty.track(observation(index)), sound.track(observation(index))
         np.testing.assert_array_equal(answer.T_local_base, expected.T_local_base)
     assert not record.exists()
+
+
+@pytest.mark.parametrize("inner", [ExactModule(), ClosingModule(False), ClosingModule(True)])
+def test_a_faulty_module_closes_loops_if_the_module_does(record, inner):
+    values = {"rate_ratio": 0.1, "lasting_s": 0.3, "jump_m": 2.0, "seed": 3}
+    faulty = FaultyModule(inner, ["raise"], record=record, **values)
+    assert faulty.closes_loops is getattr(inner, "closes_loops", False)
 
 
 def test_faults_are_as_frequent_as_told_and_of_all_kinds(record):

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import RIG, ExactModule, observation
+from fakes import RIG, ClosingModule, ExactModule, observation
 from isolation import Harmful, Hoarder, harmful, isolating, limits
 
+from sceneslam.interfaces import ClosesLoops
 from sceneslam.supervision.isolated import IsolatedModule
 from sceneslam.types.errors import ConfigError, ModuleError
 
@@ -53,6 +54,14 @@ def test_poses_are_those_of_the_module_itself(isolated):
         answer, expected = module.track(seen(index)), inline.track(seen(index))
         np.testing.assert_array_equal(answer.T_local_base, expected.T_local_base)
         assert answer.status is expected.status and answer.stamp_ns == expected.stamp_ns
+
+
+@pytest.mark.parametrize("closes", [True, False])
+def test_a_module_tells_from_its_process_whether_it_closes_loops(isolated, closes):
+    module = isolated(partial(ClosingModule, closes))
+    assert isinstance(module, ClosesLoops) and module.closes_loops is closes
+    assert module.requires == ExactModule.requires
+    assert not isolated(ExactModule).closes_loops
 
 
 @pytest.mark.parametrize(

@@ -77,6 +77,14 @@ def test_poses_in_time_are_passed_on():
         assert_true(one)
 
 
+@pytest.mark.parametrize("closes", [None, False, True])
+def test_a_late_system_closes_loops_if_it_says_so(closes):
+    system = Exact()
+    if closes is not None:
+        system.closes_loops = closes
+    assert Pipelined(system, 0.5).closes_loops is bool(closes)
+
+
 def test_not_yet_is_bridged_and_several_at_once_are_kept():
     module, found = driven(Exact(ready=lambda count: count % 4 == 0))
     assert found[2].status is TrackingStatus.DEGRADED and found[3].status is TrackingStatus.TRACKING

@@ -19,6 +19,7 @@ from isolation import limits
 from sceneslam.config.check import check_node
 from sceneslam.experiments.programs.case import run_case
 from sceneslam.experiments.programs.hostile import KINDS, plan
+from sceneslam.interfaces import ClosesLoops
 from sceneslam.modules.slam.process.__main__ import FOLDER, build
 from sceneslam.modules.slam.process.module import ProcessSlam
 from sceneslam.modules.slam.process.protocol import (
@@ -42,11 +43,10 @@ def started():
     """Give a function that starts a module on a command, and end its programs."""
     modules = []
 
-    def start(*command, late_max_s=1.0, **changes):
+    def start(*command, late_max_s=1.0, settings=None, **changes):
         bounds = limits(**({"step_deadline_s": 10.0} | changes))
-        modules.append(
-            ProcessSlam(command=[*map(str, command)], late_max_s=late_max_s, limits=bounds)
-        )
+        values = {"late_max_s": late_max_s, "limits": bounds} | (settings or {})
+        modules.append(ProcessSlam(command=[*map(str, command)], **values))
         return modules[-1]
 
     yield start
@@ -58,6 +58,15 @@ def echo(started, late=1, **options):
     module = started(sys.executable, PROGRAM, late, **options)
     module.activate(RIG)
     return module
+
+
+@pytest.mark.parametrize(
+    ("settings", "closes"),
+    [({}, True), ({"closes_loops": True}, True), ({"closes_loops": False}, False)],
+)
+def test_a_program_closes_loops_unless_its_settings_say_otherwise(started, settings, closes):
+    module = started(sys.executable, PROGRAM, 1, settings=settings)
+    assert isinstance(module, ClosesLoops) and module.closes_loops is closes
 
 
 @pytest.fixture(scope="module")
