@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sceneslam.modules.slam.grid import OccupancyGrid
+from sceneslam.scans.occupancy_grid import OccupancyGrid
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import LaserScan

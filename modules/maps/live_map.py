@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.modules.slam.grid import OccupancyGrid
 from sceneslam.scans.depth_scan import DepthScanner, scan_frame
+from sceneslam.scans.occupancy_grid import OccupancyGrid
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import HybridMap, PointLayer
 from sceneslam.types.observation import Observation

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.budget import Budget
 from sceneslam.atlas.covariances import PosedPath, calibrated, covariances
-from sceneslam.atlas.fusion import fuse
+from sceneslam.atlas.fusion import Placed, fuse
 from sceneslam.atlas.lasting.lasting_map import EXTEND, LastingMap
 from sceneslam.atlas.mapper import Mapper, Note
 from sceneslam.atlas.places.floor_plan import grid_of
@@ -263,14 +263,24 @@ class Atlas:
 
         If the run was located in a loaded map, the grid shows both.
         """
-        placed = zip(self._sessions, self._placed(), strict=True)
-        fused = fuse(
-            [(session.module, T_map_local, session.layers) for session, T_map_local in placed],
-            voxel_m=self._voxel_m,
-        )
-        if self._mapper is None or not self._mapper.is_placed:
-            return fused
-        return replace(fused, grid=grid_of(self._lasting.map_of(self._mapper).plan()))
+        revised = self._revise().T_map_local
+        placed = [
+            Placed(
+                module=session.module,
+                T_map_local=T_map_local,
+                layers=session.layers,
+                T_map_laser=self._scanned_at(session.layers, T_revised),
+            )
+            for session, T_map_local, T_revised in zip(
+                self._sessions, self._placed(), revised, strict=True
+            )
+        ]
+        if self._mapper is None or not self._mapper.has_submaps:
+            return fuse(placed, voxel_m=self._voxel_m)
+        saved = self._lasting.map_of(self._mapper)
+        own = saved.of(np.flatnonzero(saved.pieces == saved.pieces[-1]).tolist())
+        fused = fuse(placed, voxel_m=self._voxel_m, pose_graph=own.graph())
+        return replace(fused, grid=grid_of(own.plan())) if self._mapper.is_placed else fused
 
     def _in_map(self, T_run_base: Transform) -> Transform:
         """Return a pose as loops correct it, or in a loaded map if the run was located there."""
@@ -288,6 +298,15 @@ class Atlas:
                 stamp_ns = np.array([self._path.stamps_ns[rows[len(rows) // 2]]], np.int64)
                 placed[session] = self._correction.apply(stamp_ns, T_map_local[None])[0]
         return placed
+
+    def _scanned_at(self, layers: MapLayers, T_map_local: Transform) -> NDArray[np.float64] | None:
+        """Return T_map_laser (K, 4, 4) of a session's scans, each as the graph corrects it."""
+        if layers.scans is None:
+            return None
+        T_map_laser = T_map_local @ layers.scans.T_world_laser
+        if self._correction is None:
+            return np.asarray(T_map_laser)
+        return self._correction.apply(layers.scans.stamps_ns, T_map_laser)
 
     def _closes_loops(self, session: int) -> bool:
         return session >= 0 and self._sessions[session].module in self._closing

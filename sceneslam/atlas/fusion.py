@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.atlas.graph import join_landmarks, join_pose_graphs
+from sceneslam.scans.occupancy_grid import drawn, walls
 from sceneslam.types import se3
-from sceneslam.types.maps import GridLayer, HybridMap, MapLayers, PointLayer
+from sceneslam.types.maps import (
+    GridLayer,
+    HybridMap,
+    LandmarkLayer,
+    MapLayers,
+    PointLayer,
+    PoseGraphLayer,
+)
 from sceneslam.types.se3 import Transform
 
 _log = logging.getLogger(__name__)
@@ -19,46 +27,92 @@ _GREY = 160  # colour of points that no camera saw
 _CELLS_MAX = 10**8  # 500 m x 500 m at 5 cm: 400 MB during the fusion
 _LOG_ODDS_LIMIT = 10.0  # limited, so that a cell can still change after many sessions
 
-Placed = tuple[str, Transform, MapLayers]  # module, T_map_local, its layers in `local`
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Placed:
+    """The map of a session."""
+
+    module: str
+    T_map_local: Transform
+    layers: MapLayers  # in `local`
+    T_map_laser: NDArray[np.float64] | None = None  # (K, 4, 4) of its scans, if it has any
 
 
-def fuse(placed: Sequence[Placed], *, voxel_m: float) -> HybridMap:
-    """Return one map of all layers; points are thinned to one per module and voxel."""
-    modules = tuple(dict.fromkeys(module for module, _, _ in placed))
+def fuse(
+    placed: Sequence[Placed], *, voxel_m: float, pose_graph: PoseGraphLayer | None = None
+) -> HybridMap:
+    """Return one map of all layers; points are thinned to one per module and voxel.
+
+    A session without points has those of its scans.
+    """
+    modules = tuple(dict.fromkeys(one.module for one in placed))
     points, colors, owners = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)], []
-    for module, T_map_local, layers in placed:
-        if layers.points is None or not len(layers.points.points):
+    for one in placed:
+        layer = _points(one)
+        if layer is None or not len(layer.points):
             continue
-        layer = layers.points
-        points.append(se3.apply(T_map_local, layer.points).astype(np.float32))
+        points.append(layer.points)
         grey = np.full((len(layer.points), 3), _GREY, np.uint8)
         colors.append(grey if layer.colors_bgr is None else layer.colors_bgr)
-        owners.append(np.full(len(layer.points), modules.index(module), np.uint8))
+        owners.append(np.full(len(layer.points), modules.index(one.module), np.uint8))
     cloud, color = np.concatenate(points), np.concatenate(colors)
     owner = np.concatenate([np.zeros(0, np.uint8), *owners])
     keep = one_per_voxel(cloud, owner, voxel_m)
-    graphs = [(n, T, m.pose_graph) for n, T, m in placed if m.pose_graph is not None]
-    landmarks = [(n, T, m.landmarks) for n, T, m in placed if m.landmarks is not None]
+    seen = [one for one in placed if one.layers.landmarks is not None]
     return HybridMap(
         points=PointLayer(points=cloud[keep], colors_bgr=color[keep]),
         point_modules=owner[keep],
         modules=modules,
-        grid=_fuse_grids([(T, m.grid) for _, T, m in placed if m.grid is not None]),
-        pose_graph=join_pose_graphs([(T, graph) for _, T, graph in graphs]),
-        node_modules=_owners([(n, len(graph.stamps_ns)) for n, _, graph in graphs], modules),
-        landmarks=join_landmarks([(T, layer) for _, T, layer in landmarks]),
-        landmark_modules=_owners([(n, len(layer.points)) for n, _, layer in landmarks], modules),
+        grid=_fuse_grids([grid for one in placed for grid in _grids(one)]),
+        pose_graph=pose_graph,
+        landmarks=_join_landmarks([(one.T_map_local, one.layers.landmarks) for one in seen]),
+        landmark_modules=_owners(seen, modules),
     )
 
 
-def _owners(
-    counts: Sequence[tuple[str, int]], modules: tuple[str, ...]
-) -> NDArray[np.uint8] | None:
-    """Return each row's module index; `counts` gives the number of rows per module, in order."""
-    if not counts:
+def _points(one: Placed) -> PointLayer | None:
+    """Return a session's points in `map`."""
+    layer, scans = one.layers.points, one.layers.scans
+    if layer is not None:
+        points = se3.apply(one.T_map_local, layer.points).astype(np.float32)
+        return PointLayer(points=points, colors_bgr=layer.colors_bgr)
+    if scans is None or one.T_map_laser is None:
         return None
-    numbers = np.array([modules.index(name) for name, _ in counts], np.uint8)
-    return np.repeat(numbers, [count for _, count in counts])
+    return PointLayer(points=walls(scans, one.T_map_laser))
+
+
+def _grids(one: Placed) -> list[tuple[Transform, GridLayer]]:
+    """Return a session's grids with their poses."""
+    grid, scans, found = one.layers.grid, one.layers.scans, []
+    if grid is not None:
+        found.append((one.T_map_local, grid))
+    if scans is not None and one.T_map_laser is not None:
+        found.append((se3.identity(), drawn(scans, one.T_map_laser)))
+    return found
+
+
+def _join_landmarks(
+    placed: Sequence[tuple[Transform, LandmarkLayer | None]],
+) -> LandmarkLayer | None:
+    """Return all sessions' landmarks (N, 3) [m], map; shared landmarks occur once per session."""
+    layers = [(T, layer) for T, layer in placed if layer is not None]
+    if not layers:
+        return None
+    return LandmarkLayer(
+        points=np.concatenate([se3.apply(T, one.points).astype(np.float32) for T, one in layers]),
+        first_stamps_ns=np.concatenate([one.first_stamps_ns for _, one in layers]),
+        sightings=np.concatenate([one.sightings for _, one in layers]),
+    )
+
+
+def _owners(seen: Sequence[Placed], modules: tuple[str, ...]) -> NDArray[np.uint8] | None:
+    """Return the module index of each landmark."""
+    owners = [
+        np.full(len(one.layers.landmarks.points), modules.index(one.module), np.uint8)
+        for one in seen
+        if one.layers.landmarks is not None
+    ]
+    return np.concatenate(owners) if owners else None
 
 
 def one_per_voxel(

@@ -18,6 +18,13 @@ _Shapes = dict[str, tuple[str | int, ...]]
 _SHAPES: dict[str, _Shapes] = {  # of the arrays of each layer
     "points": {"points": ("N", 3), "colors_bgr": ("N", 3)},
     "grid": {"log_odds": ("rows", "columns")},
+    "scans": {
+        "stamps_ns": ("K",),
+        "T_world_laser": ("K", 4, 4),
+        "ranges_m": ("K", "B"),
+        "angle_min_rad": ("K",),
+        "angle_step_rad": ("K",),
+    },
     "pose_graph": {
         "stamps_ns": ("N",),
         "T_world_base": ("N", 4, 4),
@@ -71,6 +78,8 @@ def checked_layers(layers: object) -> MapLayers:
             _check_layer(name, _of(name, layer, kind), _SHAPES[name])
     if layers.grid is not None and not layers.grid.resolution_m > 0:
         raise ValueError(f"grid.resolution_m: expected above 0, got {layers.grid.resolution_m}")
+    if layers.scans is not None and not layers.scans.cell_m > 0:
+        raise ValueError(f"scans.cell_m: expected above 0, got {layers.scans.cell_m}")
     return layers
 
 

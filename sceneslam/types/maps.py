@@ -26,6 +26,22 @@ class GridLayer:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScanLayer:
+    """Planar scans of keyframes: the grid is drawn of them where the atlas knows the poses best.
+
+    Beam i of scan k has the angle angle_min_rad[k] + i angle_step_rad[k]. A range is 0 without a
+    measurement, negative where there was no return: -3 is free for 3 m.
+    """
+
+    stamps_ns: NDArray[np.int64]  # (K,)
+    T_world_laser: NDArray[np.float64]  # (K, 4, 4), in the layer's frame
+    ranges_m: NDArray[np.float32]  # (K, B)
+    angle_min_rad: NDArray[np.float64]  # (K,)
+    angle_step_rad: NDArray[np.float64]  # (K,)
+    cell_m: float  # of the grid
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PoseGraphLayer:
     """Keyframes or submaps, and what was measured between them. Node i is row i, by rising stamp.
 
@@ -67,6 +83,7 @@ class MapLayers:
 
     points: PointLayer | None = None
     grid: GridLayer | None = None
+    scans: ScanLayer | None = None
     pose_graph: PoseGraphLayer | None = None
     landmarks: LandmarkLayer | None = None
     loops: LoopLayer | None = None
@@ -75,6 +92,7 @@ class MapLayers:
 LAYER_TYPES: dict[str, type] = {  # by the fields of MapLayers
     "points": PointLayer,
     "grid": GridLayer,
+    "scans": ScanLayer,
     "pose_graph": PoseGraphLayer,
     "landmarks": LandmarkLayer,
     "loops": LoopLayer,
@@ -89,7 +107,6 @@ class HybridMap:
     point_modules: NDArray[np.uint8]  # (N,), index into `modules`: who saw the point
     modules: tuple[str, ...]  # keys in `slam`
     grid: GridLayer | None = None
-    pose_graph: PoseGraphLayer | None = None  # sessions one after the other, not connected
-    node_modules: NDArray[np.uint8] | None = None  # (N,), as `point_modules`, of the graph's nodes
+    pose_graph: PoseGraphLayer | None = None  # of the submaps of all modules
     landmarks: LandmarkLayer | None = None
     landmark_modules: NDArray[np.uint8] | None = None  # (N,), as `point_modules`

@@ -22,19 +22,16 @@ from sceneslam.types.planar import (
     turn,
 )
 
-from .back_end import LaserBackEnd
 from .field import LikelihoodField
-from .history import RelativePoseHistory
 from .keyframes import ScanKeyframe, ScanKeyframes
-from .loop_search import LoopSearch
 from .matcher import Match, Matcher, novelty
 from .prior import MotionPrior
-from .surface import SurfacePoints
+from .surface import ScanSurfaceReader, SurfacePoints
+from .wide_search import WideSearch
 
 _OVERLAP_MIN_RATIO = 0.5  # with less, the map does not cover this place yet
 _FAILURES_MAX = 10  # consecutive failed matches before mapping continues from dead reckoning
 _LOST_WINDOW_M, _LOST_WINDOW_RAD, _LOST_SCORE_MIN = 3.0, 0.8, 0.5
-_STEP_MIN = np.array([5e-3, 5e-3, 2e-3])  # m, m, rad: least deviation of a keyframe's motion
 _UNSEEN = np.diag([1e-2, 1e-2, 1e-1])  # 1/m^2, 1/rad^2: information in unconstrained directions
 _DEVIATION_MIN = np.array([1e-3, 1e-3, 5e-4])  # m, m, rad: least standard deviation of a pose
 
@@ -67,12 +64,10 @@ class FrontEnd:
     settings: ScanSettings
     matcher: Matcher
     motion: MotionModel
+    reader: ScanSurfaceReader
     keyframes: ScanKeyframes
-    back_end: LaserBackEnd
-    history: RelativePoseHistory
     _pose: Planar = field(default_factory=lambda: np.zeros(3), init=False)
     _covariance: Matrix = field(default_factory=lambda: np.diag(_DEVIATION_MIN**2), init=False)
-    _step: Matrix = field(default_factory=lambda: np.zeros((3, 3)), init=False)  # since a keyframe
     _stamp_ns: int | None = field(default=None, init=False)
     _held_pose: Planar = field(default_factory=lambda: np.zeros(3), init=False)
     _held_covariance: Matrix = field(default_factory=lambda: np.diag(_DEVIATION_MIN**2), init=False)
@@ -84,12 +79,6 @@ class FrontEnd:
 
     def track(self, observation: Observation, scan: LaserScan | None) -> Estimate:
         """Return the pose at the observation, corrected by its scan if it has one."""
-        estimate = self._track(observation, scan)
-        if estimate.status is not TrackingStatus.LOST:
-            self.history.add(observation.stamp_ns, self._pose)
-        return estimate
-
-    def _track(self, observation: Observation, scan: LaserScan | None) -> Estimate:
         before, before_ns, known = self._pose, self._stamp_ns, self._covariance
         motion = self.motion.predict(observation)
         self._stamp_ns = observation.stamp_ns
@@ -97,7 +86,6 @@ class FrontEnd:
         predicted = compose(before, T_prev_curr)
         noise = planar_covariance(motion.covariance)
         self._covariance = propagate(known, before, T_prev_curr, noise)
-        self._step = propagate(self._step, before, T_prev_curr, noise)
         surfaces = self._read(scan)
         if scan is None or surfaces is None:
             return self._predict(observation, predicted, motion)
@@ -106,7 +94,7 @@ class FrontEnd:
         predicted_then = compose(before, ratio * T_prev_curr)
         T_then_now = between(predicted_then, predicted)
         if self._field is None:
-            self._extend(predicted_then, None, scan, surfaces)
+            self._extend(predicted_then, scan, surfaces)
             return self._hold(observation, predicted, None)
         if self.matcher.misfit == 0.0 or self._fit_ns is None:
             self._fit_ns = before_ns
@@ -122,7 +110,7 @@ class FrontEnd:
         self._teach(match, T_then_now, motion)
         estimate = self._hold(observation, compose(match.T_local_base, T_then_now), match)
         if self.keyframes.is_due(match.T_local_base):
-            self._extend(match.T_local_base, match, scan, surfaces)
+            self._extend(match.T_local_base, scan, surfaces)
         return estimate
 
     def _prior(self, known: Matrix, before: Planar, ratio: float, motion: Motion) -> MotionPrior:
@@ -138,14 +126,14 @@ class FrontEnd:
     def _read(self, scan: LaserScan | None) -> SurfacePoints | None:
         if scan is None:
             return None
-        surfaces = self.keyframes.reader.read(scan)
+        surfaces = self.reader.read(scan)
         return surfaces if len(surfaces) >= self.settings.beams_min else None
 
     def _find_again(
         self, surfaces: SurfacePoints, field: LikelihoodField, predicted: Planar
     ) -> Match | None:
         """Return the match of a wide search, as without odometry any motion is possible."""
-        found = LoopSearch(field).find(
+        found = WideSearch(field).find(
             surfaces.points,
             predicted,
             window_m=_LOST_WINDOW_M,
@@ -218,7 +206,7 @@ class FrontEnd:
             return self._lose()
         unknown = match.overlap_ratio < _OVERLAP_MIN_RATIO or self._failures >= _FAILURES_MAX
         if unknown and self.keyframes.is_due(predicted):
-            self._extend(predicted, None, scan, surfaces)
+            self._extend(predicted, scan, surfaces)
             self._failures = 0
         return self._guess(predicted, TrackingStatus.DEGRADED)
 
@@ -246,36 +234,10 @@ class FrontEnd:
             inliers=0,
         )
 
-    def _extend(
-        self, T_local_base: Planar, match: Match | None, scan: LaserScan, surfaces: SurfacePoints
-    ) -> None:
-        """Make the scan a keyframe; if that closes a loop, continue from the corrected map."""
-        frames = self.keyframes.frames
-        information = np.linalg.inv(self._step + np.diag(_STEP_MIN**2)) + _UNSEEN
-        if match is not None:
-            information = information + match.information
-        covariance = np.linalg.inv(information) + np.diag(_STEP_MIN**2)
-        G = turn(-float(T_local_base[2]))
-        T_local_prev = frames[-1].T_local_base if frames else T_local_base
-        T_prev_curr = between(T_local_prev, T_local_base)
-        self.keyframes.add(
-            ScanKeyframe(
-                stamp_ns=scan.stamp_ns,
-                T_local_base=T_local_base,
-                T_prev_curr=T_prev_curr,
-                covariance=np.asarray(G @ covariance @ G.T),
-                distance_m=float(np.hypot(*T_prev_curr[:2])),
-                scan=scan,
-            ),
-            surfaces,
-        )
-        self._step = np.zeros((3, 3))
-        if self.back_end.take():
-            corrected = frames[-1].T_local_base
-            self._pose = compose(corrected, between(T_local_base, self._pose))
-            self._held_pose = compose(corrected, between(T_local_base, self._held_pose))
-        near = self.keyframes.around(len(frames) - 1, self.keyframes.latest)
-        self._field = LikelihoodField(self.keyframes.surfaces(near), self.settings.resolution_m)
+    def _extend(self, T_local_base: Planar, scan: LaserScan, surfaces: SurfacePoints) -> None:
+        """Make the scan a keyframe."""
+        self.keyframes.add(ScanKeyframe(T_local_base=T_local_base, scan=scan), surfaces)
+        self._field = LikelihoodField(self.keyframes.latest(), self.settings.resolution_m)
 
 
 def _share(stamp_ns: int, before_ns: int | None, now_ns: int) -> float:

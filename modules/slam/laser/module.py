@@ -18,14 +18,10 @@ from sceneslam.types.planar import to_transform, turn
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
-from .back_end import LaserBackEnd
 from .frontend import Estimate, FrontEnd, ScanSettings
-from .history import RelativePoseHistory
 from .keyframes import ScanKeyframes
 from .layers import covariance_6, map_layers
-from .loop_closure import ScanLoopCloser
 from .matcher import Matcher
-from .places import Places
 from .surface import ScanSurfaceReader
 
 _ABOVE_0 = (
@@ -58,7 +54,6 @@ class LaserSlam:
     keyframe_distance_m: float
     keyframe_angle_rad: float
     submap_keyframes: int
-    close_loops: bool
     predict_max_s: float
     height_min_m: float | None
     height_max_m: float | None
@@ -120,27 +115,21 @@ class LaserSlam:
             covariance=_covariance_base(estimate),
             quality_ratio=estimate.quality_ratio,
             inliers=estimate.inliers,
-            revision=self._front_end.back_end.revision,
         )
 
     def get_trajectory(self) -> Trajectory:
-        """Return T_local_base over time, corrected by all loop closures."""
-        if self._front_end is None:
-            return Trajectory.empty()
-        self._front_end.back_end.finish()
-        return self._front_end.history.trajectory()
+        """Return no trajectory: the atlas closes the loops."""
+        return Trajectory.empty()
 
     def get_map(self) -> MapLayers:
-        """Return the grid and points of all keyframes, in `local`, and the pose graph.
-
-        Without `close_loops` the graph is missing: then the atlas closes the loops, at the end.
-        """
+        """Return the scans of all keyframes, in `local`."""
         if self._front_end is None:
             return MapLayers()
         return map_layers(
             self._front_end.keyframes,
-            self._front_end.back_end.graph.edges if self.close_loops else None,
-            resolution_m=self.resolution_m,
+            self._T_base_laser,
+            cell_m=self.resolution_m,
+            range_max_m=self.range_max_m,
         )
 
     def shutdown(self) -> None:
@@ -177,24 +166,12 @@ class LaserSlam:
 
     def _make_front_end(self, rig: Rig) -> FrontEnd:
         from_depth = isinstance(self._scanner, DepthScanner)
-        keyframes = ScanKeyframes(
-            reader=ScanSurfaceReader(
-                T_base_laser=self._T_base_laser,
-                range_max_m=self.range_max_m,
-                noise_m=self.depth_noise_m if from_depth else self.laser_noise_m,
-                noise_per_m=self.depth_noise_per_m if from_depth else 0.0,
-            ),
-            keyframe_distance_m=self.keyframe_distance_m,
-            keyframe_angle_rad=self.keyframe_angle_rad,
-            submap_keyframes=self.submap_keyframes,
-        )
         matcher = Matcher(
             window_m=self.window_m,
             window_rad=self.window_rad,
             degeneracy_ratio=self.degeneracy_ratio,
             shift_m=self.depth_shift_m if from_depth else 0.0,
         )
-        closer = ScanLoopCloser(keyframes, Places(keyframes, self.resolution_m), matcher)
         return FrontEnd(
             settings=ScanSettings(
                 resolution_m=self.resolution_m,
@@ -204,9 +181,18 @@ class LaserSlam:
             ),
             matcher=matcher,
             motion=MotionModel(rig),
-            keyframes=keyframes,
-            history=RelativePoseHistory(keyframes),
-            back_end=LaserBackEnd(keyframes, closer if self.close_loops else None),
+            reader=ScanSurfaceReader(
+                T_base_laser=self._T_base_laser,
+                range_max_m=self.range_max_m,
+                noise_m=self.depth_noise_m if from_depth else self.laser_noise_m,
+                noise_per_m=self.depth_noise_per_m if from_depth else 0.0,
+            ),
+            keyframes=ScanKeyframes(
+                keyframe_distance_m=self.keyframe_distance_m,
+                keyframe_angle_rad=self.keyframe_angle_rad,
+                submap_keyframes=self.submap_keyframes,
+                reach_m=2.0 * self.range_max_m,
+            ),
         )
 
 

@@ -93,7 +93,7 @@ def _layer(reply: Fields, name: str, kind: type[Layer]) -> Layer | None:
     for key, value in values.items():
         if key == "is_loop":
             values[key] = value.astype(np.bool_)
-        elif key == "resolution_m":
+        elif key in ("resolution_m", "cell_m"):
             values[key] = float(value)  # type: ignore[assignment]
         elif key == "origin_xy_m":
             values[key] = tuple(value.astype(float).tolist())  # type: ignore[assignment]

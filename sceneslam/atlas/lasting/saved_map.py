@@ -13,6 +13,7 @@ from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan, join
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.graphs.edge import Edge
 from sceneslam.types import planar, se3
+from sceneslam.types.maps import PoseGraphLayer
 from sceneslam.types.se3 import Transform
 from sceneslam.views.view import Landmarks
 
@@ -72,6 +73,20 @@ class SavedMap:
         """Return the poses (N, 4, 4) in the map that the views of a submap were seen from."""
         T_submap_base = [view.T_submap_base for view in self.submaps[node].views]
         return np.asarray(self.T_map_node[node] @ np.array(T_submap_base).reshape(-1, 4, 4))
+
+    def graph(self) -> PoseGraphLayer:
+        """Return nodes and edges as a layer."""
+        edges = self.edges
+        ends = np.array([(edge.first, edge.second) for edge in edges], np.int64)
+        information = [np.linalg.inv(edge.covariance) for edge in edges]
+        return PoseGraphLayer(
+            stamps_ns=np.array([submap.stamps_ns[0] for submap in self.submaps], np.int64),
+            T_world_base=self.T_map_node,
+            edges=ends.reshape(-1, 2),
+            T_from_to=np.array([edge.T_first_second for edge in edges]).reshape(-1, 4, 4),
+            information=np.array(information).reshape(-1, 6, 6),
+            is_loop=np.array([edge.is_loop for edge in edges], bool),
+        )
 
     def of(self, keep: Sequence[int]) -> SavedMap:
         """Return the map of the nodes `keep`, with the edges between them."""

@@ -1,4 +1,4 @@
-"""The map layers: a coloured cloud and an occupancy grid from the keyframes' depth."""
+"""The map layers: a coloured cloud, and scans from the keyframes' depth."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.scans.depth_scan import DepthScanner
+from sceneslam.scans.occupancy_grid import scan_layer
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.maps import GridLayer, MapLayers, PointLayer
+from sceneslam.types.maps import MapLayers, PointLayer, ScanLayer
 from sceneslam.types.rig import Camera
 
-from ...grid import OccupancyGrid
 from .keyframes import DepthView, Keyframe, nothing_seen
 
 _LOG = logging.getLogger(__name__)
@@ -58,8 +58,8 @@ class LayerBuilder:
         return DepthView(points_base=points_base, colors_bgr=image_bgr[v, u], scan=scan)
 
     def build(self, keyframes: Sequence[Keyframe]) -> MapLayers:
-        """Return the layers in `local`; a grid only for planar motion."""
-        return MapLayers(points=self._points(keyframes), grid=self._grid(keyframes))
+        """Return the layers in `local`; scans only for planar motion."""
+        return MapLayers(points=self._points(keyframes), scans=self._scans(keyframes))
 
     def _points(self, keyframes: Sequence[Keyframe]) -> PointLayer | None:
         if not keyframes:
@@ -70,18 +70,19 @@ class LayerBuilder:
         points.flags.writeable = colors_bgr.flags.writeable = False
         return PointLayer(points=points, colors_bgr=colors_bgr)
 
-    def _grid(self, keyframes: Sequence[Keyframe]) -> GridLayer | None:
+    def _scans(self, keyframes: Sequence[Keyframe]) -> ScanLayer | None:
         if self._scanner is None or not keyframes:
             return None
         poses = np.stack([keyframe.T_local_base for keyframe in keyframes])
         tilt_rad = np.arccos(np.clip(poses[:, 2, 2], -1.0, 1.0))
         if np.abs(poses[:, 2, 3]).max() > _PLANAR_HEIGHT_M or tilt_rad.max() > _PLANAR_TILT_RAD:
             return None
-        grid = OccupancyGrid(self._resolution_m)
-        for keyframe in keyframes:
-            if keyframe.view.scan is not None:
-                grid.insert(keyframe.T_local_base @ self._scanner.T_base_laser, keyframe.view.scan)
-        return grid.layer()
+        scans = [(k.view.scan, k.T_local_base) for k in keyframes if k.view.scan is not None]
+        return scan_layer(
+            [scan for scan, _ in scans],
+            [T_local_base @ self._scanner.T_base_laser for _, T_local_base in scans],
+            cell_m=self._resolution_m,
+        )
 
 
 def _make_scanner(camera: Camera) -> DepthScanner | None:

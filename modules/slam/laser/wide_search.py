@@ -1,4 +1,4 @@
-"""A wide search for a scan in an old part of the map: branch and bound over a score pyramid.
+"""A wide search for a scan in the map: branch and bound over a score pyramid.
 
 After Hess et al., "Real-time loop closure in 2D LIDAR SLAM" (ICRA 2016), section V-B: a node of
 the search tree is a rotation and a square of shifts; its bound is the score in a grid that holds,
@@ -50,7 +50,7 @@ class _Nodes:
         )
 
 
-class LoopSearch:
+class WideSearch:
     """Searches one likelihood field."""
 
     def __init__(self, field: LikelihoodField) -> None:

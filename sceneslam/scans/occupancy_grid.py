@@ -2,58 +2,120 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.maps import GridLayer
+from sceneslam.types.maps import GridLayer, ScanLayer
 from sceneslam.types.observation import LaserScan
 
 _LIMIT = 3.5  # largest log odds; limited so that changes are learned within some scans
 _STEP = _LIMIT / 127  # log odds per unit of the int8 cells
 _HIT, _MISS = round(0.85 / _STEP), round(0.4 / _STEP)  # per measurement
 _GROWTH_CELLS = 128  # rows and columns are added in blocks, since each growth copies the grid
+_CLEAR_MAX_M = 3.0  # that a beam without a return is taken to be free
 _SHIFT = 4  # cv2 polygons with sub-cell corners, in 1/16 cells
+
+
+def signed_ranges(scan: LaserScan, range_max_m: float = np.inf) -> NDArray[np.float32]:
+    """Return a scan's ranges (B,), signed as in `ScanLayer`; farther returns than a limit are none.
+
+    A beam without a return (inf) is free for a few metres only: black surfaces, glass and walls at
+    grazing angles give none either.
+    """
+    ranges = scan.ranges_m
+    farthest_m = min(scan.range_max_m, range_max_m)
+    hit = np.isfinite(ranges) & (ranges >= scan.range_min_m) & (ranges <= farthest_m)
+    is_free = np.isposinf(ranges) | (np.isfinite(ranges) & (ranges > range_max_m))
+    clear = np.where(is_free, -np.float32(min(_CLEAR_MAX_M, farthest_m)), np.float32(0.0))
+    return np.where(hit, ranges, clear).astype(np.float32)
+
+
+def scan_layer(
+    scans: Sequence[LaserScan],
+    T_local_laser: Sequence[se3.Transform],
+    *,
+    cell_m: float,
+    range_max_m: float = np.inf,
+) -> ScanLayer:
+    """Return scans at poses T_local_laser (4, 4) as a layer; farther returns are left out."""
+    ranges = [signed_ranges(scan, range_max_m) for scan in scans]
+    padded = np.zeros((len(scans), max(map(len, ranges), default=0)), np.float32)
+    for row, each in zip(padded, ranges, strict=True):
+        row[: len(each)] = each
+    return ScanLayer(
+        stamps_ns=np.array([scan.stamp_ns for scan in scans], np.int64),
+        T_world_laser=np.array(T_local_laser).reshape(-1, 4, 4),
+        ranges_m=padded,
+        angle_min_rad=np.array([scan.angle_min_rad for scan in scans], np.float64),
+        angle_step_rad=np.array([scan.angle_step_rad for scan in scans], np.float64),
+        cell_m=cell_m,
+    )
+
+
+def drawn(scans: ScanLayer, T_map_laser: NDArray[np.float64]) -> GridLayer:
+    """Return the grid of scans at poses T_map_laser (K, 4, 4), in `map`."""
+    grid = OccupancyGrid(scans.cell_m)
+    beams = np.arange(scans.ranges_m.shape[1])
+    for T, ranges_m, least, step in zip(
+        T_map_laser, scans.ranges_m, scans.angle_min_rad, scans.angle_step_rad, strict=True
+    ):
+        grid.add(T, ranges_m, least + step * beams, float(step))
+    return grid.layer()
+
+
+def walls(scans: ScanLayer, T_map_laser: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the ends (N, 3) [m], map, of all beams with a return, at T_map_laser (K, 4, 4)."""
+    beams = np.arange(scans.ranges_m.shape[1])
+    angles = scans.angle_min_rad[:, None] + scans.angle_step_rad[:, None] * beams
+    x, y = scans.ranges_m * np.cos(angles), scans.ranges_m * np.sin(angles)
+    ends = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    ends = ends @ np.swapaxes(T_map_laser[:, :3, :3], 1, 2) + T_map_laser[:, None, :3, 3]
+    return np.asarray(ends[scans.ranges_m > 0.0], np.float32)
 
 
 class OccupancyGrid:
     """Log odds of cells: hits at the ends of beams, misses along them."""
 
-    def __init__(
-        self, resolution_m: float, *, clear_max_m: float = 3.0, cells_max: int = 64_000_000
-    ) -> None:
+    def __init__(self, resolution_m: float, *, cells_max: int = 64_000_000) -> None:
         """Make an empty grid.
 
-        A beam without a return (inf) clears up to `clear_max_m` only: black surfaces, glass and
-        walls at grazing angles give none either. The grid never has more than `cells_max` cells;
-        measurements outside are left out.
+        It never has more than `cells_max` cells; measurements outside are left out.
         """
         if not resolution_m > 0:
             raise ConfigError("resolution_m", resolution_m, "above 0")
-        if not clear_max_m >= 0:
-            raise ConfigError("clear_max_m", clear_max_m, "0 or more")
         if cells_max < _GROWTH_CELLS**2:
             raise ConfigError("cells_max", cells_max, f"{_GROWTH_CELLS**2} or more")
         self.resolution_m = resolution_m
-        self._clear_max_m, self._cells_max = clear_max_m, cells_max
+        self._cells_max = cells_max
         self._cells = np.zeros((0, 0), dtype=np.int8)  # log odds in steps
         self._origin = np.zeros(2, dtype=np.int64)  # cell (column, row) of the array's corner
 
     def insert(self, T_local_laser: se3.Transform, scan: LaserScan) -> None:
         """Add a scan at T_local_laser (4, 4) [m], projected to the xy plane."""
-        ranges = scan.ranges_m.astype(np.float64)
-        hit = np.isfinite(ranges) & (ranges >= scan.range_min_m) & (ranges <= scan.range_max_m)
-        free_to = np.where(hit, ranges - 0.5 * self.resolution_m, 0.0)
-        free_to[np.isposinf(ranges)] = min(self._clear_max_m, scan.range_max_m)
-        angles = scan.angles_rad.astype(np.float64)
-        half = 0.5 * scan.angle_step_rad
+        self.add(T_local_laser, signed_ranges(scan), scan.angles_rad, scan.angle_step_rad)
+
+    def add(
+        self,
+        T_local_laser: se3.Transform,
+        ranges_m: NDArray[np.float32],
+        angles_rad: NDArray[np.floating],
+        angle_step_rad: float,
+    ) -> None:
+        """Add ranges (B,), signed as in `ScanLayer`, at angles (B,)."""
+        ranges, angles = ranges_m.astype(np.float64), angles_rad.astype(np.float64)
+        hit = ranges > 0.0
+        free_to = np.where(hit, np.maximum(ranges - 0.5 * self.resolution_m, 0.0), -ranges)
+        half = 0.5 * angle_step_rad
         # One star-shaped polygon is the free space of all beams: each beam is a wedge.
         corners = _ends(
             T_local_laser,
             np.column_stack([angles - half, angles + half]).ravel(),
-            np.repeat(np.maximum(free_to, 0.0), 2),
+            np.repeat(free_to, 2),
         )
         origin_xy = T_local_laser[:2, 3]
         hits_xy = _ends(T_local_laser, angles[hit], ranges[hit])
