@@ -1,4 +1,4 @@
-"""Print what the 2D laser module makes of a CARMEN log with relations, beside wheel odometry.
+"""Print what the 2D laser module and the atlas make of a CARMEN log, beside wheel odometry.
 
     python experiments/laser.py LOG RELATIONS                     # odometry, no loops, loops
     python experiments/laser.py LOG RELATIONS harder              # the same log made harder
@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 import yaml
 
+from sceneslam.atlas.atlas import Atlas
 from sceneslam.evaluation.relations import Relations, relation_errors
 from sceneslam.modules.slam.laser.module import LaserSlam
 from sceneslam.sources.carmen import Carmen
@@ -80,23 +81,33 @@ class Log:
 
 
 class Run:
-    """One pass of the laser module over a log."""
+    """One pass of the laser module over a log, with or without loops by the atlas."""
 
-    def __init__(self, rig: Rig, observations: Iterable[Observation], **changes: object) -> None:
-        self.module = LaserSlam(**{**settings("slam/laser.yaml"), **changes})
-        self.module.activate(rig)
-        self.costs_ms, poses, stamps = [], [], []
+    def __init__(
+        self, rig: Rig, observations: Iterable[Observation], *, has_loops: bool = True
+    ) -> None:
+        module, atlas = LaserSlam(**settings("slam/laser.yaml")), Atlas(voxel_m=0.05)
+        module.activate(rig)
+        atlas.open(rig, self._note)
+        session = atlas.begin_session("laser", np.eye(4))
+        self.costs_ms: list[float] = []
         began_s = process_time()
         for observation in observations:
             before_s = process_time()
-            tracking = self.module.track(observation)
+            tracking = module.track(observation)
+            atlas.add_local(tracking.stamp_ns, tracking.T_local_base)
+            atlas.add(tracking.stamp_ns, tracking.T_local_base, "laser", tracking.covariance)
+            if has_loops:
+                atlas.observe(observation, None)
             self.costs_ms.append((process_time() - before_s) * 1e3)
-            poses.append(tracking.T_local_base)
-            stamps.append(observation.stamp_ns)
-        self.online = Trajectory(stamps_ns=np.array(stamps), T_world_base=np.stack(poses))
-        self.revised = self.module.get_trajectory()
-        self.map = self.module.get_map()
+        atlas.close_session(session, module.get_map(), module.get_trajectory())
+        faults = atlas.finish()
+        assert not faults, faults
+        self.online, self.revised, self.map = atlas.online, atlas.trajectory, atlas.fuse_maps()
         self.cpu_s = process_time() - began_s
+
+    def _note(self, event: str, stamp_ns: int, **fields: object) -> None:
+        """Ignore an event."""
 
     def row(self, name: str, log: Log, mirror_ns: int = 0) -> str:
         """Return a line of the table."""
@@ -151,15 +162,14 @@ def compare(log: Log) -> None:
         f"| wheel odometry | {spread(odometry, 'trans', 'm')} "
         f"| {spread(odometry, 'rot', 'deg')} | | | |"
     )
-    print(Run(source.rig, observations, close_loops=False).row("no loops", log))
+    print(Run(source.rig, observations, has_loops=False).row("no loops", log))
     before_mb = getrusage(RUSAGE_SELF).ru_maxrss / 1e3
     run = Run(source.rig, observations)
     print(run.row("with loops", log))
     graph = run.map.pose_graph
     print(
         f"\n{odometry['matched']} of {odometry['total']} relations matched; "
-        f"{len(graph.stamps_ns)} keyframes, {graph.is_loop.sum()} loops, "
-        f"{run.module.track(observations[-1]).revision} corrections; peak memory "
+        f"{len(graph.stamps_ns)} submaps, {graph.is_loop.sum()} loops; peak memory "
         f"{getrusage(RUSAGE_SELF).ru_maxrss / 1e3:.0f} MB, {before_mb:.0f} MB before closing loops"
     )
 
@@ -189,8 +199,8 @@ def main() -> None:
             Run(source.rig, islice(source, 4000))
         pstats.Stats(profile).sort_stats("tottime").print_stats(12)
     elif words[:1] == ["maps"]:
-        for name, closes in (("laser_loops", True), ("laser_no_loops", False)):
-            grid = Run(source.rig, source, close_loops=closes).map.grid
+        for name, has_loops in (("laser_loops", True), ("laser_no_loops", False)):
+            grid = Run(source.rig, source, has_loops=has_loops).map.grid
             draw(grid, Path(words[1]) / f"{name}.png")
     else:
         compare(log)

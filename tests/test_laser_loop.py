@@ -1,6 +1,6 @@
-"""Loops of the laser module: driven round a ring of corridors with wheels that turn too much."""
+"""Loops of the laser module, by the atlas: round a ring of corridors with wheels that turn."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -8,17 +8,20 @@ import pytest
 import yaml
 from test_laser_world import box, drive, loop_path, room, scan_at
 
+from sceneslam.atlas.atlas import Atlas
 from sceneslam.modules.slam.laser.field import LikelihoodField
-from sceneslam.modules.slam.laser.loop_search import LoopSearch
 from sceneslam.modules.slam.laser.module import LaserSlam
-from sceneslam.modules.slam.laser.pose_graph import ScanEdge, ScanPoseGraph, optimise
 from sceneslam.modules.slam.laser.surface import ScanSurfaceReader
+from sceneslam.modules.slam.laser.wide_search import WideSearch
 from sceneslam.types import se3
-from sceneslam.types.planar import between, betweens, compose, composed
+from sceneslam.types.maps import HybridMap
+from sceneslam.types.planar import betweens, compose, composed, to_transforms
 from sceneslam.types.rig import Laser, Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
 
 PERIOD_NS = 100_000_000
 STEP_M = 0.15
+WEAK_M = 0.5  # deviation of a loop along a direction that walls do not constrain, at least
 CORNERS = np.array([[0.0, 0.0], [14.0, 0.0], [14.0, 8.0], [0.0, 8.0]])
 VIEW = {"fov_rad": np.pi, "beams": 90, "range_max_m": 4.0}
 
@@ -70,10 +73,41 @@ def settings():
     return values
 
 
+@dataclass(frozen=True, kw_only=True)
+class Driven:
+    """What module and atlas made of a drive."""
+
+    events: list[dict[str, object]]
+    tracked: Trajectory  # by the module, without loops
+    online: Trajectory
+    corrected: Trajectory
+    map: HybridMap
+
+
+def driven(rig, observations, **changes):
+    """Return a drive with the laser module in an atlas."""
+    module, atlas, events = LaserSlam(**{**settings(), **changes}), Atlas(voxel_m=0.05), []
+    module.activate(rig)
+    atlas.open(rig, lambda event, stamp_ns, **_: events.append({"event": event, "at": stamp_ns}))
+    session = atlas.begin_session("laser", np.eye(4))
+    for observation in observations:
+        tracking = module.track(observation)
+        atlas.add_local(tracking.stamp_ns, tracking.T_local_base)
+        atlas.add(tracking.stamp_ns, tracking.T_local_base, "laser", tracking.covariance)
+        atlas.observe(observation, None)
+    atlas.close_session(session, module.get_map(), module.get_trajectory())
+    assert atlas.finish() == []
+    return Driven(
+        events=events,
+        tracked=atlas.sessions[0].trajectory,
+        online=atlas.online,
+        corrected=atlas.trajectory,
+        map=atlas.fuse_maps(),
+    )
+
+
 def run(walls, path):
-    """Return the module after the drive, and what it told."""
-    module = LaserSlam(**settings())
-    module.activate(Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser()))
+    """Return a drive with wheels that turn too much."""
     observations = drive(
         walls,
         path,
@@ -82,7 +116,9 @@ def run(walls, path):
         period_ns=PERIOD_NS,
         **VIEW,
     )
-    return module, [module.track(observation) for observation in observations]
+    return driven(
+        Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser()), observations
+    )
 
 
 def laps_apart_m(T_local_base):
@@ -93,58 +129,57 @@ def laps_apart_m(T_local_base):
 
 
 def loop_errors_m(path, graph):
-    """Return how far each loop is from the truth."""
+    """Return how far each loop is from the truth, in the directions that its walls constrain."""
     rows = graph.stamps_ns // PERIOD_NS
     first, second = rows[graph.edges[graph.is_loop]].T
-    truth = betweens(path[first], path[second])
-    measured = graph.T_from_to[graph.is_loop][:, :2, 3]
-    return np.linalg.norm(measured - truth[:, :2], axis=1)
+    truth = to_transforms(betweens(path[first], path[second]))
+    off = se3.log(se3.inverse(truth) @ graph.T_from_to[graph.is_loop])[:, :2]
+    covariance = np.linalg.inv(graph.information[graph.is_loop])[:, :2, :2]
+    variances, directions = np.linalg.eigh(covariance)
+    along = np.einsum("nji,nj->ni", directions, off)
+    return np.linalg.norm(np.where(variances < WEAK_M**2, along, 0.0), axis=1)
 
 
 @pytest.fixture(scope="module")
 def two_laps():
-    path = laps(2)
-    module, trackings = run(furnished(np.random.default_rng(1)), path)
-    return path, module, trackings, module.get_trajectory()
+    return run(furnished(np.random.default_rng(1)), laps(2))
 
 
 def test_second_lap_closes_loops_that_are_right(two_laps):
-    path, module, _, _ = two_laps
-    off_m = loop_errors_m(path, module.get_map().pose_graph)
+    off_m = loop_errors_m(laps(2), two_laps.map.pose_graph)
     assert len(off_m) > 8
     assert off_m.max() < 0.1
 
 
-def test_revised_laps_lie_on_each_other_where_those_told_had_drifted_apart(two_laps):
-    path, _, trackings, revised = two_laps
-    told = np.stack([tracking.T_local_base for tracking in trackings])
-    assert len(revised) == len(path)
-    revised_m, told_m = (laps_apart_m(T).mean() for T in (revised.T_world_base, told))
-    assert revised_m < 0.02 < told_m
+def test_corrected_laps_lie_on_each_other_where_odometry_had_drifted_apart(two_laps):
+    assert len(two_laps.corrected) == len(laps(2))
+    trajectories = two_laps.corrected, two_laps.online
+    corrected_m, online_m = (laps_apart_m(one.T_world_base).mean() for one in trajectories)
+    assert corrected_m < 0.02 < online_m
 
 
-def test_corrections_are_announced_when_the_pose_jumps(two_laps):
-    path, _, trackings, _ = two_laps
-    revisions = np.array([tracking.revision for tracking in trackings])
-    assert (np.diff(revisions) >= 0).all()
-    assert revisions[len(path) // 2] == 0 < revisions[-1]
-    told = np.stack([tracking.T_local_base for tracking in trackings])
-    steps_m = np.linalg.norm(np.diff(told[:, :2, 3], axis=0), axis=1)
-    unmoved = np.diff(revisions) == 0
-    assert steps_m[unmoved].max() < 2 * STEP_M
+def test_loops_are_reported_while_the_robot_drives_and_correct_its_pose(two_laps):
+    half_ns = PERIOD_NS * len(laps(2)) // 2
+    loops_ns = [event["at"] for event in two_laps.events if event["event"] == "loop"]
+    assert len(loops_ns) > 8 and min(loops_ns) >= 0.9 * half_ns
+    last = slice(3 * len(laps(2)) // 4, None)
+    tracked_m, online_m = (
+        np.linalg.norm(one.T_world_base[last, :2, 3] - laps(2)[last, :2], axis=1).mean()
+        for one in (two_laps.tracked, two_laps.online)
+    )
+    assert online_m < 0.5 * tracked_m, (online_m, tracked_m)
 
 
 def test_the_same_drive_gives_the_same_poses_to_the_bit(two_laps):
-    path, _, _, revised = two_laps
-    module, _ = run(furnished(np.random.default_rng(1)), path)
-    np.testing.assert_array_equal(module.get_trajectory().T_world_base, revised.T_world_base)
+    again = run(furnished(np.random.default_rng(1)), laps(2))
+    for one, other in ((again.corrected, two_laps.corrected), (again.online, two_laps.online)):
+        np.testing.assert_array_equal(one.T_world_base, other.T_world_base)
 
 
 def test_places_that_look_alike_close_no_wrong_loop():
     path = laps(2)
-    module, _ = run(alike(), path)
-    off_m = loop_errors_m(path, module.get_map().pose_graph)
-    assert (off_m < 0.3).all()
+    off_m = loop_errors_m(path, run(alike(), path).map.pose_graph)
+    assert (off_m < 0.15).all()
 
 
 def test_wide_search_finds_the_pose_and_says_where_it_cannot():
@@ -158,7 +193,7 @@ def test_wide_search_finds_the_pose_and_says_where_it_cannot():
         )
         for x in (6.0, 7.0, 8.0)
     ]
-    search = LoopSearch(LikelihoodField(seen[1], 0.05))
+    search = WideSearch(LikelihoodField(seen[1], 0.05))
     truth = np.array([7.3, 0.2, 0.4])
     scan = reader.read(scan_at(walls, se3.from_xy_yaw(*truth), stamp_ns=0, **VIEW))
     around = truth + np.array([1.7, -1.2, 0.3])
@@ -175,74 +210,29 @@ def test_wide_search_in_a_corridor_is_ambiguous():
     )
     walls = np.array([[[-200, -1], [200, -1]], [[-200, 1], [200, 1]]], float)
     scan = reader.read(scan_at(walls, np.eye(4), stamp_ns=0, beams=1440))
-    search = LoopSearch(LikelihoodField(scan, 0.05))
+    search = WideSearch(LikelihoodField(scan, 0.05))
     found = search.find(scan.points, np.zeros(3), window_m=3.0, window_rad=0.3, score_min=0.5)
     assert not found.is_unique
 
 
-def test_graph_closes_a_ring_and_a_wrong_loop_does_little_harm():
-    true = np.column_stack([np.cumsum(np.ones(20)), np.zeros(20), np.zeros(20)])
-    spoilt = betweens(true[:-1], true[1:]) + np.array([0.0, 0.0, 0.02])
-    poses = [true[0]]
-    for motion in spoilt:
-        poses.append(compose(poses[-1], motion))
-    covariance = np.diag([0.01, 0.01, 0.02]) ** 2
-
-    def edge(first, second, motion, is_loop=True):
-        return ScanEdge(
-            first=first,
-            second=second,
-            T_first_second=motion,
-            covariance=covariance,
-            is_loop=is_loop,
-        )
-
-    edges = [edge(i, i + 1, motion, is_loop=False) for i, motion in enumerate(spoilt)]
-    edges += [edge(0, i, between(true[0], true[i])) for i in (12, 16, 18, 19)]
-    found = optimise(edges, np.array(poses))
-    assert np.abs(found - true).max() < 0.05
-    graph = ScanPoseGraph()
-    for one in edges:
-        graph.add(one)
-    np.testing.assert_allclose(graph.smooth(np.array(poses)), found, atol=0.02)
-    wrong = [*edges, edge(2, 17, np.array([3.0, 1.0, 0.5]))]
-    assert np.abs(optimise(wrong, np.array(poses)) - true).max() < 0.3
-
-
-def test_pose_graph_of_the_map_holds_every_keyframe_and_edge():
-    path = loop_path(120)
-    module = LaserSlam(**settings())
+def test_scans_of_the_map_are_those_of_the_keyframes_at_their_poses():
+    module, path = LaserSlam(**settings()), loop_path(120)
     module.activate(Rig(sensors=frozenset({Sensor.SCAN}), laser=Laser()))
-    for observation in drive(room(), path, rng=np.random.default_rng(1)):
-        module.track(observation)
-    graph = module.get_map().pose_graph
-    assert (np.diff(graph.stamps_ns) > 0).all()
-    chain = graph.edges[~graph.is_loop]
-    following = np.arange(len(chain))
-    np.testing.assert_array_equal(chain, np.column_stack([following, following + 1]))
-    T_to = graph.T_world_base[chain[:, 0]] @ graph.T_from_to[~graph.is_loop]
-    np.testing.assert_allclose(T_to, graph.T_world_base[chain[:, 1]], atol=0.05)
-    assert (np.linalg.eigvalsh(graph.information) > 0).all()
+    trackings = [module.track(one) for one in drive(room(), path, rng=np.random.default_rng(1))]
+    scans = module.get_map().scans
+    assert (np.diff(scans.stamps_ns) > 0).all() and len(scans.stamps_ns) > 5
+    T_local_base = {tracking.stamp_ns: tracking.T_local_base for tracking in trackings}
+    expected = [T_local_base[stamp_ns] for stamp_ns in scans.stamps_ns.tolist()]
+    np.testing.assert_allclose(scans.T_world_laser, expected, atol=1e-9)
 
 
-def test_loops_that_are_left_to_the_atlas_make_no_graph():
-    module = LaserSlam(**(settings() | {"close_loops": False}))
-    module.activate(Rig(sensors=frozenset({Sensor.SCAN}), laser=Laser()))
-    for observation in drive(room(), loop_path(20), rng=np.random.default_rng(1)):
-        module.track(observation)
-    layers = module.get_map()
-    assert layers.pose_graph is None and layers.grid is not None
-
-
-def test_scan_that_comes_twice_leaves_the_revised_poses_finite():
+def test_scan_that_comes_twice_leaves_the_poses_finite():
     path = loop_path(60)
     observations = drive(room(), path, odometry=path, rng=np.random.default_rng(4))
     stale = [replace(one, scan=observations[i - i % 3].scan) for i, one in enumerate(observations)]
-    module = LaserSlam(**{**settings(), "keyframe_distance_m": 0.01})
-    module.activate(Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser()))
-    for observation in stale:
-        module.track(observation)
-    assert np.isfinite(module.get_trajectory().T_world_base).all()
+    rig = Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser())
+    found = driven(rig, stale, keyframe_distance_m=0.01)
+    assert np.isfinite(found.corrected.T_world_base).all()
 
 
 def test_composing_undoes_what_between_does():
