@@ -457,6 +457,13 @@ class TrajectoryLog(Protocol):
         """Record that the poses from a stamp on are removed."""
         ...
 
+    def add_correction(self, stamps_ns: NDArray[np.int64], T_new_old: NDArray[np.float64]) -> None:
+        """Record a correction T_new_old (N, 4, 4) of the poses, at rising stamps (N,).
+
+        At other stamps that were recorded before, it is as before.
+        """
+        ...
+
     def add_end(self, session: int, revised: Trajectory) -> None:
         """Record the revised poses of a session; empty if not revised."""
         ...

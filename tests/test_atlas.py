@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sceneslam.atlas.atlas import Atlas
-from sceneslam.atlas.save import save_grid, save_map, save_points
+from sceneslam.atlas.save import save_grid, save_map, save_points, save_pose_graph
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.types import se3
 from sceneslam.types.maps import (
@@ -110,33 +110,18 @@ def test_map_without_layers_is_saved_empty(tmp_path):
     assert not (tmp_path / "grid.pgm").exists()
 
 
-def two_keyframes(step_m=1.0):
-    """A pose graph of two keyframes, one ahead of the other, measured as they stand."""
-    T_local_base = np.stack([se3.identity(), se3.from_xy_yaw(step_m, 0.0, 0.0)])
-    return PoseGraphLayer(
+def test_saved_pose_graph_is_what_gtsam_reads(tmp_path):
+    gtsam = pytest.importorskip("gtsam")
+    T_map_node = np.stack([se3.identity(), se3.from_xy_yaw(1.0, 0.0, 0.0)])
+    measured = PoseGraphLayer(
         stamps_ns=np.array([1, 2_000_000_003]),
-        T_world_base=T_local_base,
+        T_world_base=T_map_node,
         edges=np.array([[0, 1]]),
-        T_from_to=T_local_base[1:],
+        T_from_to=T_map_node[1:],
         information=np.diag([1.0, 2, 3, 4, 5, 6])[None] + 0.5,
         is_loop=np.array([False]),
     )
-
-
-def test_pose_graphs_of_all_sessions_lie_in_the_map_one_after_the_other():
-    layers = MapLayers(pose_graph=two_keyframes())
-    turned = se3.from_xy_yaw(5.0, 0.0, np.pi / 2)
-    hybrid = atlas_of(("a", se3.identity(), layers), ("b", turned, layers)).fuse_maps()
-    graph = hybrid.pose_graph
-    np.testing.assert_allclose(graph.T_world_base[:, 0, 3], [0, 1, 5, 5], atol=1e-12)
-    np.testing.assert_array_equal(graph.edges, [[0, 1], [2, 3]])
-    assert [hybrid.modules[i] for i in hybrid.node_modules] == ["a", "a", "b", "b"]
-
-
-def test_saved_pose_graph_is_what_gtsam_reads(tmp_path):
-    gtsam = pytest.importorskip("gtsam")
-    layers = MapLayers(pose_graph=two_keyframes())
-    save_map(atlas_of(("a", se3.identity(), layers)).fuse_maps(), tmp_path)
+    save_pose_graph(measured, tmp_path / "pose_graph.g2o")
     graph, values = gtsam.readG2o(str(tmp_path / "pose_graph.g2o"), True)
     np.testing.assert_allclose(values.atPose3(1).translation(), [1, 0, 0])
     information = gtsam.BetweenFactorPose3.noiseModel(graph.at(0)).information()

@@ -17,7 +17,7 @@ from sceneslam.atlas.covariances import PosedPath, calibrated, covariances
 from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.atlas.places.localizer import Fix
 from sceneslam.atlas.submaps import run_graph
-from sceneslam.atlas.submaps.graph import Agreement, Solved, consistent, deviations_to, solve
+from sceneslam.atlas.submaps.graph import Agreement, Solved, consistent, deviations_to, settle
 from sceneslam.atlas.submaps.run_graph import RunGraph, SolvedRun
 from sceneslam.atlas.uncertainty import WHEELS
 from sceneslam.types import planar, se3
@@ -201,7 +201,7 @@ class Searched(Given):
     def __init__(self, monkeypatch, found):
         self.found, self.asked, self.sigma, self.forgotten, self.solved = found, [], {}, 0, 0
         monkeypatch.setattr(run_graph, "LoopFinder", lambda is_closed: self)
-        monkeypatch.setattr(run_graph, "solve", self._solve)
+        monkeypatch.setattr(run_graph, "settle", self._settle)
 
     def loops_to(self, second, submaps, plane, sigma):
         self.asked.append(second)
@@ -211,9 +211,9 @@ class Searched(Given):
     def forget(self):
         self.forgotten += 1
 
-    def _solve(self, *args, **settings):
+    def _settle(self, *given):
         self.solved += 1
-        return solve(*args, **settings)
+        return settle(*given)
 
 
 def off(first, second, aside_m=0.02):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneslam.atlas.fusion import fuse, one_per_voxel
+from sceneslam.atlas.fusion import Placed, fuse, one_per_voxel
 from sceneslam.atlas.lasting.merge import side_by_side
 from sceneslam.atlas.lasting.prune import prune
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map
@@ -325,8 +325,13 @@ def grid(values, *, resolution_m=0.5, origin=(0.0, 0.0)):
     )
 
 
+def put(module, T_map_local, layers):
+    return Placed(module=module, T_map_local=T_map_local, layers=layers)
+
+
 def fused(*placed):
-    return fuse([("a", T, MapLayers(grid=one)) for T, one in placed], voxel_m=0.1).grid
+    layers = [put("a", T, MapLayers(grid=one)) for T, one in placed]
+    return fuse(layers, voxel_m=0.1).grid
 
 
 def test_a_grid_stays_as_it_is_and_is_moved_by_whole_cells():
@@ -348,9 +353,9 @@ def test_points_without_a_colour_are_grey_and_know_their_module():
     cloud = PointLayer(points=np.array([[0, 0, 0], [5, 0, 0]], np.float32))
     colored = replace(cloud, colors_bgr=np.full((2, 3), 7, np.uint8))
     placed = [
-        ("b", at(), MapLayers(points=cloud)),
-        ("a", at(1.0), MapLayers(points=colored)),
-        ("b", at(2.0), MapLayers(points=cloud)),
+        put("b", at(), MapLayers(points=cloud)),
+        put("a", at(1.0), MapLayers(points=colored)),
+        put("b", at(2.0), MapLayers(points=cloud)),
     ]
     found = fuse(placed, voxel_m=0.1)
     assert found.modules == ("b", "a") and found.point_modules.tolist() == [0, 0, 1, 1, 0, 0]
@@ -453,3 +458,34 @@ def test_a_bridge_drifts_as_the_sensors_that_measured_it(sensors, drift):
     (motion,) = own.chain.motions
     poses = [key_pose(index, at(0.5 * index), drift=drift) for index in range(7)]
     np.testing.assert_allclose(motion.covariance, motion_covariance(poses))
+
+
+def corrections(*shifts_m, stamps_s=None):
+    stamps_s = range(len(shifts_m)) if stamps_s is None else stamps_s
+    return Correction(
+        stamps_ns=np.array(list(stamps_s), np.int64) * S,
+        T_new_old=np.array([at(shift_m) for shift_m in shifts_m]).reshape(-1, 4, 4),
+    )
+
+
+def test_a_correction_is_updated_where_it_changed_by_a_centimetre_and_at_its_end():
+    before = corrections(0.0, 0.0, 0.0, 0.0)
+    after = corrections(0.009, -0.011, 0.0, 0.005, 0.006)
+    changes = after.changes(before)
+    assert (changes.stamps_ns // S).tolist() == [1, 4]
+    updated = before.updated(changes)
+    assert (updated.stamps_ns // S).tolist() == [0, 1, 2, 3, 4]
+    np.testing.assert_allclose(updated.T_new_old[:, 0, 3], [0, -0.011, 0, 0, 0.006])
+    np.testing.assert_array_equal(Correction.none().updated(after).T_new_old, after.T_new_old)
+    assert (after.changes(Correction.none()).stamps_ns == after.stamps_ns).all()
+    for turn_rad, rows in ((0.0049, [1]), (0.0051, [0, 1])):
+        turned = replace(after, stamps_ns=after.stamps_ns[:2], T_new_old=np.array([at()] * 2))
+        turned.T_new_old[0] = at(0.0, 0.0, turn_rad)
+        changes = turned.changes(corrections(0.0, 0.0))
+        assert (changes.stamps_ns // S).tolist() == rows
+
+
+def test_a_correction_is_cut_before_replaced_poses_but_for_its_first_node():
+    whole = corrections(0.1, 0.2, 0.3)
+    for second, left in ((3, 3), (2, 2), (1, 1), (0, 1)):
+        assert len(whole.cut(second * S).stamps_ns) == left

@@ -238,14 +238,17 @@ class Solving:
 def test_the_newest_pose_is_corrected_by_loops_and_each_is_reported_once(monkeypatch):
     solving, drive = Solving(monkeypatch), Driving()
     drive.to(*range(4))
-    np.testing.assert_allclose(drive.own.T_map_run, at(0.0, 1.0), atol=1e-12)
+    np.testing.assert_allclose(drive.own.correction().T_new_old, [at(0.0, 1.0)], atol=1e-12)
+    assert drive.own.correction() is None
     drive.to(*range(4, 7))
     assert solving.lengths == [1, 2] and solving.threads == [threading.main_thread()] * 2
     assert [(event, ns // S) for event, ns, _ in drive.events] == [("loop", 0), ("loop", 3)]
     assert drive.events[1][2]["to_ns"] == 0 and not drive.events[1][2]["in_loaded_map"]
     solving.found = False
     drive.to(*range(7, 10))
-    np.testing.assert_array_equal(drive.own.T_map_run, at())  # its loops are not believed any more
+    after = drive.own.correction()  # its loops are not believed any more
+    np.testing.assert_array_equal(after.T_new_old, [at()] * 3)
+    assert (after.stamps_ns // S).tolist() == [0, 3, 6]
 
 
 def test_loops_of_a_run_are_counted_after_the_loaded_map_and_lead_between_its_submaps(monkeypatch):

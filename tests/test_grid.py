@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sceneslam.scans.occupancy_grid import OccupancyGrid
+from sceneslam.scans.occupancy_grid import OccupancyGrid, drawn, scan_layer, walls
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import LaserScan
@@ -60,12 +60,38 @@ def test_beam_without_measurement_clears_nothing():
 
 
 def test_beam_without_return_clears_only_so_far():
-    grid = OccupancyGrid(0.1, clear_max_m=4.0)
+    grid = OccupancyGrid(0.1)
     grid.insert(se3.identity(), scan_of(np.full(180, np.inf), range_max_m=80.0))
     layer = grid.layer()
-    assert value_at(layer, 3.8, 0.05) < 0
-    assert value_at(layer, 4.3, 0.05) == 0
+    assert value_at(layer, 2.8, 0.05) < 0
+    assert value_at(layer, 3.3, 0.05) == 0
     assert (layer.log_odds <= 0).all()
+
+
+def test_a_layer_of_scans_is_drawn_as_the_scans_are():
+    rng, poses = np.random.default_rng(0), [se3.from_xy_yaw(x, 0.1 * x, x) for x in (0.0, 0.7)]
+    scans = [scan_of(rng.uniform(1.0, 9.0, 360)), scan_of(rng.uniform(1.0, 9.0, 180))]
+    scans[0].ranges_m[:40] = [*[np.inf] * 10, *[np.nan] * 10, *[0.01] * 10, *[30.0] * 10]
+    grid = OccupancyGrid(0.1)
+    for scan, T in zip(scans, poses, strict=True):
+        grid.insert(T, scan)
+    layer = scan_layer(scans, poses, cell_m=0.1)
+    found, expected = drawn(layer, layer.T_world_laser), grid.layer()
+    assert (found.log_odds != expected.log_odds).mean() < 0.001  # angles are rounded
+    assert found.origin_xy_m == expected.origin_xy_m
+    assert len(walls(layer, layer.T_world_laser)) == 320 + 180
+    nearer = scan_layer(scans, poses, cell_m=0.1, range_max_m=5.0)
+    assert nearer.ranges_m.max() <= 5.0 and (nearer.ranges_m < 0).sum() > 100
+    assert scan_layer([], [], cell_m=0.1).ranges_m.shape == (0, 0)
+
+
+def test_ends_of_beams_lie_where_the_laser_is():
+    (x, y, z) = walls(
+        scan_layer([scan_of(np.array([2.0]))], [se3.identity()], cell_m=0.1),
+        se3.from_parts(np.eye(3), np.array([[1.0, 2.0, 0.3]]))[None].reshape(1, 4, 4),
+    )[0]
+    angle = scan_of(np.array([2.0])).angles_rad[0]
+    assert (x, y, z) == pytest.approx((1 + 2 * np.cos(angle), 2 + 2 * np.sin(angle), 0.3))
 
 
 def test_door_that_opens_becomes_free():
@@ -147,7 +173,5 @@ def test_layer_is_a_copy():
 def test_wrong_arguments_are_named():
     with pytest.raises(ConfigError, match="resolution_m"):
         OccupancyGrid(0.0)
-    with pytest.raises(ConfigError, match="clear_max_m"):
-        OccupancyGrid(0.1, clear_max_m=-1.0)
     with pytest.raises(ConfigError, match="cells_max"):
         OccupancyGrid(0.1, cells_max=1)

@@ -11,6 +11,7 @@ from test_laser_world import corridor, drive, loop_path, room
 
 from sceneslam.interfaces import SlamModule
 from sceneslam.modules.slam.laser.module import LaserSlam
+from sceneslam.scans.occupancy_grid import drawn, walls
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation, TrackingStatus
@@ -167,9 +168,9 @@ def test_first_observation_is_the_origin_and_activation_starts_anew():
     np.testing.assert_array_equal(first[0].T_local_base, np.eye(4))
     module.shutdown()
     module.shutdown()
-    assert (module.get_map().grid.log_odds > 0).any()
+    assert len(module.get_map().scans.stamps_ns) > 0
     module.activate(LASER_RIG)
-    assert module.get_map().grid.log_odds.size == 0
+    assert len(module.get_map().scans.stamps_ns) == 0
     again = [module.track(observation) for observation in observations]
     for one, two in zip(first, again, strict=True):
         np.testing.assert_array_equal(one.T_local_base, two.T_local_base)
@@ -181,12 +182,13 @@ def test_map_shows_the_walls_where_they_are():
     module = active()
     for observation in drive(room(), path, rng=np.random.default_rng(11)):
         module.track(observation)
-    points = module.get_map().points.points
+    scans = module.get_map().scans
+    points = walls(scans, scans.T_world_laser)
     world = se3.apply(se3.from_xy_yaw(*path[0]), points.astype(float))
     outer = np.minimum.reduce(
         [np.abs(world[:, 0] + 2), np.abs(world[:, 0] - 4), np.abs(np.abs(world[:, 1]) - 2)]
     )
-    assert 300 < len(points) < 3000
+    assert len(points) == (scans.ranges_m > 0).sum() > 3000
     assert (outer < 0.05).mean() > 0.6
 
 
@@ -210,7 +212,8 @@ def test_depth_is_the_laser_where_there_is_none():
         tracking = module.track(Observation(stamp_ns=index * 10**8, depth_m=depth))
     assert tracking.status is TrackingStatus.DEGRADED  # one wall does not hold the way along it
     assert np.abs(tracking.T_local_base - np.eye(4)).max() < 0.01
-    assert (module.get_map().grid.log_odds > 0).sum() > 20
+    scans = module.get_map().scans
+    assert (drawn(scans, scans.T_world_laser).log_odds > 0).sum() > 20
 
 
 @pytest.mark.parametrize(
@@ -238,12 +241,21 @@ def test_map_to_match_with_ends_where_no_scan_can_reach():
     module.track(drive(room(), np.zeros((1, 3)), rng=np.random.default_rng(1))[0])
     keyframes = module._front_end.keyframes
     (first,) = keyframes.frames
+    surfaces = module._front_end.reader.read(first.scan)
     for index in range(1, 12):
         T_local_base = np.array([24.0 * index, 0.0, 0.0])
-        keyframes.add(replace(first, T_local_base=T_local_base), keyframes.surfaces_base(0))
-    last = len(keyframes) - 1
-    near = keyframes.around(last, keyframes.latest)
-    away_m = [np.hypot(*(pose - keyframes.poses[last])[:2]) for pose in keyframes.poses]
-    assert len(keyframes.latest) > 10
-    assert near == [i for i in keyframes.latest if away_m[i] <= 50.0]
-    assert 1 < len(near) < 5
+        keyframes.add(replace(first, T_local_base=T_local_base), surfaces)
+    assert len(keyframes.latest()) == 3 * len(surfaces)  # at 264, 240 and 216 m
+
+
+def test_scans_are_matched_with_the_latest_two_submaps():
+    module = active(submap_keyframes=3)
+    module.track(drive(room(), np.zeros((1, 3)), rng=np.random.default_rng(1))[0])
+    keyframes = module._front_end.keyframes
+    (first,) = keyframes.frames
+    surfaces = module._front_end.reader.read(first.scan)
+    counts = []
+    for _ in range(8):
+        counts.append(len(keyframes.latest()) // len(surfaces))
+        keyframes.add(first, surfaces)
+    assert counts == [1, 2, 3, 4, 5, 6, 4, 5]

@@ -68,7 +68,7 @@ def test_motion_that_nothing_predicts_is_likelier_the_longer_scans_fit_worse():
 def test_scan_chooses_the_motion_that_it_fits():
     """The wheels stand; the robot moved on, as its inertia says."""
     walls = with_posts()
-    reader = active()._front_end.keyframes.reader
+    reader = active()._front_end.reader
     here, ahead = (
         reader.read(scan_at(walls, se3.from_xy_yaw(x, 0, 0), stamp_ns=0)) for x in (0.0, 0.25)
     )

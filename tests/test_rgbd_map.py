@@ -196,15 +196,15 @@ def test_depth_is_missing_at_depth_edges_and_where_it_is_not_a_number():
     assert (features.depth_m[(v > 102) & (u < 317)] == 1.0).all()
 
 
-@pytest.mark.parametrize(("height_m", "has_grid"), [(0.0, True), (0.5, False)])
-def test_only_a_robot_in_the_plane_gets_a_grid(height_m, has_grid):
+@pytest.mark.parametrize(("height_m", "has_scans"), [(0.0, True), (0.5, False)])
+def test_only_a_robot_in_the_plane_gives_scans(height_m, has_scans):
     layers = LayerBuilder(CAMERA, cloud_stride_px=8, cloud_voxel_m=0.03, grid_resolution_m=0.05)
     wall_m, image_bgr = np.full((480, 640), 2.0, np.float32), np.zeros((480, 640, 3), np.uint8)
     keyframe = keyframe_at(0)
     keyframe.T_local_base[2, 3] = height_m
     keyframe.view = layers.view(wall_m, image_bgr, stamp_ns=0)
     built = layers.build([keyframe])
-    assert (built.grid is not None) == has_grid
+    assert (built.scans is not None) == has_scans
     assert built.points.points[:, 0] == pytest.approx(2.0)
     assert layers.build([]).points is None
 

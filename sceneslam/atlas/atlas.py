@@ -94,9 +94,18 @@ class Atlas:
             return
         try:
             self._mapper.observe(observation, up_base)
+            correction = self._mapper.correction()
+            if correction is not None:
+                self.correct(correction.changes(self._correction or Correction.none()))
             self._lasting.keep(observation.stamp_ns, self._mapper)
         except Exception as error:  # poses continue without a map
             self._give_up(error)
+
+    def correct(self, changes: Correction) -> None:
+        """Correct the poses otherwise than before, at the nodes of a correction."""
+        if self._journal is not None:
+            self._journal.add_correction(changes.stamps_ns, changes.T_new_old)
+        self._correction = (self._correction or Correction.none()).updated(changes)
 
     def finish(self) -> list[str]:
         """Close the loops between sessions and save the map; return one sentence per failure.
@@ -120,11 +129,15 @@ class Atlas:
         at = partial(self._revised_at, revised)
         layers = [session.layers for session in self._sessions]
         self._correction = self._mapper.finish(at, layers)
+        if self._journal is not None:
+            self._journal.add_correction(self._correction.stamps_ns, self._correction.T_new_old)
         self._lasting.finish(self._mapper, self._path.stamps_ns[-1], self._note)
 
     def _give_up(self, error: Exception) -> None:
         """Continue without submaps: the trajectory stays as the modules reported it."""
         _log.info("submaps", exc_info=error)
+        if self._mapper is not None:
+            self._mapper.close()
         self._mapper, self._correction = None, None
         self._lasting.faults.append(f"the run goes on without submaps and loops: {text_of(error)}")
 
@@ -164,8 +177,13 @@ class Atlas:
         if self._journal is not None:
             self._journal.add_rewind(stamp_ns)
         self._path.cut(stamp_ns)
+        if self._correction is not None:
+            self._correction = self._correction.cut(stamp_ns)
         if self._mapper is not None:
-            self._mapper.rewind(stamp_ns)
+            try:
+                self._mapper.rewind(stamp_ns)
+            except Exception as error:  # poses continue without a map
+                self._give_up(error)
 
     def close_session(self, session: int, layers: MapLayers, revised: Trajectory) -> None:
         """Add the final map of a session, and its revised poses T_local_base (4, 4) [m].
@@ -284,7 +302,9 @@ class Atlas:
 
     def _in_map(self, T_run_base: Transform) -> Transform:
         """Return a pose as loops correct it, or in a loaded map if the run was located there."""
-        return T_run_base if self._mapper is None else self._mapper.T_map_run @ T_run_base
+        if self._correction is None or not len(self._correction.stamps_ns):
+            return T_run_base
+        return np.asarray(self._correction.T_new_old[-1] @ T_run_base)
 
     def _placed(self) -> list[Transform]:
         """Return T_map_local of every session, corrected as the middle one of its poses."""

@@ -79,7 +79,7 @@ class Mapper:
         self._solving: tuple[Chain, Future[SolvedRun]] | None = None
         self._kept = 0  # submaps that are as they were given to the graph
         self._solved = SolvedRun.nothing()
-        self._T_new_old = se3.identity()  # correction of the newest pose, by loops of the run
+        self._is_news = False  # nodes were moved since `correction` was asked for
         self._is_over = False
         self._told: set[tuple[int, int, int]] = set()  # loops, by their run and stamps
 
@@ -100,11 +100,26 @@ class Mapper:
 
     @property
     def T_map_run(self) -> Transform:
-        """Return T_map_run (4, 4) for the newest pose: in the loaded map, or as loops corrected it.
+        """Return T_map_run (4, 4) in the loaded map; the identity until the run was located."""
+        return se3.identity() if self._T_map_run is None else self._T_map_run
 
-        The identity until the run was located or has closed a loop.
+    def correction(self) -> Correction | None:
+        """Return the correction of the poses by loops or the loaded map, None if it is as before.
+
+        That of the newest submap holds for the newest pose, too.
         """
-        return self._T_new_old if self._T_map_run is None else self._T_map_run
+        if not self._is_news:
+            return None
+        self._is_news = False
+        chain = self._collector.chain
+        if self.is_placed or not self._solved.loops:
+            stamps_ns = [submap.stamps_ns[0] for submap in chain.submaps] or [0]
+            T_new_old = np.tile(self.T_map_run, (len(stamps_ns), 1, 1))
+        else:
+            nodes = self._solved.T_map_node
+            stamps_ns = [submap.stamps_ns[0] for submap in chain.submaps[: len(nodes)]]
+            T_new_old = nodes @ se3.inverse(np.array(chain.T_run_node[: len(nodes)]))
+        return Correction(stamps_ns=np.array(stamps_ns, np.int64), T_new_old=T_new_old)
 
     def rewind(self, stamp_ns: int) -> None:
         """Remove what was made of poses from a stamp on: they are replaced."""
@@ -146,6 +161,10 @@ class Mapper:
         if localizer is not None:
             look = replace(look, scan=scan, view=view if is_viewed else None)
             self._localize(localizer, look)
+
+    def close(self) -> None:
+        """Wait for the search that is running, and begin no other."""
+        self._executor.shutdown(cancel_futures=True)
 
     def finish(self, path: Path, maps: Sequence[MapLayers]) -> Correction:
         """Solve the graph; return the correction of the poses.
@@ -193,7 +212,10 @@ class Mapper:
         count, pieces = len(self._loaded.submaps), self._loaded.pieces
         own = self._collector.chain
         nodes = [*self._known_nodes()]
-        nodes += [self.T_map_run @ T for T in own.T_run_node[len(nodes) :]]
+        T_map_run = self.T_map_run
+        if nodes:
+            T_map_run = nodes[-1] @ se3.inverse(own.T_run_node[len(nodes) - 1])
+        nodes += [T_map_run @ T for T in own.T_run_node[len(nodes) :]]
         piece = 0 if self.is_found else int(pieces.max(initial=-1)) + 1
         return SavedMap(
             submaps=(*self._loaded.submaps, *own.submaps),
@@ -227,9 +249,8 @@ class Mapper:
         solved = solving.result()
         if len(chain) > self._kept:
             return  # poses were replaced meanwhile
-        self._solved, self._T_new_old = solved, se3.identity()
-        if solved.loops:
-            self._T_new_old = solved.T_map_node[-1] @ se3.inverse(chain.T_run_node[-1])
+        self._is_news |= bool(solved.loops or self._solved.loops)
+        self._solved = solved
         self._tell_loops()
 
     def _known_nodes(self) -> NDArray[np.float64]:
@@ -275,6 +296,7 @@ class Mapper:
         """Process the result of a comparison with the map."""
         assert self._began_ns is not None
         after_s = (stamp_ns - self._began_ns) / 1e9
+        self._is_news |= localizer.T_map_run is not self._T_map_run
         self._T_map_run = localizer.T_map_run
         if outcome is LocalizationEvent.FOUND:
             self.was_found = True

@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from sceneslam.atlas.atlas import Atlas
+from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.config.build import make_source
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.provenance import provenance
@@ -57,8 +58,6 @@ def recover(folder: Path) -> Recovered:
     atlas = builder.make("atlas", Atlas)
     kept = read_journal(folder / JOURNAL, _Retold(atlas))
     missing = list(_NEVER_KEPT)
-    if (config.get("atlas") or {}).get("load"):
-        missing.append("its place in the map that was loaded: poses are in the run's own frame")
     if kept.torn_bytes:
         missing.append(f"the last {kept.torn_bytes} bytes of {JOURNAL}, which are torn")
     events = _events(folder, missing)
@@ -115,6 +114,9 @@ class _Retold:
 
     def add_rewind(self, stamp_ns: int) -> None:
         self._atlas.rewind(stamp_ns)
+
+    def add_correction(self, stamps_ns: NDArray[np.int64], T_new_old: NDArray[np.float64]) -> None:
+        self._atlas.correct(Correction(stamps_ns=stamps_ns, T_new_old=T_new_old))
 
     def add_end(self, session: int, revised: Trajectory) -> None:
         self._atlas.close_session(session, MapLayers(), revised)

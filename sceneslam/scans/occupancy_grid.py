@@ -73,8 +73,8 @@ def walls(scans: ScanLayer, T_map_laser: NDArray[np.float64]) -> NDArray[np.floa
     beams = np.arange(scans.ranges_m.shape[1])
     angles = scans.angle_min_rad[:, None] + scans.angle_step_rad[:, None] * beams
     x, y = scans.ranges_m * np.cos(angles), scans.ranges_m * np.sin(angles)
-    ends = np.stack([x, y, np.zeros_like(x)], axis=-1)
-    ends = ends @ np.swapaxes(T_map_laser[:, :3, :3], 1, 2) + T_map_laser[:, None, :3, 3]
+    ends_laser = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    ends = ends_laser @ np.swapaxes(T_map_laser[:, :3, :3], 1, 2) + T_map_laser[:, None, :3, 3]
     return np.asarray(ends[scans.ranges_m > 0.0], np.float32)
 
 

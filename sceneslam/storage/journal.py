@@ -11,6 +11,7 @@
 | `L` | stamp, T_local_base of the session |
 | `P` | stamp, T_map_base, covariance (upper triangle, 21; or none), key of the module |
 | `R` | stamp from which on poses are taken back |
+| `M` | stamps and T_new_old at which the atlas corrects the poses otherwise than before |
 | `C` | a session's number; stamps and T_local_base as its module revised them at its end |
 
 A pose takes about 410 bytes. The file goes when the run's results are written.
@@ -99,10 +100,14 @@ class Journal:
         """Record that the poses from a stamp on are removed."""
         self._add(b"R", _STAMP.pack(stamp_ns))
 
+    def add_correction(self, stamps_ns: NDArray[np.int64], T_new_old: NDArray[np.float64]) -> None:
+        """Record the correction of poses, T_new_old (N, 4, 4) [m], at stamps (N,)."""
+        self._add(b"M", _poses(stamps_ns, T_new_old))
+
     def add_end(self, session: int, revised: Trajectory) -> None:
         """Record the revised trajectory of a session."""
-        poses = np.ascontiguousarray(revised.T_world_base[:, :3]).tobytes()
-        self._add(b"C", _STAMP.pack(session) + revised.stamps_ns.tobytes() + poses)
+        poses = _poses(revised.stamps_ns, revised.T_world_base)
+        self._add(b"C", _STAMP.pack(session) + poses)
 
     def flush(self) -> None:
         """Pass all records to the operating system."""
@@ -195,13 +200,13 @@ def _tell_rewind(log: TrajectoryLog, body: bytes) -> None:
     log.add_rewind(_number(body))
 
 
+def _tell_correction(log: TrajectoryLog, body: bytes) -> None:
+    correction = _trajectory(body)
+    log.add_correction(correction.stamps_ns, correction.T_world_base)
+
+
 def _tell_end(log: TrajectoryLog, body: bytes) -> None:
-    rest = body[_STAMP.size :]
-    count = len(rest) // (_STAMP.size + _POSE_BYTES)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3] = np.frombuffer(rest, offset=count * _STAMP.size).reshape(-1, 3, 4)
-    stamps_ns = np.frombuffer(rest, np.int64, count)
-    log.add_end(_number(body), Trajectory(stamps_ns=stamps_ns, T_world_base=poses))
+    log.add_end(_number(body), _trajectory(body[_STAMP.size :]))
 
 
 _TELL = {
@@ -209,6 +214,7 @@ _TELL = {
     b"L": _tell_local,
     b"P": _tell_pose,
     b"R": _tell_rewind,
+    b"M": _tell_correction,
     b"C": _tell_end,
 }
 
@@ -223,6 +229,18 @@ def _crc(kind: bytes, body: bytes) -> int:
 
 def _pose(T_a_b: Transform) -> bytes:
     return T_a_b[:3].tobytes()
+
+
+def _poses(stamps_ns: NDArray[np.int64], T_a_b: NDArray[np.float64]) -> bytes:
+    return stamps_ns.tobytes() + np.ascontiguousarray(T_a_b[:, :3]).tobytes()
+
+
+def _trajectory(body: bytes) -> Trajectory:
+    """Return stamps and poses as `_poses` wrote them."""
+    count = len(body) // (_STAMP.size + _POSE_BYTES)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3] = np.frombuffer(body, offset=count * _STAMP.size).reshape(-1, 3, 4)
+    return Trajectory(stamps_ns=np.frombuffer(body, np.int64, count), T_world_base=poses)
 
 
 def _transform(body: bytes) -> Transform:

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 
+_FELT_M, _FELT_RAD = 0.01, 0.005  # smaller changes are within the noise of a pose
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Correction:
@@ -21,6 +23,33 @@ class Correction:
     def none(cls) -> Correction:
         """Return the correction that leaves all poses unchanged, bit by bit."""
         return cls(stamps_ns=np.zeros(0, np.int64), T_new_old=np.zeros((0, 4, 4)))
+
+    def cut(self, stamp_ns: int) -> Correction:
+        """Return the correction at the nodes before a stamp, at the first one if there is none."""
+        kept = max(int(np.searchsorted(self.stamps_ns, stamp_ns)), 1)
+        return Correction(stamps_ns=self.stamps_ns[:kept], T_new_old=self.T_new_old[:kept])
+
+    def changes(self, before: Correction) -> Correction:
+        """Return the nodes that differ by 1 cm or 0.3 degrees from those of another correction.
+
+        And the newest one, whatever it is.
+        """
+        keep = np.ones(len(self.stamps_ns), bool)
+        _, rows, known = np.intersect1d(
+            self.stamps_ns[:-1], before.stamps_ns, assume_unique=True, return_indices=True
+        )
+        off = se3.inverse(before.T_new_old[known]) @ self.T_new_old[rows]
+        is_far = np.linalg.norm(off[:, :3, 3], axis=1) > _FELT_M
+        keep[rows] = is_far | (se3.rotation_angle_rad(off) > _FELT_RAD)
+        return Correction(stamps_ns=self.stamps_ns[keep], T_new_old=self.T_new_old[keep])
+
+    def updated(self, changes: Correction) -> Correction:
+        """Return the correction with other values at the nodes of `changes`."""
+        kept = ~np.isin(self.stamps_ns, changes.stamps_ns)
+        stamps_ns = np.concatenate([self.stamps_ns[kept], changes.stamps_ns])
+        order = np.argsort(stamps_ns, kind="stable")
+        T_new_old = np.concatenate([self.T_new_old[kept], changes.T_new_old])
+        return Correction(stamps_ns=stamps_ns[order], T_new_old=T_new_old[order])
 
     def apply(
         self, stamps_ns: NDArray[np.int64], T_map_base: NDArray[np.float64]

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ _LOOSE = np.array([10.0, 10.0, 1.0, 0.05, 0.05, 3.0])  # m, rad: any loop moves 
 _FLOOR = np.array([0.05, 0.02, 0.02]) ** 2  # m, rad: height and tilt between places of one floor
 _TILT_RAD = 0.04  # that modules drift in pitch along a corridor, before gravity corrects them
 _UPRIGHT_RAD = 0.01  # half a degree: of gyro and gravity, and as floors are uneven
+_STEPS, _GAIN_RATIO = 20, 1e-3  # of a solution while the run goes on: its cost falls no further
 _VAIN = 50  # starts in a row without a larger clique
 _LEVER_M = 2.5  # at this distance a turn moves walls: it makes deviations of turns comparable
 LOADED = -1  # node of a loaded map
@@ -71,21 +73,13 @@ def solve(
 
     if not loops and not uprights:
         return Solved(T_map_node=T_map_node, accepted=[])
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph, values = _problem(T_map_node, motions, uprights)
     poses = [gtsam.Pose3(T) for T in T_map_node]
-    for number, pose in enumerate(poses):
-        values.insert(number, pose)
     noise = gtsam.noiseModel.Diagonal.Sigmas(_FIXED[TO_GTSAM])
     for number in fixed:
         graph.add(gtsam.PriorFactorPose3(number, poses[number], noise))
     slack = gtsam.noiseModel.Diagonal.Sigmas((_LOOSE if len(fixed) else _FIXED)[TO_GTSAM])
     graph.add(gtsam.PriorFactorPose3(loose, poses[loose], slack))
-    for edge in motions:
-        graph.add(factor_of(edge))
-    tilt = gtsam.noiseModel.Isotropic.Sigma(2, _UPRIGHT_RAD)
-    for one in uprights:
-        directions = gtsam.Unit3(one.up_map), tilt, gtsam.Unit3(one.up_node)
-        graph.add(gtsam.AttitudeFactorPose3(one.node, *directions))
     trusted = list(range(graph.size()))
     for edge in loops:
         graph.add(factor_of(edge))
@@ -96,9 +90,68 @@ def solve(
     result = optimizer.optimize()
     weights = np.asarray(optimizer.getWeights())[len(trusted) :]
     return Solved(
-        T_map_node=np.array([result.atPose3(row).matrix() for row in range(len(poses))]),
-        accepted=np.flatnonzero(weights > 0.5).tolist(),
+        T_map_node=_nodes(result, len(poses)), accepted=np.flatnonzero(weights > 0.5).tolist()
     )
+
+
+def settle(
+    T_map_node: NDArray[np.float64],
+    motions: Sequence[Edge],
+    loops: Sequence[Edge],
+    uprights: Sequence[Upright] = (),
+) -> Solved:
+    """Return the same for a run that goes on, whose first node stays, from its last solution.
+
+    As long as all loops fit, other threads run between two steps: gtsam lets none run within one.
+    """
+    import gtsam
+
+    graph, values = _problem(T_map_node, motions, uprights)
+    noise = gtsam.noiseModel.Diagonal.Sigmas(_FIXED[TO_GTSAM])
+    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(T_map_node[0]), noise))
+    for edge in loops:
+        graph.add(factor_of(edge))
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values)
+    before = optimizer.error()
+    for _ in range(_STEPS):
+        optimizer.iterate()
+        after = optimizer.error()
+        if before - after <= _GAIN_RATIO * before:
+            break
+        before = after
+    nodes = _nodes(optimizer.values(), len(T_map_node))
+    if all(fits(edge, nodes) for edge in loops):
+        return Solved(T_map_node=nodes, accepted=list(range(len(loops))))
+    return solve(T_map_node, motions, loops, fixed=(), loose=0, uprights=uprights)
+
+
+def fits(edge: Edge, T_map_node: NDArray[np.float64]) -> bool:
+    """Tell whether an edge agrees with the nodes (N, 4, 4)."""
+    T_first_second = se3.inverse(T_map_node[edge.first]) @ T_map_node[edge.second]
+    off = se3.log(se3.inverse(T_first_second) @ edge.T_first_second)
+    return bool(off @ np.linalg.solve(edge.covariance, off) <= _CHI2_6)
+
+
+def _problem(
+    T_map_node: NDArray[np.float64], motions: Sequence[Edge], uprights: Sequence[Upright]
+) -> tuple[Any, Any]:
+    """Return the graph without its loops, and the initial poses."""
+    import gtsam
+
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for number, T in enumerate(T_map_node):
+        values.insert(number, gtsam.Pose3(T))
+    for edge in motions:
+        graph.add(factor_of(edge))
+    tilt = gtsam.noiseModel.Isotropic.Sigma(2, _UPRIGHT_RAD)
+    for one in uprights:
+        directions = gtsam.Unit3(one.up_map), tilt, gtsam.Unit3(one.up_node)
+        graph.add(gtsam.AttitudeFactorPose3(one.node, *directions))
+    return graph, values
+
+
+def _nodes(values: Any, count: int) -> NDArray[np.float64]:
+    return np.array([values.atPose3(row).matrix() for row in range(count)])
 
 
 def marginals(

@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.localizer import Fix
 from sceneslam.atlas.submaps.chain import Chain
-from sceneslam.atlas.submaps.graph import Agreement, Upright, consistent, deviations_to, solve
+from sceneslam.atlas.submaps.graph import (
+    Agreement,
+    Solved,
+    Upright,
+    consistent,
+    deviations_to,
+    fits,
+    settle,
+    solve,
+)
 from sceneslam.atlas.submaps.loop_closure import LoopFinder
 from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops, recognized_loops
 from sceneslam.graphs.edge import Edge, EdgeKind
@@ -69,19 +78,15 @@ class RunGraph:
         self._search(chain, is_level=is_level)
         agreeing = self._agreeing()
         if agreeing != self._agreed:
-            self._agreed = agreeing
-            # Without loops nothing is solved: nodes are where the motions lead.
-            start = self._T_map_node if agreeing else np.array(chain.T_run_node)
-            solved = solve(
-                start,
-                chain.motions,
-                agreeing,
-                fixed=(),
-                loose=0,
-                uprights=_uprights(chain, start, 0),
-            )
-            self._T_map_node = solved.T_map_node
-            self._accepted = [agreeing[index] for index in solved.accepted]
+            # What did not fit before is left out until it does, or to the end of the run.
+            used = [edge for edge in agreeing if self._is_used(edge)]
+            # Without loops nodes are where the motions lead.
+            start = self._T_map_node if used else np.array(chain.T_run_node)
+            solved = Solved(T_map_node=start, accepted=[])
+            if used:
+                solved = settle(start, chain.motions, used, _uprights(chain, start, 0))
+            self._agreed, self._T_map_node = agreeing, solved.T_map_node
+            self._accepted = [used[index] for index in solved.accepted]
         loops = tuple(edge.shifted(self._count) for edge in self._accepted)
         return SolvedRun(T_map_node=self._T_map_node, loops=loops)
 
@@ -129,6 +134,10 @@ class RunGraph:
         """Return the loops that agree with each other; one alone is not believed."""
         agreeing = self._found.largest()
         return [self._found.loops[index] for index in agreeing] if len(agreeing) > 1 else []
+
+    def _is_used(self, loop: Edge) -> bool:
+        is_new = all(loop is not one for one in self._agreed)
+        return is_new or fits(loop, self._T_map_node)
 
     def _place(self, chain: Chain) -> None:
         """Place the new submaps by the motions to them."""
