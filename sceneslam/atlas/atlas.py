@@ -66,11 +66,18 @@ class Atlas:
         self._journal = journal
 
     def open(
-        self, rig: Rig, note: Note, *, closing: Collection[str] = (), is_live: bool = False
+        self,
+        rig: Rig,
+        note: Note,
+        *,
+        closing: Collection[str] = (),
+        is_looking: bool = True,
+        is_live: bool = False,
     ) -> None:
         """Prepare for observations; `note` receives events, such as recognized places and loops.
 
-        `closing` are the modules that close loops themselves.
+        `closing` are the modules that close loops themselves. With `is_looking`, places are
+        recognized by what a camera sees.
         """
         self._closing = frozenset(closing)
         self._note = note
@@ -84,7 +91,7 @@ class Atlas:
             note=note,
             is_closed=self._closes_loops,
             loaded=loaded,
-            keeps_views=self._lasting.saves,
+            keeps_views=is_looking or self._lasting.saves,
             is_live=is_live,
         )
 

@@ -34,7 +34,6 @@ _SHAPES: dict[str, _Shapes] = {  # of the arrays of each layer
         "is_loop": ("M",),
     },
     "landmarks": {"points": ("N", 3), "first_stamps_ns": ("N",), "sightings": ("N",)},
-    "loops": {"stamps_ns": ("M", 2), "T_from_to": ("M", 4, 4), "information": ("M", 6, 6)},
 }
 Value = TypeVar("Value")
 

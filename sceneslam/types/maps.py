@@ -66,18 +66,6 @@ class LandmarkLayer:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopLayer:
-    """Loops from a module's earlier sessions to this one, measured by recognizing places.
-
-    The information is the inverse covariance of se3.log(T_from_to) about the measurement.
-    """
-
-    stamps_ns: NDArray[np.int64]  # (M, 2), of the poses from and to
-    T_from_to: NDArray[np.float64]  # (M, 4, 4), base then to base now
-    information: NDArray[np.float64]  # (M, 6, 6) [1/m^2, 1/rad^2]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapLayers:
     """The map of one module, in its `local` frame."""
 
@@ -86,7 +74,6 @@ class MapLayers:
     scans: ScanLayer | None = None
     pose_graph: PoseGraphLayer | None = None
     landmarks: LandmarkLayer | None = None
-    loops: LoopLayer | None = None
 
 
 LAYER_TYPES: dict[str, type] = {  # by the fields of MapLayers
@@ -95,7 +82,6 @@ LAYER_TYPES: dict[str, type] = {  # by the fields of MapLayers
     "scans": ScanLayer,
     "pose_graph": PoseGraphLayer,
     "landmarks": LandmarkLayer,
-    "loops": LoopLayer,
 }
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,12 +24,16 @@ _SAMPLES = 300  # of three matches each: one is right with 99.9 % if three of te
 _ROUNDS = 3  # of the motion by all matches that are right: which ones are depends on it
 
 
-def recognize(known: PlacedViews, landmarks: Landmarks) -> Sighting | None:
-    """Return where a view was taken in a map, None if it shows no place of it, or two alike."""
-    found = known.recognize(
-        landmarks.descriptors, lambda number: register(*known[number], landmarks)
+def recognize(
+    known: PlacedViews, landmarks: Landmarks, among: Sequence[int] | None = None
+) -> tuple[int, Sighting] | None:
+    """Return which view of a map shows the same place, and where another one was taken.
+
+    None if it shows no place of the views `among` them (None: all), or two alike.
+    """
+    return known.recognize(
+        landmarks.descriptors, lambda number: register(*known[number], landmarks), among
     )
-    return None if found is None else found[1]
 
 
 def register(T_map_first: Transform, first: Landmarks, second: Landmarks) -> Sighting | None:

@@ -46,14 +46,33 @@ class Sighting:
 class PlacedViews:
     """Landmarks of views, with their poses T_map_base (4, 4)."""
 
-    def __init__(self, placed: Sequence[tuple[Transform, Landmarks]]) -> None:
-        self._placed = list(placed)
+    def __init__(self, placed: Sequence[tuple[Transform, Landmarks]] = ()) -> None:
+        self._placed: list[tuple[Transform, Landmarks]] = []
         self._index = PlaceIndex()
-        for number, (_, landmarks) in enumerate(self._placed):
-            self._index.insert(number, landmarks.descriptors)
+        for T_map_base, landmarks in placed:
+            self.add(T_map_base, landmarks)
+
+    def __len__(self) -> int:
+        return len(self._placed)
 
     def __getitem__(self, number: int) -> tuple[Transform, Landmarks]:
         return self._placed[number]
+
+    def add(self, T_map_base: Transform, landmarks: Landmarks) -> None:
+        """Add a view at T_map_base (4, 4)."""
+        self._index.insert(len(self._placed), landmarks.descriptors)
+        self._placed.append((T_map_base, landmarks))
+
+    def move(self, T_map_base: Sequence[Transform]) -> None:
+        """Set the poses (4, 4) of all views."""
+        moved = zip(T_map_base, self._placed, strict=True)
+        self._placed = [(T, landmarks) for T, (_, landmarks) in moved]
+
+    def cut(self, count: int) -> None:
+        """Leave the first `count` views."""
+        for number in range(count, len(self._placed)):
+            self._index.remove(number)
+        del self._placed[count:]
 
     def near(self, T_map_base: Transform) -> list[int]:
         """Return the views that were taken near a pose (4, 4), the nearest first."""

@@ -20,7 +20,6 @@ from .adjust.odometry_constraints import OdometryIntegrator, led
 from .adjust.renewal import NEWEST, LocatedView, renew, seen_by
 from .answers import held, lost, placed, repeated, started
 from .locate.localizer import VisualFix
-from .loops.session_relocalizer import SessionRelocalizer
 from .parts import RgbdParts
 from .see.alignment import Alignment
 from .see.sizes import check_sizes
@@ -54,7 +53,6 @@ class RgbdSlam:
         keyframe_turn_rad: float,
         keyframe_inlier_ratio: float,
         keyframe_limit: int,
-        past_keyframe_limit: int,
         landmark_limit: int,
         cloud_stride_px: int,
         cloud_voxel_m: float,
@@ -77,7 +75,6 @@ class RgbdSlam:
             keyframe_turn_rad=keyframe_turn_rad,
             keyframe_inlier_ratio=keyframe_inlier_ratio,
             keyframe_limit=keyframe_limit,
-            past_keyframe_limit=past_keyframe_limit,
             landmark_limit=landmark_limit,
             cloud_stride_px=cloud_stride_px,
             cloud_voxel_m=cloud_voxel_m,
@@ -87,7 +84,6 @@ class RgbdSlam:
         )
         self._monocular_scenes = frozenset(monocular_scenes)
         self._ignores_depth = False
-        self._session_relocalizer = SessionRelocalizer(keyframe_limit=past_keyframe_limit)
         self._T_local_base = se3.identity()
 
     @property
@@ -102,23 +98,18 @@ class RgbdSlam:
         return tuple(frozenset({Sensor.IMAGE, scale}) for scale in scales)
 
     def activate(self, rig: Rig) -> None:
-        """Start with an empty map; raises InputError for a rig without a camera.
-
-        When it recognizes a place of an earlier, placed session, its poses are aligned to that.
-        """
+        """Start with an empty map; raises InputError for a rig without a camera."""
         if rig.camera is None:
             raise InputError("rig: rgbd needs the camera's intrinsics, got none")
         self._camera: Camera = rig.camera
         self._predictor, self._odometry = Predictor(rig), OdometryIntegrator()
-        self._session_relocalizer.begin()
         self._build(None)
         self._T_local_base = se3.identity()
         self._held_ids = np.zeros(0, np.int64)  # landmarks that support the newest pose
         self._observations, self._is_lost = 0, False
 
     def set_pose(self, T_map_local: Transform) -> None:
-        """Place `local` in the map (Eq. 1)."""
-        self._session_relocalizer.place(T_map_local)
+        """Do nothing: the poses are in `local`, independent of T_map_local."""
 
     def set_scene(self, scene: str) -> None:
         """Set the scene; in `monocular_scenes` depth is not used."""
@@ -166,18 +157,15 @@ class RgbdSlam:
         """Return in `local` the cloud, a planar robot's grid, the pose graph and the landmarks."""
         layers = self._layers.build(list(self._map.keyframes.all()))
         graph, landmarks = self._memory.pose_graph(), self._memory.landmarks()
-        return replace(
-            layers, pose_graph=graph, landmarks=landmarks, loops=self._session_relocalizer.loops
-        )
+        return replace(layers, pose_graph=graph, landmarks=landmarks)
 
     def shutdown(self) -> None:
         """Stop the workers; the map stays readable."""
         self._mapping.shutdown()
         self._memory.shutdown()
-        self._session_relocalizer.end(self._map, self._memory.recognizer)
 
     def _build(self, alignment: Alignment | None) -> RgbdParts:
-        parts = RgbdParts(self._settings, self._camera, alignment, self._session_relocalizer)
+        parts = RgbdParts(self._settings, self._camera, alignment)
         self._eye, self._health, self._search = parts.eye, parts.health, parts.search
         self._map, self._mapping, self._memory = parts.map, parts.mapping, parts.memory
         self._layers, self._place_rule = parts.layers, parts.place_rule
@@ -198,7 +186,7 @@ class RgbdSlam:
         self._held_ids = self._map.keyframes.landmarks_of(self._map.keyframes.ids[-1:])
 
     def _recall(self) -> None:
-        """Continue from the map as corrected by adjustment, loops, or an earlier session."""
+        """Continue from the map as corrected by adjustment or loops."""
         self._predictor.correct(self._mapping.step())
         T_new_old = self._memory.step()
         if T_new_old is not None:
@@ -255,8 +243,6 @@ class RgbdSlam:
         self._map.count_sightings(fix.expected_ids, fix.landmark_ids)
         segment = self._memory.segment(fix.landmark_ids)
         wanted = self._keyframe_rule.wants(T_local_base, fix, self._map.keyframes, segment)
-        if status is TrackingStatus.TRACKING:
-            self._session_relocalizer.see(view, T_local_base)
         if wanted and (status is TrackingStatus.TRACKING or (is_by_odometry and view.is_monocular)):
             self._insert_keyframe(view, segment, fix=fix)
         self._memory.hold(view.observation.stamp_ns, T_local_base, fix.landmark_ids)

@@ -11,7 +11,6 @@ from .locate.localizer import VisualLocalizer
 from .locate.pose_solver import PoseSolver
 from .locate.relocalizer import Relocalizer
 from .locate.search import Search
-from .loops.session_relocalizer import SessionRelocalizer
 from .map.keyframe_maker import KeyframeMaker
 from .map.layers import LayerBuilder
 from .map.map_history import MapHistory
@@ -30,7 +29,6 @@ class RgbdParts:
         settings: RgbdSettings,
         depth_camera: Camera,
         alignment: Alignment | None,
-        session_relocalizer: SessionRelocalizer,
     ) -> None:
         """Build; `alignment` None: assume registered depth until the search shows otherwise."""
         known = alignment or Alignment()
@@ -61,7 +59,6 @@ class RgbdParts:
             self.map,
             localizer,
             self.eye,
-            session_relocalizer,
             min_inliers=settings.degraded_inliers,
             is_repeatable=settings.is_repeatable,
         )

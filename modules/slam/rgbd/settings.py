@@ -30,7 +30,6 @@ class RgbdSettings:
     keyframe_turn_rad: float = _within(0.001, 3.2)
     keyframe_inlier_ratio: float = _within(0, 1)
     keyframe_limit: int = _within(3, 1_000_000)
-    past_keyframe_limit: int = _within(0, 1_000_000)
     landmark_limit: int = _within(1000, 100_000_000)
     cloud_stride_px: int = _within(1, 100)
     cloud_voxel_m: float = _within(0.001, 10)

@@ -100,12 +100,12 @@ def _loops_by_views(saved: SavedMap, piece: int, own: Sequence[int]) -> list[Edg
             saved,
             piece,
             node,
-            seen.T_map_base @ se3.inverse(view.T_submap_base),
-            se3.carried(seen.covariance, view.T_submap_base),
+            found[1].T_map_base @ se3.inverse(view.T_submap_base),
+            se3.carried(found[1].covariance, view.T_submap_base),
         )
         for node in own
         for view in saved.submaps[node].views
-        if (seen := recognize(known, view.landmarks)) is not None
+        if (found := recognize(known, view.landmarks)) is not None
     ]
 
 

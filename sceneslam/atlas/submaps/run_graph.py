@@ -21,8 +21,10 @@ from sceneslam.atlas.submaps.graph import (
     settle,
     solve,
 )
-from sceneslam.atlas.submaps.loop_closure import LoopFinder
-from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops, recognized_loops
+from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops
+from sceneslam.atlas.submaps.plan_loops import NEIGHBOURS, PlanLoops
+from sceneslam.atlas.submaps.submap import Submap
+from sceneslam.atlas.submaps.view_loops import ViewLoops
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.motion.tilt import upright
 from sceneslam.types import planar, se3
@@ -56,8 +58,9 @@ class RunGraph:
     def __init__(self, loaded: SavedMap, is_closed: Callable[[int], bool]) -> None:
         """Begin without submaps; `is_closed` tells in which sessions modules close loops."""
         self._loaded, self._count = loaded, len(loaded.submaps)
-        self._finder = LoopFinder(is_closed)
-        self._searched = 0  # submaps to which loops were searched
+        self._is_closed = is_closed
+        self._plans, self._views = PlanLoops(self._may_close), ViewLoops(self._may_close)
+        self._seen = self._planned = 0  # submaps to which loops were searched, by views and plans
         self._found = Agreement()  # loops between submaps of the run
         self._agreed: list[Edge] = []  # of these, used in the last solution
         self._accepted: list[Edge] = []  # of these, not rejected by it
@@ -67,10 +70,12 @@ class RunGraph:
         """Forget all submaps but the first `count`: others took their place."""
         if count >= len(self._T_map_node):
             return
-        self._searched, self._T_map_node = min(self._searched, count), self._T_map_node[:count]
+        self._seen, self._planned = min(self._seen, count), min(self._planned, count)
+        self._T_map_node = self._T_map_node[:count]
         self._found.cut(count)
         self._accepted = [edge for edge in self._accepted if edge.second < count]
-        self._finder.forget()
+        self._plans.forget(count)
+        self._views.forget(count)
 
     def extend(self, chain: Chain, *, is_level: bool) -> SolvedRun:
         """Look for loops to the submaps of a run that are new; solve without the loaded map."""
@@ -109,10 +114,9 @@ class RunGraph:
         motions = [*chain.motions, *ends.edges_of(closed_loops(maps))]
         drift = np.array(chain.drift)
         fixed = self._fix_edges(fixes, ends)
-        recognized = [edge.shifted(count) for edge in ends.edges_of(recognized_loops(maps))]
         self._place(chain)
         self._search(chain, is_level=is_level)
-        loops = [*fixed, *recognized, *(edge.shifted(count) for edge in self._found.loops)]
+        loops = [*fixed, *(edge.shifted(count) for edge in self._found.loops)]
         nodes = np.concatenate([self._loaded.T_map_node, T_map_node])
         agreeing = consistent(loops, nodes, np.concatenate([np.zeros((count, 3)), drift]))
         if len(agreeing) < 2 and not fixed:
@@ -150,14 +154,28 @@ class RunGraph:
         self._T_map_node = np.array(nodes).reshape(-1, 4, 4)
 
     def _search(self, chain: Chain, *, is_level: bool) -> None:
-        """Look for loops to the submaps that were not searched yet."""
-        plane = planar.from_transforms(self._T_map_node)
-        while is_level and self._searched < len(chain):
-            second, self._searched = self._searched, self._searched + 1
-            sigma = deviations_to(second, [*chain.motions[:second], *self._accepted])
-            loops = self._finder.loops_to(second, chain.submaps, plane, sigma)
-            if loops:
-                self._found.add(loops, np.array(chain.T_run_node), np.array(chain.drift))
+        """Look for loops to the submaps that were not searched yet; plans show a level floor."""
+        nodes, submaps = self._T_map_node, chain.submaps
+        plane, loops = planar.from_transforms(nodes), list[Edge]()
+        for second in range(self._seen, len(chain)):
+            loops += self._views.loops_to(second, submaps, nodes, self._deviations(second, chain))
+        for second in range(self._planned, len(chain) if is_level else 0):
+            loops += self._plans.loops_to(second, submaps, plane, self._deviations(second, chain))
+        self._seen, self._planned = len(chain), len(chain) if is_level else self._planned
+        if loops:
+            self._found.add(loops, np.array(chain.T_run_node), np.array(chain.drift))
+
+    def _deviations(self, second: int, chain: Chain) -> NDArray[np.float64]:
+        """Return the deviations (N, 3) of the motions from all earlier submaps to one."""
+        known = [edge for edge in self._accepted if edge.second <= second]
+        return deviations_to(second, [*chain.motions[:second], *known])
+
+    def _may_close(self, first: int, second: int, submaps: Sequence[Submap]) -> bool:
+        """Tell whether a loop may lead from a submap to a later one: not within closed sessions."""
+        a, b = submaps[first], submaps[second]
+        if (a.run, a.session) != (b.run, b.session):
+            return second - first > 1
+        return second - first > 2 * NEIGHBOURS and not self._is_closed(a.session)
 
     def _fix_edges(self, fixes: Sequence[Fix], ends: _Ends) -> list[Edge]:
         """Return the loops from the loaded map's submaps to the run's, one per run submap.

@@ -95,13 +95,6 @@ def joined(first: Trajectory, then: Trajectory) -> Trajectory:
     )
 
 
-def moved(trajectory: Trajectory, T_new_old: Transform) -> Trajectory:
-    """Return a trajectory transformed as a whole by T_new_old (4, 4)."""
-    return Trajectory(
-        stamps_ns=trajectory.stamps_ns, T_world_base=T_new_old @ trajectory.T_world_base
-    )
-
-
 def _rigid(T_a_b: np.ndarray) -> np.ndarray:
     """Return the transforms (N, 4, 4) with orthonormal rotations."""
     return se3.from_quat_xyzw(T_a_b[:, :3, 3], se3.to_quat_xyzw(T_a_b))

@@ -18,9 +18,8 @@ from ..locate.recognition import PlaceRecognizer
 from ..loops.loop_closing import VisualLoopCloser
 from ..loops.loop_detection import LoopDetector, Query
 from ..loops.pose_graph import PoseGraph, motion_covariance
-from ..loops.session_relocalizer import SessionRelocalizer
 from ..see.rectifying_extractor import RectifyingExtractor
-from .frame_log import FrameLog, joined, moved
+from .frame_log import FrameLog, joined
 from .keyframes import Keyframe, motion_between
 from .segments import Segments
 from .visual_map import VisualMap
@@ -38,12 +37,11 @@ class MapHistory:
         visual_map: VisualMap,
         localizer: VisualLocalizer,
         eye: RectifyingExtractor,
-        session_relocalizer: SessionRelocalizer,
         *,
         min_inliers: int,
         is_repeatable: bool,
     ) -> None:
-        self._map, self._eye, self._session_relocalizer = visual_map, eye, session_relocalizer
+        self._map, self._eye = visual_map, eye
         self._graph, self._frames = PoseGraph(), FrameLog()
         self._keyframes: dict[int, Keyframe] = {}  # including those just removed from the map
         self.recognizer = PlaceRecognizer(visual_map, localizer, min_inliers=min_inliers)
@@ -119,14 +117,7 @@ class MapHistory:
             return corrections.get(self.reference, se3.identity())
         if self._closer.is_solving:
             return None
-        T_new_old = self._session_relocalizer.step()
-        if T_new_old is None:
-            return self._straighten(self._eye.step_s())
-        keyframes = self._map.keyframes
-        self._map.correct({k: T_new_old @ keyframes[k].T_local_base for k in keyframes.ids})
-        self._before = moved(self._before, T_new_old)
-        self.revision += 1
-        return T_new_old
+        return self._straighten(self._eye.step_s())
 
     def trajectory(self) -> Trajectory:
         """Return T_local_base of all tracked frames, corrected by all loops."""

@@ -1,4 +1,4 @@
-"""Loop closure between submaps of any modules, by their floor plans alone."""
+"""Loop closure between submaps of any modules, by their floor plans."""
 
 from __future__ import annotations
 
@@ -17,26 +17,28 @@ from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar
 from sceneslam.types.planar import Planar
 
-_SIGMAS = 3.0  # of the drift: search range around the graph's estimate
-_GAIN_M = 0.02  # registration of two plans cannot improve on less drift
+SIGMAS = 3.0  # of the drift: search range around the graph's estimate
+GAIN_MIN_M = SIGMAS * 0.02  # a smaller range: recognition cannot improve on so little drift
 _HALF_MAX_M = 15.0  # largest search range
-_NEIGHBOURS = 2  # neighbouring submaps on either side in a target
+NEIGHBOURS = 2  # neighbouring submaps on either side in a target
 _TARGETS = 3  # per submap: three loops to different places outvote a wrong one
 _KNOWN_MIN = 0.35  # share of a submap's walls, as two submaps may overlap partly
 _CACHED = 8  # targets
 
+# Tells whether a loop may lead from a submap to a later one.
+MayClose = Callable[[int, int, Sequence[Submap]], bool]
 
-class LoopFinder:
-    """Measures the motion between submaps of different sessions, and of one if it is open."""
 
-    def __init__(self, is_closed: Callable[[int], bool]) -> None:
-        """Set which sessions are closed: there, modules close loops themselves."""
-        self._is_closed = is_closed
+class PlanLoops:
+    """Finds a submap's floor plan in those around earlier ones."""
+
+    def __init__(self, may_close: MayClose) -> None:
+        self._may_close = may_close
         self._targets: dict[tuple[int, int], Recognizer] = {}
 
-    def forget(self) -> None:
-        """Forget the submaps; they were replaced."""
-        self._targets.clear()
+    def forget(self, count: int) -> None:
+        """Forget all submaps but the first `count`."""
+        self._targets = {ends: one for ends, one in self._targets.items() if ends[1] <= count}
 
     def loops_to(
         self,
@@ -82,27 +84,22 @@ class LoopFinder:
     ) -> list[int]:
         """Return the nearest submaps that may overlap; no two of them are neighbours."""
         near: list[tuple[float, int]] = []
+        if not len(submaps[second].plan):
+            return []
         for first in range(second - 1):
-            if not self._may_close(second - first, submaps[first], submaps[second]):
+            if not (len(submaps[first].plan) and self._may_close(first, second, submaps)):
                 continue
             window = _window(T_map_node[first], T_map_node[second], sigma[first])
-            if window.half_m < _SIGMAS * _GAIN_M or window.half_m > _HALF_MAX_M:
+            if not GAIN_MIN_M <= window.half_m <= _HALF_MAX_M:
                 continue
             gap_m = _gap_m(submaps[first].plan, submaps[second].plan, window.around)
             if gap_m <= window.half_m:
                 near.append((float(np.hypot(*window.around[:2])), first))
         chosen: list[int] = []
         for _, first in sorted(near):
-            if len(chosen) < _TARGETS and all(abs(first - c) > _NEIGHBOURS for c in chosen):
+            if len(chosen) < _TARGETS and all(abs(first - c) > NEIGHBOURS for c in chosen):
                 chosen.append(first)
         return chosen
-
-    def _may_close(self, apart: int, a: Submap, b: Submap) -> bool:
-        """Tell whether a loop may lead from `a` to `b`, that many submaps later."""
-        if not (len(a.plan) and len(b.plan)):
-            return False
-        is_one = (a.run, a.session) == (b.run, b.session)
-        return not is_one or (apart > 2 * _NEIGHBOURS and not self._is_closed(a.session))
 
     def _target(
         self,
@@ -112,12 +109,12 @@ class LoopFinder:
         T_map_node: NDArray[np.float64],
     ) -> Recognizer:
         """Return a recognizer for the plan around `first`, of its session, older than `second`."""
-        end = min(first + _NEIGHBOURS + 1, second)
+        end = min(first + NEIGHBOURS + 1, second)
         if (first, end) not in self._targets:
             while len(self._targets) >= _CACHED:
                 del self._targets[next(iter(self._targets))]
             own = submaps[first]
-            around = range(max(first - _NEIGHBOURS, 0), end)
+            around = range(max(first - NEIGHBOURS, 0), end)
             placed = [
                 (planar.between(T_map_node[first], T_map_node[index]), submaps[index].plan)
                 for index in around
@@ -127,10 +124,20 @@ class LoopFinder:
         return self._targets[first, end]
 
 
+def window_m(
+    T_map_first: Planar, T_map_second: Planar, sigma: NDArray[np.float64]
+) -> float:
+    """Return how far [m] a motion with deviations `sigma` (3,) may be off."""
+    lever_m = 0.5 * np.hypot(*(T_map_second - T_map_first)[:2])
+    return SIGMAS * float(max(sigma[0], sigma[1]) + lever_m * sigma[2])
+
+
 def _window(T_map_first: Planar, T_map_second: Planar, sigma: NDArray[np.float64]) -> SearchWindow:
-    around = planar.between(T_map_first, T_map_second)
-    half_m = _SIGMAS * float(max(sigma[0], sigma[1]) + 0.5 * sigma[2] * np.hypot(*around[:2]))
-    return SearchWindow(around=around, half_m=half_m, half_rad=_SIGMAS * float(sigma[2]))
+    return SearchWindow(
+        around=planar.between(T_map_first, T_map_second),
+        half_m=window_m(T_map_first, T_map_second, sigma),
+        half_rad=SIGMAS * float(sigma[2]),
+    )
 
 
 def _gap_m(first: FloorPlan, second: FloorPlan, T_first_second: Planar) -> float:

@@ -1,0 +1,120 @@
+"""Loops between submaps by what a camera saw in both, whatever modules made them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_atlas_maps import WALL, map_of
+from test_view_merge import seen_from
+from test_views import place
+
+from sceneslam.atlas.submaps.view_loops import ViewLoops
+from sceneslam.types import se3
+from sceneslam.views.landmark_registration import register
+from sceneslam.views.view import PlacedView
+
+ASIDE = se3.from_xy_yaw(0.4, -0.2, 0.5)  # of the second view, in the place of the first
+ANY = 2.0 * np.ones((2, 3))  # deviations: the second submap may lie anywhere near
+
+
+def viewed(submap, *views):
+    """The submap with views (pose in it, landmarks)."""
+    placed = (PlacedView(stamp_ns=0, T_submap_base=T, landmarks=seen) for T, seen in views)
+    return replace(submap, views=tuple(placed))
+
+
+def two(first=1, second=1, *, T_second_view=ASIDE):
+    """Two submaps: the second begins at ASIDE in the place that both see."""
+    submaps = map_of(WALL, WALL, runs=[0, 0]).submaps
+    T_place_view = ASIDE @ T_second_view
+    return [
+        viewed(submaps[0], (se3.identity(), place(first))),
+        viewed(submaps[1], (T_second_view, seen_from(T_place_view, second))),
+    ]
+
+
+def loops_in(submaps, nodes, sigma=ANY, may_close=lambda first, second, submaps: True):
+    finder, nodes = ViewLoops(may_close), np.array(nodes)
+    assert finder.loops_to(0, submaps, nodes, sigma) == []
+    return finder.loops_to(1, submaps, nodes, sigma)
+
+
+@pytest.mark.parametrize("off_m", [0.0, 1.5])
+def test_a_place_seen_again_gives_the_motion_between_the_submaps(off_m):
+    expected = se3.from_xy_yaw(0.4 + off_m, -0.2, 0.6)
+    (loop,) = loops_in(two(), [se3.identity(), expected])
+    assert (loop.first, loop.second, loop.is_loop) == (0, 1, True)
+    np.testing.assert_allclose(loop.T_first_second, ASIDE, atol=1e-5)
+    tilted = se3.exp(np.array([0.0, 0.0, 0.0, 0.1, -0.2, 0.3]))
+    (loop,) = loops_in(two(T_second_view=tilted), [se3.identity(), expected])
+    np.testing.assert_allclose(loop.T_first_second, ASIDE, atol=1e-5)
+
+
+def test_the_covariance_is_that_of_the_view_at_the_submap():
+    T_second_view = se3.from_xy_yaw(2.0, 0.0, 0.0)
+    submaps = two(T_second_view=T_second_view)
+    (loop,) = loops_in(submaps, [se3.identity(), ASIDE])
+    seen = register(se3.identity(), place(1), submaps[1].views[0].landmarks)
+    expected = se3.carried(seen.covariance, T_second_view)
+    np.testing.assert_allclose(loop.covariance, expected, rtol=1e-6)
+    assert abs(expected[1, 1] / seen.covariance[1, 1] - 1.0) > 0.2
+
+
+def test_another_place_is_no_loop():
+    assert loops_in(two(1, 2), [se3.identity(), ASIDE]) == []
+
+
+def test_a_place_farther_away_than_drift_explains_is_no_loop():
+    away = se3.from_xy_yaw(3.0, 0.0, 0.0)
+    small = np.full((2, 3), [0.3, 0.3, 0.01])
+    assert loops_in(two(), [se3.identity(), away], small) == []
+    assert len(loops_in(two(), [se3.identity(), away])) == 1
+
+
+def test_what_drift_cannot_improve_is_not_compared():
+    little = np.full((2, 3), [0.019, 0.019, 0.0])
+    assert loops_in(two(), [se3.identity(), ASIDE], little) == []
+    enough = np.full((2, 3), [0.021, 0.021, 0.0])
+    assert len(loops_in(two(), [se3.identity(), ASIDE], enough)) == 1
+
+
+def test_submaps_that_may_not_be_connected_are_not():
+    asked = []
+
+    def refuses(first, second, submaps):
+        asked.append((first, second, len(submaps)))
+        return False
+
+    assert loops_in(two(), [se3.identity(), ASIDE], may_close=refuses) == []
+    assert asked == [(0, 1, 2)]
+
+
+def test_two_places_that_look_alike_give_no_loop():
+    submaps = [*two(), two()[1]]
+    nodes = np.array([se3.identity(), se3.from_xy_yaw(3.0, 0.0, 0.0) @ ASIDE, ASIDE])
+    finder = ViewLoops(lambda first, second, submaps: second == 2)
+    sigma = 2.0 * np.ones((3, 3))
+    for second in (0, 1):
+        finder.loops_to(second, submaps, nodes, sigma)
+    assert finder.loops_to(2, submaps, nodes, sigma) == []
+
+
+def test_of_several_views_of_one_submap_the_best_gives_the_loop():
+    first, second = two()
+    poorer = seen_from(ASIDE, 1, wrong=0.5)
+    better = second.views[0].landmarks
+    T = second.views[0].T_submap_base
+    submaps = [first, viewed(second, (se3.identity(), poorer), (T, better))]
+    (loop,) = loops_in(submaps, [se3.identity(), ASIDE])
+    np.testing.assert_allclose(loop.T_first_second, ASIDE, atol=1e-5)
+
+
+def test_forgotten_submaps_are_not_seen_again_until_they_come_back():
+    finder, submaps = ViewLoops(lambda first, second, submaps: True), two()
+    nodes = np.array([se3.identity(), ASIDE])
+    finder.loops_to(0, submaps, nodes, ANY)
+    assert len(finder.loops_to(1, submaps, nodes, ANY)) == 1
+    finder.forget(1)
+    assert len(finder.loops_to(1, submaps, nodes, ANY)) == 1
+    finder.forget(0)
+    assert finder.loops_to(0, submaps, nodes, ANY) == []
