@@ -33,10 +33,24 @@ def two(first=1, second=1, *, T_second_view=ASIDE):
     ]
 
 
-def loops_in(submaps, nodes, sigma=ANY, may_close=lambda first, second, submaps: True):
-    finder, nodes = ViewLoops(may_close), np.array(nodes)
-    assert finder.loops_to(0, submaps, nodes, sigma) == []
-    return finder.loops_to(1, submaps, nodes, sigma)
+def always(first, second, submaps):
+    return True
+
+
+def added(finder, submaps, nodes, sigma):
+    """Return the loops to each submap in turn, and which of its views are kept."""
+    loops, kept = [], []
+    for second, submap in enumerate(submaps):
+        loops.append(finder.loops_to(second, submaps, np.array(nodes), sigma))
+        views = finder.keep(second, submap, nodes[second])
+        kept.append([view in views for view in submap.views])
+    return loops, kept
+
+
+def loops_in(submaps, nodes, sigma=ANY, may_close=always):
+    (first, second), _ = added(ViewLoops(may_close), submaps, nodes, sigma)
+    assert first == []
+    return second
 
 
 @pytest.mark.parametrize("off_m", [0.0, 1.5])
@@ -93,10 +107,8 @@ def test_two_places_that_look_alike_give_no_loop():
     submaps = [*two(), two()[1]]
     nodes = np.array([se3.identity(), se3.from_xy_yaw(3.0, 0.0, 0.0) @ ASIDE, ASIDE])
     finder = ViewLoops(lambda first, second, submaps: second == 2)
-    sigma = 2.0 * np.ones((3, 3))
-    for second in (0, 1):
-        finder.loops_to(second, submaps, nodes, sigma)
-    assert finder.loops_to(2, submaps, nodes, sigma) == []
+    loops, kept = added(finder, submaps, nodes, 2.0 * np.ones((3, 3)))
+    assert loops == [[], [], []] and kept == [[True]] * 3
 
 
 def test_of_several_views_of_one_submap_the_best_gives_the_loop():
@@ -110,11 +122,32 @@ def test_of_several_views_of_one_submap_the_best_gives_the_loop():
 
 
 def test_forgotten_submaps_are_not_seen_again_until_they_come_back():
-    finder, submaps = ViewLoops(lambda first, second, submaps: True), two()
+    finder, submaps = ViewLoops(always), two()
     nodes = np.array([se3.identity(), ASIDE])
-    finder.loops_to(0, submaps, nodes, ANY)
-    assert len(finder.loops_to(1, submaps, nodes, ANY)) == 1
+    added(finder, submaps, nodes, ANY)
     finder.forget(1)
     assert len(finder.loops_to(1, submaps, nodes, ANY)) == 1
     finder.forget(0)
     assert finder.loops_to(0, submaps, nodes, ANY) == []
+
+
+@pytest.mark.parametrize(("aside_m", "is_kept"), [(0.45, False), (0.55, True)])
+def test_a_view_that_shows_what_a_known_one_shows_is_not_kept(aside_m, is_kept):
+    ahead = se3.from_xy_yaw(aside_m, 0.0, 0.0)
+    submaps = two(T_second_view=se3.inverse(ASIDE) @ ahead)
+    for nodes, sigma in (
+        ([se3.identity(), se3.from_xy_yaw(1.5, 0.0, 0.0) @ ASIDE], ANY),  # it is recognized
+        ([se3.identity(), ASIDE], np.zeros((2, 3))),  # it is known where it is
+    ):
+        _, kept = added(ViewLoops(always), submaps, nodes, sigma)
+        assert kept == [[True], [is_kept]]
+
+
+def test_views_of_a_session_that_closes_its_loops_are_known_where_they_are():
+    def refuses(first, second, submaps):
+        return False
+
+    _, kept = added(ViewLoops(refuses), two(), [se3.identity(), ASIDE], ANY)
+    assert kept == [[True], [True]]  # ASIDE is turned by more than shows the same
+    same = two(T_second_view=se3.inverse(ASIDE))
+    assert added(ViewLoops(refuses), same, [se3.identity(), ASIDE], ANY)[1] == [[True], [False]]

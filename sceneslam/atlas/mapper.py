@@ -249,6 +249,7 @@ class Mapper:
         solved = solving.result()
         if len(chain) > self._kept:
             return  # poses were replaced meanwhile
+        self._collector.chain.submaps[: len(chain)] = chain.submaps  # views were left out
         self._is_news |= bool(solved.loops or self._solved.loops)
         self._solved = solved
         self._tell_loops()

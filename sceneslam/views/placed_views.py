@@ -22,6 +22,7 @@ _ALIKE = 0.6  # another place with so many of the best one's matches, and nothin
 _SAME_M, _SAME_RAD = 0.3, 0.15
 _DEVIATION_MAX_M, _DEVIATION_MAX_RAD = 0.03, 0.03  # of a pose: two that agree are no chance
 _NOISE_M, _NOISE_RATIO = 0.017, 0.01  # of a landmark, and of its distance: structured light
+_VIEW_M, _VIEW_RAD = 0.5, 0.4  # from a view that shows the same
 SIGMAS = 3.0  # by which two measurements of a landmark differ, at most
 MATCHES_MIN = 25  # right by the pose found; by chance hardly more are than the three it is made of
 FLOOR = np.diag(np.repeat([0.01, 0.004], 3) ** 2)  # m, rad: of the map's landmarks among each other
@@ -121,6 +122,13 @@ class PlacedViews:
         """Tell whether two views show one place."""
         at, there = (self._placed[number][0][:3, 3] for number in (one, other))
         return bool(np.linalg.norm(at - there) < _PLACE_M)
+
+
+def are_covered(views: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell of each view, by its pose (N, 4, 4), whether one of the others shows the same."""
+    off = se3.inverse(views)[:, None] @ others[None]
+    is_near = np.linalg.norm(off[..., :3, 3], axis=-1) <= _VIEW_M
+    return np.asarray((is_near & (se3.rotation_angle_rad(off) <= _VIEW_RAD)).any(axis=1))
 
 
 def landmark_noise_m(far_m: NDArray[np.float64]) -> NDArray[np.float64]:

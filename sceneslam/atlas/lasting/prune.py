@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from sceneslam.atlas.lasting.saved_map import SavedMap, are_covered
+from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.graphs.edge import Edge
 from sceneslam.types import planar
+from sceneslam.views.placed_views import are_covered
 
 _COVERED_RATIO = 0.95  # of a submap's walls, covered by later submaps
 

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan, join
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.graphs.edge import Edge
-from sceneslam.types import planar, se3
+from sceneslam.types import planar
 from sceneslam.types.maps import PoseGraphLayer
 from sceneslam.types.se3 import Transform
+from sceneslam.views.placed_views import are_covered
 from sceneslam.views.view import Landmarks
-
-_VIEW_M, _VIEW_RAD = 0.5, 0.4  # from a view that shows the same
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -133,13 +132,6 @@ def forget_contradicted(saved: SavedMap, run: int) -> SavedMap:
         views = tuple(compress(submap.views, ~is_old))
         submaps[index] = replace(submap, views=views)
     return replace(saved, submaps=tuple(submaps))
-
-
-def are_covered(views: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell of each view, by its pose (N, 4, 4), whether one of the others shows the same."""
-    off = se3.inverse(views)[:, None] @ others[None]
-    is_near = np.linalg.norm(off[..., :3, 3], axis=-1) <= _VIEW_M
-    return np.asarray((is_near & (se3.rotation_angle_rad(off) <= _VIEW_RAD)).any(axis=1))
 
 
 def _without(plan: FloorPlan, T_today_plan: planar.Planar, today: FloorPlan) -> FloorPlan:

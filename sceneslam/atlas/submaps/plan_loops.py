@@ -124,9 +124,7 @@ class PlanLoops:
         return self._targets[first, end]
 
 
-def window_m(
-    T_map_first: Planar, T_map_second: Planar, sigma: NDArray[np.float64]
-) -> float:
+def window_m(T_map_first: Planar, T_map_second: Planar, sigma: NDArray[np.float64]) -> float:
     """Return how far [m] a motion with deviations `sigma` (3,) may be off."""
     lever_m = 0.5 * np.hypot(*(T_map_second - T_map_first)[:2])
     return SIGMAS * float(max(sigma[0], sigma[1]) + lever_m * sigma[2])

@@ -159,6 +159,8 @@ class RunGraph:
         plane, loops = planar.from_transforms(nodes), list[Edge]()
         for second in range(self._seen, len(chain)):
             loops += self._views.loops_to(second, submaps, nodes, self._deviations(second, chain))
+            views = self._views.keep(second, submaps[second], nodes[second])
+            submaps[second] = replace(submaps[second], views=views)
         for second in range(self._planned, len(chain) if is_level else 0):
             loops += self._plans.loops_to(second, submaps, plane, self._deviations(second, chain))
         self._seen, self._planned = len(chain), len(chain) if is_level else self._planned

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar, se3
 from sceneslam.types.se3 import Transform
 from sceneslam.views.landmark_registration import recognize
-from sceneslam.views.placed_views import PlacedViews, Sighting
+from sceneslam.views.placed_views import PlacedViews, Sighting, are_covered
 from sceneslam.views.view import PlacedView
 
 _REACH_M = 2.0  # from so far away a place is still recognized
@@ -27,6 +27,7 @@ class ViewLoops:
         self._views = PlacedViews()
         self._owners: list[int] = []  # submap of each view
         self._placed: list[PlacedView] = []
+        self._again: set[int] = set()  # views of the newest submap that show a known place
 
     def forget(self, count: int) -> None:
         """Forget all submaps but the first `count`."""
@@ -46,44 +47,68 @@ class ViewLoops:
         `T_map_node` (N, 4, 4) are the estimated nodes, `sigma` (N, 3) the standard deviations
         [m, m, rad] of the motion from each of them to this one.
         """
-        plane = planar.from_transforms(T_map_node)
-        reach_m = {
-            first: window_m(plane[first], plane[second], sigma[first])
-            for first in dict.fromkeys(self._owners)
-            if self._may_close(first, second, submaps)
-        }
-        self._views.move(
-            [
-                T_map_node[owner] @ view.T_submap_base
-                for owner, view in zip(self._owners, self._placed, strict=True)
-            ]
+        poses = [
+            T_map_node[owner] @ view.T_submap_base
+            for owner, view in zip(self._owners, self._placed, strict=True)
+        ]
+        self._views.move(poses)
+        known, reach_m = (
+            np.reshape(poses, (-1, 4, 4)),
+            self._reach_m(second, submaps, T_map_node, sigma),
         )
+        is_compared = reach_m >= GAIN_MIN_M
+        self._again = set()
         best: dict[int, tuple[int, Edge]] = {}  # matches and loop, by the earlier submap
-        for view in submaps[second].views:
+        for row, view in enumerate(submaps[second].views):
             T_map_base = T_map_node[second] @ view.T_submap_base
-            found = recognize(self._views, view.landmarks, self._within(T_map_base, reach_m))
+            if _is_covered(T_map_base, known[~is_compared]):
+                self._again.add(row)
+                continue
+            away_m = np.linalg.norm((known - T_map_base)[:, :3, 3], axis=1)
+            among = np.flatnonzero(is_compared & (away_m <= reach_m + _REACH_M)).tolist()
+            found = recognize(self._views, view.landmarks, among)
             if found is None:
                 continue
             number, seen = found
-            first = self._owners[number]
             off_m = float(np.linalg.norm((seen.T_map_base - T_map_base)[:3, 3]))
-            if off_m <= reach_m[first] and seen.matches > best.get(first, (0,))[0]:
+            if off_m > reach_m[number]:
+                continue
+            if _is_covered(seen.T_map_base, known[number][None]):
+                self._again.add(row)
+            first = self._owners[number]
+            if seen.matches > best.get(first, (0,))[0]:
                 best[first] = seen.matches, self._edge(number, second, view, seen)
-        for view in submaps[second].views:
-            self._views.add(T_map_node[second] @ view.T_submap_base, view.landmarks)
-            self._owners.append(second)
-            self._placed.append(view)
         return [loop for _, loop in best.values()]
 
-    def _within(self, T_map_base: Transform, reach_m: Mapping[int, float]) -> list[int]:
-        """Return the views of submaps that the robot may be at, if a loop improves its pose."""
-        found = []
-        for number, owner in enumerate(self._owners):
-            half_m = reach_m.get(owner, 0.0)
-            away_m = float(np.linalg.norm((self._views[number][0] - T_map_base)[:3, 3]))
-            if half_m >= GAIN_MIN_M and away_m <= half_m + _REACH_M:
-                found.append(number)
-        return found
+    def keep(self, second: int, submap: Submap, T_map_node: Transform) -> tuple[PlacedView, ...]:
+        """Add the views of the submap to which loops were searched, and return them.
+
+        Those that show what an earlier one shows are left out: time spent in a known place adds
+        none.
+        """
+        views = [view for row, view in enumerate(submap.views) if row not in self._again]
+        for view in views:
+            self._views.add(T_map_node @ view.T_submap_base, view.landmarks)
+            self._owners.append(second)
+            self._placed.append(view)
+        return tuple(views)
+
+    def _reach_m(
+        self,
+        second: int,
+        submaps: Sequence[Submap],
+        T_map_node: NDArray[np.float64],
+        sigma: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Return how far (V,) each view may be off where it is expected; 0 where no loop may be."""
+        plane = planar.from_transforms(T_map_node)
+        reach_m = {
+            first: window_m(plane[first], plane[second], sigma[first])
+            if self._may_close(first, second, submaps)
+            else 0.0
+            for first in dict.fromkeys(self._owners)
+        }
+        return np.array([reach_m[owner] for owner in self._owners])
 
     def _edge(self, number: int, second: int, view: PlacedView, seen: Sighting) -> Edge:
         """Return the loop to a submap by one of its views, which shows what view `number` shows."""
@@ -96,3 +121,8 @@ class ViewLoops:
             covariance=se3.carried(seen.covariance, view.T_submap_base),
             kind=EdgeKind.LOOP,
         )
+
+
+def _is_covered(T_map_base: Transform, known: NDArray[np.float64]) -> bool:
+    """Tell whether a view shows what one of the views at `known` poses (N, 4, 4) shows."""
+    return bool(are_covered(T_map_base[None], known)[0])
