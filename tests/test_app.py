@@ -52,9 +52,9 @@ def test_two_runs_give_identical_trajectories_and_events(tmp_path):
 def test_the_atlas_knows_which_modules_close_loops_themselves(tmp_path, monkeypatch, isolation):
     told, opened = [], Atlas.open
 
-    def watched(atlas, rig, note, *, closing, is_live):
+    def watched(atlas, rig, note, *, closing, **settings):
         told.append(list(closing))
-        opened(atlas, rig, note, closing=closing, is_live=is_live)
+        opened(atlas, rig, note, closing=closing, **settings)
 
     monkeypatch.setattr(Atlas, "open", watched)
     dark = {"_target_": "fakes.ClosingModule"}

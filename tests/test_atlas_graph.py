@@ -21,7 +21,7 @@ from sceneslam.atlas.submaps.graph import Agreement, Solved, consistent, deviati
 from sceneslam.atlas.submaps.run_graph import RunGraph, SolvedRun
 from sceneslam.atlas.uncertainty import WHEELS
 from sceneslam.types import planar, se3
-from sceneslam.types.maps import LoopLayer, MapLayers, PoseGraphLayer
+from sceneslam.types.maps import MapLayers, PoseGraphLayer
 from sceneslam.types.trajectory import Trajectory
 
 CLAIM = np.diag([4.0, 4.0, 4.0, 1.0, 1.0, 1.0]) * 1e-6
@@ -39,7 +39,7 @@ class Given:
     def __init__(self, monkeypatch, *, agreeing=None, found=()):
         self.found, self.agreeing = found, agreeing
         monkeypatch.setattr(run_graph, "solve", self._solve)
-        monkeypatch.setattr(run_graph, "LoopFinder", lambda is_closed: self)
+        monkeypatch.setattr(run_graph, "PlanLoops", lambda may_close: self)
         monkeypatch.setattr(run_graph, "consistent", self._consistent)
 
     def loops_to(self, second, submaps, plane, sigma):
@@ -76,19 +76,26 @@ def solved(own, loaded=None, *, maps=(), fixes=(), T_map_run=None):
     )
 
 
-def layer(pairs_s, T_from_to):
-    information = np.stack([np.eye(6) * 1e4] * len(pairs_s))
-    return LoopLayer(
-        stamps_ns=np.array(pairs_s) * S, T_from_to=np.stack(T_from_to), information=information
+def graph_of(pairs_s, T_from_to):
+    """A module's pose graph with loops between these seconds."""
+    seconds = sorted({second for pair in pairs_s for second in pair})
+    return PoseGraphLayer(
+        stamps_ns=np.array(seconds) * S,
+        T_world_base=np.stack([at()] * len(seconds)),
+        edges=np.array([[seconds.index(second) for second in pair] for pair in pairs_s]),
+        T_from_to=np.stack(T_from_to),
+        information=np.stack([np.eye(6) * 1e4] * len(pairs_s)),
+        is_loop=np.ones(len(pairs_s), bool),
     )
 
 
 def test_loops_of_modules_lead_from_submap_to_submap(monkeypatch):
     given, own = Given(monkeypatch), finished()
-    loops = layer([(2, 14), (7, 8), (1, 7)], [at(5.0), at(), at(2.0, 1.0, 0.5)])
-    result = solved(own, maps=[MapLayers(loops=loops)])
-    first, second = given.loops
-    assert [(one.first, one.second) for one in given.loops] == [(0, 2), (0, 1)]  # (7, 8) is in one
+    loops = graph_of([(2, 14), (7, 8), (1, 7)], [at(5.0), at(), at(2.0, 1.0, 0.5)])
+    solved(own, maps=[MapLayers(pose_graph=loops)])
+    *steps, first, second = given.motions
+    assert [(one.first, one.second) for one in steps] == [(0, 1), (1, 2)]  # (7, 8) is in one
+    assert [(one.first, one.second) for one in (first, second)] == [(0, 2), (0, 1)]
     left = at(0.0, 0.01)  # nodes stay where they were, poses are revised
     expected = at(1.0) @ left @ at(5.0) @ se3.inverse(at(1.0) @ left)
     np.testing.assert_allclose(first.T_first_second, expected, atol=1e-12)
@@ -98,19 +105,11 @@ def test_loops_of_modules_lead_from_submap_to_submap(monkeypatch):
     )
     carry = se3.adjoint(se3.inverse(T_to_node))
     np.testing.assert_allclose(second.covariance, carry @ (1.01e-4 * np.eye(6)) @ carry.T)
-    assert [(one.first, one.second) for one in result.loops] == [(0, 2), (0, 1)]
 
 
 def test_loops_within_a_module_are_motions_of_the_graph(monkeypatch):
     given, own = Given(monkeypatch), finished()
-    graph = PoseGraphLayer(
-        stamps_ns=np.array([1, 13]) * S,
-        T_world_base=np.stack([at(), at(6.0)]),
-        edges=np.array([[0, 1]]),
-        T_from_to=at(6.0)[None],
-        information=np.eye(6)[None],
-        is_loop=np.array([True]),
-    )
+    graph = graph_of([(1, 13)], [at(6.0)])
     solved(own, map_of(WALL), maps=[MapLayers(pose_graph=graph)])
     ends = [(one.first, one.second) for one in given.motions]
     assert ends == [(1, 2), (2, 3), (1, 3)] and given.loops == []
@@ -198,22 +197,33 @@ def test_headings_of_loops_agree_within_their_deviation(apart_m):
 class Searched(Given):
     """Loops are found to the submaps that they lead to; the graph is solved in earnest."""
 
+    name = "PlanLoops"
+
     def __init__(self, monkeypatch, found):
-        self.found, self.asked, self.sigma, self.forgotten, self.solved = found, [], {}, 0, 0
-        monkeypatch.setattr(run_graph, "LoopFinder", lambda is_closed: self)
+        self.found, self.asked, self.sigma, self.kept, self.solved = found, [], {}, [], 0
+        monkeypatch.setattr(run_graph, self.name, lambda may_close: self)
         monkeypatch.setattr(run_graph, "settle", self._settle)
 
-    def loops_to(self, second, submaps, plane, sigma):
+    def loops_to(self, second, submaps, nodes, sigma):
         self.asked.append(second)
-        self.plane, self.sigma[second] = plane, sigma
-        return super().loops_to(second, submaps, plane, sigma)
+        self.nodes, self.sigma[second] = nodes, sigma
+        return super().loops_to(second, submaps, nodes, sigma)
 
-    def forget(self):
-        self.forgotten += 1
+    def forget(self, count):
+        self.kept.append(count)
 
     def _settle(self, *given):
         self.solved += 1
         return settle(*given)
+
+
+class Viewed(Searched):
+    """The same, by views."""
+
+    name = "ViewLoops"
+
+    def keep(self, second, submap, T_map_node):
+        return submap.views
 
 
 def off(first, second, aside_m=0.02):
@@ -243,15 +253,39 @@ def test_loops_are_searched_once_to_each_submap_and_believed_when_two_agree(monk
     np.testing.assert_array_equal(after.T_map_node[:7], both.T_map_node)
     step = own.chain.motions[6].T_first_second
     np.testing.assert_allclose(after.T_map_node[7], both.T_map_node[6] @ step, atol=1e-12)
-    np.testing.assert_allclose(searched.plane[7], planar.from_transform(after.T_map_node[7]))
+    np.testing.assert_allclose(searched.nodes[7], planar.from_transform(after.T_map_node[7]))
 
 
-def test_a_base_that_is_not_level_searches_no_loops_until_it_is(monkeypatch):
-    searched, own = Searched(monkeypatch, [off(0, 5), off(0, 6)]), finished(48)
-    graph = RunGraph(empty_map(), lambda session: False)
-    assert graph.extend(grown(own, 7), is_level=False).loops == () and searched.asked == []
+def test_plans_are_compared_once_the_base_is_level_and_views_on_any(monkeypatch):
+    plans, views = Searched(monkeypatch, [off(0, 5), off(0, 6)]), Viewed(monkeypatch, [])
+    own, graph = finished(48), RunGraph(empty_map(), lambda session: False)
+    assert graph.extend(grown(own, 7), is_level=False).loops == ()
+    assert plans.asked == [] and views.asked == list(range(7))
     assert len(graph.extend(own.chain, is_level=True).loops) == 2
-    assert searched.asked == list(range(8))
+    assert plans.asked == views.asked == list(range(8))
+    np.testing.assert_allclose(views.nodes, own.chain.T_run_node, atol=1e-12)
+    np.testing.assert_allclose(plans.nodes, planar.from_transforms(views.nodes))
+    for second in range(8):
+        np.testing.assert_array_equal(plans.sigma[second], views.sigma[second])
+
+
+def test_views_close_loops_on_a_base_that_is_never_level(monkeypatch):
+    plans, views = Searched(monkeypatch, []), Viewed(monkeypatch, [off(0, 5), off(0, 6)])
+    own, graph = finished(48), RunGraph(empty_map(), lambda session: False)
+    assert len(graph.extend(own.chain, is_level=False).loops) == 2
+    nodes = np.stack(own.chain.T_run_node)
+    last = graph.finish(own.chain, nodes, lambda ns: at(0.5 * ns / S), [], [], is_level=False)
+    assert len(last.loops) == 2 and plans.asked == [] and views.asked == list(range(8))
+    graph.finish(own.chain, nodes, lambda ns: at(0.5 * ns / S), [], [], is_level=True)
+    assert plans.asked == views.asked == list(range(8))
+
+
+def test_a_loop_by_plans_and_one_by_views_are_believed_if_they_agree(monkeypatch):
+    own = finished(48)
+    for aside_m, accepted in ((0.02, [(0, 6), (0, 5)]), (0.9, [])):
+        Searched(monkeypatch, [off(0, 5)]), Viewed(monkeypatch, [off(0, 6, aside_m)])
+        found = RunGraph(empty_map(), lambda session: False).extend(own.chain, is_level=True)
+        assert [(one.first, one.second) for one in found.loops] == accepted
 
 
 def test_after_a_loop_the_next_search_goes_along_it(monkeypatch):
@@ -270,16 +304,17 @@ def test_after_a_loop_the_next_search_goes_along_it(monkeypatch):
 
 def test_forgotten_submaps_take_their_loops_with_them_and_are_searched_again(monkeypatch):
     searched, own = Searched(monkeypatch, [off(0, 5), off(0, 6), off(0, 7)]), finished(48)
+    views = Viewed(monkeypatch, [])
     graph = RunGraph(empty_map(), lambda session: False)
     assert len(graph.extend(own.chain, is_level=True).loops) == 3
     graph.forget(8)
-    assert searched.forgotten == 0  # there are no others
+    assert searched.kept == views.kept == []  # there are no others
     graph.forget(7)
-    assert searched.forgotten == 1
+    assert searched.kept == views.kept == [7]
     searched.found = searched.found[:2]
     again = graph.extend(own.chain, is_level=True)
     assert [(one.first, one.second) for one in again.loops] == [(0, 5), (0, 6)]
-    assert searched.asked[8:] == [7]
+    assert searched.asked[8:] == views.asked[8:] == [7]
     fresh = RunGraph(empty_map(), lambda session: False).extend(own.chain, is_level=True)
     np.testing.assert_allclose(again.T_map_node, fresh.T_map_node, atol=1e-6)
 

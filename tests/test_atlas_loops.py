@@ -1,12 +1,14 @@
-"""Which submaps are compared to close a loop, with what, and where."""
+"""Which submaps' plans are compared to close a loop, with what, and where."""
 
 import numpy as np
 import pytest
 from test_atlas_places import CELL, plan_of, quality
 
+from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.atlas.places.floor_plan import join
-from sceneslam.atlas.submaps import loop_closure
-from sceneslam.atlas.submaps.loop_closure import LoopFinder
+from sceneslam.atlas.submaps import plan_loops
+from sceneslam.atlas.submaps.plan_loops import PlanLoops
+from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.graphs.edge import EdgeKind
 from sceneslam.types import planar
@@ -23,7 +25,7 @@ class Compared:
 
     def __init__(self, monkeypatch):
         self.targets, self.windows, self.known_min = [], [], None
-        monkeypatch.setattr(loop_closure, "Recognizer", self._of)
+        monkeypatch.setattr(plan_loops, "Recognizer", self._of)
 
     def _of(self, field):
         self.targets.append(field.plan)
@@ -47,13 +49,18 @@ def submap(session, plan=WALL, run=0):
     )
 
 
+def finder_of(closed):
+    """What a run compares plans with, in these sessions modules close loops."""
+    return PlanLoops(RunGraph(empty_map(), lambda session: session in closed)._may_close)
+
+
 def loops_to(second, sessions, nodes, sigma, *, closed=(), plans=None, runs=None):
     """Find loops between submaps at nodes, with drift of `sigma` (3,) from one to the next."""
     plans, runs = plans or [WALL] * len(sessions), runs or [0] * len(sessions)
     submaps = [submap(*one) for one in zip(sessions, plans, runs, strict=True)]
     steps = np.abs(second - np.arange(len(sessions)))[:, None]
-    finder = LoopFinder(lambda session: session in closed)
-    return finder.loops_to(second, submaps, np.array(nodes, float), steps * np.array(sigma))
+    sigma = steps * np.array(sigma)
+    return finder_of(closed).loops_to(second, submaps, np.array(nodes, float), sigma)
 
 
 def line(*x_m):
@@ -110,6 +117,8 @@ def test_a_session_closes_loops_with_itself_unless_its_module_does(monkeypatch):
     assert firsts(5, [0] * 6, nodes, SMALL, closed=[0]) == []
     assert firsts(5, [0, 0, 1, 1, 1, 1], nodes, SMALL, closed=[1]) == [0]
     assert firsts(5, [0] * 6, nodes, SMALL, closed=[0], runs=[0, 0, 0, 0, 1, 1]) == [0, 3]
+    assert firsts(1, [0, 1], nodes, SMALL) == []  # the motion between them was measured
+    assert firsts(2, [0, 0, 1], nodes, SMALL, closed=[0, 1]) == [0]
     for without in (0, 5):
         plans = [EMPTY if index == without else WALL for index in range(6)]
         assert firsts(5, [0] * 6, nodes, SMALL, plans=plans) == []
@@ -156,11 +165,13 @@ def test_a_target_is_made_once_for_all_that_are_compared_with_it(monkeypatch):
     compared = Compared(monkeypatch)
     sessions = [0] * 4 + [1] * 16
     submaps = [submap(session) for session in sessions]
-    finder = LoopFinder(lambda session: session == 1)
+    finder = finder_of([1])
     sigma, nodes = np.full((20, 3), 0.1), np.zeros((20, 3))
     for second in range(6, 20):
         assert len(finder.loops_to(second, submaps, nodes, sigma)) == 2
     assert len(compared.targets) == 2
-    finder.forget()  # submaps were replaced
-    assert len(finder.loops_to(19, submaps, nodes, sigma)) == 2
-    assert len(compared.targets) == 4
+    for count, made in ((6, 0), (5, 1), (2, 2)):  # of 0 to 2, and of 1 to 5
+        compared.targets.clear()
+        finder.forget(count)
+        assert len(finder.loops_to(19, submaps, nodes, sigma)) == 2
+        assert len(compared.targets) == made

@@ -10,12 +10,13 @@ from fakes import ExactModule, observation
 from sceneslam.bus.answers import checked_layers, checked_tracking, checked_trajectory
 from sceneslam.types import se3
 from sceneslam.types.maps import (
+    LAYER_TYPES,
     GridLayer,
     LandmarkLayer,
-    LoopLayer,
     MapLayers,
     PointLayer,
     PoseGraphLayer,
+    ScanLayer,
 )
 from sceneslam.types.trajectory import Trajectory
 
@@ -96,6 +97,14 @@ LAYERS = {
     "grid": GridLayer(
         log_odds=np.ones((4, 7), np.float32), resolution_m=0.05, origin_xy_m=(1.0, 2.0)
     ),
+    "scans": ScanLayer(
+        stamps_ns=np.arange(2),
+        T_world_laser=POSES,
+        ranges_m=np.ones((2, 7), np.float32),
+        angle_min_rad=np.zeros(2),
+        angle_step_rad=np.ones(2),
+        cell_m=0.05,
+    ),
     "pose_graph": PoseGraphLayer(
         stamps_ns=np.arange(3),
         T_world_base=np.tile(np.eye(4), (3, 1, 1)),
@@ -108,9 +117,6 @@ LAYERS = {
         points=np.ones((5, 3), np.float32),
         first_stamps_ns=np.arange(5),
         sightings=np.ones(5, np.int32),
-    ),
-    "loops": LoopLayer(
-        stamps_ns=np.arange(4).reshape(2, 2), T_from_to=POSES, information=np.ones((2, 6, 6))
     ),
 }
 ARRAYS = [
@@ -130,7 +136,7 @@ def test_a_valid_layer_is_accepted(name):
 @pytest.mark.parametrize(("name", "field"), ARRAYS)
 def test_an_array_of_a_wrong_shape_is_refused_with_its_name(name, field):
     array = getattr(LAYERS[name], field)
-    if name == "grid":
+    if (name, field) in (("grid", "log_odds"), ("scans", "ranges_m")):  # of any number of columns
         wrong = [array[0], array[None]]
     else:
         wrong = [array[..., None], *(np.delete(array, 0, axis) for axis in range(1, array.ndim))]
@@ -139,15 +145,21 @@ def test_an_array_of_a_wrong_shape_is_refused_with_its_name(name, field):
             checked_layers(MapLayers(**{name: replace(LAYERS[name], **{field: one})}))
 
 
-@pytest.mark.parametrize("name", sorted(set(LAYERS) - {"grid"}))
-def test_arrays_of_one_layer_have_one_length(name):
+@pytest.mark.parametrize(("name", "field"), [one for one in ARRAYS if one[0] != "grid"])
+def test_arrays_of_one_layer_have_one_length(name, field):
     layer = LAYERS[name]
-    longest = [field for one, field in ARRAYS if one == name][-1]
-    short = replace(layer, **{longest: getattr(layer, longest)[:-1]})
+    short = replace(layer, **{field: getattr(layer, field)[:-1]})
     with pytest.raises(ValueError, match=rf"^{name}\."):
         checked_layers(MapLayers(**{name: short}))
 
 
-def test_a_grid_has_cells_of_some_size():
-    with pytest.raises(ValueError, match="resolution_m: expected above 0, got 0"):
-        checked_layers(MapLayers(grid=replace(LAYERS["grid"], resolution_m=0.0)))
+@pytest.mark.parametrize(("name", "field"), [("grid", "resolution_m"), ("scans", "cell_m")])
+def test_a_grid_has_cells_of_some_size(name, field):
+    for size_m in (0.0, -0.05, np.nan):
+        layer = replace(LAYERS[name], **{field: size_m})
+        with pytest.raises(ValueError, match=rf"^{name}\.{field}: expected"):
+            checked_layers(MapLayers(**{name: layer}))
+
+
+def test_every_type_of_layer_is_checked():
+    assert set(LAYERS) == set(LAYER_TYPES)

@@ -195,13 +195,13 @@ class Watched(Atlas):
         super().__init__(voxel_m=0.05)
         self._closing_too, self.poses_at_loops, self.is_over = closing, [], False
 
-    def open(self, rig, note, *, closing=(), is_live=False):
+    def open(self, rig, note, *, closing=(), **settings):
         def watch(event, stamp_ns, **fields):
             if event == "loop" and not self.is_over:
                 self.poses_at_loops.append(len(self.online))
             note(event, stamp_ns, **fields)
 
-        super().open(rig, watch, closing=self._closing_too, is_live=is_live)
+        super().open(rig, watch, closing=self._closing_too, **settings)
 
     def finish(self):
         self.is_over = True

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from sceneslam.modules.slam.rgbd.module import RgbdSlam
+from sceneslam.scans.occupancy_grid import drawn
 from sceneslam.testing.room import RIG, room_observation
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
@@ -148,17 +149,18 @@ def test_module_finds_its_way_back_to_a_place_it_left():
     assert np.linalg.norm(answer.T_local_base - true_pose(2)) < 0.03
 
 
-def test_map_of_a_planar_robot_has_walls_in_cloud_and_grid():
+def test_map_of_a_planar_robot_has_walls_in_cloud_and_scans():
     module = make()
     drive(module, [room_observation(index) for index in range(0, 30, 3)])
     layers = module.get_map()
-    assert layers.points is not None and layers.grid is not None
+    assert layers.points is not None and layers.grid is None
     room = se3.apply(room_observation(0).T_odom_base, layers.points.points.astype(float))
     beyond_wall_m = np.abs(room) - [3.0, 2.0, 1.2]
     assert np.abs(beyond_wall_m.max(axis=1)).max() < 0.05  # every point lies on a wall
     assert len(layers.points.points) == len(layers.points.colors_bgr) > 1000
-    assert (layers.grid.log_odds > 0.5).sum() > 20
-    assert (layers.grid.log_odds < -0.3).sum() > 200
+    grid = drawn(layers.scans, layers.scans.T_world_laser)
+    assert (grid.log_odds > 0.5).sum() > 20
+    assert (grid.log_odds < -0.3).sum() > 200
 
 
 @pytest.mark.parametrize(

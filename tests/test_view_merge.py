@@ -42,9 +42,34 @@ def test_two_views_are_registered_by_their_landmarks(noise_m, wrong, off_m):
 def test_places_that_look_alike_are_not_recognized():
     other = seen_from(TILTED, 1)
     known = PlacedViews([(HERE, place(1)), (ELSEWHERE, place(2))])
-    np.testing.assert_allclose(recognize(known, other).T_map_base, HERE @ TILTED, atol=1e-5)
-    assert recognize(PlacedViews([(HERE, place(1)), (ELSEWHERE, place(1))]), other) is None
+    number, seen = recognize(known, other)
+    assert number == 0
+    np.testing.assert_allclose(seen.T_map_base, HERE @ TILTED, atol=1e-5)
+    alike = PlacedViews([(HERE, place(1)), (ELSEWHERE, place(1))])
+    assert recognize(alike, other) is None
+    for number, T_map_seen in enumerate((HERE, ELSEWHERE)):
+        found, seen = recognize(alike, other, among=[number])
+        assert found == number
+        np.testing.assert_allclose(seen.T_map_base, T_map_seen @ TILTED, atol=1e-5)
+    assert recognize(alike, other, among=[]) is None
     assert recognize(PlacedViews([]), other) is None
+
+
+def test_views_that_are_added_moved_and_cut_are_recognized_where_they_are():
+    known, other = PlacedViews([(HERE, place(2))]), seen_from(TILTED, 1)
+    known.add(HERE, place(1))
+    known.move([HERE, ELSEWHERE])
+    number, seen = recognize(known, other)
+    assert (len(known), number) == (2, 1)
+    np.testing.assert_allclose(seen.T_map_base, ELSEWHERE @ TILTED, atol=1e-5)
+    known.cut(1)
+    assert len(known) == 1 and recognize(known, other) is None
+    known.add(HERE, place(1))
+    number, seen = recognize(known, other)
+    assert number == 1
+    np.testing.assert_allclose(seen.T_map_base, HERE @ TILTED, atol=1e-5)
+    with pytest.raises(ValueError, match="argument"):
+        known.move([HERE])
 
 
 def viewed(saved, *views):

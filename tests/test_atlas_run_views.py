@@ -1,0 +1,190 @@
+"""What a camera sees during a run: kept with its submaps, and recognized when it comes back."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_atlas_limits import at
+from test_atlas_maps import WALL, edge, map_of
+from test_atlas_view_loops import viewed
+from test_rgbd import make
+from test_view_merge import seen_from
+
+from sceneslam.atlas.atlas import Atlas
+from sceneslam.atlas.lasting.saved_map import empty_map
+from sceneslam.atlas.submaps.chain import Chain
+from sceneslam.atlas.submaps.graph import on_floor
+from sceneslam.atlas.submaps.plan_loops import PlanLoops
+from sceneslam.atlas.submaps.run_graph import RunGraph
+from sceneslam.testing.room import RIG, observation_at
+from sceneslam.types import se3
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.run import BRIDGED
+from sceneslam.types.trajectory import Trajectory
+
+# Views of submaps that a hand-over replaces.
+
+STEP = at(0.6, 0.1, 0.2)  # from submap to submap: far enough that each view is compared
+T_WORLD_PLACE = [at(), at(0.3, -0.4, 1.0), at(-0.2, 0.5, -1.0)]
+
+
+def chain_of(*places):
+    """A chain of submaps each of which sees one of the places, None: nothing; they drift widely."""
+    chain, T_world_node = Chain(), at()
+    submaps = map_of(*[WALL] * len(places), runs=[0] * len(places)).submaps
+    for node, number in enumerate(places):
+        seen = []
+        if number is not None:
+            T_place_view = se3.inverse(T_WORLD_PLACE[number]) @ T_world_node
+            seen = [(at(), seen_from(T_place_view, number))]
+        motion = replace(
+            edge(node - 1, node), T_first_second=STEP, covariance=on_floor(np.diag([0.3**2] * 3))
+        )
+        chain.append(viewed(submaps[node], *seen), T_world_node, motion if node else None)
+        T_world_node = T_world_node @ STEP
+    return chain
+
+
+def loops_of(found):
+    return sorted((one.first, one.second) for one in found.loops)
+
+
+def test_after_a_rewind_views_are_compared_with_those_that_are_left_and_those_that_came():
+    graph = RunGraph(empty_map(), lambda session: False)
+    before = graph.extend(chain_of(0, 1, 2, 0, 1, 2), is_level=False)
+    assert loops_of(before) == [(0, 3), (1, 4), (2, 5)]
+    graph.forget(2)
+    after = graph.extend(chain_of(0, 1, None, 1, 0, 2), is_level=False)
+    assert loops_of(after) == [(0, 4), (1, 3)]  # nothing but what is gone showed place 2
+    for one in after.loops:
+        expected = np.linalg.matrix_power(STEP, one.second - one.first)
+        np.testing.assert_allclose(one.T_first_second, expected, atol=1e-5)
+
+
+# A robot that comes back.
+
+LAP, STEP_NS, START_NS = 95, 160_000_000, 10**9  # one step: 0.06 m
+T_DRIFT = se3.from_xy_yaw(0.12, -0.05, 0.06)  # of what led from the first session to the second
+SEEING = Rig(sensors=frozenset({Sensor.IMAGE, Sensor.DEPTH, Sensor.ODOMETRY}), camera=RIG.camera)
+
+
+def room_at(index):
+    """The pose in the room on a circle of 0.9 m, which takes a lap."""
+    return se3.from_xy_yaw(0.3, 0.0, 2 * np.pi * index / LAP) @ se3.from_xy_yaw(0.0, -0.9, 0.0)
+
+
+def true_pose(index):
+    return se3.inverse(room_at(0)) @ room_at(index)
+
+
+def look(index):
+    one = observation_at(room_at(index), 0.0)
+    return replace(
+        one, stamp_ns=START_NS + index * STEP_NS, scan=None, points_lidar=None, T_odom_base=None
+    )
+
+
+class Lapping:
+    """An atlas that follows a robot on its circle."""
+
+    def __init__(self, **settings):
+        self.atlas, self.loops = Atlas(voxel_m=0.05, save=settings.pop("save", None)), []
+        self.atlas.open(SEEING, self._note, **settings)
+
+    def _note(self, event, stamp_ns, **fields):
+        if event == "loop":
+            self.loops.append((stamp_ns, fields))
+
+    def see(self, module, indices, T_map_local):
+        """One session of a module at T_map_local; a module that is given tracks the images."""
+        own = make(rig=SEEING) if module == "rgbd" else None
+        first, session = indices[0], self.atlas.begin_session(module, T_map_local)
+        for index in indices:
+            observation = look(index)
+            T_local_base = se3.inverse(true_pose(first)) @ true_pose(index)
+            if own is not None:
+                T_local_base = own.track(observation).T_local_base
+            self._add(observation, T_map_local @ T_local_base, module, T_local_base)
+        layers = MapLayers() if own is None else own.get_map()
+        revised = Trajectory.empty() if own is None else own.get_trajectory()
+        self.atlas.close_session(session, layers, revised)
+        if own is not None:
+            own.shutdown()
+
+    def bridge(self, indices):
+        """Dead reckoning through the dark, which drifts by T_DRIFT."""
+        for index in indices:
+            share = (index - indices[0] + 1) / len(indices)
+            T_map_base = se3.exp(share * se3.log(T_DRIFT)) @ true_pose(index)
+            dark = replace(look(index), image_bgr=None, depth_m=None)
+            self._add(dark, T_map_base, BRIDGED)
+
+    def _add(self, observation, T_map_base, module, T_local_base=None):
+        if T_local_base is not None:
+            self.atlas.add_local(observation.stamp_ns, T_local_base)
+        self.atlas.add(observation.stamp_ns, T_map_base, module)
+        self.atlas.observe(observation, None)
+
+    def errors_m(self, trajectory):
+        """How far poses are from the true ones in `map`."""
+        index = (trajectory.stamps_ns - START_NS) // STEP_NS
+        due = np.stack([true_pose(one) for one in index.tolist()])
+        return np.linalg.norm(trajectory.positions_m - due[:, :3, 3], axis=1)
+
+
+@pytest.fixture(scope="module")
+def returned():
+    """Lap with rgbd, in the dark, and with rgbd again; only views close loops."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PlanLoops, "loops_to", lambda *_: [])
+        drive = Lapping(closing=["rgbd"])
+        drive.see("rgbd", range(LAP), se3.identity())
+        drive.bridge(range(LAP, 2 * LAP))
+        drive.see("rgbd", range(2 * LAP, 3 * LAP), T_DRIFT @ true_pose(2 * LAP))
+        before = len(drive.loops)
+        assert drive.atlas.finish() == []
+    return drive, before
+
+
+def test_second_session_of_rgbd_gets_loops_to_its_first_one_and_no_session_to_itself(returned):
+    drive, _ = returned
+    assert len(drive.loops) >= 2
+    for stamp_ns, fields in drive.loops:
+        assert (fields["module"], fields["to_module"]) == ("rgbd", "rgbd")
+        first, second = ((ns - START_NS) // STEP_NS for ns in (fields["to_ns"], stamp_ns))
+        assert first < LAP and second >= 2 * LAP
+
+
+def test_poses_come_back_to_the_map_while_the_second_session_goes_on(returned):
+    drive, before = returned
+    again = drive.errors_m(drive.atlas.online)[2 * LAP :]
+    assert before >= 2
+    assert again.max() > 0.12 and (again[-4:] < 0.05).all()
+    assert (drive.errors_m(drive.atlas.trajectory) < 0.05).all()
+
+
+def test_the_second_lap_adds_no_views_of_what_the_first_one_saw(returned):
+    drive, _ = returned
+    views = [
+        (view.stamp_ns - START_NS) // STEP_NS
+        for one in drive.atlas._mapper.saved().submaps
+        for view in one.views
+    ]
+    assert sum(index < LAP for index in views) > 15
+    assert sum(index >= 2 * LAP for index in views) <= 2
+
+
+@pytest.mark.parametrize(
+    ("settings", "is_kept"),
+    [({"is_looking": False}, False), ({"is_looking": True}, True), ({}, True)],
+)
+@pytest.mark.parametrize("is_saved", [False, True])
+def test_views_are_kept_to_recognize_places_and_in_a_map_that_is_saved(
+    tmp_path, settings, is_kept, is_saved
+):
+    drive = Lapping(**settings, save=str(tmp_path / "map") if is_saved else None)
+    drive.see("a", range(0, LAP // 2, 3), se3.identity())
+    assert drive.atlas.finish() == []
+    views = [view for one in drive.atlas._mapper.saved().submaps for view in one.views]
+    assert (len(views) > 5) if is_kept or is_saved else views == []
