@@ -8,6 +8,7 @@ import pytest
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.save import save_grid, save_map, save_points, save_pose_graph
 from sceneslam.atlas.submaps.correction import Correction
+from sceneslam.scans.occupancy_grid import drawn, walls
 from sceneslam.types import se3
 from sceneslam.types.maps import (
     GridLayer,
@@ -15,6 +16,7 @@ from sceneslam.types.maps import (
     MapLayers,
     PointLayer,
     PoseGraphLayer,
+    ScanLayer,
 )
 from sceneslam.types.trajectory import Trajectory
 
@@ -189,3 +191,55 @@ def test_a_session_lies_in_the_map_as_the_middle_one_of_its_poses_is_corrected()
     assert [one.T_map_local[1, 3] for one in atlas.sessions] == pytest.approx([0.0, 0.2])
     np.testing.assert_allclose(atlas.trajectory.positions_m[4:, 1], [0.0, 0.1, 0.2, 0.3])
     np.testing.assert_array_equal(atlas.online.positions_m[:, 1], np.zeros(8))
+
+
+def scans_at(*x_m):
+    """Scans of 16 beams of 2 m, one a nanosecond from 10 on."""
+    count = len(x_m)
+    return ScanLayer(
+        stamps_ns=np.arange(10, 10 + count),
+        T_world_laser=np.array([se3.from_xy_yaw(x, 0.0, 0.1) for x in x_m]).reshape(-1, 4, 4),
+        ranges_m=np.full((count, 16), 2.0, np.float32),
+        angle_min_rad=np.zeros(count),
+        angle_step_rad=np.full(count, np.pi / 8),
+        cell_m=0.1,
+    )
+
+
+def scanned(layers, shifts_m):
+    """An atlas with one session, which is corrected sideways at its poses at 10, 11 and so on."""
+    atlas, T_map_local = Atlas(voxel_m=0.01), se3.from_xy_yaw(3.0, 0.0, np.pi / 2)
+    session = atlas.begin_session("a", T_map_local)
+    for index in range(3):
+        atlas.add_local(10 + index, se3.from_xy_yaw(index, 0, 0))
+        atlas.add(10 + index, T_map_local @ se3.from_xy_yaw(index, 0, 0), "a")
+    atlas.close_session(session, layers, Trajectory.empty())
+    T_new_old = np.array([se3.from_xy_yaw(y_m, y_m, 0.0) for y_m in shifts_m])
+    atlas._correction = Correction(stamps_ns=np.arange(10, 13), T_new_old=T_new_old)
+    return atlas.fuse_maps(), T_new_old @ T_map_local
+
+
+@pytest.mark.parametrize("shifts_m", [[0.0, 0.0, 0.0], [0.1, 0.5, 1.3]])
+def test_each_scan_is_drawn_where_the_correction_within_its_session_puts_it(shifts_m):
+    scans = scans_at(0.0, 1.0, 2.0)
+    found, T_map_local = scanned(MapLayers(scans=scans), shifts_m)
+    T_map_laser = T_map_local @ scans.T_world_laser
+    np.testing.assert_allclose(found.points.points, walls(scans, T_map_laser), atol=1e-5)
+    assert (found.points.colors_bgr == 160).all() and found.modules == ("a",)
+    expected = drawn(scans, T_map_laser)
+    np.testing.assert_array_equal(found.grid.log_odds, expected.log_odds)
+    assert found.grid.origin_xy_m == pytest.approx(expected.origin_xy_m)
+    assert found.grid.resolution_m == 0.1
+
+
+def test_a_session_with_points_and_scans_gives_its_points_and_the_grid_of_its_scans():
+    cloud = PointLayer(points=np.array([[1, 2, 3]], np.float32))
+    found, _ = scanned(MapLayers(points=cloud, scans=scans_at(0.0, 1.0, 2.0)), [0.0] * 3)
+    np.testing.assert_allclose(found.points.points, [[1, 1, 3]], atol=1e-6)
+    assert (found.grid.log_odds > 0).sum() > 20
+
+
+@pytest.mark.parametrize("layers", [MapLayers(), MapLayers(scans=scans_at())])
+def test_a_session_without_scans_or_grid_gives_none(layers):
+    found, _ = scanned(layers, [0.1, 0.5, 1.3])
+    assert found.grid is None and len(found.points.points) == 0
