@@ -62,6 +62,13 @@ def test_after_a_rewind_views_are_compared_with_those_that_are_left_and_those_th
         np.testing.assert_allclose(one.T_first_second, expected, atol=1e-5)
 
 
+def test_neighbouring_submaps_get_no_loop_even_across_a_handover():
+    graph = RunGraph(empty_map(), lambda session: False)
+    chain = chain_of(None, 0, 0, 1, 1)
+    assert [one.session for one in chain.submaps] == [0, 0, 1, 1, 2]
+    assert loops_of(graph.extend(chain, is_level=False)) == []
+
+
 # A robot that comes back.
 
 LAP, STEP_NS, START_NS = 95, 160_000_000, 10**9  # one step: 0.06 m

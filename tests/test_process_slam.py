@@ -15,12 +15,15 @@ import pytest
 from driving import assert_exact, drive, events
 from fakes import RIG, ExactModule, observation, true_pose
 from isolation import limits
+from test_module_answers import LAYERS
 
+from sceneslam.bus.answers import checked_layers
 from sceneslam.config.check import check_node
 from sceneslam.experiments.programs.case import run_case
 from sceneslam.experiments.programs.hostile import KINDS, plan
 from sceneslam.interfaces import ClosesLoops
 from sceneslam.modules.slam.process.__main__ import FOLDER, build
+from sceneslam.modules.slam.process.fields import layers
 from sceneslam.modules.slam.process.module import ProcessSlam
 from sceneslam.modules.slam.process.protocol import (
     HEAD_BYTES,
@@ -67,6 +70,21 @@ def echo(started, late=1, **options):
 def test_a_program_closes_loops_unless_its_settings_say_otherwise(started, settings, closes):
     module = started(sys.executable, PROGRAM, 1, settings=settings)
     assert isinstance(module, ClosesLoops) and module.closes_loops is closes
+
+
+@pytest.mark.parametrize("name", LAYERS)
+def test_a_program_gives_a_layer_by_its_fields(name):
+    given = {one: getattr(LAYERS[name], one) for one in LAYERS[name].__dataclass_fields__}
+    reply = {f"{name}.{one}": np.asarray(value) for one, value in given.items()}
+    found = getattr(checked_layers(layers(reply)), name)
+    assert type(found) is type(LAYERS[name])
+    for one, value in given.items():
+        np.testing.assert_array_equal(getattr(found, one), value)
+        assert isinstance(getattr(found, one), type(value))
+    missing = next(iter(given))
+    del reply[f"{name}.{missing}"]
+    with pytest.raises(ProtocolError, match=f"whose {name} is incomplete: .*{missing}"):
+        layers(reply)
 
 
 @pytest.fixture(scope="module")
