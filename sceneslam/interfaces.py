@@ -168,10 +168,7 @@ class SlamModule(Protocol):
         ...
 
     def activate(self, rig: Rig) -> None:
-        """Start a session: empty map, `local` at the next observation.
-
-        Places of an earlier session may be recognised later, as `Tracking.revision` reports.
-        """
+        """Start a session: empty map, `local` at the next observation."""
         ...
 
     def set_pose(self, T_map_local: Transform) -> None:

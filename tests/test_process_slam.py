@@ -48,7 +48,8 @@ def started():
 
     def start(*command, late_max_s=1.0, settings=None, **changes):
         bounds = limits(**({"step_deadline_s": 10.0} | changes))
-        values = {"late_max_s": late_max_s, "limits": bounds} | (settings or {})
+        values = {"late_max_s": late_max_s, "limits": bounds, "closes_loops": True}
+        values |= settings or {}
         modules.append(ProcessSlam(command=[*map(str, command)], **values))
         return modules[-1]
 
@@ -221,7 +222,7 @@ def test_a_new_session_is_a_new_run_of_the_program(started):
 @pytest.mark.parametrize("command", [[], ["no/such/program"]])
 def test_a_command_that_cannot_be_run_is_refused(command):
     with pytest.raises(ConfigError, match="command: got"):
-        ProcessSlam(command=command, late_max_s=1.0, limits=limits())
+        ProcessSlam(command=command, late_max_s=1.0, limits=limits(), closes_loops=True)
 
 
 def test_a_program_that_is_no_slam_program_is_refused_before_the_first_frame(started):
@@ -272,6 +273,7 @@ def test_a_program_that_is_killed_is_replaced_by_the_fallback_and_comes_back(sta
 def test_a_program_is_run_only_where_the_command_line_allows_it():
     node = {
         "_target_": "sceneslam.modules.slam.process.module.ProcessSlam",
+        "closes_loops": True,
         "command": ["./mine", "--fast"],
         "late_max_s": 1.0,
         "limits": {"_target_": "sceneslam.supervision.limits.Limits", **asdict(limits())},

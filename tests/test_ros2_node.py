@@ -45,6 +45,7 @@ def build(behaviour, **changes):
         "network": Network(domain_id=domain_id),
         "late_max_s": 0.5,
         "limits": limits(),
+        "closes_loops": False,
     }
     return Ros2Node(**(values | changes))
 

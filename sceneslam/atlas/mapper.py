@@ -1,7 +1,8 @@
 """The back end of a run: submaps, their pose graph, and localization in a loaded map.
 
-The graph is spatial. Places are recognized by floor plans of level scans, and in a loaded map by
-what a camera sees; a module recognizes its own earlier sessions, and reports loops to them.
+The graph is spatial. Places are recognized by floor plans of level scans and by what a camera sees,
+whatever module was active; only within the sessions of a module that closes loops itself are none
+looked for.
 """
 
 from __future__ import annotations

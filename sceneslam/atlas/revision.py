@@ -42,8 +42,7 @@ def revise(
     """Return the poses after all revisions; `pose_sessions` (N,) is -1 before the first session.
 
     Every pose is corrected as the last revised pose of its session before it, so that bridged
-    motions do not change. A session starts where the revised session before it ended (Eq. 1): what
-    its module knows of earlier sessions is in the loops that it reports.
+    motions do not change. A session starts where the revised session before it ended (Eq. 1).
     """
     moved = np.array(T_map_base)
     placed: list[Transform] = []

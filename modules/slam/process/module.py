@@ -40,7 +40,7 @@ class ProcessSlam(Restarted):
         command: Command,
         late_max_s: float,
         limits: Limits,
-        closes_loops: bool = True,
+        closes_loops: bool,
     ) -> None:
         """Start the program; without `closes_loops` the atlas closes the loops of its poses."""
         if not command or shutil.which(command[0]) is None:

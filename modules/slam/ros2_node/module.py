@@ -75,6 +75,7 @@ class Ros2Node(ProcessSlam):
         network: Network,
         late_max_s: float,
         limits: Limits,
+        closes_loops: bool,
     ) -> None:
         if network.transport == DDS and importlib.util.find_spec("cyclonedds") is None:
             raise ConfigError("network.transport", DDS, "pip install 'sceneslam[ros2]'")
@@ -107,4 +108,6 @@ class Ros2Node(ProcessSlam):
         bridge = Command(
             [sys.executable, "-P", "-c", _MAIN, json.dumps(settings), *sys.path],
         )
-        super().__init__(command=bridge, late_max_s=late_max_s, limits=limits)
+        super().__init__(
+            command=bridge, late_max_s=late_max_s, limits=limits, closes_loops=closes_loops
+        )
