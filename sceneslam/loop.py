@@ -82,7 +82,7 @@ class RunLoop:
             is_live=is_live,
         )
         closing = [key for key, module in parts.modules.items() if _closes_loops(module)]
-        is_one = len(closing) == len(parts.modules) == 1  # it recognizes all its places itself
+        is_one = len(closing) == len(parts.modules) == 1  # it recognizes its places itself
         parts.atlas.open(
             parts.rig, self._log.add, closing=closing, is_looking=not is_one, is_live=is_live
         )

@@ -483,3 +483,20 @@ def test_values_of_the_back_end_are_frozen_and_compared_by_identity():
             assert not (has_array and value.__dataclass_params__.eq), name
             seen += 1
     assert seen > 15
+
+
+def test_a_solution_on_the_way_leaves_out_what_does_not_fit():
+    own, wrong = finished(48), loop(1, 6, [14.0, 1.0, 0.0], sigma=0.01)
+    loops = [off(0, 5), off(0, 6), wrong, off(1, 7)]
+    solved = settle(np.array(own.chain.T_run_node), own.chain.motions, loops)
+    assert solved.accepted == [0, 1, 3]
+    alone = settle(np.array(own.chain.T_run_node), own.chain.motions, [*loops[:2], loops[3]])
+    np.testing.assert_allclose(solved.T_map_node, alone.T_map_node, atol=1e-3)
+
+
+def test_a_pose_that_is_gone_leaves_its_submap_where_it_was():
+    own = finished()
+    before = list(own.chain.T_run_node)
+    own.chain.remeasure(lambda ns: None if ns < 3 * S else at(1.0 + 0.5 * ns / S))
+    np.testing.assert_array_equal(own.chain.T_run_node[0], before[0])
+    np.testing.assert_allclose(own.chain.T_run_node[1], at(1.0) @ before[1])

@@ -251,6 +251,17 @@ def test_the_newest_pose_is_corrected_by_loops_and_each_is_reported_once(monkeyp
     assert (after.stamps_ns // S).tolist() == [0, 3, 6]
 
 
+def test_a_rewind_that_takes_the_last_loops_takes_their_correction(monkeypatch):
+    solving, drive = Solving(monkeypatch), Driving()
+    drive.to(*range(7))
+    assert drive.own.correction() is not None
+    solving.found = False
+    drive.rewind(0)
+    drive.to(7, 8, 9, session=1)
+    after = drive.own.correction()
+    np.testing.assert_array_equal(after.T_new_old, [at()] * len(after.stamps_ns))
+
+
 def test_loops_of_a_run_are_counted_after_the_loaded_map_and_lead_between_its_submaps(monkeypatch):
     Solving(monkeypatch)
     drive = Driving(loaded=map_of(WALL, WALL, pieces=[0, 0]))

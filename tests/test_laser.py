@@ -188,7 +188,7 @@ def test_map_shows_the_walls_where_they_are():
     outer = np.minimum.reduce(
         [np.abs(world[:, 0] + 2), np.abs(world[:, 0] - 4), np.abs(np.abs(world[:, 1]) - 2)]
     )
-    assert len(points) == (scans.ranges_m > 0).sum() > 3000
+    assert 3000 < len(points) <= (scans.ranges_m > 0).sum()
     assert (outer < 0.05).mean() > 0.6
 
 

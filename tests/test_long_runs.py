@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from sceneslam.atlas.atlas import Atlas
-from sceneslam.atlas.budget import Budget
+from sceneslam.atlas.budget import Budget, thin
 from sceneslam.atlas.pose_path import OpenSession
 from sceneslam.atlas.rows import Rows
 from sceneslam.bus.events import EventLog
 from sceneslam.engine.slowest import Slowest
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.maps import LandmarkLayer, MapLayers, PointLayer
+from sceneslam.types.maps import LandmarkLayer, MapLayers, PointLayer, ScanLayer
 from sceneslam.types.run import SlowPose
 from sceneslam.types.trajectory import Trajectory
 
@@ -148,6 +148,23 @@ def test_thinning_keeps_the_first_point_per_module_and_voxel_of_the_map():
 def test_a_budget_that_holds_nothing_leaves_a_few_points():
     fused = drive(Atlas(voxel_m=0.01, budget_mb=1e-9), [cloud(shift_m) for shift_m in range(9)])
     assert 0 < len(fused.points.points) <= 8 * 9
+
+
+def test_scans_beyond_the_limit_are_thinned_to_every_second_one():
+    scans = ScanLayer(
+        stamps_ns=np.arange(64),
+        T_world_laser=np.tile(np.eye(4), (64, 1, 1)),
+        ranges_m=np.ones((64, 100), np.float32),
+        angle_min_rad=np.zeros(64),
+        angle_step_rad=np.full(64, 0.01),
+        cell_m=0.05,
+    )
+    session = OpenSession("a", np.eye(4), layers=MapLayers(scans=scans))
+    thin([session], 0.1, 64 * 600)  # half of that is for 35 scans
+    assert session.layers.scans.stamps_ns.tolist() == list(range(0, 64, 2))
+    assert session.layers.scans.ranges_m.shape == (32, 100)
+    thin([session], 0.1, 1.0)
+    assert session.layers.scans.stamps_ns.tolist() == [0]
 
 
 def test_the_budget_is_checked():

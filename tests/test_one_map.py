@@ -324,8 +324,11 @@ def test_the_grid_of_a_run_that_was_found_is_that_of_the_whole_map(saved):
     true = through([(0.6, 2.6), (3.0, 2.4), (3.2, 0.8)])  # of one room
     alone = Drive(atlas()).go(world(flat(), 7), true).atlas.fuse_maps()
     drive = Drive(atlas(load=str(folder))).go(world(flat(), 7), true)
-    grid = drive.atlas.fuse_maps().grid
+    fused = drive.atlas.fuse_maps()
+    grid, graph = fused.grid, fused.pose_graph
     assert alone.grid is None  # dead reckoning draws none
+    assert (np.diff(graph.stamps_ns) > 0).all()  # of this run alone
+    assert len(graph.stamps_ns) == len(alone.pose_graph.stamps_ns)
     at = planar.compose(map_of(first), np.array([9.5, 3.5, 0.0]))[:2]  # in the other
     column, row = ((at - grid.origin_xy_m) / grid.resolution_m).astype(int)
     assert grid.log_odds[row, column] < 0

@@ -135,9 +135,8 @@ class Atlas:
         revised = self._revise().T_map_base
         at = partial(self._revised_at, revised)
         layers = [session.layers for session in self._sessions]
-        self._correction = self._mapper.finish(at, layers)
-        if self._journal is not None:
-            self._journal.add_correction(self._correction.stamps_ns, self._correction.T_new_old)
+        before, self._correction = self._correction, self._mapper.finish(at, layers)
+        self._record(before, self._correction)
         self._lasting.finish(self._mapper, self._path.stamps_ns[-1], self._note)
 
     def _give_up(self, error: Exception) -> None:
@@ -145,8 +144,19 @@ class Atlas:
         _log.info("submaps", exc_info=error)
         if self._mapper is not None:
             self._mapper.close()
+        self._record(self._correction, Correction.none())
         self._mapper, self._correction = None, None
         self._lasting.faults.append(f"the run goes on without submaps and loops: {text_of(error)}")
+
+    def _record(self, before: Correction | None, final: Correction) -> None:
+        """Write the final correction to the journal; where it has no node, poses stay as given."""
+        if self._journal is None:
+            return
+        known_ns = final.stamps_ns[:0] if before is None else before.stamps_ns
+        gone_ns = np.setdiff1d(known_ns, final.stamps_ns)
+        stays = Correction(stamps_ns=gone_ns, T_new_old=np.tile(np.eye(4), (len(gone_ns), 1, 1)))
+        whole = stays.updated(final)
+        self._journal.add_correction(whole.stamps_ns, whole.T_new_old)
 
     def begin_session(self, module: str, T_map_local: Transform) -> int:
         """Open a session of a module placed at T_map_local (4, 4) (Eq. 1); return its number."""
@@ -303,9 +313,9 @@ class Atlas:
         if self._mapper is None or not self._mapper.has_submaps:
             return fuse(placed, voxel_m=self._voxel_m)
         saved = self._lasting.map_of(self._mapper)
-        own = saved.of(np.flatnonzero(saved.pieces == saved.pieces[-1]).tolist())
-        fused = fuse(placed, voxel_m=self._voxel_m, pose_graph=own.graph())
-        return replace(fused, grid=grid_of(own.plan())) if self._mapper.is_placed else fused
+        own = [row for row, one in enumerate(saved.submaps) if one.run == saved.runs - 1]
+        fused = fuse(placed, voxel_m=self._voxel_m, pose_graph=saved.of(own).graph())
+        return replace(fused, grid=grid_of(saved.plan())) if self._mapper.is_placed else fused
 
     def _in_map(self, T_run_base: Transform) -> Transform:
         """Return a pose as loops correct it, or in a loaded map if the run was located there."""

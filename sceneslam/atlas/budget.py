@@ -13,7 +13,7 @@ from sceneslam.atlas.fusion import one_per_voxel
 from sceneslam.atlas.pose_path import OpenSession
 from sceneslam.executors import InStep, executor
 from sceneslam.types import se3
-from sceneslam.types.maps import LandmarkLayer, MapLayers, PointLayer
+from sceneslam.types.maps import LandmarkLayer, MapLayers, PointLayer, ScanLayer
 
 _REST = 0.5  # share of the limit that is left by thinning, so that it is not due at every session
 
@@ -23,8 +23,9 @@ Layer = PointLayer | LandmarkLayer
 class Budget:
     """Thins clouds and landmarks to one per module and voxel once they need more than `limit_mb`.
 
-    Where that is not enough, as in a large building, the voxels grow. Sessions lie where they were
-    placed during the run; their points stay in their own frames, so that later corrections apply.
+    Where that is not enough, as in a large building, the voxels grow. Of scans that need more than
+    half of what is left, every second one goes. Sessions lie where they were placed during the run;
+    their points stay in their own frames, so that later corrections apply.
     """
 
     def __init__(self, *, limit_mb: float, voxel_m: float) -> None:
@@ -56,6 +57,7 @@ def thin(sessions: Sequence[OpenSession], voxel_m: float, most: float) -> None:
 
     At the least a few points per module are left.
     """
+    _thin_scans(sessions, 0.5 * most)
     layers = [session.layers for session in sessions]  # a session that is closed meanwhile is kept
     modules = list(dict.fromkeys(session.module for session in sessions))
     owners = [modules.index(session.module) for session in sessions]
@@ -67,12 +69,27 @@ def thin(sessions: Sequence[OpenSession], voxel_m: float, most: float) -> None:
         points = _kept([one.points for one in layers], owners, poses, voxel_m)
         landmarks = _kept([one.landmarks for one in layers], owners, poses, voxel_m)
         left = [_of(*one) for one in zip(layers, points, landmarks, strict=True)]
-        if sum(_bytes(one) for one in left) <= most or voxel_m > 2.0 * reach_m:
+        if sum(map(_bytes, left)) <= most or voxel_m > 2.0 * reach_m:
             break
         voxel_m *= 2.0
     for session, before, after in zip(sessions, layers, left, strict=True):
         if before.points is not None or before.landmarks is not None:
             session.layers = replace(session.layers, points=after.points, landmarks=after.landmarks)
+
+
+def _thin_scans(sessions: Sequence[OpenSession], most: float) -> None:
+    """Leave every second scan of all sessions, down to `most` bytes or one scan each."""
+    while True:
+        held = [one.layers.scans for one in sessions if one.layers.scans is not None]
+        too_many = sum(_bytes_of(one) for one in held) > most
+        if not too_many or max(len(one.stamps_ns) for one in held) < 2:
+            return
+        for session in sessions:
+            scans = session.layers.scans
+            if scans is not None:
+                arrays = {each.name: getattr(scans, each.name) for each in fields(scans)}
+                arrays |= {name: value[::2] for name, value in arrays.items() if name != "cell_m"}
+                session.layers = replace(session.layers, scans=ScanLayer(**arrays))
 
 
 def _of(layers: MapLayers, rows: NDArray[np.intp], marks: NDArray[np.intp]) -> MapLayers:
@@ -110,7 +127,11 @@ def _kept(
 
 
 def _bytes(layers: MapLayers) -> int:
-    """Return what the points and landmarks need."""
-    held = [one for one in (layers.points, layers.landmarks) if one is not None]
-    arrays = [getattr(one, each.name) for one in held for each in fields(one)]
-    return sum(array.nbytes for array in arrays if array is not None)
+    """Return what points, landmarks and scans need."""
+    held = (layers.points, layers.landmarks, layers.scans)
+    return sum(_bytes_of(one) for one in held if one is not None)
+
+
+def _bytes_of(layer: Layer | ScanLayer) -> int:
+    arrays = [getattr(layer, each.name) for each in fields(layer)]
+    return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))

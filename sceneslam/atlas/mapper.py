@@ -127,6 +127,7 @@ class Mapper:
         self._collector.rewind(stamp_ns)
         kept = len(self._collector.chain)
         if kept < self._kept:
+            self._is_news |= bool(self._solved.loops)
             self._kept, self._solved = kept, self._solved.cut(kept, len(self._loaded.submaps))
 
     def observe(self, observation: Observation, up_base: Vector | None) -> None:
@@ -164,8 +165,8 @@ class Mapper:
             self._localize(localizer, look)
 
     def close(self) -> None:
-        """Wait for the search that is running, and begin no other."""
-        self._executor.shutdown(cancel_futures=True)
+        """Begin no other search; one that is running goes on, and nothing takes its result."""
+        self._executor.shutdown(wait=False, cancel_futures=True)
 
     def finish(self, path: Path, maps: Sequence[MapLayers]) -> Correction:
         """Solve the graph; return the correction of the poses.
@@ -248,9 +249,10 @@ class Mapper:
             return
         (chain, solving), self._solving = self._solving, None
         solved = solving.result()
-        if len(chain) > self._kept:
-            return  # poses were replaced meanwhile
-        self._collector.chain.submaps[: len(chain)] = chain.submaps  # views were left out
+        kept = min(len(chain), self._kept)  # less, if poses were replaced meanwhile
+        self._collector.chain.submaps[:kept] = chain.submaps[:kept]  # views were left out
+        if kept < len(chain):
+            return
         self._is_news |= bool(solved.loops or self._solved.loops)
         self._solved = solved
         self._tell_loops()

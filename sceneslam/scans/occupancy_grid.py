@@ -69,13 +69,22 @@ def drawn(scans: ScanLayer, T_map_laser: NDArray[np.float64]) -> GridLayer:
 
 
 def walls(scans: ScanLayer, T_map_laser: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the ends (N, 3) [m], map, of all beams with a return, at T_map_laser (K, 4, 4)."""
-    beams = np.arange(scans.ranges_m.shape[1])
-    angles = scans.angle_min_rad[:, None] + scans.angle_step_rad[:, None] * beams
-    x, y = scans.ranges_m * np.cos(angles), scans.ranges_m * np.sin(angles)
-    ends_laser = np.stack([x, y, np.zeros_like(x)], axis=-1)
-    ends = ends_laser @ np.swapaxes(T_map_laser[:, :3, :3], 1, 2) + T_map_laser[:, None, :3, 3]
-    return np.asarray(ends[scans.ranges_m > 0.0], np.float32)
+    """Return the ends (N, 3) [m], map, of beams with a return, at T_map_laser (K, 4, 4).
+
+    Of those of one scan that lie in one cell, the first.
+    """
+    beams, found = np.arange(scans.ranges_m.shape[1]), [np.zeros((0, 3), np.float32)]
+    for T, ranges_m, least, step in zip(
+        T_map_laser, scans.ranges_m, scans.angle_min_rad, scans.angle_step_rad, strict=True
+    ):
+        hit = ranges_m > 0.0
+        angles, reach_m = (least + step * beams)[hit], ranges_m[hit].astype(np.float64)
+        x, y = reach_m * np.cos(angles), reach_m * np.sin(angles)
+        ends = se3.apply(T, np.column_stack([x, y, np.zeros_like(x)]))
+        cells = np.floor(ends / scans.cell_m).astype(np.int64)
+        _, first = np.unique(cells, axis=0, return_index=True)
+        found.append(ends[np.sort(first)].astype(np.float32))
+    return np.concatenate(found)
 
 
 class OccupancyGrid:

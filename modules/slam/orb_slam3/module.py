@@ -54,6 +54,4 @@ class OrbSlam3(ProcessSlam):
         }
         arguments = ["-P", "-c", _MAIN, json.dumps(settings), *sys.path]
         command = Command([sys.executable, *arguments])
-        super().__init__(
-            command=command, late_max_s=late_max_s, limits=limits, closes_loops=True
-        )
+        super().__init__(command=command, late_max_s=late_max_s, limits=limits, closes_loops=True)

@@ -63,27 +63,22 @@ class Chain:
     def remeasure(self, path: Path) -> None:
         """Set the poses of the submaps and their views as revised, and the motions between them.
 
-        `path` has a pose at every stamp of a submap.
+        Where `path` has no pose, as a hand-over took it back long after, they stay.
         """
-        poses = [_at(path, int(submap.stamps_ns[0])) for submap in self.submaps]
-        self.submaps = [
-            replace(
-                submap,
-                views=tuple(
-                    replace(view, T_submap_base=se3.inverse(pose) @ _at(path, view.stamp_ns))
-                    for view in submap.views
-                ),
+        poses, submaps = [], []
+        for submap, before in zip(self.submaps, self.T_run_node, strict=True):
+            now = path(int(submap.stamps_ns[0]))
+            pose = before if now is None else now
+            views = [(view, path(view.stamp_ns)) for view in submap.views]
+            moved = tuple(
+                view if T is None else replace(view, T_submap_base=se3.inverse(pose) @ T)
+                for view, T in views
             )
-            for submap, pose in zip(self.submaps, poses, strict=True)
-        ]
+            poses.append(pose)
+            submaps.append(replace(submap, views=moved))
+        self.submaps = submaps
         self.T_run_node = poses
         self.motions = [
             replace(edge, T_first_second=se3.inverse(poses[edge.first]) @ poses[edge.second])
             for edge in self.motions
         ]
-
-
-def _at(path: Path, stamp_ns: int) -> Transform:
-    pose = path(stamp_ns)
-    assert pose is not None, "a step has a pose"
-    return pose

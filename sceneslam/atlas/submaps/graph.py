@@ -26,6 +26,7 @@ _LOOSE = np.array([10.0, 10.0, 1.0, 0.05, 0.05, 3.0])  # m, rad: any loop moves 
 _FLOOR = np.array([0.05, 0.02, 0.02]) ** 2  # m, rad: height and tilt between places of one floor
 _TILT_RAD = 0.04  # that modules drift in pitch along a corridor, before gravity corrects them
 _UPRIGHT_RAD = 0.01  # half a degree: of gyro and gravity, and as floors are uneven
+_ROUNDS = 10  # in which the loops that fit worst are left out
 _STEPS, _GAIN_RATIO = 20, 1e-3  # of a solution while the run goes on: its cost falls no further
 _VAIN = 50  # starts in a row without a larger clique
 _LEVER_M = 2.5  # at this distance a turn moves walls: it makes deviations of turns comparable
@@ -102,16 +103,33 @@ def settle(
 ) -> Solved:
     """Return the same for a run that goes on, whose first node stays, from its last solution.
 
-    As long as all loops fit, other threads run between two steps: gtsam lets none run within one.
+    Loops that fit worst are left out, and it is solved again. Other threads run between two steps:
+    gtsam lets none run within one, nor within the optimizer of `solve`.
     """
     import gtsam
 
-    graph, values = _problem(T_map_node, motions, uprights)
+    accepted, nodes = list(range(len(loops))), T_map_node
     noise = gtsam.noiseModel.Diagonal.Sigmas(_FIXED[TO_GTSAM])
-    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(T_map_node[0]), noise))
-    for edge in loops:
-        graph.add(factor_of(edge))
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values)
+    for _ in range(_ROUNDS):
+        graph, values = _problem(nodes, motions, uprights)
+        graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(T_map_node[0]), noise))
+        for index in accepted:
+            graph.add(factor_of(loops[index]))
+        nodes = _stepped(gtsam.LevenbergMarquardtOptimizer(graph, values), len(nodes))
+        misfits = [_misfit(loops[index], nodes) for index in accepted]
+        limit = max(_CHI2_6, 0.5 * max(misfits, default=0.0))  # a wrong loop bends those around it
+        if all(misfit <= limit for misfit in misfits):
+            break
+        accepted = [
+            index for index, misfit in zip(accepted, misfits, strict=True) if misfit <= limit
+        ]
+    return Solved(
+        T_map_node=nodes, accepted=[index for index in accepted if fits(loops[index], nodes)]
+    )
+
+
+def _stepped(optimizer: Any, count: int) -> NDArray[np.float64]:
+    """Return the nodes (N, 4, 4) after steps until the cost falls no further."""
     before = optimizer.error()
     for _ in range(_STEPS):
         optimizer.iterate()
@@ -119,17 +137,19 @@ def settle(
         if before - after <= _GAIN_RATIO * before:
             break
         before = after
-    nodes = _nodes(optimizer.values(), len(T_map_node))
-    if all(fits(edge, nodes) for edge in loops):
-        return Solved(T_map_node=nodes, accepted=list(range(len(loops))))
-    return solve(T_map_node, motions, loops, fixed=(), loose=0, uprights=uprights)
+    return _nodes(optimizer.values(), count)
 
 
 def fits(edge: Edge, T_map_node: NDArray[np.float64]) -> bool:
     """Tell whether an edge agrees with the nodes (N, 4, 4)."""
+    return _misfit(edge, T_map_node) <= _CHI2_6
+
+
+def _misfit(edge: Edge, T_map_node: NDArray[np.float64]) -> float:
+    """Return the squared deviation of an edge from the nodes, over its covariance."""
     T_first_second = se3.inverse(T_map_node[edge.first]) @ T_map_node[edge.second]
     off = se3.log(se3.inverse(T_first_second) @ edge.T_first_second)
-    return bool(off @ np.linalg.solve(edge.covariance, off) <= _CHI2_6)
+    return float(off @ np.linalg.solve(edge.covariance, off))
 
 
 def _problem(

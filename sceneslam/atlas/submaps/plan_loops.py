@@ -21,7 +21,7 @@ SIGMAS = 3.0  # of the drift: search range around the graph's estimate
 GAIN_MIN_M = SIGMAS * 0.02  # a smaller range: recognition cannot improve on so little drift
 _HALF_MAX_M = 15.0  # largest search range
 NEIGHBOURS = 2  # neighbouring submaps on either side in a target
-_TARGETS = 3  # per submap: three loops to different places outvote a wrong one
+TARGETS = 3  # per submap: three loops to different places outvote a wrong one
 _KNOWN_MIN = 0.35  # share of a submap's walls, as two submaps may overlap partly
 _CACHED = 8  # targets
 
@@ -87,7 +87,7 @@ class PlanLoops:
         if not len(submaps[second].plan):
             return []
         for first in range(second - 1):
-            if not (len(submaps[first].plan) and self._may_close(first, second, submaps)):
+            if not (self._may_close(first, second, submaps) and len(submaps[first].plan)):
                 continue
             window = _window(T_map_node[first], T_map_node[second], sigma[first])
             if not GAIN_MIN_M <= window.half_m <= _HALF_MAX_M:
@@ -97,7 +97,7 @@ class PlanLoops:
                 near.append((float(np.hypot(*window.around[:2])), first))
         chosen: list[int] = []
         for _, first in sorted(near):
-            if len(chosen) < _TARGETS and all(abs(first - c) > NEIGHBOURS for c in chosen):
+            if len(chosen) < TARGETS and all(abs(first - c) > NEIGHBOURS for c in chosen):
                 chosen.append(first)
         return chosen
 

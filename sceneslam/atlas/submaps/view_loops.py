@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.atlas.submaps.plan_loops import GAIN_MIN_M, MayClose, window_m
+from sceneslam.atlas.submaps.plan_loops import GAIN_MIN_M, TARGETS, MayClose, window_m
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar, se3
@@ -78,7 +78,8 @@ class ViewLoops:
             first = self._owners[number]
             if seen.matches > best.get(first, (0,))[0]:
                 best[first] = seen.matches, self._edge(number, second, view, seen)
-        return [loop for _, loop in best.values()]
+        by_matches = sorted(best.values(), key=lambda each: -each[0])
+        return [loop for _, loop in by_matches[:TARGETS]]
 
     def keep(self, second: int, submap: Submap, T_map_node: Transform) -> tuple[PlacedView, ...]:
         """Add the views of the submap to which loops were searched, and return them.
