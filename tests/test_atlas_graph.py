@@ -2,7 +2,7 @@
 
 import importlib
 import pkgutil
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from sceneslam.atlas.covariances import PosedPath, calibrated, covariances
 from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.atlas.places.localizer import Fix
 from sceneslam.atlas.submaps import run_graph
-from sceneslam.atlas.submaps.graph import Agreement, Solved, consistent, deviations_to, settle
+from sceneslam.atlas.submaps.graph import Agreement, Solved, consistent, settle
 from sceneslam.atlas.submaps.run_graph import RunGraph, SolvedRun
 from sceneslam.atlas.uncertainty import WHEELS
 from sceneslam.types import planar, se3
@@ -253,7 +253,6 @@ def test_loops_are_searched_once_to_each_submap_and_believed_when_two_agree(monk
     np.testing.assert_array_equal(after.T_map_node[:7], both.T_map_node)
     step = own.chain.motions[6].T_first_second
     np.testing.assert_allclose(after.T_map_node[7], both.T_map_node[6] @ step, atol=1e-12)
-    np.testing.assert_allclose(searched.nodes[7], planar.from_transform(after.T_map_node[7]))
 
 
 def test_plans_are_compared_once_the_base_is_level_and_views_on_any(monkeypatch):
@@ -266,7 +265,8 @@ def test_plans_are_compared_once_the_base_is_level_and_views_on_any(monkeypatch)
     np.testing.assert_allclose(views.nodes, own.chain.T_run_node, atol=1e-12)
     np.testing.assert_allclose(plans.nodes, planar.from_transforms(views.nodes))
     for second in range(8):
-        np.testing.assert_array_equal(plans.sigma[second], views.sigma[second])
+        count = len(views.sigma[second])  # plans are searched when there are more submaps
+        np.testing.assert_array_equal(plans.sigma[second][:count], views.sigma[second])
 
 
 def test_views_close_loops_on_a_base_that_is_never_level(monkeypatch):
@@ -288,18 +288,18 @@ def test_a_loop_by_plans_and_one_by_views_are_believed_if_they_agree(monkeypatch
         assert [(one.first, one.second) for one in found.loops] == accepted
 
 
-def test_after_a_loop_the_next_search_goes_along_it(monkeypatch):
+def test_after_a_loop_places_are_searched_around_where_motions_alone_lead(monkeypatch):
+    """Around a solution with a wrong loop those that agree with it would be found."""
     searched, own = Searched(monkeypatch, [off(0, 5), off(0, 6)]), finished(54)
     graph = RunGraph(empty_map(), lambda session: False)
     for count in (7, 9):
         found = graph.extend(grown(own, count), is_level=True)
+    assert len(found.loops) == 2
     drift = np.array(own.chain.drift)
-    np.testing.assert_allclose(searched.sigma[5], drift[5] - drift[:6], atol=1e-12)
-    loops = [one.shifted(0) for one in found.loops]
-    for second in (7, 8):
-        expected = deviations_to(second, [*own.chain.motions[:second], *loops])
-        np.testing.assert_array_equal(searched.sigma[second], expected)
-        assert (searched.sigma[second][0] < 0.5 * drift[second]).all()
+    for second in (5, 8):
+        count = len(searched.sigma[second])
+        np.testing.assert_array_equal(searched.sigma[second], np.abs(drift - drift[second])[:count])
+    np.testing.assert_array_equal(searched.nodes[8], planar.from_transform(own.chain.T_run_node[8]))
 
 
 def test_forgotten_submaps_take_their_loops_with_them_and_are_searched_again(monkeypatch):
@@ -335,54 +335,6 @@ def test_a_solution_is_cut_with_its_loops():
     loops = tuple(loop(*ends, [1.0, 0.0, 0.0]) for ends in ((0, 4), (2, 5), (3, 6)))
     found = SolvedRun(T_map_node=np.tile(np.eye(4), (5, 1, 1)), loops=loops).cut(3, loaded=3)
     assert len(found.T_map_node) == 3 and found.loops == loops[:2]
-
-
-def links(seed):
-    """Some nodes with random edges between them, which may leave some apart."""
-    rng = np.random.default_rng(seed)
-    count = int(rng.integers(1, 7))
-    edges = []
-    for _ in range(int(rng.integers(0, 10)) if count > 1 else 0):
-        first, second = sorted(rng.choice(count, 2, replace=False).tolist())
-        one = loop(first, second, [1.0, 0.0, 0.0])
-        sigmas = rng.uniform(0.01, 1.0, 3)
-        covariance = planar.spatial_covariance(np.diag(sigmas**2), level=np.ones(3))
-        edges.append(replace(one, covariance=covariance))
-    return count, edges
-
-
-def sigmas_of(edge):
-    return np.sqrt(np.diag(planar.planar_covariance(edge.covariance)))
-
-
-def shortest(start, end, edges, passed=()):
-    """Return the deviations along the most certain of all paths, one after the other."""
-    if start == end:
-        return np.zeros(3)
-    found = [np.full(3, np.inf)]
-    for one in edges:
-        for here, there in ((one.first, one.second), (one.second, one.first)):
-            if here == start and there not in passed:
-                rest = shortest(there, end, edges, (*passed, start))
-                found.append(sigmas_of(one) + rest)
-    return min(found, key=lambda sigma: sigma @ [1.0, 1.0, 2.5])
-
-
-@given(st.integers(0, 10**6))
-def test_deviations_add_up_along_the_most_certain_path(seed):
-    count, edges = links(seed)
-    for node in range(count):
-        found = deviations_to(node, edges)
-        assert len(found) > node and (found[node] == 0).all()
-        for other in range(len(found)):
-            expected = shortest(other, node, edges)
-            np.testing.assert_allclose(found[other], expected, atol=1e-12)
-
-
-def test_deviations_to_a_node_without_a_path_are_infinite():
-    found = deviations_to(3, [loop(0, 1, [1.0, 0.0, 0.0])])
-    np.testing.assert_array_equal(found, [[np.inf] * 3] * 3 + [[0.0] * 3])
-    np.testing.assert_array_equal(deviations_to(0, []), np.zeros((1, 3)))
 
 
 _NODES = 12

@@ -41,6 +41,7 @@ class Drive:
     is_live: bool = False
     events: list[dict[str, Any]] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
+    reckoned: list[Planar] = field(default_factory=list)  # T_run_base as the atlas got them
 
     def go(
         self,
@@ -64,6 +65,7 @@ class Drive:
                 self.atlas.begin_session(name, planar.to_transform(T_run_local))
                 deviation = 1e-3
             deviation += _DEVIATION * float(np.abs(step).sum())
+            self.reckoned.append(T_run_base)
             stamp_ns = _START_NS + round(row * _STEP_S * 1e9)
             T_local_base = planar.between(T_run_local, T_run_base)
             self.atlas.add_local(stamp_ns, planar.to_transform(T_local_base))
@@ -82,8 +84,11 @@ class Drive:
     ) -> NDArray[np.float64]:
         """Return the distance of every pose (N,) from where it should be in the map."""
         found = self.atlas.online if is_online else self.atlas.trajectory
-        due = np.array([planar.compose(T_map_world, pose) for pose in true])
-        return np.asarray(np.linalg.norm(found.positions_m[:, :2] - due[:, :2], axis=1))
+        return _apart_m(found.positions_m, true, T_map_world)
+
+    def drifted_m(self, true: NDArray[np.float64], T_map_world: Planar) -> NDArray[np.float64]:
+        """Return the same of the poses (N,) as the atlas got them, without any loop."""
+        return _apart_m(np.array(self.reckoned), true, T_map_world)
 
     def of_kind(self, event: str) -> list[dict[str, Any]]:
         """Return the events of one kind."""
@@ -91,6 +96,13 @@ class Drive:
 
     def _note(self, event: str, stamp_ns: int, **fields: Any) -> None:
         self.events.append({"event": event, "stamp_ns": stamp_ns, **fields})
+
+
+def _apart_m(
+    positions: NDArray[np.float64], true: NDArray[np.float64], T_map_world: Planar
+) -> NDArray[np.float64]:
+    due = np.array([planar.compose(T_map_world, pose) for pose in true])
+    return np.asarray(np.linalg.norm(positions[:, :2] - due[:, :2], axis=1))
 
 
 def map_of(true: NDArray[np.float64]) -> Planar:

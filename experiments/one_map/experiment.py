@@ -216,7 +216,7 @@ class OneMapExperiment:
                     World(walls, rng, Scanner()), true, odometry=odometry, sessions=4
                 )
                 off_m = drive.errors_m(true, map_of(true))
-                drifted_m = drive.errors_m(true, map_of(true), is_online=True)
+                drifted_m = drive.drifted_m(true, map_of(true))
                 loops += len(drive.of_kind("loop"))
                 wrong += bool(off_m.max() > drifted_m.max() + _WRONG_M)
             self._rows.append([f"{name}: loops over {len(self._seeds)} drives", loops])
@@ -252,7 +252,7 @@ class OneMapExperiment:
                 World(flat(), rng, Scanner()), true, odometry=odometry, sessions=4 * self._laps
             )
             with_m = _rmse_m(drive.errors_m(true, map_of(true)))
-            without_m = _rmse_m(drive.errors_m(true, map_of(true), is_online=True))
+            without_m = _rmse_m(drive.drifted_m(true, map_of(true)))
             ratios.append(with_m / without_m)
             self._rows.append([f"laps, seed {seed}: RMSE without loops [m]", without_m])
             self._rows.append([f"laps, seed {seed}: RMSE with loops [m]", with_m])

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from heapq import heappop, heappush
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,6 @@ _UPRIGHT_RAD = 0.01  # half a degree: of gyro and gravity, and as floors are une
 _ROUNDS = 10  # in which the loops that fit worst are left out
 _STEPS, _GAIN_RATIO = 20, 1e-3  # of a solution while the run goes on: its cost falls no further
 _VAIN = 50  # starts in a row without a larger clique
-_LEVER_M = 2.5  # at this distance a turn moves walls: it makes deviations of turns comparable
 LOADED = -1  # node of a loaded map
 
 
@@ -205,32 +203,6 @@ def marginals(
     solved.update(graph, values)
     back = np.ix_(TO_GTSAM, TO_GTSAM)
     return {node: solved.marginalCovariance(node)[back] for node in nodes}
-
-
-def deviations_to(node: int, edges: Sequence[Edge]) -> NDArray[np.float64]:
-    """Return the standard deviations (N, 3) [m, m, rad] of the motions from all nodes to one.
-
-    They add up along the most certain path (Dijkstra), as drift is systematic. Node N - 1 is the
-    newest of all; without a path they are infinite.
-    """
-    links: list[list[tuple[int, list[float]]]]
-    links = [[] for _ in range(1 + max([node, *(edge.second for edge in edges)]))]
-    for edge in edges:
-        step = np.sqrt(np.diag(planar.planar_covariance(edge.covariance))).tolist()
-        links[edge.first].append((edge.second, step))
-        links[edge.second].append((edge.first, step))
-    summed = np.full((len(links), 3), np.inf)
-    waiting = [(0.0, node, 0.0, 0.0, 0.0)]
-    while waiting:
-        far, here, *deviation = heappop(waiting)
-        if np.isfinite(summed[here, 0]):
-            continue
-        summed[here] = deviation
-        x_m, y_m, yaw_rad = deviation
-        for there, (dx_m, dy_m, turn_rad) in links[here]:
-            length = far + dx_m + dy_m + _LEVER_M * turn_rad
-            heappush(waiting, (length, there, x_m + dx_m, y_m + dy_m, yaw_rad + turn_rad))
-    return summed
 
 
 class Agreement:

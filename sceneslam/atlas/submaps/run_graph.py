@@ -16,7 +16,6 @@ from sceneslam.atlas.submaps.graph import (
     Solved,
     Upright,
     consistent,
-    deviations_to,
     fits,
     settle,
     solve,
@@ -154,23 +153,23 @@ class RunGraph:
         self._T_map_node = np.array(nodes).reshape(-1, 4, 4)
 
     def _search(self, chain: Chain, *, is_level: bool) -> None:
-        """Look for loops to the submaps that were not searched yet; plans show a level floor."""
-        nodes, submaps = self._T_map_node, chain.submaps
+        """Look for loops to the submaps that were not searched yet; plans show a level floor.
+
+        Around where the motions alone lead: near a solution with a wrong loop, others that agree
+        with it would be found, and not the right ones.
+        """
+        nodes, drift, submaps = np.array(chain.T_run_node), np.array(chain.drift), chain.submaps
         plane, loops = planar.from_transforms(nodes), list[Edge]()
         for second in range(self._seen, len(chain)):
-            loops += self._views.loops_to(second, submaps, nodes, self._deviations(second, chain))
+            sigma = np.abs(drift - drift[second])
+            loops += self._views.loops_to(second, submaps, nodes, sigma)
             views = self._views.keep(second, submaps[second], nodes[second])
             submaps[second] = replace(submaps[second], views=views)
         for second in range(self._planned, len(chain) if is_level else 0):
-            loops += self._plans.loops_to(second, submaps, plane, self._deviations(second, chain))
+            loops += self._plans.loops_to(second, submaps, plane, np.abs(drift - drift[second]))
         self._seen, self._planned = len(chain), len(chain) if is_level else self._planned
         if loops:
-            self._found.add(loops, np.array(chain.T_run_node), np.array(chain.drift))
-
-    def _deviations(self, second: int, chain: Chain) -> NDArray[np.float64]:
-        """Return the deviations (N, 3) of the motions from all earlier submaps to one."""
-        known = [edge for edge in self._accepted if edge.second <= second]
-        return deviations_to(second, [*chain.motions[:second], *known])
+            self._found.add(loops, nodes, drift)
 
     def _may_close(self, first: int, second: int, submaps: Sequence[Submap]) -> bool:
         """Tell whether a loop may lead from a submap to a later one: not within closed sessions."""
