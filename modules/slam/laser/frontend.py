@@ -22,7 +22,6 @@ from sceneslam.types.planar import (
     turn,
 )
 
-from .doubt import Doubt
 from .field import LikelihoodField
 from .keyframes import ScanKeyframe, ScanKeyframes
 from .matcher import Match, Matcher, novelty
@@ -77,7 +76,6 @@ class FrontEnd:
     _fit_ns: int | None = field(default=None, init=False)  # scans fitted as usual until then
     _failures: int = field(default=0, init=False)
     _field: LikelihoodField | None = field(default=None, init=False)
-    _doubt: Doubt = field(default_factory=Doubt, init=False)
 
     def track(self, observation: Observation, scan: LaserScan | None) -> Estimate:
         """Return the pose at the observation, corrected by its scan if it has one."""
@@ -110,7 +108,6 @@ class FrontEnd:
         if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
         self._teach(match, T_then_now, motion)
-        self._doubt.add(match, priors)
         estimate = self._hold(observation, compose(match.T_local_base, T_then_now), match)
         if self.keyframes.is_due(match.T_local_base):
             self._extend(match.T_local_base, scan, surfaces)
@@ -179,7 +176,7 @@ class FrontEnd:
             self._seen_pose = match.T_local_base
         return Estimate(
             T_local_base=pose,
-            covariance=self._covariance + self._doubt.covariance,
+            covariance=self._covariance,
             status=TrackingStatus.DEGRADED if weak else TrackingStatus.TRACKING,
             quality_ratio=1.0 if match is None else match.inlier_ratio,
             inliers=0 if match is None else match.inliers,
@@ -217,7 +214,7 @@ class FrontEnd:
         self._pose = predicted
         return Estimate(
             T_local_base=predicted,
-            covariance=self._covariance + self._doubt.covariance,
+            covariance=self._covariance,
             status=status,
             quality_ratio=0.0,
             inliers=0,
