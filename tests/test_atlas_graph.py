@@ -42,8 +42,8 @@ class Given:
         monkeypatch.setattr(run_graph, "PlanLoops", lambda may_close: self)
         monkeypatch.setattr(run_graph, "consistent", self._consistent)
 
-    def loops_to(self, second, submaps, plane, sigma):
-        return [edge for edge in self.found if edge.second == second]
+    def loops_to(self, query):
+        return [edge for edge in self.found if edge.second == query.second]
 
     def _consistent(self, loops, nodes, drift):
         self.measured, self.nodes, self.drift = loops, nodes, drift
@@ -200,14 +200,14 @@ class Searched(Given):
     name = "PlanLoops"
 
     def __init__(self, monkeypatch, found):
-        self.found, self.asked, self.sigma, self.kept, self.solved = found, [], {}, [], 0
+        self.found, self.asked, self.queries, self.kept, self.solved = found, [], {}, [], 0
         monkeypatch.setattr(run_graph, self.name, lambda may_close: self)
         monkeypatch.setattr(run_graph, "settle", self._settle)
 
-    def loops_to(self, second, submaps, nodes, sigma):
-        self.asked.append(second)
-        self.nodes, self.sigma[second] = nodes, sigma
-        return super().loops_to(second, submaps, nodes, sigma)
+    def loops_to(self, query):
+        self.asked.append(query.second)
+        self.queries[query.second] = query
+        return super().loops_to(query)
 
     def forget(self, count):
         self.kept.append(count)
@@ -222,8 +222,8 @@ class Viewed(Searched):
 
     name = "ViewLoops"
 
-    def keep(self, second, submap, T_map_node):
-        return submap.views
+    def loops_to(self, query):
+        return super().loops_to(query), query.submap.views
 
 
 def off(first, second, aside_m=0.02):
@@ -262,11 +262,12 @@ def test_plans_are_compared_once_the_base_is_level_and_views_on_any(monkeypatch)
     assert plans.asked == [] and views.asked == list(range(7))
     assert len(graph.extend(own.chain, is_level=True).loops) == 2
     assert plans.asked == views.asked == list(range(8))
-    np.testing.assert_allclose(views.nodes, own.chain.T_run_node, atol=1e-12)
-    np.testing.assert_allclose(plans.nodes, planar.from_transforms(views.nodes))
+    last = views.queries[7]
+    np.testing.assert_allclose(last.T_run_node, own.chain.T_run_node, atol=1e-12)
+    np.testing.assert_allclose(plans.queries[7].plane, planar.from_transforms(last.T_run_node))
     for second in range(8):
-        count = len(views.sigma[second])  # plans are searched when there are more submaps
-        np.testing.assert_array_equal(plans.sigma[second][:count], views.sigma[second])
+        drift = views.queries[second].drift  # plans are searched when there are more submaps
+        np.testing.assert_array_equal(plans.queries[second].drift[: len(drift)], drift)
 
 
 def test_views_close_loops_on_a_base_that_is_never_level(monkeypatch):
@@ -295,11 +296,10 @@ def test_after_a_loop_places_are_searched_around_where_motions_alone_lead(monkey
     for count in (7, 9):
         found = graph.extend(grown(own, count), is_level=True)
     assert len(found.loops) == 2
-    drift = np.array(own.chain.drift)
     for second in (5, 8):
-        count = len(searched.sigma[second])
-        np.testing.assert_array_equal(searched.sigma[second], np.abs(drift - drift[second])[:count])
-    np.testing.assert_array_equal(searched.nodes[8], planar.from_transform(own.chain.T_run_node[8]))
+        query = searched.queries[second]
+        np.testing.assert_array_equal(query.drift, own.chain.drift[: len(query.drift)])
+    np.testing.assert_array_equal(query.plane[8], planar.from_transform(own.chain.T_run_node[8]))
 
 
 def test_forgotten_submaps_take_their_loops_with_them_and_are_searched_again(monkeypatch):

@@ -7,11 +7,13 @@ from test_atlas_places import CELL, plan_of, quality
 from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.submaps import plan_loops
+from sceneslam.atlas.submaps.chain import Chain
+from sceneslam.atlas.submaps.loop_query import LoopQuery
 from sceneslam.atlas.submaps.plan_loops import PlanLoops
 from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.graphs.edge import EdgeKind
-from sceneslam.types import planar
+from sceneslam.types import planar, se3
 
 WALL = plan_of("##")
 EMPTY = join([])
@@ -58,9 +60,14 @@ def loops_to(second, sessions, nodes, sigma, *, closed=(), plans=None, runs=None
     """Find loops between submaps at nodes, with drift of `sigma` (3,) from one to the next."""
     plans, runs = plans or [WALL] * len(sessions), runs or [0] * len(sessions)
     submaps = [submap(*one) for one in zip(sessions, plans, runs, strict=True)]
-    steps = np.abs(second - np.arange(len(sessions)))[:, None]
-    sigma = steps * np.array(sigma)
-    return finder_of(closed).loops_to(second, submaps, np.array(nodes, float), sigma)
+    drift = np.arange(len(sessions))[:, None] * np.array(sigma)
+    return finder_of(closed).loops_to(query_of(second, submaps, nodes, drift))
+
+
+def query_of(second, submaps, nodes, drift):
+    """The query for a submap, at nodes (x, y, yaw) with drift (N, 3) up to each."""
+    T_run_node = [se3.from_xy_yaw(*node) for node in nodes]
+    return LoopQuery.of(Chain(submaps=submaps, T_run_node=T_run_node, drift=list(drift)), second)
 
 
 def line(*x_m):
@@ -165,13 +172,12 @@ def test_a_target_is_made_once_for_all_that_are_compared_with_it(monkeypatch):
     compared = Compared(monkeypatch)
     sessions = [0] * 4 + [1] * 16
     submaps = [submap(session) for session in sessions]
-    finder = finder_of([1])
-    sigma, nodes = np.full((20, 3), 0.1), np.zeros((20, 3))
+    finder, drift = finder_of([1]), 0.1 * np.outer(sessions, np.ones(3))
     for second in range(6, 20):
-        assert len(finder.loops_to(second, submaps, nodes, sigma)) == 2
+        assert len(finder.loops_to(query_of(second, submaps, np.zeros((20, 3)), drift))) == 2
     assert len(compared.targets) == 2
     for count, made in ((6, 0), (5, 1), (2, 2)):  # of 0 to 2, and of 1 to 5
         compared.targets.clear()
         finder.forget(count)
-        assert len(finder.loops_to(19, submaps, nodes, sigma)) == 2
+        assert len(finder.loops_to(query_of(19, submaps, np.zeros((20, 3)), drift))) == 2
         assert len(compared.targets) == made

@@ -8,13 +8,15 @@ from test_atlas_maps import WALL, map_of
 from test_view_merge import seen_from
 from test_views import place
 
+from sceneslam.atlas.submaps.chain import Chain
+from sceneslam.atlas.submaps.loop_query import LoopQuery
 from sceneslam.atlas.submaps.view_loops import ViewLoops
 from sceneslam.types import se3
 from sceneslam.views.landmark_registration import register
 from sceneslam.views.view import PlacedView
 
 ASIDE = se3.from_xy_yaw(0.4, -0.2, 0.5)  # of the second view, in the place of the first
-ANY = 2.0 * np.ones((2, 3))  # deviations: the second submap may lie anywhere near
+ANY = 2.0 * np.ones(3)  # deviations: the second submap may lie anywhere near
 
 
 def viewed(submap, *views):
@@ -37,12 +39,18 @@ def always(first, second, submaps):
     return True
 
 
+def query_of(second, submaps, nodes, sigma):
+    """The query for a submap, with deviations `sigma` (3,) of the motion from any other to it."""
+    drift = [sigma * (index == second) for index in range(len(submaps))]
+    return LoopQuery.of(Chain(submaps=submaps, T_run_node=list(nodes), drift=drift), second)
+
+
 def added(finder, submaps, nodes, sigma):
     """Return the loops to each submap in turn, and which of its views are kept."""
     loops, kept = [], []
     for second, submap in enumerate(submaps):
-        loops.append(finder.loops_to(second, submaps, np.array(nodes), sigma))
-        views = finder.keep(second, submap, nodes[second])
+        found, views = finder.loops_to(query_of(second, submaps, nodes, sigma))
+        loops.append(found)
         kept.append([view in views for view in submap.views])
     return loops, kept
 
@@ -80,15 +88,15 @@ def test_another_place_is_no_loop():
 
 def test_a_place_farther_away_than_drift_explains_is_no_loop():
     away = se3.from_xy_yaw(3.0, 0.0, 0.0)
-    small = np.full((2, 3), [0.3, 0.3, 0.01])
+    small = np.array([0.3, 0.3, 0.01])
     assert loops_in(two(), [se3.identity(), away], small) == []
     assert len(loops_in(two(), [se3.identity(), away])) == 1
 
 
 def test_what_drift_cannot_improve_is_not_compared():
-    little = np.full((2, 3), [0.019, 0.019, 0.0])
+    little = np.array([0.019, 0.019, 0.0])
     assert loops_in(two(), [se3.identity(), ASIDE], little) == []
-    enough = np.full((2, 3), [0.021, 0.021, 0.0])
+    enough = np.array([0.021, 0.021, 0.0])
     assert len(loops_in(two(), [se3.identity(), ASIDE], enough)) == 1
 
 
@@ -105,9 +113,9 @@ def test_submaps_that_may_not_be_connected_are_not():
 
 def test_two_places_that_look_alike_give_no_loop():
     submaps = [*two(), two()[1]]
-    nodes = np.array([se3.identity(), se3.from_xy_yaw(3.0, 0.0, 0.0) @ ASIDE, ASIDE])
+    nodes = [se3.identity(), se3.from_xy_yaw(3.0, 0.0, 0.0) @ ASIDE, ASIDE]
     finder = ViewLoops(lambda first, second, submaps: second == 2)
-    loops, kept = added(finder, submaps, nodes, 2.0 * np.ones((3, 3)))
+    loops, kept = added(finder, submaps, nodes, ANY)
     assert loops == [[], [], []] and kept == [[True]] * 3
 
 
@@ -123,12 +131,12 @@ def test_of_several_views_of_one_submap_the_best_gives_the_loop():
 
 def test_forgotten_submaps_are_not_seen_again_until_they_come_back():
     finder, submaps = ViewLoops(always), two()
-    nodes = np.array([se3.identity(), ASIDE])
+    nodes = [se3.identity(), ASIDE]
     added(finder, submaps, nodes, ANY)
     finder.forget(1)
-    assert len(finder.loops_to(1, submaps, nodes, ANY)) == 1
+    assert len(finder.loops_to(query_of(1, submaps, nodes, ANY))[0]) == 1
     finder.forget(0)
-    assert finder.loops_to(0, submaps, nodes, ANY) == []
+    assert finder.loops_to(query_of(0, submaps, nodes, ANY))[0] == []
 
 
 @pytest.mark.parametrize(("aside_m", "is_kept"), [(0.45, False), (0.55, True)])
@@ -137,7 +145,7 @@ def test_a_view_that_shows_what_a_known_one_shows_is_not_kept(aside_m, is_kept):
     submaps = two(T_second_view=se3.inverse(ASIDE) @ ahead)
     for nodes, sigma in (
         ([se3.identity(), se3.from_xy_yaw(1.5, 0.0, 0.0) @ ASIDE], ANY),  # it is recognized
-        ([se3.identity(), ASIDE], np.zeros((2, 3))),  # it is known where it is
+        ([se3.identity(), ASIDE], np.zeros(3)),  # it is known where it is
     ):
         _, kept = added(ViewLoops(always), submaps, nodes, sigma)
         assert kept == [[True], [is_kept]]

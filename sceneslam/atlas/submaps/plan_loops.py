@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
 import numpy as np
-from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import FloorPlan, join
 from sceneslam.atlas.places.plan_field import PlanField
-from sceneslam.atlas.places.plan_search import SearchWindow
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.submaps.graph import on_floor
-from sceneslam.atlas.submaps.submap import Submap
+from sceneslam.atlas.submaps.loop_query import GAIN_MIN_M, NEIGHBOURS, TARGETS, LoopQuery, MayClose
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar
 from sceneslam.types.planar import Planar
 
-SIGMAS = 3.0  # of the drift: search range around the graph's estimate
-GAIN_MIN_M = SIGMAS * 0.02  # a smaller range: recognition cannot improve on so little drift
 _HALF_MAX_M = 15.0  # largest search range
-NEIGHBOURS = 2  # neighbouring submaps on either side in a target
-TARGETS = 3  # per submap: three loops to different places outvote a wrong one
 _KNOWN_MIN = 0.35  # share of a submap's walls, as two submaps may overlap partly
 _CACHED = 8  # targets
-
-# Tells whether a loop may lead from a submap to a later one.
-MayClose = Callable[[int, int, Sequence[Submap]], bool]
 
 
 class PlanLoops:
@@ -40,25 +29,13 @@ class PlanLoops:
         """Forget all submaps but the first `count`."""
         self._targets = {ends: one for ends, one in self._targets.items() if ends[1] <= count}
 
-    def loops_to(
-        self,
-        second: int,
-        submaps: Sequence[Submap],
-        T_map_node: NDArray[np.float64],
-        sigma: NDArray[np.float64],
-    ) -> list[Edge]:
-        """Return the verified loops from earlier submaps to one, near the graph's estimate.
-
-        `T_map_node` (N, 3) are the estimated nodes [m, m, rad], `sigma` (N, 3) the standard
-        deviations [m, m, rad] of the motion from each of them to this one.
-        """
-        query: PlanField | None = None
+    def loops_to(self, query: LoopQuery) -> list[Edge]:
+        """Return the verified loops to a submap, around where the motions alone lead."""
+        field: PlanField | None = None
         found = []
-        for first in self._candidates(second, submaps, T_map_node, sigma):
-            query = query or PlanField(submaps[second].plan)
-            window = _window(T_map_node[first], T_map_node[second], sigma[first])
-            target = self._target(first, second, submaps, T_map_node)
-            match = target.recognize(query, window, known_min=_KNOWN_MIN)
+        for first in self._candidates(query):
+            field, window = field or PlanField(query.submap.plan), query.window(first)
+            match = self._target(first, query).recognize(field, window, known_min=_KNOWN_MIN)
             if match is None:
                 continue
             off = planar.between(window.around, match.T_target_query)
@@ -67,7 +44,7 @@ class PlanLoops:
             found.append(
                 Edge(
                     first=first,
-                    second=second,
+                    second=query.second,
                     T_first_second=planar.to_transform(match.T_target_query),
                     covariance=on_floor(match.covariance),
                     kind=EdgeKind.LOOP,
@@ -75,25 +52,19 @@ class PlanLoops:
             )
         return found
 
-    def _candidates(
-        self,
-        second: int,
-        submaps: Sequence[Submap],
-        T_map_node: NDArray[np.float64],
-        sigma: NDArray[np.float64],
-    ) -> list[int]:
+    def _candidates(self, query: LoopQuery) -> list[int]:
         """Return the nearest submaps that may overlap; no two of them are neighbours."""
         near: list[tuple[float, int]] = []
-        if not len(submaps[second].plan):
+        second, submaps, plan = query.second, query.submaps, query.submap.plan
+        if not len(plan):
             return []
         for first in range(second - 1):
             if not (self._may_close(first, second, submaps) and len(submaps[first].plan)):
                 continue
-            window = _window(T_map_node[first], T_map_node[second], sigma[first])
+            window = query.window(first)
             if not GAIN_MIN_M <= window.half_m <= _HALF_MAX_M:
                 continue
-            gap_m = _gap_m(submaps[first].plan, submaps[second].plan, window.around)
-            if gap_m <= window.half_m:
+            if _gap_m(submaps[first].plan, plan, window.around) <= window.half_m:
                 near.append((float(np.hypot(*window.around[:2])), first))
         chosen: list[int] = []
         for _, first in sorted(near):
@@ -101,41 +72,20 @@ class PlanLoops:
                 chosen.append(first)
         return chosen
 
-    def _target(
-        self,
-        first: int,
-        second: int,
-        submaps: Sequence[Submap],
-        T_map_node: NDArray[np.float64],
-    ) -> Recognizer:
-        """Return a recognizer for the plan around `first`, of its session, older than `second`."""
-        end = min(first + NEIGHBOURS + 1, second)
+    def _target(self, first: int, query: LoopQuery) -> Recognizer:
+        """Return a recognizer for the plan around `first`, of its session, older than the query."""
+        end = min(first + NEIGHBOURS + 1, query.second)
         if (first, end) not in self._targets:
             while len(self._targets) >= _CACHED:
                 del self._targets[next(iter(self._targets))]
-            own = submaps[first]
-            around = range(max(first - NEIGHBOURS, 0), end)
+            own, start = query.submaps[first], max(first - NEIGHBOURS, 0)
             placed = [
-                (planar.between(T_map_node[first], T_map_node[index]), submaps[index].plan)
-                for index in around
-                if (submaps[index].run, submaps[index].session) == (own.run, own.session)
+                (planar.between(query.plane[first], query.plane[index]), one.plan)
+                for index, one in enumerate(query.submaps[start:end], start)
+                if (one.run, one.session) == (own.run, own.session)
             ]
             self._targets[first, end] = Recognizer(PlanField(join(placed)))
         return self._targets[first, end]
-
-
-def window_m(T_map_first: Planar, T_map_second: Planar, sigma: NDArray[np.float64]) -> float:
-    """Return how far [m] a motion with deviations `sigma` (3,) may be off."""
-    lever_m = 0.5 * np.hypot(*(T_map_second - T_map_first)[:2])
-    return SIGMAS * float(max(sigma[0], sigma[1]) + lever_m * sigma[2])
-
-
-def _window(T_map_first: Planar, T_map_second: Planar, sigma: NDArray[np.float64]) -> SearchWindow:
-    return SearchWindow(
-        around=planar.between(T_map_first, T_map_second),
-        half_m=window_m(T_map_first, T_map_second, sigma),
-        half_rad=SIGMAS * float(sigma[2]),
-    )
 
 
 def _gap_m(first: FloorPlan, second: FloorPlan, T_first_second: Planar) -> float:

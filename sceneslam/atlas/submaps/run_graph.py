@@ -20,13 +20,14 @@ from sceneslam.atlas.submaps.graph import (
     settle,
     solve,
 )
+from sceneslam.atlas.submaps.loop_query import NEIGHBOURS, LoopQuery
 from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops
-from sceneslam.atlas.submaps.plan_loops import NEIGHBOURS, PlanLoops
+from sceneslam.atlas.submaps.plan_loops import PlanLoops
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.atlas.submaps.view_loops import ViewLoops
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.motion.tilt import upright
-from sceneslam.types import planar, se3
+from sceneslam.types import se3
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.se3 import Transform
 
@@ -153,23 +154,17 @@ class RunGraph:
         self._T_map_node = np.array(nodes).reshape(-1, 4, 4)
 
     def _search(self, chain: Chain, *, is_level: bool) -> None:
-        """Look for loops to the submaps that were not searched yet; plans show a level floor.
-
-        Around where the motions alone lead: near a solution with a wrong loop, others that agree
-        with it would be found, and not the right ones.
-        """
-        nodes, drift, submaps = np.array(chain.T_run_node), np.array(chain.drift), chain.submaps
-        plane, loops = planar.from_transforms(nodes), list[Edge]()
+        """Look for loops to the submaps that were not searched yet; plans show a level floor."""
+        loops: list[Edge] = []
         for second in range(self._seen, len(chain)):
-            sigma = np.abs(drift - drift[second])
-            loops += self._views.loops_to(second, submaps, nodes, sigma)
-            views = self._views.keep(second, submaps[second], nodes[second])
-            submaps[second] = replace(submaps[second], views=views)
+            found, views = self._views.loops_to(LoopQuery.of(chain, second))
+            loops += found
+            chain.submaps[second] = replace(chain.submaps[second], views=views)
         for second in range(self._planned, len(chain) if is_level else 0):
-            loops += self._plans.loops_to(second, submaps, plane, np.abs(drift - drift[second]))
+            loops += self._plans.loops_to(LoopQuery.of(chain, second))
         self._seen, self._planned = len(chain), len(chain) if is_level else self._planned
         if loops:
-            self._found.add(loops, nodes, drift)
+            self._found.add(loops, np.array(chain.T_run_node), np.array(chain.drift))
 
     def _may_close(self, first: int, second: int, submaps: Sequence[Submap]) -> bool:
         """Tell whether a loop may lead from a submap to a later one: not within closed sessions."""

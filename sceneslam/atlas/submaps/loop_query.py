@@ -1,0 +1,64 @@
+"""Where loops to a submap are searched: around where the motions alone lead, by summed drift."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.atlas.places.plan_search import SearchWindow
+from sceneslam.atlas.submaps.chain import Chain
+from sceneslam.atlas.submaps.submap import Submap
+from sceneslam.types import planar
+
+SIGMAS = 3.0  # of the drift: search range
+GAIN_MIN_M = SIGMAS * 0.02  # a smaller range: recognition cannot improve on so little drift
+NEIGHBOURS = 2  # neighbouring submaps on either side in a target
+TARGETS = 3  # per submap: three loops to different places outvote a wrong one
+
+# Tells whether a loop may lead from a submap to a later one.
+MayClose = Callable[[int, int, Sequence[Submap]], bool]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopQuery:
+    """A submap of a run, and where the motions alone lead.
+
+    Around a solution with a wrong loop, others that agree with it would be found, and not the right
+    ones.
+    """
+
+    second: int  # index of the submap
+    submaps: Sequence[Submap]
+    T_run_node: NDArray[np.float64]  # (N, 4, 4)
+    plane: NDArray[np.float64]  # (N, 3), the nodes in the plane [m, m, rad]
+    drift: NDArray[np.float64]  # (N, 3), deviations [m, m, rad], summed up along the path
+
+    @classmethod
+    def of(cls, chain: Chain, second: int) -> LoopQuery:
+        """Return the query for a submap of a chain."""
+        return cls(
+            second=second,
+            submaps=chain.submaps,
+            T_run_node=np.array(chain.T_run_node),
+            plane=planar.from_transforms(chain.T_run_node),
+            drift=np.array(chain.drift),
+        )
+
+    @property
+    def submap(self) -> Submap:
+        """Return the submap to which loops are searched."""
+        return self.submaps[self.second]
+
+    def window(self, first: int) -> SearchWindow:
+        """Return where the submap may lie in the frame of an earlier one."""
+        T_run_first, T_run_second = self.plane[first], self.plane[self.second]
+        x_m, y_m, yaw_rad = np.abs(self.drift[first] - self.drift[self.second])
+        lever_m = 0.5 * np.hypot(*(T_run_second - T_run_first)[:2])
+        return SearchWindow(
+            around=planar.between(T_run_first, T_run_second),
+            half_m=SIGMAS * float(max(x_m, y_m) + lever_m * yaw_rad),
+            half_rad=SIGMAS * float(yaw_rad),
+        )
