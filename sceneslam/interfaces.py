@@ -221,6 +221,11 @@ class ClosesLoops(Protocol):
         ...
 
 
+def closes_own_loops(module: object) -> bool:
+    """Tell whether a module closes loops itself."""
+    return isinstance(module, ClosesLoops) and module.closes_loops
+
+
 @runtime_checkable
 class PipelinedSlam(Protocol):
     """A SLAM system whose poses come later than their observations.

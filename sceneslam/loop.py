@@ -24,7 +24,7 @@ from sceneslam.engine.open_sinks import OpenSinks
 from sceneslam.engine.slowest import Stopwatch
 from sceneslam.engine.steering import Operator, SteeredDetector
 from sceneslam.executors import executor
-from sceneslam.interfaces import ClosesLoops, Live, LiveFeed, SlamModule
+from sceneslam.interfaces import Live, LiveFeed, closes_own_loops
 from sceneslam.keeping import Keeping
 from sceneslam.moments import Moments
 from sceneslam.results import Results
@@ -81,7 +81,7 @@ class RunLoop:
             catch_up_steps=parts.run.catch_up_steps,
             is_live=is_live,
         )
-        closing = [key for key, module in parts.modules.items() if _closes_loops(module)]
+        closing = [key for key, module in parts.modules.items() if closes_own_loops(module)]
         is_one = len(closing) == len(parts.modules) == 1  # it recognizes its places itself
         parts.atlas.open(
             parts.rig, self._log.add, closing=closing, is_looking=not is_one, is_live=is_live
@@ -332,7 +332,3 @@ class RunLoop:
         said = f"no pose: module {names} was lost from the first observation on"
         said = f"{said}; {self._tally.words()}"
         return f"{said}. Most likely: {'; '.join(self._warnings)}" if self._warnings else said
-
-
-def _closes_loops(module: SlamModule) -> bool:
-    return isinstance(module, ClosesLoops) and module.closes_loops

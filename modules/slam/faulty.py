@@ -12,7 +12,7 @@ from time import sleep
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.interfaces import ClosesLoops, SlamModule
+from sceneslam.interfaces import SlamModule, closes_own_loops
 from sceneslam.types import se3
 from sceneslam.types.fault_plan import FaultPlan
 from sceneslam.types.maps import MapLayers
@@ -62,7 +62,7 @@ class FaultyModule:
     @property
     def closes_loops(self) -> bool:
         """Tell whether the module closes loops itself."""
-        return isinstance(self._module, ClosesLoops) and self._module.closes_loops
+        return closes_own_loops(self._module)
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:

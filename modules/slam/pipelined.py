@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sceneslam.interfaces import ClosesLoops, PipelinedSlam
+from sceneslam.interfaces import PipelinedSlam, closes_own_loops
 from sceneslam.motion.late import Pipeline
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
@@ -30,7 +30,7 @@ class Pipelined:
     @property
     def closes_loops(self) -> bool:
         """Tell whether the system closes loops itself."""
-        return isinstance(self._system, ClosesLoops) and self._system.closes_loops
+        return closes_own_loops(self._system)
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:

@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
-from sceneslam.interfaces import ClosesLoops
+from sceneslam.interfaces import closes_own_loops
 from sceneslam.supervision.messages import LogLine, Reply, Request
 from sceneslam.supervision.transport import Channel
 from sceneslam.types.errors import ModuleError
@@ -46,8 +46,7 @@ class Worker:
         limit_bytes = memory_limit_mb << 20
         resource.setrlimit(resource.RLIMIT_DATA, (limit_bytes, limit_bytes))
         self._module = make()
-        module = self._module
-        return module.requires, isinstance(module, ClosesLoops) and module.closes_loops
+        return self._module.requires, closes_own_loops(self._module)
 
     def _call(self, request: Request) -> Any:
         owner = self if request.method == "build" else self._module
