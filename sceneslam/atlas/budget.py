@@ -87,9 +87,9 @@ def _thin_scans(sessions: Sequence[OpenSession], most: float) -> None:
         for session in sessions:
             scans = session.layers.scans
             if scans is not None:
-                arrays = {each.name: getattr(scans, each.name) for each in fields(scans)}
-                arrays |= {name: value[::2] for name, value in arrays.items() if name != "cell_m"}
-                session.layers = replace(session.layers, scans=ScanLayer(**arrays))
+                names = [each.name for each in fields(scans) if each.name != "cell_m"]
+                halved = {name: getattr(scans, name)[::2] for name in names}
+                session.layers = replace(session.layers, scans=replace(scans, **halved))
 
 
 def _of(layers: MapLayers, rows: NDArray[np.intp], marks: NDArray[np.intp]) -> MapLayers:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -60,11 +60,9 @@ def scan_layer(
 def drawn(scans: ScanLayer, T_map_laser: NDArray[np.float64]) -> GridLayer:
     """Return the grid of scans at poses T_map_laser (K, 4, 4), in `map`."""
     grid = OccupancyGrid(scans.cell_m)
-    beams = np.arange(scans.ranges_m.shape[1])
-    for T, ranges_m, least, step in zip(
-        T_map_laser, scans.ranges_m, scans.angle_min_rad, scans.angle_step_rad, strict=True
-    ):
-        grid.add(T, ranges_m, least + step * beams, float(step))
+    beams = zip(scans.ranges_m, _angles_rad(scans), scans.angle_step_rad.tolist(), strict=True)
+    for T, seen in zip(T_map_laser, beams, strict=True):
+        grid.add(T, *seen)
     return grid.layer()
 
 
@@ -73,18 +71,23 @@ def walls(scans: ScanLayer, T_map_laser: NDArray[np.float64]) -> NDArray[np.floa
 
     Of those of one scan that lie in one cell, the first.
     """
-    beams, found = np.arange(scans.ranges_m.shape[1]), [np.zeros((0, 3), np.float32)]
-    for T, ranges_m, least, step in zip(
-        T_map_laser, scans.ranges_m, scans.angle_min_rad, scans.angle_step_rad, strict=True
-    ):
+    found = [np.zeros((0, 3), np.float32)]
+    for T, ranges_m, angles in zip(T_map_laser, scans.ranges_m, _angles_rad(scans), strict=True):
         hit = ranges_m > 0.0
-        angles, reach_m = (least + step * beams)[hit], ranges_m[hit].astype(np.float64)
-        x, y = reach_m * np.cos(angles), reach_m * np.sin(angles)
+        reach_m = ranges_m[hit].astype(np.float64)
+        x, y = reach_m * np.cos(angles[hit]), reach_m * np.sin(angles[hit])
         ends = se3.apply(T, np.column_stack([x, y, np.zeros_like(x)]))
         cells = np.floor(ends / scans.cell_m).astype(np.int64)
         _, first = np.unique(cells, axis=0, return_index=True)
         found.append(ends[np.sort(first)].astype(np.float32))
     return np.concatenate(found)
+
+
+def _angles_rad(scans: ScanLayer) -> Iterator[NDArray[np.float64]]:
+    """Yield the angles (B,) of each scan's beams."""
+    beams = np.arange(scans.ranges_m.shape[1])
+    for least, step in zip(scans.angle_min_rad, scans.angle_step_rad, strict=True):
+        yield least + step * beams
 
 
 class OccupancyGrid:
