@@ -238,15 +238,15 @@ class Solving:
 def test_the_newest_pose_is_corrected_by_loops_and_each_is_reported_once(monkeypatch):
     solving, drive = Solving(monkeypatch), Driving()
     drive.to(*range(4))
-    np.testing.assert_allclose(drive.own.correction().T_new_old, [at(0.0, 1.0)], atol=1e-12)
-    assert drive.own.correction() is None
+    np.testing.assert_allclose(drive.own.take_correction().T_new_old, [at(0.0, 1.0)], atol=1e-12)
+    assert drive.own.take_correction() is None
     drive.to(*range(4, 7))
     assert solving.lengths == [1, 2] and solving.threads == [threading.main_thread()] * 2
     assert [(event, ns // S) for event, ns, _ in drive.events] == [("loop", 0), ("loop", 3)]
     assert drive.events[1][2]["to_ns"] == 0 and not drive.events[1][2]["in_loaded_map"]
     solving.found = False
     drive.to(*range(7, 10))
-    after = drive.own.correction()  # its loops are not believed any more
+    after = drive.own.take_correction()  # its loops are not believed any more
     np.testing.assert_array_equal(after.T_new_old, [at()] * 3)
     assert (after.stamps_ns // S).tolist() == [0, 3, 6]
 
@@ -254,11 +254,11 @@ def test_the_newest_pose_is_corrected_by_loops_and_each_is_reported_once(monkeyp
 def test_a_rewind_that_takes_the_last_loops_takes_their_correction(monkeypatch):
     solving, drive = Solving(monkeypatch), Driving()
     drive.to(*range(7))
-    assert drive.own.correction() is not None
+    assert drive.own.take_correction() is not None
     solving.found = False
     drive.rewind(0)
     drive.to(7, 8, 9, session=1)
-    after = drive.own.correction()
+    after = drive.own.take_correction()
     np.testing.assert_array_equal(after.T_new_old, [at()] * len(after.stamps_ns))
 
 

@@ -101,7 +101,7 @@ class Atlas:
             return
         try:
             self._mapper.observe(observation, up_base)
-            correction = self._mapper.correction()
+            correction = self._mapper.take_correction()
             if correction is not None:
                 self.correct(correction.changes(self._correction or Correction.none()))
             self._lasting.keep(observation.stamp_ns, self._mapper)

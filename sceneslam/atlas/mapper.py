@@ -80,7 +80,7 @@ class Mapper:
         self._solving: tuple[Chain, Future[SolvedRun]] | None = None
         self._kept = 0  # submaps that are as they were given to the graph
         self._solved = SolvedRun.nothing()
-        self._is_news = False  # nodes were moved since `correction` was asked for
+        self._is_news = False  # nodes were moved since the correction was taken
         self._is_over = False
         self._told: set[tuple[int, int, int]] = set()  # loops, by their run and stamps
 
@@ -104,7 +104,7 @@ class Mapper:
         """Return T_map_run (4, 4) in the loaded map; the identity until the run was located."""
         return se3.identity() if self._T_map_run is None else self._T_map_run
 
-    def correction(self) -> Correction | None:
+    def take_correction(self) -> Correction | None:
         """Return the correction of the poses by loops or the loaded map, None if it is as before.
 
         That of the newest submap holds for the newest pose, too.
