@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -53,7 +53,7 @@ class Atlas:
         self._lasting = LastingMap(load=load, save=save, mode=mode, save_every_s=save_every_s)
         self._mapper: Mapper | None = None  # None while only poses are given
         self._note: Note | None = None
-        self._correction: Correction | None = None
+        self._correction = Correction.none()
         self._voxel_m = voxel_m
         self._sessions: list[OpenSession] = []
         self._closing: frozenset[str] = frozenset()  # modules that close loops themselves
@@ -103,7 +103,7 @@ class Atlas:
             self._mapper.observe(observation, up_base)
             correction = self._mapper.take_correction()
             if correction is not None:
-                self.correct(correction.changes(self._correction or Correction.none()))
+                self.correct(correction.changes(self._correction))
             self._lasting.keep(observation.stamp_ns, self._mapper)
         except Exception as error:  # poses continue without a map
             self._give_up(error)
@@ -112,7 +112,7 @@ class Atlas:
         """Correct the poses otherwise than before, at the nodes of a correction."""
         if self._journal is not None:
             self._journal.add_correction(changes.stamps_ns, changes.T_new_old)
-        self._correction = (self._correction or Correction.none()).updated(changes)
+        self._correction = self._correction.updated(changes)
 
     def finish(self) -> list[str]:
         """Close the loops between sessions and save the map; return one sentence per failure.
@@ -135,8 +135,7 @@ class Atlas:
         revised = self._revise().T_map_base
         at = partial(self._revised_at, revised)
         layers = [session.layers for session in self._sessions]
-        before, self._correction = self._correction, self._mapper.finish(at, layers)
-        self._record(before, self._correction)
+        self._end_with(self._mapper.finish(at, layers))
         self._lasting.finish(self._mapper, self._path.stamps_ns[-1], self._note)
 
     def _give_up(self, error: Exception) -> None:
@@ -144,16 +143,16 @@ class Atlas:
         _log.info("submaps", exc_info=error)
         if self._mapper is not None:
             self._mapper.close()
-        self._record(self._correction, Correction.none())
-        self._mapper, self._correction = None, None
+        self._end_with(Correction.none())
+        self._mapper = None
         self._lasting.faults.append(f"the run goes on without submaps and loops: {text_of(error)}")
 
-    def _record(self, before: Correction | None, final: Correction) -> None:
-        """Write the final correction to the journal; where it has no node, poses stay as given."""
+    def _end_with(self, final: Correction) -> None:
+        """Take the final correction; in the journal, poses where it has no node stay as given."""
+        before, self._correction = self._correction, final
         if self._journal is None:
             return
-        known_ns = final.stamps_ns[:0] if before is None else before.stamps_ns
-        gone_ns = np.setdiff1d(known_ns, final.stamps_ns)
+        gone_ns = np.setdiff1d(before.stamps_ns, final.stamps_ns)
         stays = Correction(stamps_ns=gone_ns, T_new_old=np.tile(np.eye(4), (len(gone_ns), 1, 1)))
         whole = stays.updated(final)
         self._journal.add_correction(whole.stamps_ns, whole.T_new_old)
@@ -194,8 +193,7 @@ class Atlas:
         if self._journal is not None:
             self._journal.add_rewind(stamp_ns)
         self._path.cut(stamp_ns)
-        if self._correction is not None:
-            self._correction = self._correction.cut(stamp_ns)
+        self._correction = self._correction.cut(stamp_ns)
         if self._mapper is not None:
             try:
                 self._mapper.rewind(stamp_ns)
@@ -244,9 +242,7 @@ class Atlas:
         if not self._path.stamps_ns:
             return Trajectory.empty()
         stamps_ns = np.array(self._path.stamps_ns, np.int64)
-        poses = self._revise().T_map_base
-        if self._correction is not None:
-            poses = self._correction.apply(stamps_ns, poses)
+        poses = self._correction.apply(stamps_ns, self._revise().T_map_base)
         return Trajectory(stamps_ns=stamps_ns, T_world_base=poses)
 
     def session_starts(self) -> list[SessionStart]:
@@ -282,7 +278,7 @@ class Atlas:
     @property
     def sessions(self) -> tuple[Session, ...]:
         """Return every session so far, as revised."""
-        placed = self._placed()
+        placed = self._placed(self._revise().T_map_local)
         return tuple(
             Session(
                 index=index,
@@ -307,7 +303,7 @@ class Atlas:
                 T_map_laser=self._scanned_at(session.layers, T_revised),
             )
             for session, T_map_local, T_revised in zip(
-                self._sessions, self._placed(), revised, strict=True
+                self._sessions, self._placed(revised), revised, strict=True
             )
         ]
         if self._mapper is None or not self._mapper.has_submaps:
@@ -319,17 +315,14 @@ class Atlas:
 
     def _in_map(self, T_run_base: Transform) -> Transform:
         """Return a pose as loops correct it, or in a loaded map if the run was located there."""
-        if self._correction is None or not len(self._correction.stamps_ns):
+        if not len(self._correction.stamps_ns):
             return T_run_base
         return np.asarray(self._correction.T_new_old[-1] @ T_run_base)
 
-    def _placed(self) -> list[Transform]:
+    def _placed(self, T_revised: Sequence[Transform]) -> list[Transform]:
         """Return T_map_local of every session, corrected as the middle one of its poses."""
-        placed = self._revise().T_map_local
-        if self._correction is None:
-            return placed
-        path = np.array(self._path.sessions, np.int64)
-        for session, T_map_local in enumerate(placed):
+        placed, path = list(T_revised), np.array(self._path.sessions, np.int64)
+        for session, T_map_local in enumerate(T_revised):
             rows = np.flatnonzero(path == session)
             if len(rows):
                 stamp_ns = np.array([self._path.stamps_ns[rows[len(rows) // 2]]], np.int64)
@@ -341,8 +334,6 @@ class Atlas:
         if layers.scans is None:
             return None
         T_map_laser = T_map_local @ layers.scans.T_world_laser
-        if self._correction is None:
-            return np.asarray(T_map_laser)
         return self._correction.apply(layers.scans.stamps_ns, T_map_laser)
 
     def _closes_loops(self, session: int) -> bool:
