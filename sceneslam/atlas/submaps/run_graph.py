@@ -140,8 +140,7 @@ class RunGraph:
         return [self._found.loops[index] for index in agreeing] if len(agreeing) > 1 else []
 
     def _is_used(self, loop: Edge) -> bool:
-        is_new = all(loop is not one for one in self._agreed)
-        return is_new or fits(loop, self._T_map_node)
+        return loop not in self._agreed or fits(loop, self._T_map_node)
 
     def _place(self, chain: Chain) -> None:
         """Place the new submaps by the motions to them."""
@@ -196,9 +195,7 @@ class RunGraph:
             [edge.covariance for edge in edges],
         )
         return replace(
-            start,
-            T_first_second=se3.inverse(nodes[start.first]) @ mean,
-            covariance=covariance,
+            start, T_first_second=se3.inverse(nodes[start.first]) @ mean, covariance=covariance
         )
 
     def _fix_edge(self, fix: Fix, node: int, T_base_node: Transform) -> Edge:
