@@ -25,7 +25,7 @@ class Correction:
         return cls(stamps_ns=np.zeros(0, np.int64), T_new_old=np.zeros((0, 4, 4)))
 
     def cut(self, stamp_ns: int) -> Correction:
-        """Return the correction at the nodes before a stamp, at the first one if there is none."""
+        """Return the correction at the nodes before a stamp; the first node always stays."""
         kept = max(int(np.searchsorted(self.stamps_ns, stamp_ns)), 1)
         return Correction(stamps_ns=self.stamps_ns[:kept], T_new_old=self.T_new_old[:kept])
 
