@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from planar_poses import transforms
 from test_atlas_limits import S, at, loop, pitched, run_of
 from test_atlas_maps import WALL, map_of
 
@@ -187,7 +188,7 @@ def test_headings_of_loops_agree_within_their_deviation(apart_m):
     for sign in (1.0, -1.0):
         for share in (0.999, 1.001):
             second = loop(1, 3, [10 + apart_m, 0, sign * share * bound])
-            both = consistent([second, loop(0, 2, [10, 0, 0])], planar.to_transforms(nodes), drift)
+            both = consistent([second, loop(0, 2, [10, 0, 0])], transforms(nodes), drift)
             assert (len(both) == 2) == (share < 1.0)
 
 
@@ -344,7 +345,7 @@ _NODES = 12
 def test_loops_that_are_compared_as_they_are_found_agree_as_all_at_once(seed, kept):
     rng = np.random.default_rng(seed)
     plane = np.cumsum(rng.normal(0.0, 1.0, (_NODES, 3)), axis=0)
-    nodes, drift = planar.to_transforms(plane), np.cumsum(rng.uniform(0, 0.05, (_NODES, 3)), axis=0)
+    nodes, drift = transforms(plane), np.cumsum(rng.uniform(0, 0.05, (_NODES, 3)), axis=0)
     loops = []
     for _ in range(10):
         first, second = sorted(rng.choice(_NODES, 2, replace=False).tolist())

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from planar_poses import transforms
 
 from sceneslam.atlas.fusion import Placed, fuse, one_per_voxel
 from sceneslam.atlas.lasting.merge import side_by_side
@@ -225,7 +226,7 @@ def agree(off_m, *, apart_m=0.0, drift=None):
     nodes = np.array([[0, 0, 0], [0, 0, 0], [10, 0, 0], [10 + apart_m, 0, 0]], float)
     drift = np.zeros((4, 3)) if drift is None else drift
     loops = [loop(0, 2, [10, 0, 0]), loop(1, 3, [10 + apart_m + off_m, 0, 0])]
-    return len(consistent(loops, planar.to_transforms(nodes), drift)) == 2
+    return len(consistent(loops, transforms(nodes), drift)) == 2
 
 
 def test_loops_agree_within_the_99th_percentile_of_their_uncertainty():
@@ -246,7 +247,7 @@ def test_loops_apart_agree_within_what_their_headings_and_the_path_allow():
 
 
 def test_the_largest_set_of_loops_that_agree_is_kept():
-    nodes = planar.to_transforms(np.zeros((12, 3)))
+    nodes = transforms(np.zeros((12, 3)))
     offs = [0.0, 5.0, 0.0, 5.0, 5.0, 9.0]
     loops = [loop(2 * i, 2 * i + 1, [off, 0, 0]) for i, off in enumerate(offs)]
     assert consistent(loops, nodes, np.zeros((12, 3))) == [1, 3, 4]
@@ -417,7 +418,7 @@ def test_motions_through_a_removed_submap_are_composed_with_their_uncertainty():
     ]
     saved = replace(
         a_map(),
-        T_map_node=planar.to_transforms(nodes),
+        T_map_node=transforms(nodes),
         edges=tuple(motions),
         pieces=np.array([1, 0, 0]),
     )

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from planar_poses import transforms
 from test_atlas_places import CELL, plan_of, quality, text_of
 
 from sceneslam.atlas.lasting import merge
@@ -35,7 +36,7 @@ def map_of(*plans, nodes=None, runs=None, pieces=None, edges=()):
             )
             for index, plan in enumerate(plans)
         ),
-        T_map_node=planar.to_transforms(np.zeros((count, 3)) if nodes is None else nodes),
+        T_map_node=transforms(np.zeros((count, 3)) if nodes is None else nodes),
         pieces=np.zeros(count, np.int64) if pieces is None else np.array(pieces),
         edges=tuple(edges),
     )

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from planar_poses import transforms
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.lasting.map_files import HEAD, load_map_files, save_map_files
@@ -128,13 +129,7 @@ def edge_of(first, second, T_first_second, sigma, kind=EdgeKind.LOOP):
 
 def solved(nodes, motions, loops):
     """The solution of a planar graph, and its poses in the plane."""
-    result = solve(
-        planar.to_transforms(nodes),
-        motions,
-        loops,
-        fixed=(),
-        loose=0,
-    )
+    result = solve(transforms(nodes), motions, loops, fixed=(), loose=0)
     return result, planar.from_transforms(result.T_map_node)
 
 
@@ -146,11 +141,7 @@ def test_loops_that_agree_are_believed_and_a_wrong_one_is_not():
     ]
     wrong = edge_of(2, 9, np.array([3.0, 1.0, 1.5]), 0.01)
     drift = np.cumsum(np.full((13, 3), 0.03), axis=0)
-    assert consistent([right[0], wrong, *right[1:]], planar.to_transforms(drifted), drift) == [
-        0,
-        2,
-        3,
-    ]
+    assert consistent([right[0], wrong, *right[1:]], transforms(drifted), drift) == [0, 2, 3]
     result, nodes = solved(drifted, motions, right)
     assert result.accepted == [0, 1, 2]
     assert np.abs(nodes[:, :2] - true[:, :2]).max() < 0.1

@@ -24,14 +24,7 @@ def from_transform(T_a_b: se3.Transform) -> Planar:
     return np.array([T_a_b[0, 3], T_a_b[1, 3], se3.yaw_rad(T_a_b)])
 
 
-def to_transforms(poses: Sequence[Planar] | NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the transforms (N, 4, 4) of planar ones (N, 3)."""
-    return np.array([to_transform(pose) for pose in poses]).reshape(-1, 4, 4)
-
-
-def from_transforms(
-    T_a_b: Sequence[se3.Transform] | NDArray[np.float64],
-) -> NDArray[np.float64]:
+def from_transforms(T_a_b: Sequence[se3.Transform] | NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the planar parts (N, 3), x, y [m], yaw [rad], of transforms (N, 4, 4)."""
     return np.array([from_transform(T) for T in T_a_b]).reshape(-1, 3)
 
@@ -48,27 +41,6 @@ def between(T_a_b: Planar, T_a_c: Planar) -> Planar:
     c, s = np.cos(T_a_b[2]), np.sin(T_a_b[2])
     x, y = T_a_c[:2] - T_a_b[:2]
     return np.array([c * x + s * y, -s * x + c * y, wrap(T_a_c[2] - T_a_b[2])])
-
-
-def composed(T_a_b: NDArray[np.float64], T_b_c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return T_a_c (N, 3) of stacks (N, 3)."""
-    c, s = np.cos(T_a_b[:, 2]), np.sin(T_a_b[:, 2])
-    x, y, yaw = T_b_c.T
-    return np.column_stack(
-        [T_a_b[:, 0] + c * x - s * y, T_a_b[:, 1] + s * x + c * y, wrapped(T_a_b[:, 2] + yaw)]
-    )
-
-
-def betweens(T_a_b: NDArray[np.float64], T_a_c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return T_b_c (N, 3) of stacks (N, 3)."""
-    c, s = np.cos(T_a_b[:, 2]), np.sin(T_a_b[:, 2])
-    x, y = (T_a_c[:, :2] - T_a_b[:, :2]).T
-    return np.column_stack([c * x + s * y, c * y - s * x, wrapped(T_a_c[:, 2] - T_a_b[:, 2])])
-
-
-def wrapped(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return angles (...) [rad] in [-pi, pi)."""
-    return np.asarray((angle_rad + np.pi) % (2 * np.pi) - np.pi)
 
 
 def wrap(angle_rad: float) -> float:
