@@ -236,12 +236,17 @@ def test_odometry_that_was_reset_is_not_taken_for_motion(jump_m):
     assert errors(path, trackings)[:, 0].max() < 0.03
 
 
-def test_map_to_match_with_ends_where_no_scan_can_reach():
-    module = active(range_max_m=25.0)
+def first_keyframe(**settings):
+    """Return the keyframes of a module after one scan, and the surfaces of that scan."""
+    module = active(**settings)
     module.track(drive(room(), np.zeros((1, 3)), rng=np.random.default_rng(1))[0])
     keyframes = module._front_end.keyframes
+    return keyframes, module._front_end.reader.read(keyframes.frames[0].scan)
+
+
+def test_map_to_match_with_ends_where_no_scan_can_reach():
+    keyframes, surfaces = first_keyframe(range_max_m=25.0)
     (first,) = keyframes.frames
-    surfaces = module._front_end.reader.read(first.scan)
     for index in range(1, 12):
         T_local_base = np.array([24.0 * index, 0.0, 0.0])
         keyframes.add(replace(first, T_local_base=T_local_base), surfaces)
@@ -249,11 +254,8 @@ def test_map_to_match_with_ends_where_no_scan_can_reach():
 
 
 def test_scans_are_matched_with_the_latest_two_submaps():
-    module = active(submap_keyframes=3)
-    module.track(drive(room(), np.zeros((1, 3)), rng=np.random.default_rng(1))[0])
-    keyframes = module._front_end.keyframes
+    keyframes, surfaces = first_keyframe(submap_keyframes=3)
     (first,) = keyframes.frames
-    surfaces = module._front_end.reader.read(first.scan)
     counts = []
     for _ in range(8):
         counts.append(len(keyframes.latest()) // len(surfaces))
