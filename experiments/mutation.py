@@ -38,6 +38,7 @@ _PARTS = {  # name -> its code, and the tests that guard it
     "atlas": (
         ["sceneslam/atlas"],
         [
+            "tests/test_atlas_submaps.py",
             "tests/test_atlas_limits.py",
             "tests/test_atlas_places.py",
             "tests/test_atlas_loops.py",

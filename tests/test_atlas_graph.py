@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from planar_poses import transforms
-from test_atlas_limits import S, at, loop, pitched, run_of
+from test_atlas_limits import loop
 from test_atlas_maps import WALL, map_of
+from test_atlas_submaps import S, at, pitched, run_of
 
 import sceneslam.atlas
 from sceneslam.atlas.atlas import Atlas

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_atlas_limits import RIG, S, at
 from test_atlas_mapper import SCAN
 from test_atlas_maps import WALL, edge, map_of
+from test_atlas_submaps import RIG, S, at
 
 from sceneslam.atlas.mapper import Mapper
 from sceneslam.atlas.submaps.collector import Collector, Known

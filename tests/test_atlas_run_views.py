@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_atlas_limits import at
 from test_atlas_maps import WALL, edge, map_of
+from test_atlas_submaps import at
 from test_atlas_view_loops import viewed
 from test_rgbd import make
 from test_view_merge import seen_from

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_atlas_limits import RIG, S, at, pitched
+from test_atlas_submaps import RIG, S, at, pitched
 
 from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.atlas.submaps.collector import Collector, Known
