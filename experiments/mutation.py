@@ -44,6 +44,7 @@ _PARTS = {  # name -> its code, and the tests that guard it
             "tests/test_atlas_loops.py",
             "tests/test_atlas_maps.py",
             "tests/test_atlas_graph.py",
+            "tests/test_atlas_run_loops.py",
             "tests/test_long_runs.py",
             "tests/test_atlas_upright.py",
             "tests/test_atlas.py",
