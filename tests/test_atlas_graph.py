@@ -136,10 +136,7 @@ def test_a_fix_leads_from_the_nearest_submap_of_the_loaded_piece(monkeypatch):
     given, own = Given(monkeypatch), finished()
     nodes = [[0.0, 0.0, 0.0], [3.0, 0.0, 0.5], [4.2, 0.1, 0.0], [2.0, 3.0, 0.0]]
     loaded = map_of(*[WALL] * 4, nodes=nodes, pieces=[0, 0, 1, 0])
-    fixes = [
-        Fix(stamp_ns=1 * S, **there(0.5, 0.2)),
-        Fix(stamp_ns=8 * S, **there(4.0, 0.0, 0.25)),
-    ]
+    fixes = [Fix(stamp_ns=1 * S, **there(0.5, 0.2)), Fix(stamp_ns=8 * S, **there(4.0, 0.0, 0.25))]
     solved(own, loaded, fixes=fixes)
     ends = [(edge.first, edge.second) for edge in given.measured]
     assert ends == [(0, 4), (1, 5)]

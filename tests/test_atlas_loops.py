@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from planar_poses import transforms
 from test_atlas_places import CELL, plan_of, quality
 
 from sceneslam.atlas.lasting.saved_map import empty_map
@@ -13,7 +14,7 @@ from sceneslam.atlas.submaps.plan_loops import PlanLoops
 from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.graphs.edge import EdgeKind
-from sceneslam.types import planar, se3
+from sceneslam.types import planar
 
 WALL = plan_of("##")
 EMPTY = join([])
@@ -61,13 +62,12 @@ def loops_to(second, sessions, nodes, sigma, *, closed=(), plans=None, runs=None
     plans, runs = plans or [WALL] * len(sessions), runs or [0] * len(sessions)
     submaps = [submap(*one) for one in zip(sessions, plans, runs, strict=True)]
     drift = np.arange(len(sessions))[:, None] * np.array(sigma)
-    return finder_of(closed).loops_to(query_of(second, submaps, nodes, drift))
+    return finder_of(closed).loops_to(query_of(second, submaps, transforms(nodes), drift))
 
 
-def query_of(second, submaps, nodes, drift):
-    """The query for a submap, at nodes (x, y, yaw) with drift (N, 3) up to each."""
-    T_run_node = [se3.from_xy_yaw(*node) for node in nodes]
-    return LoopQuery.of(Chain(submaps=submaps, T_run_node=T_run_node, drift=list(drift)), second)
+def query_of(second, submaps, T_run_node, drift):
+    """The query for a submap, with nodes (N, 4, 4) and the drift (N, 3) up to each."""
+    return LoopQuery.of(Chain(submaps=submaps, T_run_node=T_run_node, drift=drift), second)
 
 
 def line(*x_m):
@@ -172,12 +172,13 @@ def test_a_target_is_made_once_for_all_that_are_compared_with_it(monkeypatch):
     compared = Compared(monkeypatch)
     sessions = [0] * 4 + [1] * 16
     submaps = [submap(session) for session in sessions]
-    finder, drift = finder_of([1]), 0.1 * np.outer(sessions, np.ones(3))
+    finder, nodes = finder_of([1]), transforms(np.zeros((20, 3)))
+    drift = 0.1 * np.outer(sessions, np.ones(3))
     for second in range(6, 20):
-        assert len(finder.loops_to(query_of(second, submaps, np.zeros((20, 3)), drift))) == 2
+        assert len(finder.loops_to(query_of(second, submaps, nodes, drift))) == 2
     assert len(compared.targets) == 2
     for count, made in ((6, 0), (5, 1), (2, 2)):  # of 0 to 2, and of 1 to 5
         compared.targets.clear()
         finder.forget(count)
-        assert len(finder.loops_to(query_of(19, submaps, np.zeros((20, 3)), drift))) == 2
+        assert len(finder.loops_to(query_of(19, submaps, nodes, drift))) == 2
         assert len(compared.targets) == made

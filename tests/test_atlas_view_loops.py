@@ -4,12 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_atlas_loops import query_of
 from test_atlas_maps import WALL, map_of
 from test_view_merge import seen_from
 from test_views import place
 
-from sceneslam.atlas.submaps.chain import Chain
-from sceneslam.atlas.submaps.loop_query import LoopQuery
 from sceneslam.atlas.submaps.view_loops import ViewLoops
 from sceneslam.types import se3
 from sceneslam.views.landmark_registration import register
@@ -39,17 +38,17 @@ def always(first, second, submaps):
     return True
 
 
-def query_of(second, submaps, nodes, sigma):
-    """The query for a submap, with deviations `sigma` (3,) of the motion from any other to it."""
-    drift = [sigma * (index == second) for index in range(len(submaps))]
-    return LoopQuery.of(Chain(submaps=submaps, T_run_node=list(nodes), drift=drift), second)
+def loops_to(finder, second, submaps, nodes, sigma):
+    """Find loops, with deviations `sigma` (3,) of the motion from any other submap to this one."""
+    drift = np.outer(np.arange(len(submaps)) == second, sigma)
+    return finder.loops_to(query_of(second, submaps, nodes, drift))
 
 
 def added(finder, submaps, nodes, sigma):
     """Return the loops to each submap in turn, and which of its views are kept."""
     loops, kept = [], []
     for second, submap in enumerate(submaps):
-        found, views = finder.loops_to(query_of(second, submaps, nodes, sigma))
+        found, views = loops_to(finder, second, submaps, nodes, sigma)
         loops.append(found)
         kept.append([view in views for view in submap.views])
     return loops, kept
@@ -134,9 +133,9 @@ def test_forgotten_submaps_are_not_seen_again_until_they_come_back():
     nodes = [se3.identity(), ASIDE]
     added(finder, submaps, nodes, ANY)
     finder.forget(1)
-    assert len(finder.loops_to(query_of(1, submaps, nodes, ANY))[0]) == 1
+    assert len(loops_to(finder, 1, submaps, nodes, ANY)[0]) == 1
     finder.forget(0)
-    assert finder.loops_to(query_of(0, submaps, nodes, ANY))[0] == []
+    assert loops_to(finder, 0, submaps, nodes, ANY)[0] == []
 
 
 @pytest.mark.parametrize(("aside_m", "is_kept"), [(0.45, False), (0.55, True)])

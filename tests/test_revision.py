@@ -91,7 +91,7 @@ def seen_again(true):
 
     def loops_to(_, query):
         starts = [int(submap.stamps_ns[0]) // 10**9 for submap in query.submaps]
-        loops = [
+        return [
             Edge(
                 first=first,
                 second=query.second,
@@ -101,8 +101,7 @@ def seen_again(true):
             )
             for first in range(query.second)
             if (query.submaps[first].session, query.submap.session) == (0, 2)
-        ]
-        return loops, ()
+        ], ()
 
     return loops_to
 
