@@ -28,6 +28,7 @@ from sceneslam.atlas.atlas import Atlas
 from sceneslam.evaluation.relations import Relations, relation_errors
 from sceneslam.modules.slam.laser.module import LaserSlam
 from sceneslam.sources.carmen import Carmen
+from sceneslam.types.errors import InputError
 from sceneslam.types.maps import GridLayer
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
@@ -189,6 +190,8 @@ def harder(log: Log) -> None:
 def main() -> None:
     """Run one of the commands above."""
     cv2.setNumThreads(1)
+    if len(sys.argv) < 3:
+        sys.exit(__doc__)
     path, relations, *words = sys.argv[1:]
     source = Carmen(**{**settings("source/carmen.yaml"), "path": path})
     log = Log(source=source, relations=Relations.read(Path(relations)))
@@ -207,4 +210,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except InputError as error:
+        sys.exit(f"error: {error}")
