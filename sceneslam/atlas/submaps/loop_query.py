@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,10 @@ class LoopQuery:
             plane=planar.from_transforms(chain.T_run_node),
             drift=np.array(chain.drift),
         )
+
+    def to(self, second: int) -> LoopQuery:
+        """Return the query for another submap of the same run."""
+        return replace(self, second=second)
 
     @property
     def submap(self) -> Submap:

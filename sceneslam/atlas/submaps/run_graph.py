@@ -154,16 +154,16 @@ class RunGraph:
 
     def _search(self, chain: Chain, *, is_level: bool) -> None:
         """Look for loops to the submaps that were not searched yet; plans show a level floor."""
-        loops: list[Edge] = []
+        loops, query = list[Edge](), LoopQuery.of(chain, self._seen)
         for second in range(self._seen, len(chain)):
-            found, views = self._views.loops_to(LoopQuery.of(chain, second))
+            found, views = self._views.loops_to(query.to(second))
             loops += found
             chain.submaps[second] = replace(chain.submaps[second], views=views)
         for second in range(self._planned, len(chain) if is_level else 0):
-            loops += self._plans.loops_to(LoopQuery.of(chain, second))
+            loops += self._plans.loops_to(query.to(second))
         self._seen, self._planned = len(chain), len(chain) if is_level else self._planned
         if loops:
-            self._found.add(loops, np.array(chain.T_run_node), np.array(chain.drift))
+            self._found.add(loops, query.T_run_node, query.drift)
 
     def _may_close(self, first: int, second: int, submaps: Sequence[Submap]) -> bool:
         """Tell whether a loop may lead from a submap to a later one: not within closed sessions."""
