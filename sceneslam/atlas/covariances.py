@@ -70,7 +70,7 @@ def covariances(path: PosedPath, *, loops: Sequence[Edge], bridge: Drift) -> NDA
     drifts: dict[tuple[int, int], Covariance] = {}
     for first, last in pairwise(rows):
         claim, driven = path.claim(slice(first, last)), moved[last] - moved[first]
-        if sessions[first] != sessions[last]:  # the next session begins at the last one's pose
+        if sessions[first] != sessions[last]:  # one begins where the other ended
             drift = _carried(beside[first], T[first], T[last])
         else:
             drift = drifted(MAPPED, driven) if claim is None else _submaps(driven) * claim
@@ -145,7 +145,7 @@ def _beside(path: PosedPath, moved: NDArray[np.float64], bridge: Drift) -> NDArr
     begins = np.diff(path.sessions, prepend=-2) != 0
     held = np.maximum.accumulate(
         np.where(begins | ~path.is_bridged, np.arange(len(moved)), 0)
-    )  # the last row that a module measured in this session
+    )  # the newest row that a module measured, within one map
     for row in np.flatnonzero(path.is_bridged).tolist():
         at, T = held[row], path.T_map_base
         beside[row] = drifted(bridge, moved[row] - moved[at])
