@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from concurrent.futures import Future
-from dataclasses import dataclass
 
 import numpy as np
 
 from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.decision import Health
 from sceneslam.bus.events import EventLog
+from sceneslam.bus.gate import Gate
 from sceneslam.bus.handover import Handover
 from sceneslam.bus.hold import Hold
 from sceneslam.bus.observation_buffer import BufferedObservation, ObservationBuffer
@@ -20,18 +20,10 @@ from sceneslam.bus.session import ModuleSession
 from sceneslam.interfaces import BackEnd
 from sceneslam.types import se3
 from sceneslam.types.maps import MapLayers
-from sceneslam.types.observation import Observation, TrackingStatus
+from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
-
-
-@dataclass(frozen=True, slots=True)
-class _Ending:
-    """A module that is being shut down."""
-
-    legacy: Future[Legacy]
-    placed: list[int]  # its sessions in the back end
 
 
 class Estimator:
@@ -42,16 +34,14 @@ class Estimator:
     ) -> None:
         self._policy, self._rig, self._back_end, self._log = policy, rig, back_end, log
         # The paper's (cold) hand-over uses a module's last pose and nothing after it.
-        bridge = Bridge(is_active=policy.handover != "cold")
-        self._session = ModuleSession(None, self._new_hold(), bridge)
+        self._session = self._new_session(None, Bridge(is_active=policy.handover != "cold"))
         self._memory = ObservationBuffer(
             span_s=policy.buffer_s if policy.handover == "rewind" else 0.0,
             limit_mb=policy.buffer_mb,
             keeps_sensors=has_choice,
         )
-        self._placed: list[int] = []  # the active module's sessions in the back end
-        self._ending: list[_Ending] = []  # modules that are being shut down
-        self._told: TrackingStatus | None = None  # the active module's status as last logged
+        # Modules that are being shut down, each with its sessions in the back end.
+        self._ending: list[tuple[Future[Legacy], list[int]]] = []
         self._told_lie = False  # whether the wheels were last logged as wrong
 
     @property
@@ -100,27 +90,25 @@ class Estimator:
         anchor = self._memory.newest
         if self._policy.handover == "rewind" and not is_trial:
             anchor = self._memory.anchor(since_ns)
-        session = ModuleSession(runner, self._new_hold(), anchor.bridge.copy())
+        session = self._new_session(runner, anchor.bridge.copy())
         pace = Pace(self._policy.catch_up)
         return Handover(session, self._memory, anchor=anchor, pace=pace)
 
     def accept(self, handover: Handover) -> None:
         """Make a module that has caught up the active one, and shut the old one down."""
-        old, placed, bridge = self.active, self._placed, self._session.bridge
-        self._session, self._placed, self._told = handover.session, [], None
-        self._session.bridge = bridge
-        if handover.session.is_placed:
+        old, self._session = self._session, handover.session
+        self._session.bridge = old.bridge
+        if self._session.is_placed:
             self._rewrite(handover)
         now_ns = self._memory.newest.stamp_ns
         self._tell(now_ns)
         self._log.add("cost", now_ns, **handover.cost(now_ns))
-        self._retire(old, placed)
+        self._retire(old)
 
     def retire(self) -> None:
         """Shut the active module down and keep its map."""
-        self._retire(self.active, self._placed)
-        self._session = ModuleSession(None, self._new_hold(), self._session.bridge)
-        self._placed = []
+        self._retire(self._session)
+        self._session = self._new_session(None, self._session.bridge)
 
     def close(self) -> None:
         """Shut the active module down, and delete the buffered observations."""
@@ -180,7 +168,7 @@ class Estimator:
         assert self.active is not None and self.active.T_map_local is not None
         T_map_local, last_ns = self.active.T_map_local, self._back_end.last_stamp_ns
         session = self._back_end.begin_session(self.active.key, T_map_local)
-        self._placed.append(session)
+        self._session.stored.append(session)
         self._log.add(
             "handover",
             stamp_ns,
@@ -200,15 +188,15 @@ class Estimator:
             self._told_lie = self.hold.wheels_lie
             self._log.add("odometry", stamp_ns, is_believed=not self._told_lie)
         status = self.hold.status
-        if status is None or status is self._told or self.active is None:
+        if status is None or status is self._session.logged or self.active is None:
             return
-        self._told = status
+        self._session.logged = status
         self._log.add("tracking", stamp_ns, module=self.active.key, status=status.value)
 
-    def _retire(self, runner: Runner | None, placed: list[int]) -> None:
+    def _retire(self, session: ModuleSession) -> None:
         """Shut a module down; its map stays where it was placed last."""
-        if runner is not None:
-            self._ending.append(_Ending(runner.retire(), placed))
+        if session.runner is not None:
+            self._ending.append((session.runner.retire(), session.stored))
             self._keep_maps(waits=False)
 
     def _keep_maps(self, *, waits: bool) -> None:
@@ -216,16 +204,17 @@ class Estimator:
 
         `waits`: wait for modules that are still shutting down.
         """
-        while self._ending and (waits or self._ending[0].legacy.done()):
-            ending = self._ending.pop(0)
-            legacy, placed = ending.legacy.result(), ending.placed
-            for what in legacy.lost if placed else ():
+        while self._ending and (waits or self._ending[0][0].done()):
+            ended, stored = self._ending.pop(0)
+            legacy = ended.result()
+            for what in legacy.lost if stored else ():
                 self._log.add("fault", self._memory.newest.stamp_ns, what=what)
-            for session in placed:
-                layers = legacy.layers if session == placed[-1] else MapLayers()
+            for session in stored:
+                layers = legacy.layers if session == stored[-1] else MapLayers()
                 self._back_end.close_session(session, layers, legacy.trajectory)
 
-    def _new_hold(self) -> Hold:
-        gate = self._policy.gate if self._policy.handover != "cold" else None
-        silence_ns = round(self._policy.lost_patience_s * 1e9)
-        return Hold(silence_ns=silence_ns, gate=gate, wheels=self._rig.wheels)
+    def _new_session(self, runner: Runner | None, bridge: Bridge) -> ModuleSession:
+        settings = self._policy.gate if self._policy.handover != "cold" else None
+        gate = None if settings is None else Gate(settings, self._rig.wheels)
+        hold = Hold(silence_ns=round(self._policy.lost_patience_s * 1e9), gate=gate)
+        return ModuleSession(runner, hold, bridge)

@@ -8,21 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.bus.decision import Health
-from sceneslam.bus.gate import Gate, GateSettings
+from sceneslam.bus.gate import Gate
 from sceneslam.bus.recent import CovarianceMonitor
 from sceneslam.bus.runner import Runner
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
-from sceneslam.types.rig import Wheels
 from sceneslam.types.se3 import Transform
 
 
 class Hold:
     """Follows one activation of a module: since when it tracks, is lost, silent or suspect."""
 
-    def __init__(
-        self, *, silence_ns: int, gate: GateSettings | None, wheels: Wheels | None = None
-    ) -> None:
+    def __init__(self, *, silence_ns: int, gate: Gate | None) -> None:
         self.status: TrackingStatus | None = None  # None before its first answer
         self.is_suspect = False  # from a disagreement on until it has agreed for long enough
         self.suspect_since_ns: int | None = None  # since when it may have been wrong
@@ -37,7 +34,7 @@ class Hold:
         self.turn: NDArray[np.float64] | None = None  # its last (3, 3) rotation, if trusted
         self._T_odom_prev: Transform | None = None
         self._agreed: tuple[Transform, Transform] | None = None  # local, odom, as turns last agreed
-        self._gate = Gate(gate, wheels or Wheels()) if gate is not None else None
+        self._gate = gate
         self._covariances = CovarianceMonitor()
         self._revision = 0
         self._fed_ns: int | None = None  # when its sensors last delivered data

@@ -26,6 +26,8 @@ class ModuleSession:
         self.is_placed = False
         self.tracking: Tracking | None = None  # of the last observation, where its pose is used
         self.fault: ModuleError | None = None  # failure at the last observation
+        self.stored: list[int] = []  # its sessions in the back end
+        self.logged: TrackingStatus | None = None  # its status as last logged
 
     @property
     def key(self) -> str:
