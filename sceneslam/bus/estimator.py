@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Future
+from dataclasses import replace
 
 import numpy as np
 
@@ -125,7 +126,8 @@ class Estimator:
         bridge, bridged = before.bridge.copy(), []
         for each in [*untrusted, moment]:
             T_map_base = bridge.predict(each.observation, by_velocity=False, turn=each.turn)
-            bridged.append(each.bridged(T_map_base, bridge.copy()))
+            given = replace(each, T_map_base=T_map_base, bridge=bridge.copy())
+            bridged.append(replace(given, module=BRIDGED, covariance=None, is_trusted=False))
         self._back_end.rewind(untrusted[0].stamp_ns)
         self._put(bridged[:-1], moment.stamp_ns)
         self._session.bridge = bridge

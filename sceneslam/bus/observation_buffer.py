@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.bus.bridge import Bridge
 from sceneslam.types.observation import Observation
-from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
 
 _BULKY = ("image_bgr", "depth_m", "points_lidar", "point_times_s")
@@ -24,9 +24,7 @@ class BufferedObservation:
     T_map_base: Transform | None  # None: no pose could be given
     module: str  # the module that gave the pose, BRIDGED without one
     bridge: Bridge  # after the observation
-    turn: (
-        NDArray[np.float64] | None
-    )  # (3, 3) rotation since the previous entry, of a trusted module
+    turn: NDArray[np.float64] | None  # (3, 3) rotation since the previous entry, if trusted
     covariance: NDArray[np.float64] | None  # (6, 6) of its T_local_base, as the module reports it
     is_trusted: bool  # a module that was not suspect was tracking, as certain as usual
 
@@ -34,17 +32,6 @@ class BufferedObservation:
     def stamp_ns(self) -> int:
         """Return the observation's stamp."""
         return self.observation.stamp_ns
-
-    def bridged(self, T_map_base: Transform | None, bridge: Bridge) -> BufferedObservation:
-        """Return the entry with a bridged pose."""
-        return replace(
-            self,
-            T_map_base=T_map_base,
-            module=BRIDGED,
-            bridge=bridge,
-            covariance=None,
-            is_trusted=False,
-        )
 
 
 class ObservationBuffer:
@@ -59,9 +46,8 @@ class ObservationBuffer:
         self._span_ns, self._limit_bytes = round(span_s * 1e9), round(limit_mb * 1e6)
         self._keeps_sensors = keeps_sensors
         self._moments: list[BufferedObservation] = []  # by rising stamp
-        self._full_ns: list[int] = []  # stamps of the moments that still have their sensor data
-        self._sizes: list[int] = []  # bytes of that sensor data, in the same order
-        self._bytes = 0  # in all
+        self._full: list[BufferedObservation] = []  # those that still have their sensor data
+        self._bytes = 0  # of that sensor data
 
     @property
     def newest(self) -> BufferedObservation:
@@ -71,13 +57,12 @@ class ObservationBuffer:
     def add(self, moment: BufferedObservation) -> None:
         """Add an entry; remove those that are too old."""
         self._append(moment)
-        old = self._count(moment.stamp_ns - self._span_ns - 1)
-        if old:
-            del self._moments[:old]
-            self._drop(slice(0, bisect_left(self._full_ns, self._moments[0].stamp_ns)))
-        if not self._keeps_sensors and len(self._full_ns) > 1:
+        old_ns = moment.stamp_ns - self._span_ns - 1
+        del self._moments[: _count(self._moments, old_ns)]
+        self._drop(slice(0, _count(self._full, old_ns)))
+        if not self._keeps_sensors and len(self._full) > 1:
             self._strip(-2)
-        while self._bytes > self._limit_bytes and len(self._full_ns) > 2:
+        while self._bytes > self._limit_bytes and len(self._full) > 2:
             self._strip(self._least_missed())
 
     def anchor(self, until_ns: int | None) -> BufferedObservation:
@@ -93,66 +78,57 @@ class ObservationBuffer:
 
     def after(self, stamp_ns: int) -> list[BufferedObservation]:
         """Return all entries after a stamp."""
-        return self._moments[self._count(stamp_ns) :]
+        return self._moments[_count(self._moments, stamp_ns) :]
 
     def last_until(self, stamp_ns: int) -> BufferedObservation | None:
         """Return the newest entry up to a stamp, None if it was removed."""
-        count = self._count(stamp_ns)
+        count = _count(self._moments, stamp_ns)
         return self._moments[count - 1] if count else None
 
     def rewrite(self, moments: list[BufferedObservation]) -> None:
         """Replace all entries from the first of `moments` on by these, with corrected poses."""
-        from_ns = moments[0].stamp_ns
-        del self._moments[self._count(from_ns - 1) :]
-        self._drop(slice(bisect_left(self._full_ns, from_ns), None))
+        before_ns = moments[0].stamp_ns - 1
+        del self._moments[_count(self._moments, before_ns) :]
+        self._drop(slice(_count(self._full, before_ns), None))
         for moment in moments:
             self._append(moment)
 
     def clear(self) -> None:
         """Remove all entries, to free memory when a finished run is kept for its results."""
-        self._moments, self._bytes = [], 0
-        self._full_ns, self._sizes = [], []
-
-    def _count(self, stamp_ns: int) -> int:
-        """Return the number of entries up to a stamp."""
-        return bisect_right(self._moments, stamp_ns, key=_stamp_ns)
+        self._moments, self._full, self._bytes = [], [], 0
 
     def _append(self, moment: BufferedObservation) -> None:
         self._moments.append(moment)
         size = _size(moment.observation)
         if size:
-            self._full_ns.append(moment.stamp_ns)
-            self._sizes.append(size)
+            self._full.append(moment)
             self._bytes += size
 
     def _drop(self, full: slice) -> None:
-        """Remove the sizes of removed entries."""
-        self._bytes -= sum(self._sizes[full])
-        del self._full_ns[full], self._sizes[full]
+        """Leave removed entries out of what has sensor data."""
+        self._bytes -= sum(_size(moment.observation) for moment in self._full[full])
+        del self._full[full]
 
     def _least_missed(self) -> int:
         """Return the index, among the entries with sensor data, of the least needed one."""
-        stamps_ns = np.array(self._full_ns, np.float64)
+        stamps_ns = np.array([moment.stamp_ns for moment in self._full], np.float64)
         ages_ns = stamps_ns[-1] - stamps_ns[1:-1]
         return int(np.argmin((stamps_ns[2:] - stamps_ns[:-2]) / ages_ns)) + 1
 
     def _strip(self, full: int) -> None:
         """Remove the sensor data of one entry."""
-        index = self._count(self._full_ns[full]) - 1
-        self._bytes -= self._sizes.pop(full)
-        del self._full_ns[full]
-        self._moments[index].observation = _stripped(self._moments[index].observation)
+        moment = self._full.pop(full)
+        self._bytes -= _size(moment.observation)
+        bare = replace(moment.observation, **dict.fromkeys(_BULKY))  # type: ignore[arg-type]
+        moment.observation = bare
 
 
-def _stamp_ns(moment: BufferedObservation) -> int:
-    return moment.observation.stamp_ns
+def _count(moments: list[BufferedObservation], stamp_ns: int) -> int:
+    """Return the number of entries up to a stamp."""
+    return bisect_right(moments, stamp_ns, key=attrgetter("observation.stamp_ns"))
 
 
 def _size(observation: Observation) -> int:
     """Return the bytes of the sensor data that can be removed."""
     arrays = (getattr(observation, name) for name in _BULKY)
     return sum(array.nbytes for array in arrays if array is not None)
-
-
-def _stripped(observation: Observation) -> Observation:
-    return replace(observation, **dict.fromkeys(_BULKY))  # type: ignore[arg-type]
