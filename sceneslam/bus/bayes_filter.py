@@ -54,8 +54,7 @@ class BayesFilter:
         # confirmed one, summed since the vote at which it began to grow.
         self._evidence = np.zeros(len(scenes))
         self._began_ns = np.zeros(len(scenes), np.int64)
-        self.scene: str | None = None
-        self.since_ns = 0
+        self.scene: str | None = None  # confirmed last, None before the first
 
     @property
     def posterior(self) -> Mapping[str, float] | None:
@@ -110,8 +109,6 @@ class BayesFilter:
         if scene == self.scene or self._belief[place] < self._settings.confirm_probability:
             return None
         previous, self.scene = self.scene, scene
-        self.since_ns = int(self._began_ns[place])
         self._evidence[:] = 0.0
-        return ConfirmedScene(
-            stamp_ns=stamp_ns, since_ns=self.since_ns, scene=scene, previous=previous
-        )
+        since_ns = int(self._began_ns[place])
+        return ConfirmedScene(stamp_ns=stamp_ns, since_ns=since_ns, scene=scene, previous=previous)

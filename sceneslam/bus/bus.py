@@ -228,10 +228,11 @@ class Bus:
     def _await_scene(self, observation: Observation) -> Outcome | None:
         if not self._watch.is_working:
             return Outcome.FAILURE
-        if self._watch.scene is None:
+        confirmed = self._watch.confirmed
+        if confirmed is None:
             return None
-        self._candidates.serve(self._watch.scene)
-        keys = self._candidates.of(self._watch.scene)
+        self._candidates.serve(confirmed.scene)
+        keys = self._candidates.of(confirmed.scene)
         at_ns = observation.stamp_ns
         self._changeover.begin(
             Plan(keys=keys, reason="first", at_ns=at_ns, since_ns=None, held_ns=0)
@@ -259,16 +260,16 @@ class Bus:
 
     def _plan(self, now: Situation, verdict: Decision) -> None:
         """Begin to carry out a verdict."""
-        is_scene = verdict.reason == "scene"
-        if is_scene:
-            self._candidates.serve(now.scene)
+        confirmed = self._watch.confirmed if verdict.reason == "scene" else None
+        if confirmed is not None:
+            self._candidates.serve(confirmed.scene)
         self._candidates.limit(verdict.to, verdict.rounds)
         self._changeover.begin(
             Plan(
                 keys=verdict.to,
                 reason=verdict.reason,
                 at_ns=now.stamp_ns,
-                since_ns=self._watch.since_ns if is_scene else None,
+                since_ns=None if confirmed is None else confirmed.since_ns,
                 held_ns=now.held_ns,
             )
         )
@@ -288,7 +289,8 @@ class Bus:
     def _look(self, observation: Observation) -> Situation:
         """Return all that is known at an observation."""
         hold, health = self._estimator.hold, self._estimator.health
-        scene = self._watch.scene or self.scene
+        confirmed = self._watch.confirmed
+        scene = self.scene if confirmed is None else confirmed.scene
         return Situation(
             stamp_ns=observation.stamp_ns,
             scene=scene,

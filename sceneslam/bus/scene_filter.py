@@ -22,9 +22,6 @@ class ConfirmedScene:
 class SceneFilter(Protocol):
     """Turns votes, given by rising stamp, into confirmed scenes."""
 
-    scene: str | None  # confirmed last, None before the first
-    since_ns: int  # stamp of the first vote that supported it
-
     @property
     def posterior(self) -> Mapping[str, float] | None:
         """Return the probability of every scene after the last vote, None if unknown."""
@@ -49,8 +46,7 @@ class WindowFilter:
         self._candidate: str | None = None
         self._candidate_since_ns = 0
         self._last_ns = 0
-        self.scene: str | None = None
-        self.since_ns = 0
+        self.scene: str | None = None  # confirmed last, None before the first
 
     def update(self, vote: SceneVote) -> ConfirmedScene | None:
         """Return the scene that this vote confirms, None when nothing changes.
@@ -66,7 +62,10 @@ class WindowFilter:
         self._last_ns = vote.stamp_ns
         if vote.scene == self.scene or vote.stamp_ns - self._candidate_since_ns < window_ns:
             return None
-        previous, self.scene, self.since_ns = self.scene, vote.scene, self._candidate_since_ns
+        previous, self.scene = self.scene, vote.scene
         return ConfirmedScene(
-            stamp_ns=vote.stamp_ns, since_ns=self.since_ns, scene=vote.scene, previous=previous
+            stamp_ns=vote.stamp_ns,
+            since_ns=self._candidate_since_ns,
+            scene=vote.scene,
+            previous=previous,
         )

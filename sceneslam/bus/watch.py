@@ -51,22 +51,13 @@ class Watch:
     ) -> None:
         self.spent_us = array("d")
         self.is_working = True
+        self.confirmed: ConfirmedScene | None = None  # last, None before the first
         self._detector, self._log = detector, log
         self._filter = scene_filter
         try:
             detector.activate(rig)
         except Exception as error:
             raise ModuleError(f"detector could not be activated: {text_of(error)}") from error
-
-    @property
-    def scene(self) -> str | None:
-        """Return the confirmed scene, None before the first."""
-        return self._filter.scene
-
-    @property
-    def since_ns(self) -> int:
-        """Return the stamp of the first vote that supported the confirmed scene."""
-        return self._filter.since_ns
 
     def look(self, observation: Observation) -> None:
         """Get a vote for the observation; log it and the scene that it confirms."""
@@ -84,6 +75,7 @@ class Watch:
         if vote is None:
             return
         confirmed = self._filter.update(vote)
+        self.confirmed = confirmed or self.confirmed
         log_vote(self._log, vote, confirmed, self._filter.posterior)
 
     def close(self) -> None:
