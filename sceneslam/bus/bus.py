@@ -9,7 +9,7 @@ from typing import Protocol
 
 from statemachine import State, StateMachine
 
-from sceneslam.bus.changeover import Candidates, Changeover, Outcome, Plan
+from sceneslam.bus.changeover import Candidates, Changeover, Outcome
 from sceneslam.bus.dead_reckoning import DeadReckoning
 from sceneslam.bus.decision import Action, Decision, Health, Situation, decide
 from sceneslam.bus.decision_log import DecisionLog
@@ -228,15 +228,10 @@ class Bus:
     def _await_scene(self, observation: Observation) -> Outcome | None:
         if not self._watch.is_working:
             return Outcome.FAILURE
-        confirmed = self._watch.confirmed
-        if confirmed is None:
+        if self._watch.confirmed is None:
             return None
-        self._candidates.serve(confirmed.scene)
-        keys = self._candidates.of(confirmed.scene)
-        at_ns = observation.stamp_ns
-        self._changeover.begin(
-            Plan(keys=keys, reason="first", at_ns=at_ns, since_ns=None, held_ns=0)
-        )
+        now = self._look(observation)
+        self._begin(now, Decision(action=Action.SWITCH, to=now.choices, reason="first"))
         return Outcome.SUCCESS
 
     def _change_over(self, observation: Observation) -> Outcome | None:
@@ -254,25 +249,17 @@ class Bus:
         elif verdict.action is Action.TRY:
             self._changeover.begin_trial(verdict.to[0], observation.stamp_ns)
         elif verdict.action is Action.SWITCH:
-            self._plan(situation, verdict)
+            self._begin(situation, verdict)
             return Outcome.FAILURE
         return None
 
-    def _plan(self, now: Situation, verdict: Decision) -> None:
+    def _begin(self, now: Situation, verdict: Decision) -> None:
         """Begin to carry out a verdict."""
-        confirmed = self._watch.confirmed if verdict.reason == "scene" else None
+        confirmed = self._watch.confirmed if verdict.reason in ("first", "scene") else None
         if confirmed is not None:
             self._candidates.serve(confirmed.scene)
         self._candidates.limit(verdict.to, verdict.rounds)
-        self._changeover.begin(
-            Plan(
-                keys=verdict.to,
-                reason=verdict.reason,
-                at_ns=now.stamp_ns,
-                since_ns=None if confirmed is None else confirmed.since_ns,
-                held_ns=now.held_ns,
-            )
-        )
+        self._changeover.begin(now, verdict, None if confirmed is None else confirmed.since_ns)
 
     # Steps that the states use.
 

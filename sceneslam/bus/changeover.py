@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from sceneslam.bus.decision import StandbyTrial
+from sceneslam.bus.decision import Decision, Situation, StandbyTrial
 from sceneslam.bus.estimator import Estimator
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.handover import Handover
@@ -25,17 +25,6 @@ class Outcome(Enum):
 
     SUCCESS = "success"
     FAILURE = "failure"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
-    """A decision to change the module."""
-
-    keys: tuple[str, ...]  # candidates, best first
-    reason: str
-    at_ns: int
-    since_ns: int | None  # when the scene that calls for it began, None for another reason
-    held_ns: int  # how long the active module had tracked without a break
 
 
 class Candidates:
@@ -103,7 +92,7 @@ class _Attempt:
 
 
 class Changeover:
-    """Goes through the planned candidates; offline at once, live a few observations at a time."""
+    """Goes through a decision's candidates; offline at once, live a few observations at a time."""
 
     def __init__(
         self,
@@ -119,9 +108,10 @@ class Changeover:
         self._runners, self._candidates, self._estimator = runners, candidates, estimator
         self._policy, self._rig, self._log, self._limit = policy, rig, log, catch_up_steps
         self._run_began_ns: int | None = None
-        self._plan: Plan | None = None
-        self._queue: list[str] = []
-        self._replaced: str | None = None  # the module that the plan replaces
+        self._now: Situation  # at the decision that is carried out
+        self._verdict: Decision
+        self._since_ns: int | None  # when the scene that calls for it began
+        self._queue: list[str] = []  # its candidates that were not tried yet
         self._attempt: _Attempt | None = None
         self._trial: _Attempt | None = None
 
@@ -134,17 +124,18 @@ class Changeover:
         tracked_ns = -1 if handover is None else handover.tracked_ns(self._estimator.now_ns)
         return StandbyTrial.PASSED if tracked_ns >= _TRIAL_NS else StandbyTrial.RUNNING
 
-    def begin(self, plan: Plan) -> None:
-        """Begin to change the module."""
-        if plan.reason != "return":
+    def begin(self, now: Situation, verdict: Decision, since_ns: int | None) -> None:
+        """Begin to change the module.
+
+        `since_ns`: when the scene that calls for it began, None for another reason.
+        """
+        if verdict.reason != "return":
             self._end_trial()
-        self._plan, self._queue = plan, list(plan.keys)
-        active = self._estimator.active
-        self._replaced = active.key if active is not None else None
+        self._now, self._verdict, self._since_ns = now, verdict, since_ns
+        self._queue = list(verdict.to)
 
     def go_on(self, stamp_ns: int) -> Outcome | None:
         """Advance the change by one candidate or one observation; return None until it is over."""
-        assert self._plan is not None
         while self._attempt is not None or self._queue:
             if self._attempt is None:
                 key = self._queue.pop(0)
@@ -155,9 +146,9 @@ class Changeover:
             if is_accepted is None:
                 return None
             key, self._attempt = self._attempt.key, None
-            is_start = self._plan.reason == "first"
+            is_start = self._verdict.reason == "first"
             if is_accepted:
-                is_best = is_start or key == self._plan.keys[0]
+                is_best = is_start or key == self._verdict.to[0]
                 return Outcome.SUCCESS if is_best else Outcome.FAILURE
             if is_start:
                 return Outcome.FAILURE  # the machine enters `start` again, with the next candidate
@@ -228,12 +219,11 @@ class Changeover:
 
     def _lead(self, attempt: _Attempt, stamp_ns: int) -> bool | None:
         """Advance one candidate; return whether it took over, None while undecided."""
-        assert self._plan is not None
         if stamp_ns < attempt.ready_ns:
             return None
-        runner, since_ns = self._runners[attempt.key], self._plan.since_ns
+        runner = self._runners[attempt.key]
         try:
-            handover = self._begun(attempt, since_ns)
+            handover = self._begun(attempt, self._since_ns)
             if handover is None or not handover.advance(self._limit):
                 return None
         except ModuleError as error:
@@ -242,7 +232,7 @@ class Changeover:
         if handover.is_lost and self._can_refuse():
             return self._refuse(runner, stamp_ns, "lost")
         self._estimator.accept(handover)
-        is_in_vain = self._plan.held_ns < round(self._policy.confirm_window_s * 1e9)
+        is_in_vain = self._now.held_ns < round(self._policy.confirm_window_s * 1e9)
         self._candidates.postpone(stamp_ns, is_in_vain=is_in_vain)
         self._log_choice("decision", stamp_ns, attempt.key)
         return True
@@ -275,14 +265,13 @@ class Changeover:
         return False
 
     def _log_choice(self, event: str, stamp_ns: int, key: str, **more: str) -> None:
-        assert self._plan is not None
         self._log.add(
             event,
             stamp_ns,
             scene=self._scene,
-            **{"from": self._replaced, "to": key},
-            reason=self._plan.reason,
-            decided_ns=self._plan.at_ns,
+            **{"from": self._now.active or None, "to": key},
+            reason=self._verdict.reason,
+            decided_ns=self._now.stamp_ns,
             **more,
         )
 
