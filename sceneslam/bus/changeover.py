@@ -85,7 +85,7 @@ class Candidates:
 class _Attempt:
     """A candidate that is being started."""
 
-    key: str
+    runner: Runner
     ready_ns: int  # when it may be started
     is_begun: bool = False  # it is being started, or was
     handover: Handover | None = None  # None until it has started
@@ -138,14 +138,14 @@ class Changeover:
         """Advance the change by one candidate or one observation; return None until it is over."""
         while self._attempt is not None or self._queue:
             if self._attempt is None:
-                key = self._queue.pop(0)
-                if self._is_running(key):
+                runner = self._runners[self._queue.pop(0)]
+                if runner is self._estimator.active and not runner.is_failed:
                     return Outcome.FAILURE  # the active module stays, as the fallback
-                self._attempt = self._start(key, stamp_ns)
+                self._attempt = self._start(runner, stamp_ns)
             is_accepted = self._lead(self._attempt, stamp_ns)
             if is_accepted is None:
                 return None
-            key, self._attempt = self._attempt.key, None
+            key, self._attempt = self._attempt.runner.key, None
             is_start = self._verdict.reason == "first"
             if is_accepted:
                 is_best = is_start or key == self._verdict.to[0]
@@ -158,7 +158,8 @@ class Changeover:
 
     def begin_trial(self, key: str, stamp_ns: int) -> None:
         """Run the scene's first choice on standby beside the fallback; its poses are not used."""
-        self._trial = _Attempt(key=key, ready_ns=self._ready_ns(key, stamp_ns))
+        runner = self._runners[key]
+        self._trial = _Attempt(runner=runner, ready_ns=self._ready_ns(key, stamp_ns))
         self.try_on(stamp_ns)
 
     def submit(self, observation: Observation) -> None:
@@ -166,7 +167,7 @@ class Changeover:
         if self._trial is None or self._trial.handover is None:
             return
         try:
-            self._trial.handover.runner.submit(observation)
+            self._trial.runner.submit(observation)
         except ModuleError as error:
             self._log.add_fault(observation.stamp_ns, str(error))
             self._end_trial()
@@ -177,7 +178,7 @@ class Changeover:
         if trial is None or stamp_ns < trial.ready_ns:
             return
         try:
-            handover = self._begun(trial, None, is_trial=True)
+            handover = self._begun(trial)
             if handover is None:
                 return
             handover.advance(None)
@@ -193,61 +194,52 @@ class Changeover:
         """Shut down every module that is being started."""
         self._end_trial()
         if self._attempt is not None:
-            self._runners[self._attempt.key].retire()
+            self._attempt.runner.retire()
             self._attempt = None
 
-    @property
-    def _scene(self) -> str:
-        return self._candidates.scene
-
-    def _is_running(self, key: str) -> bool:
-        active = self._estimator.active
-        return active is not None and active.key == key and not active.is_failed
-
-    def _start(self, key: str, stamp_ns: int) -> _Attempt:
+    def _start(self, runner: Runner, stamp_ns: int) -> _Attempt:
         """Begin to start a module, which may take seconds."""
-        self._candidates.use(key)
-        if self._trial is not None and self._trial.key == key:
+        self._candidates.use(runner.key)
+        if self._trial is not None and self._trial.runner is runner:
             attempt, self._trial = self._trial, None
             if attempt.handover is not None:
                 attempt.handover.settle()
             return attempt
-        ready_ns = self._ready_ns(key, stamp_ns)
+        ready_ns = self._ready_ns(runner.key, stamp_ns)
         if self._policy.handover == "cold" and ready_ns > stamp_ns:
             self._estimator.retire()  # the paper shuts a module down before it starts the next
-        return _Attempt(key=key, ready_ns=ready_ns)
+        return _Attempt(runner=runner, ready_ns=ready_ns)
 
     def _lead(self, attempt: _Attempt, stamp_ns: int) -> bool | None:
         """Advance one candidate; return whether it took over, None while undecided."""
         if stamp_ns < attempt.ready_ns:
             return None
-        runner = self._runners[attempt.key]
         try:
-            handover = self._begun(attempt, self._since_ns)
+            handover = self._begun(attempt)
             if handover is None or not handover.advance(self._limit):
                 return None
         except ModuleError as error:
             self._log.add_fault(stamp_ns, str(error))
-            return self._refuse(runner, stamp_ns, "failed")
+            return self._refuse(attempt.runner, stamp_ns, "failed")
         if handover.is_lost and self._can_refuse():
-            return self._refuse(runner, stamp_ns, "lost")
+            return self._refuse(attempt.runner, stamp_ns, "lost")
         self._estimator.accept(handover)
         is_in_vain = self._now.held_ns < round(self._policy.confirm_window_s * 1e9)
         self._candidates.postpone(stamp_ns, is_in_vain=is_in_vain)
-        self._log_choice("decision", stamp_ns, attempt.key)
+        self._log_choice("decision", stamp_ns, attempt.runner.key)
         return True
 
-    def _begun(
-        self, attempt: _Attempt, since_ns: int | None, *, is_trial: bool = False
-    ) -> Handover | None:
+    def _begun(self, attempt: _Attempt) -> Handover | None:
         """Start a candidate; return its hand-over once it has started, None until then."""
         if attempt.handover is None:
-            runner = self._runners[attempt.key]
             if not attempt.is_begun:
                 attempt.is_begun = True
-                runner.start(self._rig, self._scene)
-            if runner.has_started():
-                attempt.handover = self._estimator.begin(runner, since_ns, is_trial=is_trial)
+                attempt.runner.start(self._rig, self._candidates.scene)
+            if attempt.runner.has_started():
+                is_trial = attempt is self._trial
+                attempt.handover = self._estimator.begin(
+                    attempt.runner, self._since_ns, is_trial=is_trial
+                )
         return attempt.handover
 
     def _can_refuse(self) -> bool:
@@ -268,7 +260,7 @@ class Changeover:
         self._log.add(
             event,
             stamp_ns,
-            scene=self._scene,
+            scene=self._candidates.scene,
             **{"from": self._now.active or None, "to": key},
             reason=self._verdict.reason,
             decided_ns=self._now.stamp_ns,
@@ -277,7 +269,7 @@ class Changeover:
 
     def _end_trial(self) -> None:
         if self._trial is not None:
-            self._runners[self._trial.key].retire()
+            self._trial.runner.retire()
             self._candidates.postpone(self._estimator.now_ns, is_in_vain=True)
         self._trial = None
 

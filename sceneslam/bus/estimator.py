@@ -82,7 +82,7 @@ class Estimator:
         if session.fault is not None:
             raise session.fault
 
-    def begin(self, runner: Runner, since_ns: int | None, *, is_trial: bool = False) -> Handover:
+    def begin(self, runner: Runner, since_ns: int | None, *, is_trial: bool) -> Handover:
         """Begin to hand over to a module that has started.
 
         `since_ns`: when the scene that calls for it began, None for another reason. A trial begins
