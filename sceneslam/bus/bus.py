@@ -5,7 +5,6 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter_ns
-from typing import Protocol
 
 from statemachine import State, StateMachine
 
@@ -26,30 +25,11 @@ from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Vector
 
 
-class Guards(Protocol):
-    """Conditions of the state machine's transitions after a failure."""
-
-    def candidate_left(self) -> bool:
-        """Tell whether another module could still be started."""
-        ...
-
-    def fallback_active(self) -> bool:
-        """Tell whether a fallback runs in place of the module that failed."""
-        ...
-
-
 class BusMachine(StateMachine):
     """Success and failure lead from state to state (Fig. 2); `stop` ends the run from anywhere.
 
-    | state     | success          | failure                                             |
-    |-----------|------------------|-----------------------------------------------------|
-    | init      | start            | terminate                                           |
-    | start     | run              | start with the next candidate; run without a module  |
-    |           |                  | while one may come back, terminate if none can      |
-    | run       | - (it goes on)   | switch: the scene changed or the module is unhealthy |
-    | switch    | run              | run with the fallback, terminate if none            |
-
-    On entering a state the owner's method `on_enter_STATE` is called, if it exists.
+    After a failure the owner's `candidate_left` and `fallback_active` tell what is possible. On
+    entering a state its method `on_enter_STATE` is called, if it exists.
     """
 
     init = State(initial=True)
@@ -62,7 +42,7 @@ class BusMachine(StateMachine):
     failure = (
         init.to(terminate)
         | start.to(start, cond="candidate_left")
-        | start.to(run, cond="fallback_active")
+        | start.to(run, cond="fallback_active")  # without a module, while one may come back
         | start.to(terminate)
         | run.to(switch)
         | switch.to(run, cond="fallback_active")
@@ -70,7 +50,7 @@ class BusMachine(StateMachine):
     )
     stop = terminate.from_(init, start, run, switch)
 
-    def __init__(self, owner: Guards) -> None:
+    def __init__(self, owner: object) -> None:
         super().__init__(listeners=[owner])
 
     @property
@@ -115,6 +95,7 @@ class Bus:
             log,
             scene_filter=policy.make_scene_filter(detector.scenes),
         )
+        self.detector_us = self._watch.spent_us  # time that each vote took
         self._reckoning = DeadReckoning(policy, rig)
         self._estimator = Estimator(
             policy=policy, rig=rig, back_end=back_end, log=log, has_choice=len(modules) > 1
@@ -135,11 +116,6 @@ class Bus:
         self._go_on: _Step  # the same for the observation at which the state was entered
         self._machine = BusMachine(self)
         self._state = self._machine.state
-
-    @property
-    def detector_us(self) -> array[float]:
-        """Return the time [us] that each vote took."""
-        return self._watch.spent_us
 
     @property
     def state(self) -> str:
@@ -173,14 +149,14 @@ class Bus:
         self._watch.look(observation)
         observation = self._reckoning.correct(observation, self.active)
         self._changeover.submit(observation)
-        self._track(observation)
+        self._estimator.track(observation, by_velocity=self._has_other())
         self._reckoning.learn(self._estimator.hold, self.active)
         outcome = self._do(observation)
         while outcome is not None:
             self._send(outcome.value, observation.stamp_ns)
             outcome = self._go_on(observation)
         own_ns = perf_counter_ns() - began_ns - (self._spent_ns() - spent_ns)
-        self.bus_us.append(own_ns / 1e3 - self._watch.spent_us[-1])
+        self.bus_us.append(own_ns / 1e3 - self.detector_us[-1])
 
     def close(self, stamp_ns: int) -> None:
         """End the run: shut the module down, then the detector. May be called twice."""
@@ -262,12 +238,6 @@ class Bus:
         self._changeover.begin(now, verdict, None if confirmed is None else confirmed.since_ns)
 
     # Steps that the states use.
-
-    def _track(self, observation: Observation) -> None:
-        try:
-            self._estimator.track(observation, by_velocity=self._has_other())
-        except ModuleError as error:
-            self._log.add_fault(observation.stamp_ns, str(error))
 
     def _has_other(self) -> bool:
         """Tell whether another module could take over, or the failed one could return."""

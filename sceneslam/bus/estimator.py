@@ -66,7 +66,7 @@ class Estimator:
         return self._memory.newest.stamp_ns
 
     def track(self, observation: Observation, *, by_velocity: bool) -> None:
-        """Give the observation its pose; raises ModuleError if the module violates its contract."""
+        """Give the observation its pose; if the module violates its contract, log that."""
         self._keep_maps(waits=False)
         session, was_placed = self._session, self._session.is_placed
         moment = session.advance(observation, by_velocity=by_velocity)
@@ -80,7 +80,7 @@ class Estimator:
         self._report(moment)
         self._memory.add(moment)
         if session.fault is not None:
-            raise session.fault
+            self._log.add_fault(moment.stamp_ns, str(session.fault))
 
     def begin(self, runner: Runner, since_ns: int | None, *, is_trial: bool) -> Handover:
         """Begin to hand over to a module that has started.
