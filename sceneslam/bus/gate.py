@@ -87,11 +87,6 @@ class _Excess:
     turn: float
     apart_m: float  # of points 1 m ahead of base, which move in a turn as well
 
-    @property
-    def largest(self) -> float:
-        """Return the larger of both."""
-        return max(self.distance, self.turn)
-
 
 class Gate:
     """Follows one activation of one module; its output depends on its inputs alone.
@@ -106,11 +101,12 @@ class Gate:
         self._samples: list[_Sample] = []  # by rising stamp, back to the longest horizon
         self._T_odom_base: Transform | None = None
         self._way_m, self._turn_rad = 0.0, 0.0
-        self._distance_since_ns: int | None = None  # since when the distance has been within bounds
+        self._within_since_ns = 0  # since when both have been within bounds
         self._has_jumped = False  # the module has jumped as no robot can, since the two agreed
         self._is_wheels = False  # the wheels were at fault, since the two agreed
         self._is_acute = False  # the shortest horizon shows a disagreement
-        self._distances = _none_yet()  # the newest excesses while wheels were right
+        # The newest excesses of distance while the wheels were right.
+        self._distances = RecentMedian(_USUAL_KEPT, width=1)
         self._usual_excess = 0.0  # their median
         self._usual_m, self._usual_ns = 0.0, 0  # path length and stamp at the newest
 
@@ -146,7 +142,7 @@ class Gate:
             way_m=self._way_m,
             turn_rad=self._turn_rad,
         )
-        judgement = self._judge(now, deviation_m)
+        judgement = self._judge(now, deviation_m) if self._samples else self._begin(now)
         self._samples.append(now)
         return judgement
 
@@ -160,33 +156,39 @@ class Gate:
         for sample in self._samples:
             sample.T_local_base = T_new_old @ sample.T_local_base
 
+    def _begin(self, now: _Sample) -> Judgement:
+        self._within_since_ns = now.stamp_ns
+        self._usual(now, 0.0)
+        return Judgement(is_trusted=False)
+
     def _judge(self, now: _Sample, deviation_m: float | None) -> Judgement:
         found = self._anchors(now.stamp_ns)
         excesses = [_excess(then, now, self._sigmas, self._wheels) for then in found]
-        if self._is_acute and excesses[0].largest <= 1.0:
+        newest = max(excesses[0].distance, excesses[0].turn)
+        if self._is_acute and newest <= 1.0:
             self._forget_before(found[0])  # the disagreement is over, and was judged
             found, excesses = found[:1], excesses[:1]
-        self._is_acute = bool(excesses) and excesses[0].largest > 1.0
-        distance = max((excess.distance for excess in excesses), default=0.0)
-        turn = max((excess.turn for excess in excesses), default=0.0)
+        self._is_acute = newest > 1.0
+        distance = max(excess.distance for excess in excesses)
+        turn = max(excess.turn for excess in excesses)
         distance = max(distance, self._usual(now, distance) / _USUAL_SIGMAS * self._sigmas)
-        if self._distance_since_ns is None or max(distance, turn) > 1.0:
-            self._distance_since_ns = now.stamp_ns
-        elif now.stamp_ns - self._distance_since_ns >= _PROBATION_NS:
-            self._has_jumped = self._is_wheels = False  # they belong to another disagreement
         is_wrong = max(distance, turn) > 1.0
-        apart_m = max((excess.apart_m for excess in excesses), default=0.0)
+        if is_wrong:
+            self._within_since_ns = now.stamp_ns
+        is_long = now.stamp_ns - self._within_since_ns >= _PROBATION_NS
+        if is_long:
+            self._has_jumped = self._is_wheels = False  # they belong to another disagreement
+        apart_m = max(excess.apart_m for excess in excesses)
         if is_wrong and self._is_wheels_fault(found[-1], now, apart_m, deviation_m):
-            self._distances, self._usual_excess = _none_yet(), 0.0
+            self._distances, self._usual_excess = RecentMedian(_USUAL_KEPT, width=1), 0.0
             return Judgement(is_trusted=True, wheels_lie=True)
-        is_long = now.stamp_ns - self._distance_since_ns >= _PROBATION_NS
         # There is no probation for turns: a module that was wrong and is within the bounds again
         # turns correctly, and the wheels' turn would be worse meanwhile.
         return Judgement(
-            is_trusted=bool(found) and not is_wrong and is_long,
+            is_trusted=is_long,
             is_wrong=is_wrong,
             since_ns=found[0].stamp_ns if is_wrong else None,
-            turn_agrees=bool(found) and turn <= 1.0,
+            turn_agrees=turn <= 1.0,
         )
 
     def _is_wheels_fault(
@@ -241,8 +243,6 @@ class Gate:
 
         Older samples are forgotten.
         """
-        if not self._samples:
-            return []
         found = [
             self._samples[max(self._until(stamp_ns - horizon_ns) - 1, 0)]
             for horizon_ns in self._horizons_ns
@@ -256,10 +256,6 @@ class Gate:
 
     def _forget_before(self, sample: _Sample) -> None:
         del self._samples[: self._until(sample.stamp_ns - 1)]
-
-
-def _none_yet() -> RecentMedian:
-    return RecentMedian(_USUAL_KEPT, width=1)
 
 
 def _excess(then: _Sample, now: _Sample, sigmas: float, wheels: Wheels) -> _Excess:
