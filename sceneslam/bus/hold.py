@@ -56,11 +56,11 @@ class Hold:
 
     def ask(self, runner: Runner, observation: Observation) -> Tracking | None:
         """Return a module's answer if its pose may be used; raises ModuleError as the runner."""
-        self.is_trusted, self.tracking = False, None
-        self.is_asked = runner.can_use(observation)
-        if not self.is_asked:
-            self._judge(observation, None)
-            self._wait(observation.stamp_ns)
+        self.is_trusted, self.tracking, self.is_asked = False, None, True
+        if not runner.can_use(observation):
+            self.spare(observation)
+            if self._fed_ns is None or observation.stamp_ns - self._fed_ns > 2 * self._period_ns:
+                self._lose(observation.stamp_ns)
             return None
         tracking = runner.track(observation)
         self._feed(tracking)
@@ -80,7 +80,7 @@ class Hold:
         return tracking
 
     def spare(self, observation: Observation) -> None:
-        """Record an observation that was skipped while the module catches up."""
+        """Record an observation that is not given to the module."""
         self.is_trusted, self.tracking, self.is_asked = False, None, False
         self._judge(observation, None)
 
@@ -124,11 +124,6 @@ class Hold:
             if self._agreed is not None and T_odom_prev is not None:
                 self.turn = _turn(*self._agreed, *now, T_odom_prev)
             self._agreed = now
-
-    def _wait(self, stamp_ns: int) -> None:
-        """Record an observation without data of the module's sensors."""
-        if self._fed_ns is None or stamp_ns - self._fed_ns > 2 * self._period_ns:
-            self._lose(stamp_ns)
 
     def _lose(self, stamp_ns: int) -> None:
         if self.unheld_since_ns is None:
