@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 from sceneslam.bus.bayes_filter import BayesFilter, BayesSettings
@@ -11,13 +11,6 @@ from sceneslam.bus.pace import PaceSettings
 from sceneslam.bus.scene_filter import SceneFilter, WindowFilter
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.run import HANDOVERS
-
-_OTHERS = (  # settings that are not durations
-    "handover",
-    "catch_up",
-    "gate",
-    "scene_filter",
-)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -39,13 +32,13 @@ class Policy:
     def __post_init__(self) -> None:
         if self.handover not in HANDOVERS:
             raise ConfigError("handover", self.handover, " | ".join(HANDOVERS))
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name == "startup_s":
-                _check_startups(value)
-            elif field.name not in _OTHERS and not 0 <= value < float("inf"):
-                unit = "megabytes" if field.name.endswith("_mb") else "seconds"
-                raise ConfigError(field.name, value, f"{unit}, 0 or more")
+        amounts = {field.name: getattr(self, field.name) for field in fields(self)}
+        amounts = {key: value for key, value in amounts.items() if key.endswith(("_s", "_mb"))}
+        amounts |= {f"startup_s.{key}": value for key, value in amounts.pop("startup_s").items()}
+        for key, value in amounts.items():
+            if not isinstance(value, int | float) or not 0 <= value < float("inf"):
+                unit = "megabytes" if key == "buffer_mb" else "seconds"
+                raise ConfigError(key, value, f"{unit}, 0 or more")
 
     def make_scene_filter(self, scenes: Sequence[str]) -> SceneFilter:
         """Return a new filter of votes for `scenes`."""
@@ -54,9 +47,3 @@ class Policy:
         return WindowFilter(
             window_s=self.confirm_window_s, first_window_s=self.first_confirm_window_s
         )
-
-
-def _check_startups(startup_s: Mapping[str, float]) -> None:
-    for key, value in startup_s.items():
-        if not isinstance(value, int | float) or not 0 <= value < float("inf"):
-            raise ConfigError(f"startup_s.{key}", value, "seconds, 0 or more")
