@@ -6,7 +6,7 @@ log alone (`python -m sceneslam.decisions RUN`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 from sceneslam.bus.policy import Policy
@@ -34,7 +34,7 @@ class StandbyTrial(StrEnum):
 class Situation:
     """All that a decision depends on."""
 
-    stamp_ns: int
+    stamp_ns: int = field(compare=False)
     scene: str  # as confirmed by the detector
     served_scene: str  # the scene that the active module was chosen for
     active: str  # "" while no module is active

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from dataclasses import asdict, fields, replace
-from operator import attrgetter
 from typing import Any
 
 from sceneslam.bus.decision import GO_ON, Decision, Health, Situation, StandbyTrial, decide
@@ -13,23 +12,19 @@ from sceneslam.bus.events import EventLog
 from sceneslam.bus.policy import Policy
 from sceneslam.types.run import Event
 
-_FACTS = attrgetter(*(field.name for field in fields(Situation) if field.name != "stamp_ns"))
-
 
 class DecisionLog:
     """Logs a situation whenever more than its time changed, and every verdict but `go on`."""
 
     def __init__(self, log: EventLog) -> None:
         self._log = log
-        self._last: tuple[Any, ...] | None = None
+        self._last: Situation | None = None
 
     def add(self, now: Situation, verdict: Decision) -> None:
         """Log a decision with its inputs."""
-        facts = _FACTS(now)
-        is_known, self._last = facts == self._last, facts
-        if is_known and verdict == GO_ON:
-            return
-        self._log.add("situation", **_in_json(now), verdict=_in_json(verdict))
+        if now != self._last or verdict != GO_ON:
+            self._log.add("situation", **_in_json(now), verdict=_in_json(verdict))
+        self._last = now
 
 
 def decide_again(events: Iterable[Event], policy: Policy) -> list[str]:
