@@ -34,9 +34,7 @@ class Handover:
     ) -> None:
         assert session.runner is not None
         self.session, self.runner, self.anchor = session, session.runner, anchor
-        self.trail: list[
-            BufferedObservation
-        ] = []  # after the anchor, or from it if no module gave its pose
+        self.trail: list[BufferedObservation] = []  # after the anchor; with it, if it is bridged
         self.tracked: list[Tracking] = []  # its answers from the anchor on, while it tracks
         self._pace, self._memory = pace, memory
         self._spared_ns: list[int] = []  # of observations skipped since it tracked
@@ -133,8 +131,9 @@ class Handover:
             self._pace.spare(given)
             if self._spared_ns:
                 self._spared_ns.append(given.stamp_ns)
-        has_spared = was_placed and bool(self._spared_ns)
-        T_map_told = session.told(given, motion) if has_spared else None
+        T_map_bridged = None
+        if was_placed and self._spared_ns:
+            T_map_bridged = session.predict(session.bridge.copy(), given, True, motion)
         found = session.advance(given, by_velocity=True, T_prev_curr=motion)
         if session.fault is not None:
             raise session.fault
@@ -144,9 +143,9 @@ class Handover:
                 self._first_cost_ns = self._cost_ns + perf_counter_ns() - self._since_ns
             self.tracked.append(session.tracking)
             assert found.T_map_base is not None
-            if T_map_told is not None and not session.hold.is_revised:
-                T_told_base = se3.inverse(T_map_told) @ found.T_map_base
-                self._bend(session.tracking, T_told_base)
+            if T_map_bridged is not None and not session.hold.is_revised:
+                T_bridged_base = se3.inverse(T_map_bridged) @ found.T_map_base
+                self._bend(session.tracking, T_bridged_base)
             self._spared_ns, self._given_ns = [], moment.stamp_ns
         self._remember(moment, replace(found, observation=moment.observation))
 
@@ -161,13 +160,13 @@ class Handover:
         if moment is not self.anchor or moment.module == BRIDGED:
             self.trail.append(found)
 
-    def _bend(self, tracking: Tracking, T_told_base: Transform) -> None:
+    def _bend(self, tracking: Tracking, T_bridged_base: Transform) -> None:
         """Distribute the drift of the trail since the module's last answer, which odometry bridged.
 
-        `T_told_base` (4, 4) is the module's pose now, in the frame of the pose that odometry led
+        `T_bridged_base` (4, 4) is the module's pose now, in the frame of the pose that odometry led
         to. What it was not asked about has its key; where it was lost, poses stay bridged.
         """
-        xi, given_s = se3.log(T_told_base), (tracking.stamp_ns - self._given_ns) / 1e9
+        xi, given_s = se3.log(T_bridged_base), (tracking.stamp_ns - self._given_ns) / 1e9
         first = bisect_right(self.trail, self._given_ns, key=lambda each: each.stamp_ns)
         for index, moment in enumerate(self.trail[first:], first):
             share = (moment.stamp_ns - self._given_ns) / 1e9 / given_s

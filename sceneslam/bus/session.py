@@ -59,20 +59,30 @@ class ModuleSession:
         except ModuleError as error:
             self.fault, self.tracking = error, None
         is_silent = self.hold.status is not TrackingStatus.LOST
-        by_velocity = by_velocity or is_silent
-        return self._moment(
-            observation, self._predict(self.bridge, observation, by_velocity, T_prev_curr)
-        )
+        T_map_base = self.predict(self.bridge, observation, by_velocity or is_silent, T_prev_curr)
+        return self._moment(observation, T_map_base)
 
     def skip(self, observation: Observation, T_prev_curr: Transform | None) -> BufferedObservation:
         """Return an observation with a bridged pose; it is not given to the module."""
         self.fault, self.tracking = None, None
         self.hold.spare(observation)
-        return self._moment(observation, self._predict(self.bridge, observation, True, T_prev_curr))
+        return self._moment(observation, self.predict(self.bridge, observation, True, T_prev_curr))
 
-    def told(self, observation: Observation, T_prev_curr: Transform | None) -> Transform | None:
-        """Return T_map_base at an observation as `skip` would bridge it."""
-        return self._predict(self.bridge.copy(), observation, True, T_prev_curr)
+    def predict(
+        self,
+        bridge: Bridge,
+        observation: Observation,
+        by_velocity: bool,
+        T_prev_curr: Transform | None,
+    ) -> Transform | None:
+        """Return T_map_base (4, 4) by a bridge, which continues from it; None if it is unknown."""
+        if self.hold.wheels_lie and self.is_running:
+            observation = replace(observation, T_odom_base=None)
+        turn = self.hold.turn if self.is_running else None
+        T_map_base = bridge.predict(observation, by_velocity=by_velocity, turn=turn)
+        if T_map_base is None and T_prev_curr is not None:
+            T_map_base = bridge.follow(observation, T_prev_curr)
+        return T_map_base
 
     def _ask(self, observation: Observation) -> Tracking | None:
         """Return the module's answer if it may be used; raises ModuleError as the runner does."""
@@ -93,22 +103,6 @@ class ModuleSession:
         assert self.runner.T_map_local is not None
         T_map_base = self.runner.T_map_local @ tracking.T_local_base
         self.bridge.update(observation, T_map_base, is_jump=self.hold.is_revised)
-        return T_map_base
-
-    def _predict(
-        self,
-        bridge: Bridge,
-        observation: Observation,
-        by_velocity: bool,
-        T_prev_curr: Transform | None,
-    ) -> Transform | None:
-        """Return T_map_base (4, 4) without the module, None if it is unknown."""
-        if self.hold.wheels_lie and self.is_running:
-            observation = replace(observation, T_odom_base=None)
-        turn = self.hold.turn if self.is_running else None
-        T_map_base = bridge.predict(observation, by_velocity=by_velocity, turn=turn)
-        if T_map_base is None and T_prev_curr is not None:
-            T_map_base = bridge.follow(observation, T_prev_curr)
         return T_map_base
 
     def _moment(
