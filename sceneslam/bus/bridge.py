@@ -9,7 +9,7 @@ from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
-_VELOCITY_S = 0.5  # a robot without measurements is assumed to keep its velocity this long
+_VELOCITY_NS = 500_000_000  # a robot without measurements is assumed to keep its velocity so long
 
 
 class Bridge:
@@ -17,7 +17,6 @@ class Bridge:
 
     def __init__(self, *, is_active: bool) -> None:
         self._is_active = is_active
-        self._horizon_ns = round(_VELOCITY_S * 1e9) if is_active else 0
         self._T_map_base: Transform | None = None
         self._T_odom_base: Transform | None = None
         self._stamp_ns = 0
@@ -73,7 +72,7 @@ class Bridge:
                 # Roll and pitch stay the wheels': a module's tilt error would appear as a climb.
                 T_prev_curr = se3.with_yaw(T_prev_curr, se3.yaw_rad(turn))
             self._note(observation.stamp_ns, self.T_map_base @ T_prev_curr)
-        elif by_velocity and self._within_horizon(observation.stamp_ns):
+        elif self._is_active and by_velocity and self._is_recent(observation.stamp_ns):
             T_prev_curr = self._at_constant_velocity(observation.stamp_ns - self._stamp_ns)
         else:
             return None
@@ -91,8 +90,8 @@ class Bridge:
         self._move(observation, self.T_map_base @ T_prev_curr)
         return self.T_map_base
 
-    def _within_horizon(self, stamp_ns: int) -> bool:
-        return self._known is not None and stamp_ns - self._known[0] <= self._horizon_ns
+    def _is_recent(self, stamp_ns: int) -> bool:
+        return self._known is not None and stamp_ns - self._known[0] <= _VELOCITY_NS
 
     def _at_constant_velocity(self, elapsed_ns: int) -> Transform:
         """Return the motion in `elapsed_ns` at the velocity of the last two measured poses."""
