@@ -209,8 +209,8 @@ class Estimator:
         while self._ending and (waits or self._ending[0][0].done()):
             ended, stored = self._ending.pop(0)
             legacy = ended.result()
-            for what in legacy.lost if stored else ():
-                self._log.add("fault", self._memory.newest.stamp_ns, what=what)
+            if legacy.lost and stored:
+                self._log.add("fault", self._memory.newest.stamp_ns, what=legacy.lost)
             for session in stored:
                 layers = legacy.layers if session == stored[-1] else MapLayers()
                 self._back_end.close_session(session, layers, legacy.trajectory)

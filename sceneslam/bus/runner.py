@@ -28,7 +28,7 @@ class Legacy:
 
     layers: MapLayers
     trajectory: Trajectory  # T_local_base as revised, empty without revisions
-    lost: tuple[str, ...] = ()  # one sentence for each result that it could not give
+    lost: str  # what it could not give, "" if it gave all
 
 
 class Runner:
@@ -58,9 +58,10 @@ class Runner:
     def can_run(self) -> bool:
         """Tell whether the module can be activated at once."""
         module = self._module
-        if self._ending is not None and not self._ending.done():
-            return not self.is_failed  # it can be activated again once it has shut down
-        return not self.is_failed or (isinstance(module, Restartable) and module.is_ready)
+        has_ended = self._ending is None or self._ending.done()
+        return not self.is_failed or (
+            has_ended and isinstance(module, Restartable) and module.is_ready
+        )
 
     @property
     def may_return(self) -> bool:
@@ -153,7 +154,7 @@ class Runner:
         with self._parting("could not be shut down", []):
             self._module.shutdown()
         self._is_active = False
-        return Legacy(layers=layers, trajectory=trajectory, lost=tuple(lost[-1:]))
+        return Legacy(layers=layers, trajectory=trajectory, lost="".join(lost[-1:]))
 
     def _answer(self, observation: Observation) -> Tracking:
         submitted, self._submitted = self._submitted, None
