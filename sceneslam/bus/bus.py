@@ -125,7 +125,7 @@ class Bus:
     @property
     def active(self) -> str:
         """Return the key of the active module, "" when no module is active."""
-        return self._estimator.active.key if self._estimator.active else ""
+        return self._estimator.session.key
 
     @property
     def beside(self) -> list[str]:
@@ -150,7 +150,7 @@ class Bus:
         observation = self._reckoning.correct(observation, self.active)
         self._changeover.submit(observation)
         self._estimator.track(observation, by_velocity=self._has_other())
-        self._reckoning.learn(self._estimator.hold, self.active)
+        self._reckoning.learn(self._estimator.session.hold, self.active)
         outcome = self._do(observation)
         while outcome is not None:
             self._send(outcome.value, observation.stamp_ns)
@@ -245,7 +245,7 @@ class Bus:
 
     def _look(self, observation: Observation) -> Situation:
         """Return all that is known at an observation."""
-        hold, health = self._estimator.hold, self._estimator.health
+        hold, health = self._estimator.session.hold, self._estimator.session.health
         confirmed = self._watch.confirmed
         scene = self.scene if confirmed is None else confirmed.scene
         return Situation(

@@ -246,9 +246,7 @@ class Changeover:
         """Tell whether there is an alternative to a lost module; the paper has no such check."""
         if self._policy.handover == "cold":
             return False
-        return bool(self._queue) or (
-            self._estimator.active is not None and self._estimator.hold.is_held
-        )
+        return bool(self._queue) or self._estimator.session.hold.is_held
 
     def _refuse(self, runner: Runner, stamp_ns: int, why: str) -> bool:
         runner.retire()

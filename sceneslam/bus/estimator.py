@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from sceneslam.bus.bridge import Bridge
-from sceneslam.bus.decision import Health
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.gate import Gate
 from sceneslam.bus.handover import Handover
@@ -34,8 +33,8 @@ class Estimator:
         self, *, policy: Policy, rig: Rig, back_end: BackEnd, log: EventLog, has_choice: bool
     ) -> None:
         self._policy, self._rig, self._back_end, self._log = policy, rig, back_end, log
-        # The paper's (cold) hand-over uses a module's last pose and nothing after it.
-        self._session = self._new_session(None, Bridge(is_active=policy.handover != "cold"))
+        # The active module's; the paper's (cold) hand-over uses its last pose and nothing after it.
+        self.session = self._new_session(None, Bridge(is_active=policy.handover != "cold"))
         self._memory = ObservationBuffer(
             span_s=policy.buffer_s if policy.handover == "rewind" else 0.0,
             limit_mb=policy.buffer_mb,
@@ -48,17 +47,7 @@ class Estimator:
     @property
     def active(self) -> Runner | None:
         """Return the active module, None while no module is active."""
-        return self._session.runner
-
-    @property
-    def hold(self) -> Hold:
-        """Return how the active module has tracked so far."""
-        return self._session.hold
-
-    @property
-    def health(self) -> Health:
-        """Return the active module's health; FAILED while no module is active."""
-        return self.hold.health if self._session.is_running else Health.FAILED
+        return self.session.runner
 
     @property
     def now_ns(self) -> int:
@@ -68,7 +57,7 @@ class Estimator:
     def track(self, observation: Observation, *, by_velocity: bool) -> None:
         """Give the observation its pose; if the module violates its contract, log that."""
         self._keep_maps(waits=False)
-        session, was_placed = self._session, self._session.is_placed
+        session, was_placed = self.session, self.session.is_placed
         moment = session.advance(observation, by_velocity=by_velocity)
         self._tell(observation.stamp_ns)
         if session.hold.suspect_since_ns is not None and session.fault is None:
@@ -97,19 +86,18 @@ class Estimator:
 
     def accept(self, handover: Handover) -> None:
         """Make a module that has caught up the active one, and shut the old one down."""
-        old, self._session = self._session, handover.session
-        self._session.bridge = old.bridge
-        if self._session.is_placed:
+        old, self.session = self.session, handover.session
+        self.session.bridge = old.bridge
+        if self.session.is_placed:
             self._rewrite(handover)
-        now_ns = self._memory.newest.stamp_ns
-        self._tell(now_ns)
-        self._log.add("cost", now_ns, **handover.cost(now_ns))
+        self._tell(self.now_ns)
+        self._log.add("cost", self.now_ns, **handover.cost(self.now_ns))
         self._retire(old)
 
     def retire(self) -> None:
         """Shut the active module down and keep its map."""
-        self._retire(self._session)
-        self._session = self._new_session(None, self._session.bridge)
+        self._retire(self.session)
+        self.session = self._new_session(None, self.session.bridge)
 
     def close(self) -> None:
         """Shut the active module down, and delete the buffered observations."""
@@ -119,7 +107,7 @@ class Estimator:
 
     def _distrust(self, since_ns: int, moment: BufferedObservation) -> BufferedObservation:
         """Replace the poses after `since_ns` by bridged ones; return the newest one, bridged."""
-        self._log.add("suspect", moment.stamp_ns, module=self._session.key)
+        self._log.add("suspect", moment.stamp_ns, module=self.session.key)
         untrusted, before = self._memory.after(since_ns), self._memory.last_until(since_ns)
         if before is None or not untrusted:
             return moment
@@ -130,7 +118,7 @@ class Estimator:
             bridged.append(replace(given, module=BRIDGED, covariance=None, is_trusted=False))
         self._back_end.rewind(untrusted[0].stamp_ns)
         self._put(bridged[:-1], moment.stamp_ns)
-        self._session.bridge = bridge
+        self.session.bridge = bridge
         return bridged[-1]
 
     def _put(self, moments: list[BufferedObservation], stamp_ns: int) -> None:
@@ -145,14 +133,14 @@ class Estimator:
 
     def _report(self, moment: BufferedObservation) -> None:
         """Report a pose to the back end."""
-        if moment.T_map_base is not None:
-            given = (moment.T_map_base, moment.module, moment.covariance)
-            self._back_end.add(moment.stamp_ns, *given)
+        T_map_base = moment.T_map_base
+        if T_map_base is not None:
+            self._back_end.add(moment.stamp_ns, T_map_base, moment.module, moment.covariance)
 
     def _rewrite(self, handover: Handover) -> None:
         """Replace the untrusted poses by those of a module that has caught up."""
         newest = self._memory.newest
-        before, known = newest.T_map_base, handover.T_map_base
+        before, known = newest.T_map_base, (handover.trail or [handover.anchor])[-1].T_map_base
         jump = se3.identity() if before is None or known is None else se3.inverse(before) @ known
         keeps_anchor = handover.anchor.module != BRIDGED
         self._back_end.rewind(handover.anchor.stamp_ns + keeps_anchor)
@@ -160,7 +148,7 @@ class Estimator:
         for tracking in handover.tracked:
             self._back_end.add_local(tracking.stamp_ns, tracking.T_local_base)
         self._put(handover.trail, newest.stamp_ns)
-        self._session.bridge = self._memory.newest.bridge.copy()
+        self.session.bridge = self._memory.newest.bridge.copy()
 
     def _begin_session(self, stamp_ns: int, from_ns: int, *, jump: Transform) -> None:
         """Open the active module's session in the back end; it begins at `from_ns`.
@@ -170,7 +158,7 @@ class Estimator:
         assert self.active is not None and self.active.T_map_local is not None
         T_map_local, last_ns = self.active.T_map_local, self._back_end.last_stamp_ns
         session = self._back_end.begin_session(self.active.key, T_map_local)
-        self._session.stored.append(session)
+        self.session.stored.append(session)
         self._log.add(
             "handover",
             stamp_ns,
@@ -186,14 +174,13 @@ class Estimator:
 
     def _tell(self, stamp_ns: int) -> None:
         """Log changes of the active module's status and of whether the wheels are trusted."""
-        if self.hold.wheels_lie is not self._told_lie:
-            self._told_lie = self.hold.wheels_lie
+        if self.session.hold.wheels_lie is not self._told_lie:
+            self._told_lie = self.session.hold.wheels_lie
             self._log.add("odometry", stamp_ns, is_believed=not self._told_lie)
-        status = self.hold.status
-        if status is None or status is self._session.logged or self.active is None:
-            return
-        self._session.logged = status
-        self._log.add("tracking", stamp_ns, module=self.active.key, status=status.value)
+        status = self.session.hold.status
+        if status is not None and status is not self.session.logged:
+            self.session.logged = status
+            self._log.add("tracking", stamp_ns, module=self.session.key, status=status.value)
 
     def _retire(self, session: ModuleSession) -> None:
         """Shut a module down; its map stays where it was placed last."""
@@ -210,7 +197,7 @@ class Estimator:
             ended, stored = self._ending.pop(0)
             legacy = ended.result()
             if legacy.lost and stored:
-                self._log.add("fault", self._memory.newest.stamp_ns, what=legacy.lost)
+                self._log.add("fault", self.now_ns, what=legacy.lost)
             for session in stored:
                 layers = legacy.layers if session == stored[-1] else MapLayers()
                 self._back_end.close_session(session, layers, legacy.trajectory)

@@ -51,11 +51,6 @@ class Handover:
         hold = self.session.hold
         return hold.status is TrackingStatus.LOST or hold.is_suspect
 
-    @property
-    def T_map_base(self) -> Transform | None:
-        """Return the newest pose (4, 4), None before the first."""
-        return self.trail[-1].T_map_base if self.trail else self.anchor.T_map_base
-
     def tracked_ns(self, stamp_ns: int) -> int:
         """Return for how long the module has tracked without a break."""
         hold = self.session.hold

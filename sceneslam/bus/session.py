@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from sceneslam.bus.bridge import Bridge
+from sceneslam.bus.decision import Health
 from sceneslam.bus.hold import Hold
 from sceneslam.bus.observation_buffer import BufferedObservation
 from sceneslam.bus.runner import Runner
@@ -31,13 +32,18 @@ class ModuleSession:
 
     @property
     def key(self) -> str:
-        """Return the module's key in `slam`."""
+        """Return the module's key in `slam`, "" without one."""
         return BRIDGED if self.runner is None else self.runner.key
 
     @property
     def is_running(self) -> bool:
         """Tell whether there is a module that has not failed."""
         return self.runner is not None and not self.runner.is_failed
+
+    @property
+    def health(self) -> Health:
+        """Return the module's health, FAILED without one."""
+        return self.hold.health if self.is_running else Health.FAILED
 
     def advance(
         self,
