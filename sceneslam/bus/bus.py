@@ -219,8 +219,7 @@ class Bus:
         verdict = decide(self._policy, situation)
         self._decisions.add(situation, verdict)
         if verdict.action is Action.TELL:
-            self._candidates.serve(situation.scene)
-            self._candidates.limit((), 0)
+            self._candidates.serve(situation.scene, (), 0)
             self._tell_scene(observation.stamp_ns)
         elif verdict.action is Action.TRY:
             self._changeover.begin_trial(verdict.to[0], observation.stamp_ns)
@@ -232,9 +231,8 @@ class Bus:
     def _begin(self, now: Situation, verdict: Decision) -> None:
         """Begin to carry out a verdict."""
         confirmed = self._watch.confirmed if verdict.reason in ("first", "scene") else None
-        if confirmed is not None:
-            self._candidates.serve(confirmed.scene)
-        self._candidates.limit(verdict.to, verdict.rounds)
+        scene = now.served_scene if confirmed is None else confirmed.scene
+        self._candidates.serve(scene, verdict.to, verdict.rounds)
         self._changeover.begin(now, verdict, None if confirmed is None else confirmed.since_ns)
 
     # Steps that the states use.

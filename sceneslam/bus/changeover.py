@@ -58,14 +58,12 @@ class Candidates:
         """Return the modules of a scene that can run, now or later."""
         return tuple(key for key in self._scenes.get(scene, ()) if self._runners[key].may_return)
 
-    def serve(self, scene: str) -> None:
-        """Set the served scene; all of its modules may be tried."""
+    def serve(self, scene: str, keys: Sequence[str], rounds: int) -> None:
+        """Set the served scene; of its modules only `keys` may be tried."""
         if scene != self.scene:
-            self.scene, self.rounds, self._retries = scene, 0, 0
-
-    def limit(self, keys: Sequence[str], rounds: int) -> None:
-        """Allow only the modules `keys` of the scene to be tried."""
-        self.tried, self.rounds = frozenset(self._scenes[self.scene]) - frozenset(keys), rounds
+            self._retries = 0
+        self.scene, self.rounds = scene, rounds
+        self.tried = frozenset(self._scenes.get(scene, ())) - frozenset(keys)
 
     def use(self, key: str) -> None:
         """Note that a module is being tried."""
@@ -121,7 +119,7 @@ class Changeover:
         if self._trial is None:
             return StandbyTrial.NONE
         handover = self._trial.handover
-        tracked_ns = -1 if handover is None else handover.tracked_ns(self._estimator.now_ns)
+        tracked_ns = 0 if handover is None else handover.tracked_ns(self._estimator.now_ns)
         return StandbyTrial.PASSED if tracked_ns >= _TRIAL_NS else StandbyTrial.RUNNING
 
     def begin(self, now: Situation, verdict: Decision, since_ns: int | None) -> None:

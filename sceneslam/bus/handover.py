@@ -52,10 +52,11 @@ class Handover:
         return hold.status is TrackingStatus.LOST or hold.is_suspect
 
     def tracked_ns(self, stamp_ns: int) -> int:
-        """Return for how long the module has tracked without a break."""
+        """Return for how long the module has tracked without a break, 0 if it does not track."""
         hold = self.session.hold
-        is_tracking = hold.status is TrackingStatus.TRACKING and hold.held_since_ns is not None
-        return stamp_ns - (hold.held_since_ns or 0) if is_tracking else -1
+        if hold.held_since_ns is None or hold.status is not TrackingStatus.TRACKING:
+            return 0
+        return stamp_ns - hold.held_since_ns
 
     def cost(self, stamp_ns: int) -> dict[str, object]:
         """Return the time it took, for the log; this is not reproducible between runs."""
