@@ -47,7 +47,8 @@ class Judgement:
     wheels_lie: bool = False  # they disagree with a module that is certain and moves plausibly
 
 
-_HORIZONS_S = (1.0, 5.0)  # over each: a jump shows in the shorter, a slow slide in the longer
+# Motions are compared over each: a jump shows in the shorter, a slow slide in the longer.
+_HORIZONS_NS = (1_000_000_000, 5_000_000_000)
 _PROBATION_NS = 1_000_000_000  # a module is trusted after agreeing over a whole horizon
 # Any two motions differ by this: sensor clocks 0.05 s apart at 0.6 m/s and 20 deg/s.
 _DISTANCE_M, _TURN_RAD = 0.03, 0.0175
@@ -97,7 +98,6 @@ class Gate:
 
     def __init__(self, settings: GateSettings, wheels: Wheels) -> None:
         self._sigmas, self._wheels = settings.sigmas, wheels
-        self._horizons_ns = [round(horizon_s * 1e9) for horizon_s in _HORIZONS_S]
         self._samples: list[_Sample] = []  # by rising stamp, back to the longest horizon
         self._T_odom_base: Transform | None = None
         self._way_m, self._turn_rad = 0.0, 0.0
@@ -245,7 +245,7 @@ class Gate:
         """
         found = [
             self._samples[max(self._until(stamp_ns - horizon_ns) - 1, 0)]
-            for horizon_ns in self._horizons_ns
+            for horizon_ns in _HORIZONS_NS
         ]
         self._forget_before(found[-1])
         return found
