@@ -115,12 +115,7 @@ class Bus:
         self._do: _Step  # what the state does with an observation
         self._go_on: _Step  # the same for the observation at which the state was entered
         self._machine = BusMachine(self)
-        self._state = self._machine.state
-
-    @property
-    def state(self) -> str:
-        """Return the state that the machine is in."""
-        return self._state
+        self.state = self._machine.state
 
     @property
     def active(self) -> str:
@@ -273,10 +268,10 @@ class Bus:
 
     def _send(self, event: str, stamp_ns: int) -> None:
         """Send an event to the machine and log the state it leads to."""
-        source = self._state
+        source = self.state
         self._machine.send(event)
-        self._state = self._machine.state
-        self._log.add("state", stamp_ns, **{"from": source, "to": self._state}, reason=event)
+        self.state = self._machine.state
+        self._log.add("state", stamp_ns, **{"from": source, "to": self.state}, reason=event)
 
     def _spent_ns(self) -> int:
         """Return what all modules have cost so far."""
