@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from sceneslam.bus.decision_log import decide_again
+from sceneslam.bus.decision import GO_ON, Health, Situation, StandbyTrial, decide, in_json
 from sceneslam.bus.policy import Policy
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.types.errors import InputError, SceneSlamError
@@ -26,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     try:
         events, policy = _read_events(Path(words[0])), _read_policy(Path(words[0]))
-        wrong = _decide_again(events, policy)
+        wrong = _checked(events, policy)
     except SceneSlamError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -37,11 +38,47 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if wrong else 0
 
 
-def _decide_again(events: Sequence[Event], policy: Policy) -> list[str]:
+def _checked(events: Sequence[Event], policy: Policy) -> list[str]:
     try:
         return decide_again(events, policy)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"the log is of another version: {error!r} in a situation") from error
+
+
+def decide_again(events: Iterable[Event], policy: Policy) -> list[str]:
+    """Return one sentence for every logged decision that its logged inputs do not reproduce.
+
+    The log holds a vote for every observation and every change of situation; each of them in the
+    state `run` is decided again.
+    """
+    wrong: list[str] = []
+    state, pending, now = "init", None, None
+    for event in events:
+        kind, stamp_ns = event["event"], event["stamp_ns"]
+        if kind == "vote":
+            if pending is not None and now is not None:
+                wrong += _check(policy, replace(now, stamp_ns=pending), in_json(GO_ON))
+            pending = stamp_ns if state == "run" else None
+        elif kind == "situation":
+            now, pending = _situation(event), None
+            wrong += _check(policy, now, event["verdict"])
+        elif kind == "state":
+            state = event["to"]
+    return wrong
+
+
+def _check(policy: Policy, now: Situation, logged: Any) -> list[str]:
+    verdict = in_json(decide(policy, now))
+    if verdict == logged:
+        return []
+    return [f"at {now.stamp_ns}: logged {logged['action']}, decided {verdict['action']}"]
+
+
+def _situation(event: Event) -> Situation:
+    values = {field.name: event[field.name] for field in fields(Situation)}
+    values |= {"health": Health(values["health"]), "trial": StandbyTrial(values["trial"])}
+    values |= {key: tuple(values[key]) for key in ("choices", "served_choices")}
+    return Situation(**values | {"tried": frozenset(values["tried"])})
 
 
 def _read_events(folder: Path) -> list[Event]:

@@ -9,7 +9,7 @@ from fakes import PERIOD_NS, ExactModule, observation, true_pose
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneslam.bus.decision_log import decide_again
+from sceneslam.decisions import decide_again
 from sceneslam.types import se3
 from sceneslam.types.run import BRIDGED
 

@@ -10,8 +10,7 @@ from statemachine import State, StateMachine
 
 from sceneslam.bus.changeover import Candidates, Changeover, Outcome
 from sceneslam.bus.dead_reckoning import DeadReckoning
-from sceneslam.bus.decision import Action, Decision, Health, Situation, decide
-from sceneslam.bus.decision_log import DecisionLog
+from sceneslam.bus.decision import Action, Decision, DecisionLog, Health, Situation, decide
 from sceneslam.bus.estimator import Estimator
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.policy import Policy

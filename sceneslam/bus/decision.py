@@ -6,9 +6,12 @@ log alone (`python -m sceneslam.decisions RUN`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import json
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
+from typing import Any
 
+from sceneslam.bus.events import EventLog
 from sceneslam.bus.policy import Policy
 
 
@@ -125,3 +128,23 @@ def _decide_on_loss(policy: Policy, now: Situation) -> Decision:
 def _patience_ns(policy: Policy, now: Situation) -> int:
     share = _BLIND if now.is_blind else 1.0
     return round(share * policy.lost_patience_s * 1e9)
+
+
+class DecisionLog:
+    """Logs a situation whenever more than its time changed, and every verdict but `go on`."""
+
+    def __init__(self, log: EventLog) -> None:
+        self._log = log
+        self._last: Situation | None = None
+
+    def add(self, now: Situation, verdict: Decision) -> None:
+        """Log a decision with its inputs."""
+        if now != self._last or verdict != GO_ON:
+            self._log.add("situation", **in_json(now), verdict=in_json(verdict))
+        self._last = now
+
+
+def in_json(record: Situation | Decision) -> dict[str, Any]:
+    """Return a record in its JSON form."""
+    form: dict[str, Any] = json.loads(json.dumps(asdict(record), default=sorted))
+    return form
