@@ -108,29 +108,27 @@ class Handover:
         if not session.is_placed and moment.is_trusted:
             self.anchor, self.trail, session.bridge = moment, [], moment.bridge.copy()
         is_newest = moment is self._memory.newest
-        is_sure = session.is_placed and session.hold.is_held
-        if is_sure and not is_newest and self._pace.spares(moment.observation):
-            self._pace.spare(moment.observation)
-            self._spared_ns.append(moment.stamp_ns)
-            self._remember(moment, session.skip(moment.observation, motion))
-            return False
-        self._ask(moment, motion)
-        return True
+        is_tracking = session.is_placed and session.hold.is_held
+        is_given = is_newest or not is_tracking or not self._pace.spares(moment.observation)
+        self._advance(moment, motion, is_given=is_given)
+        return is_given
 
-    def _ask(self, moment: BufferedObservation, motion: Transform | None) -> None:
-        """Give the module a buffered observation, with the gyro samples of skipped ones."""
+    def _advance(
+        self, moment: BufferedObservation, motion: Transform | None, *, is_given: bool
+    ) -> None:
+        """Continue to a buffered observation, given with the gyro samples of skipped ones."""
         session, given = self.session, moment.observation
         was_placed = session.is_placed
-        if self.runner.can_use(given):
+        if is_given and self.runner.can_use(given):
             given = self._pace.give(given)
         else:
             self._pace.spare(given)
-            if self._spared_ns:
+            if self._spared_ns or not is_given:
                 self._spared_ns.append(given.stamp_ns)
         T_map_bridged = None
-        if was_placed and self._spared_ns:
+        if is_given and was_placed and self._spared_ns:
             T_map_bridged = session.predict(session.bridge.copy(), given, True, motion)
-        found = session.advance(given, by_velocity=True, T_prev_curr=motion)
+        found = session.advance(given, by_velocity=True, T_prev_curr=motion, is_given=is_given)
         if session.fault is not None:
             raise session.fault
         if session.tracking is not None:
@@ -143,18 +141,14 @@ class Handover:
                 T_bridged_base = se3.inverse(T_map_bridged) @ found.T_map_base
                 self._bend(session.tracking, T_bridged_base)
             self._spared_ns, self._given_ns = [], moment.stamp_ns
-        self._remember(moment, replace(found, observation=moment.observation))
+        if moment is not self.anchor or moment.module == BRIDGED:
+            self.trail.append(replace(found, observation=moment.observation))
 
     def _motion_to(self, moment: BufferedObservation) -> Transform | None:
         """Return the motion (4, 4) since the previous observation, as it was estimated then."""
         if self._reported is None or moment.T_map_base is None:
             return None
         return se3.inverse(self._reported) @ moment.T_map_base
-
-    def _remember(self, moment: BufferedObservation, found: BufferedObservation) -> None:
-        """Continue to a buffered observation with its newly estimated pose."""
-        if moment is not self.anchor or moment.module == BRIDGED:
-            self.trail.append(found)
 
     def _bend(self, tracking: Tracking, T_bridged_base: Transform) -> None:
         """Distribute the drift of the trail since the module's last answer, which odometry bridged.

@@ -51,15 +51,20 @@ class ModuleSession:
         *,
         by_velocity: bool,
         T_prev_curr: Transform | None = None,
+        is_given: bool = True,
     ) -> BufferedObservation:
         """Return the observation with its pose: the module's, or a bridged one.
 
+        The module is spared the observation unless `is_given`.
         Odometry bridges; else constant velocity, if `by_velocity` or while the module's sensors
         are silent; else `T_prev_curr`, the motion as it was estimated at the time.
         """
         self.fault, self.tracking = None, None
         try:
-            self.tracking = self._ask(observation)
+            if is_given:
+                self.tracking = self._ask(observation)
+            else:
+                self.hold.spare(observation)
             if self.tracking is not None:
                 return self._moment(observation, self._place(observation, self.tracking))
         except ModuleError as error:
@@ -67,12 +72,6 @@ class ModuleSession:
         is_silent = self.hold.status is not TrackingStatus.LOST
         T_map_base = self.predict(self.bridge, observation, by_velocity or is_silent, T_prev_curr)
         return self._moment(observation, T_map_base)
-
-    def skip(self, observation: Observation, T_prev_curr: Transform | None) -> BufferedObservation:
-        """Return an observation with a bridged pose; it is not given to the module."""
-        self.fault, self.tracking = None, None
-        self.hold.spare(observation)
-        return self._moment(observation, self.predict(self.bridge, observation, True, T_prev_curr))
 
     def predict(
         self,
