@@ -173,19 +173,16 @@ class Changeover:
     def try_on(self, stamp_ns: int) -> None:
         """Feed the module on trial, if any; the trial ends when it fails or stays lost."""
         trial = self._trial
-        if trial is None or stamp_ns < trial.ready_ns:
+        if trial is None:
             return
         try:
-            handover = self._begun(trial)
-            if handover is None:
-                return
-            handover.advance(None)
+            handover = self._caught_up(trial, stamp_ns)
         except ModuleError as error:
             self._log.add_fault(stamp_ns, str(error))
             self._end_trial()
             return
         is_given_time = stamp_ns - trial.ready_ns < self._policy.retry_s * 1e9  # it may need motion
-        if handover.is_lost and not is_given_time:
+        if handover is not None and handover.is_lost and not is_given_time:
             self._end_trial()
 
     def close(self) -> None:
@@ -210,15 +207,13 @@ class Changeover:
 
     def _lead(self, attempt: _Attempt, stamp_ns: int) -> bool | None:
         """Advance one candidate; return whether it took over, None while undecided."""
-        if stamp_ns < attempt.ready_ns:
-            return None
         try:
-            handover = self._begun(attempt)
-            if handover is None or not handover.advance(self._limit):
-                return None
+            handover = self._caught_up(attempt, stamp_ns)
         except ModuleError as error:
             self._log.add_fault(stamp_ns, str(error))
             return self._refuse(attempt.runner, stamp_ns, "failed")
+        if handover is None:
+            return None
         if handover.is_lost and self._can_refuse():
             return self._refuse(attempt.runner, stamp_ns, "lost")
         self._estimator.accept(handover)
@@ -227,18 +222,20 @@ class Changeover:
         self._log_choice("decision", stamp_ns, attempt.runner.key)
         return True
 
-    def _begun(self, attempt: _Attempt) -> Handover | None:
-        """Start a candidate; return its hand-over once it has started, None until then."""
+    def _caught_up(self, attempt: _Attempt, stamp_ns: int) -> Handover | None:
+        """Start or advance a candidate; return its hand-over once it has caught up."""
+        if stamp_ns < attempt.ready_ns:
+            return None
+        runner, is_trial = attempt.runner, attempt is self._trial
+        if not attempt.is_begun:
+            attempt.is_begun = True
+            runner.start(self._rig, self._candidates.scene)
         if attempt.handover is None:
-            if not attempt.is_begun:
-                attempt.is_begun = True
-                attempt.runner.start(self._rig, self._candidates.scene)
-            if attempt.runner.has_started():
-                is_trial = attempt is self._trial
-                attempt.handover = self._estimator.begin(
-                    attempt.runner, self._since_ns, is_trial=is_trial
-                )
-        return attempt.handover
+            if not runner.has_started():
+                return None
+            attempt.handover = self._estimator.begin(runner, self._since_ns, is_trial=is_trial)
+        has_caught_up = attempt.handover.advance(None if is_trial else self._limit)
+        return attempt.handover if has_caught_up else None
 
     def _can_refuse(self) -> bool:
         """Tell whether there is an alternative to a lost module; the paper has no such check."""
