@@ -111,7 +111,7 @@ class ObservationBuffer:
 
     def _least_missed(self) -> int:
         """Return the index, among the entries with sensor data, of the least needed one."""
-        stamps_ns = np.array([moment.stamp_ns for moment in self._full], np.float64)
+        stamps_ns = np.array([moment.observation.stamp_ns for moment in self._full], np.float64)
         ages_ns = stamps_ns[-1] - stamps_ns[1:-1]
         return int(np.argmin((stamps_ns[2:] - stamps_ns[:-2]) / ages_ns)) + 1
 
