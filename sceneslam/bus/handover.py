@@ -127,7 +127,9 @@ class Handover:
                 self._spared_ns.append(given.stamp_ns)
         T_map_bridged = None
         if is_given and was_placed and self._spared_ns:
-            T_map_bridged = session.predict(session.bridge.copy(), given, True, motion)
+            T_map_bridged = session.predict(
+                session.bridge.copy(), given, by_velocity=True, T_prev_curr=motion
+            )
         found = session.advance(given, by_velocity=True, T_prev_curr=motion, is_given=is_given)
         if session.fault is not None:
             raise session.fault

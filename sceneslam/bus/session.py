@@ -70,13 +70,19 @@ class ModuleSession:
         except ModuleError as error:
             self.fault, self.tracking = error, None
         is_silent = self.hold.status is not TrackingStatus.LOST
-        T_map_base = self.predict(self.bridge, observation, by_velocity or is_silent, T_prev_curr)
+        T_map_base = self.predict(
+            self.bridge,
+            observation,
+            by_velocity=by_velocity or is_silent,
+            T_prev_curr=T_prev_curr,
+        )
         return self._moment(observation, T_map_base)
 
     def predict(
         self,
         bridge: Bridge,
         observation: Observation,
+        *,
         by_velocity: bool,
         T_prev_curr: Transform | None,
     ) -> Transform | None:
