@@ -191,6 +191,29 @@ def test_first_choice_comes_back_when_it_holds_beside_the_fallback():
     assert_exact(atlas)
 
 
+def test_first_choice_that_cannot_be_placed_after_its_trial_is_refused():
+    class Unplaceable(ExactModule):
+        """Can be placed at its start and for its trial, and not when it returns."""
+
+        def __init__(self, **options):
+            super().__init__(**options)
+            self._places_left = 2
+
+        def set_pose(self, T_map_local):
+            if not self._places_left:
+                raise RuntimeError("no map")
+            self._places_left -= 1
+
+    modules = {"bright": Unplaceable(lost=range(50, 70)), "dark": ExactModule()}
+    _, atlas, log, _ = drive(modules, handover="rewind", retry_s=2.0)
+    (fault,), (refused,) = events(log, "fault"), events(log, "refused")
+    assert fault["what"] == "slam.bright could not be placed: RuntimeError: no map"
+    assert (refused["to"], refused["reason"], refused["why"]) == ("bright", "return", "failed")
+    assert fault["stamp_ns"] == refused["stamp_ns"] == 83 * PERIOD_NS
+    assert set(atlas.pose_modules[53:]) == {"dark"} and len(atlas.trajectory) == 100
+    assert_exact(atlas)
+
+
 def test_vain_trials_become_rare():
     bright = ExactModule(lost=range(50, 5000))
     _, _, log, _ = drive(

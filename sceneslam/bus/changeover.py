@@ -85,6 +85,7 @@ class _Attempt:
 
     runner: Runner
     ready_ns: int  # when it may be started
+    is_trial: bool = False  # it began on standby beside the fallback
     is_begun: bool = False  # it is being started, or was
     handover: Handover | None = None  # None until it has started
 
@@ -157,7 +158,8 @@ class Changeover:
     def begin_trial(self, key: str, stamp_ns: int) -> None:
         """Run the scene's first choice on standby beside the fallback; its poses are not used."""
         runner = self._runners[key]
-        self._trial = _Attempt(runner=runner, ready_ns=self._ready_ns(key, stamp_ns))
+        ready_ns = self._ready_ns(key, stamp_ns)
+        self._trial = _Attempt(runner=runner, ready_ns=ready_ns, is_trial=True)
         self.try_on(stamp_ns)
 
     def submit(self, observation: Observation) -> None:
@@ -197,8 +199,6 @@ class Changeover:
         self._candidates.use(runner.key)
         if self._trial is not None and self._trial.runner is runner:
             attempt, self._trial = self._trial, None
-            if attempt.handover is not None:
-                attempt.handover.settle()
             return attempt
         ready_ns = self._ready_ns(runner.key, stamp_ns)
         if self._policy.handover == "cold" and ready_ns > stamp_ns:
@@ -209,6 +209,8 @@ class Changeover:
         """Advance one candidate; return whether it took over, None while undecided."""
         try:
             handover = self._caught_up(attempt, stamp_ns)
+            if handover is not None and attempt.is_trial:
+                handover.settle()
         except ModuleError as error:
             self._log.add_fault(stamp_ns, str(error))
             return self._refuse(attempt.runner, stamp_ns, "failed")
@@ -226,7 +228,7 @@ class Changeover:
         """Start or advance a candidate; return its hand-over once it has caught up."""
         if stamp_ns < attempt.ready_ns:
             return None
-        runner, is_trial = attempt.runner, attempt is self._trial
+        runner, is_trial = attempt.runner, attempt.is_trial
         if not attempt.is_begun:
             attempt.is_begun = True
             runner.start(self._rig, self._candidates.scene)

@@ -83,7 +83,7 @@ class Handover:
     def settle(self) -> None:
         """Place the module, which has caught up, at the pose of the newest observation.
 
-        Its earlier observations belong to its trial, not to the hand-over.
+        Its earlier observations belong to its trial, not to the hand-over. Raises ModuleError.
         """
         last, anchor = self.tracked[-1], self._memory.newest
         self._began_ns, self._cost_ns = anchor.stamp_ns, 0
