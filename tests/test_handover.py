@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from sceneslam.decisions import decide_again
 from sceneslam.types import se3
+from sceneslam.types.rig import Sensor
 from sceneslam.types.run import BRIDGED
 
 SLIP = se3.exp(np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.01]))
@@ -211,6 +212,23 @@ def test_first_choice_that_cannot_be_placed_after_its_trial_is_refused():
     assert (refused["to"], refused["reason"], refused["why"]) == ("bright", "return", "failed")
     assert fault["stamp_ns"] == refused["stamp_ns"] == 83 * PERIOD_NS
     assert set(atlas.pose_modules[53:]) == {"dark"} and len(atlas.trajectory) == 100
+    assert_exact(atlas)
+
+
+@pytest.mark.parametrize("slow", ["bright"])
+def test_first_choice_comes_back_without_a_gap_or_a_jump_where_a_sensor_is_slow(slow):
+    class Slow(ExactModule):
+        requires = (frozenset({Sensor.POINTS}),)
+
+    def feed(index):
+        points = None if index % 3 else np.zeros((1, 3), np.float32)
+        return replace(observation(index), points_lidar=points)
+
+    kinds = {"bright": ExactModule, "dark": ExactModule} | {slow: Slow}
+    modules = {"bright": kinds["bright"](lost=range(50, 70)), "dark": kinds["dark"]()}
+    _, atlas, log, _ = drive(modules, feed=feed, steps=150, handover="rewind", retry_s=2.0)
+    assert [event["reason"] for event in events(log, "decision")] == ["first", "lost", "return"]
+    assert len(atlas.trajectory) == 150
     assert_exact(atlas)
 
 

@@ -52,10 +52,11 @@ class Handover:
         return hold.status is TrackingStatus.LOST or hold.is_suspect
 
     def tracked_ns(self, stamp_ns: int) -> int:
-        """Return for how long the module has tracked without a break, 0 if it does not track."""
+        """Return how long it has tracked without a break, 0 if not at the newest observation."""
         hold = self.session.hold
-        if hold.held_since_ns is None or hold.status is not TrackingStatus.TRACKING:
+        if hold.tracking is None or hold.tracking.status is not TrackingStatus.TRACKING:
             return 0
+        assert hold.held_since_ns is not None
         return stamp_ns - hold.held_since_ns
 
     def cost(self, stamp_ns: int) -> dict[str, object]:
