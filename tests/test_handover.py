@@ -215,7 +215,7 @@ def test_first_choice_that_cannot_be_placed_after_its_trial_is_refused():
     assert_exact(atlas)
 
 
-@pytest.mark.parametrize("slow", ["bright"])
+@pytest.mark.parametrize("slow", ["bright", "dark"])
 def test_first_choice_comes_back_without_a_gap_or_a_jump_where_a_sensor_is_slow(slow):
     class Slow(ExactModule):
         requires = (frozenset({Sensor.POINTS}),)

@@ -142,8 +142,8 @@ class Estimator:
         newest = self._memory.newest
         before, known = newest.T_map_base, (handover.trail or [handover.anchor])[-1].T_map_base
         jump = se3.identity() if before is None or known is None else se3.inverse(before) @ known
-        keeps_anchor = handover.anchor.module != BRIDGED
-        self._back_end.rewind(handover.anchor.stamp_ns + keeps_anchor)
+        if handover.trail:
+            self._back_end.rewind(handover.trail[0].stamp_ns)
         self._begin_session(newest.stamp_ns, handover.tracked[0].stamp_ns, jump=jump)
         for tracking in handover.tracked:
             self._back_end.add_local(tracking.stamp_ns, tracking.T_local_base)
