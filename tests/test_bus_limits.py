@@ -7,7 +7,7 @@ import hostile
 import numpy as np
 import pytest
 from driving import dark_from, drive, events, policy
-from fakes import PERIOD_NS, ExactModule, ScriptedDetector, observation
+from fakes import PERIOD_NS, RIG, ExactModule, ScriptedDetector, observation
 
 from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.changeover import Candidates
@@ -16,11 +16,14 @@ from sceneslam.bus.events import EventLog, log_uncertainty
 from sceneslam.bus.gate import Gate, GateSettings, Judgement
 from sceneslam.bus.hold import Hold
 from sceneslam.bus.recent import CovarianceMonitor, RecentMedian
+from sceneslam.bus.runner import Runner
 from sceneslam.bus.scene_filter import WindowFilter
+from sceneslam.bus.session import ModuleSession
 from sceneslam.bus.watch import Watch
 from sceneslam.bus.wheel_scale import WheelScale
+from sceneslam.executors import InStep
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError
+from sceneslam.types.errors import ConfigError, ModuleError
 from sceneslam.types.observation import SceneVote, Tracking, TrackingStatus
 from sceneslam.types.rig import Wheels
 from sceneslam.types.run import SessionStart
@@ -293,6 +296,23 @@ def test_a_sensor_is_silent_after_two_of_its_periods():
     assert silent.unheld_since_ns == silent.held_ns == 3 * S // 10 + 1
     assert asked(0, silent_ns=6 * S).is_held and not asked(0, silent_ns=6 * S + 1).is_held
     assert asked(silent_ns=5).unheld_since_ns == 5  # it never delivered anything
+
+
+@pytest.mark.parametrize("method", ["set_pose", "set_scene", "track"])
+def test_a_failed_module_has_answered_no_later_observation(method):
+    module, hold = ExactModule(), Hold(silence_ns=S, gate=None)
+    runner = Runner("bright", module, InStep())
+    runner.start(RIG, "Bright")
+    setattr(module, method, lambda _: hostile.throw("Exception"))
+    session = ModuleSession(runner, hold, Bridge(is_active=True))
+    session.advance(observation(0), by_velocity=True)
+    if method == "set_scene":
+        with pytest.raises(ModuleError):
+            runner.set_scene("Dark")
+    assert session.health is Health.FAILED
+    session.advance(observation(1), by_velocity=True)
+    assert session.tracking is None and hold.tracking is None
+    assert not hold.is_asked and not hold.is_trusted
 
 
 @pytest.mark.parametrize("row", [0, 2, 3, 5])

@@ -61,7 +61,7 @@ class ModuleSession:
         """
         self.fault, self.tracking = None, None
         try:
-            if is_given:
+            if is_given and self.is_running:
                 self.tracking = self._ask(observation)
             else:
                 self.hold.spare(observation)
@@ -97,8 +97,7 @@ class ModuleSession:
 
     def _ask(self, observation: Observation) -> Tracking | None:
         """Return the module's answer if it may be used; raises ModuleError as the runner does."""
-        if self.runner is None or self.runner.is_failed:
-            return None
+        assert self.runner is not None
         tracking = self.hold.ask(self.runner, observation)
         if self.hold.is_suspect:
             self.is_placed = False  # it is placed anew at the robot's next pose
