@@ -59,6 +59,30 @@ def test_module_that_keeps_sliding_is_replaced():
     assert errors_m(atlas.trajectory).max() < 1e-9 and atlas.pose_modules[-1] == "dark"
 
 
+@pytest.mark.parametrize("after", ["tracks", "lost", "silent", "raises"])
+def test_suspicion_is_logged_once_whatever_the_module_does_next(after):
+    class Jumping(ExactModule):
+        """Is off by a metre at index 40 alone."""
+
+        def track(self, observation):
+            tracking = super().track(observation)
+            shift = se3.from_xy_yaw(float(observation.stamp_ns == 40 * PERIOD_NS), 0.0, 0.0)
+            return replace(tracking, T_local_base=shift @ tracking.T_local_base)
+
+    def feed(index):
+        is_blind = after == "silent" and 40 < index < 45
+        return replace(observation(index), image_bgr=None) if is_blind else observation(index)
+
+    modules = {
+        "bright": Jumping(**{after: range(41, 45)} if after in ("lost", "raises") else {}),
+        "dark": ExactModule(),
+    }
+    startup_s = {"dark": 2.0}  # the failed module stays for so long
+    _, atlas, log, _ = drive(modules, gate=GATE, feed=feed, handover="rewind", startup_s=startup_s)
+    assert [event["stamp_ns"] for event in events(log, "suspect")] == [40 * PERIOD_NS]
+    assert len(atlas.trajectory) == 100 and errors_m(atlas.trajectory).max() < 1e-9
+
+
 def test_candidate_that_slides_is_refused_while_the_old_module_holds():
     modules = {"bright": ExactModule(), "dark": Sliding(10, 1000)}
     _, atlas, log, _ = drive(

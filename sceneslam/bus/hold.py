@@ -22,7 +22,7 @@ class Hold:
     def __init__(self, *, silence_ns: int, gate: Gate | None) -> None:
         self.status: TrackingStatus | None = None  # None before its first answer
         self.is_suspect = False  # from a disagreement on until it has agreed for long enough
-        self.suspect_since_ns: int | None = None  # since when it may have been wrong
+        self.suspect_since_ns: int | None = None  # where suspicion begins: since when it may err
         self.is_trusted = False  # another module may start from its last pose
         self.wheels_lie = False  # by the module's motion and the robot's inertia
         self.is_asked = False  # it was given the last observation
@@ -98,7 +98,7 @@ class Hold:
         covariance: NDArray[np.float64] | None = None,
     ) -> None:
         """Compare the module's motion with the odometry's."""
-        self.turn = None
+        self.turn, self.suspect_since_ns = None, None
         T_odom_prev, self._T_odom_prev = self._T_odom_prev, observation.T_odom_base
         if self._gate is None:
             return
@@ -115,7 +115,7 @@ class Hold:
             self.suspect_since_ns = None if self.is_suspect else judgement.since_ns
             self.is_suspect = True
         elif judgement.is_trusted:
-            self.is_suspect, self.suspect_since_ns = False, None
+            self.is_suspect = False
         if self.is_revised:
             self._agreed = None  # its earlier pose is not comparable with its corrected ones
         if judgement.turn_agrees and T_local_base is not None:
