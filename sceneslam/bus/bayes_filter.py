@@ -54,7 +54,7 @@ class BayesFilter:
         # confirmed one, summed since the vote at which it began to grow.
         self._evidence = np.zeros(len(scenes))
         self._began_ns = np.zeros(len(scenes), np.int64)
-        self.scene: str | None = None  # confirmed last, None before the first
+        self._scene: str | None = None  # confirmed last, None before the first
 
     @property
     def posterior(self) -> Mapping[str, float] | None:
@@ -98,7 +98,7 @@ class BayesFilter:
 
     def _accumulate(self, log_likelihoods: NDArray[np.float64], stamp_ns: int) -> None:
         """Update, per scene, since when the votes have supported it over the confirmed scene."""
-        confirmed = 0.0 if self.scene is None else log_likelihoods[self._places[self.scene]]
+        confirmed = 0.0 if self._scene is None else log_likelihoods[self._places[self._scene]]
         begins = self._evidence <= 0.0
         self._began_ns[begins] = stamp_ns
         self._evidence = np.maximum(self._evidence + log_likelihoods - confirmed, 0.0)
@@ -106,9 +106,9 @@ class BayesFilter:
     def _confirmed(self, stamp_ns: int) -> ConfirmedScene | None:
         place = int(np.argmax(self._belief))
         scene = list(self._places)[place]
-        if scene == self.scene or self._belief[place] < self._settings.confirm_probability:
+        if scene == self._scene or self._belief[place] < self._settings.confirm_probability:
             return None
-        previous, self.scene = self.scene, scene
+        previous, self._scene = self._scene, scene
         self._evidence[:] = 0.0
         since_ns = int(self._began_ns[place])
         return ConfirmedScene(stamp_ns=stamp_ns, since_ns=since_ns, scene=scene, previous=previous)

@@ -46,7 +46,7 @@ class WindowFilter:
         self._candidate: str | None = None
         self._candidate_since_ns = 0
         self._last_ns = 0
-        self.scene: str | None = None  # confirmed last, None before the first
+        self._scene: str | None = None  # confirmed last, None before the first
 
     def update(self, vote: SceneVote) -> ConfirmedScene | None:
         """Return the scene that this vote confirms, None when nothing changes.
@@ -55,14 +55,14 @@ class WindowFilter:
         """
         if vote.scene == UNSURE:
             return None
-        window_ns = self._first_window_ns if self.scene is None else self._window_ns
+        window_ns = self._first_window_ns if self._scene is None else self._window_ns
         silent = vote.stamp_ns - self._last_ns > window_ns
         if vote.scene != self._candidate or silent:
             self._candidate, self._candidate_since_ns = vote.scene, vote.stamp_ns
         self._last_ns = vote.stamp_ns
-        if vote.scene == self.scene or vote.stamp_ns - self._candidate_since_ns < window_ns:
+        if vote.scene == self._scene or vote.stamp_ns - self._candidate_since_ns < window_ns:
             return None
-        previous, self.scene = self.scene, vote.scene
+        previous, self._scene = self._scene, vote.scene
         return ConfirmedScene(
             stamp_ns=vote.stamp_ns,
             since_ns=self._candidate_since_ns,
