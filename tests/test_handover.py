@@ -152,6 +152,15 @@ def test_module_that_is_lost_does_not_replace_one_that_holds():
     assert_exact(atlas)
 
 
+def test_module_that_is_lost_replaces_one_that_failed():
+    modules = {"bright": ExactModule(raises={50}), "dark": ExactModule(lost={70})}
+    _, atlas, log, _ = drive(modules, handover="rewind", startup_s={"dark": 2.0})
+    assert not events(log, "refused") and modules["dark"].activations == 1
+    (failed,) = (each for each in events(log, "situation") if each["health"] == "failed")
+    assert failed["held_ns"] == failed["unheld_since_ns"] == 50 * PERIOD_NS
+    assert_exact(atlas)
+
+
 def test_poses_told_at_the_time_are_kept_where_nothing_better_is_known():
     """The new module is lost for a second in the past; there is no odometry, the old one held."""
     modules = {"bright": ExactModule(), "dark": ExactModule(lost=range(45, 58))}

@@ -60,7 +60,7 @@ class Hold:
         if not runner.can_use(observation):
             self.spare(observation)
             if self._fed_ns is None or observation.stamp_ns - self._fed_ns > 2 * self._period_ns:
-                self._lose(observation.stamp_ns)
+                self.lose(observation.stamp_ns)
             return None
         tracking = runner.track(observation)
         self._feed(tracking)
@@ -69,7 +69,7 @@ class Hold:
         covariance = tracking.covariance if is_tracking else None
         self._judge(observation, None if is_lost else tracking.T_local_base, covariance)
         if is_lost or self.is_suspect:
-            self._lose(tracking.stamp_ns)
+            self.lose(tracking.stamp_ns)
             return None
         self.tracking = tracking
         is_usual = self._covariances.is_usual(tracking.covariance)
@@ -125,7 +125,8 @@ class Hold:
                 self.turn = _turn(*self._agreed, *now, T_odom_prev)
             self._agreed = now
 
-    def _lose(self, stamp_ns: int) -> None:
+    def lose(self, stamp_ns: int) -> None:
+        """Record that the module does not track, for whatever reason."""
         if self.unheld_since_ns is None:
             self.unheld_since_ns = stamp_ns
             held_since_ns, self.held_since_ns = self.held_since_ns, None

@@ -69,6 +69,8 @@ class ModuleSession:
                 return self._moment(observation, self._place(observation, self.tracking))
         except ModuleError as error:
             self.fault, self.tracking = error, None
+        if not self.is_running:
+            self.hold.lose(observation.stamp_ns)
         is_silent = self.hold.status is not TrackingStatus.LOST
         T_map_base = self.predict(
             self.bridge,
