@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from driving import assert_exact, drive, events
+from driving import assert_exact, dark_from, drive, events
 from fakes import PERIOD_NS, ExactModule, observation
 
 
@@ -41,6 +41,30 @@ def test_the_only_module_is_started_again_at_once():
     bus, atlas, log, _ = drive({"only": only}, table=ALONE, has_odometry=False)
     assert bus.state == "terminate" and only.activations == 3 and only.failures == 2
     assert len(atlas.trajectory) == 100 and len(events(log, "fault")) == 2
+    assert_exact(atlas)
+
+
+@pytest.mark.parametrize("choices", [("bright", "dark"), ("dark", "bright")])
+def test_a_module_that_fails_where_the_scene_changes_ends_before_it_starts_again(choices):
+    class Noting(Phoenix):
+        """Notes in which order it is started and shut down."""
+
+        calls = ()
+
+        def activate(self, rig):
+            self.calls += ("activate",)
+            super().activate(rig)
+
+        def shutdown(self):
+            self.calls += ("shutdown",)
+            super().shutdown()
+
+    bright = Noting(raises={60})
+    modules = {"bright": bright, "dark": ExactModule(raises_on_activate=True)}
+    table = {"Bright": ["bright"], "Dark": choices}
+    _, atlas, log, _ = drive(modules, table=table, scene_at=dark_from(40))
+    assert events(log, "decision")[-1]["stamp_ns"] == 60 * PERIOD_NS
+    assert bright.calls == ("activate", "shutdown") * 2
     assert_exact(atlas)
 
 

@@ -138,8 +138,10 @@ class Changeover:
         while self._attempt is not None or self._queue:
             if self._attempt is None:
                 runner = self._runners[self._queue.pop(0)]
-                if runner is self._estimator.active and not runner.is_failed:
-                    return Outcome.FAILURE  # the active module stays, as the fallback
+                if runner is self._estimator.active:
+                    if not runner.is_failed:
+                        return Outcome.FAILURE  # the active module stays, as the fallback
+                    self._estimator.retire()  # before it is started again
                 self._attempt = self._start(runner, stamp_ns)
             is_accepted = self._lead(self._attempt, stamp_ns)
             if is_accepted is None:
