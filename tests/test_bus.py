@@ -3,6 +3,7 @@
 import weakref
 
 import numpy as np
+import pytest
 from driving import assert_exact, dark_from, drive, events
 from fakes import PERIOD_NS, ExactModule, observation, true_pose
 
@@ -51,6 +52,17 @@ def test_same_module_for_the_new_scene_is_told_and_not_restarted():
     )
     assert module.activations == 1 and module.scenes == ["Bright", "Dark"]
     assert len(events(log, "decision")) == 1
+
+
+@pytest.mark.parametrize("choices", [("dark",), ("dark", "bright")])
+@pytest.mark.parametrize("why", ["lost", "failed"])
+def test_module_that_stays_because_no_other_can_take_over_is_told_the_scene(why, choices):
+    cannot = {"lost": {"lost": range(100)}, "failed": {"raises_on_activate": True}}[why]
+    modules = {"bright": ExactModule(), "dark": ExactModule(**cannot)}
+    table = {"Bright": ["bright"], "Dark": choices}
+    _, atlas, log, _ = drive(modules, scene_at=dark_from(40), table=table)
+    assert events(log, "refused")[0]["why"] == why and set(atlas.pose_modules) == {"bright"}
+    assert modules["bright"].scenes == ["Bright", "Dark"]
 
 
 def test_lost_module_is_bridged_by_odometry_then_replaced():

@@ -18,7 +18,6 @@ from sceneslam.bus.runner import Runner
 from sceneslam.bus.watch import Watch
 from sceneslam.executors import executor
 from sceneslam.interfaces import BackEnd, Detector, SlamModule
-from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Vector
@@ -214,7 +213,7 @@ class Bus:
         self._decisions.add(situation, verdict)
         if verdict.action is Action.TELL:
             self._candidates.serve(situation.scene, (), 0)
-            self._tell_scene(observation.stamp_ns)
+            self._changeover.tell_scene(observation.stamp_ns)
         elif verdict.action is Action.TRY:
             self._changeover.begin_trial(verdict.to[0], observation.stamp_ns)
         elif verdict.action is Action.SWITCH:
@@ -257,13 +256,6 @@ class Bus:
             retry_ns=self._candidates.retry_ns,
             may_return=bool(self._candidates.returning(self.scene)),
         )
-
-    def _tell_scene(self, stamp_ns: int) -> None:
-        assert self._estimator.active is not None
-        try:
-            self._estimator.active.set_scene(self.scene)
-        except ModuleError as error:
-            self._log.add_fault(stamp_ns, str(error))
 
     def _send(self, event: str, stamp_ns: int) -> None:
         """Send an event to the machine and log the state it leads to."""

@@ -140,7 +140,7 @@ class Changeover:
                 runner = self._runners[self._queue.pop(0)]
                 if runner is self._estimator.active:
                     if not runner.is_failed:
-                        return Outcome.FAILURE  # the active module stays, as the fallback
+                        break  # the active module stays, as the fallback
                     self._estimator.retire()  # before it is started again
                 self._attempt = self._start(runner, stamp_ns)
             is_accepted = self._lead(self._attempt, stamp_ns)
@@ -153,9 +153,20 @@ class Changeover:
                 return Outcome.SUCCESS if is_best else Outcome.FAILURE
             if is_start:
                 return Outcome.FAILURE  # the machine enters `start` again, with the next candidate
-        if self._estimator.active is not None and self._estimator.active.is_failed:
+        active = self._estimator.active
+        if active is not None and active.is_failed:
             self._estimator.retire()
+        elif active is not None and self._verdict.reason == "scene":
+            self.tell_scene(stamp_ns)
         return Outcome.FAILURE
+
+    def tell_scene(self, stamp_ns: int) -> None:
+        """Inform the active module, which stays, of the scene that it serves now."""
+        assert self._estimator.active is not None
+        try:
+            self._estimator.active.set_scene(self._candidates.scene)
+        except ModuleError as error:
+            self._log.add_fault(stamp_ns, str(error))
 
     def begin_trial(self, key: str, stamp_ns: int) -> None:
         """Run the scene's first choice on standby beside the fallback; its poses are not used."""
