@@ -54,6 +54,14 @@ def test_same_module_for_the_new_scene_is_told_and_not_restarted():
     assert len(events(log, "decision")) == 1
 
 
+def test_same_module_for_the_new_scene_is_replaced_when_the_patience_is_over():
+    """It had tracked for less than a window, so that modules that were tried would have to wait."""
+    modules = {"bright": ExactModule(lost={30, *range(45, 100)}), "dark": ExactModule()}
+    table = {scene: ["bright", "dark"] for scene in ("Bright", "Dark")}
+    _, _, log, _ = drive(modules, scene_at=dark_from(20), table=table)
+    assert [event["stamp_ns"] for event in events(log, "decision")] == [0, 48 * PERIOD_NS]
+
+
 @pytest.mark.parametrize("choices", [("dark",), ("dark", "bright")])
 @pytest.mark.parametrize("why", ["lost", "failed"])
 def test_module_that_stays_because_no_other_can_take_over_is_told_the_scene(why, choices):

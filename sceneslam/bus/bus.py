@@ -212,7 +212,7 @@ class Bus:
         verdict = decide(self._policy, situation)
         self._decisions.add(situation, verdict)
         if verdict.action is Action.TELL:
-            self._candidates.serve(situation.scene, (), 0)
+            self._candidates.serve(situation.scene, situation.choices[1:], 0)
             self._changeover.tell_scene(observation.stamp_ns)
         elif verdict.action is Action.TRY:
             self._changeover.begin_trial(verdict.to[0], observation.stamp_ns)
