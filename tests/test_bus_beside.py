@@ -120,6 +120,36 @@ def test_module_that_cannot_start_is_refused_when_that_is_known():
     assert "no licence" in events(log, "fault")[0]["what"]
 
 
+def test_trial_that_cannot_start_is_logged_and_delays_the_next():
+    class Once(ExactModule):
+        """Can be started once."""
+
+        def __init__(self, **options):
+            super().__init__(**options)
+            self.starts, self.has_failed = 0, Event()
+
+        def activate(self, rig):
+            self.starts += 1
+            if self.starts > 1:
+                self.has_failed.set()
+                raise RuntimeError("no licence")
+            super().activate(rig)
+
+    bright, dark = Once(lost=range(20, 1000)), Slow()
+
+    def feed(index):
+        assert index != 30 or dark.has_started.wait(10.0)
+        assert index != 150 or bright.has_failed.wait(10.0)
+        return observation(index)
+
+    modules = {"bright": bright, "dark": dark}
+    _, _, log, _ = drive(modules, feed=feed, is_live=True, retry_s=5.0, steps=160)
+    assert bright.starts == 2
+    assert [event["what"] for event in events(log, "fault")] == [
+        "slam.bright could not be activated: RuntimeError: no licence"
+    ]
+
+
 def test_map_is_saved_beside_the_pose_and_its_failure_is_told(tmp_path):
     may_save, told = Event(), []
 

@@ -92,6 +92,20 @@ def test_a_module_that_came_back_to_the_scene_it_is_first_for_is_used_again():
     assert_exact(atlas)
 
 
+def test_a_trial_ends_where_a_better_choice_is_ready_again():
+    modules = {
+        "first": Phoenix(raises={30}, asked=90),
+        "second": ExactModule(lost=range(30, 40)),
+        "third": ExactModule(),
+    }
+    table = {"Bright": ["first", "second", "third"]}
+    options = {"handover": "rewind", "retry_s": 1.0, "catch_up_steps": 4}
+    bus, atlas, log, _ = drive(modules, table=table, **options)
+    assert [event["to"] for event in events(log, "decision")] == ["first", "third", "first"]
+    assert modules["second"].activations == 2 and len(bus.runners["second"].track_ms) < 20
+    assert_exact(atlas)
+
+
 def test_a_module_whose_budget_is_spent_ends_the_run_as_one_that_cannot_be_restarted():
     only = Phoenix(raises={30, 31}, budget=1)
     bus, atlas, log, _ = drive({"only": only}, table=ALONE, has_odometry=False)

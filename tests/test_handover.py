@@ -250,6 +250,16 @@ def test_vain_trials_become_rare():
     assert bright.activations <= 14  # 1 + after 1, 2, 4, and then every 8 s, each given 1 s
 
 
+def test_trial_ends_where_the_fallback_becomes_the_first_choice():
+    modules = {"bright": ExactModule(lost=range(30, 60)), "dark": ExactModule()}
+    table = {"Bright": ["bright", "dark"], "Dark": ["dark"]}
+    options = {"scene_at": dark_from(50), "handover": "rewind", "retry_s": 2.0}
+    bus, _, _, _ = drive(modules, table=table, **options)
+    # It is on trial from 53 on, 2 s after it was replaced; at 70 the new scene is confirmed.
+    assert len(bus.runners["bright"].track_ms) == len(range(34)) + len(range(53, 71))
+    assert modules["dark"].scenes == ["Bright", "Dark"]
+
+
 def test_flapping_first_choice_is_given_more_and_more_time():
     lost = [index for index in range(50, 3000) if index % 30 > 12]
     _, atlas, log, _ = drive(

@@ -170,9 +170,8 @@ class Changeover:
 
     def begin_trial(self, key: str, stamp_ns: int) -> None:
         """Run the scene's first choice on standby beside the fallback; its poses are not used."""
-        runner = self._runners[key]
         ready_ns = self._ready_ns(key, stamp_ns)
-        self._trial = _Attempt(runner=runner, ready_ns=ready_ns, is_trial=True)
+        self._trial = _Attempt(runner=self._runners[key], ready_ns=ready_ns, is_trial=True)
         self.try_on(stamp_ns)
 
     def submit(self, observation: Observation) -> None:
@@ -186,9 +185,14 @@ class Changeover:
             self._end_trial()
 
     def try_on(self, stamp_ns: int) -> None:
-        """Feed the module on trial, if any; the trial ends when it fails or stays lost."""
+        """Feed the module on trial until it fails, stays lost or is the first choice no longer."""
         trial = self._trial
         if trial is None:
+            return
+        first = self._candidates.of(self._candidates.scene)[:1]
+        if first != (trial.runner.key,) and not trial.runner.is_failed:
+            trial.runner.retire()
+            self._trial = None
             return
         try:
             handover = self._caught_up(trial, stamp_ns)
