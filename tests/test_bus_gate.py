@@ -95,7 +95,8 @@ def test_candidate_that_slides_is_refused_while_the_old_module_holds():
     assert set(atlas.pose_modules) == {"bright"}
 
 
-def test_jump_that_the_module_announces_is_a_correction_and_not_a_motion():
+@pytest.mark.parametrize("lost", [range(0), range(50, 51), range(48, 53)])
+def test_jump_that_the_module_announces_is_a_correction_and_not_a_motion(lost):
     class Closing(ExactModule):
         def track(self, observation):
             tracking = super().track(observation)
@@ -104,9 +105,10 @@ def test_jump_that_the_module_announces_is_a_correction_and_not_a_motion():
             shift = se3.from_xy_yaw(0.5, 0.0, 0.0)
             return replace(tracking, T_local_base=shift @ tracking.T_local_base, revision=1)
 
-    _, atlas, log, _ = drive({"bright": Closing()}, table=ONE, gate=GATE, handover="rewind")
-    assert not events(log, "suspect") and set(atlas.pose_modules) == {"bright"}
-    np.testing.assert_allclose(errors_m(atlas.trajectory)[50:], 0.5, atol=1e-9)
+    modules = {"bright": Closing(lost=lost)}
+    _, atlas, log, _ = drive(modules, table=ONE, gate=GATE, handover="rewind")
+    assert not events(log, "suspect") and atlas.pose_modules.count(BRIDGED) == len(lost)
+    np.testing.assert_allclose(errors_m(atlas.trajectory)[53:], 0.5, atol=1e-9)
 
 
 def test_map_begins_with_the_odometry_where_the_module_holds_its_pose_later():

@@ -88,8 +88,9 @@ class Hold:
         if self._fed_ns is not None:
             self._period_ns = tracking.stamp_ns - self._fed_ns
         self._fed_ns, self.status = tracking.stamp_ns, tracking.status
-        self.is_revised = tracking.revision != self._revision
-        self._revision = tracking.revision
+        if tracking.status is not TrackingStatus.LOST:  # else its pose is the one before
+            self.is_revised = tracking.revision != self._revision
+            self._revision = tracking.revision
 
     def _judge(
         self,
@@ -116,7 +117,7 @@ class Hold:
             self.is_suspect = True
         elif judgement.is_trusted:
             self.is_suspect = False
-        if self.is_revised:
+        if self.is_revised and T_local_base is not None:
             self._agreed = None  # its earlier pose is not comparable with its corrected ones
         if judgement.turn_agrees and T_local_base is not None:
             assert observation.T_odom_base is not None
