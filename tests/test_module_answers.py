@@ -77,10 +77,11 @@ def test_an_answer_is_accepted_up_to_the_limits(good, bad):
         checked_tracking(replace(tracked(), **bad), STAMP_NS)
 
 
-def test_a_checked_pose_is_a_copy_that_nobody_changes():
-    given = tracked()
-    pose = checked_tracking(given, STAMP_NS).T_local_base
-    assert not pose.flags.writeable and not np.shares_memory(pose, given.T_local_base)
+@pytest.mark.parametrize("name", ["T_local_base", "covariance"])
+def test_a_checked_array_is_a_copy_that_nobody_changes(name):
+    given = replace(tracked(), covariance=np.eye(6))
+    checked = getattr(checked_tracking(given, STAMP_NS), name)
+    assert not checked.flags.writeable and not np.shares_memory(checked, getattr(given, name))
 
 
 def test_stamps_of_a_trajectory_increase():

@@ -39,7 +39,7 @@ Value = TypeVar("Value")
 
 
 def checked_tracking(tracking: object, stamp_ns: int) -> Tracking:
-    """Return the module's answer to the observation at `stamp_ns`, with a copy of its pose."""
+    """Return the module's answer to the observation at `stamp_ns`, with copies of its arrays."""
     tracking = _of("track's answer", tracking, Tracking)
     _of("status", tracking.status, TrackingStatus)
     _of("revision", tracking.revision, int)
@@ -51,9 +51,12 @@ def checked_tracking(tracking: object, stamp_ns: int) -> Tracking:
     _check_shape("T_local_base", T_local_base, (4, 4))
     _check_rigid("T_local_base", T_local_base)
     T_local_base.flags.writeable = False
-    if tracking.covariance is not None:
-        _check_covariance(tracking.covariance)
-    return replace(tracking, T_local_base=T_local_base)
+    covariance = tracking.covariance
+    if covariance is not None:
+        _check_covariance(covariance)
+        covariance = np.array(covariance)
+        covariance.flags.writeable = False
+    return replace(tracking, T_local_base=T_local_base, covariance=covariance)
 
 
 def checked_trajectory(trajectory: object) -> Trajectory:
