@@ -67,6 +67,9 @@ ANSWERS = {
     "covariance of text": as_is(covariance="small"),
     "quality NaN": as_is(quality_ratio=float("nan")),
     "quality of text": as_is(quality_ratio="good"),
+    "inliers of text": as_is(inliers="many"),
+    "no inliers": as_is(inliers=None),
+    "inliers NaN": as_is(inliers=float("nan")),
     "revision of text": as_is(revision="second"),
     "no revision": as_is(revision=None),
 }
@@ -107,6 +110,7 @@ TRAJECTORIES = {
     "fewer poses than stamps": Trajectory(stamps_ns=STAMPS_NS, T_world_base=POSES[:2]),
     "stamps that fall": Trajectory(stamps_ns=STAMPS_NS[::-1], T_world_base=POSES),
     "stamps of another time": Trajectory(stamps_ns=STAMPS_NS + 10**18, T_world_base=POSES),
+    "stamps in a column": Trajectory(stamps_ns=STAMPS_NS[:, None], T_world_base=POSES),
     "stamps in seconds": Trajectory(stamps_ns=STAMPS_NS * 1e-9, T_world_base=POSES),
     "positions beyond all measure": Trajectory(
         stamps_ns=STAMPS_NS, T_world_base=POSES * np.array([1, 1, 1, 1e200])

@@ -64,6 +64,7 @@ def with_pose(x_m=0.0, scale=1.0):
     [
         ({"quality_ratio": 0.0}, {"quality_ratio": -0.01}),
         ({"quality_ratio": 1.0}, {"quality_ratio": 1.01}),
+        ({"inliers": 0}, {"inliers": -1}),
         ({"covariance": np.zeros((6, 6))}, {"covariance": np.diag([1.0] * 5 + [-1e-9])}),
         (with_pose(x_m=0.99e8), with_pose(x_m=1.01e8)),
         (with_pose(x_m=-0.99e8), with_pose(x_m=-1.01e8)),

@@ -47,6 +47,8 @@ def checked_tracking(tracking: object, stamp_ns: int) -> Tracking:
         raise ValueError(f"stamp_ns: expected {stamp_ns}, got {tracking.stamp_ns}")
     if not 0.0 <= tracking.quality_ratio <= 1.0:
         raise ValueError(f"quality_ratio: expected 0 to 1, got {tracking.quality_ratio}")
+    if not tracking.inliers >= 0:
+        raise ValueError(f"inliers: expected 0 or more, got {tracking.inliers}")
     T_local_base = np.array(tracking.T_local_base, dtype=np.float64)
     _check_shape("T_local_base", T_local_base, (4, 4))
     _check_rigid("T_local_base", T_local_base)
@@ -65,6 +67,7 @@ def checked_trajectory(trajectory: object) -> Trajectory:
     stamps_ns = _of("stamps_ns", trajectory.stamps_ns, np.ndarray)
     if stamps_ns.dtype.kind != "i" or (np.diff(stamps_ns) <= 0).any():
         raise ValueError(f"stamps_ns: expected rising int64, got {stamps_ns.dtype}: {stamps_ns}")
+    _check_shape("stamps_ns", stamps_ns, (stamps_ns.size,))
     T_world_base = _of("T_world_base", trajectory.T_world_base, np.ndarray)
     _check_shape("T_world_base", T_world_base, (len(stamps_ns), 4, 4))
     _check_rigid("T_world_base", T_world_base)
