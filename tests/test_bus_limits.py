@@ -1,5 +1,6 @@
 """Durations and thresholds of the bus, each on both sides of its limit."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -144,15 +145,23 @@ def test_a_gap_as_long_as_the_window_is_bridged_by_two_votes():
         assert (found is not None) == is_confirmed
 
 
-class Likely(ScriptedDetector):
-    """Votes with likelihoods."""
+class Votes(ScriptedDetector):
+    """Gives a vote with other fields."""
 
-    def __init__(self, likelihoods):
+    def __init__(self, **fields):
         super().__init__(lambda index: "Bright")
-        self._likelihoods = likelihoods
+        self._fields = fields
 
     def get_scene(self, observation):
-        return replace(super().get_scene(observation), likelihoods=self._likelihoods)
+        return replace(super().get_scene(observation), **self._fields)
+
+
+def watched(detector):
+    """Return the watch of a detector after one vote, with the log."""
+    log, window = EventLog(), WindowFilter(window_s=1.0, first_window_s=0.0)
+    watch = Watch(detector, None, log, scene_filter=window)
+    watch.look(observation(0))
+    return watch, log
 
 
 @pytest.mark.parametrize(
@@ -170,11 +179,32 @@ class Likely(ScriptedDetector):
     ],
 )
 def test_likelihoods_are_finite_of_known_scenes_and_not_all_zero(likelihoods, is_valid):
-    log = EventLog()
-    window = WindowFilter(window_s=1.0, first_window_s=0.0)
-    watch = Watch(Likely(likelihoods), None, log, scene_filter=window)
-    watch.look(observation(0))
+    watch, log = watched(Votes(likelihoods=likelihoods))
     assert watch.is_working == is_valid and (events(log, "fault") == []) == is_valid
+
+
+@pytest.mark.parametrize(
+    ("fields", "is_valid"),
+    [
+        ({"stamp_ns": None}, False),
+        ({"stamp_ns": "now"}, False),
+        ({"stamp_ns": 1}, False),
+        ({"stamp_ns": np.int64(0)}, False),
+        ({"value": 3}, True),
+        ({"value": np.float64(0.5)}, True),
+        ({"value": np.float32(0.5)}, False),
+        ({"value": "grey"}, False),
+        ({"features": {"grey": float("nan"), "lines": 5}}, True),
+        ({"features": {"grey": np.float32(0.5)}}, False),
+        ({"features": {"grey": "dark"}}, False),
+        ({"features": [0.5]}, False),
+    ],
+)
+def test_a_vote_that_cannot_be_logged_stops_the_detector_not_the_run(fields, is_valid):
+    watch, log = watched(Votes(**fields))
+    log.flush()
+    assert watch.is_working == is_valid and (events(log, "fault") == []) == is_valid
+    json.dumps(log.events)
 
 
 def test_constant_velocity_ends_at_its_horizon_and_keeps_the_twist():

@@ -65,7 +65,7 @@ class Watch:
         vote: SceneVote | None = None
         try:
             if self.is_working:
-                vote = self._checked(self._detector.get_scene(observation))
+                vote = self._checked(self._detector.get_scene(observation), observation.stamp_ns)
         except KeyboardInterrupt:
             raise
         except BaseException as error:
@@ -85,13 +85,18 @@ class Watch:
         except Exception as error:
             _log.warning("the detector could not be shut down: %s", text_of(error))
 
-    def _checked(self, vote: object) -> SceneVote:
-        """Return a vote for a scene that the detector knows; raises TypeError or ValueError."""
+    def _checked(self, vote: object, stamp_ns: int) -> SceneVote:
+        """Return a vote at a stamp for a known scene; raises TypeError or ValueError."""
         if not isinstance(vote, SceneVote):
             raise TypeError(f"get_scene returned {type(vote).__name__}, expected SceneVote")
         if vote.scene not in (*self._detector.scenes, UNSURE):
             scenes = ", ".join(self._detector.scenes)
             raise ValueError(f"scene: got {vote.scene!r}, expected {scenes} or {UNSURE}")
+        if not isinstance(vote.stamp_ns, int) or vote.stamp_ns != stamp_ns:
+            raise ValueError(f"stamp_ns: got {vote.stamp_ns!r}, expected {stamp_ns}")
+        for number in (vote.value, *(vote.features or {}).values()):
+            if not isinstance(number, int | float):
+                raise TypeError(f"value, features: got {type(number).__name__}, expected float")
         _check_likelihoods(vote.likelihoods, self._detector.scenes)
         return vote
 
