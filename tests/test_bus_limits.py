@@ -207,6 +207,14 @@ def test_a_vote_that_cannot_be_logged_stops_the_detector_not_the_run(fields, is_
     json.dumps(log.events)
 
 
+@pytest.mark.parametrize("error", ["Exception", "SystemExit", "unheard"])
+def test_whatever_a_detector_raises_at_its_end_is_no_more_than_a_warning(error, caplog):
+    watch, _ = watched(Votes())
+    watch._detector.shutdown = lambda: hostile.throw(error)
+    watch.close()
+    assert "the detector could not be shut down" in caplog.text
+
+
 def test_constant_velocity_ends_at_its_horizon_and_keeps_the_twist():
     def at(stamp_ns):
         return replace(observation(0, has_odometry=False), stamp_ns=stamp_ns)

@@ -82,7 +82,9 @@ class Watch:
         """Shut the detector down. May be called twice."""
         try:
             self._detector.shutdown()
-        except Exception as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
             _log.warning("the detector could not be shut down: %s", text_of(error))
 
     def _checked(self, vote: object, stamp_ns: int) -> SceneVote:
