@@ -1,8 +1,12 @@
 """Two modules that have a process each work on the same observation at once."""
 
+from dataclasses import replace
+
 import numpy as np
 from driving import drive, events
-from fakes import ExactModule
+from fakes import ExactModule, observation
+
+from sceneslam.types.rig import Sensor
 
 TABLE = {"Bright": ["bright", "dark"]}
 
@@ -49,6 +53,32 @@ def test_a_module_on_trial_works_while_the_active_one_does():
     at = calls.index(("submit", "bright"))
     assert calls[at + 1 : at + 3] == [("track", "dark"), ("collect", "bright")]
     assert calls.count(("submit", "bright")) == calls.count(("collect", "bright")) >= 9
+
+
+def test_a_module_on_trial_tracks_every_observation_once():
+    """Its sensor is slower than the gyro, whose samples in between a catch-up adds."""
+
+    class Slow(Remote):
+        requires = (frozenset({Sensor.POINTS}),)
+        stamps_ns = ()
+
+        def collect(self):
+            self.stamps_ns += (self.pending.stamp_ns,)
+            return super().collect()
+
+        def track(self, observation):
+            self.stamps_ns += (observation.stamp_ns,)
+            return super().track(observation)
+
+    def feed(index):
+        points = None if index % 3 else np.zeros((1, 3), np.float32)
+        return replace(observation(index), points_lidar=points, gyro_base=np.zeros((1, 4)))
+
+    bright = Slow("bright", [], lost=range(20, 50))
+    options = {"table": TABLE, "handover": "rewind", "retry_s": 1.0, "steps": 150, "feed": feed}
+    drive({"bright": bright, "dark": ExactModule()}, **options)
+    assert ("submit", "bright") in bright.calls
+    assert len(bright.stamps_ns) == len(set(bright.stamps_ns))
 
 
 def test_it_does_not_matter_whether_they_work_at_once():

@@ -160,7 +160,7 @@ class Runner:
         submitted, self._submitted = self._submitted, None
         if isinstance(self._module, Concurrent) and submitted is not None:
             answer = self._module.collect()
-            if submitted is observation:
+            if submitted.stamp_ns == observation.stamp_ns:
                 return answer
         return self._module.track(observation)
 
