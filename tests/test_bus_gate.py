@@ -46,6 +46,18 @@ def test_sliding_module_is_bridged_from_before_it_slid_and_chained_when_it_agree
     assert [session.module for session in atlas.sessions] == ["bright", "bright"]
 
 
+@pytest.mark.parametrize("index", [39, 41])
+def test_suspicion_costs_no_pose_where_odometry_is_missing(index):
+    def feed(i):
+        return observation(i, has_odometry=i != index)
+
+    modules = {"bright": Sliding(40, 60)}
+    options = {"steps": 150, "table": ONE, "gate": GATE, "handover": "rewind", "feed": feed}
+    _, atlas, log, _ = drive(modules, **options)
+    assert len(events(log, "suspect")) == 1 and atlas.pose_modules[index] == BRIDGED
+    assert len(atlas.trajectory) == 150 and errors_m(atlas.trajectory).max() < 1e-9
+
+
 def test_sliding_module_without_the_gate_does_harm():
     _, atlas, _, _ = drive({"bright": Sliding(40, 60)}, steps=150, table=ONE)
     assert errors_m(atlas.trajectory).max() > 1.9

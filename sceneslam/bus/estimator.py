@@ -114,6 +114,8 @@ class Estimator:
         bridge, bridged = before.bridge.copy(), []
         for each in [*untrusted, moment]:
             T_map_base = bridge.predict(each.observation, by_velocity=False, turn=each.turn)
+            if T_map_base is None:  # without odometry; the next odometry continues from the last
+                T_map_base = bridge.copy().predict(each.observation, by_velocity=True)
             given = replace(each, T_map_base=T_map_base, bridge=bridge.copy())
             bridged.append(replace(given, module=BRIDGED, covariance=None, is_trusted=False))
         self._back_end.rewind(untrusted[0].stamp_ns)
