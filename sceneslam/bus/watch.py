@@ -6,6 +6,8 @@ import logging
 import math
 from array import array
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from numbers import Real
 from time import perf_counter_ns
 from typing import Any
 
@@ -94,13 +96,20 @@ class Watch:
         if vote.scene not in (*self._detector.scenes, UNSURE):
             scenes = ", ".join(self._detector.scenes)
             raise ValueError(f"scene: got {vote.scene!r}, expected {scenes} or {UNSURE}")
-        if not isinstance(vote.stamp_ns, int) or vote.stamp_ns != stamp_ns:
+        if vote.stamp_ns != stamp_ns:
             raise ValueError(f"stamp_ns: got {vote.stamp_ns!r}, expected {stamp_ns}")
-        for number in (vote.value, *(vote.features or {}).values()):
-            if not isinstance(number, int | float):
-                raise TypeError(f"value, features: got {type(number).__name__}, expected float")
         _check_likelihoods(vote.likelihoods, self._detector.scenes)
-        return vote
+        features = vote.features
+        if features is not None:
+            features = {name: _float(number) for name, number in features.items()}
+        return replace(vote, stamp_ns=stamp_ns, value=_float(vote.value), features=features)
+
+
+def _float(number: object) -> float:
+    """Return a number of any type, NumPy's included, as a float; raises TypeError."""
+    if not isinstance(number, Real):
+        raise TypeError(f"value, features: got {type(number).__name__}, expected float")
+    return float(number)
 
 
 def _check_likelihoods(likelihoods: Mapping[str, float] | None, scenes: Sequence[str]) -> None:
