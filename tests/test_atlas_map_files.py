@@ -152,6 +152,14 @@ def test_a_head_of_another_program_is_no_map_and_is_not_replaced(tmp_path, text)
     assert (tmp_path / HEAD).read_text() == text
 
 
+@pytest.mark.parametrize("x_m", [2e5, np.nan])
+def test_a_map_that_could_not_be_loaded_again_replaces_none(tmp_path, x_m):
+    save_map_files(whole_map(), tmp_path)
+    with pytest.raises(InputError, match="node_pose: expected"):
+        save_map_files(map_of(WALL, nodes=[[x_m, 0.0, 0.0]]), tmp_path)
+    assert len(load_map_files(tmp_path).submaps) == 2
+
+
 def test_what_a_killed_writer_left_is_no_obstacle(tmp_path):
     (tmp_path / "arrays-0123.npz").write_bytes(b"")
     (tmp_path / f"{HEAD}.part").write_text("format:")

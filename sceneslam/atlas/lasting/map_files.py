@@ -91,12 +91,15 @@ def save_map_files(saved: SavedMap, folder: Path, *, known: str | None = None) -
     """Write the map into its own folder; the same map gives the same bytes.
 
     `known` is the checksum of the map that this one takes the place of; any other is kept. Raises
-    InputError if the folder holds something else, OSError if it cannot be written.
+    InputError if the folder holds something else or the map could not be loaded again, OSError if
+    it cannot be written.
     """
     check_map_folder(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     modules = sorted({submap.module for submap in saved.submaps})
-    data = _packed(_arrays(saved, modules))
+    arrays = _arrays(saved, modules)
+    _check(arrays, folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    data = _packed(arrays)
     seal = hashlib.sha256(data).hexdigest()
     name = f"{_ARRAYS}{seal[:16]}.npz"
     head = {
