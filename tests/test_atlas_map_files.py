@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -138,6 +139,14 @@ def test_numbers_that_no_map_has_are_named(tmp_path, name, value):
     with_arrays(tmp_path, harm)
     with pytest.raises(InputError, match=f"{name}: expected"):
         load_map_files(tmp_path)
+
+
+def test_what_wheels_mapped_before_the_first_session_is_loaded_again(tmp_path):
+    saved, path = whole_map(), tmp_path / "map"
+    first, second = saved.submaps
+    before = replace(first, session=-1, module="")
+    save_map_files(replace(saved, submaps=(before, second)), path)
+    assert [submap.session for submap in load_map_files(path).submaps] == [-1, 0]
 
 
 @pytest.mark.parametrize("text", ["[" * 20_000, "image: office.pgm\n", ""])

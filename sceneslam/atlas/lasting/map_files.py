@@ -247,7 +247,7 @@ def _check(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
             raise InputError(f"{name}: expected rotations and translations: {path}")
         if counts.setdefault(rows, len(found)) != len(found):
             raise InputError(f"{name}: expected {counts[rows]} rows, got {len(found)}: {path}")
-    for name in ("node_run", "node_session", "node_module", "node_piece", "node_grid_shape"):
+    for name in ("node_run", "node_module", "node_piece", "node_grid_shape"):
         if (arrays[name] < 0).any():
             raise InputError(f"{name}: expected 0 or more: {path}")
     for name in ("node_pose", "node_grid_origin", "scan_pose", "point", "view_pose", "landmark"):
