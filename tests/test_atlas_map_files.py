@@ -149,6 +149,16 @@ def test_what_wheels_mapped_before_the_first_session_is_loaded_again(tmp_path):
     assert [submap.session for submap in load_map_files(path).submaps] == [-1, 0]
 
 
+def test_rotations_that_a_module_rounded_are_saved_as_rotations(tmp_path):
+    saved = whole_map()
+    rounded = np.round(saved.T_map_node, 4)
+    motion = replace(saved.edges[0], T_first_second=np.round(rounded[1], 3))
+    save_map_files(replace(saved, T_map_node=rounded, edges=(motion,)), tmp_path)
+    found = load_map_files(tmp_path)
+    np.testing.assert_allclose(found.T_map_node, saved.T_map_node, atol=1e-4)
+    np.testing.assert_allclose(found.edges[0].T_first_second, saved.T_map_node[1], atol=1e-3)
+
+
 @pytest.mark.parametrize("text", ["[" * 20_000, "image: office.pgm\n", ""])
 def test_a_head_of_another_program_is_no_map_and_is_not_replaced(tmp_path, text):
     (tmp_path / HEAD).write_text(text)

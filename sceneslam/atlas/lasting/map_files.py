@@ -26,6 +26,7 @@ from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.graphs.edge import Edge, EdgeKind
+from sceneslam.types import se3
 from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.files import PART, whole
 from sceneslam.views.view import Landmarks, PlacedView
@@ -324,10 +325,15 @@ def _arrays(saved: SavedMap, modules: list[str]) -> dict[str, NDArray[Any]]:
         "edge_covariance": [edge.covariance for edge in edges],
         "edge_kind": [int(edge.kind) for edge in edges],
     }
-    return {
+    arrays = {
         name: np.asarray(columns[name], np.dtype(dtype)).reshape(-1, *inner)
         for name, (dtype, _, inner) in _SHAPES.items()
     }
+    for name in ("node_pose", "view_pose", "edge_motion"):
+        if not _are_rigid(arrays[name]):  # modules report rotations that are rounded
+            T, quats_xyzw = arrays[name], se3.to_quat_xyzw(arrays[name])
+            arrays[name] = se3.from_quat_xyzw(T[:, :3, 3], quats_xyzw)
+    return arrays
 
 
 def _joined(parts: list[NDArray[Any]]) -> NDArray[Any]:
