@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from planar_poses import transforms
-from test_atlas_submaps import S, at, run_of
+from test_atlas_submaps import RIG, S, at, run_of
 
+from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.fusion import Placed, fuse, one_per_voxel
+from sceneslam.atlas.lasting.map_files import load_map_files
 from sceneslam.atlas.lasting.merge import side_by_side
 from sceneslam.atlas.lasting.prune import prune
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map
@@ -19,6 +21,7 @@ from sceneslam.atlas.submaps.own_loops import closed_loops
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import GridLayer, MapLayers, PointLayer, PoseGraphLayer
+from sceneslam.types.observation import Observation
 
 # Loops.
 
@@ -91,6 +94,20 @@ def test_loops_of_modules_have_their_stamps_and_the_inverse_of_their_information
     np.testing.assert_array_equal(closed.T_from_to, at(3.0))
     expected = np.diag([0.25, 0.04, 1.0, 0.01, 1.0, 1.0]) + 1e-6 * np.eye(6)
     np.testing.assert_allclose(closed.covariance, expected)
+
+
+@pytest.mark.parametrize("unknown", [1e16, np.finfo(float).max])
+def test_a_covariance_that_says_unknown_costs_no_map(tmp_path, unknown):
+    own = Atlas(voxel_m=0.05, save=str(tmp_path / "map"))
+    own.open(RIG, lambda *_, **__: None)
+    own.begin_session("a", np.eye(4))
+    for index in range(80):
+        T, covariance = at(0.1 * index, 0.0, 0.03 * index), np.diag([1e-4, 1e-4, *[unknown] * 4])
+        own.add(index * S, T, "a", covariance)
+        own.observe(Observation(stamp_ns=index * S), None)
+    assert own.finish() == []
+    assert len(own.fuse_maps().pose_graph.edges) == len(load_map_files(tmp_path / "map").edges) > 1
+    assert np.isfinite(own.covariances(has_odometry=False)).all()
 
 
 @pytest.mark.parametrize("sigma_yaw", [1e-6, 0.1])

@@ -21,6 +21,7 @@ from sceneslam.types.trajectory import Trajectory
 
 _UPPER = np.triu_indices(6)
 _NONE = np.full(len(_UPPER[0]), np.nan)  # no covariance was reported
+_UNKNOWN = 1e10  # m^2, rad^2, of a robot that may be anywhere; float64 adds 1e-6 to no more
 
 
 @dataclass(slots=True)
@@ -82,7 +83,8 @@ class PosePath:
         """Add T_map_base (4, 4) [m] unless its stamp already has a pose."""
         if self.stamps_ns and stamp_ns <= self.stamps_ns[-1]:
             return
-        self._covariances.append(_NONE if covariance is None else covariance[_UPPER])
+        reported = _NONE if covariance is None else covariance[_UPPER]
+        self._covariances.append(np.clip(reported, -_UNKNOWN, _UNKNOWN))
         self.stamps_ns.append(stamp_ns)
         self.poses.append(T_map_base)
         self.modules.append(module)
