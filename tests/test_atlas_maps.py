@@ -8,6 +8,7 @@ from planar_poses import transforms
 from test_atlas_places import CELL, plan_of, quality, text_of
 
 from sceneslam.atlas.lasting import merge
+from sceneslam.atlas.lasting.map_files import save_map_files
 from sceneslam.atlas.lasting.merge import join_pieces
 from sceneslam.atlas.lasting.prune import prune
 from sceneslam.atlas.lasting.saved_map import SavedMap, forget_contradicted
@@ -15,6 +16,7 @@ from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.graphs.edge import Edge, EdgeKind
+from sceneslam.maps.__main__ import main
 from sceneslam.maps.inspect import flaws
 from sceneslam.types import planar
 
@@ -268,3 +270,15 @@ def test_submaps_of_other_runs_are_no_neighbours(monkeypatch):
     submaps = [*saved.submaps[:4], replace(saved.submaps[4], run=2)]
     join_pieces(replace(saved, submaps=tuple(submaps)))
     assert [len(plan) for plan in found.queries] == [2, 2, 1]
+
+
+# What is too large.
+
+
+@pytest.mark.parametrize("command", ["info", "export", "merge"])
+def test_a_map_that_is_too_large_to_draw_is_named(tmp_path, capsys, command):
+    folder = str(tmp_path / "map")
+    save_map_files(map_of(WALL, WALL, nodes=[[0, 0, 0], [400, 400, 0]]), tmp_path / "map")
+    out = [] if command == "info" else ["--out", str(tmp_path / "out")]
+    assert main([command, folder, *out]) == 2
+    assert capsys.readouterr().err.startswith("error: a floor plan of 403 m x 401 m, allowed")

@@ -16,6 +16,7 @@ from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.places.registration import PlanRegistration, register
 from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar
+from sceneslam.types.errors import InputError
 
 S = 10**9
 CELL = 0.05
@@ -95,7 +96,7 @@ def test_the_normal_of_a_cell_is_that_of_its_line_towards_the_sensor():
 
 
 def test_a_plan_of_half_a_kilometre_is_refused():
-    with pytest.raises(ValueError, match="a floor plan of 1001 m x 1001 m"):
+    with pytest.raises(InputError, match="a floor plan of 1001 m x 1001 m"):
         draw([(np.zeros(3), scan_of((1000.0, 1000.0)))])
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sceneslam.scans.key_scan import KeyScan, line_normals
 from sceneslam.types import planar
+from sceneslam.types.errors import InputError
 from sceneslam.types.maps import GridLayer
 from sceneslam.types.planar import Planar
 
@@ -123,12 +124,16 @@ def _plan(
 
 
 def _box(points: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, int]]:
-    """Return the lowest cell and the (rows, columns) of a grid around points."""
+    """Return the lowest cell and the (rows, columns) of a grid around points.
+
+    Raises InputError if it needs too much memory.
+    """
     low = np.floor(points.min(axis=0) / CELL_M).astype(np.int64) - _PAD
     high = np.floor(points.max(axis=0) / CELL_M).astype(np.int64) + _PAD + 1
     columns, rows = (high - low).tolist()
     if rows * columns > _CELLS_MAX:
-        raise ValueError(f"a floor plan of {columns * CELL_M:.0f} m x {rows * CELL_M:.0f} m")
+        size = f"{columns * CELL_M:.0f} m x {rows * CELL_M:.0f} m"
+        raise InputError(f"a floor plan of {size}, allowed: {_CELLS_MAX * CELL_M**2:.0f} m2")
     return low, (rows, columns)
 
 
