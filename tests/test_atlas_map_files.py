@@ -290,15 +290,17 @@ def test_a_map_is_saved_at_intervals_and_at_the_end(tmp_path, monkeypatch):
     assert own.faults == []
 
 
-def test_what_could_not_be_saved_is_told_once(tmp_path, monkeypatch):
+@pytest.mark.parametrize("failure", [OSError, MemoryError])
+def test_what_could_not_be_saved_is_told_once(tmp_path, monkeypatch, failure):
     own, _ = lasting(tmp_path, monkeypatch)
 
     def fails(*_, **__):
-        raise OSError("no space left")
+        raise failure("no space left")
 
     monkeypatch.setattr(lasting_map, "save_map_files", fails)
     for second in (0, 2, 4):
         own.keep(second * S, Mapped())
+    own.finish(Mapped(), 5 * S, lambda *_, **__: None)  # poses stay as loops corrected them
     (fault,) = own.faults
     assert fault.startswith("the map could not be saved: ") and "no space left" in fault
 

@@ -112,7 +112,8 @@ class LastingMap:
         assert self._save is not None
         try:
             files = save_map_files(self._updated(saved, is_found), self._save, known=self._seal)
-        except (OSError, InputError) as error:
+        except Exception as error:  # the run and its poses do not depend on it
+            _log.info("save", exc_info=error)
             self._fault(f"the map could not be saved: {text_of(error)}")
             return False
         if files.displaced is not None:
