@@ -150,6 +150,14 @@ def test_a_budget_that_holds_nothing_leaves_a_few_points():
     assert 0 < len(fused.points.points) <= 8 * 9
 
 
+@pytest.mark.parametrize("is_live", [False, True])
+def test_maps_that_cannot_be_thinned_stay_and_the_run_ends_well(monkeypatch, is_live):
+    monkeypatch.setattr("sceneslam.atlas.budget.one_per_voxel", lambda *_: 1 / 0)
+    atlas = Atlas(voxel_m=0.01, budget_mb=1e-3)
+    assert len(drive(atlas, [cloud()], is_live=is_live).points.points) == 10_000
+    assert atlas.finish()[0] == "the maps could not be thinned: ZeroDivisionError: division by zero"
+
+
 def test_scans_beyond_the_limit_are_thinned_to_every_second_one():
     scans = ScanLayer(
         stamps_ns=np.arange(64),

@@ -119,8 +119,11 @@ class Atlas:
 
         Call it after the last session was closed.
         """
-        if self._budget is not None:
-            self._budget.close()
+        try:
+            if self._budget is not None:
+                self._budget.close()
+        except Exception as error:  # the maps stay as they are
+            self._lasting.faults.append(f"the maps could not be thinned: {text_of(error)}")
         if self._mapper is None or not self._path.stamps_ns:
             return self._lasting.faults
         try:
