@@ -1,6 +1,8 @@
 """When a run looks for itself in a loaded map, and what is saved of it."""
 
+from concurrent.futures import Executor, Future
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -96,6 +98,32 @@ def test_a_run_tells_once_after_five_seconds_that_it_was_not_located(monkeypatch
     searched.answer, searched.T_map_run = LocalizationEvent.WITHDRAWN, None
     observe(8.0)
     assert events[1:] == [("relocalization_withdrawn", 8 * S, {"after_s": 7.0})]
+
+
+class Busy(Executor):
+    """Runs its calls when it is shut down."""
+
+    def __init__(self):
+        self.waiting = []
+
+    def submit(self, function, *args, **kwargs):
+        self.waiting.append((Future(), partial(function, *args, **kwargs)))
+        return self.waiting[-1][0]
+
+    def shutdown(self, **_):
+        for future, call in self.waiting:
+            future.set_result(call())
+
+
+def test_what_a_live_run_finds_by_its_last_search_counts(monkeypatch):
+    searched = Searched(monkeypatch)
+    own, events, observe = looking(speed_m_s=1.0)
+    own._executor = Busy()
+    observe(1.0)
+    searched.answer, searched.T_map_run = LocalizationEvent.FOUND, HERE
+    correction = own.finish(lambda stamp_ns: None, [])
+    assert [event for event, *_ in events] == ["relocalized"] and own.is_found
+    np.testing.assert_allclose(correction.T_new_old, [HERE])
 
 
 def test_the_newest_eighty_scans_are_compared_when_it_is_due(monkeypatch):

@@ -179,6 +179,8 @@ class Mapper:
         chain = self._collector.chain
         if not len(chain):
             return Correction.none()
+        if self._localizer is not None:
+            self._collect(self._localizer, int(chain.submaps[-1].stamps_ns[-1]))
         chain.remeasure(path)
         self._graph.forget(self._kept)
         old = np.array(chain.T_run_node)
