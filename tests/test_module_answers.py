@@ -163,5 +163,12 @@ def test_a_grid_has_cells_of_some_size(name, field):
             checked_layers(MapLayers(**{name: layer}))
 
 
+@pytest.mark.parametrize("edges", [[[0, 1], [1, 3]], [[-1, 1], [1, 2]], [[0.0, 1.0], [1.0, 2.0]]])
+def test_edges_lead_between_nodes_of_the_graph(edges):
+    graph = replace(LAYERS["pose_graph"], edges=np.array(edges))
+    with pytest.raises(ValueError, match=r"^pose_graph\.edges: expected int64, from 0 to 2"):
+        checked_layers(MapLayers(pose_graph=graph))
+
+
 def test_every_type_of_layer_is_checked():
     assert set(LAYERS) == set(LAYER_TYPES)

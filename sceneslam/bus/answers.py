@@ -85,6 +85,10 @@ def checked_layers(layers: object) -> MapLayers:
         raise ValueError(f"grid.resolution_m: expected above 0, got {layers.grid.resolution_m}")
     if layers.scans is not None and not layers.scans.cell_m > 0:
         raise ValueError(f"scans.cell_m: expected above 0, got {layers.scans.cell_m}")
+    if layers.pose_graph is not None:
+        edges, nodes = layers.pose_graph.edges, len(layers.pose_graph.stamps_ns)
+        if edges.dtype.kind not in "iu" or ((edges < 0) | (edges >= nodes)).any():
+            raise ValueError(f"pose_graph.edges: expected int64, from 0 to {nodes - 1}")
     return layers
 
 
