@@ -96,6 +96,21 @@ def test_loops_of_modules_have_their_stamps_and_the_inverse_of_their_information
     np.testing.assert_allclose(closed.covariance, expected)
 
 
+def test_what_a_loop_of_a_module_did_not_measure_is_unknown():
+    """A graph in the plane says nothing about height and tilt."""
+    graph = PoseGraphLayer(
+        stamps_ns=np.array([10, 20]),
+        T_world_base=np.stack([at(0.0), at(1.0)]),
+        edges=np.array([[0, 1]]),
+        T_from_to=at(1.0)[None],
+        information=np.diag([100.0, 100.0, 0.0, 0.0, 0.0, 400.0])[None],
+        is_loop=np.array([True]),
+    )
+    (closed,) = closed_loops([MapLayers(pose_graph=graph)])
+    expected = [0.01, 0.01, 1e6, 1e6, 1e6, 0.0025]
+    np.testing.assert_allclose(np.diag(closed.covariance), expected, rtol=1e-3)
+
+
 @pytest.mark.parametrize("unknown", [1e16, np.finfo(float).max])
 def test_a_covariance_that_says_unknown_costs_no_map(tmp_path, unknown):
     own = Atlas(voxel_m=0.05, save=str(tmp_path / "map"))
