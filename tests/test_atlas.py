@@ -131,11 +131,12 @@ def test_saved_pose_graph_is_what_gtsam_reads(tmp_path):
     assert Trajectory.read_tum(tmp_path / "pose_graph.tum").stamps_ns.tolist() == [1, 2_000_000_003]
 
 
-def test_saved_landmarks_say_where_they_come_from(tmp_path):
+@pytest.mark.parametrize("dtype", [np.int64, np.int32, np.uint16])
+def test_saved_landmarks_say_where_they_come_from(tmp_path, dtype):
     landmarks = LandmarkLayer(
         points=np.array([[1, 2, 3]], np.float32),
         first_stamps_ns=np.array([1_500_000_000]),
-        sightings=np.array([7]),
+        sightings=np.array([7], dtype),
     )
     save_map(atlas_of(("a", se3.identity(), MapLayers(landmarks=landmarks))).fuse_maps(), tmp_path)
     header, _, body = (tmp_path / "landmarks.ply").read_bytes().partition(b"end_header\n")

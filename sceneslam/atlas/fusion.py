@@ -101,7 +101,7 @@ def _join_landmarks(
     return LandmarkLayer(
         points=np.concatenate([se3.apply(T, one.points).astype(np.float32) for T, one in layers]),
         first_stamps_ns=np.concatenate([one.first_stamps_ns for _, one in layers]),
-        sightings=np.concatenate([one.sightings for _, one in layers]),
+        sightings=np.concatenate([one.sightings for _, one in layers]).astype(np.int64),
     )
 
 
