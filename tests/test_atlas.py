@@ -244,3 +244,19 @@ def test_a_session_with_points_and_scans_gives_its_points_and_the_grid_of_its_sc
 def test_a_session_without_scans_or_grid_gives_none(layers):
     found, _ = scanned(layers, [0.1, 0.5, 1.3])
     assert found.grid is None and len(found.points.points) == 0
+
+
+def test_the_map_of_a_session_whose_poses_were_replaced_is_corrected_as_well():
+    atlas = Atlas(voxel_m=0.05)
+    layers = MapLayers(points=PointLayer(points=np.array([[1.0, 2.0, 0.0]], np.float32)))
+    for module in "ab":
+        atlas.rewind(0)
+        atlas.begin_session(module, se3.identity())
+        for stamp_ns in range(5):
+            atlas.add_local(stamp_ns, se3.identity())
+            atlas.add(stamp_ns, se3.identity(), module)
+    T_new_old = se3.from_xy_yaw(5.0, 0.0, np.pi / 2)
+    atlas.correct(Correction(stamps_ns=np.array([0]), T_new_old=T_new_old[None]))
+    for session in range(2):
+        atlas.close_session(session, layers, Trajectory.empty())
+    np.testing.assert_allclose(atlas.fuse_maps().points.points, [[3.0, 1.0, 0.0]] * 2, atol=1e-6)

@@ -325,11 +325,14 @@ class Atlas:
     def _placed(self, T_revised: Sequence[Transform]) -> list[Transform]:
         """Return T_map_local of every session, corrected as the middle one of its poses."""
         placed, path = list(T_revised), np.array(self._path.sessions, np.int64)
+        stamps_ns = np.array(self._path.stamps_ns, np.int64)
         for session, T_map_local in enumerate(T_revised):
-            rows = np.flatnonzero(path == session)
-            if len(rows):
-                stamp_ns = np.array([self._path.stamps_ns[rows[len(rows) // 2]]], np.int64)
-                placed[session] = self._correction.apply(stamp_ns, T_map_local[None])[0]
+            own_ns = stamps_ns[path == session]
+            if not len(own_ns):  # a hand-over replaced all of them
+                own_ns = np.array(self._sessions[session].stamps_ns, np.int64)
+            if len(own_ns):
+                middle_ns = own_ns[[len(own_ns) // 2]]
+                placed[session] = self._correction.apply(middle_ns, T_map_local[None])[0]
         return placed
 
     def _scanned_at(self, layers: MapLayers, T_map_local: Transform) -> NDArray[np.float64] | None:
