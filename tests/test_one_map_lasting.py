@@ -12,11 +12,12 @@ from test_one_map import atlas, world
 from sceneslam.atlas.lasting.map_files import HEAD, load_map_files, save_map_files
 from sceneslam.atlas.lasting.saved_map import forget_contradicted
 from sceneslam.atlas.places.plan_field import PlanField
-from sceneslam.experiments.one_map.drive import Drive, map_of
+from sceneslam.experiments.one_map.drive import RIG, Drive, map_of
 from sceneslam.maps.__main__ import main
 from sceneslam.testing.floor_plans import CUPBOARD, FLAT_TOUR, box, flat, through
 from sceneslam.types import planar
 from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.observation import Observation
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +45,33 @@ def test_a_run_finds_itself_in_a_loaded_map_and_its_poses_lie_in_it(saved, tmp_p
     assert drive.errors_m(true, map_of(first)).max() < 0.05
     both = load_map_files(tmp_path / "map")
     assert both.runs == 2 and set(both.pieces.tolist()) == {0}
+
+
+def test_a_run_whose_poses_were_replaced_is_where_the_new_ones_lead(saved):
+    """A module measures 12 s of motion a fifth too long, until a hand-over replaces its poses."""
+    folder, first = saved
+    own, room, events = atlas(load=str(folder)), world(flat(), 5), []
+    step_ns = 200_000_000
+    own.open(RIG, lambda event, *_, **__: events.append(event))
+    true = through([(7.3, 0.9), (9.2, 1.0), (9.3, 2.0), (5.2, 2.0), (3.2, 0.9), (5.3, 0.9)])
+    right = [planar.between(true[0], pose) for pose in true]
+    T_run_base, off_m = right[0], []
+    for row, pose in enumerate(true):
+        step = planar.between(right[max(row - 1, 0)], right[row])
+        T_run_base = planar.compose(T_run_base, step * ([1.2, 1.2, 1.0] if row > 15 else 1.0))
+        if row == 75:
+            own.rewind(16 * step_ns)
+        since = 16 if row == 75 else row
+        for given in range(since, row + 1):
+            T = T_run_base if row < 75 else right[given]
+            own.add(given * step_ns, planar.to_transform(T), "a", np.eye(6) * 1e-4)
+        own.observe(Observation(stamp_ns=row * step_ns, scan=room.scan(pose, 0)), None)
+        at = planar.compose(map_of(first), pose)
+        off_m.append(np.linalg.norm(own.pose_at(row * step_ns)[:2, 3] - at[:2]))
+    assert own.finish() == [] and "relocalization_withdrawn" not in events
+    assert max(off_m[60:75]) > 0.2 and max(off_m[75:]) < 0.05
+    expected = [planar.compose(map_of(first), pose)[:2] for pose in true]
+    assert np.abs(own.trajectory.positions_m[:, :2] - expected).max() < 0.02
 
 
 class Later(Future):

@@ -71,6 +71,7 @@ class Mapper:
         self._executor = executor("search", is_live=is_live)
         self._search: Future[LocalizationEvent] | None = None
         self._recent: list[Look] = []  # with a scan
+        self._rewound_ns: int | None = None  # looks from here on have poses that were replaced
         self._is_level = True  # at the last step
         self._T_map_run: Transform | None = None
         self._began_ns: int | None = None
@@ -124,6 +125,8 @@ class Mapper:
 
     def rewind(self, stamp_ns: int) -> None:
         """Remove what was made of poses from a stamp on: they are replaced."""
+        before_ns = stamp_ns if self._rewound_ns is None else self._rewound_ns
+        self._rewound_ns = min(stamp_ns, before_ns)
         self._collector.rewind(stamp_ns)
         kept = len(self._collector.chain)
         if kept < self._kept:
@@ -294,16 +297,31 @@ class Mapper:
             self._take(LocalizationEvent.NOTHING, localizer, look.stamp_ns)
 
     def _collect(self, localizer: MapLocalizer, stamp_ns: int) -> None:
+        """Take the result of a search, if there is one, and between two the replaced poses."""
         if self._search is not None and self._search.done():
             search, self._search = self._search, None
             self._take(search.result(), localizer, stamp_ns)
+        if self._search is None and self._rewound_ns is not None:
+            recent = [(look, self._pose_at(look.stamp_ns)) for look in self._recent]
+            self._recent = [replace(look, T_run_base=T) for look, T in recent if T is not None]
+            localizer.rewind(self._rewound_ns, self._pose_at)
+            self._rewound_ns = None
+            self._follow(localizer)
+
+    def _pose_at(self, stamp_ns: int) -> Transform | None:
+        known = self._known(stamp_ns)
+        return None if known is None else known.T_map_base
+
+    def _follow(self, localizer: MapLocalizer) -> None:
+        """Take the localizer's estimate of where the run lies in the loaded map."""
+        self._is_news |= localizer.T_map_run is not self._T_map_run
+        self._T_map_run = localizer.T_map_run
 
     def _take(self, outcome: LocalizationEvent, localizer: MapLocalizer, stamp_ns: int) -> None:
         """Process the result of a comparison with the map."""
         assert self._began_ns is not None
         after_s = (stamp_ns - self._began_ns) / 1e9
-        self._is_news |= localizer.T_map_run is not self._T_map_run
-        self._T_map_run = localizer.T_map_run
+        self._follow(localizer)
         if outcome is LocalizationEvent.FOUND:
             self.was_found = True
             self._note(outcome.value, stamp_ns, after_s=after_s, T_map_run=self.T_map_run.tolist())

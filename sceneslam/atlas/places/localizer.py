@@ -15,6 +15,7 @@ from sceneslam.atlas.places.plan_search import SearchWindow
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.places.registration import PlanRegistration, register
 from sceneslam.atlas.submaps.graph import on_floor
+from sceneslam.atlas.submaps.own_loops import Path
 from sceneslam.atlas.uncertainty import WHEELS
 from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar, se3
@@ -110,6 +111,19 @@ class MapLocalizer:
             return LocalizationEvent.NOTHING
         self._take(newest, _mean(fix, before, newest))
         return LocalizationEvent.FOUND
+
+    def rewind(self, stamp_ns: int, path: Path) -> None:
+        """Forget what was found by poses that `path` replaced from a stamp on.
+
+        The first fix stays: the run was located.
+        """
+        self._guess, self._doubts = None, 0
+        self.fixes = [fix for fix in self.fixes if fix.stamp_ns < stamp_ns] or self.fixes[:1]
+        fix = self.fixes[-1] if self.fixes else None
+        T_run_base = None if fix is None else path(fix.stamp_ns)
+        if fix is not None and T_run_base is not None:
+            self._fixed_at = Look(stamp_ns=fix.stamp_ns, T_run_base=T_run_base)
+            self.T_map_run = fix.T_map_base @ se3.inverse(T_run_base)
 
     def _is_time(self, newest: Look, next_ns: int) -> bool:
         """Tell whether the time has come, and a located robot has moved since its last fix."""
