@@ -272,7 +272,16 @@ def test_submaps_of_other_runs_are_no_neighbours(monkeypatch):
     assert [len(plan) for plan in found.queries] == [2, 2, 1]
 
 
-# What is too large.
+# Where it may be written, and what is too large.
+
+
+@pytest.mark.parametrize("command", ["merge", "prune", "export"])
+@pytest.mark.parametrize("name", ["map/out", "map/../map/out"])
+def test_nothing_is_written_into_a_map(tmp_path, capsys, command, name):
+    save_map_files(map_of(WALL), tmp_path / "map")
+    assert main([command, str(tmp_path / "map"), "--out", str(tmp_path / name)]) == 2
+    assert "a map is saved in a folder of its own" in capsys.readouterr().err
+    save_map_files(map_of(WALL, WALL), tmp_path / "map")
 
 
 @pytest.mark.parametrize("command", ["info", "export", "merge"])

@@ -12,6 +12,7 @@ from sceneslam.atlas.lasting.map_files import (
     check_map_folder,
     load_map_files,
     save_map_files,
+    seal_of,
 )
 from sceneslam.atlas.lasting.merge import join_pieces, side_by_side
 from sceneslam.atlas.lasting.prune import prune
@@ -75,7 +76,7 @@ def _prune(options: argparse.Namespace) -> int:
 
 
 def _export(options: argparse.Namespace) -> int:
-    if (options.out / HEAD).exists():
+    if (options.out / HEAD).exists() or seal_of(options.out.absolute().parent) is not None:
         raise InputError(f"a map is saved in a folder of its own, choose another: {options.out}")
     for path in export(load_map_files(options.map), options.out):
         print(path)

@@ -65,7 +65,12 @@ _SHAPES: Mapping[str, tuple[str, str, tuple[int, ...]]] = {  # name -> dtype, ro
 
 
 def check_map_folder(folder: Path) -> None:
-    """Raise InputError if a map cannot be saved in a folder: it holds something else."""
+    """Raise InputError if a map cannot be saved in a folder: it holds something else.
+
+    Nor in a folder of another map, which could not be saved again.
+    """
+    if seal_of(folder.absolute().parent) is not None:
+        raise InputError(f"a map is saved in a folder of its own, not in another map: {folder}")
     if not folder.is_dir():
         there = next(path for path in (folder, *folder.parents) if os.path.lexists(path))
         if not there.is_dir():
