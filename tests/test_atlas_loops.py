@@ -168,6 +168,14 @@ def test_a_target_is_the_plan_of_two_neighbours_on_either_side_in_one_session(mo
     assert around(4, [0] * 4 + [1] * 4) == (2, [0, 1, 2, 3])
 
 
+def test_a_submap_at_a_pose_that_jumped_is_in_no_target(monkeypatch):
+    compared, nodes = Compared(monkeypatch), line(*[0.0] * 7)
+    nodes[3] = [600.0, 600.0, 0.0]
+    assert firsts(6, [0] * 6 + [1], nodes, SMALL) == [0, 4]
+    shapes = {plan.free.shape for plan in compared.targets}
+    assert shapes == {join([(np.zeros(3), WALL)]).free.shape}
+
+
 def test_a_target_is_made_once_for_all_that_are_compared_with_it(monkeypatch):
     compared = Compared(monkeypatch)
     sessions = [0] * 4 + [1] * 16

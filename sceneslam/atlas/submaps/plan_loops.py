@@ -79,10 +79,12 @@ class PlanLoops:
             while len(self._targets) >= _CACHED:
                 del self._targets[next(iter(self._targets))]
             own, start = query.submaps[first], max(first - NEIGHBOURS, 0)
+            near = [planar.between(query.plane[first], T) for T in query.plane[start:end]]
             placed = [
-                (planar.between(query.plane[first], query.plane[index]), one.plan)
-                for index, one in enumerate(query.submaps[start:end], start)
+                (T, one.plan)
+                for T, one in zip(near, query.submaps[start:end], strict=True)
                 if (one.run, one.session) == (own.run, own.session)
+                and np.hypot(T[0], T[1]) <= _HALF_MAX_M  # a pose that jumps makes no huge plan
             ]
             self._targets[first, end] = Recognizer(PlanField(join(placed)))
         return self._targets[first, end]
