@@ -115,6 +115,15 @@ def test_the_grid_of_a_run_that_was_found_is_that_of_the_whole_map(saved):
     assert grid.log_odds[row, column] < 0
 
 
+@pytest.mark.parametrize("mode", ["extend", "update"])
+def test_a_loaded_map_that_is_too_large_for_a_grid_costs_no_other_layer(saved, monkeypatch, mode):
+    drive = Drive(atlas(load=str(saved[0]), mode=mode)).go(world(flat(), 7), through(FLAT_TOUR[:3]))
+    assert drive.of_kind("relocalized")
+    monkeypatch.setattr("sceneslam.atlas.places.floor_plan._CELLS_MAX", 10)
+    fused = drive.atlas.fuse_maps()
+    assert fused.grid is None and len(fused.pose_graph.stamps_ns)
+
+
 def test_a_run_that_is_nowhere_in_the_map_says_so_and_keeps_its_own_piece(saved, tmp_path):
     folder, _ = saved
     other = world(box(0, 0, 7.5, 3.2) + box(2, 1, 2.5, 1.4) + box(5, 2.2, 6.3, 3.0))

@@ -21,7 +21,7 @@ from sceneslam.atlas.revision import Revised, revise
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.uncertainty import VELOCITY, WHEELS, Covariance
 from sceneslam.interfaces import TrajectoryLog
-from sceneslam.types.errors import ConfigError, text_of
+from sceneslam.types.errors import ConfigError, InputError, text_of
 from sceneslam.types.maps import HybridMap, MapLayers
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
@@ -311,10 +311,16 @@ class Atlas:
         ]
         if self._mapper is None or not self._mapper.has_submaps:
             return fuse(placed, voxel_m=self._voxel_m)
-        saved = self._lasting.map_of(self._mapper)
+        saved = self._mapper.saved()
         own = [row for row, one in enumerate(saved.submaps) if one.run == saved.runs - 1]
         fused = fuse(placed, voxel_m=self._voxel_m, pose_graph=saved.of(own).graph())
-        return replace(fused, grid=grid_of(saved.plan())) if self._mapper.is_placed else fused
+        if not self._mapper.is_placed:
+            return fused
+        try:
+            return replace(fused, grid=grid_of(self._lasting.map_of(self._mapper).plan()))
+        except InputError as error:  # it is too large
+            _log.warning("the grid is without the loaded map: %s", error)
+            return fused
 
     def _in_map(self, T_run_base: Transform) -> Transform:
         """Return a pose as loops correct it, or in a loaded map if the run was located there."""
