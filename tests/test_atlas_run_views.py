@@ -62,6 +62,21 @@ def test_after_a_rewind_views_are_compared_with_those_that_are_left_and_those_th
         np.testing.assert_allclose(one.T_first_second, expected, atol=1e-5)
 
 
+def test_views_of_a_search_that_was_interrupted_are_kept(monkeypatch):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    graph, places = RunGraph(empty_map(), lambda session: False), (0, 1, 2, 0)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(PlanLoops, "loops_to", stopped)
+        graph.extend(chain_of(*places), is_level=True)
+    chain, whole = chain_of(*places), chain_of(*places)
+    graph.extend(chain, is_level=False)
+    RunGraph(empty_map(), lambda session: False).extend(whole, is_level=False)
+    for one, other in zip(chain.submaps, whole.submaps, strict=True):
+        assert len(one.views) == len(other.views)
+
+
 def test_neighbouring_submaps_get_no_loop_even_across_a_handover():
     graph = RunGraph(empty_map(), lambda session: False)
     chain = chain_of(None, 0, 0, 1, 1)

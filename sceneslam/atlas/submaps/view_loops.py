@@ -38,6 +38,7 @@ class ViewLoops:
         Views that show what an earlier one shows are left out: time spent in a known place adds
         none.
         """
+        self.forget(query.second)  # what a search that was interrupted left
         poses = [query.T_run_node[owner] @ view.T_submap_base for owner, view in self._owned]
         self._views.move(poses)
         known, reach_m = np.reshape(poses, (-1, 4, 4)), self._reach_m(query)
