@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.motion.motion import UNKNOWN_VELOCITY, Step, still
+from sceneslam.motion.motion import BELIEVED, UNKNOWN_VELOCITY, Step, still
 from sceneslam.motion.trust import NoiseRatio, student_cost
 from sceneslam.types import se3
 
@@ -24,6 +24,7 @@ _JUMP = 3.0  # times the acceleration: a larger change of velocity is a jump
 _KEPT_S = 0.5  # longest time that an unmeasured velocity is kept
 _STEP = np.array([1e-4, 1e-4])  # m, rad: least standard deviation of a predicted step
 _FASTEST = np.array([25.0, 20.0])  # m/s, rad/s: with a larger deviation a velocity is unknown
+_UNUSED = 1e6  # m^2, rad^2: variance of what is not used
 _MISSED = (0.05, 0.1)  # m, rad: standard deviation of a predicted motion before it is learnt
 
 Matrix = NDArray[np.float64]
@@ -83,9 +84,13 @@ class Inertia:
     def noise_of(
         self, wheels: Step, lying: NDArray[np.float64], duration_s: float
     ) -> NDArray[np.float64]:
-        """Return the variances (2,) of the wheels' motion, wrong with the probabilities `lying`."""
+        """Return the variances (2,) of the wheels' motion, wrong with the probabilities `lying`.
+
+        Wheels that are not believed have no influence.
+        """
+        noise = self.missed**2 + wheels.variance
         wrong = (UNKNOWN_VELOCITY * duration_s) ** 2
-        return np.asarray(self.missed**2 + wheels.variance + lying * wrong)
+        return np.where(lying < BELIEVED, noise + lying * wrong, _UNUSED)
 
     def learn(
         self, T_before_now: Matrix, covariance: Matrix, guess: Step, duration_s: float

@@ -153,6 +153,9 @@ class MotionModel:
         if duration_s <= 0.0 or not self._is_followed:  # the interval is unknown
             self.skip()
             return
+        if evidence is not None:
+            for lie, one in zip(self._lies, evidence.tolist(), strict=True):
+                lie.judge(one)
         self._inertia.learn(
             *self._with_wheels(T_before_now, covariance), guess=guess, duration_s=duration_s
         )
@@ -165,9 +168,7 @@ class MotionModel:
         )
         for channel, axes in enumerate((slice(0, 2), slice(2, 3))):
             R = measured[axes, axes]
-            if evidence is not None:
-                self._lies[channel].judge(float(evidence[channel]))
-            elif had_velocity:
+            if evidence is None and had_velocity:
                 self._lies[channel].judge(
                     evidence_of_a_lie(
                         wheels=off[axes],
