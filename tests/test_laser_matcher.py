@@ -7,6 +7,7 @@ import pytest
 from test_laser_world import box, room, scan_at
 
 from sceneslam.modules.slam.laser.field import LikelihoodField
+from sceneslam.modules.slam.laser.free_space import FreeSpace
 from sceneslam.modules.slam.laser.matcher import Matcher
 from sceneslam.modules.slam.laser.prior import MotionPrior
 from sceneslam.modules.slam.laser.surface import ScanSurfaceReader
@@ -84,3 +85,58 @@ def test_wall_that_comes_into_view_behind_a_post_hardly_pulls():
     seen = np.concatenate([[[[1.5, -1.0], [1.5, 0.4]]], box(1.39, 0.4, 1.44, 0.45)])
     new = np.array([[[1.5, 0.4], [1.5, 0.75]]])
     assert pull_m(seen, new, beams=1440) < 0.03  # 30 cm when it does
+
+
+@pytest.mark.parametrize("hangs", [False, True])
+def test_space_is_free_where_beams_passed_around_it(hangs):
+    """A laser at (0, 0) that looks ahead, in a room of 4 m by 4 m without a wall on its left."""
+    walls = box(-2, -2, 2, 2)[[0, 1, 3]]
+    scan = scan_at(walls, se3.identity(), stamp_ns=0, beams=180, fov_rad=np.pi)
+    clockwise = replace(
+        scan,
+        ranges_m=scan.ranges_m[::-1],
+        angle_min_rad=float(scan.angles_rad[-1]),
+        angle_step_rad=-scan.angle_step_rad,
+    )
+    T_base_laser = se3.identity()
+    if hangs:  # its beams turn the other way
+        T_base_laser = np.diag([1.0, -1.0, -1.0, 1.0])
+        scan, clockwise = (
+            replace(each, angle_min_rad=-each.angle_min_rad, angle_step_rad=-each.angle_step_rad)
+            for each in (scan, clockwise)
+        )
+    expected = {
+        (1.0, 0.0): True,
+        (0.5, -1.5): True,
+        (1.9, 0.0): False,  # nearer than 0.2 m to a wall
+        (1.5, -1.9): False,
+        (3.0, 0.0): False,  # behind a wall
+        (-1.0, 0.0): False,  # behind the laser
+        (0.3, 1.5): False,  # its beams did not return
+    }
+    for each in (scan, clockwise):
+        free = FreeSpace([each], [np.zeros(3)], T_base_laser, 10.0)
+        assert free.contains(np.array(list(expected))).tolist() == list(expected.values())
+
+
+def test_what_was_not_seen_before_is_no_evidence_against_a_motion():
+    """A robot that looks ahead moves back, so that more and more of its walls are new."""
+    walls = np.concatenate([box(-20, -1, 8, 1), box(3, -1, 3.5, -0.5), box(5, 0.6, 5.5, 1)])
+    reader = ScanSurfaceReader(
+        T_base_laser=se3.identity(), range_max_m=25.0, noise_m=0.01, noise_per_m=0.0
+    )
+    rng, T_here_back = np.random.default_rng(0), se3.from_xy_yaw(-0.3, 0, 0)
+    here, back = (
+        scan_at(walls, T_here_laser, stamp_ns=0, rng=rng, beams=181, fov_rad=np.pi)
+        for T_here_laser in (se3.identity(), T_here_back)
+    )
+    seen = FreeSpace([here], [np.zeros(3)], se3.identity(), 25.0)
+
+    def cost(moved_m, free):
+        field = LikelihoodField(reader.read(here), 0.05, free)
+        matcher = Matcher(window_m=0.5, window_rad=0.5, degeneracy_ratio=0.01, shift_m=0.0)
+        prior = MotionPrior.of(np.array([moved_m, 0.0, 0.0]), np.diag([0.01, 0.01, 0.01]) ** 2)
+        return matcher.match(reader.read(back), field, [prior]).scan_cost
+
+    assert cost(-0.3, None) > cost(0.0, None)  # all space is taken as free
+    assert cost(-0.3, seen) < 0.5 * cost(0.0, seen)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .free_space import FreeSpace
 from .surface import SurfacePoints
 
 _REACH_M = 0.3  # the likelihood falls to 0 at this distance from a surface
@@ -29,9 +30,11 @@ class NearestSurfaces:
 class LikelihoodField:
     """Surfaces around the robot, in `local`, with look-ups in constant time."""
 
-    def __init__(self, surfaces: SurfacePoints, resolution_m: float) -> None:
-        """Build the field of a local map with at least one point."""
-        self.resolution_m = resolution_m
+    def __init__(
+        self, surfaces: SurfacePoints, resolution_m: float, free: FreeSpace | None = None
+    ) -> None:
+        """Build the field of a local map with at least one point; `free`: None if unknown."""
+        self.resolution_m, self._free = resolution_m, free
         cells = np.floor(surfaces.points / resolution_m).astype(np.int64)
         self._origin = cells.min(axis=0) - _MARGIN_CELLS
         columns, rows = (cells.max(axis=0) - self._origin + 1 + _MARGIN_CELLS).tolist()
@@ -51,6 +54,12 @@ class LikelihoodField:
         self._likelihood = np.maximum(
             np.float32(1.0) - distance_px * np.float32(resolution_m / _REACH_M), np.float32(0.0)
         )
+
+    def is_free(self, points_local: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Tell which of the points (N, 2) [m] lie in space that was seen to be free."""
+        if self._free is None:
+            return np.ones(len(points_local), bool)
+        return self._free.contains(points_local)
 
     def nearest(self, points_local: NDArray[np.float64]) -> NearestSurfaces:
         """Return the nearest surfaces of points (N, 2) [m]."""

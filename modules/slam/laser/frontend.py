@@ -21,6 +21,7 @@ from sceneslam.types.planar import (
     to_transform,
     turn,
 )
+from sceneslam.types.se3 import Transform
 
 from .field import LikelihoodField
 from .keyframes import ScanKeyframe, ScanKeyframes
@@ -55,6 +56,8 @@ class ScanSettings:
     beams_min: int
     inlier_min_ratio: float
     predict_max_s: float
+    range_max_m: float
+    T_base_laser: Transform
 
 
 @dataclass(slots=True)
@@ -237,7 +240,11 @@ class FrontEnd:
     def _extend(self, T_local_base: Planar, scan: LaserScan, surfaces: SurfacePoints) -> None:
         """Make the scan a keyframe."""
         self.keyframes.add(ScanKeyframe(T_local_base=T_local_base, scan=scan), surfaces)
-        self._field = LikelihoodField(self.keyframes.latest(), self.settings.resolution_m)
+        self._field = LikelihoodField(
+            self.keyframes.latest(),
+            self.settings.resolution_m,
+            self.keyframes.free(self.settings.T_base_laser, self.settings.range_max_m),
+        )
 
 
 def _share(stamp_ns: int, before_ns: int | None, now_ns: int) -> float:

@@ -8,7 +8,9 @@ import numpy as np
 
 from sceneslam.types.observation import LaserScan
 from sceneslam.types.planar import Planar, wrap
+from sceneslam.types.se3 import Transform
 
+from .free_space import FreeSpace
 from .surface import SurfacePoints, joined
 
 
@@ -51,6 +53,16 @@ class ScanKeyframes:
             del self._surfaces[: -self.submap_keyframes]
         self.frames.append(frame)
         self._surfaces.append(surfaces_base.moved(frame.T_local_base))
+
+    def free(self, T_base_laser: Transform, range_max_m: float) -> FreeSpace:
+        """Return the free space of the latest two submaps."""
+        recent = self.frames[-len(self._surfaces) :]
+        return FreeSpace(
+            [frame.scan for frame in recent],
+            [frame.T_local_base for frame in recent],
+            T_base_laser,
+            range_max_m,
+        )
 
     def latest(self) -> SurfacePoints:
         """Return the surfaces of the latest two submaps that the newest keyframe may see, local.

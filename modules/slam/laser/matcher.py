@@ -12,7 +12,9 @@ scans taken from almost the same place.
 
 Scan points beyond the end of a mapped surface do not belong to it: such pairs are dropped (after
 Turk and Levoy, "Zippered polygon meshes from range images", SIGGRAPH 1994). Otherwise they would
-bias a turn: on the side to which the robot turns, the scan always shows more than the map.
+bias a turn: on the side to which the robot turns, the scan always shows more than the map. Nor are
+such points evidence against a pose, unless beams passed where they are: otherwise a robot would
+seem to stand still, as then there is least that is new.
 """
 
 from __future__ import annotations
@@ -208,7 +210,7 @@ class Matcher:
             alone, _, _ = self._laser_equations(
                 scan_base, field, pose, _KERNELS_M[-1], self.shift_m
             )
-        residual, far, evident = _residuals(scan_base, field, pose)
+        residual, far, evident = _residuals(scan_base, field, pose, self.noise.ratio)
         inlier = residual < _INLIER_M
         count = max(len(scan_base), 1)
         prior, off = expected.weighed(pose), expected.off(pose)
@@ -238,18 +240,11 @@ class Matcher:
         shift_m: float,
     ) -> tuple[Matrix, Planar, int]:
         """Return the normal equations H, g in (x, y, yaw), and the number of weak directions."""
-        arms = scan_base.points @ rotation(pose[2]).T
-        near = field.nearest(arms + pose[:2])
-        ex, ey = (arms + pose[:2] - near.points).T
-        xx, xy, yy = near.shape.T
-        ax, ay = xx * ex + xy * ey, xy * ex + yy * ey  # the error across the surface
+        pairs = _Pairs.of(scan_base, field, pose)
+        arms, (ex, ey), (ax, ay) = pairs.arms, pairs.error.T, pairs.across.T
+        xx, xy, yy = pairs.shape.T
         robust = (kernel_m**2 / (kernel_m**2 + ax * ex + ay * ey)) ** 2
-        gate = ex * ex + ey * ey < (4.0 * kernel_m) ** 2
-        along = (ex - ax) ** 2 + (ey - ay) ** 2  # a surface's end is farther away
-        gate &= along < np.maximum(_END_M, 2.0 * scan_base.spacing_m) ** 2
-        beyond = near.outward[:, 0] * ex + near.outward[:, 1] * ey
-        is_dense = scan_base.spacing_m < field.resolution_m  # else cells between beams are empty
-        gate &= (beyond < 0.5 * field.resolution_m) | ~is_dense
+        gate = ~pairs.is_beyond & (ex * ex + ey * ey < (4.0 * kernel_m) ** 2)
         weight = scan_base.weight * robust * gate / _CORRELATION
         total = float(weight.sum())
         centre = (weight @ arms) / max(total, 1e-12)
@@ -295,23 +290,57 @@ def novelty(T_before_now: Planar) -> float:
     return float(np.clip(max(moved), _NOVELTY_MIN, 1.0))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Pairs:
+    """A scan's points, each with the nearest surface of the map."""
+
+    arms: NDArray[np.float64]  # (N, 2) [m], from the base, axes of local
+    error: NDArray[np.float64]  # (N, 2) [m], from the surface
+    across: NDArray[np.float64]  # (N, 2) [m], of that, across the surface
+    shape: NDArray[np.float64]  # (N, 3)
+    is_beyond: NDArray[np.bool_]  # (N,), the surface has ended before
+
+    @classmethod
+    def of(cls, scan_base: SurfacePoints, field: LikelihoodField, pose: Planar) -> _Pairs:
+        """Return the pairs of a scan at a pose."""
+        arms = scan_base.points @ rotation(pose[2]).T
+        near = field.nearest(arms + pose[:2])
+        error = arms + pose[:2] - near.points
+        xx, xy, yy = near.shape.T
+        ex, ey = error.T
+        across = np.column_stack([xx * ex + xy * ey, xy * ex + yy * ey])
+        along = ((error - across) ** 2).sum(axis=1)  # a surface's end is farther away
+        beyond = near.outward[:, 0] * ex + near.outward[:, 1] * ey
+        is_dense = scan_base.spacing_m < field.resolution_m  # else cells between beams are empty
+        return cls(
+            arms=arms,
+            error=error,
+            across=across,
+            shape=near.shape,
+            is_beyond=(along >= np.maximum(_END_M, 2.0 * scan_base.spacing_m) ** 2)
+            | ((beyond >= 0.5 * field.resolution_m) & is_dense),
+        )
+
+
 def _residuals(
-    scan_base: SurfacePoints, field: LikelihoodField, pose: Planar
+    scan_base: SurfacePoints, field: LikelihoodField, pose: Planar, noise: float
 ) -> tuple[Planar, Planar, Planar]:
     """Return the points' distances [m] to the nearest surface, to its nearest point, and the first
-    again only for points that are evidence: with sparse beams, a surface is near only by chance.
+    again as evidence: a point without a surface, in space that nothing saw before, is as likely as
+    one at its surface, by the `noise` relative to the expected one. With sparse beams, a surface is
+    near only by chance.
     """
-    points = scan_base.points @ rotation(pose[2]).T + pose[:2]
-    near = field.nearest(points)
-    error = points - near.points
-    xx, xy, yy = near.shape.T
-    across = xx * error[:, 0] ** 2 + 2 * xy * error[:, 0] * error[:, 1] + yy * error[:, 1] ** 2
-    across = np.sqrt(np.maximum(across, 0.0))
-    far = np.linalg.norm(error, axis=1)
-    unknown = xx + yy == 0
+    pairs = _Pairs.of(scan_base, field, pose)
+    across = np.sqrt(np.maximum((pairs.across * pairs.error).sum(axis=1), 0.0))
+    far = np.linalg.norm(pairs.error, axis=1)
+    unknown = pairs.shape[:, 0] + pairs.shape[:, 2] == 0
     is_near = far < 4 * _INLIER_M
-    evident = np.where(is_near | (far < 2.0 * scan_base.spacing_m), across, far)
-    return np.where(is_near & ~unknown, across, far), far, np.where(unknown, 0.0, evident)
+    is_alone = ~is_near & (far >= 2.0 * scan_base.spacing_m) | pairs.is_beyond
+    evident = np.where(unknown, 0.0, across)
+    alone = np.flatnonzero(is_alone & ~unknown)
+    is_free = field.is_free((pairs.arms + pose[:2])[alone])
+    evident[alone] = np.where(is_free, far[alone], noise / np.sqrt(scan_base.weight[alone]))
+    return np.where(is_near & ~unknown, across, far), far, evident
 
 
 def _scan_cost(scan_base: SurfacePoints, residual: NDArray[np.float64]) -> float:

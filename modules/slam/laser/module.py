@@ -178,6 +178,8 @@ class LaserSlam:
                 beams_min=self.beams_min,
                 inlier_min_ratio=self.inlier_min_ratio,
                 predict_max_s=self.predict_max_s,
+                range_max_m=self.range_max_m,
+                T_base_laser=self._T_base_laser,
             ),
             matcher=matcher,
             motion=MotionModel(rig),
