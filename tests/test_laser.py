@@ -261,3 +261,19 @@ def test_scans_are_matched_with_the_latest_two_submaps():
         counts.append(len(keyframes.latest()) // len(surfaces))
         keyframes.add(first, surfaces)
     assert counts == [1, 2, 3, 4, 5, 6, 4, 5]
+
+
+def test_robot_that_was_turned_by_hand_is_found_again():
+    """Its wheels report nothing of 1.5 rad in 1 s."""
+    path = loop_path(160)
+    path[80:, 2] += 1.5
+    told = loop_path(160)
+    observations = drive(room(), path, odometry=told, rng=np.random.default_rng(1))
+    late = [
+        replace(each, stamp_ns=stamp_ns, scan=replace(each.scan, stamp_ns=stamp_ns))
+        for each in observations
+        for stamp_ns in [each.stamp_ns + 900_000_000 * (each.stamp_ns >= 8_000_000_000)]
+    ]
+    module = active()
+    trackings = [module.track(observation) for observation in late]
+    assert errors(path, trackings)[90:].max() < 0.02

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sceneslam.motion.model import MotionModel
-from sceneslam.motion.motion import Motion
+from sceneslam.motion.motion import UNKNOWN_VELOCITY, Motion
 from sceneslam.types.observation import LaserScan, Observation, TrackingStatus
 from sceneslam.types.planar import (
     Matrix,
@@ -106,8 +106,9 @@ class FrontEnd:
         is_known = motion.is_measured and not motion.is_doubted
         new = novelty(between(self._seen_pose, predicted_then)) if is_known else 1.0
         match = self.matcher.match(surfaces, self._field, priors, novelty=new)
-        if not is_known and not self._believes(match):
-            match = self._find_again(surfaces, self._field, predicted_then) or match
+        if not self._believes(match) and (not is_known or self.matcher.misfit > 0.0):
+            again = self._find_again(surfaces, self._field, predicted_then, is_known=is_known)
+            match = again or match
         if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
         self._teach(match, T_then_now, motion)
@@ -133,14 +134,21 @@ class FrontEnd:
         return surfaces if len(surfaces) >= self.settings.beams_min else None
 
     def _find_again(
-        self, surfaces: SurfacePoints, field: LikelihoodField, predicted: Planar
+        self, surfaces: SurfacePoints, field: LikelihoodField, predicted: Planar, *, is_known: bool
     ) -> Match | None:
-        """Return the match of a wide search, as without odometry any motion is possible."""
+        """Return the match of a wide search: any motion is possible.
+
+        `is_known`: the wheels predict the motion, and the scan contradicts them.
+        """
+        assert self._stamp_ns is not None
+        turned_rad = float(np.sqrt(self._covariance[2, 2]))
+        if is_known and self._held_ns is not None:
+            turned_rad = float(UNKNOWN_VELOCITY[1]) * (self._stamp_ns - self._held_ns) * 1e-9
         found = WideSearch(field).find(
             surfaces.points,
             predicted,
             window_m=_LOST_WINDOW_M,
-            window_rad=_LOST_WINDOW_RAD,
+            window_rad=float(np.clip(2.0 * turned_rad, _LOST_WINDOW_RAD, np.pi)),
             score_min=_LOST_SCORE_MIN,
         )
         if found is None or not found.is_unique:
