@@ -7,6 +7,7 @@ import logging
 import sys
 from array import array
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from itertools import chain, islice
 from time import perf_counter
 from typing import Any
@@ -70,28 +71,30 @@ class RunLoop:
         self._operator = Operator(
             detector, parts.scenes, save_map, results.folder, self._log.add, saver
         )
-        self._bus = Bus(
-            detector=detector,
-            modules=parts.modules,
-            scenes=parts.scenes,
-            policy=parts.policy,
-            rig=parts.rig,
-            back_end=parts.atlas,
-            log=self._log,
-            catch_up_steps=parts.run.catch_up_steps,
-            is_live=is_live,
-        )
-        closing = [key for key, module in parts.modules.items() if closes_own_loops(module)]
-        is_one = len(closing) == len(parts.modules) == 1  # it recognizes its places itself
-        parts.atlas.open(
-            parts.rig, self._log.add, closing=closing, is_looking=not is_one, is_live=is_live
-        )
-        self._sinks = OpenSinks(self.faults)
-        try:
+        with ExitStack() as opened:  # closed again if anything cannot be opened
+            opened.callback(self.close, is_saved=True)
+            self._bus = Bus(
+                detector=detector,
+                modules=parts.modules,
+                scenes=parts.scenes,
+                policy=parts.policy,
+                rig=parts.rig,
+                back_end=parts.atlas,
+                log=self._log,
+                catch_up_steps=parts.run.catch_up_steps,
+                is_live=is_live,
+            )
+            opened.callback(self._bus.close, 0)
+            closing = [key for key, module in parts.modules.items() if closes_own_loops(module)]
+            is_one = len(closing) == len(parts.modules) == 1  # it recognizes its places itself
+            opened.callback(parts.atlas.finish)
+            parts.atlas.open(
+                parts.rig, self._log.add, closing=closing, is_looking=not is_one, is_live=is_live
+            )
+            self._sinks = OpenSinks(self.faults)
+            opened.callback(self._sinks.abandon)
             self._sinks.open(parts.sinks, parts.rig, results.folder)
-        except InputError:
-            self.close(is_saved=True)
-            raise
+            opened.pop_all()
 
     def run(self) -> None:
         """Process all observations; an error or Ctrl-C ends the run, not the program."""

@@ -1,6 +1,7 @@
 """Components that break every promise they can: the run goes on, and says what was wrong."""
 
 import os
+import threading
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -10,11 +11,13 @@ import numpy as np
 import pytest
 from configured import config
 from driving import assert_exact, dark_from, drive, events
-from fakes import ExactModule
+from fakes import ExactModule, IdleSink
 from isolation import isolating
 from test_isolation import active, drive_into, seen
 
 from sceneslam.app import run
+from sceneslam.atlas.atlas import Atlas
+from sceneslam.modules.detectors.grey_mean import GreyMean
 from sceneslam.types.errors import InputError, ModuleError
 
 ERRORS = sorted(hostile.ERRORS.keys() - {"KeyboardInterrupt"})  # that one ends the run
@@ -121,6 +124,25 @@ def test_a_sink_that_cannot_be_opened_is_named_before_the_first_frame(tmp_path):
     sinks = {"tape": {"_target_": "hostile_parts.Fails", "method": "open"}}
     with pytest.raises(InputError, match=r"sinks\.tape could not be opened: Exception: as usual"):
         run(hostile_config(sinks=sinks), tmp_path)
+
+
+def test_a_sink_that_cannot_be_opened_leaves_nothing_open(tmp_path, monkeypatch):
+    closed = []
+    monkeypatch.setattr(IdleSink, "close", lambda sink: closed.append("sink"))
+    monkeypatch.setattr(GreyMean, "shutdown", lambda detector: closed.append("detector"))
+    monkeypatch.setattr(Atlas, "finish", lambda atlas: closed.append("atlas"))
+    tape = {"_target_": "hostile_parts.Fails", "method": "open"}
+    with pytest.raises(InputError):
+        run(hostile_config(sinks={"first": {"_target_": "fakes.IdleSink"}, "tape": tape}), tmp_path)
+    assert closed == ["sink", "sink", "atlas", "detector"]
+
+
+def test_a_detector_that_cannot_be_activated_leaves_no_thread(tmp_path):
+    before = threading.active_count()
+    detector = {"_target_": "hostile_parts.Votes", "how": "throws at once"}
+    with pytest.raises(ModuleError, match="no weights"):
+        run(hostile_config(detector=detector), tmp_path)
+    assert threading.active_count() == before
 
 
 @pytest.mark.parametrize("method", ["write", "write_event", "write_truth", "close"])

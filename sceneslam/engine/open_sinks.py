@@ -36,12 +36,12 @@ class OpenSinks:
         """Open all sinks by key; raises InputError for one that fails."""
         # Who steers a robot waits for poses; files do not.
         for key, sink in sorted(sinks.items(), key=lambda one: not isinstance(one[1], Steering)):
+            self._sinks[key] = sink
             try:
                 sink.open(rig, folder)
             except Exception as error:
                 _log.info("sinks.%s", key, exc_info=error)
                 raise InputError(f"sinks.{key} could not be opened: {text_of(error)}") from error
-            self._sinks[key] = sink
 
     def commands(self) -> Iterator[Command]:
         """Yield the operators' commands since the last call."""
@@ -90,6 +90,15 @@ class OpenSinks:
         """Remove all sinks because of an error."""
         for key in list(self._sinks):
             self._drop(key, error)
+
+    def abandon(self) -> None:
+        """Close all sinks without results."""
+        while self._sinks:
+            key, sink = self._sinks.popitem()
+            try:
+                sink.close()
+            except Exception as error:
+                _log.info("sinks.%s", key, exc_info=error)
 
     def _drop(self, key: str, error: Exception) -> None:
         _log.info("sinks.%s", key, exc_info=error)
