@@ -153,6 +153,15 @@ def test_a_sink_that_fails_is_dropped(tmp_path, method):
     assert len(finished.trajectory) == 100
 
 
+@pytest.mark.parametrize("method", ["write", "write_event", "write_truth"])
+def test_a_sink_that_fails_is_closed(tmp_path, monkeypatch, method):
+    closed = []
+    monkeypatch.setattr(IdleSink, "close", lambda sink: closed.append(sink))
+    tape = {"_target_": "hostile_parts.Fails", "method": method}
+    run(hostile_config(sinks={"tape": tape}), tmp_path)
+    assert len(closed) == 1
+
+
 def hostile_config(**changes):
     allowed = ["fakes", "hostile", "hostile_parts"]
     return config(allow_targets=allowed, run__report=False, **changes)

@@ -87,20 +87,23 @@ class OpenSinks:
                 self._drop(key, error)
 
     def drop_all(self, error: Exception) -> None:
-        """Remove all sinks because of an error."""
+        """Remove and close all sinks because of an error."""
         for key in list(self._sinks):
             self._drop(key, error)
 
     def abandon(self) -> None:
         """Close all sinks without results."""
-        while self._sinks:
-            key, sink = self._sinks.popitem()
-            try:
-                sink.close()
-            except Exception as error:
-                _log.info("sinks.%s", key, exc_info=error)
+        for key in list(self._sinks):
+            self._abandon(key)
 
     def _drop(self, key: str, error: Exception) -> None:
         _log.info("sinks.%s", key, exc_info=error)
         self._faults.append(f"sinks.{key} stopped writing: {text_of(error)}")
-        del self._sinks[key]
+        self._abandon(key)
+
+    def _abandon(self, key: str) -> None:
+        """Close a sink, without an error if that fails."""
+        try:
+            self._sinks.pop(key).close()
+        except Exception as error:
+            _log.info("sinks.%s", key, exc_info=error)
