@@ -53,8 +53,7 @@ class Ended:
 def main() -> None:
     """Run `python -m sceneslam` and exit."""
     if "--version" in sys.argv[1:]:
-        print(f"SceneSLAM {sceneslam.__version__}")
-        sys.exit(OK)
+        sys.exit(_tell(lambda: [f"SceneSLAM {sceneslam.__version__}"]))
     if sys.argv[1:2] == ["list"]:
         sys.exit(_tell(lambda: listing(sys.argv[2:])))
     if sys.argv[1:2] == ["doctor"]:
@@ -77,10 +76,17 @@ def main() -> None:
         codes.append(_say(error))
     except KeyboardInterrupt:  # also ends a sweep
         codes.append(INCOMPLETE)
-    if not codes and (lost := lost_output()):  # the results of a run are in its folder
-        print(f"error: standard output: {text_of(lost)}", file=sys.stderr)
-        codes.append(INCOMPLETE)
-    sys.exit(max(codes, default=OK))
+    # The results of a run are in its folder, whatever standard output lost.
+    sys.exit(max(codes) if codes else _printed())
+
+
+def _printed() -> int:
+    """Return the exit code of a command whose result is on standard output alone."""
+    lost = lost_output()
+    if lost is None:
+        return OK
+    print(f"error: standard output: {text_of(lost)}", file=sys.stderr)
+    return INCOMPLETE
 
 
 def _tell(find: Callable[[], list[str]]) -> int:
@@ -91,7 +97,7 @@ def _tell(find: Callable[[], list[str]]) -> int:
         return _say(error)
     except KeyboardInterrupt:
         return INCOMPLETE
-    return OK
+    return _printed()
 
 
 def _words(words: list[str]) -> list[str]:

@@ -107,6 +107,17 @@ def test_reader_that_has_gone_is_no_error(folder, asked):
     assert (done.returncode, done.stderr) == (0, b"")
 
 
+@pytest.mark.parametrize("asked", ["list", "--version"])
+def test_answer_that_a_full_disk_loses_is_an_error(folder, asked):
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with open("/dev/full", "wb") as full:
+        words = [sys.executable, "-m", "sceneslam", asked]
+        done = subprocess.run(
+            words, cwd=folder, env=environment, stdout=full, stderr=subprocess.PIPE, text=True
+        )
+    assert done.returncode == 1 and done.stderr.startswith("error: standard output: OSError")
+
+
 def test_cut_recording_is_read_as_far_as_it_goes(folder, recording):
     data = recording.read_bytes()
     (folder / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
