@@ -114,12 +114,11 @@ def _end(
 ) -> Finished:
     """Write the results, the trajectories before anything else."""
     loop.finish()
-    faults = len(results.faults)
     results.save_trajectories(loop.result())
     loop.read_truth()
     loop.close_sinks()
     metrics = results.save_rest(loop.result(), loop.truth, reference=reference)
-    loop.close(is_saved=len(results.faults) == faults)
+    loop.close(is_saved=not results.unsaved)
     result = loop.result()
     return Finished(
         folder=results.folder,

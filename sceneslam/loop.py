@@ -132,6 +132,9 @@ class RunLoop:
             self.truth = self._parts.source.ground_truth()
         except InputError as error:
             self.faults.append(f"no ground truth: {error}")
+        except Exception as error:
+            _log.info("no ground truth", exc_info=error)
+            self.faults.append(f"no ground truth: {text_of(error)}")
 
     def close_sinks(self) -> None:
         """Pass the final results to the sinks, and close them."""

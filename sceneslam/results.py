@@ -6,7 +6,7 @@ import logging
 import resource
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ class Results:
     value_label: str  # of the detector's votes, for the figures
     faults: list[str]  # errors of the run, for the report
     source: Source | None  # if it is Logged, the files of trajectories have its stamps
+    unsaved: list[str] = field(default_factory=list)  # the faults of saving among them
 
     def save_trajectories(self, result: RunResult) -> None:
         """Write the trajectories first, as they are the most important result."""
@@ -124,7 +125,8 @@ class Results:
             yield
         except Exception as error:
             _log.info("%s could not all be saved", what, exc_info=error)
-            self.faults.append(f"{what} could not all be saved: {text_of(error)}")
+            self.unsaved.append(f"{what} could not all be saved: {text_of(error)}")
+            self.faults.append(self.unsaved[-1])
 
 
 def _peak_rss_mb() -> float:

@@ -198,6 +198,13 @@ class SourceWithoutTruth(FakeSource):
         raise InputError("groundtruth.txt: line 3")
 
 
+class BuggyTruth(FakeSource):
+    """Raises an error of its own where the truth is asked for."""
+
+    def ground_truth(self):
+        raise ValueError("7 numbers")
+
+
 class InterruptedSource(FakeSource):
     """Is stopped while it renders; its truth would have to be rendered too."""
 

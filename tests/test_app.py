@@ -131,6 +131,25 @@ def test_ground_truth_that_cannot_be_read_costs_no_result(tmp_path):
     assert finished.metrics["ate_rmse_m"] is None and len(finished.trajectory) == 100
 
 
+def test_source_that_breaks_at_its_ground_truth_costs_no_result(tmp_path):
+    finished = run(config(source___target_="fakes.BuggyTruth"), tmp_path)
+    assert finished.faults == ("no ground truth: ValueError: 7 numbers",)
+    assert (tmp_path / "metrics.json").exists() and len(finished.trajectory) == 100
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"source___target_": "fakes.SourceWithoutTruth"},
+        {"sinks": {"tape": {"_target_": "hostile_parts.Fails", "method": "close"}}},
+    ],
+)
+def test_what_fails_beside_the_results_leaves_no_journal(tmp_path, changes):
+    allowed = ["fakes", "hostile_parts"]
+    finished = run(config(**changes, allow_targets=allowed, run__report=False), tmp_path)
+    assert finished.faults and not (tmp_path / "journal.bin").exists()
+
+
 def test_ctrl_c_before_the_first_observation_ends_at_once(tmp_path):
     finished = run(config(source___target_="fakes.InterruptedSource"), tmp_path)
     assert finished.is_interrupted and "stopped after 0" in finished.faults[0]

@@ -75,7 +75,6 @@ def recover(folder: Path) -> Recovered:
         faults=[_sentence(atlas, kept), *(f"recovered without {what}" for what in missing)],
         source=source,
     )
-    told_before = len(results.faults)
     result = _result(atlas, kept, events)
     results.save_trajectories(result)
     reference = folder / "reference" / "trajectory.tum"
@@ -85,10 +84,9 @@ def recover(folder: Path) -> Recovered:
         reference=Trajectory.read_tum(reference) if reference.is_file() else None,
         has_costs=False,
     )
-    faults = tuple(results.faults[told_before:])
-    if not faults:
+    if not results.unsaved:
         _tidy(folder)
-    return Recovered(metrics=metrics, missing=tuple(missing), faults=faults)
+    return Recovered(metrics=metrics, missing=tuple(missing), faults=tuple(results.unsaved))
 
 
 class _Retold:
