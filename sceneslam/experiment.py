@@ -32,13 +32,14 @@ from sceneslam.evaluation.verdict import write_verdict
 from sceneslam.evaluation.verdict_page import Asked, Ran, write_verdict_page
 from sceneslam.interfaces import Experiment
 from sceneslam.interrupts import terminate_with
-from sceneslam.types.errors import ConfigError
+from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.experiment import Trial, TrialResult, Verdict
 from sceneslam.types.files import replacing
 from sceneslam.types.ranges import check_least
 from sceneslam.types.trajectory import Trajectory
 
 _END = "finished.json"  # written to a trial's folder when it is finished
+_READ = ("metrics.json", "trajectory.tum", "trajectory_online.tum")  # of a finished trial
 
 
 def run_experiment(config: DictConfig, folder: Path) -> Verdict:
@@ -183,6 +184,8 @@ def _run_unless_finished(config: dict[str, Any], folder: Path, name: str) -> Non
         if finished.is_interrupted:
             raise KeyboardInterrupt(f"stopped during the trial {name}")
         faults, is_stop_requested = finished.faults, finished.is_stop_requested
+        if lost := [one for one in _READ if not (folder / one).is_file()]:
+            raise InputError(f"{lost[0]} of a trial is missing: {'; '.join(faults)}: {folder}")
     end = {"made_by": made_by, "faults": faults}
     with replacing(folder / _END) as file:
         file.write(json.dumps(end, indent=2))

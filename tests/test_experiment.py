@@ -12,8 +12,10 @@ import time
 from pathlib import Path
 
 import pytest
+from configured import config
 
 from sceneslam.evaluation.verdict import verdict_lines, write_verdict
+from sceneslam.experiment import _run_unless_finished
 from sceneslam.experiments.openloris.dataset import Dataset
 from sceneslam.experiments.openloris.rates import Rates, mean
 from sceneslam.types.errors import InputError
@@ -182,6 +184,19 @@ def test_runs_beside_each_other_give_what_runs_in_turn_give_and_go_on_where_they
     done = call(folder, "openloris.path=data", "jobs=2", out="beside")
     assert done.returncode == 0 and first.is_file()
     assert {path: path.stat().st_mtime_ns for path in others} == was
+
+
+def test_a_trial_whose_metrics_could_not_be_saved_is_run_again(tmp_path, monkeypatch):
+    def fail(path, metrics):
+        raise OSError("no space left on device")
+
+    settings = config(run__report=False)
+    with monkeypatch.context() as full:
+        full.setattr("sceneslam.results.write_metrics", fail)
+        with pytest.raises(InputError, match=r"metrics\.json of a trial is missing: .* no space"):
+            _run_unless_finished(settings, tmp_path, "trial")
+    _run_unless_finished(settings, tmp_path, "trial")
+    assert (tmp_path / "metrics.json").is_file() and (tmp_path / "finished.json").is_file()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
