@@ -159,8 +159,10 @@ def carry_out(config: DictConfig) -> Ended:
             print("\n".join([*verdict_lines(verdict), f"report  {_short(folder)}/report.html"]))
             return Ended(code=OK)
         if OmegaConf.select(config, "run.mode") == DETECT_ONLY:
-            print("\n".join(detect(resolved(config), folder)))
-            return Ended(code=OK)
+            faults = detect(resolved(config), folder, print)
+            for fault in faults:
+                print(f"error: {fault}", file=sys.stderr)
+            return Ended(code=INCOMPLETE if faults else OK, errors=faults)
         finished = _run(config, folder)
     except SceneSlamError as error:
         print(f"error: {error}", file=sys.stderr)

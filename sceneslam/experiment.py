@@ -178,7 +178,7 @@ def _run_unless_finished(config: dict[str, Any], folder: Path, name: str) -> Non
     faults: tuple[str, ...] = ()
     is_stop_requested = False
     if config["run"]["mode"] == DETECT_ONLY:
-        detect(config, folder)
+        faults = detect(config, folder)
     else:
         finished = run(config, folder, title=name)
         if finished.is_interrupted:

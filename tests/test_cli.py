@@ -127,6 +127,18 @@ def test_cut_recording_is_read_as_far_as_it_goes(folder, recording):
     assert 5 < len(Trajectory.read_tum(folder / "out" / "trajectory.tum")) < 30
 
 
+def test_cut_recording_is_an_error_without_slam_too_and_from_the_cache(
+    folder, recording, monkeypatch
+):
+    monkeypatch.setenv("SCENESLAM_CACHE_DIR", str(folder / "cache"))
+    data = recording.read_bytes()
+    (folder / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
+    for _ in range(2):
+        done = call(folder, "run=detect_only", "source=mcap", "source.path=cut.mcap")
+        assert done.returncode == 1 and "could not be read" in done.stderr
+        assert "scenes confirmed" in done.stdout
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopped_run_saves_what_it_has(folder, number):
     overrides = (*SINGLE, "run.mode=live")  # paced: 30 observations take a second

@@ -20,6 +20,7 @@ from sceneslam.detection.features import RecordingFeatures
 from sceneslam.detection.grid import Axis, try_all
 from sceneslam.detection.run import detect
 from sceneslam.types.errors import ConfigError
+from sceneslam.types.files import AppendedFile
 from sceneslam.types.truth import SceneChange
 
 ROOT = Path(__file__).parents[1]
@@ -109,6 +110,15 @@ def test_recording_is_read_once_for_all_settings(config, tmp_path, cache, monkey
     detect(config(*words, "detector.threshold=60", "run.progress=true"), tmp_path)
     with pytest.raises(TypeError):
         detect(config(*words, "run.max_observations=50"), tmp_path)  # other images
+
+
+def test_events_that_a_full_disk_cuts_off_are_a_fault(config, tmp_path, monkeypatch):
+    def fail(file, piece):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(AppendedFile, "append", fail)
+    (fault,) = detect(config(*TINY, "run=detect_only"), tmp_path)
+    assert fault == "events.jsonl is not complete: OSError: no space left on device"
 
 
 def test_thousand_settings_take_seconds(config):

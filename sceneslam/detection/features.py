@@ -24,6 +24,7 @@ class RecordingFeatures:
     values: NDArray[np.float64]  # (N, F); rows without input are not used
     is_there: NDArray[np.bool_]  # (N,) whether the observation had an input for the detector
     scenes: tuple[SceneChange, ...] | None  # true scenes, None: unknown
+    faults: tuple[str, ...] = ()  # of the recording
 
     @property
     def truth(self) -> GroundTruth | None:
@@ -42,6 +43,7 @@ class RecordingFeatures:
                 values=self.values,
                 is_there=self.is_there,
                 scenes=np.array(json.dumps(scenes)),
+                faults=np.array(json.dumps(self.faults)),
             )
         part.replace(path)
 
@@ -57,6 +59,7 @@ class RecordingFeatures:
                 scenes=None
                 if scenes is None
                 else tuple(SceneChange(stamp_ns=at, scene=scene) for at, scene in scenes),
+                faults=tuple(json.loads(str(arrays["faults"]))),
             )
 
 

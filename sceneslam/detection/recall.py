@@ -38,7 +38,13 @@ def recall(
     detector.shutdown()
     truth = source.ground_truth()
     scenes = truth.scenes if truth is not None and truth.scenes else None
-    found = RecordingFeatures(stamps_ns=stamps_ns, values=values, is_there=is_there, scenes=scenes)
+    found = RecordingFeatures(
+        stamps_ns=stamps_ns,
+        values=values,
+        is_there=is_there,
+        scenes=scenes,
+        faults=tuple(source.faults),
+    )
     found.write(path)
     return found
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,6 @@ class Watched:
 
     rig: Rig
     features: RecordingFeatures
-    faults: Sequence[str]  # of the recording, if it was read just now
 
 
 def watch(config: Mapping[str, Any]) -> Watched:
@@ -51,11 +50,16 @@ def watch(config: Mapping[str, Any]) -> Watched:
     rig = source.rig
     check_detector(config, detector, rig)
     features = recall(config, detector, source, run)
-    return Watched(rig=rig, features=features, faults=tuple(source.faults))
+    return Watched(rig=rig, features=features)
 
 
-def detect(config: Mapping[str, Any], folder: Path) -> list[str]:
-    """Write events, metrics and configuration to a folder; return a summary in short lines."""
+def detect(
+    config: Mapping[str, Any], folder: Path, say: Callable[[str], None] = lambda text: None
+) -> tuple[str, ...]:
+    """Write events, metrics and configuration to a folder; return the faults.
+
+    `say` receives a summary in short lines.
+    """
     watched = watch(config)
     builder = ComponentBuilder(config)
     detector = builder.make("detector", FeatureDetector)
@@ -64,12 +68,12 @@ def detect(config: Mapping[str, Any], folder: Path) -> list[str]:
     results = list(filtered(votes, scene_filter))
     confirmed = [one.confirmed for one in results if one.confirmed is not None]
     folder.mkdir(parents=True, exist_ok=True)
-    _write_events(folder / "events.jsonl", results)
+    fault = _write_events(folder / "events.jsonl", results)
     save_config(config, folder / "config.yaml")
     metrics = score(watched.features, confirmed, builder.make("evaluation", EvaluationSettings))
     write_metrics(folder / "metrics.json", metrics)
     scores = metrics["detection"]
-    return [
+    lines = [
         f"{metrics['observations']} observations, {scores['confirmed']} scenes confirmed",
         f"votes: {_shares(votes, watched.features.truth)}",
         f"false {number(scores['false'], 0)}, missed {number(scores['missed'], 0)}, "
@@ -77,6 +81,8 @@ def detect(config: Mapping[str, Any], folder: Path) -> list[str]:
         f"(at most {number(scores['delay_max_s'], 2, ' s')}), "
         f"wrong for {number(scores['wrong_s'], 2, ' s')}",
     ]
+    say("\n".join(lines))
+    return (*watched.features.faults, *([fault] if fault else []))
 
 
 def score(
@@ -103,9 +109,10 @@ def _shares(votes: Sequence[SceneVote], truth: GroundTruth | None) -> str:
     return ", ".join(shares) or "none"
 
 
-def _write_events(path: Path, results: Sequence[Filtered]) -> None:
-    """Write votes and confirmed scenes in the format of a run with SLAM."""
+def _write_events(path: Path, results: Sequence[Filtered]) -> str:
+    """Write votes and scenes as a run with SLAM does; return the fault, "" without one."""
     log = EventLog(path)
     for one in results:
         log_vote(log, one.vote, one.confirmed, one.posterior)
     log.close()
+    return log.fault
