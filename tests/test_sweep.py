@@ -23,7 +23,7 @@ from sceneslam.collect.status import State, Status
 from sceneslam.config.check import check_keys
 from sceneslam.sweep.__main__ import main
 from sceneslam.sweep.backends import Basic, Joblib, Ray, Submitit
-from sceneslam.sweep.supervise import JobOrder
+from sceneslam.sweep.supervise import JobOrder, run_job
 from sceneslam.types.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
@@ -163,6 +163,18 @@ def test_folders_that_collide_are_refused(folder):
     code, _, errors = sweep(folder, *MIXED, "hydra.sweep.dir=out", "hydra.sweep.subdir=same")
     assert code == 2 and "hydra.sweep.subdir: got 'same'" in errors
     assert not list((folder / "out").glob("*/metrics.json"))
+
+
+def test_job_that_a_real_time_signal_ends_is_settled(tmp_path):
+    program = tmp_path / "code" / "sceneslam" / "sweep" / "job.py"
+    program.parent.mkdir(parents=True)
+    program.write_text("import os\nos.kill(os.getpid(), 40)\n")
+    for folder in program.parents[:2]:
+        (folder / "__init__.py").touch()
+    code, stop = tmp_path / "code", tmp_path / "stop"
+    run_job(JobOrder(folder=tmp_path, code=code, began_in=tmp_path, stop=stop))
+    status = Status.read(tmp_path)
+    assert status.state is State.KILLED and "killed by signal 40" in status.error
 
 
 def test_folder_that_is_no_sweep_is_named(tmp_path, capsys):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ from time import perf_counter
 from typing import BinaryIO
 
 from sceneslam.collect.status import State, Status
+from sceneslam.supervision.ending import how_it_ended
 
 _LOOK_S = 0.2  # interval of checks for a stop of the sweep
 _PATIENCE_S = 30.0  # for a stopped job to save its results
@@ -38,7 +38,7 @@ def run_job(order: JobOrder) -> None:
     with (order.folder / "job.log").open("wb") as log, _start(order, log) as process:
         _wait(process, order.stop)
     died = State.STOPPED if order.stop.exists() else State.KILLED
-    settle(order.folder, died, _last_words(process.returncode))
+    settle(order.folder, died, f"its process {how_it_ended(process.returncode)}; see job.log")
     ended = Status.read(order.folder) or Status(state=died)
     replace(ended, wall_s=perf_counter() - began_s).write(order.folder)
 
@@ -90,9 +90,3 @@ def _environment(order: JobOrder) -> dict[str, str]:
     threads = {name: os.environ.get(name, "1") for name in _THREADS}
     cores = {} if order.cores is None else {"SCENESLAM_CORES": str(order.cores)}
     return {**os.environ, **threads, **cores, "PYTHONPATH": os.pathsep.join(path)}
-
-
-def _last_words(code: int) -> str:
-    if code < 0:
-        return f"its process was ended by {signal.Signals(-code).name}; see job.log"
-    return f"its process ended with exit code {code}; see job.log"
