@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -119,9 +120,12 @@ class _Trials:
                 names = [trial.name for trial, _ in configs]
                 plain = [config for _, config in configs]
                 yield from pool.map(_run_beside, plain, folders, names)
-            except BaseException:
+            except BaseException as error:
                 writer.close()
                 pool.shutdown(wait=False, cancel_futures=True)
+                if isinstance(error, BrokenProcessPool):
+                    cause = f"it was killed, or jobs={self._jobs} need too much memory"
+                    raise InputError(f"a trial's process ended ({cause}): {self._folder}") from error
                 raise
 
     def _outcome(self, trial: Trial, folder: Path, has_poses: bool) -> TrialResult:

@@ -15,11 +15,11 @@ import pytest
 from configured import config
 
 from sceneslam.evaluation.verdict import verdict_lines, write_verdict
-from sceneslam.experiment import _run_unless_finished
+from sceneslam.experiment import _run_unless_finished, _Trials
 from sceneslam.experiments.openloris.dataset import Dataset
 from sceneslam.experiments.openloris.rates import Rates, mean
 from sceneslam.types.errors import InputError
-from sceneslam.types.experiment import Figure, Relation, Table, Verdict
+from sceneslam.types.experiment import Figure, Relation, Table, Trial, Verdict
 
 ROOT = Path(__file__).parents[1]
 AT_LEAST, AT_MOST = Relation.AT_LEAST, Relation.AT_MOST
@@ -197,6 +197,13 @@ def test_a_trial_whose_metrics_could_not_be_saved_is_run_again(tmp_path, monkeyp
             _run_unless_finished(settings, tmp_path, "trial")
     _run_unless_finished(settings, tmp_path, "trial")
     assert (tmp_path / "metrics.json").is_file() and (tmp_path / "finished.json").is_file()
+
+
+def test_a_trial_whose_process_is_killed_is_one_sentence(tmp_path):
+    killed = config(run__report=False, sinks={"killer": {"_target_": "fakes.Killer", "at": 10}})
+    trials = _Trials("matrix", tmp_path, [], 2, None)
+    with pytest.raises(InputError, match=r"a trial's process ended \(it was killed, or jobs=2 need"):
+        list(trials._made([(Trial(name="trial"), killed)]))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
