@@ -198,6 +198,19 @@ class SourceWithoutTruth(FakeSource):
         raise InputError("groundtruth.txt: line 3")
 
 
+class LiveFeedSource(FakeSource):
+    """Measures now, until it is closed."""
+
+    is_open = True
+
+    @property
+    def live(self):
+        return self
+
+    def close(self):
+        LiveFeedSource.is_open = False
+
+
 class BuggyTruth(FakeSource):
     """Raises an error of its own where the truth is asked for."""
 

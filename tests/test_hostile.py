@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from configured import config
 from driving import assert_exact, dark_from, drive, events
-from fakes import ExactModule, IdleSink
+from fakes import ExactModule, IdleSink, LiveFeedSource
 from isolation import isolating
 from test_isolation import active, drive_into, seen
 
@@ -135,6 +135,14 @@ def test_a_sink_that_cannot_be_opened_leaves_nothing_open(tmp_path, monkeypatch)
     with pytest.raises(InputError):
         run(hostile_config(sinks={"first": {"_target_": "fakes.IdleSink"}, "tape": tape}), tmp_path)
     assert closed == ["sink", "sink", "atlas", "detector"]
+
+
+def test_a_sink_that_cannot_be_opened_leaves_no_live_source_open(tmp_path):
+    sinks = {"tape": {"_target_": "hostile_parts.Fails", "method": "open"}}
+    source = {"_target_": "fakes.LiveFeedSource", "steps": 100, "dark_from": 1000}
+    with pytest.raises(InputError, match="could not be opened"):
+        run(hostile_config(sinks=sinks, source=source, run__mode="live"), tmp_path)
+    assert not LiveFeedSource.is_open
 
 
 def test_a_detector_that_cannot_be_activated_leaves_no_thread(tmp_path):

@@ -40,10 +40,13 @@ class RunParts:
     run: RunSettings
 
     def close(self) -> None:
-        """End the processes of modules with a process of their own."""
+        """End the processes of modules with a process of their own, and close a live source."""
         for module in self.modules.values():
             if isinstance(module, IsolatedModule):
                 module.close()
+        feed = self.source.live if isinstance(self.source, Live) else None
+        if feed is not None:
+            feed.close()
 
 
 def build(config: Mapping[str, Any]) -> RunParts:
