@@ -64,6 +64,17 @@ def test_a_killed_run_is_recovered_as_it_would_have_been_written(tmp_path, hando
     assert "recovered from its journal" in page and "what detector, bus and modules cost" in page
 
 
+def test_events_that_cannot_be_written_again_cost_no_pose(tmp_path, monkeypatch, capsys):
+    def fail(path):
+        raise OSError("no space left on device")
+
+    folder = killed(tmp_path, 80)
+    monkeypatch.setattr("sceneslam.recover.recover.replacing", fail)
+    assert main([str(folder)]) == 0
+    assert "missing: a new events.jsonl: OSError: no space left" in capsys.readouterr().err
+    assert len(Trajectory.read_tum(folder / "trajectory.tum")) == 81
+
+
 def test_a_run_at_its_end_has_no_journal_and_is_not_recovered(tmp_path, capsys):
     run(config(run__report=False), tmp_path)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}

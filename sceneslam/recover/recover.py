@@ -145,8 +145,11 @@ def _events(folder: Path, missing: list[str]) -> list[Event]:
             if any(lines[number - 1 :]):
                 missing.append(f"the events from line {number} of events.jsonl on, which is torn")
             break
-    with replacing(path) as file:
-        file.writelines(json.dumps(event) + "\n" for event in events)
+    try:
+        with replacing(path) as file:
+            file.writelines(json.dumps(event) + "\n" for event in events)
+    except OSError as error:  # such as a full disk: the path matters more
+        missing.append(f"a new events.jsonl: {text_of(error)}")
     return events
 
 
