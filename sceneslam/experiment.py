@@ -125,7 +125,9 @@ class _Trials:
                 pool.shutdown(wait=False, cancel_futures=True)
                 if isinstance(error, BrokenProcessPool):
                     cause = f"it was killed, or jobs={self._jobs} need too much memory"
-                    raise InputError(f"a trial's process ended ({cause}): {self._folder}") from error
+                    raise InputError(
+                        f"a trial's process ended ({cause}): {self._folder}"
+                    ) from error
                 raise
 
     def _outcome(self, trial: Trial, folder: Path, has_poses: bool) -> TrialResult:

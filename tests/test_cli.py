@@ -110,7 +110,7 @@ def test_reader_that_has_gone_is_no_error(folder, asked):
 @pytest.mark.parametrize("asked", ["list", "--version"])
 def test_answer_that_a_full_disk_loses_is_an_error(folder, asked):
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with open("/dev/full", "wb") as full:
+    with Path("/dev/full").open("wb") as full:
         words = [sys.executable, "-m", "sceneslam", asked]
         done = subprocess.run(
             words, cwd=folder, env=environment, stdout=full, stderr=subprocess.PIPE, text=True

@@ -202,7 +202,7 @@ def test_a_trial_whose_metrics_could_not_be_saved_is_run_again(tmp_path, monkeyp
 def test_a_trial_whose_process_is_killed_is_one_sentence(tmp_path):
     killed = config(run__report=False, sinks={"killer": {"_target_": "fakes.Killer", "at": 10}})
     trials = _Trials("matrix", tmp_path, [], 2, None)
-    with pytest.raises(InputError, match=r"a trial's process ended \(it was killed, or jobs=2 need"):
+    with pytest.raises(InputError, match=r"a trial's process ended \(it was killed, or jobs=2"):
         list(trials._made([(Trial(name="trial"), killed)]))
 
 
