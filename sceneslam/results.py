@@ -66,13 +66,24 @@ class Results:
         has_costs: bool = True,
     ) -> Metrics:
         """Write map, metrics and report; return the metrics."""
-        metrics = evaluate(
-            result,
-            truth,
-            settings=self.evaluation,
-            peak_rss_mb=_peak_rss_mb() if has_costs else None,
-            reference=reference,
-        )
+        peak_rss_mb = _peak_rss_mb() if has_costs else None
+
+        def evaluated() -> Metrics:
+            return evaluate(
+                result,
+                truth,
+                settings=self.evaluation,
+                peak_rss_mb=peak_rss_mb,
+                reference=reference,
+            )
+
+        try:
+            metrics = evaluated()
+        except Exception as error:  # such as NaN in the ground truth
+            _log.info("no comparison", exc_info=error)
+            self.faults.append(f"no comparison with the ground truth: {text_of(error)}")
+            truth, reference = None, None
+            metrics = evaluated()
         with self._noting("the metrics"):
             if truth is not None and len(truth.trajectory):
                 truth.trajectory.write_tum(self.folder / "groundtruth.tum")

@@ -218,6 +218,15 @@ class BuggyTruth(FakeSource):
         raise ValueError("7 numbers")
 
 
+class TruthOfNaN(FakeSource):
+    """Knows where it was, but for the numbers."""
+
+    def ground_truth(self):
+        truth = super().ground_truth()
+        truth.trajectory.T_world_base[:] = np.nan
+        return truth
+
+
 class InterruptedSource(FakeSource):
     """Is stopped while it renders; its truth would have to be rendered too."""
 

@@ -137,6 +137,13 @@ def test_source_that_breaks_at_its_ground_truth_costs_no_result(tmp_path):
     assert (tmp_path / "metrics.json").exists() and len(finished.trajectory) == 100
 
 
+def test_ground_truth_that_cannot_be_compared_costs_no_result(tmp_path):
+    finished = run(config(source___target_="fakes.TruthOfNaN"), tmp_path)
+    assert finished.faults[0].startswith("no comparison with the ground truth: ")
+    assert finished.metrics["ate_rmse_m"] is None and len(finished.trajectory) == 100
+    assert (tmp_path / "metrics.json").exists() and (tmp_path / "map").is_dir()
+
+
 @pytest.mark.parametrize(
     "changes",
     [
