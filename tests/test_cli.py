@@ -95,13 +95,13 @@ def test_file_that_hydra_breaks_on_is_one_sentence(folder, tmp_path, written, se
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("asked", ["--help", "--info"])
+@pytest.mark.parametrize("asked", [["--help"], ["--cfg", "job"]])
 def test_reader_that_has_gone_is_no_error(folder, asked):
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     reader, writer = os.pipe()
     os.close(reader)
     done = subprocess.run(
-        command("--help"), cwd=folder, env=environment, stdout=writer, stderr=subprocess.PIPE
+        command(*asked), cwd=folder, env=environment, stdout=writer, stderr=subprocess.PIPE
     )
     os.close(writer)
     assert (done.returncode, done.stderr) == (0, b"")
