@@ -145,7 +145,9 @@ def test_features_are_taken_anew_where_the_model_changed(folders, tmp_path, monk
         given += ["detector=learned", f"detector.path={model}", "run.progress=false"]
         with initialize_config_module("sceneslam.conf", version_base="1.3"):
             config = resolved(compose("config", overrides=given))
-        assert "votes: Dark 100.0 %" in detect(config, tmp_path / "run")
+        told = []
+        assert detect(config, tmp_path / "run", told.append) == ()
+        assert "votes: Dark 100.0 %" in told[0].splitlines()
 
 
 @pytest.mark.parametrize(

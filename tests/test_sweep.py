@@ -113,7 +113,7 @@ def test_killed_job_takes_nobody_along_and_is_resumed(folder, capsys):
     assert process.returncode == 1, errors
     rows = table(folder / "out")
     assert [row["status"] for row in rows] == ["done", "killed", "done"]
-    assert "ended by SIGKILL" in rows[1]["error"]
+    assert "killed by signal 9 (SIGKILL)" in rows[1]["error"]
     before = (folder / "out" / "0" / "metrics.json").stat().st_mtime_ns
     assert main([str(folder / "out")]) == 0
     assert "3 jobs: 3 done (2 of them before)" in capsys.readouterr().out
