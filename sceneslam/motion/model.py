@@ -115,9 +115,7 @@ class MotionModel:
                 )
                 wheels = wheels.turned(turn, noise_rad, duration_s)
         if self._is_weighed and wheels is not None and gap is None:
-            evidence = self._inertia.evidence(wheels, guess, duration_s)
-            for lie, one in zip(self._lies, evidence.tolist(), strict=True):
-                lie.judge(one)
+            self._judge(self._inertia.evidence(wheels, guess, duration_s))
         self._since_s += duration_s
         self._since_guess = self._since_guess.then(guess)
         if wheels is not None and self._since_wheels is not None:
@@ -154,8 +152,7 @@ class MotionModel:
             self.skip()
             return
         if evidence is not None:
-            for lie, one in zip(self._lies, evidence.tolist(), strict=True):
-                lie.judge(one)
+            self._judge(evidence)
         self._inertia.learn(
             *self._with_wheels(T_before_now, covariance), guess=guess, duration_s=duration_s
         )
@@ -197,6 +194,11 @@ class MotionModel:
             self._turns.learn(
                 float(off[2]), wheels.causes, float(wheels.variance[1] + measured[2, 2])
             )
+
+    def _judge(self, evidence: NDArray[np.float64]) -> None:
+        """Take the log-likelihood ratios (2,) of distance and turn, wheels wrong against right."""
+        for lie, one in zip(self._lies, evidence.tolist(), strict=True):
+            lie.judge(one)
 
     def _with_wheels(
         self, T_before_now: Transform, covariance: NDArray[np.float64]
