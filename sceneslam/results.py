@@ -7,6 +7,7 @@ import resource
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -66,24 +67,19 @@ class Results:
         has_costs: bool = True,
     ) -> Metrics:
         """Write map, metrics and report; return the metrics."""
-        peak_rss_mb = _peak_rss_mb() if has_costs else None
-
-        def evaluated() -> Metrics:
-            return evaluate(
-                result,
-                truth,
-                settings=self.evaluation,
-                peak_rss_mb=peak_rss_mb,
-                reference=reference,
-            )
-
+        compared = partial(
+            evaluate,
+            result,
+            settings=self.evaluation,
+            peak_rss_mb=_peak_rss_mb() if has_costs else None,
+        )
         try:
-            metrics = evaluated()
+            metrics = compared(truth, reference=reference)
         except Exception as error:  # such as NaN in the ground truth
             _log.info("no comparison", exc_info=error)
             self.faults.append(f"no comparison with the ground truth: {text_of(error)}")
             truth, reference = None, None
-            metrics = evaluated()
+            metrics = compared(truth, reference=reference)
         with self._noting("the metrics"):
             if truth is not None and len(truth.trajectory):
                 truth.trajectory.write_tum(self.folder / "groundtruth.tum")
