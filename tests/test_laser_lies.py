@@ -53,6 +53,18 @@ def test_turn_that_frozen_wheels_do_not_report_is_followed():
     assert error[-1, 1] < 0.02  # the wheels miss 2.5 rad
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_push_is_followed_without_wheels(seed):
+    count, walls = 170, with_posts()
+    steps_m = np.full(count, SPEED_M_S * PERIOD_S)
+    steps_m[100] = 0.6
+    path = np.column_stack([np.cumsum(steps_m), np.zeros((count, 2))])
+    module, rng = active(), np.random.default_rng(seed)
+    observations = drive(walls, path, rng=rng, period_ns=round(PERIOD_S * 1e9))
+    error = errors(path, [module.track(observation) for observation in observations])
+    assert error[-1, 0] < 0.03  # 0.1 to 0.4 m if a robot without wheels moves by inertia alone
+
+
 def test_motion_that_nothing_predicts_is_likelier_the_longer_scans_fit_worse():
     drive = Drive()
     for _ in range(50):

@@ -237,7 +237,8 @@ def test_without_wheels_the_velocity_goes_on_and_the_gyro_turns_it():
     motion = model.predict(Observation(stamp_ns=300_000_000))
     np.testing.assert_allclose(motion.T_prev_curr, se3.from_xy_yaw(0.1, 0.0, 0.05), atol=1e-4)
     assert not motion.is_measured
-    assert motion.alternatives == ()
+    (anywhere,) = motion.alternatives
+    assert anywhere.is_unknown
     gyro = constant_rate(-0.5)
     motion = model.predict(Observation(stamp_ns=400_000_000, gyro_base=gyro))
     assert se3.yaw_rad(motion.T_prev_curr) == pytest.approx(-0.05)

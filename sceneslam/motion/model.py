@@ -127,7 +127,7 @@ class MotionModel:
             guess,
             self._inertia.anywhere(guess, duration_s),
             lying=self.lying,
-            is_measured=self._since_wheels is not None,
+            is_measured=wheels is not None and self._since_wheels is not None,
         )
         if self._gap is not None:
             self._gap = self._gap @ motion.T_prev_curr

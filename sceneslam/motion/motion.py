@@ -58,7 +58,7 @@ class Motion:
 
     @property
     def is_doubted(self) -> bool:
-        """Tell whether the wheels are probably wrong, so that it is predicted without."""
+        """Tell whether it is predicted without the wheels: missing ones, or probably wrong."""
         return any(self.is_guessed)
 
     def since_misfit(self, misfit: float, since_s: float) -> Motion:
@@ -109,14 +109,15 @@ def motion_of(
     lying: NDArray[np.float64],
     is_measured: bool,
 ) -> Motion:
-    """Return the motion with distance and turn by the wheels, unless they are wrong.
+    """Return the motion with distance and turn by the wheels, unless they are wrong or missing.
 
     `lying` (2,): the probabilities of that. `guess` is by inertia; `anywhere` is what a robot of
     unknown velocity does, the distance if neither wheels nor inertia are right.
     """
     if wheels is None:
-        return _motion(guess, guess, is_measured=False)
-    distances, turns = (_ranked(wheels, guess, p) for p in lying.tolist())
+        distances, turns = [(guess, 1.0)], [(guess, 1.0)]
+    else:
+        distances, turns = (_ranked(wheels, guess, p) for p in lying.tolist())
     distances.append((anywhere, _RARE))
     best, *others = (
         replace(
