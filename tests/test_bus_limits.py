@@ -301,8 +301,9 @@ def test_probation_ends_after_one_second():
         assert found.is_trusted is is_trusted and found.turn_agrees and not found.is_wrong
 
 
-def test_a_motion_that_nothing_checks_is_trusted():
-    assert judged(np.eye(4), None) == Judgement(is_trusted=True)
+@pytest.mark.parametrize(("after_ns", "is_trusted"), [(S, False), (S + 1, True)])
+def test_a_motion_that_nothing_has_checked_for_a_second_is_trusted(after_ns, is_trusted):
+    assert judged(np.eye(4), None, after_ns=after_ns) == Judgement(is_trusted=is_trusted)
 
 
 class Seen:

@@ -131,6 +131,14 @@ def test_without_odometry_nothing_is_held_against_a_module():
     assert judgement.is_trusted and not judgement.turn_agrees
 
 
+def test_suspicion_lasts_between_two_measurements_of_odometry_but_not_without_any():
+    def every_second_step_of_ten_seconds(step):
+        return arc(step) if step % 2 == 0 and step < 100 else None
+
+    judgements = judged(scaled(0.75), odometry=every_second_step_of_ten_seconds, steps=130)
+    assert not any(trusted(judgements)[12:108]) and all(trusted(judgements)[109:])
+
+
 def test_a_corrected_past_is_no_motion():
     assert not judged(jumping(30, 1.0))[30].is_trusted
     assert all(trusted(judged(jumping(30, 1.0), revised_at=30))[10:])

@@ -42,7 +42,7 @@ class Bridge:
         `is_jump`: the pose jumped by a correction, so that no velocity is derived from it.
         """
         if is_jump:
-            self._before, self._known = None, None
+            self._before, self._known, self._T_odom_base = None, None, None
         self._note(observation.stamp_ns, T_map_base)
         self._move(observation, T_map_base)
 
@@ -102,6 +102,9 @@ class Bridge:
         return se3.exp(elapsed_ns / step_ns * se3.log(T_prev_curr))
 
     def _move(self, observation: Observation, T_map_base: Transform) -> None:
-        self._T_map_base = T_map_base
-        self._T_odom_base = observation.T_odom_base
+        T_odom_base = observation.T_odom_base
+        if T_odom_base is None and self._T_odom_base is not None:
+            # The next odometry measures from the last one, not from here.
+            T_odom_base = self._T_odom_base @ se3.inverse(self.T_map_base) @ T_map_base
+        self._T_map_base, self._T_odom_base = T_map_base, T_odom_base
         self._stamp_ns = observation.stamp_ns

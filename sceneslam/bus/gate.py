@@ -100,6 +100,8 @@ class Gate:
         self._sigmas, self._wheels = settings.sigmas, wheels
         self._samples: list[_Sample] = []  # by rising stamp, back to the longest horizon
         self._T_odom_base: Transform | None = None
+        self._odom_ns = 0  # when odometry was there last
+        self._unchecked = Judgement(is_trusted=True)  # while the next odometry is awaited
         self._way_m, self._turn_rad = 0.0, 0.0
         self._within_since_ns = 0  # since when both have been within bounds
         self._has_jumped = False  # the module has jumped as no robot can, since the two agreed
@@ -126,7 +128,9 @@ class Gate:
         without motion. `deviation_m`: standard deviation of the module's position, None if unknown.
         """
         if T_odom_base is None:
-            return Judgement(is_trusted=True)
+            is_silent = stamp_ns - self._odom_ns > _PROBATION_NS
+            return Judgement(is_trusted=True) if is_silent else self._unchecked
+        self._odom_ns = stamp_ns
         T_odom_prev, self._T_odom_base = self._T_odom_base, T_odom_base
         if T_odom_prev is not None:
             self._way_m += _norm(T_odom_base[:3, 3] - T_odom_prev[:3, 3])
@@ -144,6 +148,9 @@ class Gate:
         )
         judgement = self._judge(now, deviation_m) if self._samples else self._begin(now)
         self._samples.append(now)
+        self._unchecked = Judgement(
+            is_trusted=judgement.is_trusted, wheels_lie=judgement.wheels_lie
+        )
         return judgement
 
     def _move_past(self, last: _Sample, T_local_base: Transform, T_odom_base: Transform) -> None:
