@@ -144,7 +144,9 @@ def test_an_output_stamp_is_passed_over_and_bad_poses_are_left_out(write):
     np.testing.assert_array_equal(one.trajectory.positions_m, [[4, 2, 3]])  # the last of a repeat
 
 
-@pytest.mark.parametrize("bad", ["1.0 2.0\n", "1.0 a 0 0 0 0 0 1\n", "seq: one\n"])
+@pytest.mark.parametrize(
+    "bad", ["1.0 2.0\n", "1.0 a 0 0 0 0 0 1\n", "seq: one\n", "1e30 0 0 0 0 0 0 1\n"]
+)
 def test_a_line_that_makes_no_sense_is_named(write, bad):
     with pytest.raises(InputError, match="line 10: expected"):
         read_recorded(write(lines() + bad))

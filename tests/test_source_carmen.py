@@ -115,6 +115,14 @@ def test_a_cut_off_line_is_passed_over_and_told(tmp_path: Path) -> None:
     assert any("is invalid: 1 time" in fault for fault in source.faults)
 
 
+def test_a_stamp_that_no_clock_has_counts_as_missing(tmp_path: Path) -> None:
+    stamps = ["51.0", "52.0", "99999999999999999999.0", "54.0"]
+    path = write(tmp_path / "a.log", *(flaser([2.0] * 180, stamp) for stamp in stamps))
+    source = make_source("carmen", path)
+    logged_ns = source.logged_ns(np.array([one.stamp_ns for one in source]))
+    np.testing.assert_array_equal(logged_ns, np.arange(51, 55) * 10**9)
+
+
 @pytest.mark.parametrize(("places", "order"), [((1, 2, 3), (0, 1, 2)), ((1, 3, 2), (0, 2, 1))])
 def test_scans_come_in_the_order_in_which_the_robot_drove(
     tmp_path: Path, places: tuple[int, ...], order: tuple[int, ...]

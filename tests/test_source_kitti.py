@@ -92,3 +92,6 @@ def test_wrong_folders_times_and_ranges_are_one_sentence(tmp_path: Path) -> None
     (folder / "times.txt").write_text("0.0\nsoon\n0.2")
     with pytest.raises(InputError, match="'soon'"):
         make_source("kitti", folder)
+    (folder / "times.txt").write_text("0.0\n1317384506405226048\n0.2")  # nanoseconds
+    with pytest.raises(InputError, match="expected seconds, got '1317384506405226048'"):
+        make_source("kitti", folder)

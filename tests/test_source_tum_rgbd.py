@@ -143,6 +143,7 @@ def test_images_of_another_kind_end_the_reading(
         ("100.0\n", "line 1: expected `stamp_s name`"),
         ("100.0 rgb/0.png\nnow rgb/1.png\n", "line 2: expected"),
         ("nan rgb/0.png\n", "line 1: expected"),
+        ("1403636579763555584 rgb/0.png\n", "line 1: expected `stamp_s name`"),
         ("100.0 rgb/9.png\n", "none of the colour images"),
     ],
 )

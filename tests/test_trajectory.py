@@ -28,7 +28,21 @@ def test_poses_are_sorted_by_stamp(tmp_path):
     assert trajectory.positions_m[:, 0].tolist() == [1.0, 2.0]
 
 
-@pytest.mark.parametrize("line", ["1.0 2 0 0", "x 1 2 3 0 0 0 1", "1.0 nan 0 0 0 0 0 1"])
+def test_stamps_in_powers_of_ten_keep_their_nanoseconds(tmp_path):
+    (tmp_path / "t.tum").write_text("1.305031102175304001e+09 1 0 0 0 0 0 1\n")  # as of savetxt
+    assert Trajectory.read_tum(tmp_path / "t.tum").stamps_ns.tolist() == [1305031102_175304001]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "1.0 2 0 0",
+        "x 1 2 3 0 0 0 1",
+        "1.0 nan 0 0 0 0 0 1",
+        "1403636579763555584 1 2 3 0 0 0 1",  # nanoseconds
+        "1e400 1 2 3 0 0 0 1",
+    ],
+)
 def test_bad_line_is_named(tmp_path, line):
     (tmp_path / "t.tum").write_text(f"# fine\n{line}\n")
     with pytest.raises(InputError, match="line 2"):

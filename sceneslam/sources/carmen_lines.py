@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
+from sceneslam.types.trajectory import parse_stamp_ns
 
 FLASER, ROBOTLASER = b"FLASER ", b"ROBOTLASER1 "
 _HALF_TURN_COUNTS = {180: 1.0, 181: 1.0, 360: 0.5, 361: 0.5, 401: 0.25}  # SICK: degrees per beam
@@ -39,9 +40,8 @@ def parse_scan(line: bytes) -> ScanLine | None:
 def stamp_of(line: bytes) -> int:
     """Return the `ipc_timestamp` [ns] of a line, the third word from its end; 0 if invalid."""
     words = line.rsplit(maxsplit=3)
-    whole, _, fraction = (words[1] if len(words) == 4 else b"").partition(b".")
     try:
-        return int(whole) * 10**9 + int((fraction + b"0" * 9)[:9])
+        return parse_stamp_ns(words[1].decode()) if len(words) == 4 else 0
     except ValueError:
         return 0
 

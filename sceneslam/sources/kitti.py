@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from decimal import Decimal, InvalidOperation
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from sceneslam.types.errors import InputError
 from sceneslam.types.input_files import given_folder, read_text
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Lidar, Rig, Sensor
-from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.trajectory import Trajectory, parse_stamp_ns
 from sceneslam.types.truth import GroundTruth
 
 _FOLDERS = ("velodyne", "velodyne_points/data", ".")
@@ -129,11 +128,11 @@ def _stamp_ns(line: str, path: Path) -> int:
     """Return the stamp [ns] of a line: seconds, or date and time as in the raw drives (as UTC)."""
     try:
         if ":" not in line:
-            return int(Decimal(line).scaleb(9))
+            return parse_stamp_ns(line)
         day_time, _, fraction = line.replace(" ", "T").partition(".")
         whole = int(np.datetime64(day_time, "s").astype(np.int64))
         return whole * 10**9 + int((fraction + "0" * 9)[:9])
-    except (InvalidOperation, ValueError, OverflowError) as err:
+    except ValueError as err:
         raise InputError(f"times: expected seconds, got {line[:40]!r}: {path}") from err
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 
 from sceneslam.types.errors import InputError
 from sceneslam.types.input_files import read_text
+from sceneslam.types.trajectory import parse_stamp_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,9 +34,9 @@ def read_list(path: Path) -> Sequence[StampedFile]:
         if not words or words[0].startswith("#"):
             continue
         try:
-            stamp_ns = int(Decimal(words[0]).scaleb(9))
+            stamp_ns = parse_stamp_ns(words[0])
             name = words[1].strip()
-        except (InvalidOperation, IndexError, ValueError, OverflowError) as err:
+        except (IndexError, ValueError) as err:
             raise InputError(
                 f"line {number}: expected `stamp_s name`, got {line.strip()[:60]!r}: {path}"
             ) from err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.files import replacing
 from sceneslam.types.input_files import read_text
+
+STAMP_MAX_NS = 2**62  # 146 years: differences of two stamps fit into 64 bits
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -84,12 +87,17 @@ class Trajectory:
 
 
 def parse_stamp_ns(text: str) -> int:
-    """Return a decimal number of seconds as whole nanoseconds, without a float's rounding."""
-    if "e" in text.lower():
-        return round(float(text) * 1e9)
-    whole, _, fraction = text.partition(".")
-    sign = -1 if whole.startswith("-") else 1
-    return int(whole or "0") * 10**9 + sign * int((fraction + "000000000")[:9])
+    """Return a decimal number of seconds as whole nanoseconds, without a float's rounding.
+
+    Raises ValueError for other text, and beyond `STAMP_MAX_NS`: nanoseconds are no seconds.
+    """
+    try:
+        stamp_ns = Decimal(text).scaleb(9)
+        if abs(stamp_ns) <= STAMP_MAX_NS:
+            return int(stamp_ns)
+    except ArithmeticError:  # of Decimal: no number, NaN, or an exponent without end
+        pass
+    raise ValueError(f"expected seconds, got {text[:40]!r}")
 
 
 def _is_pose(numbers: list[float]) -> bool:

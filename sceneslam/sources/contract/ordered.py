@@ -15,10 +15,10 @@ from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.sources.wrapped import Wrapped
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
+from sceneslam.types.trajectory import STAMP_MAX_NS
 from sceneslam.types.truth import GroundTruth
 
 _LOG = logging.getLogger(__name__)
-_STAMP_MAX_NS = 2**62  # 146 years: differences of two stamps fit into 64 bits
 _PERIODS = 4  # one or two frames lost in a row are common
 
 
@@ -90,7 +90,7 @@ class Ordered(Wrapped):
     def _is_stamped(self, observation: object) -> bool:
         """Tell whether this is an observation with a valid stamp."""
         stamp_ns: Any = observation.stamp_ns if isinstance(observation, Observation) else None
-        if isinstance(stamp_ns, Integral) and abs(int(stamp_ns)) <= _STAMP_MAX_NS:
+        if isinstance(stamp_ns, Integral) and abs(int(stamp_ns)) <= STAMP_MAX_NS:
             return True
         self._log.add("observation left out, it has no stamp in nanoseconds", f"stamp {stamp_ns}")
         return False
