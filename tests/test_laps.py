@@ -36,6 +36,33 @@ def test_truth_is_that_of_all_laps():
     assert truth.scenes[2].stamp_ns == stamps_ns[10]
 
 
+def test_odometry_that_begins_late_or_ends_early_goes_on():
+    every = list(FakeSource(10, 6))
+    for gap in (0, -1):
+        one = [replace(each) for each in every]
+        one[gap] = replace(one[gap], T_odom_base=None)
+        known = [each.T_odom_base for each in Laps(Listed(one), 3) if each.T_odom_base is not None]
+        for lap in range(1, 3):
+            np.testing.assert_allclose(known[9 * lap], known[9 * lap - 1], atol=1e-12)
+            np.testing.assert_allclose(
+                se3.inverse(known[9 * lap]) @ known[9 * lap + 8],
+                se3.inverse(known[0]) @ known[8],
+                atol=1e-9,
+            )
+
+
+def test_truth_outside_of_a_lap_is_not_repeated():
+    class Within(FakeSource):
+        def __iter__(self):
+            yield from list(super().__iter__())[3:8]
+
+    laps = Laps(Within(10, 2), 3)
+    truth, stamps_ns = laps.ground_truth(), [each.stamp_ns for each in laps]
+    assert truth.trajectory.stamps_ns.tolist() == stamps_ns
+    assert [each.scene for each in truth.scenes] == ["Dark"]
+    assert 0 <= stamps_ns[0] - truth.scenes[0].stamp_ns < 33_000_000
+
+
 def test_scan_is_moved_with_its_observation():
     scan = LaserScan(
         stamp_ns=90_000_000,

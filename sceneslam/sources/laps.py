@@ -45,20 +45,27 @@ class Laps(Wrapped):
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the observations of all laps."""
-        shift_ns, T_odom_start = 0, se3.identity()
+        shift_ns = 0
+        T_odom_base: Transform | None = None  # the last odometry that was passed on
         for _ in range(self._laps):
             first: Observation | None = None
             last: Observation | None = None
+            T_odom_lap: Transform | None = None  # takes this lap's odometry to the first lap's
             for observation in self._source:
-                if first is None:
-                    first = observation
-                last = _moved(observation, shift_ns, first.T_odom_base, T_odom_start)
+                first = observation if first is None else first
+                last = _moved(observation, shift_ns)
+                T_lap_base = observation.T_odom_base
+                if T_lap_base is not None:
+                    if T_odom_base is None:
+                        T_odom_lap = se3.identity()
+                    elif T_odom_lap is None:
+                        T_odom_lap = T_odom_base @ se3.inverse(T_lap_base)
+                    T_odom_base = T_odom_lap @ T_lap_base
+                    last = replace(last, T_odom_base=T_odom_base)
                 yield last
             if first is None or last is None:
                 return
             shift_ns = last.stamp_ns + _PAUSE_NS - first.stamp_ns
-            if last.T_odom_base is not None:
-                T_odom_start = last.T_odom_base
 
     def ground_truth(self) -> GroundTruth | None:
         """Return the ground truth of all laps."""
@@ -68,32 +75,31 @@ class Laps(Wrapped):
             return truth
         lap_ns = stamps_ns[-1] + _PAUSE_NS - stamps_ns[0]
         shifts_ns = [lap * lap_ns for lap in range(self._laps)]
-        known = truth.trajectory
-        is_within = known.stamps_ns < stamps_ns[0] + lap_ns
+        known, start_ns = truth.trajectory, stamps_ns[0] - _PAUSE_NS // 2
+        end_ns = start_ns + lap_ns
+        is_within = (known.stamps_ns >= start_ns) & (known.stamps_ns < end_ns)
         return GroundTruth(
             trajectory=Trajectory(
                 stamps_ns=np.concatenate([known.stamps_ns[is_within] + by for by in shifts_ns]),
                 T_world_base=np.concatenate([known.T_world_base[is_within]] * self._laps),
             ),
-            scenes=_repeated(truth.scenes, shifts_ns),
+            scenes=_repeated(_within(truth.scenes, start_ns, end_ns), shifts_ns),
         )
 
 
-def _moved(
-    observation: Observation,
-    shift_ns: int,
-    T_odom_first: Transform | None,
-    T_odom_start: Transform,
-) -> Observation:
-    """Return an observation of a later lap, whose odometry starts at `T_odom_start`."""
-    T_odom_base = observation.T_odom_base
-    if T_odom_base is not None and T_odom_first is not None and shift_ns:
-        T_odom_base = T_odom_start @ se3.inverse(T_odom_first) @ T_odom_base
+def _moved(observation: Observation, shift_ns: int) -> Observation:
+    """Return an observation and its scan with later stamps."""
     scan = observation.scan
     if scan is not None:
         scan = replace(scan, stamp_ns=scan.stamp_ns + shift_ns)
     stamp_ns = observation.stamp_ns + shift_ns
-    return replace(observation, stamp_ns=stamp_ns, scan=scan, T_odom_base=T_odom_base)
+    return replace(observation, stamp_ns=stamp_ns, scan=scan)
+
+
+def _within(scenes: Sequence[SceneChange], start_ns: int, end_ns: int) -> Sequence[SceneChange]:
+    """Return the scene changes of one lap, beginning with the scene at its start."""
+    before = [replace(one, stamp_ns=start_ns) for one in scenes if one.stamp_ns < start_ns]
+    return [*before[-1:], *(one for one in scenes if start_ns <= one.stamp_ns < end_ns)]
 
 
 def _repeated(scenes: Sequence[SceneChange], shifts_ns: Sequence[int]) -> tuple[SceneChange, ...]:
