@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 from ros_recordings import STAMP_NS, Recorder, make_source
+from rosbags.typesys import Stores, get_typestore
 
+from sceneslam.ros.encode import Encoder
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.rig import Sensor, optical_to_rep103
 
@@ -281,3 +283,30 @@ def test_wrong_values_are_named_by_their_key(
     with pytest.raises(ConfigError) as caught:
         make_source("mcap", path, **changes)
     assert caught.value.key == key
+
+
+def test_a_scan_without_a_stamp_has_that_of_its_recording(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        add = recorder.add
+        recorder.add = lambda topic, _, message: add(topic, STAMP_NS, message)  # type: ignore[method-assign]
+        recorder.scan("/scan", 0, [1.0] * 20)
+    (one,) = make_source("rosbag", tmp_path / "a.mcap")
+    assert one.stamp_ns == one.scan.stamp_ns == STAMP_NS
+
+
+@pytest.mark.parametrize("is_absolute", [True, False])
+def test_times_of_points_count_from_the_observation(tmp_path: Path, is_absolute: bool) -> None:
+    """A cloud that was measured 40 ms before the image it is given with."""
+    stamp_ns, after_s = STAMP_NS - 40_000_000, np.array([0.0, 0.05])
+    times_s = after_s + stamp_ns * 1e-9 if is_absolute else after_s
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.image("/rgb", STAMP_NS, COLOR)
+        recorder.add("/points", stamp_ns, cloud_message(stamp_ns, times_s))
+    (one,) = make_source("rosbag", tmp_path / "a.mcap")
+    np.testing.assert_allclose(one.point_times_s, [-0.04, 0.01], atol=1e-6)
+
+
+def cloud_message(stamp_ns: int, times_s: np.ndarray) -> Any:
+    points = np.ones((len(times_s), 3), np.float32)
+    data = Encoder().points(stamp_ns, points, times_s)
+    return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, "sensor_msgs/msg/PointCloud2")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -132,19 +132,19 @@ class BundleDecoder:
         scan = None if sample is None else decode.scan(sample.value)
         if sample is not None and scan is None:
             problems.append("a laser scan has no usable angles")
-        return scan
+        return None if sample is None or scan is None else replace(scan, stamp_ns=sample.stamp_ns)
 
     def _points(self, bundle: SynchronisedSamples, problems: list[str]) -> Cloud | None:
         sample = self._sample(Sensor.POINTS, bundle)
         if sample is None:
             return None
-        found = cloud(sample.value, bundle.primary.stamp_ns)
+        found = cloud(sample.value, sample.stamp_ns)
         if found is None:
             problems.append("a point cloud is shorter than it says")
             return None
         times_s = found.point_times_s
         if times_s is not None:
-            times_s = locked(times_s)
+            times_s = locked(times_s + (sample.stamp_ns - bundle.primary.stamp_ns) * 1e-9)
         return Cloud(points_lidar=locked(found.points_lidar), point_times_s=times_s)
 
     def _odometry(self, bundle: SynchronisedSamples) -> NDArray[np.float64] | None:

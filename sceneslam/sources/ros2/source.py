@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from time import monotonic_ns
 from typing import Any
 
@@ -263,8 +262,6 @@ class Ros2(Measuring):
         self._streams.hear(topic, lined, arrival.arrived_ns)
         if lined.order is StampOrder.UNORDERED:
             return
-        if lined.stamp_ns != decode.stamp_ns(message):
-            message = _restamped(message, lined.stamp_ns)
         for sensor in (one for one, name in self._by_sensor.items() if name == topic):
             held = measured(message, sensor, self._T_base_imu)
             if held is not None:
@@ -302,10 +299,3 @@ class Ros2(Measuring):
             for topic, msgtype in sorted(announced.items())
         ]
         return f"there is {', '.join(parts)}" if parts else "nobody publishes a sensor there"
-
-
-def _restamped(message: Any, stamp_ns: int) -> Any:
-    """Return a decoded message with another stamp in its header."""
-    sec, nanosec = divmod(stamp_ns, 10**9)
-    stamp = replace(message.header.stamp, sec=sec, nanosec=nanosec)
-    return replace(message, header=replace(message.header, stamp=stamp))
