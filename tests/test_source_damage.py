@@ -136,6 +136,31 @@ def test_no_place_for_a_flipped_bit_makes_wrong_pixels_or_a_crash(tmp_path: Path
             assert observation.image_bgr.tobytes() == good[observation.stamp_ns]
 
 
+def test_a_damaged_record_outside_of_chunks_is_left_out_and_told(tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+
+    record(tmp_path / "whole.mcap")
+    with (tmp_path / "whole.mcap").open("rb") as old, (tmp_path / "flat.mcap").open("wb") as new:
+        writer = Writer(new, use_chunking=False)
+        writer.start(profile="ros2", library="test")
+        channels: dict[str, int] = {}
+        for schema, channel, message in make_reader(old).iter_messages():
+            if channel.topic not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
+            writer.add_message(channels[channel.topic], message.log_time, message.data, 0)
+        writer.finish()
+    assert len(read(tmp_path / "flat.mcap")[1]) == COUNT
+    data = bytearray((tmp_path / "flat.mcap").read_bytes())
+    data[data.index(b"sensor_msgs/msg/CameraInfo")] = 0xA1  # no UTF-8
+    (tmp_path / "flat.mcap").write_bytes(data)
+    source, found = read(tmp_path / "flat.mcap")
+    assert len(found) == COUNT
+    (fault,) = source.faults
+    assert "is damaged and could not be read" in fault
+
+
 @pytest.mark.parametrize(
     ("name", "data", "says"),
     [

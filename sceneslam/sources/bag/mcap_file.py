@@ -124,9 +124,9 @@ class McapFile:
             is_complete = opcode == records.DATA_END
             if opcode in _KEPT:
                 file.seek(position)
-                found = records.read_records(file.read(whole))
-                lost += whole if found is None else 0
-                spans.append((position, whole, content.take(found or ())))
+                span = content.take(records.read_records(file.read(whole)))
+                lost += whole if span is None else 0
+                spans.append((position, whole, span))
             position += whole
         topics = self._topics(content)
         chunks = [

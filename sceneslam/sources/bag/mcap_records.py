@@ -35,8 +35,16 @@ class Content:
     counts: Counter[int] = field(default_factory=Counter)  # by channel
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
 
-    def take(self, records: Sequence[McapRecord]) -> dict[int, tuple[int, int]]:
-        """Add records; return each channel's first and last log time [ns] among them."""
+    def take(self, records: Sequence[McapRecord] | None) -> dict[int, tuple[int, int]] | None:
+        """Add records; return each channel's first and last log time [ns], None if damaged."""
+        from mcap.exceptions import McapError
+
+        try:
+            return None if records is None else self._take(records)
+        except (McapError, ValueError, struct.error):
+            return None
+
+    def _take(self, records: Sequence[McapRecord]) -> dict[int, tuple[int, int]]:
         from mcap import records as mcap
         from mcap.data_stream import ReadDataStream
 
