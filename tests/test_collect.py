@@ -10,12 +10,13 @@ from html.parser import HTMLParser
 import numpy as np
 import pyarrow.parquet
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from sceneslam.collect.__main__ import main
 from sceneslam.collect.chart import Line, Point, draw_lines, front
 from sceneslam.collect.curves import _alike, charts
 from sceneslam.collect.flatten import flat
-from sceneslam.collect.rows import Row, read_rows
+from sceneslam.collect.rows import Row, parsed, read_rows
 from sceneslam.collect.status import State, Status
 from sceneslam.collect.summary import groups_of, mean_of, student_t
 
@@ -132,6 +133,16 @@ def test_run_of_hydras_own_launcher_is_read_too(tmp_path):
     (tmp_path / "1" / "metrics.json").write_text(json.dumps(metrics(0.5)))
     rows = read_rows(tmp_path)
     assert [(row.status, row.keys["seed"]) for row in rows] == [("failed", 0), ("done", 1)]
+
+
+@pytest.mark.parametrize(
+    "text", ["010", "1:30", "0x1F", "1e-3", "-2.5E+3", ".5", "1_000", "7", "-0", "1.", "a.5", "e5"]
+)
+def test_swept_value_is_the_one_that_hydra_read(text):
+    key, value = parsed(f"+story.key={text}")
+    assert key == "story.key"
+    read = OverridesParser.create().parse_override(f"a={text}").value()
+    assert value == read and type(value) is type(read)
 
 
 def test_numbers_of_a_run_that_was_stopped_half_way_are_left_out(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,6 +17,10 @@ from sceneslam.types.errors import InputError
 
 ROWS = "rows.jsonl"  # rows of settings that were evaluated in one process
 Value = str | float | None
+# As Hydra reads it; YAML takes 010 for 8, 1:30 for 90 and 1e-3 for text.
+_NUMBER = re.compile(
+    r"[+-]?(?=\.?\d)(0|[1-9](_?\d)*)?(?P<decimals>\.\d*)?(?P<power>e[+-]?\d+)?", re.IGNORECASE
+)
 _COSTS = ("_us", "_ms", "realtime_factor", "peak_rss_mb", "wall_s")  # suffixes of metrics
 
 
@@ -111,13 +116,10 @@ def parsed(override: str) -> tuple[str, Value]:
     key, _, text = override.partition("=")
     if key.startswith("~"):
         return key[1:], "(left out)"
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
-        value = text
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return key.lstrip("+"), text
-    return key.lstrip("+"), value
+    name, number = key.lstrip("+"), _NUMBER.fullmatch(text)
+    if number is None:
+        return name, text
+    return name, float(text) if number["decimals"] or number["power"] else int(text)
 
 
 def _json(path: Path) -> Mapping[str, object]:
