@@ -40,9 +40,10 @@ def test_automatic_exposure_hides_darkness_from_the_image_alone():
     assert {vote.scene for vote in unaware} == {"Bright"}
 
 
-def test_exposures_of_a_file_reach_the_images(tmp_path):
+def test_exposures_of_a_file_reach_the_images(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "times.txt").write_text("# stamp_s exposure_s gain\n5.0 0.01 1\n15.0 0.02 4\n")
-    effect = ExposureTimes(film(), path=str(tmp_path / "times.txt"), reference_s=0.01)
+    effect = ExposureTimes(film(), path="~/times.txt", reference_s=0.01)
     ratios = [one.exposure_ratio for one in effect]
     assert ratios[0] == 1.0 and ratios[49] == 1.0 and ratios[-1] == pytest.approx(8.0)
     assert effect.ground_truth() is not None
@@ -53,6 +54,8 @@ def test_wrong_file_of_exposures_is_refused_in_one_sentence(tmp_path, text):
     (tmp_path / "times.txt").write_text(text)
     with pytest.raises(InputError, match=r"expected lines `stamp_s exposure_s`.*times\.txt"):
         ExposureTimes(film(), path=str(tmp_path / "times.txt"), reference_s=None)
+    with pytest.raises(InputError, match="a path is empty"):
+        ExposureTimes(film(), path="", reference_s=None)
     with pytest.raises(InputError, match="not found"):
         ExposureTimes(film(), path=str(tmp_path / "nothing.txt"), reference_s=None)
     with pytest.raises(ConfigError, match="reference_s"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
@@ -106,9 +107,26 @@ def test_rate_that_makes_no_sense_is_refused(images, rate_hz) -> None:
         make_source("video", images, rate_hz=rate_hz)
 
 
+def test_home_folder_is_found(film, monkeypatch) -> None:
+    monkeypatch.setenv("HOME", str(film.parent))
+    assert make_source("video", "~/clip.mp4").length == len(GREYS)
+
+
+def test_pipe_is_no_footage(images) -> None:
+    os.mkfifo(images / "004.5.png")  # reading it waits for its writer
+    source = make_source("video", images)
+    assert len(list(source)) == len(GREYS)
+    assert "image is damaged: 1 time" in source.faults[0]
+    os.mkfifo(images / "pipe.mp4")
+    with pytest.raises(InputError, match=r"got a pipe or a device: .*pipe\.mp4"):
+        make_source("video", images / "pipe.mp4")
+
+
 def test_path_without_footage_is_one_sentence(tmp_path) -> None:
     with pytest.raises(InputError, match="film not found"):
         make_source("video", tmp_path / "nothing.mp4")
+    with pytest.raises(InputError, match="a path is empty"):
+        make_source("video", "")
     with pytest.raises(InputError, match="holds no images"):
         make_source("video", tmp_path)
     (tmp_path / "words.mp4").write_text("words")

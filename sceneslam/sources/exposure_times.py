@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sceneslam.interfaces import Source
 from sceneslam.sources.wrapped import Wrapped
 from sceneslam.types.errors import ConfigError, InputError
-from sceneslam.types.input_files import read_text
+from sceneslam.types.input_files import given_path, read_text
 from sceneslam.types.observation import Observation
 from sceneslam.types.truth import GroundTruth
 
@@ -30,7 +30,7 @@ class ExposureTimes(Wrapped):
         if reference_s is not None and not 0 < reference_s < np.inf:
             raise ConfigError("reference_s", reference_s, "seconds above 0, or null")
         super().__init__(source)
-        rows = _read(Path(path))
+        rows = _read(given_path(path))
         self._stamps_s = rows[:, 0]
         exposures_s = rows[:, 1:].prod(axis=1)
         self._ratios = exposures_s / (reference_s or float(np.median(exposures_s)))

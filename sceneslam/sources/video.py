@@ -19,6 +19,7 @@ from sceneslam.sources.intrinsics import checked_above_zero, given_intrinsics
 from sceneslam.sources.prefetch import prefetched
 from sceneslam.sources.spanned import TimeSpan
 from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.input_files import check_regular, given_path
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.truth import GroundTruth, SceneChange
@@ -62,7 +63,7 @@ class Video:
         camera: dict[str, Any],
         scenes: list[list[float | str]] | None,
     ) -> None:
-        self._footage = _footage(Path(path))
+        self._footage = _footage(given_path(path))
         self._rate_hz = None if rate_hz is None else checked_above_zero("rate_hz", rate_hz)
         self._period_s = 1.0 / (self._rate_hz or self._footage.rate_hz)
         self._camera = self._with_size(camera, path)
@@ -170,7 +171,7 @@ class _Folder:
     @staticmethod
     def _read(file: Path) -> _Frame:
         try:
-            image_bgr = decode_bgr(file.read_bytes())
+            image_bgr = decode_bgr(file.read_bytes()) if file.is_file() else None  # a pipe waits
         except OSError:
             image_bgr = None
         return _Frame(image_bgr=image_bgr, time_s=np.nan, name=str(file))
@@ -213,9 +214,11 @@ def _footage(path: Path) -> _Footage:
     """Return the footage of a path; raises InputError for anything else."""
     if not path.exists():
         raise InputError(f"film not found, expected a file or a folder of images: {path}")
-    if path.is_file() and path.suffix.lower() not in _IMAGES:
-        return _Film(path)
-    inside = [path] if path.is_file() else sorted(path.iterdir())
+    if not path.is_dir():
+        check_regular(path, "a film or a folder of images")
+        if path.suffix.lower() not in _IMAGES:
+            return _Film(path)
+    inside = sorted(path.iterdir()) if path.is_dir() else [path]
     files = [file for file in inside if file.suffix.lower() in _IMAGES]
     if not files:
         raise InputError(f"the folder holds no images ({' '.join(sorted(_IMAGES))}): {path}")
