@@ -22,7 +22,8 @@ def cleaned(observation: Observation, log: FaultLog) -> Observation:
     """Return the observation with finite arrays; the same object if nothing had to be removed.
 
     Depth that is not finite becomes 0, missing (REP-118). Empty images, points and gyro samples
-    that are not finite, and odometry that is not a valid pose, are left out and counted in `log`.
+    that are not finite, a cloud's times if one is not finite, and odometry that is not a valid
+    pose, are left out and counted in `log`.
     """
     changes = {
         **_pictures(observation, log),
@@ -52,13 +53,16 @@ def _pictures(observation: Observation, log: FaultLog) -> Mapping[str, object]:
 
 def _points(observation: Observation, log: FaultLog) -> Mapping[str, object]:
     points, times_s = observation.points_lidar, observation.point_times_s
-    if points is None or np.isfinite(points).all():
-        return {}
-    is_good = np.isfinite(points).all(axis=1)
-    log.add("points that are not finite", at_stamp(observation.stamp_ns))
-    changes: dict[str, object] = {"points_lidar": locked(points[is_good])}
-    if times_s is not None:
-        changes["point_times_s"] = locked(times_s[is_good])
+    changes: dict[str, object] = {}
+    if points is not None and not np.isfinite(points).all():
+        is_good = np.isfinite(points).all(axis=1)
+        log.add("points that are not finite", at_stamp(observation.stamp_ns))
+        changes["points_lidar"] = locked(points[is_good])
+        if times_s is not None:
+            changes["point_times_s"] = times_s = locked(times_s[is_good])
+    if times_s is not None and not np.isfinite(times_s).all():
+        log.add("times of points that are not finite", at_stamp(observation.stamp_ns))
+        changes["point_times_s"] = None
     return changes
 
 
