@@ -13,6 +13,7 @@ from sceneslam.ros.clouds import cloud
 from sceneslam.ros.encode import Encoder
 from sceneslam.sources.bag.open_recording import open_recording
 from sceneslam.types.errors import InputError
+from sceneslam.types.rig import Camera
 
 BGR = np.random.default_rng(2).integers(0, 256, (6, 8, 3), dtype=np.uint8)
 UNITS = pixels.DepthUnits(1000.0, (0.3, 8.0))
@@ -189,3 +190,28 @@ def test_a_cloud_without_z_or_with_too_few_bytes_is_told() -> None:
     message.fields = message.fields[:2]
     with pytest.raises(InputError, match="expected x, y, z, got x, y"):
         cloud(message, STAMP_NS)
+
+
+def camera_info(**changes: Any) -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    data = Encoder().camera_info(STAMP_NS, Camera(size_wh=(4, 3), fx=5.0, fy=5.0, cx=2.0, cy=1.0))
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    message = store.deserialize_cdr(data, "sensor_msgs/msg/CameraInfo")
+    for name, value in changes.items():
+        setattr(message, name, np.array(value))
+    return message
+
+
+@pytest.mark.parametrize(
+    "changes", [{"k": np.zeros(9)}, {"k": [np.nan, 0, 2, 0, 5, 1, 0, 0, 1]}, {"d": [0.1, np.inf]}]
+)
+def test_a_calibration_that_is_no_number_is_missing(changes: dict[str, Any]) -> None:
+    assert decode.camera(camera_info()).fx == 5.0
+    assert decode.camera(camera_info(**changes)) is None
+
+
+def test_a_lens_that_opencv_does_not_have_is_named() -> None:
+    assert decode.camera(camera_info(d=[0.1] * 4)).distortion == (0.1, 0.1, 0.1, 0.1, 0.0)
+    with pytest.raises(InputError, match="got 6 coefficients, allowed: 0 to 5, 8, 12 or 14"):
+        decode.camera(camera_info(d=[0.1] * 6))

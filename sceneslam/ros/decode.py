@@ -183,14 +183,19 @@ def scan(message: Any) -> LaserScan | None:
 
 
 def camera(message: Any) -> Camera | None:
-    """Return the camera of a CameraInfo, None if it is not calibrated (K is zero)."""
+    """Return the camera of a CameraInfo, None if it is not calibrated: K is zero, or no number.
+
+    Raises InputError for a lens that OpenCV does not have.
+    """
     k, d = (_coefficients(message, letter) for letter in "kd")
-    if k[0] <= 0 or k[4] <= 0:
+    if not (k[0] > 0 and k[4] > 0 and np.isfinite([*k, *d]).all()):
         return None
     model = str(message.distortion_model)
     if d.any() and model not in ("plumb_bob", "rational_polynomial", ""):
         raise InputError(f"distortion model: got {model!r}, allowed: plumb_bob")
     distortion = (*d.tolist(), 0.0, 0.0, 0.0, 0.0, 0.0)[: max(5, len(d))]
+    if len(distortion) not in (5, 8, 12, 14):
+        raise InputError(f"distortion: got {len(d)} coefficients, allowed: 0 to 5, 8, 12 or 14")
     return Camera(
         size_wh=(int(message.width), int(message.height)),
         fx=float(k[0]),
