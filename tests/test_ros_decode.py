@@ -67,6 +67,11 @@ def test_an_unknown_encoding_is_named(tmp_path: Path) -> None:
         decode.image_bgr(image(tmp_path, BGR, "hsv8"))
 
 
+@pytest.mark.parametrize("encoding", ["yuv422", "yuv422_yuy2"])
+def test_an_odd_width_in_yuv_is_damaged(tmp_path: Path, encoding: str) -> None:
+    assert decode.image_bgr(image(tmp_path, np.zeros((6, 7, 2), np.uint8), encoding)) is None
+
+
 def test_an_image_shorter_than_it_says_is_damaged(tmp_path: Path) -> None:
     message = image(tmp_path, BGR, "bgr8")
     message.data = message.data[:-1]

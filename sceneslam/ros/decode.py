@@ -100,7 +100,10 @@ def image_bgr(message: Any) -> NDArray[np.uint8] | None:
         return None
     if dtype == "u2":
         raw = (raw >> 8).astype(np.uint8)
-    image = raw if conversion is None else cv2.cvtColor(raw, conversion)
+    try:
+        image = raw if conversion is None else cv2.cvtColor(raw, conversion)
+    except cv2.error:  # an odd width, of which YUV has none
+        return None
     return pixels.locked(np.ascontiguousarray(image, dtype=np.uint8))
 
 
