@@ -21,9 +21,9 @@ _SKEW_MAX = 1e-3  # of R^T R off the identity; the rounding of float32 is a thou
 def cleaned(observation: Observation, log: FaultLog) -> Observation:
     """Return the observation with finite arrays; the same object if nothing had to be removed.
 
-    Depth that is not finite becomes 0, missing (REP-118). Empty images, points and gyro samples
-    that are not finite, a cloud's times if one is not finite, and odometry that is not a valid
-    pose, are left out and counted in `log`.
+    Depth that is not finite becomes 0, missing (REP-118); the time of a point, that of its
+    observation. Empty images, points and gyro samples that are not finite, and odometry that is not
+    a valid pose, are left out. All but depth is counted in `log`.
     """
     changes = {
         **_pictures(observation, log),
@@ -62,7 +62,7 @@ def _points(observation: Observation, log: FaultLog) -> Mapping[str, object]:
             changes["point_times_s"] = times_s = locked(times_s[is_good])
     if times_s is not None and not np.isfinite(times_s).all():
         log.add("times of points that are not finite", at_stamp(observation.stamp_ns))
-        changes["point_times_s"] = None
+        changes["point_times_s"] = locked(np.where(np.isfinite(times_s), times_s, 0.0))
     return changes
 
 
