@@ -185,11 +185,30 @@ def test_file_that_is_no_model_is_refused(tmp_path, text):
         learned(tmp_path / "nothing.yaml")
 
 
-def test_weights_that_do_not_fit_the_features_are_refused(model, tmp_path):
-    node = yaml.safe_load(model.read_text())
-    node["weights"]["Dark"] = [1.0]
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("weights", {"Bright": [1.0, 1.0, 1.0, 1.0], "Dark": [1.0]}),
+        ("weights", {"Bright": [1.0], "Dark": [1.0]}),
+        ("features", ["q50", "q75"]),
+        ("scale", [0.0, 1.0, 1.0, 1.0]),
+        ("bias", {"Bright": float("nan"), "Dark": 0.0}),
+        ("scenes", ["Dark", "Dark"]),
+    ],
+)
+def test_values_of_a_model_that_do_not_fit_are_refused_by_all_readers(model, tmp_path, key, value):
+    node = yaml.safe_load(model.read_text()) | {key: value}
+    path = tmp_path / "model.yaml"
+    path.write_text(yaml.safe_dump(node))
+    for read in (learned, Model.read):
+        with pytest.raises(InputError, match=r"do not fit each other.*model\.yaml"):
+            read(path)
+
+
+def test_unknown_features_of_a_model_are_refused_with_its_file(model, tmp_path):
+    node = yaml.safe_load(model.read_text()) | {"features": ["q50", "q75", "q90", "shape"]}
     (tmp_path / "model.yaml").write_text(yaml.safe_dump(node))
-    with pytest.raises(InputError, match="do not fit each other"):
+    with pytest.raises(InputError, match=r"features.*shape.*allowed: .*q10.*model\.yaml"):
         learned(tmp_path / "model.yaml")
 
 

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from sceneslam.types.errors import InputError
+from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import UNSURE, Observation, SceneVote
 from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.scene_model import read_scene_model
 
 from .image_features import ImageFeatures
 
 _SHIPPED = Path(__file__).with_name("bright_dark.yaml")
-_KEYS = ("scenes", "features", "mean", "scale", "weights", "bias")
 
 
 class Learned:
@@ -30,18 +28,16 @@ class Learned:
 
     def __init__(self, path: str | None) -> None:
         file = _SHIPPED if path is None else Path(path)
-        model = _read(file)
+        model = read_scene_model(file)
+        self.scenes = model.scenes
         try:
-            self.scenes: tuple[str, ...] = tuple(map(str, model["scenes"]))
-            self._features = ImageFeatures(model["features"])
-            scale = np.array(model["scale"], np.float64)
-            weights = np.array([model["weights"][scene] for scene in self.scenes], np.float64)
-            bias = np.array([model["bias"][scene] for scene in self.scenes], np.float64)
-            # Logits are W (f - mean) / scale + bias, here as one matrix and one offset.
-            self._weights = weights / scale
-            self._offset = bias - self._weights @ np.array(model["mean"], np.float64)
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"model: its {_KEYS} do not fit each other: {file}") from error
+            self._features = ImageFeatures(model.features)
+        except ConfigError as error:
+            got = f"got {error.value}, allowed: {error.allowed}"
+            raise InputError(f"model: its features: {got}: {file}") from error
+        # As one matrix and one offset.
+        self._weights = model.weights / model.scale
+        self._offset = model.bias - self._weights @ model.mean
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
@@ -76,17 +72,3 @@ class Learned:
 
     def shutdown(self) -> None:
         """Do nothing."""
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """Return the contents of a model's file; raises InputError if it is invalid."""
-    if not path.is_file():
-        raise InputError(f"model not found (python -m sceneslam.scenes train makes one): {path}")
-    try:
-        model = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"model: expected YAML: {path}") from error
-    missing = [key for key in _KEYS if not isinstance(model, dict) or key not in model]
-    if missing:
-        raise InputError(f"model: it has no {', '.join(missing)}: {path}")
-    return dict(model)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -11,21 +11,16 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.scene_model import SceneModel, read_scene_model
 
 _DIGITS = 5  # significant digits in the file
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Model:
+class Model(SceneModel):
     """A softmax regression on features that are normalised to mean 0 and standard deviation 1."""
 
-    scenes: tuple[str, ...]
-    features: tuple[str, ...]
-    mean: NDArray[np.float64]  # (F,)
-    scale: NDArray[np.float64]  # (F,)
-    weights: NDArray[np.float64]  # (S, F)
-    bias: NDArray[np.float64]  # (S,)
+    __slots__ = ()
 
     def scores(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the scenes' logits (N, S) for features (N, F)."""
@@ -62,21 +57,8 @@ class Model:
     @classmethod
     def read(cls, path: Path) -> Model:
         """Return the model in a file; raises InputError if it is missing or invalid."""
-        if not path.is_file():
-            raise InputError(f"model not found: {path}")
-        try:
-            node: Mapping[str, Any] = yaml.safe_load(path.read_text())
-            scenes = tuple(node["scenes"])
-            return cls(
-                scenes=scenes,
-                features=tuple(node["features"]),
-                mean=np.array(node["mean"], np.float64),
-                scale=np.array(node["scale"], np.float64),
-                weights=np.array([node["weights"][scene] for scene in scenes], np.float64),
-                bias=np.array([node["bias"][scene] for scene in scenes], np.float64),
-            )
-        except (KeyError, TypeError, ValueError, yaml.YAMLError) as error:
-            raise InputError(f"not a model ({type(error).__name__}): {path}") from error
+        found = read_scene_model(path)
+        return cls(**{each.name: getattr(found, each.name) for each in fields(found)})
 
 
 def shares(scores: NDArray[np.float64]) -> NDArray[np.float64]:
