@@ -19,7 +19,7 @@ from sceneslam.config.resolve import resolved
 from sceneslam.detection.run import detect
 from sceneslam.interfaces import FeatureDetector
 from sceneslam.scenes.__main__ import main
-from sceneslam.scenes.model import Model
+from sceneslam.scenes.model import Model, fit
 from sceneslam.scenes.words import read_word
 from sceneslam.types.errors import InputError
 from sceneslam.types.observation import UNSURE, Observation
@@ -174,6 +174,15 @@ def test_training_asks_for_two_scenes_and_known_features(folders, capsys, tmp_pa
     assert main(one) == 2 and "two scenes" in capsys.readouterr().err
     assert main([*one, "--features", "q50,shape"]) == 2
     assert "names: got ['q50', 'shape'], allowed: different ones of q10" in capsys.readouterr().err
+
+
+def test_a_feature_that_was_constant_in_training_decides_nothing():
+    rng = np.random.default_rng(0)
+    features = np.column_stack([rng.normal(size=200), np.full(200, 0.1)])
+    labels = ["Bright" if value > 0 else "Dark" for value in features[:, 0]]
+    model = fit(features, labels, rng.uniform(0.1, 1.0, 200), ["q50", "white"])
+    scores = model.scores(np.array([[2.0, 0.1], [-2.0, 0.1], [2.0, 0.3], [-2.0, 0.3]]))
+    assert [model.scenes[place] for place in scores.argmax(axis=1)] == ["Bright", "Dark"] * 2
 
 
 @pytest.mark.parametrize("text", ["[]", "scenes: [A, B]", "a: [", "\x00"])

@@ -84,7 +84,8 @@ def fit(
         raise ConfigError("scikit-learn", "nothing", allowed) from error
     mean = np.average(features, axis=0, weights=weights)
     scale = np.sqrt(np.average((features - mean) ** 2, axis=0, weights=weights))
-    scale = np.where(scale > 0, scale, 1.0)
+    # The mean of a constant feature is rounded, so that its deviation is not exactly 0.
+    scale = np.where(np.ptp(features, axis=0) > 0, scale, 1.0)
     regression: Any = LogisticRegression(max_iter=5000)  # type: ignore[no-untyped-call]
     regression.fit((features - mean) / scale, np.array(labels), sample_weight=weights)
     rows, bias = np.asarray(regression.coef_), np.asarray(regression.intercept_)
