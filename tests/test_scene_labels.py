@@ -103,9 +103,11 @@ def test_every_instant_gets_the_module_whose_error_grew_least(runs, tmp_path, ca
     assert '"scenes={eyes:[eyes,laser],laser:[laser,eyes]}"' in capsys.readouterr().out
 
 
-def test_a_change_that_costs_more_than_it_gains_is_not_made(runs, tmp_path):
+def test_a_change_that_costs_more_than_it_gains_is_not_made(runs, tmp_path, capsys):
     assert main(["label", str(tmp_path / "l.yaml"), str(runs), "--change-m", "1.0"]) == 0
     assert len(spans_of(tmp_path / "l.yaml")) == 1
+    assert main(["label", str(tmp_path / "l.yaml"), str(runs), "--change-m", "-1"]) == 2
+    assert "--change-m: got -1.0, allowed: 0 or more" in capsys.readouterr().err
 
 
 def test_a_lost_module_is_never_the_best(tmp_path):

@@ -159,6 +159,9 @@ def test_features_are_taken_anew_where_the_model_changed(folders, tmp_path, monk
         ("Bright=FOLDER effects=fog", "effects/fog.*FOLDER"),
         ("Unsure=FOLDER", "example: got 'Unsure=FOLDER'"),
         ("Dusk=FOLDER", "example: got 'Dusk', the model knows: Bright, Dark"),
+        ("Bright='FOLDER", "example: got .*allowed: SCENE=PATH"),
+        ("Bright= ", "example: got 'Bright= ', allowed: SCENE=PATH"),
+        ("Bright=FOLDER@1.2.3:8", "example: got .*allowed: SCENE=PATH"),
         ("Bright=FOLDER@7:8", "no observation of Bright has all features.*@7:8"),
     ],
 )
@@ -174,6 +177,8 @@ def test_training_asks_for_two_scenes_and_known_features(folders, capsys, tmp_pa
     assert main(one) == 2 and "two scenes" in capsys.readouterr().err
     assert main([*one, "--features", "q50,shape"]) == 2
     assert "names: got ['q50', 'shape'], allowed: different ones of q10" in capsys.readouterr().err
+    assert main([*one, "--images", "0"]) == 2
+    assert "--images: got 0, allowed: 1 or more" in capsys.readouterr().err
 
 
 def test_a_feature_that_was_constant_in_training_decides_nothing():

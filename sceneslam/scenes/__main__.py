@@ -81,6 +81,8 @@ def _test(options: argparse.Namespace) -> None:
 
 
 def _look(options: argparse.Namespace, names: Sequence[str]) -> list[MeasuredExample]:
+    if options.images < 1:
+        raise InputError(f"--images: got {options.images}, allowed: 1 or more")
     examples = read_words(options.examples)
     node = {"_target_": _FEATURES_TARGET, "names": list(names)}
     features = ComponentBuilder({"features": node}).make("features", FeatureSource)
@@ -88,6 +90,8 @@ def _look(options: argparse.Namespace, names: Sequence[str]) -> list[MeasuredExa
 
 
 def _label(options: argparse.Namespace, words: Sequence[str]) -> None:
+    if not options.change_m >= 0:
+        raise InputError(f"--change-m: got {options.change_m}, allowed: 0 or more [m]")
     labels = label(read_runs(options.runs), options.change_m)
     labels.write(options.labels, shlex.join([*_COMMAND, *words]))
     for one in labels.recordings:

@@ -64,13 +64,13 @@ def read_word(word: str) -> Example:
     found = _WORD.fullmatch(word)
     if not found or found["scene"] == UNSURE:
         raise InputError(f"example: got {word!r}, allowed: {_USAGE}")
-    given, *overrides = shlex.split(found["rest"])
-    span = _SPAN.fullmatch(given)
-    path = span["path"] if span else given
     try:
+        given, *overrides = shlex.split(found["rest"])
+        span = _SPAN.fullmatch(given)
         start_s, end_s = (float(span[k]) for k in ("start", "end")) if span else (0.0, np.inf)
-    except ValueError:
+    except ValueError:  # an open quotation, an empty path, or a time such as 1.2.3
         raise InputError(f"example: got {word!r}, allowed: {_USAGE}") from None
+    path = span["path"] if span else given
     name = " ".join([given, *overrides])
     return Example(
         scene=found["scene"],
