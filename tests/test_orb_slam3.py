@@ -8,6 +8,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,6 +18,8 @@ from isolation import limits
 from sceneslam.modules.slam.orb_slam3.anchor import Anchor, inverse
 from sceneslam.modules.slam.orb_slam3.module import OrbSlam3
 from sceneslam.modules.slam.orb_slam3.scale import Scale
+from sceneslam.modules.slam.orb_slam3.worker import OrbSlam3Worker
+from sceneslam.modules.slam.process.fields import observation_fields, rig_fields
 from sceneslam.testing import RIG, room_observation
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
@@ -126,6 +129,48 @@ def test_a_map_of_another_motion_gets_no_scale():
     for index in range(30):
         scale.add(se3.from_xy_yaw(0.0, 0.3 * index, 0.0), se3.from_xy_yaw(0.05 * index, 0.0, 0.0))
     assert scale.metres is None
+
+
+class FakeOrbSlam3:
+    """Stands still at the origin; writes its trajectory as `System::SaveTrajectoryTUM` does."""
+
+    Sensor = SimpleNamespace(RGBD=0, MONOCULAR=1)
+    TrackingState = SimpleNamespace(
+        OK=0, OK_KLT=1, NO_IMAGES_YET=2, NOT_INITIALIZED=3, SYSTEM_NOT_READY=4
+    )
+
+    def Slam(self, vocabulary, settings, sensor):
+        self.stamps_s = []
+        return self
+
+    def track_rgbd(self, image, depth, stamp_s):
+        self.stamps_s.append(stamp_s)
+        return SimpleNamespace(state=0, pose_valid=True, pose_wc=np.eye(4), num_tracked_points=100)
+
+    def map_changed(self):
+        return False
+
+    def tracked_map_points(self):
+        return np.random.default_rng(0).uniform(-1.0, 1.0, (100, 3))
+
+    def save_trajectory_tum(self, path):
+        Path(path).write_text("".join(f"{s:.6f} 0 0 0 0 0 0 1\n" for s in self.stamps_s))
+
+
+def working(tmp_path):
+    settings = {"vocabulary": str(tmp_path / "words.txt"), "features": 1000, "fast": 20}
+    worker = OrbSlam3Worker(FakeOrbSlam3(), tmp_path, settings)
+    worker.activate(rig_fields(RIG))
+    return worker
+
+
+def test_revised_poses_have_the_stamps_of_their_images(tmp_path):
+    worker = working(tmp_path)
+    observation = observation_fields(room_observation(0))
+    stamps_ns = [1_700_000_000_123_456_789 + 33_333_333 * index for index in range(50)]
+    for stamp_ns in stamps_ns:
+        worker.track({**observation, "stamp_ns": np.int64(stamp_ns)})
+    assert worker.trajectory()["stamps_ns"].tolist() == stamps_ns
 
 
 @needs_orb_slam3

@@ -42,6 +42,7 @@ class OrbSlam3Worker:
         self._T_odom_base: Transform | None = None  # odometry at that pose
         self._revision, self._images = 0, 0
         self._points: list[NDArray[np.float32]] = []
+        self._stamps_ns: list[int] = []  # of all images
 
     def activate(self, rig: Fields) -> None:
         """Write the settings; start ORB-SLAM3 if there is a vocabulary."""
@@ -68,6 +69,7 @@ class OrbSlam3Worker:
                 self._start(self._trained(image))
             except InputError:  # no features yet
                 return pose(stamp_ns, self._T_local_base, LOST)
+        self._stamps_ns.append(stamp_ns)
         if self._has_depth:
             found = self._slam.track_rgbd(image, depth, stamp_ns * 1e-9)
         else:
@@ -85,7 +87,11 @@ class OrbSlam3Worker:
             return poses([], [])
         T_cam_base = inverse(self._T_base_cam)
         placed = [self._anchors[0].place(T) @ T_cam_base for T in _transforms(rows[:, 1:])]
-        return poses([round(stamp_s * 1e9) for stamp_s in rows[:, 0]], placed)
+        # The file's stamps are rounded to microseconds; each is that of the nearest image.
+        stamps_ns = np.array(self._stamps_ns, np.int64)
+        middles_ns = (stamps_ns[1:] + stamps_ns[:-1]) // 2
+        nearest = np.searchsorted(middles_ns, np.rint(rows[:, 0] * 1e9))
+        return poses(stamps_ns[nearest].tolist(), placed)
 
     def map(self) -> dict[str, Any]:
         """Return the tracked map points, in local [m]."""
