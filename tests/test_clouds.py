@@ -1,11 +1,13 @@
 """Clouds for registration: swept ones made still, and depth images as points."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sceneslam.modules.slam.clouds import CloudReader
+from sceneslam.modules.slam.voxel_cloud import VoxelCloud
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.observation import Observation
@@ -46,3 +48,16 @@ def test_depth_becomes_points_of_base():
     assert (cloud[:, 1] < 0).all()  # the right half of the image lies to the right
     with pytest.raises(InputError, match="depth_m"):
         reader.read(Observation(stamp_ns=0, depth_m=np.zeros((4, 4), np.float32)))
+
+
+def test_cloud_of_a_place_that_is_seen_again_does_not_grow():
+    rng, cloud = np.random.default_rng(0), VoxelCloud(0.1)
+    parts = [rng.uniform(0.0, 1.0, (30_000, 3)).astype(np.float32) for _ in range(40)]
+    sizes = []
+    for part in parts:
+        cloud.add(part)
+        sizes.append(len(pickle.dumps(cloud)))
+    assert max(sizes) < 5 * sizes[0]
+    points = np.concatenate(parts)
+    first = np.unique(np.floor(points / 0.1).astype(np.int64), axis=0, return_index=True)[1]
+    np.testing.assert_array_equal(cloud.points(), points[np.sort(first)])

@@ -54,7 +54,7 @@ ALLOWED = {  # package -> what of ours it may import
 
 SLAM = {  # what more than one SLAM module may use
     "cloud_shape", "clouds", "degeneracy", "grid", "process",
-    "surfaces", "cloud_odometry", "cloud_map", "quiet"}  # fmt: skip
+    "surfaces", "cloud_odometry", "cloud_map", "voxel_cloud", "quiet"}  # fmt: skip
 
 
 @pytest.mark.parametrize("package", ALLOWED)

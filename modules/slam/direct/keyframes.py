@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from sceneslam.types import se3
 from sceneslam.types.maps import PointLayer, PoseGraphLayer
 
+from ..voxel_cloud import VoxelCloud
 from .view import DirectView, Tracker
 
 _CLOUD_STEP_M, _CLOUD_TURN_RAD = 0.2, 0.2  # smallest motion between keyframes that add points
@@ -18,11 +19,11 @@ class DirectKeyframes:
     """Stores the poses of all keyframes, and points of those with a new view."""
 
     def __init__(self, tracker: Tracker, voxel_m: float) -> None:
-        self._tracker, self._voxel_m = tracker, voxel_m
+        self._tracker = tracker
         self._stamps_ns: list[int] = []
         self._T_local_cam: list[se3.Transform] = []
         self._edges: list[tuple[int, NDArray[np.float64]]] = []  # target node and information
-        self._points: list[NDArray[np.float32]] = []
+        self._cloud = VoxelCloud(voxel_m)
         self._T_local_shown: se3.Transform | None = None  # of the last keyframe that added points
 
     def add(
@@ -44,17 +45,11 @@ class DirectKeyframes:
                 return
         self._T_local_shown = T_local_cam
         points = self._tracker.points(view, _CLOUD_STRIDE_PX)
-        points = se3.apply(T_local_cam, points[points[:, 2] > 0])
-        self._points.append(points.astype(np.float32))
+        self._cloud.add(se3.apply(T_local_cam, points[points[:, 2] > 0]))
 
     def cloud(self) -> PointLayer | None:
-        """Return the points (N, 3) [m], local, one per voxel; None without a point."""
-        if not self._points:
-            return None
-        points = np.concatenate(self._points)
-        voxels = np.floor(points / self._voxel_m).astype(np.int64)
-        first = np.unique(voxels, axis=0, return_index=True)[1]
-        return PointLayer(points=points[np.sort(first)])
+        """Return the points (N, 3) [m], local, one per voxel; None without a keyframe."""
+        return PointLayer(points=self._cloud.points()) if self._stamps_ns else None
 
     def graph(self, T_cam_base: se3.Transform) -> PoseGraphLayer | None:
         """Return the graph of T_local_base at the keyframes; None without a keyframe."""

@@ -19,6 +19,7 @@ from sceneslam.vocabulary import describe, train
 
 from ..process.client import DEGRADED, LOST, TRACKING, pose, poses, serve
 from ..process.protocol import Fields, as_text
+from ..voxel_cloud import VoxelCloud
 from .anchor import Anchor, Transform, inverse
 from .scale import Scale
 from .settings import write_settings
@@ -41,7 +42,7 @@ class OrbSlam3Worker:
         self._T_local_base: Transform = np.eye(4)
         self._T_odom_base: Transform | None = None  # odometry at that pose
         self._revision, self._images = 0, 0
-        self._points: list[NDArray[np.float32]] = []
+        self._cloud = VoxelCloud(_POINT_M)
         self._stamps_ns: list[int] = []  # of all images
 
     def activate(self, rig: Fields) -> None:
@@ -95,12 +96,8 @@ class OrbSlam3Worker:
 
     def map(self) -> dict[str, Any]:
         """Return the tracked map points, in local [m]."""
-        if not self._points:
-            return {}
-        points = np.concatenate(self._points)
-        cubes = np.floor(points / _POINT_M).astype(np.int64)
-        first = np.unique(cubes, axis=0, return_index=True)[1]
-        return {"points.points": points[np.sort(first)]}
+        points = self._cloud.points()
+        return {"points.points": points} if len(points) else {}
 
     def _start(self, vocabulary: Path) -> None:
         settings = self._folder / "settings.yaml"
@@ -170,7 +167,7 @@ class OrbSlam3Worker:
     def _keep_points(self) -> None:
         if self._images % _POINTS_EVERY == 1:  # including the first
             points_world = self._slam.tracked_map_points()
-            self._points.append(self._anchors[-1].place_points(points_world))
+            self._cloud.add(self._anchors[-1].place_points(points_world))
 
 
 def _distance(T_a: Transform, T_b: Transform) -> float:
