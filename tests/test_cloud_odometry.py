@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import replace
+from importlib.machinery import ModuleSpec
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from sceneslam.modules.slam.cloud_map import CloudMap
 from sceneslam.modules.slam.cloud_odometry import CloudOdometry
 from sceneslam.modules.slam.degeneracy import Localizability
 from sceneslam.modules.slam.quiet import quiet
+from sceneslam.modules.slam.rko_lio import RkoLio
 from sceneslam.testing import RIG, room_observation
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
@@ -123,3 +127,61 @@ def test_quiet_drops_standard_output_and_gives_it_back(capfd):
         os.write(1, b"a page of status")
     os.write(1, b"kept")
     assert capfd.readouterr().out == "kept"
+
+
+@pytest.fixture
+def rko(monkeypatch):
+    """Return the calls of a stand-in for the library, which is not installed everywhere."""
+    calls = {"imu_ns": [], "scans_ns": []}
+
+    class LIO:
+        def __init__(self, config):
+            pass
+
+        def add_imu_measurement(self, force, rate, time_ns, T_base_imu):
+            calls["imu_ns"].append(time_ns)
+
+        def register_scan(self, points, stamps_ns, T_base_lidar):
+            calls["scans_ns"].append(stamps_ns)
+
+        def pose(self):
+            return np.eye(4)
+
+        def map_point_cloud(self):
+            return np.zeros((0, 3))
+
+    parts = {
+        "rko_lio": {"__spec__": ModuleSpec("rko_lio", None)},
+        "rko_lio.config": {"LIOConfig": lambda **settings: settings},
+        "rko_lio.lio": {"LIO": LIO},
+        "rko_lio.rko_lio_pybind": {"InputError": RuntimeError},
+    }
+    for name, members in parts.items():
+        module = ModuleType(name)
+        vars(module).update(members)
+        monkeypatch.setitem(sys.modules, name, module)
+    return calls
+
+
+def inertial(index):
+    """Return ten samples of gyro and accelerometer since the observation before."""
+    times_s = np.linspace(-0.03, 0.0, 10)
+    samples = np.column_stack([times_s, np.zeros((10, 2)), np.full(10, 9.8)])
+    return replace(room_observation(index), gyro_base=samples, accelerometer_base=samples)
+
+
+def lio():
+    names = ("depth_range_max_m", "depth_stride_px")
+    settings = {name: value for name, value in SETTINGS.items() if name not in names}
+    module = RkoLio(**settings, correspondence_max_m=None, is_at_rest_first=True)
+    module.activate(RIG)
+    return module
+
+
+def test_imu_samples_of_observations_without_a_cloud_are_used(rko):
+    module = lio()
+    for index in range(6):
+        silent = {} if index % 3 == 0 else {"points_lidar": None}
+        module.track(replace(inertial(index), **silent))
+    assert len(rko["scans_ns"]) == 2
+    assert len(rko["imu_ns"]) == 60 and (np.diff(rko["imu_ns"]) > 0).all()

@@ -34,6 +34,9 @@ class CloudMap(ABC):
         self._known = np.zeros(_SLOTS, np.bool_)  # a hash table of voxels with few collisions
         self._marked_at = np.zeros(3)
 
+    def listen(self, observation: Observation) -> None:  # noqa: B027
+        """Take what an observation holds besides its cloud; called for all, also without one."""
+
     @abstractmethod
     def register(
         self, cloud: Cloud, T_local_guess: se3.Transform, observation: Observation

@@ -94,6 +94,7 @@ class CloudOdometry(ABC):
         if self._reader is None or self._icp is None:
             raise RuntimeError("track() before activate()")
         prediction = self._predictor.predict(observation)
+        self._icp.listen(observation)
         twist_s = self._predictor.model.velocity if self.deskew else np.zeros(6)
         cloud = self._reader.read_unswept(observation, twist_s)
         if cloud is None:

@@ -71,18 +71,21 @@ class _RkoMap(CloudMap):
         self._lio = LIO(LIOConfig(**common, **settings, max_num_threads=1))
         self._T_local_world: se3.Transform | None = None
 
+    def listen(self, observation: Observation) -> None:
+        """Add the IMU samples."""
+        for after_s, rate, force in _inertial(observation):
+            time_ns = observation.stamp_ns + round(after_s * 1e9)
+            self._lio.add_imu_measurement(force, rate, time_ns, np.eye(4))
+
     def register(
         self, cloud: Cloud, T_local_guess: se3.Transform, observation: Observation
     ) -> se3.Transform | None:
-        """Return T_local_base (4, 4) [m] by the observation's points and IMU samples."""
+        """Return T_local_base (4, 4) [m] by the observation's points and the IMU samples."""
         from rko_lio.rko_lio_pybind import InputError
 
         self.source = self.dense = cloud
         points = observation.points_lidar
         assert points is not None
-        for after_s, rate, force in _inertial(observation):
-            time_ns = observation.stamp_ns + round(after_s * 1e9)
-            self._lio.add_imu_measurement(force, rate, time_ns, np.eye(4))
         times_s = observation.point_times_s
         after_ns = np.zeros(len(points)) if times_s is None else times_s * 1e9
         stamps_ns = observation.stamp_ns + np.rint(after_ns).astype(np.int64)
