@@ -185,3 +185,18 @@ def test_imu_samples_of_observations_without_a_cloud_are_used(rko):
         module.track(replace(inertial(index), **silent))
     assert len(rko["scans_ns"]) == 2
     assert len(rko["imu_ns"]) == 60 and (np.diff(rko["imu_ns"]) > 0).all()
+
+
+def test_points_without_a_valid_time_have_the_stamp_of_their_cloud(rko):
+    observation = inertial(0)
+    times_s = np.full(len(observation.points_lidar), -0.05)
+    times_s[:3] = np.nan, np.inf, -np.inf
+    lio().track(replace(observation, point_times_s=times_s))
+    (stamps_ns,) = rko["scans_ns"]
+    after_ns = [0, 0, 0] + [-50_000_000] * (len(times_s) - 3)
+    assert (stamps_ns - observation.stamp_ns).tolist() == after_ns
+
+
+def test_gyro_without_a_sample_of_the_accelerometer_is_not_used(rko):
+    lio().track(replace(inertial(0), accelerometer_base=np.zeros((0, 4))))
+    assert len(rko["scans_ns"]) == 1 and not rko["imu_ns"]

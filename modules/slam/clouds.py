@@ -54,8 +54,7 @@ class CloudReader:
             raise InputError(f"point_times_s: expected {len(found)} values, got {len(times_s)}")
         valid = self._valid(found)
         points = np.asarray(se3.apply(self.T_base_sensor, found[valid]))
-        times = np.nan_to_num(times_s[valid], nan=0.0, posinf=0.0, neginf=0.0)
-        return _moved(points, times, twist_s)
+        return _moved(points, valid_times_s(times_s[valid]), twist_s)
 
     def _sensed(self, observation: Observation) -> Cloud | None:
         if not self.is_depth:
@@ -82,6 +81,11 @@ class CloudReader:
                 return np.asarray((reach > 0) & (reach >= near_m) & (reach <= far_m))
             square = np.einsum("ij,ij->i", points_sensor, points_sensor)
             return np.asarray((square > 0) & (square >= near_m**2) & (square <= far_m**2))
+
+
+def valid_times_s(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the points' times (N,) [s], 0 for those that are not finite."""
+    return np.nan_to_num(times_s, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def _moved(points: Cloud, times_s: NDArray[np.float64], twist_s: NDArray[np.float64]) -> Cloud:

@@ -21,7 +21,7 @@ from sceneslam.types.rig import Sensor
 
 from .cloud_map import CloudMap
 from .cloud_odometry import CloudOdometry
-from .clouds import Cloud, CloudReader
+from .clouds import Cloud, CloudReader, valid_times_s
 from .quiet import quiet
 
 
@@ -87,8 +87,8 @@ class _RkoMap(CloudMap):
         points = observation.points_lidar
         assert points is not None
         times_s = observation.point_times_s
-        after_ns = np.zeros(len(points)) if times_s is None else times_s * 1e9
-        stamps_ns = observation.stamp_ns + np.rint(after_ns).astype(np.int64)
+        after_s = np.zeros(len(points)) if times_s is None else valid_times_s(times_s)
+        stamps_ns = observation.stamp_ns + np.rint(after_s * 1e9).astype(np.int64)
         with quiet():  # it prints logs
             try:
                 self._lio.register_scan(points, stamps_ns, self._T_base_lidar)
@@ -113,7 +113,7 @@ class _RkoMap(CloudMap):
 def _inertial(observation: Observation) -> list[tuple[float, NDArray[Any], NDArray[Any]]]:
     """Return (time after the stamp [s], rate (3,), force (3,)) at the gyro's samples."""
     gyro, force = observation.gyro_base, observation.accelerometer_base
-    if gyro is None or force is None:
+    if gyro is None or force is None or not len(force):
         return []
     forces = [np.interp(gyro[:, 0], force[:, 0], force[:, axis]) for axis in (1, 2, 3)]
     return list(zip(gyro[:, 0].tolist(), gyro[:, 1:], np.stack(forces, axis=1), strict=True))
