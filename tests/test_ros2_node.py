@@ -17,6 +17,8 @@ from isolation import limits
 from omegaconf import OmegaConf
 
 from sceneslam.config.check import check_node
+from sceneslam.modules.slam.process.client import LOST, TRACKING
+from sceneslam.modules.slam.ros2_node.client import NodeClient
 from sceneslam.modules.slam.ros2_node.listener import moved
 from sceneslam.modules.slam.ros2_node.module import NodeTopics, Ros2Node
 from sceneslam.ros.transport.transport import Network
@@ -99,6 +101,34 @@ def test_a_node_that_is_unsure_is_lost():
             if statuses[-1] is TrackingStatus.LOST or monotonic() - began_s > 20:
                 break
         assert statuses[-1] is TrackingStatus.LOST
+
+
+def answered(said):
+    """Return the client's poses and statuses for what a node said of a robot at rest."""
+    client = NodeClient({"topics": NONE, "needs": ["scan"], "deviation_max_m": 1.0})
+    client._T_frame_base = np.eye(4)
+    client._sent = dict.fromkeys(said)
+    client._first = (min(said), None)
+    reply = client._answer(said)
+    return dict(zip(reply["stamps_ns"].tolist(), reply["T_local_base"], strict=True)), reply[
+        "status"
+    ].tolist()
+
+
+@pytest.mark.parametrize("first_ns", [0, -(10**9)])
+def test_a_pose_at_any_first_stamp_counts(first_ns):
+    T_world_base = {first_ns: se3.from_xy_yaw(3.0, 1.0, 0.5), 10**8: se3.from_xy_yaw(4.0, 1.0, 0.5)}
+    found, statuses = answered({ns: (T, 0.1) for ns, T in T_world_base.items()})
+    assert list(found) == [first_ns, 10**8] and statuses == [TRACKING, TRACKING]
+    np.testing.assert_allclose(found[first_ns], np.eye(4), atol=1e-12)
+
+
+@pytest.mark.parametrize("deviation_m", [100.0, np.nan])
+def test_local_is_where_the_node_first_knows_the_pose(deviation_m):
+    nowhere, T_world_base = se3.from_xy_yaw(50.0, 0.0, 1.0), se3.from_xy_yaw(3.0, 1.0, 0.5)
+    found, statuses = answered({1: (nowhere, deviation_m), 2: (T_world_base, 0.1)})
+    assert statuses == [LOST, TRACKING]
+    np.testing.assert_allclose(found[2], np.eye(4), atol=1e-12)
 
 
 def test_a_node_that_ends_ends_the_session_with_a_sentence():

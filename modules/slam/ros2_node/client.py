@@ -46,7 +46,7 @@ class NodeClient:
         self._sent: dict[int, Transform | None] = {}  # stamp -> T_odom_base
         self._first: tuple[int, Transform | None] | None = None
         self._T_local_world: Transform | None = None
-        self._given_ns = 0  # stamp of the newest returned pose
+        self._given_ns: int | None = None  # stamp of the newest returned pose
 
     def activate(self, rig: Fields) -> None:
         """Join the domain and start the node; its standard output is its log."""
@@ -110,15 +110,20 @@ class NodeClient:
 
     def _answer(self, said: dict[int, tuple[Transform, float]]) -> dict[str, Any]:
         """Return the poses of published observations, without those that are too late."""
-        stamps_ns = sorted(ns for ns in said if ns in self._sent and ns > self._given_ns)
+        given_ns = self._given_ns
+        stamps_ns = sorted(
+            ns for ns in said if ns in self._sent and (given_ns is None or ns > given_ns)
+        )
         statuses, found = [], []
         for stamp_ns in stamps_ns:
             T_world_frame, deviation_m = said[stamp_ns]
             T_world_base = T_world_frame @ self._T_frame_base
-            if self._T_local_world is None:
+            is_lost = not deviation_m <= self._settings["deviation_max_m"]  # also NaN
+            if self._T_local_world is None and not is_lost:
                 self._T_local_world = self._since_first(stamp_ns) @ se3.inverse(T_world_base)
-            found.append(se3.orthonormal(self._T_local_world @ T_world_base))
-            is_lost = deviation_m > self._settings["deviation_max_m"]
+            # Before the first certain pose `local` is unknown in the node's world.
+            T_local_world = np.eye(4) if self._T_local_world is None else self._T_local_world
+            found.append(se3.orthonormal(T_local_world @ T_world_base))
             statuses.append(LOST if is_lost else TRACKING)
             self._given_ns = stamp_ns
         return {**poses(stamps_ns, found), "status": np.array(statuses, np.int64)}
