@@ -153,6 +153,11 @@ def test_a_setting_that_makes_no_sense_is_named(key, value):
         build("good", **{key: value})
 
 
+def test_a_pose_by_tf_is_that_of_base():
+    with pytest.raises(ConfigError, match=r"pose_frame: got 'camera', allowed: base"):
+        build("good", pose_kind="tf", pose_frame="camera")
+
+
 @pytest.mark.parametrize("preset", ["slam_toolbox", "cartographer", "rtabmap", "orb_slam3"])
 def test_a_preset_is_a_whole_configuration(preset):
     with initialize_config_module("sceneslam.conf", version_base="1.3"):

@@ -86,6 +86,9 @@ class Ros2Node(ProcessSlam):
                 raise ConfigError(name, given, " | ".join(known))
         if pose_frame not in ("base", "camera"):
             raise ConfigError("pose_frame", pose_frame, "base | camera")
+        if pose_kind == "tf" and pose_frame != "base":
+            allowed = "base: map -> odom times the odometry is the pose of base"
+            raise ConfigError("pose_frame", pose_frame, allowed)
         if pose_kind != "tf" and topics.pose is None:
             raise ConfigError("topics.pose", None, f"a topic, as pose_kind is {pose_kind}")
         for name, value in (("answer_s", answer_s), ("deviation_max_m", deviation_max_m)):
