@@ -19,7 +19,10 @@ from sceneslam.config.resolve import resolved
 from sceneslam.detection.run import detect
 from sceneslam.interfaces import FeatureDetector
 from sceneslam.scenes.__main__ import main
+from sceneslam.scenes.examples import Example, MeasuredExample
 from sceneslam.scenes.model import Model, fit
+from sceneslam.scenes.score import table
+from sceneslam.scenes.train import Judged
 from sceneslam.scenes.words import read_word
 from sceneslam.types.errors import InputError
 from sceneslam.types.observation import UNSURE, Observation
@@ -224,6 +227,26 @@ def test_unknown_features_of_a_model_are_refused_with_its_file(model, tmp_path):
     (tmp_path / "model.yaml").write_text(yaml.safe_dump(node))
     with pytest.raises(InputError, match=r"features.*shape.*allowed: .*q10.*model\.yaml"):
         learned(tmp_path / "model.yaml")
+
+
+def judged(probabilities, thumbnails=()):
+    """Return an example of Bright with the probabilities (N, 3) that a model gave it."""
+    example = Example(scene="Bright", group="a", name="a", parts=[], config={})
+    count = len(probabilities)
+    seen = MeasuredExample(
+        example=example,
+        features=np.zeros((count, 1)),
+        weights=np.ones(count),
+        thumbnails=thumbnails,
+    )
+    scenes = ("Bright", "Dark", "Dusty")
+    return Judged(seen=seen, scenes=scenes, scores=np.log(probabilities))
+
+
+def test_calibration_counts_all_images_of_three_scenes():
+    lines = list(table([judged([[0.4, 0.35, 0.25], [0.6, 0.3, 0.1], [0.9, 0.05, 0.05]])]))
+    counts = [int(line.split()[3]) for line in lines if " to " in line]
+    assert sum(counts) == 3, lines
 
 
 def test_words_are_read_as_documented(folders):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sceneslam.scenes.train import Judged
 
-_BINS = (0.5, 0.7, 0.9, 0.99)  # lower limits of the probability bins
+_BINS = (0.0, 0.5, 0.7, 0.9, 0.99)  # lower limits of the probability bins
 _SHOWN = 48  # images on a sheet, by decreasing probability
 _COLUMNS = 6
 _CELL_WH = (160, 150)  # an image with its two lines of text [px]
