@@ -19,9 +19,9 @@ from sceneslam.config.resolve import resolved
 from sceneslam.detection.run import detect
 from sceneslam.interfaces import FeatureDetector
 from sceneslam.scenes.__main__ import main
-from sceneslam.scenes.examples import Example, MeasuredExample
+from sceneslam.scenes.examples import Example, MeasuredExample, _Collected
 from sceneslam.scenes.model import Model, fit
-from sceneslam.scenes.score import table
+from sceneslam.scenes.score import table, write_sheet
 from sceneslam.scenes.train import Judged
 from sceneslam.scenes.words import read_word
 from sceneslam.types.errors import InputError
@@ -229,8 +229,9 @@ def test_unknown_features_of_a_model_are_refused_with_its_file(model, tmp_path):
         learned(tmp_path / "model.yaml")
 
 
-def judged(probabilities, thumbnails=()):
+def judged(probabilities, thumbnails=None):
     """Return an example of Bright with the probabilities (N, 3) that a model gave it."""
+    thumbnails = [None] * len(probabilities) if thumbnails is None else thumbnails
     example = Example(scene="Bright", group="a", name="a", parts=[], config={})
     count = len(probabilities)
     seen = MeasuredExample(
@@ -247,6 +248,22 @@ def test_calibration_counts_all_images_of_three_scenes():
     lines = list(table([judged([[0.4, 0.35, 0.25], [0.6, 0.3, 0.1], [0.9, 0.05, 0.05]])]))
     counts = [int(line.split()[3]) for line in lines if " to " in line]
     assert sum(counts) == 3, lines
+
+
+def test_sheet_shows_the_image_of_each_wrong_vote(tmp_path):
+    class Mean:
+        def get_features(self, observation):
+            return np.array([0.0])
+
+    collected = _Collected(Example(scene="Bright", group="a", name="a", parts=[], config={}))
+    for grey in (None, 50, 200):
+        image = None if grey is None else np.full((10, 16, 3), grey, np.uint8)
+        collected.take(Observation(stamp_ns=1, image_bgr=image), 1.0, Mean())
+    wrong = np.array([[0.1, 0.8, 0.1], [0.1, 0.8, 0.1], [0.2, 0.7, 0.1]])
+    one = Judged(seen=collected.seen(), scenes=("Bright", "Dark", "Dusty"), scores=np.log(wrong))
+    assert write_sheet([one], tmp_path / "wrong.png") == 2  # of the first there is no image
+    sheet = cv2.imread(str(tmp_path / "wrong.png"))
+    assert sheet[5, 5].tolist() == [50] * 3 and sheet[5, 165].tolist() == [200] * 3
 
 
 def test_words_are_read_as_documented(folders):

@@ -61,7 +61,7 @@ class MeasuredExample:
     example: Example
     features: NDArray[np.float64]  # (N, F)
     weights: NDArray[np.float64]  # (N,)
-    thumbnails: Sequence[NDArray[np.uint8]]  # N, empty without images
+    thumbnails: Sequence[NDArray[np.uint8] | None]  # (N,), None for an observation without an image
 
 
 def look(
@@ -86,7 +86,7 @@ class _Collected:
     count: int = 0
     rows: list[NDArray[np.float64]] = field(default_factory=list)
     weights: list[float] = field(default_factory=list)
-    thumbnails: list[NDArray[np.uint8]] = field(default_factory=list)
+    thumbnails: list[NDArray[np.uint8] | None] = field(default_factory=list)
 
     def take(self, observation: Observation, weight: float, features: FeatureSource) -> None:
         row = features.get_features(observation)
@@ -94,8 +94,8 @@ class _Collected:
             return
         self.rows.append(row)
         self.weights.append(weight)
-        if observation.image_bgr is not None:
-            self.thumbnails.append(_thumbnail(observation.image_bgr))
+        image_bgr = observation.image_bgr
+        self.thumbnails.append(None if image_bgr is None else _thumbnail(image_bgr))
 
     def seen(self) -> MeasuredExample:
         if not self.rows:

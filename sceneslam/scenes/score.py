@@ -35,10 +35,12 @@ def table(judged: Sequence[Judged]) -> Iterator[str]:
 def write_sheet(judged: Sequence[Judged], path: Path) -> int:
     """Write one sheet of wrongly classified images; return their number."""
     wrong = [
-        (float(probability), one, place)
+        (float(probability), one, place, image)
         for one in judged
-        for place, probability in enumerate(one.probabilities.max(axis=1))
-        if not one.is_right[place] and one.seen.thumbnails
+        for place, (probability, image) in enumerate(
+            zip(one.probabilities.max(axis=1), one.seen.thumbnails, strict=True)
+        )
+        if not one.is_right[place] and image is not None
     ]
     wrong.sort(key=lambda entry: -entry[0])
     if not wrong:
@@ -75,11 +77,13 @@ def _calibration(judged: Sequence[Judged]) -> Iterator[str]:
             yield f"{span:16} {inside.sum():7} {100 * mean:5.1f} % {100 * share:5.1f} %"
 
 
-def _cell(probability: float, one: Judged, place: int) -> NDArray[np.uint8]:
+def _cell(
+    probability: float, one: Judged, place: int, thumbnail: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
     """Return a thumbnail with its true and its estimated scene below."""
     width, height = _CELL_WH
     cell = np.full((height, width, 3), 255, np.uint8)
-    image = one.seen.thumbnails[place][: height - 30]
+    image = thumbnail[: height - 30]
     cell[: image.shape[0], : image.shape[1]] = image
     texts = (
         f"{one.seen.example.scene}: {one.votes[place]} {100 * probability:.0f} %",
