@@ -15,7 +15,9 @@ from hypothesis import strategies as st
 from networks import footage
 
 from sceneslam.scenes.__main__ import main
+from sceneslam.scenes.examples import Example, MeasuredExample
 from sceneslam.scenes.label import Labels, cheapest
+from sceneslam.scenes.train import train
 from sceneslam.scenes.words import read_word
 from sceneslam.types.trajectory import Trajectory
 
@@ -175,3 +177,36 @@ def test_file_without_labels_is_refused(tmp_path, capsys, text):
     assert "labels not found" in capsys.readouterr().err
     assert main(["label", str(tmp_path / "l.yaml"), str(tmp_path)]) == 2
     assert "no finished run" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("is_empty", [True, False])
+def test_a_run_without_truth_and_covariances_is_one_sentence(tmp_path, capsys, is_empty):
+    recording = film(tmp_path / "film")
+    for name in ("eyes", "laser"):
+        folder = tmp_path / "runs" / name
+        write_run(folder, name, np.full(100, 0.01), recording=recording, has_truth=False)
+    path = tmp_path / "runs" / "laser" / "trajectory_covariance.txt"
+    if is_empty:
+        path.write_text("# stamp_s xx xy\n")
+    else:
+        path.unlink()
+    assert main(["label", str(tmp_path / "l.yaml"), str(tmp_path / "runs")]) == 2
+    said = capsys.readouterr().err
+    assert "neither ground truth nor covariances" in said and said.count("\n") == 1
+
+
+def test_labels_of_modules_that_are_equally_good_are_trained_on(tmp_path):
+    pytest.importorskip("sklearn", reason="the extra `learn` is not installed")
+    examples = [
+        MeasuredExample(
+            example=Example(
+                scene=scene, group=scene, name=scene, parts=[], config={}, is_weighted=True
+            ),
+            features=np.full((5, 1), value),
+            weights=np.zeros(5),
+            thumbnails=[None] * 5,
+        )
+        for scene, value in (("eyes", 1.0), ("laser", -1.0))
+    ]
+    model = train(examples, ["q50"]).model
+    assert (np.argmax(model.scores(np.array([[1.0], [-1.0]])), axis=1) == [0, 1]).all()

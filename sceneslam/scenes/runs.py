@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sceneslam.evaluation.association import interpolated
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
+from sceneslam.types.input_files import read_text
 from sceneslam.types.observation import TrackingStatus
 from sceneslam.types.trajectory import Trajectory
 
@@ -75,8 +76,15 @@ class ModuleRun:
     def _growth(
         self, before_ns: NDArray[np.int64], after_ns: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return the growth (N,) [m] of the position's standard deviation between two stamps."""
-        rows = np.loadtxt(self.folder / "trajectory_covariance.txt", ndmin=2)
+        """Return the growth (N,) [m] of the position's standard deviation between two stamps.
+
+        Raises InputError for a module that reports no covariances.
+        """
+        path = self.folder / "trajectory_covariance.txt"
+        lines = read_text(path).splitlines() if path.is_file() else []
+        if all(line.startswith("#") for line in lines):
+            raise InputError(f"run: it has neither ground truth nor covariances: {self.folder}")
+        rows = np.loadtxt(lines, ndmin=2)
         stamps_s, variances_m2 = rows[:, 0], rows[:, _VARIANCES].sum(axis=1)
         before_m2, after_m2 = (
             np.interp(at_ns * 1e-9, stamps_s, variances_m2) for at_ns in (before_ns, after_ns)

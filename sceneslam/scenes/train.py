@@ -95,9 +95,9 @@ def _weights(all_seen: Sequence[MeasuredExample]) -> NDArray[np.float64]:
     of their own.
     """
     total = _IMAGES_PER_SCENE * len(_scenes(all_seen))
-    if all(seen.example.is_weighted for seen in all_seen):
-        weights = np.concatenate([seen.weights for seen in all_seen])
-        return np.asarray(total * weights / max(float(weights.sum()), 1e-12))
+    weights = np.concatenate([seen.weights for seen in all_seen])
+    if all(seen.example.is_weighted for seen in all_seen) and weights.any():
+        return np.asarray(total * weights / weights.sum())
     parts = []
     for seen in all_seen:
         examples = sum(other.example.scene == seen.example.scene for other in all_seen)
