@@ -62,10 +62,12 @@ def test_it_votes_at_its_own_rate(make):
     assert cast == [0, 10, 20]
 
 
-def test_classes_are_found_by_patterns_of_their_labels(make, tmp_path):
-    (tmp_path / "labels.txt").write_text("living_room\nmeadow\ncellar\n")
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1"])
+def test_classes_are_found_by_patterns_of_their_labels(make, tmp_path, encoding):
+    text = "living_room\nprairie fleurie \u00e9t\u00e9\ncellar\n"
+    (tmp_path / "labels.txt").write_text(text, encoding)
     labels = f"detector.labels={tmp_path / 'labels.txt'}"
-    scenes = "+detector.scenes={Inside:['*room',cellar],Outside:[1]}"
+    scenes = "+detector.scenes={Inside:['living_*',cellar],Outside:[1]}"
     detector = make("~detector.scenes", scenes, labels, "detector.rate_hz=null")
     assert detector.get_scene(seen("Dark", 7)).scene == "Inside"
     assert detector.get_scene(seen("Outdoor", 7)).scene == "Outside"

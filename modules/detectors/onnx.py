@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.input_files import read_text
 from sceneslam.types.observation import UNSURE, Observation, SceneVote
 from sceneslam.types.rig import Rig, Sensor
 
@@ -145,7 +146,7 @@ def _read_labels(path: Path) -> Sequence[str]:
     """Return the classes' names, one per line, in the network's order."""
     if not path.is_file():
         raise InputError(f"labels not found, expected a file with one class per line: {path}")
-    return [line.strip() for line in path.read_text().splitlines() if line.strip()]
+    return [line.strip() for line in read_text(path).splitlines() if line.strip()]
 
 
 def _members(
