@@ -1,5 +1,8 @@
 """Detectors: the paper's formula to its rounding, and the manual bus."""
 
+import os
+import threading
+
 import numpy as np
 import pytest
 
@@ -122,3 +125,19 @@ def test_operator_takes_over_from_the_schedule(monkeypatch):
         if thread.name == "operator":
             thread.join(5.0)
     assert detector.get_scene(Observation(stamp_ns=0)).scene == "Dark"
+
+
+def test_operator_is_heard_by_one_thread_however_often_it_is_activated(monkeypatch):
+    reading, writing = os.pipe()
+    with os.fdopen(reading) as stdin, os.fdopen(writing, "w") as operator:
+        monkeypatch.setattr("sys.stdin", stdin)
+        before = threading.active_count()
+        detector = Manual(schedule=[[0, "Bright"]], operator=True, scenes=["Dark"])
+        for _ in range(3):
+            detector.activate(RIG)
+            detector.shutdown()
+        assert threading.active_count() == before + 1
+        operator.close()
+        for thread in threading.enumerate():
+            if thread.name == "operator":
+                thread.join(5.0)

@@ -45,14 +45,16 @@ class Manual:
         self._names = [str(entry[1]) for entry in schedule]
         self._operator = operator
         self.scenes = tuple(dict.fromkeys([*self._names, *(scenes or [])]))
+        self._thread: threading.Thread | None = None  # waits for standard input until it ends
         self._typed: str | None = None
         self._first_ns: int | None = None
 
     def activate(self, rig: Rig) -> None:
         """Start the schedule at the next observation; read standard input."""
         self._first_ns, self._typed = None, None
-        if self._operator:
-            threading.Thread(target=self._listen, daemon=True, name="operator").start()
+        if self._operator and self._thread is None:
+            self._thread = threading.Thread(target=self._listen, daemon=True, name="operator")
+            self._thread.start()
 
     def get_scene(self, observation: Observation) -> SceneVote:
         """Return the scene at the observation's stamp."""
