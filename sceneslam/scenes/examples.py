@@ -67,8 +67,9 @@ class MeasuredExample:
 def look(
     examples: Sequence[Example], features: FeatureSource, images: int
 ) -> list[MeasuredExample]:
-    """Return the features of up to `images` observations of each recording, evenly over it.
+    """Return the features of every n-th observation of each example.
 
+    n is the recording's length over `images`, rounded down; 1 if the length is unknown.
     Consecutive examples of one recording are read together. Raises ConfigError or InputError if a
     recording cannot be read, or an example has no observation.
     """
