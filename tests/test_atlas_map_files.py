@@ -10,6 +10,7 @@ import yaml
 from test_atlas_maps import WALL, S, edge, map_of
 from test_atlas_places import CELL, plan_of
 
+from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.lasting import lasting_map
 from sceneslam.atlas.lasting.lasting_map import LastingMap
 from sceneslam.atlas.lasting.map_files import (
@@ -20,9 +21,12 @@ from sceneslam.atlas.lasting.map_files import (
     save_map_files,
 )
 from sceneslam.atlas.lasting.saved_map import empty_map
+from sceneslam.config.component import ComponentBuilder
 from sceneslam.graphs.edge import EdgeKind
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.files import MARK, owned
+
+ATLAS = "sceneslam.atlas.atlas.Atlas"
 
 
 def whole_map():
@@ -303,6 +307,30 @@ def test_what_could_not_be_saved_is_told_once(tmp_path, monkeypatch, failure):
     own.finish(Mapped(), 5 * S, lambda *_, **__: None)  # poses stay as loops corrected them
     (fault,) = own.faults
     assert fault.startswith("the map could not be saved: ") and "no space left" in fault
+
+
+LARGE = map_of(WALL, WALL, nodes=[[0, 0, 0], [400, 400, 0]])
+
+
+def test_a_map_that_is_too_large_to_load_is_named_with_its_key_and_folder(tmp_path):
+    save_map_files(LARGE, tmp_path)
+    builder = ComponentBuilder(
+        {"atlas": {"_target_": ATLAS, "voxel_m": 0.1, "load": f"{tmp_path}"}}
+    )
+    with pytest.raises(ConfigError, match="a floor plan of 403 m x 401 m") as caught:
+        builder.make("atlas", Atlas)
+    assert str(caught.value).startswith(f"atlas.load: got '{tmp_path}'")
+
+
+def test_a_run_whose_map_is_too_large_to_load_replaces_none(tmp_path):
+    save_map_files(whole_map(), tmp_path)
+    own = LastingMap(load=None, save=str(tmp_path), mode="extend", save_every_s=1.0)
+    run = Mapped()
+    run.saved = lambda: LARGE
+    own.finish(run, 0, lambda *_, **__: None)
+    (fault,) = own.faults
+    assert fault.startswith("the map could not be saved: ") and "403 m x 401 m" in fault
+    assert len(load_map_files(tmp_path).submaps) == 2
 
 
 def test_a_run_that_localizes_saves_no_map(tmp_path):

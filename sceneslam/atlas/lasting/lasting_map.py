@@ -51,6 +51,7 @@ class LastingMap:
         try:
             if self._load is not None:
                 self.loaded, seal = read_map_files(self._load)
+                self.loaded.check_size()
                 self._seal = seal if self._load == self._save else None
         except (InputError, OSError) as error:
             allowed = f"the folder of a saved map ({text_of(error)})"
@@ -111,7 +112,9 @@ class LastingMap:
         """Save a map; return whether it was possible."""
         assert self._save is not None
         try:
-            files = save_map_files(self._updated(saved, is_found), self._save, known=self._seal)
+            updated = self._updated(saved, is_found)
+            updated.check_size()  # no run could load it again
+            files = save_map_files(updated, self._save, known=self._seal)
         except Exception as error:  # the run and its poses do not depend on it
             _log.info("save", exc_info=error)
             self._fault(f"the map could not be saved: {text_of(error)}")

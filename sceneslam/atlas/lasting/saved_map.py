@@ -9,11 +9,12 @@ from itertools import compress
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan, join
+from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan, check_size, join
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.graphs.edge import Edge
 from sceneslam.types import planar
 from sceneslam.types.maps import PoseGraphLayer
+from sceneslam.types.planar import Planar
 from sceneslam.types.se3 import Transform
 from sceneslam.views.placed_views import are_covered
 from sceneslam.views.view import Landmarks
@@ -44,13 +45,12 @@ class SavedMap:
         return planar.from_transforms(self.T_map_node)
 
     def plan(self, piece: int = 0, *, newest_wins: bool = True) -> FloorPlan:
-        """Return the floor plan of a piece, in its frame."""
-        placed = [
-            (T, submap.plan)
-            for T, submap, own in zip(self.plane, self.submaps, self.pieces, strict=True)
-            if own == piece
-        ]
-        return join(placed, newest_wins=newest_wins)
+        """Return the floor plan of a piece, in its frame; raises InputError as `check_size`."""
+        return join(self._placed(piece), newest_wins=newest_wins)
+
+    def check_size(self) -> None:
+        """Raise InputError if the plan of the first piece, which runs load, is too large."""
+        check_size(self._placed(0))
 
     def views(self, piece: int = 0) -> list[tuple[Transform, Landmarks]]:
         """Return what a camera saw in a piece, and the poses (4, 4) it was seen from."""
@@ -100,6 +100,14 @@ class SavedMap:
                 if edge.first in number and edge.second in number
             ),
         )
+
+    def _placed(self, piece: int) -> list[tuple[Planar, FloorPlan]]:
+        """Return the plans of a piece with their poses in its frame, oldest first."""
+        return [
+            (T, submap.plan)
+            for T, submap, own in zip(self.plane, self.submaps, self.pieces, strict=True)
+            if own == piece
+        ]
 
 
 def empty_map() -> SavedMap:

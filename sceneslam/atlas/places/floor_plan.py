@@ -77,12 +77,13 @@ def draw(scans: Sequence[tuple[Planar, KeyScan]]) -> FloorPlan:
 def join(placed: Sequence[tuple[Planar, FloorPlan]], *, newest_wins: bool = False) -> FloorPlan:
     """Return one plan joined from plans at poses T_joined_plan, oldest first.
 
-    `newest_wins`: a wall is removed if a later plan saw free space around its cell.
+    `newest_wins`: a wall is removed if a later plan saw free space around its cell. Raises
+    InputError as `check_size` does.
     """
-    placed = [(T, plan) for T, plan in placed if len(plan) or plan.free.any()]
+    placed = _shown(placed)
     if not placed:
         return empty()
-    points = [planar.apply(T, plan.points.astype(np.float64)) for T, plan in placed]
+    points = _walls(placed)
     normals = [plan.normals @ planar.rotation(float(T[2])).T for T, plan in placed]
     low, (rows, columns) = _box(np.concatenate([*points, *(_corners(T, p) for T, p in placed)]))
     free = np.zeros((rows, columns), bool)
@@ -100,12 +101,29 @@ def join(placed: Sequence[tuple[Planar, FloorPlan]], *, newest_wins: bool = Fals
     return _plan(centres, mean, free, low)
 
 
+def check_size(placed: Sequence[tuple[Planar, FloorPlan]]) -> None:
+    """Raise InputError if a plan joined from plans at poses T_joined_plan needs too much memory."""
+    placed = _shown(placed)
+    if placed:
+        _box(np.concatenate([*_walls(placed), *(_corners(T, plan) for T, plan in placed)]))
+
+
 def grid_of(plan: FloorPlan) -> GridLayer:
     """Return a plan as an occupancy grid."""
     log_odds = np.where(plan.free, _FREE, 0.0).astype(np.float32)
     cells = plan.cells(plan.points)
     log_odds[cells[:, 1], cells[:, 0]] = _WALL
     return GridLayer(log_odds=log_odds, resolution_m=CELL_M, origin_xy_m=plan.origin_xy_m)
+
+
+def _shown(placed: Sequence[tuple[Planar, FloorPlan]]) -> list[tuple[Planar, FloorPlan]]:
+    """Return the plans that are not empty."""
+    return [(T, plan) for T, plan in placed if len(plan) or plan.free.any()]
+
+
+def _walls(placed: Sequence[tuple[Planar, FloorPlan]]) -> list[NDArray[np.float64]]:
+    """Return the wall points (P, 2) of each plan at its pose."""
+    return [planar.apply(T, plan.points.astype(np.float64)) for T, plan in placed]
 
 
 def _plan(
