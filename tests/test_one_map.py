@@ -5,6 +5,7 @@ import pytest
 from planar_poses import transforms
 
 from sceneslam.atlas.atlas import Atlas
+from sceneslam.atlas.lasting.map_files import load_map_files
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.places.registration import register
@@ -232,6 +233,21 @@ def test_a_live_search_that_fails_leaves_the_poses_and_is_named(monkeypatch):
     (fault,) = drive.faults
     assert "goes on without submaps" in fault and "division by zero" in fault
     assert len(drive.atlas.online) == len(drive.atlas.trajectory) == len(through(FLAT_TOUR[:3]))
+
+
+def test_a_final_solution_that_fails_leaves_the_last_one_and_the_map(monkeypatch, tmp_path):
+    monkeypatch.setattr("sceneslam.atlas.submaps.run_graph.solve", lambda *_, **__: 1 / 0)
+    drive, true = drive_twice_round(atlas(save=str(tmp_path / "map")))
+    (fault,) = drive.faults
+    assert fault.startswith("the graph was not solved at the end") and "by zero" in fault
+    before, after = drive.drifted_m(true, map_of(true)), drive.errors_m(true, map_of(true))
+    assert rms(after) < rms(before) / 2
+    saved = load_map_files(tmp_path / "map")
+    assert sum(edge.is_loop for edge in saved.edges) == len(drive.of_kind("loop")) >= 3
+    trajectory = drive.atlas.trajectory
+    starts_ns = [submap.stamps_ns[0] for submap in saved.submaps]
+    rows = np.searchsorted(trajectory.stamps_ns, starts_ns)
+    np.testing.assert_allclose(saved.T_map_node, trajectory.T_world_base[rows], atol=1e-9)
 
 
 def test_a_run_without_loops_stays_as_it_was_to_the_bit():

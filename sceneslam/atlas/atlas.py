@@ -139,6 +139,7 @@ class Atlas:
         at = partial(self._revised_at, revised)
         layers = [session.layers for session in self._sessions]
         self._end_with(self._mapper.finish(at, layers))
+        self._lasting.faults += self._mapper.faults
         self._lasting.finish(self._mapper, self._path.stamps_ns[-1], self._note)
 
     def _give_up(self, error: Exception) -> None:

@@ -7,6 +7,7 @@ looked for.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
@@ -29,6 +30,7 @@ from sceneslam.executors import executor
 from sceneslam.graphs.edge import Edge
 from sceneslam.scans.key_scan import KeyScanner
 from sceneslam.types import se3
+from sceneslam.types.errors import text_of
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
@@ -36,6 +38,7 @@ from sceneslam.types.se3 import Transform, Vector
 from sceneslam.views.view import Landmarks
 from sceneslam.views.view_finder import ViewFinder
 
+_log = logging.getLogger(__name__)
 _REST_NS = 1_000_000_000  # between two searches in the map while the robot stands
 _UNFOUND_NS = 5_000_000_000  # after this time a run reports that it was not located
 _RECENT = 80  # newest looks with a scan that the localizer gets
@@ -76,6 +79,7 @@ class Mapper:
         self._T_map_run: Transform | None = None
         self._began_ns: int | None = None
         self._has_told = False
+        self.faults: list[str] = []
         self.was_found = False  # the run was located in the loaded map, at any time
         self._graph = RunGraph(self._loaded, is_closed)
         self._solving: tuple[Chain, Future[SolvedRun]] | None = None
@@ -172,7 +176,7 @@ class Mapper:
         self._executor.shutdown(wait=False, cancel_futures=True)
 
     def finish(self, path: Path, maps: Sequence[MapLayers]) -> Correction:
-        """Solve the graph; return the correction of the poses.
+        """Solve the graph; return the correction of the poses. `faults` says if it failed.
 
         `path` is revised by the modules, `maps` are theirs, with their own loops.
         """
@@ -187,14 +191,16 @@ class Mapper:
         chain.remeasure(path)
         self._graph.forget(self._kept)
         old = np.array(chain.T_run_node)
-        self._solved = self._graph.finish(
-            chain,
-            old if self._T_map_run is None else self._T_map_run @ old,
-            path,
-            maps,
-            self._localizer.fixes if self._localizer is not None and self.is_placed else [],
-            is_level=self._collector.is_level,
-        )
+        fixes = self._localizer.fixes if self._localizer is not None and self.is_placed else []
+        start, is_level = self.T_map_run @ old, self._collector.is_level
+        try:
+            self._solved = self._graph.finish(chain, start, path, maps, fixes, is_level=is_level)
+        except Exception as error:  # what was solved during the run is kept
+            _log.info("final solution", exc_info=error)
+            self.faults.append(
+                f"the graph was not solved at the end, its last solution stays: {text_of(error)}"
+            )
+            self._solved = self._last_solved(start)
         self._is_over = True
         self._tell_loops()
         if not (self._solved.loops or chain.up_node or self.is_placed):
@@ -261,6 +267,19 @@ class Mapper:
         self._is_news |= bool(solved.loops or self._solved.loops)
         self._solved = solved
         self._tell_loops()
+
+    def _last_solved(self, T_map_node: NDArray[np.float64]) -> SolvedRun:
+        """Return the last solution during the run, for all of its nodes (N, 4, 4).
+
+        Later nodes follow it by the motions. It was without the loaded map: a run that was located
+        in that stays where it was located.
+        """
+        solved, loops = self._solved.T_map_node, self._solved.loops
+        if not loops or self.is_placed:
+            return SolvedRun(T_map_node=T_map_node, loops=loops)
+        last = len(solved) - 1
+        later = solved[last] @ se3.inverse(T_map_node[last]) @ T_map_node[last + 1 :]
+        return SolvedRun(T_map_node=np.concatenate([solved, later]), loops=loops)
 
     def _known_nodes(self) -> NDArray[np.float64]:
         """Return the nodes (N, 4, 4) that were solved, in the map that the run is in."""
