@@ -25,6 +25,8 @@ from sceneslam.testing.floor_plans import (
     twins,
 )
 from sceneslam.types import planar
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Camera, Rig, Sensor
 
 
 def world(walls, seed=0):
@@ -248,6 +250,23 @@ def test_a_final_solution_that_fails_leaves_the_last_one_and_the_map(monkeypatch
     starts_ns = [submap.stamps_ns[0] for submap in saved.submaps]
     rows = np.searchsorted(trajectory.stamps_ns, starts_ns)
     np.testing.assert_allclose(saved.T_map_node, trajectory.T_world_base[rows], atol=1e-9)
+
+
+def test_depth_images_of_another_size_are_left_out_and_named_once():
+    camera = Camera(size_wh=(64, 48), fx=40.0, fy=40.0, cx=31.5, cy=23.5)
+    rig = Rig(sensors=frozenset({Sensor.DEPTH}), camera=camera)
+    own, events = atlas(), []
+    own.open(rig, lambda event, *_, **fields: events.append((event, fields)))
+    own.begin_session("a", np.eye(4))
+    for index in range(60):
+        shape = (24, 32) if 20 <= index < 40 else (48, 64)
+        depth_m = np.full(shape, 2.0, np.float32)
+        own.add(index * 10**8, planar.to_transform(np.array([0.1 * index, 0.0, 0.0])), "a")
+        own.observe(Observation(stamp_ns=index * 10**8, depth_m=depth_m), None)
+    assert own.finish() == []
+    ((event, fields),) = events
+    assert event == "warning" and "depth_m: expected" in fields["what"]
+    assert len(own.fuse_maps().pose_graph.stamps_ns) == 3
 
 
 def test_a_run_without_loops_stays_as_it_was_to_the_bit():

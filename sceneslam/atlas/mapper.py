@@ -28,9 +28,9 @@ from sceneslam.atlas.submaps.own_loops import Path
 from sceneslam.atlas.submaps.run_graph import RunGraph, SolvedRun
 from sceneslam.executors import executor
 from sceneslam.graphs.edge import Edge
-from sceneslam.scans.key_scan import KeyScanner
+from sceneslam.scans.key_scan import KeyScan, KeyScanner
 from sceneslam.types import se3
-from sceneslam.types.errors import text_of
+from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
@@ -79,6 +79,7 @@ class Mapper:
         self._T_map_run: Transform | None = None
         self._began_ns: int | None = None
         self._has_told = False
+        self._has_refused = False  # a measurement
         self.faults: list[str] = []
         self.was_found = False  # the run was located in the loaded map, at any time
         self._graph = RunGraph(self._loaded, is_closed)
@@ -155,7 +156,7 @@ class Mapper:
             return
         if is_step:
             self._is_level = self._collector.step_to(known.T_map_base)
-        scan = self._scanner.make(observation) if is_scanned and self._is_level else None
+        scan = self._scan(observation) if is_scanned and self._is_level else None
         view, is_kept = None, is_step and self._views.is_kept(known.T_map_base)
         if is_kept or is_viewed:
             view = self._views.take(observation, known.T_map_base, is_kept=is_kept)
@@ -295,6 +296,18 @@ class Mapper:
         if views and rig.camera is not None and self._views.can_look:
             finder = ViewFinder(rig.camera, views)
         return MapLocalizer(plan, finder) if len(plan) or finder is not None else None
+
+    def _scan(self, observation: Observation) -> KeyScan | None:
+        """Return the scan of an observation; None without one, or with an invalid measurement."""
+        try:
+            return self._scanner.make(observation)
+        except InputError as error:  # as of a depth image that has another size than before
+            if not self._has_refused:
+                what = f"the submaps are without such a measurement: {error}"
+                _log.warning("%s", what)
+                self._note("warning", observation.stamp_ns, what=what)
+            self._has_refused = True
+            return None
 
     def _rests(self, stamp_ns: int) -> bool:
         """Tell whether a robot at rest should search the map."""
