@@ -16,6 +16,7 @@ from sceneslam.ros.transport.transport import Qos, Transport
 from sceneslam.sinks.ros2 import requests
 from sceneslam.sinks.ros2.topics import TopicSink
 from sceneslam.types.errors import ConfigError, text_of
+from sceneslam.types.files import replacing
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.run import Event
@@ -76,7 +77,8 @@ class FoxgloveSink(TopicSink):
         self._rig, self._images = rig, 0
         super().open(rig, folder)
         layout = files("sceneslam.sinks").joinpath(LAYOUT).read_text()
-        (folder / LAYOUT).write_text(layout)
+        with replacing(folder / LAYOUT) as file:
+            file.write(layout)
 
     def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
         """Publish an observation and its pose."""
