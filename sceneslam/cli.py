@@ -168,6 +168,9 @@ def carry_out(config: DictConfig) -> Ended:
         print(f"error: {error}", file=sys.stderr)
         give_back(folder)
         return Ended(code=UNUSABLE, errors=(str(error),))
+    except OSError as error:  # what is in the folder stays, as of an experiment
+        print(f"error: {text_of(error)}", file=sys.stderr)
+        return Ended(code=UNUSABLE, errors=(text_of(error),))
     except KeyboardInterrupt as stop:
         print(f"error: {str(stop) or 'stopped before the first observation'}", file=sys.stderr)
         raise

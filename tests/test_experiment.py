@@ -10,10 +10,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from configured import config
+from omegaconf import OmegaConf
 
+from sceneslam import cli
 from sceneslam.evaluation.verdict import verdict_lines, write_verdict
 from sceneslam.experiment import _run_unless_finished, _Trials
 from sceneslam.experiments.openloris.dataset import Dataset
@@ -184,6 +187,20 @@ def test_runs_beside_each_other_give_what_runs_in_turn_give_and_go_on_where_they
     done = call(folder, "openloris.path=data", "jobs=2", out="beside")
     assert done.returncode == 0 and first.is_file()
     assert {path: path.stat().st_mtime_ns for path in others} == was
+
+
+def test_a_disk_that_fails_in_an_experiment_is_one_sentence(tmp_path, monkeypatch, capsys):
+    def fail(*_):
+        raise OSError(5, "input/output error", "verdict.json")
+
+    runtime, task = SimpleNamespace(output_dir=str(tmp_path)), SimpleNamespace(task=[])
+    given = SimpleNamespace(runtime=runtime, overrides=task)
+    monkeypatch.setattr(cli.HydraConfig, "get", lambda: given)
+    monkeypatch.setattr(cli, "run_experiment", fail)
+    ended = cli.carry_out(OmegaConf.create({"experiment": "matrix", "allow_targets": []}))
+    sentence = "OSError: [Errno 5] input/output error: 'verdict.json'"
+    assert ended == cli.Ended(code=cli.UNUSABLE, errors=(sentence,))
+    assert capsys.readouterr().err == f"error: {sentence}\n"
 
 
 def test_a_trial_whose_metrics_could_not_be_saved_is_run_again(tmp_path, monkeypatch):
