@@ -19,7 +19,7 @@ from sceneslam.config.resolve import resolved
 from sceneslam.detection.features import RecordingFeatures
 from sceneslam.detection.grid import Axis, try_all
 from sceneslam.detection.run import detect
-from sceneslam.types.errors import ConfigError
+from sceneslam.types.errors import ConfigError, ModuleError
 from sceneslam.types.files import AppendedFile
 from sceneslam.types.truth import SceneChange
 
@@ -145,6 +145,58 @@ def test_features_are_kept_to_the_bit(tmp_path):
     for name in ("stamps_ns", "values", "is_there"):
         assert np.array_equal(getattr(read, name), getattr(features, name))
     assert read.scenes == features.scenes
+
+
+def torn(path):
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def emptied(path):
+    path.write_bytes(b"")
+
+
+def with_a_wrong_byte(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 0xFF
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("harm", [torn, emptied, with_a_wrong_byte])
+def test_damaged_features_are_computed_again(config, tmp_path, monkeypatch, harm, caplog):
+    monkeypatch.setenv("SCENESLAM_CACHE_DIR", str(tmp_path / "cache"))
+    words = config(*TINY, "run=detect_only", "run.max_observations=20")
+    detect(words, tmp_path / "first")
+    (kept,) = (tmp_path / "cache").glob("*.npz")
+    whole = kept.read_bytes()
+    harm(kept)
+    detect(words, tmp_path / "second")
+    assert "cached features are damaged" in caplog.text
+    assert len(RecordingFeatures.read(kept).stamps_ns) == 20 and len(kept.read_bytes()) == len(
+        whole
+    )
+    first, second = (tmp_path / name / "events.jsonl" for name in ("first", "second"))
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_features_that_cannot_be_kept_cost_no_result(config, tmp_path, monkeypatch, caplog):
+    def fail(features, path):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(RecordingFeatures, "write", fail)
+    words = config(*TINY, "run=detect_only", "run.max_observations=15")
+    assert detect(words, tmp_path) == () and (tmp_path / "metrics.json").is_file()
+    assert "the features are not kept" in caplog.text and "no space left" in caplog.text
+
+
+@pytest.mark.parametrize("method", ["activate", "get_features", "decide"])
+def test_a_detector_that_fails_is_one_sentence(config, tmp_path, monkeypatch, method):
+    def fail(*_):
+        raise OSError("the camera is gone")
+
+    monkeypatch.setattr(f"sceneslam.modules.detectors.grey_mean.GreyMean.{method}", fail)
+    words = config(*TINY, "run=detect_only", "run.max_observations=12")
+    with pytest.raises(ModuleError, match="the detector failed: OSError: the camera is gone"):
+        detect(words, tmp_path)
 
 
 def test_detector_without_features_is_refused(config, tmp_path):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.scene_filter import ConfirmedScene, SceneFilter
-from sceneslam.detection.features import RecordingFeatures
+from sceneslam.detection.features import RecordingFeatures, failures_named
 from sceneslam.interfaces import FeatureDetector
 from sceneslam.types.observation import SceneVote
 from sceneslam.types.rig import Rig
@@ -23,13 +23,17 @@ class Filtered:
 
 
 def vote(detector: FeatureDetector, rig: Rig, features: RecordingFeatures) -> list[SceneVote]:
-    """Return the detector's vote for each observation of stored features."""
-    detector.activate(rig)
+    """Return the detector's vote for each observation of stored features.
+
+    Raises ModuleError if the detector fails.
+    """
     rows = zip(
         features.stamps_ns.tolist(), features.values, features.is_there.tolist(), strict=True
     )
-    votes = [detector.decide(at, row if is_there else None) for at, row, is_there in rows]
-    detector.shutdown()
+    with failures_named():
+        detector.activate(rig)
+        votes = [detector.decide(at, row if is_there else None) for at, row, is_there in rows]
+        detector.shutdown()
     return votes
 
 

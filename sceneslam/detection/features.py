@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.interfaces import FeatureDetector
+from sceneslam.types.errors import ModuleError, SceneSlamError, text_of
 from sceneslam.types.observation import Observation
 from sceneslam.types.truth import GroundTruth, SceneChange
 
@@ -50,7 +52,7 @@ class RecordingFeatures:
     @classmethod
     def read(cls, path: Path) -> RecordingFeatures:
         """Return the features of a file, exactly as written."""
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             scenes = json.loads(str(arrays["scenes"]))
             return cls(
                 stamps_ns=arrays["stamps_ns"],
@@ -63,14 +65,29 @@ class RecordingFeatures:
             )
 
 
+@contextmanager
+def failures_named() -> Iterator[None]:
+    """Raise ModuleError where the detector, which is called within, fails."""
+    try:
+        yield
+    except SceneSlamError:
+        raise
+    except Exception as error:
+        raise ModuleError(f"the detector failed: {text_of(error)}") from error
+
+
 def measure(
     observations: Iterable[Observation], detector: FeatureDetector
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Return stamps (N,) [ns], features (N, F) and whether there was input (N,)."""
+    """Return stamps (N,) [ns], features (N, F) and whether there was input (N,).
+
+    Raises ModuleError if the detector fails.
+    """
     stamps_ns, rows = [], []
     for observation in observations:
         stamps_ns.append(observation.stamp_ns)
-        rows.append(detector.get_features(observation))
+        with failures_named():
+            rows.append(detector.get_features(observation))
     width = max((len(row) for row in rows if row is not None), default=0)
     values = np.zeros((len(rows), width))
     for number, row in enumerate(rows):

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
+import zipfile
+import zlib
 from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
@@ -14,9 +17,11 @@ from tqdm import tqdm
 
 from sceneslam.config.provenance import code_sha256, input_sha256
 from sceneslam.config.settings import RunSettings
-from sceneslam.detection.features import RecordingFeatures, measure
+from sceneslam.detection.features import RecordingFeatures, failures_named, measure
 from sceneslam.interfaces import FeatureDetector, Source
+from sceneslam.types.errors import text_of
 
+_log = logging.getLogger(__name__)
 _CACHE = "~/.cache/sceneslam"
 _WITHOUT_EFFECT = ("progress", "workers")  # keys of a source that do not change its images
 
@@ -26,16 +31,19 @@ def recall(
 ) -> RecordingFeatures:
     """Return the detector's features for all observations of the source.
 
-    Raises InputError if the source cannot be read.
+    Raises InputError if the source cannot be read, ModuleError if the detector fails.
     """
     path = _path(config, detector)
-    if path.is_file():
-        return RecordingFeatures.read(path)
-    detector.activate(source.rig)
+    kept = _kept(path)
+    if kept is not None:
+        return kept
+    with failures_named():
+        detector.activate(source.rig)
     observations = islice(source, run.max_observations)
     bar = tqdm(observations, desc="features", unit="obs", disable=not run.progress)
     stamps_ns, values, is_there = measure(bar, detector)
-    detector.shutdown()
+    with failures_named():
+        detector.shutdown()
     truth = source.ground_truth()
     scenes = truth.scenes if truth is not None and truth.scenes else None
     found = RecordingFeatures(
@@ -45,8 +53,20 @@ def recall(
         scenes=scenes,
         faults=tuple(source.faults),
     )
-    found.write(path)
+    try:
+        found.write(path)
+    except OSError as error:
+        _log.warning("the features are not kept for the next time: %s", text_of(error))
     return found
+
+
+def _kept(path: Path) -> RecordingFeatures | None:
+    """Return cached features, None without them or if their file is damaged."""
+    try:
+        return RecordingFeatures.read(path) if path.is_file() else None
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        _log.warning("cached features are damaged, %s: %s", text_of(error), path)
+        return None
 
 
 def _path(config: Mapping[str, Any], detector: FeatureDetector) -> Path:
