@@ -18,7 +18,7 @@ from test_isolation import active, drive_into, seen
 from sceneslam.app import run
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.modules.detectors.grey_mean import GreyMean
-from sceneslam.types.errors import InputError, ModuleError
+from sceneslam.types.errors import ConfigError, InputError, ModuleError
 
 ERRORS = sorted(hostile.ERRORS.keys() - {"KeyboardInterrupt"})  # that one ends the run
 SOUND = {"covariance huge"}  # it may be so
@@ -142,6 +142,22 @@ def test_a_sink_that_cannot_be_opened_leaves_no_live_source_open(tmp_path):
     source = {"_target_": "fakes.LiveFeedSource", "steps": 100, "dark_from": 1000}
     with pytest.raises(InputError, match="could not be opened"):
         run(hostile_config(sinks=sinks, source=source, run__mode="live"), tmp_path)
+    assert not LiveFeedSource.is_open
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, r"run\.mode: got 'recording'"),
+        ({"run__mode": "live", "slam__bright": {"_target_": "fakes.DepthModule"}}, "slam.bright"),
+        ({"run__mode": "live", "effects": {"_target_": "fakes.Mute"}}, "effects: got"),
+    ],
+)
+def test_parts_that_do_not_fit_leave_no_live_source_open(tmp_path, monkeypatch, changes, said):
+    monkeypatch.setattr(LiveFeedSource, "is_open", True)
+    source = {"_target_": "fakes.LiveFeedSource", "steps": 100, "dark_from": 1000}
+    with pytest.raises(ConfigError, match=said):
+        run(config(source=source, **changes), tmp_path)
     assert not LiveFeedSource.is_open
 
 

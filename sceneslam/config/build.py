@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -14,7 +15,7 @@ from sceneslam.config.check import NOTHING, check_keys
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.settings import DETECT_ONLY, LIVE, RunSettings
 from sceneslam.evaluation.settings import EvaluationSettings
-from sceneslam.interfaces import Detector, Live, Sink, SlamModule, Source
+from sceneslam.interfaces import Detector, Live, LiveFeed, Sink, SlamModule, Source
 from sceneslam.sources.contract.ordered import Ordered
 from sceneslam.sources.contract.rising_live import RisingLive
 from sceneslam.supervision.isolated import IsolatedModule
@@ -44,9 +45,7 @@ class RunParts:
         for module in self.modules.values():
             if isinstance(module, IsolatedModule):
                 module.close()
-        feed = self.source.live if isinstance(self.source, Live) else None
-        if feed is not None:
-            feed.close()
+        _release(self.source)
 
 
 def build(config: Mapping[str, Any]) -> RunParts:
@@ -68,11 +67,14 @@ def build(config: Mapping[str, Any]) -> RunParts:
     evaluation = builder.make("evaluation", EvaluationSettings)
     sinks = {key: builder.make(f"sinks.{key}", Sink) for key in _group(config, "sinks")}
     source = make_source(config, builder)
-    _check_mode(run, source)
-    rig = source.rig
-    check_detector(config, detector, rig)
-    for key in modules:
-        _check_sensors(f"slam.{key}", config["slam"][key], requires[key], rig)
+    with ExitStack() as opened:  # closed again if it does not fit
+        opened.callback(_release, source)
+        _check_mode(run, source)
+        rig = source.rig
+        check_detector(config, detector, rig)
+        for key in modules:
+            _check_sensors(f"slam.{key}", config["slam"][key], requires[key], rig)
+        opened.pop_all()
     return RunParts(
         source=source,
         rig=rig,
@@ -88,11 +90,15 @@ def build(config: Mapping[str, Any]) -> RunParts:
 
 
 def make_source(config: Mapping[str, Any], builder: ComponentBuilder) -> Source:
-    """Return the source with its effects."""
+    """Return the source with its effects; a live one is closed if they cannot be built."""
     source = builder.make("source", Source)
     if config.get("effects"):
-        source = builder.make("effects", Source, source)
-    feed = source.live if isinstance(source, Live) else None
+        with ExitStack() as opened:
+            opened.callback(_release, source)
+            changed = builder.make("effects", Source, source)
+            opened.pop_all()
+        source = changed
+    feed = _feed(source)
     return Ordered(source) if feed is None else RisingLive(source, feed)
 
 
@@ -112,8 +118,20 @@ def check_no_map(config: Mapping[str, Any]) -> None:
 
 def _check_mode(run: RunSettings, source: Source) -> None:
     """Raise ConfigError if a live source is run in another mode than `live`."""
-    if run.mode != LIVE and isinstance(source, Live) and source.live is not None:
+    if run.mode != LIVE and _feed(source) is not None:
         raise ConfigError("run.mode", run.mode, f"{LIVE}, since this source measures now: run=live")
+
+
+def _feed(source: Source) -> LiveFeed | None:
+    """Return the feed of a live source, None if it is recorded."""
+    return source.live if isinstance(source, Live) else None
+
+
+def _release(source: Source) -> None:
+    """Close a source if it is live."""
+    feed = _feed(source)
+    if feed is not None:
+        feed.close()
 
 
 def _module(builder: ComponentBuilder, run: RunSettings, key: str) -> SlamModule:
