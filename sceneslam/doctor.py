@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import difflib
 import logging
+import re
 from collections.abc import Iterator, Sequence
 from importlib.resources import files
 from typing import Any
 
 from sceneslam.config.build import make_source
+from sceneslam.config.check import TOP_LEVEL
 from sceneslam.config.component import ComponentBuilder
+from sceneslam.config.words import is_override
 from sceneslam.interfaces import Live, SlamModule
 from sceneslam.script import composed
 from sceneslam.sources.survey.preflight import Preflight, preflight
@@ -31,11 +35,14 @@ _BOTH = (  # scenarios and required sensors; the first that fits is proposed
 def examine(words: Sequence[str]) -> list[str]:
     """Return the lines of `python -m sceneslam doctor source=NAME [source.KEY=VALUE ...]`.
 
-    Raises ConfigError or InputError if the source cannot be read.
+    Words for other keys, as of a command that is to be run, have no effect. Raises ConfigError for
+    a word that is none, ConfigError or InputError if the source cannot be read.
     """
+    for word in words:
+        _check_word(word)
     if not any(word.startswith("source=") for word in words):
         raise ConfigError("doctor", " ".join(words) or "nothing", "source=NAME, as source=ros2")
-    words = [word for word in words if word.startswith(("source", "effects"))]
+    words = [word for word in words if _key_of(word) in ("source", "effects")]
     config: dict[str, Any] = composed(tuple(words), None)
     source = make_source(config, ComponentBuilder(config))
     feed = source.live if isinstance(source, Live) else None
@@ -56,6 +63,20 @@ def examine(words: Sequence[str]) -> list[str]:
         "",
         *_proposal(words, rig, is_live=feed is not None),
     ]
+
+
+def _key_of(word: str) -> str:
+    """Return the top-level key that a word of the command line sets."""
+    return re.split(r"[=.@]", word.lstrip("+~"), maxsplit=1)[0]
+
+
+def _check_word(word: str) -> None:
+    """Raise ConfigError for a word of the command line that sets no known key."""
+    key, known = _key_of(word), (*TOP_LEVEL, "scenario", "experiment")
+    if not is_override(word) or key not in known:
+        close = difflib.get_close_matches(key, known, n=1)
+        hint = f" (did you mean {close[0]}?)" if close else ""
+        raise ConfigError("doctor", word, f"source=NAME, source.KEY=VALUE, effects=NAME{hint}")
 
 
 def _places(rig: Rig) -> Iterator[str]:

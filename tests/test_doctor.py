@@ -58,6 +58,21 @@ def test_doctor_wants_a_source():
         examine(("seed=1",))
 
 
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("sorce.path=scans.mcap", r"got 'sorce.path=scans.mcap', .* \(did you mean source\?\)"),
+        ("efects=lights_out", r"did you mean effects\?"),
+        ("--hlep", "got '--hlep', allowed: source=NAME"),
+        ("+source.pth=scans.mcap", r"source\.pth"),
+        ("source", "got 'source', allowed: source=NAME"),
+    ],
+)
+def test_a_misspelt_word_is_refused_with_the_nearest_known_one(tmp_path, word, said):
+    with pytest.raises(ConfigError, match=said):
+        examine(("source=rosbag", f"source.path={tmp_path}", word))
+
+
 def test_nobody_there_is_an_input_error(monkeypatch):
     monkeypatch.setattr(ros2, "open_transport", lambda network: Robot())
     with pytest.raises(InputError, match="nobody publishes a sensor there"):
