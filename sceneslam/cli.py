@@ -74,6 +74,9 @@ def main() -> None:
         if codes and not isinstance(error, HydraException):  # errors of a run are handled there
             raise
         codes.append(_say(error))
+    except SystemExit as stop:  # Hydra exits with 0 after --help, whatever was printed
+        if stop.code:
+            raise
     except KeyboardInterrupt:  # also ends a sweep
         codes.append(INCOMPLETE)
     # The results of a run are in its folder, whatever standard output lost.

@@ -107,7 +107,7 @@ def test_reader_that_has_gone_is_no_error(folder, asked):
     assert (done.returncode, done.stderr) == (0, b"")
 
 
-@pytest.mark.parametrize("asked", ["list", "--version"])
+@pytest.mark.parametrize("asked", ["list", "--version", "--help", "--hydra-help"])
 def test_answer_that_a_full_disk_loses_is_an_error(folder, asked):
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with Path("/dev/full").open("wb") as full:
