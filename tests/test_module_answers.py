@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from fakes import ExactModule, observation
 
+from sceneslam.atlas.fusion import Placed, fuse
 from sceneslam.bus.answers import checked_layers, checked_tracking, checked_trajectory
 from sceneslam.types import se3
 from sceneslam.types.maps import (
@@ -153,6 +154,30 @@ def test_arrays_of_one_layer_have_one_length(name, field):
     short = replace(layer, **{field: getattr(layer, field)[:-1]})
     with pytest.raises(ValueError, match=rf"^{name}\."):
         checked_layers(MapLayers(**{name: short}))
+
+
+@pytest.mark.parametrize("kind", [bool, complex, object])
+@pytest.mark.parametrize(("name", "field"), [one for one in ARRAYS if one[1] != "is_loop"])
+def test_an_array_of_another_type_is_refused_with_its_name(name, field, kind):
+    odd = getattr(LAYERS[name], field).astype(kind)
+    with pytest.raises(ValueError, match=rf"^{name}\.{field}: expected numbers, got {odd.dtype}"):
+        checked_layers(MapLayers(**{name: replace(LAYERS[name], **{field: odd})}))
+
+
+@pytest.mark.parametrize("odd", [None, 1.0, "ab", (1.0, 2.0, 0.0), (np.nan, 0.0), (0.0, 1e9)])
+def test_a_grid_has_a_corner_of_two_numbers(odd):
+    grid = replace(LAYERS["grid"], origin_xy_m=odd)
+    with pytest.raises(ValueError, match=r"^grid\.origin_xy_m: expected \(x, y\)"):
+        checked_layers(MapLayers(grid=grid))
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float64, np.longdouble, np.int8])
+def test_a_grid_of_any_numbers_is_fused(kind):
+    grid = replace(LAYERS["grid"], log_odds=LAYERS["grid"].log_odds.astype(kind))
+    layers = checked_layers(MapLayers(grid=grid))
+    placed = Placed(module="a", T_map_local=np.eye(4), layers=layers)
+    fused = fuse([placed], voxel_m=0.05).grid
+    assert fused.log_odds.dtype == np.float32 and (fused.log_odds == 1.0).sum() == 28
 
 
 @pytest.mark.parametrize(("name", "field"), [("grid", "resolution_m"), ("scans", "cell_m")])

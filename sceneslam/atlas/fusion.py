@@ -171,7 +171,8 @@ def _resample(
     offset = T[:2, :2] @ centre + T[:2, 3] - np.array(grid.origin_xy_m) - grid.resolution_m / 2
     affine = np.column_stack([scale * T[:2, :2], offset / grid.resolution_m])
     flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpAffine(grid.log_odds, affine, size_wh, flags=flags), np.float32)
+    log_odds = grid.log_odds.astype(np.float32, copy=False)  # OpenCV knows few types
+    return np.asarray(cv2.warpAffine(log_odds, affine, size_wh, flags=flags))
 
 
 def _planar(T_map_local: Transform) -> Transform:

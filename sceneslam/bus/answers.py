@@ -8,12 +8,13 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.types.maps import LAYER_TYPES, MapLayers
+from sceneslam.types.maps import LAYER_TYPES, GridLayer, MapLayers
 from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.trajectory import Trajectory
 
 _FAR_M = 1e8  # more than twice around the Earth
 _SKEW_MAX = 1e-3  # largest deviation of R^T R from the identity; float32 rounds to 1e-6
+_NUMBER, _BOOL = "fiu", "biu"  # kinds of types (NumPy)
 _Shapes = dict[str, tuple[str | int, ...]]
 _SHAPES: dict[str, _Shapes] = {  # of the arrays of each layer
     "points": {"points": ("N", 3), "colors_bgr": ("N", 3)},
@@ -77,6 +78,8 @@ def checked_trajectory(trajectory: object) -> Trajectory:
 def checked_layers(layers: object) -> MapLayers:
     """Return a map whose arrays have the declared shapes and hold finite numbers."""
     layers = _of("get_map's answer", layers, MapLayers)
+    if layers.grid is not None:
+        _check_origin(_of("grid", layers.grid, GridLayer).origin_xy_m)
     for name, kind in LAYER_TYPES.items():
         layer = getattr(layers, name)
         if layer is not None:
@@ -106,8 +109,20 @@ def _check_layer(name: str, layer: Any, shapes: _Shapes) -> None:
                     sizes.setdefault(str(axis), size)
             expected = tuple(a if isinstance(a, int) else sizes.get(a) for a in shapes[field.name])
             _check_shape(key, array, expected)
+            if array.dtype.kind not in (_BOOL if field.name == "is_loop" else _NUMBER):
+                raise ValueError(f"{key}: expected numbers, got {array.dtype}")
             if not np.isfinite(array).all():
                 raise ValueError(f"{key}: it is not finite")
+
+
+def _check_origin(origin_xy_m: object) -> None:
+    """Raise ValueError unless the corner of a grid is two finite numbers."""
+    try:
+        corner = np.array(origin_xy_m, np.float64)
+    except (TypeError, ValueError):
+        corner = np.zeros(0)
+    if corner.shape != (2,) or not (np.abs(corner) <= _FAR_M).all():
+        raise ValueError(f"grid.origin_xy_m: expected (x, y) on Earth [m], got {origin_xy_m!r}")
 
 
 def _of(name: str, value: object, kind: type[Value]) -> Value:
