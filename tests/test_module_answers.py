@@ -8,6 +8,7 @@ import pytest
 from fakes import ExactModule, observation
 
 from sceneslam.atlas.fusion import Placed, fuse
+from sceneslam.atlas.save import save_points
 from sceneslam.bus.answers import checked_layers, checked_tracking, checked_trajectory
 from sceneslam.types import se3
 from sceneslam.types.maps import (
@@ -169,6 +170,22 @@ def test_a_grid_has_a_corner_of_two_numbers(odd):
     grid = replace(LAYERS["grid"], origin_xy_m=odd)
     with pytest.raises(ValueError, match=r"^grid\.origin_xy_m: expected \(x, y\)"):
         checked_layers(MapLayers(grid=grid))
+
+
+@pytest.mark.parametrize("value", [-1, 256, 0.5])
+def test_colours_that_are_no_bytes_are_refused(value):
+    points = replace(LAYERS["points"], colors_bgr=np.full((5, 3), value))
+    with pytest.raises(ValueError, match=r"^points\.colors_bgr: expected 0 to 255, got"):
+        checked_layers(MapLayers(points=points))
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.int64])
+def test_colours_of_wider_integers_are_saved_as_bytes(tmp_path, kind):
+    points = replace(LAYERS["points"], colors_bgr=np.full((5, 3), 200, kind))
+    layers = checked_layers(MapLayers(points=points))
+    placed = Placed(module="a", T_map_local=np.eye(4), layers=layers)
+    save_points(fuse([placed], voxel_m=0.05), tmp_path / "points.ply")
+    assert b"property uchar red" in (tmp_path / "points.ply").read_bytes()
 
 
 @pytest.mark.parametrize("kind", [np.float16, np.float64, np.longdouble, np.int8])

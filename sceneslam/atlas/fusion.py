@@ -53,7 +53,7 @@ def fuse(
             continue
         points.append(layer.points)
         grey = np.full((len(layer.points), 3), _GREY, np.uint8)
-        colors.append(grey if layer.colors_bgr is None else layer.colors_bgr)
+        colors.append(grey if layer.colors_bgr is None else layer.colors_bgr.astype(np.uint8))
         owners.append(np.full(len(layer.points), modules.index(one.module), np.uint8))
     cloud, color = np.concatenate(points), np.concatenate(colors)
     owner = np.concatenate([np.zeros(0, np.uint8), *owners])

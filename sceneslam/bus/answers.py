@@ -86,6 +86,8 @@ def checked_layers(layers: object) -> MapLayers:
             _check_layer(name, _of(name, layer, kind), _SHAPES[name])
     if layers.grid is not None and not layers.grid.resolution_m > 0:
         raise ValueError(f"grid.resolution_m: expected above 0, got {layers.grid.resolution_m}")
+    if layers.points is not None and layers.points.colors_bgr is not None:
+        _check_colors(layers.points.colors_bgr)
     if layers.scans is not None and not layers.scans.cell_m > 0:
         raise ValueError(f"scans.cell_m: expected above 0, got {layers.scans.cell_m}")
     if layers.pose_graph is not None:
@@ -123,6 +125,12 @@ def _check_origin(origin_xy_m: object) -> None:
         corner = np.zeros(0)
     if corner.shape != (2,) or not (np.abs(corner) <= _FAR_M).all():
         raise ValueError(f"grid.origin_xy_m: expected (x, y) on Earth [m], got {origin_xy_m!r}")
+
+
+def _check_colors(colors_bgr: NDArray[Any]) -> None:
+    kind, low, high = colors_bgr.dtype, colors_bgr.min(initial=0), colors_bgr.max(initial=0)
+    if kind.kind == "f" or low < 0 or high > 255:
+        raise ValueError(f"points.colors_bgr: expected 0 to 255, got {kind}: {low} to {high}")
 
 
 def _of(name: str, value: object, kind: type[Value]) -> Value:
