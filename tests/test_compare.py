@@ -83,6 +83,20 @@ def test_nothing_foreign_and_no_run_is_overwritten(runs, tmp_path, capsys):
     assert capsys.readouterr().err.count("error: --out") == 2
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("metrics.json", "[]"), ("metrics.json", "{}"), ("config.yaml", "words")],
+)
+def test_files_that_are_not_those_of_a_run_are_named(runs, tmp_path, capsys, name, text):
+    whole = runs[0].folder
+    for one in ("metrics.json", "trajectory.tum", "config.yaml"):
+        (tmp_path / one).write_bytes((whole / one).read_bytes())
+    (tmp_path / name).write_text(text)
+    assert main([str(whole), str(tmp_path), "--out", str(tmp_path / "page")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and name in error and str(tmp_path) in error
+
+
 @pytest.mark.parametrize("kind", ["one", "twice", "empty", "damaged"])
 def test_what_cannot_be_compared_is_named(runs, tmp_path, capsys, kind):
     whole = runs[0].folder

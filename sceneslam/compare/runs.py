@@ -72,6 +72,10 @@ def _read(folder: Path, name: str) -> Run:
         config = yaml.safe_load((folder / "config.yaml").read_text("utf-8"))
     except (ValueError, yaml.YAMLError) as error:
         raise InputError(f"damaged metrics.json or config.yaml: {folder}") from error
+    if not isinstance(metrics, Mapping) or not isinstance(config or {}, Mapping):
+        raise InputError(f"metrics.json or config.yaml is not a table: {folder}")
+    if "association_gap_s" not in metrics:
+        raise InputError(f"metrics.json is not that of a run, no association_gap_s: {folder}")
     truth = folder / "groundtruth.tum"
     return Run(
         name=name,
