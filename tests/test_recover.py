@@ -115,7 +115,7 @@ def test_a_recording_that_is_gone_costs_the_ground_truth_alone(tmp_path, capsys)
     assert len(Trajectory.read_tum(folder / "trajectory.tum")) == 21
 
 
-@pytest.mark.parametrize("what", ["nothing", "empty", "no_config", "garbage"])
+@pytest.mark.parametrize("what", ["nothing", "empty", "no_config", "garbage", "a_folder"])
 def test_what_is_no_run_is_told_and_left_alone(tmp_path, capsys, what):
     folder = tmp_path / "run"
     if what != "nothing":
@@ -125,6 +125,9 @@ def test_what_is_no_run_is_told_and_left_alone(tmp_path, capsys, what):
         (folder / "config.yaml").unlink()
     if what == "garbage":
         (folder / "journal.bin").write_bytes(b"garbage")
+    if what == "a_folder":
+        (folder / "journal.bin").unlink()
+        (folder / "journal.bin").mkdir()
     assert main([str(folder)]) == 2
     assert capsys.readouterr().err.startswith("error: ")
     assert not (folder / "trajectory.tum").exists()

@@ -13,7 +13,7 @@ from sceneslam.recover.recover import recover
 from sceneslam.storage.folder import RunFolder
 from sceneslam.storage.journal import JOURNAL
 from sceneslam.streams import secure_streams
-from sceneslam.types.errors import InputError, SceneSlamError
+from sceneslam.types.errors import InputError, SceneSlamError, text_of
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -30,8 +30,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise InputError(f"nothing to recover, there is no {JOURNAL}: {folder}")
         with closing(RunFolder.claim(folder)):
             recovered = recover(folder)
-    except SceneSlamError as error:
-        print(f"error: {error}", file=sys.stderr)
+    except (SceneSlamError, OSError) as error:
+        said = str(error) if isinstance(error, SceneSlamError) else text_of(error)
+        print(f"error: {said}", file=sys.stderr)
         return 2
     for sentence in recovered.missing:
         print(f"missing: {sentence}", file=sys.stderr)
