@@ -24,7 +24,8 @@ from sceneslam.config.check import check_keys
 from sceneslam.sweep.__main__ import main
 from sceneslam.sweep.backends import Basic, Joblib, Ray, Submitit
 from sceneslam.sweep.supervise import JobOrder, run_job
-from sceneslam.types.errors import ConfigError
+from sceneslam.sweep.sweep import run_sweep
+from sceneslam.types.errors import ConfigError, InputError
 
 ROOT = Path(__file__).parents[1]
 JOBS = ("+scenario=single", "source=mcap", "source.path=room.mcap", "slam@slam.only=odometry")
@@ -180,6 +181,28 @@ def test_job_that_a_real_time_signal_ends_is_settled(tmp_path):
 def test_folder_that_is_no_sweep_is_named(tmp_path, capsys):
     assert main([str(tmp_path)]) == 2
     assert "not the folder of a sweep" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["", '{"launcher": {', "[]", "{}", '{"launcher": 3}'])
+def test_a_sweep_whose_file_is_damaged_is_named(tmp_path, capsys, text):
+    (tmp_path / ".sweep").mkdir()
+    (tmp_path / ".sweep" / "sweep.json").write_text(text)
+    assert main([str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: the sweep's file is damaged") and "sweep.json" in error
+
+
+def test_the_file_of_a_sweep_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch):
+    def fail(descriptor):
+        raise OSError("no space left on device")
+
+    with pytest.raises(InputError, match="no run in the folder"):
+        run_sweep(tmp_path, [], {"backend": "basic"}, tmp_path)
+    before = (tmp_path / ".sweep" / "sweep.json").read_text()
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError, match="no space left"):
+        run_sweep(tmp_path, [], {"backend": "joblib", "n_jobs": 2, "cpus_per_job": 1}, tmp_path)
+    assert (tmp_path / ".sweep" / "sweep.json").read_text() == before
 
 
 @pytest.mark.parametrize(

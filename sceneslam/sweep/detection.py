@@ -24,6 +24,7 @@ from sceneslam.collect.status import State
 from sceneslam.collect.write import write_rows
 from sceneslam.config.resolve import resolved, without_hydra
 from sceneslam.detection.grid import Axis, Tried, try_all
+from sceneslam.types.files import whole
 
 _INNER = ("detector.", "policy.")  # keys that need no new composition and no new reading
 _TOLD_ERRORS = 5  # shown; the table has all
@@ -49,7 +50,8 @@ def sweep_detection(
             for tried in try_all(resolved(without_hydra(cell.config)), cell.axes):
                 rows.append(_row(len(rows), cell.chosen, tried))
                 bar.update()
-    (folder / ROWS).write_text("".join(json.dumps(asdict(row)) + "\n" for row in rows))
+    with whole(folder / ROWS) as file:
+        file.writelines(json.dumps(asdict(row)) + "\n" for row in rows)
     page = write_rows(folder, rows)
     print(overview(rows), end="")
     for cell in cells:

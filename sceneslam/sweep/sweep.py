@@ -18,7 +18,8 @@ from sceneslam.sweep.backends import BACKENDS, Backend
 from sceneslam.sweep.progress import Progress
 from sceneslam.sweep.snapshot import keep_code
 from sceneslam.sweep.supervise import JobOrder, settle
-from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.errors import ConfigError, InputError, text_of
+from sceneslam.types.files import whole
 
 _OWN = ".sweep"  # in a sweep's folder: launcher, code and stop file
 _KEPT = "sweep.json"
@@ -37,7 +38,8 @@ def run_sweep(
     own = sweep / _OWN
     own.mkdir(parents=True, exist_ok=True)
     kept = {"launcher": dict(launcher), "began_in": str(began_in)}
-    (own / _KEPT).write_text(json.dumps(kept, indent=2) + "\n")
+    with whole(own / _KEPT) as file:
+        file.write(json.dumps(kept, indent=2) + "\n")
     stop = own / "stop"
     stop.unlink(missing_ok=True)
     missing = [folder for folder in folders if not _is_finished(folder)]
@@ -62,8 +64,12 @@ def resume(sweep: Path) -> bool:
     if not path.is_file():
         raise InputError(f"not the folder of a sweep (it has no {_OWN}/{_KEPT}): {sweep}")
     folders = sorted((path.parent for path in sweep.rglob("job.json")), key=_order)
-    kept = json.loads(path.read_text())
-    return run_sweep(sweep, folders, kept["launcher"], Path(kept["began_in"]))
+    try:
+        kept = json.loads(path.read_text())
+        launcher, began_in = dict(kept["launcher"]), Path(kept["began_in"])
+    except (ValueError, TypeError, KeyError) as error:
+        raise InputError(f"the sweep's file is damaged ({text_of(error)}): {path}") from error
+    return run_sweep(sweep, folders, launcher, began_in)
 
 
 def _tell(sweep: Path, folders: Sequence[Path], *, skipped: int) -> None:
