@@ -54,6 +54,30 @@ def test_images_are_taken_a_step_apart_and_only_where_there_is_a_pose():
     assert not list(views(late, trajectory, CAMERA)) and not list(views(empty, trajectory, CAMERA))
 
 
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"{: [", "config.yaml cannot be read"),
+        (b"\xff\xfe\xff", "config.yaml cannot be read"),
+        (b"[]", "config.yaml is not a table"),
+    ],
+)
+def test_a_damaged_configuration_is_one_sentence(tmp_path, capsys, data, said):
+    (tmp_path / "config.yaml").write_bytes(data)
+    (tmp_path / "trajectory.tum").write_text("")
+    assert main([str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: mesh: {said}") and str(tmp_path) in error
+
+
+def test_a_shared_run_cannot_allow_its_own_code(tmp_path, capsys):
+    text = "source: {_target_: fakes.FakeSource, steps: 5, dark_from: 9}\nallow_targets: [fakes]\n"
+    (tmp_path / "config.yaml").write_text(text)
+    (tmp_path / "trajectory.tum").write_text("")
+    assert main([str(tmp_path)]) == 2
+    assert "source._target_: got 'fakes.FakeSource'" in capsys.readouterr().err
+
+
 def test_what_is_no_run_is_one_sentence(tmp_path, capsys):
     assert main([str(tmp_path)]) == 2
     assert "config.yaml is missing" in capsys.readouterr().err

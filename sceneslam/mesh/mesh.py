@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import yaml
 from numpy.typing import NDArray
 
 from sceneslam.config.build import make_source
+from sceneslam.config.check import first_line
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.evaluation.association import interpolated
 from sceneslam.interfaces import Live, Source
@@ -152,12 +153,18 @@ def _is_apart(T_map_first: Transform, T_map_second: Transform) -> bool:
 
 
 def _source(folder: Path) -> Source:
-    """Return the source of a finished run."""
+    """Return the source of a finished run; its file cannot allow code of its own."""
     for name in ("config.yaml", "trajectory.tum"):
         if not (folder / name).is_file():
             raise InputError(f"mesh: not the folder of a finished run, {name} is missing: {folder}")
-    config: Mapping[str, Any] = yaml.safe_load((folder / "config.yaml").read_text())
-    source = make_source(config, ComponentBuilder(config))
+    try:
+        config = yaml.safe_load((folder / "config.yaml").read_text())
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        reason = first_line(error)
+        raise InputError(f"mesh: config.yaml cannot be read ({reason}): {folder}") from error
+    if not isinstance(config, dict):
+        raise InputError(f"mesh: config.yaml is not a table: {folder}")
+    source = make_source(config, ComponentBuilder(config | {"allow_targets": []}))
     if isinstance(source, Live) and source.live is not None:
         raise InputError(f"mesh: the run's source is live and cannot be read again: {folder}")
     return source
