@@ -1,5 +1,7 @@
 """One map of all modules and runs: places recognized, and loops closed."""
 
+import threading
+
 import numpy as np
 import pytest
 from planar_poses import transforms
@@ -267,6 +269,21 @@ def test_depth_images_of_another_size_are_left_out_and_named_once():
     ((event, fields),) = events
     assert event == "warning" and "depth_m: expected" in fields["what"]
     assert len(own.fuse_maps().pose_graph.stamps_ns) == 3
+
+
+def test_a_live_run_that_fails_leaves_no_thread_and_says_that_its_map_is_not_saved(
+    monkeypatch, tmp_path
+):
+    monkeypatch.setattr("sceneslam.atlas.submaps.run_graph.RunGraph.extend", lambda *_, **__: 1 / 0)
+    before = threading.active_count()
+    own = atlas(save=str(tmp_path / "map"), save_every_s=0.5)
+    own._lasting.open(is_live=True)
+    own._lasting._executor.submit(int)  # a map was saved before
+    monkeypatch.setattr(own._lasting, "open", lambda **_: None)
+    drive = Drive(own, is_live=True).go(world(flat()), through(FLAT_TOUR[:3]))
+    (fault,) = drive.faults
+    assert "goes on without submaps and loops, its map is not saved from here on" in fault
+    assert threading.active_count() == before
 
 
 def test_a_run_without_loops_stays_as_it_was_to_the_bit():

@@ -124,12 +124,13 @@ class Atlas:
                 self._budget.close()
         except Exception as error:  # the maps stay as they are
             self._lasting.faults.append(f"the maps could not be thinned: {text_of(error)}")
-        if self._mapper is None or not self._path.stamps_ns:
-            return self._lasting.faults
-        try:
-            self._solve()
-        except Exception as error:
-            self._give_up(error)
+        if self._mapper is not None and self._path.stamps_ns:
+            try:
+                self._solve()
+                return self._lasting.faults
+            except Exception as error:
+                self._give_up(error)
+        self._lasting.close()
         return self._lasting.faults
 
     def _solve(self) -> None:
@@ -149,7 +150,10 @@ class Atlas:
             self._mapper.close()
         self._end_with(Correction.none())
         self._mapper = None
-        self._lasting.faults.append(f"the run goes on without submaps and loops: {text_of(error)}")
+        unsaved = ", its map is not saved from here on" if self._lasting.saves else ""
+        self._lasting.faults.append(
+            f"the run goes on without submaps and loops{unsaved}: {text_of(error)}"
+        )
 
     def _end_with(self, final: Correction) -> None:
         """Take the final correction; in the journal, poses where it has no node stay as given."""

@@ -103,6 +103,10 @@ class LastingMap:
         elif self._write(saved, mapper.is_found):
             note("map_saved", stamp_ns, submaps=len(saved.submaps), loops=_loops(saved))
 
+    def close(self) -> None:
+        """Wait for a map that is being saved, and save no other. May be called twice."""
+        self._executor.shutdown()
+
     def _updated(self, saved: SavedMap, is_found: bool) -> SavedMap:
         if self._mode == UPDATE and self.loaded is not None and is_found:
             return forget_contradicted(saved, self.loaded.runs)
