@@ -76,6 +76,10 @@ def test_a_shared_run_cannot_allow_its_own_code(tmp_path, capsys):
     (tmp_path / "trajectory.tum").write_text("")
     assert main([str(tmp_path)]) == 2
     assert "source._target_: got 'fakes.FakeSource'" in capsys.readouterr().err
+    assert main([str(tmp_path), "allow_targets=[fakes]"]) == 2
+    assert "the run's source has no depth camera" in capsys.readouterr().err
+    assert main([str(tmp_path), "allow=[fakes]"]) == 2
+    assert "allowed: RUN, --voxel-m, allow_targets=[NAME]" in capsys.readouterr().err
 
 
 def test_what_is_no_run_is_one_sentence(tmp_path, capsys):

@@ -20,7 +20,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if not 0.002 <= options.voxel_m <= 1.0:
             raise ConfigError("--voxel-m", options.voxel_m, "0.002 to 1 m")
-        meshed = write_mesh(options.run.resolve(), options.voxel_m)
+        allowed = [] if options.allowed is None else _names(options.allowed)
+        meshed = write_mesh(options.run.resolve(), options.voxel_m, allowed)
     except SceneSlamError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -34,7 +35,21 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--voxel-m", type=float, default=_VOXEL_M, help=f"size of a voxel [m] ({_VOXEL_M})"
     )
+    parser.add_argument(
+        "allowed",
+        nargs="?",
+        metavar="allow_targets=[NAME]",
+        help="packages of your own that hold the run's source",
+    )
     return parser
+
+
+def _names(word: str) -> list[str]:
+    """Return the names in `allow_targets=[NAME,...]`; raises ConfigError for another word."""
+    key, _, names = word.partition("=")
+    if key != "allow_targets" or not (names.startswith("[") and names.endswith("]")):
+        raise ConfigError("mesh", word, "RUN, --voxel-m, allow_targets=[NAME]")
+    return [name.strip() for name in names[1:-1].split(",") if name.strip()]
 
 
 if __name__ == "__main__":

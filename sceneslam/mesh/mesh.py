@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,13 +48,14 @@ class Meshed:
     triangles: int
 
 
-def write_mesh(folder: Path, voxel_m: float) -> Meshed:
+def write_mesh(folder: Path, voxel_m: float, allowed: Sequence[str] = ()) -> Meshed:
     """Write `map/mesh.ply` (x y z [m, map], colours) of a run; return its properties.
 
-    The recording is read again; the poses of its images are those of `trajectory.tum`. Raises
-    ConfigError or InputError if the run or its recording cannot be read, or has no depth.
+    The recording is read again; the poses of its images are those of `trajectory.tum`. `allowed`
+    names the packages of the user that may hold its source. Raises ConfigError or InputError if
+    the run or its recording cannot be read, or has no depth.
     """
-    source = _source(folder)
+    source = _source(folder, allowed)
     camera = source.rig.camera
     if camera is None:
         raise InputError(f"mesh: the run's source has no depth camera: {folder}")
@@ -152,7 +153,7 @@ def _is_apart(T_map_first: Transform, T_map_second: Transform) -> bool:
     return moved_m > _STEP_M or float(se3.rotation_angle_rad(T_first_second)) > _STEP_RAD
 
 
-def _source(folder: Path) -> Source:
+def _source(folder: Path, allowed: Sequence[str]) -> Source:
     """Return the source of a finished run; its file cannot allow code of its own."""
     for name in ("config.yaml", "trajectory.tum"):
         if not (folder / name).is_file():
@@ -164,7 +165,7 @@ def _source(folder: Path) -> Source:
         raise InputError(f"mesh: config.yaml cannot be read ({reason}): {folder}") from error
     if not isinstance(config, dict):
         raise InputError(f"mesh: config.yaml is not a table: {folder}")
-    source = make_source(config, ComponentBuilder(config | {"allow_targets": []}))
+    source = make_source(config, ComponentBuilder(config | {"allow_targets": list(allowed)}))
     if isinstance(source, Live) and source.live is not None:
         raise InputError(f"mesh: the run's source is live and cannot be read again: {folder}")
     return source
