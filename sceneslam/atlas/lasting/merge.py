@@ -13,6 +13,7 @@ from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.submaps.graph import consistent, on_floor, solve
+from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar, se3
 from sceneslam.types.se3 import Transform
@@ -62,7 +63,7 @@ def _joined(saved: SavedMap, target: int, piece: int) -> SavedMap | None:
     """Return the map with a piece joined to another, None if it is not recognized there."""
     own = np.flatnonzero(saved.pieces == piece).tolist()
     loops = [*_loops_by_walls(saved, target, own), *_loops_by_views(saved, target, own)]
-    drift = np.zeros((len(saved.submaps), 3))
+    drift = PathDrift.nothing(len(saved.submaps))
     agreeing = [loops[index] for index in consistent(loops, saved.T_map_node, drift)]
     if len(agreeing) < _LOOPS_MIN:
         return None

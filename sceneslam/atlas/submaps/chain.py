@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.submaps.own_loops import Path
+from sceneslam.atlas.submaps.path_drift import summed
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.graphs.edge import Edge
-from sceneslam.types import planar, se3
+from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
 
@@ -22,7 +23,7 @@ class Chain:
     submaps: list[Submap] = field(default_factory=list)
     T_run_node: list[Transform] = field(default_factory=list)
     motions: list[Edge] = field(default_factory=list)
-    drift: list[NDArray[np.float64]] = field(default_factory=list)  # deviations [m, m, rad], summed
+    drift: list[NDArray[np.float64]] = field(default_factory=list)  # (2, 3) each: `summed`
     up_node: dict[int, NDArray[np.float64]] = field(default_factory=dict)  # vertical (3,), if known
 
     def __len__(self) -> int:
@@ -33,11 +34,10 @@ class Chain:
         self.submaps.append(submap)
         self.T_run_node.append(T_run_node)
         if motion is None:
-            self.drift.append(np.zeros(3))
+            self.drift.append(np.zeros((2, 3)))
             return
         self.motions.append(motion)
-        deviations = np.sqrt(np.diag(planar.planar_covariance(motion.covariance)))
-        self.drift.append(self.drift[-1] + deviations)
+        self.drift.append(summed(self.drift[-1], motion))
 
     def cut(self, count: int) -> None:
         """Leave the first `count` submaps."""

@@ -1,4 +1,4 @@
-"""Where loops to a submap are searched: around where the motions alone lead, by summed drift."""
+"""Where loops to a submap are searched: around where the motions alone lead, by what they drift."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.places.plan_search import SearchWindow
 from sceneslam.atlas.submaps.chain import Chain
+from sceneslam.atlas.submaps.path_drift import Lever, PathDrift
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.types import planar
 
@@ -34,17 +35,20 @@ class LoopQuery:
     submaps: Sequence[Submap]
     T_run_node: NDArray[np.float64]  # (N, 4, 4)
     plane: NDArray[np.float64]  # (N, 3), the nodes in the plane [m, m, rad]
-    drift: NDArray[np.float64]  # (N, 3), deviations [m, m, rad], summed up along the path
+    drift: PathDrift
+    lever: Lever
 
     @classmethod
     def of(cls, chain: Chain, second: int) -> LoopQuery:
         """Return the query for a submap of a chain."""
+        plane, drift = planar.from_transforms(chain.T_run_node), PathDrift.of(chain.drift)
         return cls(
             second=second,
             submaps=chain.submaps,
             T_run_node=np.array(chain.T_run_node),
-            plane=planar.from_transforms(chain.T_run_node),
-            drift=np.array(chain.drift),
+            plane=plane,
+            drift=drift,
+            lever=drift.lever(plane[:, :2]),
         )
 
     def to(self, second: int) -> LoopQuery:
@@ -56,13 +60,16 @@ class LoopQuery:
         """Return the submap to which loops are searched."""
         return self.submaps[self.second]
 
+    def reach_m(self, first: int | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return how far [m] (...) the submap may be off, as seen from earlier ones (...)."""
+        x_m, y_m, _ = np.moveaxis(self.drift.deviations(first, self.second), -1, 0)
+        swung_m = self.lever.deviation_m(first, self.second)
+        return np.asarray(SIGMAS * np.hypot(np.maximum(x_m, y_m), swung_m))
+
     def window(self, first: int) -> SearchWindow:
         """Return where the submap may lie in the frame of an earlier one."""
-        T_run_first, T_run_second = self.plane[first], self.plane[self.second]
-        x_m, y_m, yaw_rad = np.abs(self.drift[first] - self.drift[self.second])
-        lever_m = 0.5 * np.hypot(*(T_run_second - T_run_first)[:2])
         return SearchWindow(
-            around=planar.between(T_run_first, T_run_second),
-            half_m=SIGMAS * float(max(x_m, y_m) + lever_m * yaw_rad),
-            half_rad=SIGMAS * float(yaw_rad),
+            around=planar.between(self.plane[first], self.plane[self.second]),
+            half_m=float(self.reach_m(first)),
+            half_rad=SIGMAS * float(self.drift.deviations(first, self.second)[2]),
         )

@@ -22,6 +22,7 @@ from sceneslam.atlas.submaps.graph import (
 )
 from sceneslam.atlas.submaps.loop_query import NEIGHBOURS, LoopQuery
 from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops
+from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.plan_loops import PlanLoops
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.atlas.submaps.view_loops import ViewLoops
@@ -81,7 +82,7 @@ class RunGraph:
         """Look for loops to the submaps of a run that are new; solve without the loaded map."""
         self._place(chain)
         self._search(chain, is_level=is_level)
-        agreeing = self._agreeing()
+        agreeing = self._found.believed()
         if agreeing != self._agreed:
             # What did not fit before is left out until it does, or to the end of the run.
             used = [edge for edge in agreeing if self._is_used(edge)]
@@ -112,15 +113,13 @@ class RunGraph:
         """
         count, ends = self._count, _Ends(chain, path)
         motions = [*chain.motions, *ends.edges_of(closed_loops(maps))]
-        drift = np.array(chain.drift)
+        drift = PathDrift.of(chain.drift).after(PathDrift.nothing(count))
         fixed = self._fix_edges(fixes, ends)
         self._place(chain)
         self._search(chain, is_level=is_level)
-        loops = [*fixed, *(edge.shifted(count) for edge in self._found.loops)]
+        loops = [*fixed, *(edge.shifted(count) for edge in self._found.believed())]
         nodes = np.concatenate([self._loaded.T_map_node, T_map_node])
-        agreeing = consistent(loops, nodes, np.concatenate([np.zeros((count, 3)), drift]))
-        if len(agreeing) < 2 and not fixed:
-            agreeing = []  # no other loop agrees with it
+        agreeing = consistent(loops, nodes, drift)
         solved = solve(
             nodes,
             [edge.shifted(count) for edge in motions],
@@ -133,11 +132,6 @@ class RunGraph:
             T_map_node=solved.T_map_node[count:],
             loops=tuple(loops[agreeing[index]] for index in solved.accepted),
         )
-
-    def _agreeing(self) -> list[Edge]:
-        """Return the loops that agree with each other; one alone is not believed."""
-        agreeing = self._found.largest()
-        return [self._found.loops[index] for index in agreeing] if len(agreeing) > 1 else []
 
     def _is_used(self, loop: Edge) -> bool:
         return loop not in self._agreed or fits(loop, self._T_map_node)
@@ -163,7 +157,8 @@ class RunGraph:
             loops += self._plans.loops_to(query.to(second))
         self._seen, self._planned = len(chain), len(chain) if is_level else self._planned
         if loops:
-            self._found.add(loops, query.T_run_node, query.drift)
+            reach_m = [float(query.to(loop.second).reach_m(loop.first)) for loop in loops]
+            self._found.add(loops, reach_m, query.T_run_node, query.drift)
 
     def _may_close(self, first: int, second: int, submaps: Sequence[Submap]) -> bool:
         """Tell whether a loop may lead from a submap to a later one: not within closed sessions."""

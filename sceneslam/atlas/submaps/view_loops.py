@@ -66,8 +66,9 @@ class ViewLoops:
 
     def _reach_m(self, query: LoopQuery) -> NDArray[np.float64]:
         """Return how far (V,) each view may be off where it is expected; 0 where no loop may be."""
+        drifted_m = query.reach_m(np.arange(query.second))
         reach_m = {
-            first: query.window(first).half_m
+            first: float(drifted_m[first])
             if self._may_close(first, query.second, query.submaps)
             else 0.0
             for first in dict.fromkeys(owner for owner, _ in self._owned)

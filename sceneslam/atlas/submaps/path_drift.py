@@ -1,0 +1,90 @@
+"""How far a path drifts between two submaps: what the errors of its motions add up to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.graphs.edge import Edge, EdgeKind
+from sceneslam.types import planar
+
+# Of the summed variances: (1 + r) / (1 - r), as errors of successive submaps correlate by r = 0.6
+# (0.53 on Intel, 0.61 on ACES, -0.01 on MIT CSAIL).
+_CORRELATED = (1.0 + 0.6) / (1.0 - 0.6)
+
+Indices = int | NDArray[np.int64]  # of submaps
+
+
+def summed(before: NDArray[np.float64], motion: Edge) -> NDArray[np.float64]:
+    """Return the sums (2, 3) after a motion: of systematic deviations, and of random variances.
+
+    Both of x, y [m], and yaw [rad]. Those of wheels and of velocity are systematic, those of a map
+    are random.
+    """
+    variances = np.diag(planar.planar_covariance(motion.covariance))
+    after = before.copy()
+    if motion.kind is EdgeKind.BRIDGE:
+        after[0] += np.sqrt(variances)
+    else:
+        after[1] += variances
+    return after
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PathDrift:
+    """The drift of the path to each submap."""
+
+    sums: NDArray[np.float64]  # (N, 2, 3), as `summed` has them
+
+    @classmethod
+    def of(cls, rows: Sequence[NDArray[np.float64]]) -> PathDrift:
+        """Return the drift of a chain, from its sums (2, 3)."""
+        return cls(sums=np.array(rows).reshape(-1, 2, 3))
+
+    @classmethod
+    def nothing(cls, count: int) -> PathDrift:
+        """Return that of submaps whose poses stay."""
+        return cls(sums=np.zeros((count, 2, 3)))
+
+    def after(self, others: PathDrift) -> PathDrift:
+        """Return the drift of other submaps, and then of these."""
+        return PathDrift(sums=np.concatenate([others.sums, self.sums]))
+
+    def deviations(self, *ends: Indices) -> NDArray[np.float64]:
+        """Return the standard deviations (..., 3) [m, m, rad] of all paths between two ends."""
+        off = np.zeros((2, 3))
+        for first, second in zip(ends[::2], ends[1::2], strict=True):
+            off = off + np.abs(self.sums[second] - self.sums[first])
+        return np.asarray(off[..., 0, :] + np.sqrt(_CORRELATED * off[..., 1, :]))
+
+    def lever(self, xy_m: NDArray[np.float64]) -> Lever:
+        """Return what the headings' errors move, for submaps at positions (N, 2)."""
+        variances = np.diff(self.sums[:, 1, 2], prepend=0.0)
+        moments = np.column_stack(
+            [variances, variances[:, None] * xy_m, variances * (xy_m**2).sum(axis=1)]
+        )
+        return Lever(xy_m=xy_m, moments=moments.cumsum(axis=0), systematic=self.sums[:, 0, 2])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Lever:
+    """Moves a submap by the errors of the headings before it, by its distance from each of them."""
+
+    xy_m: NDArray[np.float64]  # (N, 2)
+    moments: NDArray[np.float64]  # (N, 4), summed: variances, times x and y, times x^2 + y^2
+    systematic: NDArray[np.float64]  # (N,) [rad], deviations summed
+
+    def deviation_m(self, first: Indices, second: int) -> NDArray[np.float64]:
+        """Return the standard deviation (...) [m] of a submap, as seen from earlier ones.
+
+        Systematic errors turn half of the way between the two.
+        """
+        moved = self.moments[second] - self.moments[first]
+        at = np.array([self.xy_m[second] @ self.xy_m[second], *(-2.0 * self.xy_m[second]), 1.0])
+        random_m2 = _CORRELATED * np.maximum(moved @ at, 0.0)
+        away_m = np.linalg.norm(self.xy_m[second] - self.xy_m[first], axis=-1)
+        turned = np.abs(self.systematic[second] - self.systematic[first])
+        return np.asarray(np.sqrt(random_m2) + 0.5 * away_m * turned)
