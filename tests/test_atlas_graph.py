@@ -18,6 +18,7 @@ from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.atlas.places.localizer import Fix
 from sceneslam.atlas.submaps import run_graph
 from sceneslam.atlas.submaps.graph import Solved, consistent
+from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.atlas.uncertainty import WHEELS
 from sceneslam.types import planar, se3
@@ -149,8 +150,8 @@ def test_a_fix_leads_from_the_nearest_submap_of_the_loaded_piece(monkeypatch):
     assert T_node_base[0] == pytest.approx(1.0)
     measured = planar.planar_covariance(given.measured[1].covariance)
     np.testing.assert_allclose(measured, at_node, atol=1e-9)
-    assert given.nodes.shape == (7, 4, 4) and (given.drift[:4] == 0).all()
-    np.testing.assert_array_equal(given.drift[4:], own.chain.drift)
+    assert given.nodes.shape == (7, 4, 4) and (given.drift.sums[:4] == 0).all()
+    np.testing.assert_array_equal(given.drift.sums[4:], own.chain.drift)
 
 
 def test_fixes_of_one_submap_are_one_loop_their_mean(monkeypatch):
@@ -178,8 +179,8 @@ def test_the_first_vertical_direction_gives_that_of_the_map(monkeypatch):
 @pytest.mark.parametrize("apart_m", [0.0, 3.0])
 def test_headings_of_loops_agree_within_their_deviation(apart_m):
     nodes = np.array([[0, 0, 0], [0, 0, 0], [10, 0, 0], [10 + apart_m, 0, 0]], float)
-    drift = np.zeros((4, 3))
-    drift[3, 2] = 0.02
+    drift = PathDrift.nothing(4)
+    drift.sums[3, 0, 2] = 0.02
     bound = np.sqrt(16.81) * np.hypot(np.sqrt(2) * 0.01, 0.02)
     for sign in (1.0, -1.0):
         for share in (0.999, 1.001):

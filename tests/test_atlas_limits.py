@@ -18,6 +18,7 @@ from sceneslam.atlas.rows import Rows
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.submaps.graph import consistent, on_floor
 from sceneslam.atlas.submaps.own_loops import closed_loops
+from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import GridLayer, MapLayers, PointLayer, PoseGraphLayer
@@ -40,6 +41,7 @@ def agree(off_m, *, apart_m=0.0, drift=None):
     """Tell whether two loops agree that differ by `off_m`, their ends `apart_m` from each other."""
     nodes = np.array([[0, 0, 0], [0, 0, 0], [10, 0, 0], [10 + apart_m, 0, 0]], float)
     drift = np.zeros((4, 3)) if drift is None else drift
+    drift = PathDrift(sums=np.stack([drift, np.zeros_like(drift)], axis=1))
     loops = [loop(0, 2, [10, 0, 0]), loop(1, 3, [10 + apart_m + off_m, 0, 0])]
     return len(consistent(loops, transforms(nodes), drift)) == 2
 
@@ -65,9 +67,9 @@ def test_the_largest_set_of_loops_that_agree_is_kept():
     nodes = transforms(np.zeros((12, 3)))
     offs = [0.0, 5.0, 0.0, 5.0, 5.0, 9.0]
     loops = [loop(2 * i, 2 * i + 1, [off, 0, 0]) for i, off in enumerate(offs)]
-    assert consistent(loops, nodes, np.zeros((12, 3))) == [1, 3, 4]
-    assert consistent(loops[:1], nodes, np.zeros((12, 3))) == [0]
-    assert consistent([], nodes, np.zeros((12, 3))) == []
+    assert consistent(loops, nodes, PathDrift.nothing(12)) == [1, 3, 4]
+    assert consistent(loops[:1], nodes, PathDrift.nothing(12)) == [0]
+    assert consistent([], nodes, PathDrift.nothing(12)) == []
 
 
 def test_a_motion_in_the_plane_keeps_height_and_tilt_as_a_floor_does():

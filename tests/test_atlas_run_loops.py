@@ -13,6 +13,7 @@ from test_atlas_submaps import S, at
 from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.atlas.submaps import run_graph
 from sceneslam.atlas.submaps.graph import Agreement, consistent, settle
+from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.run_graph import RunGraph, SolvedRun
 from sceneslam.types import planar
 
@@ -89,8 +90,8 @@ def test_plans_are_compared_once_the_base_is_level_and_views_on_any(monkeypatch)
     np.testing.assert_allclose(last.T_run_node, own.chain.T_run_node, atol=1e-12)
     np.testing.assert_allclose(plans.queries[7].plane, planar.from_transforms(last.T_run_node))
     for second in range(8):
-        drift = views.queries[second].drift  # plans are searched when there are more submaps
-        np.testing.assert_array_equal(plans.queries[second].drift[: len(drift)], drift)
+        drift = views.queries[second].drift.sums  # plans are searched when there are more submaps
+        np.testing.assert_array_equal(plans.queries[second].drift.sums[: len(drift)], drift)
 
 
 def test_views_close_loops_on_a_base_that_is_never_level(monkeypatch):
@@ -121,7 +122,7 @@ def test_after_a_loop_places_are_searched_around_where_motions_alone_lead(monkey
     assert len(found.loops) == 2
     for second in (5, 8):
         query = searched.queries[second]
-        np.testing.assert_array_equal(query.drift, own.chain.drift[: len(query.drift)])
+        np.testing.assert_array_equal(query.drift.sums, own.chain.drift[: len(query.drift.sums)])
     np.testing.assert_array_equal(query.plane[8], planar.from_transform(own.chain.T_run_node[8]))
 
 
@@ -167,7 +168,8 @@ _NODES = 12
 def test_loops_that_are_compared_as_they_are_found_agree_as_all_at_once(seed, kept):
     rng = np.random.default_rng(seed)
     plane = np.cumsum(rng.normal(0.0, 1.0, (_NODES, 3)), axis=0)
-    nodes, drift = transforms(plane), np.cumsum(rng.uniform(0, 0.05, (_NODES, 3)), axis=0)
+    nodes = transforms(plane)
+    drift = PathDrift(sums=np.cumsum(rng.uniform(0, 0.05, (_NODES, 2, 3)), axis=0))
     loops = []
     for _ in range(10):
         first, second = sorted(rng.choice(_NODES, 2, replace=False).tolist())

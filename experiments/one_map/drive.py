@@ -22,7 +22,8 @@ from sceneslam.types.trajectory import Trajectory
 RIG = Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser())
 _STEP_S = 0.2  # between two poses 0.1 m apart: half a metre per second
 _START_NS = 10**9
-_DEVIATION = 0.03  # that dead reckoning states, per metre and per radian: deviations add up
+# That dead reckoning states, of distance and heading, per metre and per radian: they add up.
+_DEVIATION = np.repeat([0.03, 0.01], 3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,7 +55,7 @@ class Drive:
         """Drive along true poses (N, 3), in so many sessions of two modules by dead reckoning."""
         self.atlas.open(RIG, self._note, is_live=self.is_live)
         T_run_base, T_run_local, session = np.zeros(3), np.zeros(3), -1
-        deviation = 1e-3
+        deviation = np.full(6, 1e-3)
         for row, pose in enumerate(true):
             step = planar.between(true[max(row - 1, 0)], pose)
             T_run_base = planar.compose(T_run_base, _measured(step, odometry or Odometry()))
@@ -63,15 +64,13 @@ class Drive:
                 T_run_local = T_run_base
                 name = f"module_{session % 2}"
                 self.atlas.begin_session(name, planar.to_transform(T_run_local))
-                deviation = 1e-3
-            deviation += _DEVIATION * float(np.abs(step).sum())
+                deviation = np.full(6, 1e-3)
+            deviation = deviation + _DEVIATION * float(np.abs(step).sum())
             self.reckoned.append(T_run_base)
             stamp_ns = _START_NS + round(row * _STEP_S * 1e9)
             T_local_base = planar.between(T_run_local, T_run_base)
             self.atlas.add_local(stamp_ns, planar.to_transform(T_local_base))
-            self.atlas.add(
-                stamp_ns, planar.to_transform(T_run_base), name, np.eye(6) * deviation**2
-            )
+            self.atlas.add(stamp_ns, planar.to_transform(T_run_base), name, np.diag(deviation**2))
             scan = world.scan(pose, stamp_ns)
             self.atlas.observe(Observation(stamp_ns=stamp_ns, scan=scan), None)
         for number in range(session + 1):

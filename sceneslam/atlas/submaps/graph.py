@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.submaps.path_drift import PathDrift
-from sceneslam.atlas.submaps.submap import LENGTH_M
 from sceneslam.graphs.edge import Edge
 from sceneslam.graphs.factors import TO_GTSAM, factor_of, noise_of
 from sceneslam.types import planar, se3
@@ -29,7 +28,6 @@ _TILT_RAD = 0.04  # that modules drift in pitch along a corridor, before gravity
 _UPRIGHT_RAD = 0.01  # half a degree: of gyro and gravity, and as floors are uneven
 _ROUNDS = 10  # in which the loops that fit worst are left out
 _STEPS, _GAIN_RATIO = 20, 1e-3  # of a solution while the run goes on: its cost falls no further
-_NEAR_M = 0.35  # drift of the path between two loops: a wrong one would be off by three times that
 _VAIN = 50  # starts in a row without a larger clique
 LOADED = -1  # node of a loaded map
 
@@ -209,90 +207,46 @@ def marginals(
 
 
 class Agreement:
-    """Tells which loops within a run are believed; loops are added as they are found.
-
-    Two places that look alike do not overlap: the pose that one of them seems to have is off by the
-    width of the place, at least. So a loop is believed where others that agree with it, each near
-    the next along the path, show a place as wide as the range in which it was searched; and of these
-    the largest set that agrees pairwise.
-    """
+    """Tells which loops agree pairwise within the drift; loops are added as they are found."""
 
     def __init__(self) -> None:
         self.loops: list[Edge] = []
-        self._reach_m = np.zeros(0)
-        self._at_m = np.zeros((0, 3))  # where the later submaps are
         self._agree = np.zeros((0, 0), bool)
-        self._near = np.zeros((0, 0), bool)  # also, so that the path between them hardly drifts
 
-    def add(
-        self,
-        loops: Sequence[Edge],
-        reach_m: Sequence[float],
-        T_map_node: NDArray[np.float64],
-        drift: PathDrift,
-    ) -> None:
-        """Compare loops with all others.
-
-        `reach_m` is how far from the expected pose each was searched, `T_map_node` (N, 4, 4) are
-        the estimated nodes.
-        """
-        count, total = len(self.loops), len(self.loops) + len(loops)
+    def add(self, loops: Sequence[Edge], T_map_node: NDArray[np.float64], drift: PathDrift) -> None:
+        """Compare loops with all others; `T_map_node` (N, 4, 4) are the estimated nodes."""
+        count = len(self.loops)
         self.loops = [*self.loops, *loops]
-        self._reach_m = np.append(self._reach_m, reach_m)
-        self._at_m = T_map_node[[loop.second for loop in self.loops], :3, 3]
-        agree, near = np.zeros((total, total), bool), np.zeros((total, total), bool)
-        agree[:count, :count], near[:count, :count] = self._agree, self._near
-        for row in range(max(count, 1), total):
-            others = self.loops[:row]
-            agree[row, :row], drift_m = _agree(self.loops[row], others, T_map_node, drift)
-            near[row, :row] = agree[row, :row] & (drift_m <= _NEAR_M)
-            agree[:row, row], near[:row, row] = agree[row, :row], near[row, :row]
-        self._agree, self._near = agree, near
+        agree = np.zeros((len(self.loops), len(self.loops)), bool)
+        agree[:count, :count] = self._agree
+        for row in range(max(count, 1), len(self.loops)):
+            agree[row, :row] = _agree(self.loops[row], self.loops[:row], T_map_node, drift)
+            agree[:row, row] = agree[row, :row]
+        self._agree = agree
 
     def cut(self, count: int) -> None:
         """Leave the loops between the first `count` nodes."""
         kept = [row for row, loop in enumerate(self.loops) if loop.second < count]
-        square = np.ix_(kept, kept)
-        self.loops, self._reach_m = [self.loops[row] for row in kept], self._reach_m[kept]
-        self._at_m, self._agree, self._near = self._at_m[kept], self._agree[square], self._near[square]
+        self.loops, self._agree = [self.loops[row] for row in kept], self._agree[np.ix_(kept, kept)]
 
-    def believed(self) -> list[Edge]:
-        """Return the loops that are believed; one alone is not."""
-        wide = np.flatnonzero(self._are_wide())
-        rows = wide[_largest_clique(self._agree[np.ix_(wide, wide)])].tolist()
-        return [self.loops[row] for row in rows] if len(rows) > 1 else []
-
-    def _are_wide(self) -> NDArray[np.bool_]:
-        """Tell of each loop (M,) whether the place around it is as wide as its range."""
-        left, wide = np.ones(len(self.loops), bool), np.zeros(len(self.loops), bool)
-        while left.any():
-            place = np.zeros(len(left), bool)
-            place[np.argmax(left)] = True
-            while (grown := place | self._near[place].any(axis=0)).sum() > place.sum():
-                place = grown
-            width_m = LENGTH_M + float(np.linalg.norm(np.ptp(self._at_m[place], axis=0)))
-            wide[place] = self._reach_m[place] <= width_m
-            left &= ~place
-        return wide
+    def largest(self) -> list[int]:
+        """Return the indices of the largest set of loops that agree pairwise."""
+        return _largest_clique(self._agree)
 
 
 def consistent(
     loops: Sequence[Edge], T_map_node: NDArray[np.float64], drift: PathDrift
 ) -> list[int]:
-    """Return the indices of the largest set of loops that agree pairwise within the drift."""
-    agree = np.zeros((len(loops), len(loops)), bool)
-    for row in range(1, len(loops)):
-        agree[row, :row], _ = _agree(loops[row], loops[:row], T_map_node, drift)
-    return _largest_clique(agree | agree.T)
+    """Return the indices of the largest set of loops that agree pairwise, as in `Agreement`."""
+    agreement = Agreement()
+    agreement.add(loops, T_map_node, drift)
+    return agreement.largest()
 
 
 def _agree(
     a: Edge, others: Sequence[Edge], T_map_node: NDArray[np.float64], drift: PathDrift
-) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Tell of each other loop b whether the cycle of a, the path to b's end, b and back closes.
-
-    And how far [m] that path may drift: one standard deviation.
-    """
+) -> NDArray[np.bool_]:
+    """Tell of each other loop b whether the cycle of a, the path to b's end, b and back closes."""
     firsts, seconds = np.array([(b.first, b.second) for b in others]).T
     T_ends = se3.inverse(T_map_node[a.second]) @ T_map_node[seconds]
     T_starts = se3.inverse(T_map_node[a.first]) @ T_map_node[firsts]
@@ -306,8 +260,7 @@ def _agree(
     covariance = np.array([b.covariance for b in others])
     covariance += se3.carried(a.covariance, se3.inverse(T_ends))
     measured = np.diagonal(covariance, axis1=1, axis2=2)
-    agree = (off**2 / (path**2 + measured)).sum(axis=1) < _CHI2_6
-    return np.asarray(agree), path[:, :2].max(axis=1)
+    return np.asarray((off**2 / (path**2 + measured)).sum(axis=1) < _CHI2_6)
 
 
 def _largest_clique(agree: NDArray[np.bool_]) -> list[int]:

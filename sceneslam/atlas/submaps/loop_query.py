@@ -66,10 +66,14 @@ class LoopQuery:
         swung_m = self.lever.deviation_m(first, self.second)
         return np.asarray(SIGMAS * np.hypot(np.maximum(x_m, y_m), swung_m))
 
+    def turn_rad(self, first: int | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return by how much [rad] (...) the submap may be turned, as seen from earlier ones."""
+        return np.asarray(SIGMAS * self.drift.deviations(first, self.second)[..., 2])
+
     def window(self, first: int) -> SearchWindow:
         """Return where the submap may lie in the frame of an earlier one."""
         return SearchWindow(
             around=planar.between(self.plane[first], self.plane[self.second]),
             half_m=float(self.reach_m(first)),
-            half_rad=SIGMAS * float(self.drift.deviations(first, self.second)[2]),
+            half_rad=float(self.turn_rad(first)),
         )

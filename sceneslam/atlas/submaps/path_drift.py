@@ -8,12 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.atlas.submaps.submap import LENGTH_M
+from sceneslam.atlas.uncertainty import MAPPED, drifted
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar
 
-# Of the summed variances: (1 + r) / (1 - r), as errors of successive submaps correlate by r = 0.6
-# (0.53 on Intel, 0.61 on ACES, -0.01 on MIT CSAIL).
+# Of the summed variances of a map: (1 + r) / (1 - r), as errors of successive submaps correlate by
+# r = 0.6 (0.53 on Intel, 0.61 on ACES, -0.01 on MIT CSAIL). What modules report needs none.
 _CORRELATED = (1.0 + 0.6) / (1.0 - 0.6)
+_LEAST = np.array([0.003, 0.003, 0.002]) ** 2
+_MAPPED = np.diag(planar.planar_covariance(drifted(MAPPED, np.array([LENGTH_M, 0.0])))) + _LEAST
 
 Indices = int | NDArray[np.int64]  # of submaps
 
@@ -29,7 +33,8 @@ def summed(before: NDArray[np.float64], motion: Edge) -> NDArray[np.float64]:
     if motion.kind is EdgeKind.BRIDGE:
         after[0] += np.sqrt(variances)
     else:
-        after[1] += variances
+        mapped = np.minimum(variances, _MAPPED)
+        after[1] += _CORRELATED * mapped + (variances - mapped)
     return after
 
 
@@ -58,7 +63,7 @@ class PathDrift:
         off = np.zeros((2, 3))
         for first, second in zip(ends[::2], ends[1::2], strict=True):
             off = off + np.abs(self.sums[second] - self.sums[first])
-        return np.asarray(off[..., 0, :] + np.sqrt(_CORRELATED * off[..., 1, :]))
+        return np.asarray(off[..., 0, :] + np.sqrt(off[..., 1, :]))
 
     def lever(self, xy_m: NDArray[np.float64]) -> Lever:
         """Return what the headings' errors move, for submaps at positions (N, 2)."""
@@ -84,7 +89,7 @@ class Lever:
         """
         moved = self.moments[second] - self.moments[first]
         at = np.array([self.xy_m[second] @ self.xy_m[second], *(-2.0 * self.xy_m[second]), 1.0])
-        random_m2 = _CORRELATED * np.maximum(moved @ at, 0.0)
+        random_m2 = np.maximum(moved @ at, 0.0)
         away_m = np.linalg.norm(self.xy_m[second] - self.xy_m[first], axis=-1)
         turned = np.abs(self.systematic[second] - self.systematic[first])
         return np.asarray(np.sqrt(random_m2) + 0.5 * away_m * turned)

@@ -13,6 +13,7 @@ from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar
 from sceneslam.types.planar import Planar
 
+_TURN_MAX_RAD = np.pi  # a larger range: the heading is unknown, and so is where the place is
 _TARGET_MAX_M = 15.0  # from the middle of a target: a pose that jumps makes no huge plan
 _KNOWN_MIN = 0.35  # share of a submap's walls, as two submaps may overlap partly
 _CACHED = 8  # targets
@@ -58,13 +59,15 @@ class PlanLoops:
         second, submaps, plan = query.second, query.submaps, query.submap.plan
         if not len(plan):
             return []
-        reach_m = query.reach_m(np.arange(second))
-        for first in np.flatnonzero(reach_m[: second - 1] >= GAIN_MIN_M).tolist():
+        earlier = np.arange(second - 1)
+        reach_m = query.reach_m(earlier)
+        is_near = (reach_m >= GAIN_MIN_M) & (query.turn_rad(earlier) <= _TURN_MAX_RAD)
+        for first in np.flatnonzero(is_near).tolist():
             if not (self._may_close(first, second, submaps) and len(submaps[first].plan)):
                 continue
             around = planar.between(query.plane[first], query.plane[second])
             if _gap_m(submaps[first].plan, plan, around) <= reach_m[first]:
-                near.append((_apart_m(submaps[first].plan, plan, around), first))
+                near.append((float(np.hypot(*around[:2])), first))
         chosen: list[int] = []
         for _, first in sorted(near):
             if len(chosen) < TARGETS and all(abs(first - c) > NEIGHBOURS for c in chosen):
@@ -95,10 +98,3 @@ def _gap_m(first: FloorPlan, second: FloorPlan, T_first_second: Planar) -> float
     b = planar.apply(T_first_second, second.points.astype(np.float64))
     gaps = np.maximum(a.min(axis=0) - b.max(axis=0), b.min(axis=0) - a.max(axis=0))
     return float(gaps.max())
-
-
-def _apart_m(first: FloorPlan, second: FloorPlan, T_first_second: Planar) -> float:
-    """Return the distance [m] of two plans' walls: a robot that comes back may see others."""
-    middle = second.points.astype(np.float64).mean(axis=0)[None]
-    off = planar.apply(T_first_second, middle)[0] - first.points.mean(axis=0, dtype=np.float64)
-    return float(np.hypot(*off))

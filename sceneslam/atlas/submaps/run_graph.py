@@ -82,7 +82,7 @@ class RunGraph:
         """Look for loops to the submaps of a run that are new; solve without the loaded map."""
         self._place(chain)
         self._search(chain, is_level=is_level)
-        agreeing = self._found.believed()
+        agreeing = self._agreeing()
         if agreeing != self._agreed:
             # What did not fit before is left out until it does, or to the end of the run.
             used = [edge for edge in agreeing if self._is_used(edge)]
@@ -117,9 +117,11 @@ class RunGraph:
         fixed = self._fix_edges(fixes, ends)
         self._place(chain)
         self._search(chain, is_level=is_level)
-        loops = [*fixed, *(edge.shifted(count) for edge in self._found.believed())]
+        loops = [*fixed, *(edge.shifted(count) for edge in self._found.loops)]
         nodes = np.concatenate([self._loaded.T_map_node, T_map_node])
         agreeing = consistent(loops, nodes, drift)
+        if len(agreeing) < 2 and not fixed:
+            agreeing = []  # no other loop agrees with it
         solved = solve(
             nodes,
             [edge.shifted(count) for edge in motions],
@@ -132,6 +134,11 @@ class RunGraph:
             T_map_node=solved.T_map_node[count:],
             loops=tuple(loops[agreeing[index]] for index in solved.accepted),
         )
+
+    def _agreeing(self) -> list[Edge]:
+        """Return the loops that agree with each other; one alone is not believed."""
+        agreeing = self._found.largest()
+        return [self._found.loops[index] for index in agreeing] if len(agreeing) > 1 else []
 
     def _is_used(self, loop: Edge) -> bool:
         return loop not in self._agreed or fits(loop, self._T_map_node)
@@ -157,8 +164,7 @@ class RunGraph:
             loops += self._plans.loops_to(query.to(second))
         self._seen, self._planned = len(chain), len(chain) if is_level else self._planned
         if loops:
-            reach_m = [float(query.to(loop.second).reach_m(loop.first)) for loop in loops]
-            self._found.add(loops, reach_m, query.T_run_node, query.drift)
+            self._found.add(loops, query.T_run_node, query.drift)
 
     def _may_close(self, first: int, second: int, submaps: Sequence[Submap]) -> bool:
         """Tell whether a loop may lead from a submap to a later one: not within closed sessions."""
