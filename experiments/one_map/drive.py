@@ -22,8 +22,7 @@ from sceneslam.types.trajectory import Trajectory
 RIG = Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser())
 _STEP_S = 0.2  # between two poses 0.1 m apart: half a metre per second
 _START_NS = 10**9
-# That dead reckoning states, of distance and heading, per metre and per radian: they add up.
-_DEVIATION = np.repeat([0.03, 0.01], 3)
+_DEVIATION = 0.03  # of distance and height that dead reckoning states, per metre and per radian
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,6 +39,7 @@ class Drive:
 
     atlas: Atlas
     is_live: bool = False
+    turn_deviation: float = 0.03  # of rotation, likewise; all deviations add up
     events: list[dict[str, Any]] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     reckoned: list[Planar] = field(default_factory=list)  # T_run_base as the atlas got them
@@ -65,7 +65,8 @@ class Drive:
                 name = f"module_{session % 2}"
                 self.atlas.begin_session(name, planar.to_transform(T_run_local))
                 deviation = np.full(6, 1e-3)
-            deviation = deviation + _DEVIATION * float(np.abs(step).sum())
+            ratio = np.repeat([_DEVIATION, self.turn_deviation], 3)
+            deviation = deviation + ratio * float(np.abs(step).sum())
             self.reckoned.append(T_run_base)
             stamp_ns = _START_NS + round(row * _STEP_S * 1e9)
             T_local_base = planar.between(T_run_local, T_run_base)

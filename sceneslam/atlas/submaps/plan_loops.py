@@ -13,7 +13,7 @@ from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar
 from sceneslam.types.planar import Planar
 
-_TURN_MAX_RAD = np.pi  # a larger range: the heading is unknown, and so is where the place is
+_TURN_MAX_RAD = 0.5 * np.pi  # a larger range: motions do not tell where a place is
 _TARGET_MAX_M = 15.0  # from the middle of a target: a pose that jumps makes no huge plan
 _KNOWN_MIN = 0.35  # share of a submap's walls, as two submaps may overlap partly
 _CACHED = 8  # targets
