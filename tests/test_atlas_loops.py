@@ -111,6 +111,13 @@ def test_a_loop_that_is_found_outside_its_window_is_left_out(monkeypatch, axis):
     assert firsts(2, [0, 0, 1], line(0, 0, 0), SMALL) == []
 
 
+def test_no_plans_are_compared_where_the_heading_may_be_off_by_more_than_a_right_angle(monkeypatch):
+    Compared(monkeypatch)
+    for share in (0.999, 1.001):
+        sigma = [0.1, 0.1, share * np.pi / 2 / 3.0 / 2.0]  # three deviations over two motions
+        assert firsts(2, [0, 0, 1], line(0, 0, 0), sigma) == ([0] if share < 1.0 else [])
+
+
 def test_the_three_nearest_submaps_that_are_no_neighbours_are_compared(monkeypatch):
     Compared(monkeypatch)
     x_m = [0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.0, 0.0, 0.0]

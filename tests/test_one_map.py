@@ -184,7 +184,7 @@ def drive_twice_round(atlas, **settings):
     """Drive through the flat twice, by odometry that drifts; return the drive and true poses."""
     true = np.concatenate([through(FLAT_TOUR), through(FLAT_TOUR)])
     odometry = Odometry(scale=0.01, turn_rad_per_m=0.003)
-    drive = Drive(atlas, turn_deviation=0.005, **settings)
+    drive = Drive(atlas, turn_deviation=0.006, **settings)
     return drive.go(world(flat()), true, odometry=odometry), true
 
 
@@ -249,7 +249,7 @@ def test_a_final_solution_that_fails_leaves_the_last_one_and_the_map(monkeypatch
     before, after = drive.drifted_m(true, map_of(true)), drive.errors_m(true, map_of(true))
     assert rms(after) < rms(before) / 2
     saved = load_map_files(tmp_path / "map")
-    assert 3 <= sum(edge.is_loop for edge in saved.edges) <= len(drive.of_kind("loop"))
+    assert sum(edge.is_loop for edge in saved.edges) == len(drive.of_kind("loop")) >= 3
     trajectory = drive.atlas.trajectory
     starts_ns = [submap.stamps_ns[0] for submap in saved.submaps]
     rows = np.searchsorted(trajectory.stamps_ns, starts_ns)

@@ -82,8 +82,7 @@ def check_trust(config: DictConfig, words: Sequence[str]) -> None:
     A `_target_` is code. A shared file must not allow its own code: only the person who types the
     command does.
     """
-    typed = [one.value() for one in map(_parsed, words) if one and one.key_or_group == _TRUST]
-    vouched = _plain(typed[-1]) if typed else []
+    vouched = typed_targets(words)
     node = OmegaConf.select(config, _TRUST)
     given = OmegaConf.to_container(node) if OmegaConf.is_config(node) else node
     if given != vouched:
@@ -92,6 +91,12 @@ def check_trust(config: DictConfig, words: Sequence[str]) -> None:
             given,
             "the packages named on the command line itself; a file cannot allow its own code",
         )
+
+
+def typed_targets(words: Sequence[str]) -> Any:
+    """Return what words of the command line set `allow_targets` to, [] if none does."""
+    typed = [one.value() for one in map(_parsed, words) if one and one.key_or_group == _TRUST]
+    return _plain(typed[-1]) if typed else []
 
 
 def _parsed(word: str) -> Override | None:

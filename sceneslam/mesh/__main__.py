@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from sceneslam.config.words import typed_targets
 from sceneslam.mesh.mesh import write_mesh
 from sceneslam.streams import secure_streams
 from sceneslam.types.errors import ConfigError, SceneSlamError
@@ -20,8 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if not 0.002 <= options.voxel_m <= 1.0:
             raise ConfigError("--voxel-m", options.voxel_m, "0.002 to 1 m")
-        allowed = [] if options.allowed is None else _names(options.allowed)
-        meshed = write_mesh(options.run.resolve(), options.voxel_m, allowed)
+        meshed = write_mesh(options.run.resolve(), options.voxel_m, _names(options.allowed))
     except SceneSlamError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -44,12 +44,13 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _names(word: str) -> list[str]:
+def _names(word: str | None) -> list[str]:
     """Return the names in `allow_targets=[NAME,...]`; raises ConfigError for another word."""
-    key, _, names = word.partition("=")
-    if key != "allow_targets" or not (names.startswith("[") and names.endswith("]")):
+    if word is None:
+        return []
+    if not (word.startswith("allow_targets=[") and word.endswith("]")):
         raise ConfigError("mesh", word, "RUN, --voxel-m, allow_targets=[NAME]")
-    return [name.strip() for name in names[1:-1].split(",") if name.strip()]
+    return list(typed_targets([word]))
 
 
 if __name__ == "__main__":

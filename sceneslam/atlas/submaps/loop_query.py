@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.places.plan_search import SearchWindow
 from sceneslam.atlas.submaps.chain import Chain
-from sceneslam.atlas.submaps.path_drift import Lever, PathDrift
+from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.types import planar
 
@@ -36,19 +36,16 @@ class LoopQuery:
     T_run_node: NDArray[np.float64]  # (N, 4, 4)
     plane: NDArray[np.float64]  # (N, 3), the nodes in the plane [m, m, rad]
     drift: PathDrift
-    lever: Lever
 
     @classmethod
     def of(cls, chain: Chain, second: int) -> LoopQuery:
         """Return the query for a submap of a chain."""
-        plane, drift = planar.from_transforms(chain.T_run_node), PathDrift.of(chain.drift)
         return cls(
             second=second,
             submaps=chain.submaps,
             T_run_node=np.array(chain.T_run_node),
-            plane=plane,
-            drift=drift,
-            lever=drift.lever(plane[:, :2]),
+            plane=planar.from_transforms(chain.T_run_node),
+            drift=PathDrift.of(chain.drift),
         )
 
     def to(self, second: int) -> LoopQuery:
@@ -63,7 +60,7 @@ class LoopQuery:
     def reach_m(self, first: int | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return how far [m] (...) the submap may be off, as seen from earlier ones (...)."""
         x_m, y_m, _ = np.moveaxis(self.drift.deviations(first, self.second), -1, 0)
-        swung_m = self.lever.deviation_m(first, self.second)
+        swung_m = self.drift.swing_m(self.plane[:, :2], first, self.second)
         return np.asarray(SIGMAS * np.hypot(np.maximum(x_m, y_m), swung_m))
 
     def turn_rad(self, first: int | NDArray[np.int64]) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.atlas.submaps.submap import LENGTH_M
+from sceneslam.atlas.submaps.submap import LEAST, LENGTH_M
 from sceneslam.atlas.uncertainty import MAPPED, drifted
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar
@@ -16,8 +16,8 @@ from sceneslam.types import planar
 # Of the summed variances of a map: (1 + r) / (1 - r), as errors of successive submaps correlate by
 # r = 0.6 (0.53 on Intel, 0.61 on ACES, -0.01 on MIT CSAIL). What modules report needs none.
 _CORRELATED = (1.0 + 0.6) / (1.0 - 0.6)
-_LEAST = np.array([0.003, 0.003, 0.002]) ** 2
-_MAPPED = np.diag(planar.planar_covariance(drifted(MAPPED, np.array([LENGTH_M, 0.0])))) + _LEAST
+_SUBMAP = drifted(MAPPED, np.array([LENGTH_M, 0.0])) + np.diag(LEAST**2)
+_MAPPED = np.diag(planar.planar_covariance(_SUBMAP))  # of a map's motion from submap to submap
 
 Indices = int | NDArray[np.int64]  # of submaps
 
@@ -65,31 +65,16 @@ class PathDrift:
             off = off + np.abs(self.sums[second] - self.sums[first])
         return np.asarray(off[..., 0, :] + np.sqrt(off[..., 1, :]))
 
-    def lever(self, xy_m: NDArray[np.float64]) -> Lever:
-        """Return what the headings' errors move, for submaps at positions (N, 2)."""
-        variances = np.diff(self.sums[:, 1, 2], prepend=0.0)
-        moments = np.column_stack(
-            [variances, variances[:, None] * xy_m, variances * (xy_m**2).sum(axis=1)]
-        )
-        return Lever(xy_m=xy_m, moments=moments.cumsum(axis=0), systematic=self.sums[:, 0, 2])
+    def swing_m(
+        self, xy_m: NDArray[np.float64], first: Indices, second: int
+    ) -> NDArray[np.float64]:
+        """Return how far [m] (...) the headings' errors on the way move a submap.
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Lever:
-    """Moves a submap by the errors of the headings before it, by its distance from each of them."""
-
-    xy_m: NDArray[np.float64]  # (N, 2)
-    moments: NDArray[np.float64]  # (N, 4), summed: variances, times x and y, times x^2 + y^2
-    systematic: NDArray[np.float64]  # (N,) [rad], deviations summed
-
-    def deviation_m(self, first: Indices, second: int) -> NDArray[np.float64]:
-        """Return the standard deviation (...) [m] of a submap, as seen from earlier ones.
-
-        Systematic errors turn half of the way between the two.
+        Of nodes at `xy_m` (N, 2), from earlier ones to it. A random error moves it by its distance
+        from where that arose; systematic ones turn half of the way between the two.
         """
-        moved = self.moments[second] - self.moments[first]
-        at = np.array([self.xy_m[second] @ self.xy_m[second], *(-2.0 * self.xy_m[second]), 1.0])
-        random_m2 = np.maximum(moved @ at, 0.0)
-        away_m = np.linalg.norm(self.xy_m[second] - self.xy_m[first], axis=-1)
-        turned = np.abs(self.systematic[second] - self.systematic[first])
-        return np.asarray(np.sqrt(random_m2) + 0.5 * away_m * turned)
+        away2 = ((xy_m - xy_m[second]) ** 2).sum(axis=1)
+        moved2 = (np.diff(self.sums[:, 1, 2], prepend=0.0) * away2).cumsum()
+        turned = np.abs(self.sums[second, 0, 2] - self.sums[first, 0, 2])
+        random_m = np.sqrt(moved2[second] - moved2[first])
+        return np.asarray(random_m + 0.5 * np.sqrt(away2[first]) * turned)

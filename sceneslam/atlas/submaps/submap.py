@@ -21,7 +21,7 @@ from sceneslam.views.view import Landmarks, PlacedView
 LENGTH_M = 2.5  # length of path in a submap: by MAPPED it drifts 1 cm
 TURN_RAD = 2 * np.pi  # or this much turning, after which everything around was seen
 STEP_M, STEP_RAD = 0.1, 0.1  # between two scans of a submap
-_FLOOR_M, _FLOOR_RAD = 0.003, 0.002  # least standard deviation between two submaps
+LEAST = np.repeat([0.003, 0.002], 3)  # m, rad: least standard deviations between two submaps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -143,7 +143,7 @@ def motion_covariance(poses: Sequence[KeyPose]) -> Covariance:
     away = _planar(poses[0], poses[-1])
     lever_m = 0.5 * float(np.hypot(away[0], away[1]))
     shift_m = float(np.hypot(per_m @ along_m, turn * lever_m))
-    variances = np.repeat([shift_m**2 + _FLOOR_M**2, turn**2 + _FLOOR_RAD**2], 3)
+    variances = np.repeat([shift_m**2, turn**2], 3) + LEAST**2
     return np.diag(variances) + _grown(poses[0], poses[-1])
 
 
