@@ -39,7 +39,7 @@ class Drive:
 
     atlas: Atlas
     is_live: bool = False
-    turn_deviation: float = 0.03  # of rotation, likewise; all deviations add up
+    turn_deviation: float = _DEVIATION  # of rotation, likewise; all deviations add up
     events: list[dict[str, Any]] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     reckoned: list[Planar] = field(default_factory=list)  # T_run_base as the atlas got them

@@ -70,6 +70,7 @@ class OneMapExperiment:
         found_min: float,
         error_max_m: float,
         error_max_deg: float,
+        alike_turn_deviation: float,
         drift_ratio: float,
         laps: int,
         kills: int,
@@ -77,10 +78,12 @@ class OneMapExperiment:
         check_some(stories=stories, seeds=seeds, story_seeds=story_seeds)
         check_least(1, starts=starts, laps=laps, kills=kills)
         check_above(0, within_s=within_s, error_max_m=error_max_m, error_max_deg=error_max_deg)
+        check_above(0, alike_turn_deviation=alike_turn_deviation)
         self._mapped, self._stories, self._seeds = mapped_story, tuple(stories), tuple(seeds)
         self._starts, self._within_s, self._found_min = starts, within_s, found_min
         self._story_seeds = tuple(story_seeds)
         self._error_max_m, self._error_max_rad = error_max_m, float(np.radians(error_max_deg))
+        self._alike_turn_deviation = alike_turn_deviation
         self._drift_ratio, self._laps, self._kills = drift_ratio, laps, kills
         self._rows: list[list[str | float | None]] = []
 
@@ -213,7 +216,8 @@ class OneMapExperiment:
             for seed in self._seeds:
                 rng, true = np.random.default_rng(seed), through(corners)
                 odometry = Odometry(scale=rng.normal(0, 0.02), turn_rad_per_m=rng.normal(0, 0.005))
-                drive = Drive(Atlas(voxel_m=_VOXEL_M)).go(
+                atlas = Atlas(voxel_m=_VOXEL_M)
+                drive = Drive(atlas, turn_deviation=self._alike_turn_deviation).go(
                     World(walls, rng, Scanner()), true, odometry=odometry, sessions=4
                 )
                 off_m = drive.errors_m(true, map_of(true))
