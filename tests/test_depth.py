@@ -10,6 +10,7 @@ from depth_views import CAMERA, CORRIDOR, RIG, ROOM, WALL, handheld, observe
 
 from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.modules.slam.depth.module import DepthSlam
+from sceneslam.modules.slam.surfaces.surface import DepthSurfaceReader
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
@@ -166,6 +167,15 @@ def test_map_lies_on_the_walls():
     gaps = np.min([d - room @ np.array(n) for *n, d in ROOM], axis=0)
     assert len(points) > 3000
     assert np.quantile(np.abs(gaps), 0.95) < 0.02
+
+
+@pytest.mark.parametrize(("column", "row"), [(-0.9, 5.0), (5.0, -0.9), (-0.9, -0.9)])
+def test_points_beyond_the_first_column_or_row_are_out_of_view(column, row):
+    grid = DepthSurfaceReader(CAMERA).grid
+    ray = [(column - grid.cx) / grid.fx, (row - grid.cy) / grid.fy, 1.0]
+    cells, seen = grid.index(np.array([ray, grid.rays[0], grid.rays[-1]], np.float32))
+    np.testing.assert_array_equal(seen, [False, True, True])
+    np.testing.assert_array_equal(cells, [0, 0, len(grid.rays) - 1])
 
 
 def test_two_runs_are_identical_to_the_bit():

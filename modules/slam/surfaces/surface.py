@@ -43,14 +43,12 @@ class Grid:
         """Return the cell (N,) of points (N, 3) [m], cam, and whether it is in view (N,)."""
         z = points_cam[:, 2]
         scale = 1.0 / np.maximum(z, np.float32(_NEAR_M))
-        u = (points_cam[:, 0] * scale * np.float32(self.fx) + np.float32(self.cx + 0.5)).astype(
-            np.int32
-        )
-        v = (points_cam[:, 1] * scale * np.float32(self.fy) + np.float32(self.cy + 0.5)).astype(
-            np.int32
-        )
+        # Checked before the cast, which would round -0.5 to cell 0.
+        u = points_cam[:, 0] * scale * np.float32(self.fx) + np.float32(self.cx + 0.5)
+        v = points_cam[:, 1] * scale * np.float32(self.fy) + np.float32(self.cy + 0.5)
         seen = (z > _NEAR_M) & (u >= 0) & (v >= 0) & (u < self.width) & (v < self.height)
-        return np.where(seen, v * self.width + u, 0), seen
+        cells = v.astype(np.int32) * np.int32(self.width) + u.astype(np.int32)
+        return np.where(seen, cells, 0), seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
