@@ -6,10 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from depth_views import CAMERA, CORRIDOR, RIG, ROOM, WALL, handheld, observe
+from depth_views import CAMERA, CORRIDOR, RIG, ROOM, WALL, depth_image, handheld, observe
 
 from sceneslam.evaluation.accuracy import absolute_errors
+from sceneslam.modules.slam.depth.keyframe_map import KeyframeMap
+from sceneslam.modules.slam.depth.localizer import DepthLocalizer
 from sceneslam.modules.slam.depth.module import DepthSlam
+from sceneslam.modules.slam.surfaces.registration import CameraPrior, samples_of
 from sceneslam.modules.slam.surfaces.surface import DepthSurfaceReader
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types import se3
@@ -117,6 +120,23 @@ def test_unknown_view_is_lost_and_the_known_one_is_found_again():
     assert {tracking.status for tracking in found} == {TrackingStatus.TRACKING}
     expected = (se3.inverse(poses[0]) @ back[-1])[:3, 3]
     assert np.linalg.norm(found[-1].T_local_base[:3, 3] - expected) < 0.01
+
+
+@pytest.mark.parametrize(("known_ratio", "is_found"), [(0.3, False), (0.7, True)])
+def test_a_view_is_found_again_by_three_keyframes_if_they_show_its_larger_part(
+    known_ratio, is_found
+):
+    reader = DepthSurfaceReader(CAMERA)
+    known_m, image_m = (depth_image(ROOM, np.eye(4), seed=seed) for seed in (0, 1))
+    known_m[:, round(known_ratio * CAMERA.size_wh[0]) :] = 0.0
+    keyframes = KeyframeMap(reader.grid)
+    for stamp_ns in range(3):
+        keyframes.add(reader.read(known_m), CAMERA.T_base_cam, stamp_ns=stamp_ns)
+    image = reader.read(image_m)
+    localizer = DepthLocalizer(keyframes, matched_min_ratio=0.4, weak_ratio=0.005)
+    expected = CameraPrior(CAMERA.T_base_cam, np.eye(6))
+    found = localizer.alike(samples_of(image, reader.grid), image, expected)
+    assert (found is not None) is is_found
 
 
 def test_blind_camera_is_lost_without_odometry_and_degraded_with_it():

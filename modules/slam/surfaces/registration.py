@@ -83,13 +83,9 @@ class SurfaceRegistration:
     T_local_cam: se3.Transform
     information: Doubles  # (6, 6) of se3.log order, cam: of the image, 0 along weak directions
     localizability: Localizability  # by the matched points, cam
-    seen: int  # points that a keyframe shows
-    matched: int  # of these, the points that lie on its planes
-
-    @property
-    def matched_ratio(self) -> float:
-        """Return the share of the points in view that match."""
-        return self.matched / max(self.seen, 1)
+    matched_ratio: float  # share of the points in view that match, over all keyframes
+    seen: int  # points that any keyframe shows
+    matched: int  # of these, the points that lie on planes of any
 
 
 def register(
@@ -105,7 +101,7 @@ def register(
     T_local_cam, gate_m = prior.T_local_cam, _GATE_M[0]
     for _ in range(_ITERATIONS_MAX):
         system = _System(samples, keyframes, T_local_cam, gate_m=gate_m, grid=grid)
-        if system.matched < _POINTS_MIN:
+        if system.is_matched.sum() < _POINTS_MIN:
             return None
         off = se3.log(se3.inverse(prior.T_local_cam) @ T_local_cam)
         information = held.T @ system.information @ held + prior.information
@@ -118,7 +114,14 @@ def register(
     matched = samples.localizability(system.is_matched)
     held = matched.held(weak_ratio)
     information = held.T @ system.information @ held
-    return SurfaceRegistration(T_local_cam, information, matched, system.seen, system.matched)
+    return SurfaceRegistration(
+        T_local_cam,
+        information,
+        matched,
+        matched_ratio=system.pairs_matched / max(system.pairs_seen, 1),
+        seen=int(system.is_seen.sum()),
+        matched=int(system.is_matched.sum()),
+    )
 
 
 class _System:
@@ -134,8 +137,8 @@ class _System:
         grid: Grid,
     ) -> None:
         self.information, self.pull = np.zeros((6, 6)), np.zeros(6)
-        self.seen, self.matched = 0, 0
-        self.is_matched = np.zeros(len(samples), np.bool_)
+        self.pairs_seen, self.pairs_matched = 0, 0  # of a point and a keyframe
+        self.is_seen, self.is_matched = np.zeros((2, len(samples)), np.bool_)
         for keyframe in keyframes:
             self._add(samples, keyframe, keyframe.T_cam_local @ T_local_cam, gate_m, grid)
         self.information /= _CORRELATION
@@ -160,9 +163,10 @@ class _System:
         weighted = jacobian * (kernel / sigmas_m**2)[:, None]
         self.information += (jacobian.T @ weighted).astype(np.float64)
         self.pull -= (weighted.T @ residuals).astype(np.float64)
+        self.is_seen |= seen
         self.is_matched |= same
-        self.seen += int(seen.sum())
-        self.matched += len(rows)
+        self.pairs_seen += int(seen.sum())
+        self.pairs_matched += len(rows)
 
 
 def compare(
