@@ -63,6 +63,20 @@ def test_an_image_of_another_place_is_no_pose(odometry):
     assert found.status is expected and (found.covariance is None) is not odometry
 
 
+@pytest.mark.parametrize("is_blind", [False, True])
+def test_a_first_keyframe_after_unknown_motion_is_degraded(is_blind):
+    module = active()
+    if is_blind:
+        seen = room_observation(0)
+        blind = replace(seen, depth_m=np.zeros_like(seen.depth_m), **SILENT)
+        assert module.track(blind).status is TrackingStatus.LOST
+    first, second = (
+        module.track(replace(room_observation(index), **SILENT)).status for index in (1, 2)
+    )
+    assert first is (TrackingStatus.DEGRADED if is_blind else TrackingStatus.TRACKING)
+    assert second is TrackingStatus.TRACKING
+
+
 def test_a_blank_wall_is_degraded_along_itself():
     wall = replace(
         room_observation(0),

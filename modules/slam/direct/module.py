@@ -141,12 +141,13 @@ class DirectSlam:
     ) -> Tracking:
         """Make the first keyframe of the session, or after tracking was lost."""
         is_first = self._key is None
+        is_known = is_first and not self._predictor.is_lost
         self._predictor.coast(prediction)
         self._T_local_base = prediction.T_local_base
         self._add_keyframe(observation, view, None)
         if is_first:
             self._predictor.measure(observation, self._T_local_base, prediction.covariance)
-        status = TrackingStatus.TRACKING if is_first else TrackingStatus.DEGRADED
+        status = TrackingStatus.TRACKING if is_known else TrackingStatus.DEGRADED
         return self._predictor.tracking(
             observation, self._T_local_base, status, quality_ratio=1.0 if is_first else 0.0
         )
