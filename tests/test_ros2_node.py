@@ -26,6 +26,7 @@ from sceneslam.testing import RIG, room_observation
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, ModuleError
 from sceneslam.types.observation import TrackingStatus
+from sceneslam.types.rig import Sensor
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: pip install sceneslam[ros2]")
 NODE = Path(__file__).with_name("ros2_odometry_node.py")
@@ -156,6 +157,15 @@ def test_a_setting_that_makes_no_sense_is_named(key, value):
 def test_a_pose_by_tf_is_that_of_base():
     with pytest.raises(ConfigError, match=r"pose_frame: got 'camera', allowed: base"):
         build("good", pose_kind="tf", pose_frame="camera")
+
+
+def test_a_pose_of_a_camera_that_the_rig_does_not_have_is_named():
+    module = build("good", pose_frame="camera")
+    try:
+        with pytest.raises(ConfigError, match=r"pose_frame: got 'camera', allowed: base"):
+            module.activate(replace(RIG, camera=None, sensors=frozenset({Sensor.ODOMETRY})))
+    finally:
+        module.note_failure()
 
 
 @pytest.mark.parametrize("preset", ["slam_toolbox", "cartographer", "rtabmap", "orb_slam3"])

@@ -18,7 +18,7 @@ import numpy as np
 from sceneslam.ros.transport.transport import DDS, Network
 from sceneslam.supervision.limits import Limits
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.rig import Sensor
+from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import Command
 
 from ..process.module import ProcessSlam
@@ -114,3 +114,10 @@ class Ros2Node(ProcessSlam):
         super().__init__(
             command=bridge, late_max_s=late_max_s, limits=limits, closes_loops=closes_loops
         )
+        self._pose_frame = pose_frame
+
+    def activate(self, rig: Rig) -> None:
+        """Start a session; raises ConfigError if the poses are those of a missing camera."""
+        if self._pose_frame == "camera" and rig.camera is None:
+            raise ConfigError("pose_frame", "camera", "base, as the rig has no camera")
+        super().activate(rig)
