@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic, sleep
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,12 +20,14 @@ from omegaconf import OmegaConf
 from sceneslam.config.check import check_node
 from sceneslam.modules.slam.process.client import LOST, TRACKING
 from sceneslam.modules.slam.ros2_node.client import NodeClient
-from sceneslam.modules.slam.ros2_node.listener import moved
+from sceneslam.modules.slam.ros2_node.listener import NodeListener, moved
 from sceneslam.modules.slam.ros2_node.module import NodeTopics, Ros2Node
-from sceneslam.ros.transport.transport import Network
+from sceneslam.ros.encode_results import ResultEncoder
+from sceneslam.ros.transport.transport import Arrival, Network
 from sceneslam.testing import RIG, room_observation
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError, ModuleError
+from sceneslam.types.errors import ConfigError, InputError, ModuleError
+from sceneslam.types.maps import GridLayer
 from sceneslam.types.observation import TrackingStatus
 from sceneslam.types.rig import Sensor
 
@@ -181,6 +184,27 @@ def test_a_preset_is_a_whole_configuration(preset):
         check_node(plain, "slam.only", allow=[])
     node.command = ["true"]  # the real one is not installed here
     assert isinstance(instantiate(node, _convert_="all"), Ros2Node)
+
+
+def listened(T_world_grid):
+    """Return the map that a listener has after a grid of one cell at a pose."""
+    heard = {}
+    transport = SimpleNamespace(
+        subscribe=lambda topic, kind, hear, qos: heard.update({topic: hear})
+    )
+    topics = NONE | {"pose": "/pose", "map": "/map"}
+    listener = NodeListener(transport, {"topics": topics, "pose_kind": "pose", "map_kind": "grid"})
+    cell = GridLayer(log_odds=np.ones((1, 1)), resolution_m=0.05, origin_xy_m=(0.0, 0.0))
+    cdr = ResultEncoder().grid(0, cell, T_world_grid, "map")
+    heard["/map"](Arrival(topic="/map", cdr=cdr, arrived_ns=0))
+    return listener.map()
+
+
+def test_a_grid_that_is_rotated_in_its_map_is_refused():
+    origin_xy_m = listened(se3.from_xy_yaw(1.0, 2.0, 0.0))["grid.origin_xy_m"]
+    np.testing.assert_allclose(origin_xy_m, [1.0, 2.0])
+    with pytest.raises(InputError, match=r"grid: expected the orientation 0 0 0 1 .* got 0 0 0.14"):
+        listened(se3.from_xy_yaw(1.0, 2.0, 0.3))
 
 
 def test_a_grid_is_moved_unless_it_would_have_to_be_turned():

@@ -13,11 +13,13 @@ from sceneslam.ros import decode, names
 from sceneslam.ros.clouds import cloud
 from sceneslam.ros.transport.transport import Arrival, Qos, Transport
 from sceneslam.types import se3
+from sceneslam.types.errors import InputError
 from sceneslam.types.se3 import Transform
 
 _MAP_TYPES = {"grid": "nav_msgs/msg/OccupancyGrid", "points": "sensor_msgs/msg/PointCloud2"}
 _POSE_TYPES = {"odometry": "nav_msgs/msg/Odometry", "pose": "geometry_msgs/msg/PoseStamped"}
 _LOG_ODDS = 4.0  # of a cell with occupancy 100
+_TURN_MAX_RAD = 1e-3  # of a grid against the axes of the map, or of `local`
 
 
 class NodeListener:
@@ -83,14 +85,18 @@ class NodeListener:
 
 
 def _grid(message: Any) -> dict[str, NDArray[Any]]:
-    """Return an OccupancyGrid as log odds; its axes must be parallel to the map frame's."""
-    info = message.info
+    """Return an OccupancyGrid as log odds; raises InputError if it is rotated in the map frame."""
+    info, turn = message.info, message.info.origin.orientation
+    T_world_grid = decode.transform(info.origin.position, turn)
+    if T_world_grid is None or se3.rotation_angle_rad(T_world_grid) > _TURN_MAX_RAD:
+        got = f"{turn.x:g} {turn.y:g} {turn.z:g} {turn.w:g}"
+        raise InputError(f"grid: expected the orientation 0 0 0 1 (x y z w) of origin, got {got}")
     percent = np.asarray(message.data, np.float32).reshape(info.height, info.width)
     log_odds = np.where(percent < 0, 0.0, (percent - 50.0) / 50.0 * _LOG_ODDS)
     return {
         "grid.log_odds": log_odds.astype(np.float32),
         "grid.resolution_m": np.array(info.resolution, np.float64),
-        "grid.origin_xy_m": np.array([info.origin.position.x, info.origin.position.y]),
+        "grid.origin_xy_m": T_world_grid[:2, 3],
     }
 
 
@@ -104,7 +110,7 @@ def moved(layers: dict[str, NDArray[Any]], T_local_world: Transform) -> dict[str
     if "points.points" in layers:
         points = se3.apply(T_local_world, layers["points.points"])
         return {"points.points": points.astype(np.float32)}
-    if "grid.log_odds" in layers and se3.rotation_angle_rad(T_local_world) < 1e-3:
+    if "grid.log_odds" in layers and se3.rotation_angle_rad(T_local_world) < _TURN_MAX_RAD:
         origin = layers["grid.origin_xy_m"] + T_local_world[:2, 3]
         return {**layers, "grid.origin_xy_m": origin}
     return {}
