@@ -68,6 +68,13 @@ def test_the_parameter_places_the_laser(tmp_path: Path) -> None:
     assert source.rig.laser.T_base_laser[0, 3] == 0.115
 
 
+@pytest.mark.parametrize("offset", ["nan", "inf", "-inf", "0,115"])
+def test_a_place_of_the_laser_that_is_no_number_is_named(tmp_path: Path, offset: str) -> None:
+    lines = f"PARAM robot_frontlaser_offset {offset} nohost 0", flaser([1.0] * 180, "1.0")
+    with pytest.raises(InputError, match=rf"robot_frontlaser_offset: .* got '{offset}': .*a\.log"):
+        make_source("carmen", write(tmp_path / "a.log", *lines))
+
+
 def test_new_lines_say_their_angles_and_mount(tmp_path: Path) -> None:
     line = (
         "ROBOTLASER1 0 -2.0 4.0 0.5 30.0 0.01 0 4 1.0 2.0 31.0 0.0 1 7 "

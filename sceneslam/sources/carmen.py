@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -62,9 +63,9 @@ class Carmen(StampedScans):
         order = _driven_order(self._lines, distinct_ns)
         self._lines = [self._lines[place] for place in order]
         self._logged_ns = distinct_ns[order]
-        T_base_laser = se3.from_xy_yaw(self._offset_m(), 0.0, 0.0)
-        if first.T_base_laser is not None:
-            T_base_laser = first.T_base_laser
+        T_base_laser = first.T_base_laser
+        if T_base_laser is None:
+            T_base_laser = se3.from_xy_yaw(self._offset_m(), 0.0, 0.0)
         rig = Rig(
             sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}),
             laser=Laser(T_base_laser=T_base_laser),
@@ -150,15 +151,19 @@ class Carmen(StampedScans):
         return new if len(new) >= len(old) else old
 
     def _offset_m(self) -> float:
-        """Return the laser's distance [m] in front of the robot's centre, 0 if not logged."""
+        """Return the laser's distance [m] in front of the robot's centre, 0 if not logged.
+
+        Raises InputError if it is not a finite number.
+        """
         with self._path.open("rb") as file:
             for line in file:
                 words = line.split()
                 if words[:1] == [b"PARAM"] and words[1:2] == [_OFFSET] and len(words) > 2:
-                    try:
-                        return float(words[2])
-                    except ValueError:
-                        return 0.0
+                    with suppress(ValueError):
+                        if np.isfinite(offset_m := float(words[2])):
+                            return offset_m
+                    name, got = (word.decode(errors="replace")[:40] for word in words[1:3])
+                    raise InputError(f"{name}: expected metres, got {got!r}: {self._path}")
         return 0.0
 
 
