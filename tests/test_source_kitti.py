@@ -58,6 +58,16 @@ def test_poses_of_twelve_numbers_are_truth(tmp_path: Path) -> None:
         make_source("kitti", folder).ground_truth()
 
 
+@pytest.mark.parametrize("wrong", [np.zeros((3, 3)), 1.1 * np.eye(3), np.diag([1.0, 1.0, -1.0])])
+def test_a_pose_without_a_rotation_is_named_by_its_line(tmp_path: Path, wrong: np.ndarray) -> None:
+    folder = make_folder(tmp_path / "a")
+    rows = np.tile(np.eye(4)[:3], (3, 1, 1))
+    rows[1, :, :3] = wrong
+    np.savetxt(folder / "poses.txt", rows.reshape(3, 12), header="two lines\nof comment")
+    with pytest.raises(InputError, match=r"poses: line 4 has no rotation: .*poses\.txt"):
+        make_source("kitti", folder).ground_truth()
+
+
 def test_damaged_scans_are_passed_over_and_named(tmp_path: Path) -> None:
     folder = make_folder(tmp_path / "a")
     (folder / "velodyne" / "000001.bin").write_bytes(POINTS.tobytes()[:-3])

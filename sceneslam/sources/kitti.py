@@ -27,6 +27,7 @@ _TIMES = ("times.txt", "velodyne_points/timestamps.txt", "timestamps.txt")
 _PERIOD_NS = 100_000_000
 _POINT_BYTES = 16  # float32 x y z reflectance
 _SAMPLES = 3  # scans that are read for a survey
+_SKEW_MAX = 1e-2  # entries of R^T R - I of a rotation written with three decimals or more
 
 
 class Kitti(StampedScans):
@@ -91,6 +92,13 @@ class Kitti(StampedScans):
             )
         T_gt_base = np.tile(se3.identity(), (len(rows), 1, 1))
         T_gt_base[:, :3, :] = rows.reshape(-1, 3, 4)
+        rotations = T_gt_base[:, :3, :3]
+        skews = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
+        wrong = np.flatnonzero((skews > _SKEW_MAX) | (np.linalg.det(rotations) < 0))
+        if len(wrong):
+            text = read_text(path).splitlines()
+            numbers = [n for n, line in enumerate(text, start=1) if line.partition("#")[0].strip()]
+            raise InputError(f"poses: line {numbers[wrong[0]]} has no rotation: {path}")
         return Trajectory(stamps_ns=self._stamps_ns, T_world_base=T_gt_base)
 
     def _jobs(self) -> Iterator[Callable[[], NDArray[np.float32] | None]]:
