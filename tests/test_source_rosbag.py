@@ -294,6 +294,19 @@ def test_a_scan_without_a_stamp_has_that_of_its_recording(tmp_path: Path) -> Non
     assert one.stamp_ns == one.scan.stamp_ns == STAMP_NS
 
 
+def test_messages_outside_of_the_chunks_of_a_file_are_read_in_their_order(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        chunk = recorder._writer._Writer__chunk_builder
+        for index in range(6):
+            is_inside = index in (0, 2, 3, 5)
+            recorder._writer._Writer__chunk_builder = chunk if is_inside else None
+            recorder.scan("/scan", STAMP_NS + index, [1.0] * 400)
+        recorder._writer._Writer__chunk_builder = chunk
+    source = make_source("rosbag", tmp_path / "a.mcap")
+    assert [one.stamp_ns - STAMP_NS for one in source] == list(range(6))
+    assert source.length == 6 and list(source.faults) == []
+
+
 @pytest.mark.parametrize("is_absolute", [True, False])
 def test_times_of_points_count_from_the_observation(tmp_path: Path, is_absolute: bool) -> None:
     """A cloud that was measured 40 ms before the image it is given with."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -105,7 +105,34 @@ class McapFile:
             )
             for entry in summary.chunk_indexes
         ]
+        # No index lists the messages outside of chunks.
+        begin = len(records.MAGIC)
+        for entry in sorted(summary.chunk_indexes, key=lambda entry: entry.chunk_start_offset):
+            chunks += self._messages_between(file, begin, entry.chunk_start_offset)
+            begin = entry.chunk_start_offset + entry.chunk_length + entry.message_index_length
+        chunks += self._messages_between(file, begin, self._path.stat().st_size)
         return Layout(chunks=chunks, topics=topics, metadata=metadata)
+
+    def _messages_between(self, file: IO[bytes], begin: int, end: int) -> Iterator[Chunk]:
+        """Yield the messages in a part of the file without chunks, each as a chunk of its own."""
+        while begin + records.RECORD_HEAD.size <= end:
+            file.seek(begin)
+            opcode, length = records.RECORD_HEAD.unpack(file.read(records.RECORD_HEAD.size))
+            whole = records.RECORD_HEAD.size + length
+            if opcode == records.DATA_END or begin + whole > end:
+                return
+            if opcode == records.MESSAGE and length >= records.MESSAGE_HEAD.size:
+                head = file.read(records.MESSAGE_HEAD.size)
+                channel, _, log_ns, _ = records.MESSAGE_HEAD.unpack(head)
+                yield Chunk(
+                    file=self._path,
+                    offset=begin,
+                    length=whole,
+                    start_ns=log_ns,
+                    end_ns=log_ns,
+                    topics=self._named([channel]),
+                )
+            begin += whole
 
     def _from_content(self, file: IO[bytes], size: int, note: str) -> Layout:
         """Return the layout by reading the whole file, up to its last readable record.
