@@ -84,6 +84,15 @@ def test_images_that_are_wrong_are_counted_and_shown(folders, model, capsys, tmp
     assert sheet.shape == (300, 960, 3) and sheet[:120, :160].mean() < 30  # a dark one
 
 
+@pytest.mark.parametrize("name", ["wrong.xyz", "wrong"])
+def test_a_sheet_that_is_no_image_is_named_before_a_recording_is_read(
+    model, capsys, tmp_path, name
+):
+    missing = f"Dark={tmp_path / 'nowhere'}"
+    assert main(["test", str(model), missing, "--sheet", str(tmp_path / name)]) == 2
+    assert f"error: --sheet: got {tmp_path / name}, allowed: an image" in capsys.readouterr().err
+
+
 def test_detector_votes_as_the_model_does_with_probabilities_that_sum_to_one(folders, model):
     detector, read = learned(model), Model.read(model)
     for folder in ("Bright_2", "Dark_2"):

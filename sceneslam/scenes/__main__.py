@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from sceneslam.config.component import ComponentBuilder
@@ -67,6 +68,8 @@ def _train(options: argparse.Namespace, words: Sequence[str]) -> None:
 
 
 def _test(options: argparse.Namespace) -> None:
+    if not cv2.haveImageWriter(str(options.sheet)):
+        raise InputError(f"--sheet: got {options.sheet}, allowed: an image, such as wrong.png")
     model = Model.read(options.model)
     seen = _look(options, model.features)
     for one in seen:
