@@ -105,6 +105,15 @@ def test_every_instant_gets_the_module_whose_error_grew_least(runs, tmp_path, ca
     assert '"scenes={eyes:[eyes,laser],laser:[laser,eyes]}"' in capsys.readouterr().out
 
 
+def test_labels_count_from_the_first_observation_where_the_poses_begin_later(runs, tmp_path):
+    vote = {"event": "vote", "stamp_ns": FIRST_NS - 2 * 10**9, "scene": "Any", "value": None}
+    for path in runs.rglob("events.jsonl"):
+        path.write_text(f"{json.dumps(vote)}\n")
+    assert main(["label", str(tmp_path / "labels.yaml"), str(runs)]) == 0
+    first, second = spans_of(tmp_path / "labels.yaml")
+    assert first == ("eyes", 2.0) and second[0] == "laser" and second[1] == pytest.approx(7, abs=1)
+
+
 def test_a_change_that_costs_more_than_it_gains_is_not_made(runs, tmp_path, capsys):
     assert main(["label", str(tmp_path / "l.yaml"), str(runs), "--change-m", "1.0"]) == 0
     assert len(spans_of(tmp_path / "l.yaml")) == 1

@@ -105,7 +105,8 @@ def label(runs: Sequence[ModuleRun], change_m: float) -> Labels:
         stamps_ns = _instants_ns(group)
         drift_mps = _drifts_mps(group, keys, stamps_ns)
         best = cheapest(drift_mps * STEP_S, change_m)
-        recordings.append(_labelled(group[0], keys, best, drift_mps))
+        start_s = (int(stamps_ns[0]) - min(run.first_ns for run in group)) * 1e-9
+        recordings.append(_labelled(group[0], keys, best, drift_mps, start_s=start_s))
         drifts.append(np.column_stack([best, drift_mps]))
     return Labels(recordings=recordings, table=_table(keys, np.concatenate(drifts)))
 
@@ -159,7 +160,12 @@ def _drifts_mps(
 
 
 def _labelled(
-    run: ModuleRun, keys: Sequence[str], best: NDArray[np.int64], drift_mps: NDArray[np.float64]
+    run: ModuleRun,
+    keys: Sequence[str],
+    best: NDArray[np.int64],
+    drift_mps: NDArray[np.float64],
+    *,
+    start_s: float,
 ) -> Labelled:
     source = run.config["source"]
     group = str(source.get("path") or source.get("story") or source["_target_"])
@@ -170,8 +176,8 @@ def _labelled(
         inside = [at for at, _ in found]
         spans.append(
             BestModuleSpan(
-                start_s=round(inside[0] * STEP_S, 3),
-                end_s=round((inside[-1] + 1) * STEP_S, 3),
+                start_s=round(start_s + inside[0] * STEP_S, 3),
+                end_s=round(start_s + (inside[-1] + 1) * STEP_S, 3),
                 scene=keys[place],
                 gain_m=round(float(gains_m[inside].sum()), 6),
             )

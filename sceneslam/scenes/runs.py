@@ -41,6 +41,13 @@ class ModuleRun:
         """Return an identifier of the recording: the source with its effects, as text."""
         return json.dumps([self.config["source"], self.config.get("effects")], sort_keys=True)
 
+    @property
+    def first_ns(self) -> int:
+        """Return the stamp of the first observation: poses may begin later, votes do not."""
+        first_pose_ns = int(self.estimate.stamps_ns[0])
+        votes_ns = (int(one["stamp_ns"]) for one in self._events() if one["event"] == "vote")
+        return min(first_pose_ns, next(votes_ns, first_pose_ns))
+
     def drift_mps(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the drift (N,) [m/s]: growth of its error around each stamp.
 
