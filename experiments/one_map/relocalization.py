@@ -176,9 +176,9 @@ def _starts(count: int, offs: Sequence[tuple[float, float]]) -> Starts:
 def _start(plan: FloorPlan, world: World, T_world_map: Planar, within_s: float) -> Planar | None:
     """Return by how much a start was found beside the truth, None where it was not found."""
     localizer, latest = MapLocalizer(plan), list[Look]()
-    pose = start = _free_pose(world)
-    for step in range(round(within_s / _STEP_S) + 1):
-        T_run_base = planar.between(start, pose)
+    drive = short_drive(world, within_s)
+    for step, pose in enumerate(drive):
+        T_run_base = planar.between(drive[0], pose)
         scan = key_scan(world, pose, round(step * _STEP_S * 1e9))
         T_run = planar.to_transform(T_run_base)
         latest.append(Look(stamp_ns=scan.stamp_ns, T_run_base=T_run, scan=scan))
@@ -188,8 +188,15 @@ def _start(plan: FloorPlan, world: World, T_world_map: Planar, within_s: float) 
         if is_found and localizer.T_map_run is not None:
             T_map_base = planar.from_transform(localizer.T_map_run @ T_run)
             return planar.between(planar.between(T_world_map, pose), T_map_base)
-        pose = _driven_on(world, pose)
     return None
+
+
+def short_drive(world: World, within_s: float) -> list[Planar]:
+    """Return the poses (3,) of a drive from a random place, every 0.2 s."""
+    poses = [_free_pose(world)]
+    for _ in range(round(within_s / _STEP_S)):
+        poses.append(_driven_on(world, poses[-1]))
+    return poses
 
 
 def _free_pose(world: World) -> Planar:

@@ -104,7 +104,7 @@ class World:
         """Return the laser's scan at T_world_base (3,); the laser is at the origin of `base`."""
         scanner = self.scanner
         angles = np.linspace(-scanner.field_rad / 2, scanner.field_rad / 2, scanner.beams)
-        hit_m = self._hit(T_world_base, angles)
+        hit_m = self.hit(T_world_base, angles)
         hit_m = hit_m + self.rng.normal(0.0, scanner.noise_m, scanner.beams)
         return LaserScan(
             stamp_ns=stamp_ns,
@@ -115,7 +115,7 @@ class World:
             range_max_m=scanner.range_m,
         )
 
-    def _hit(self, T_world_base: Planar, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    def hit(self, T_world_base: Planar, angles: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the distance (beams,) [m] to each beam's first wall, inf without one."""
         walls = np.array(self.walls, np.float64)
         yaw = T_world_base[2] + angles
