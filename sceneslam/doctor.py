@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from importlib.resources import files
 from typing import Any
 
-from sceneslam.config.build import make_source
+from sceneslam.config.build import opened_source
 from sceneslam.config.check import TOP_LEVEL
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.words import is_override
@@ -44,15 +44,11 @@ def examine(words: Sequence[str]) -> list[str]:
         raise ConfigError("doctor", " ".join(words) or "nothing", "source=NAME, as source=ros2")
     words = [word for word in words if _key_of(word) in ("source", "effects")]
     config: dict[str, Any] = composed(tuple(words), None)
-    source = make_source(config, ComponentBuilder(config))
-    feed = source.live if isinstance(source, Live) else None
-    try:
+    with opened_source(config, ComponentBuilder(config)) as source:
+        is_live = isinstance(source, Live) and source.live is not None
         rig = source.rig
         survey = source.survey() if isinstance(source, Surveyed) else None
         found = Preflight(lines=(), warnings=()) if survey is None else preflight(survey, rig)
-    finally:
-        if feed is not None:
-            feed.close()
     return [
         *(found.lines or [f"sensors: {', '.join(_named(rig.sensors))}"]),
         *(f"warning: {one}" for one in found.warnings),
@@ -61,7 +57,7 @@ def examine(words: Sequence[str]) -> list[str]:
         "",
         *_modules(words, rig),
         "",
-        *_proposal(words, rig, is_live=feed is not None),
+        *_proposal(words, rig, is_live=is_live),
     ]
 
 

@@ -20,7 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
 from sceneslam.app import run
-from sceneslam.config.build import make_source
+from sceneslam.config.build import opened_source
 from sceneslam.config.check import check_given, first_line
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.overlay import command_of, comment_of
@@ -201,13 +201,15 @@ def _run_unless_finished(config: dict[str, Any], folder: Path, name: str) -> Non
 
 def _prepare(config: dict[str, Any]) -> None:
     """Read the first observation, for which the simulator renders and caches its whole story."""
-    next(iter(make_source(config, ComponentBuilder(config))), None)
+    with opened_source(config, ComponentBuilder(config)) as source:
+        next(iter(source), None)
 
 
 def _try_sources(configs: Iterable[Mapping[str, Any]]) -> None:
     """Raise the error of a source that cannot be opened."""
     for config in {_input_of(config): config for config in configs}.values():
-        make_source(config, ComponentBuilder(config))
+        with opened_source(config, ComponentBuilder(config)):
+            pass
 
 
 def _input_of(config: Mapping[str, Any]) -> str:

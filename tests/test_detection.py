@@ -7,11 +7,14 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from time import process_time
 
 import numpy as np
 import pytest
+from configured import config as faked
+from fakes import LiveFeedSource
 from hydra import compose, initialize_config_module
 
 from sceneslam.app import run
@@ -19,7 +22,7 @@ from sceneslam.config.resolve import resolved
 from sceneslam.detection.features import RecordingFeatures
 from sceneslam.detection.grid import Axis, try_all
 from sceneslam.detection.run import detect
-from sceneslam.types.errors import ConfigError, ModuleError
+from sceneslam.types.errors import ConfigError, InputError, ModuleError
 from sceneslam.types.files import AppendedFile
 from sceneslam.types.truth import SceneChange
 
@@ -27,6 +30,7 @@ ROOT = Path(__file__).parents[1]
 TINY = ("story=flicker", "source.camera.size_wh=[80,60]", "source.camera.rate_hz=10")
 FULL = ("+scenario=single", "slam@slam.only=odometry", "detector=grey_mean", "run.report=false")
 FULL = (*FULL, "~sinks@sinks.rerun", "+scenes={Bright:[only],Dark:[only]}", "run.progress=false")
+BROKEN = pytest.raises(InputError, match="breaks off")
 
 
 @pytest.fixture(scope="module")
@@ -197,6 +201,18 @@ def test_a_detector_that_fails_is_one_sentence(config, tmp_path, monkeypatch, me
     words = config(*TINY, "run=detect_only", "run.max_observations=12")
     with pytest.raises(ModuleError, match="the detector failed: OSError: the camera is gone"):
         detect(words, tmp_path)
+
+
+@pytest.mark.parametrize(("breaks_at", "outcome"), [(None, nullcontext()), (3, BROKEN)])
+def test_live_source_is_closed_at_the_end_of_a_run_without_slam(
+    cache, tmp_path, monkeypatch, breaks_at, outcome
+):
+    monkeypatch.setenv("SCENESLAM_CACHE_DIR", str(cache))
+    monkeypatch.setattr(LiveFeedSource, "is_open", True)
+    source = {"_target_": "fakes.LiveFeedSource", "steps": 9, "dark_from": 5}
+    with outcome:
+        detect(faked(source=source | {"breaks_at": breaks_at}, run__mode="detect_only"), tmp_path)
+    assert not LiveFeedSource.is_open
 
 
 def test_detector_without_features_is_refused(config, tmp_path):

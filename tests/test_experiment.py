@@ -14,11 +14,12 @@ from types import SimpleNamespace
 
 import pytest
 from configured import config
+from fakes import LiveFeedSource
 from omegaconf import OmegaConf
 
 from sceneslam import cli
 from sceneslam.evaluation.verdict import verdict_lines, write_verdict
-from sceneslam.experiment import _run_unless_finished, _Trials
+from sceneslam.experiment import _prepare, _run_unless_finished, _Trials, _try_sources
 from sceneslam.experiments.openloris.dataset import Dataset
 from sceneslam.experiments.openloris.rates import Rates, mean
 from sceneslam.types.errors import InputError
@@ -221,6 +222,13 @@ def test_a_trial_whose_process_is_killed_is_one_sentence(tmp_path):
     trials = _Trials("matrix", tmp_path, [], 2, None)
     with pytest.raises(InputError, match=r"a trial's process ended \(it was killed, or jobs=2"):
         list(trials._made([(Trial(name="trial"), killed)]))
+
+
+@pytest.mark.parametrize("read", [_prepare, lambda settings: _try_sources([settings])])
+def test_a_live_source_that_was_tried_before_the_trials_is_closed(monkeypatch, read):
+    monkeypatch.setattr(LiveFeedSource, "is_open", True)
+    read(config(source={"_target_": "fakes.LiveFeedSource", "steps": 9, "dark_from": 5}))
+    assert not LiveFeedSource.is_open
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -100,6 +100,16 @@ def make_source(config: Mapping[str, Any], builder: ComponentBuilder) -> Source:
         source = changed
     feed = _feed(source)
     return Ordered(source) if feed is None else RisingLive(source, feed)
+
+
+@contextmanager
+def opened_source(config: Mapping[str, Any], builder: ComponentBuilder) -> Iterator[Source]:
+    """Give the source with its effects; a live one is closed at the end."""
+    source = make_source(config, builder)
+    try:
+        yield source
+    finally:
+        _release(source)
 
 
 def check_detector(config: Mapping[str, Any], detector: Detector, rig: Rig) -> None:

@@ -12,7 +12,7 @@ from sceneslam.bus.events import EventLog
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.scene_filter import ConfirmedScene
 from sceneslam.bus.watch import log_vote
-from sceneslam.config.build import check_detector, check_no_map, make_source
+from sceneslam.config.build import check_detector, check_no_map, opened_source
 from sceneslam.config.check import check_keys
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.provenance import save_config
@@ -46,10 +46,10 @@ def watch(config: Mapping[str, Any]) -> Watched:
     builder = ComponentBuilder(config)
     run = builder.make("run", RunSettings)
     detector = builder.make("detector", FeatureDetector)
-    source = make_source(config, builder)
-    rig = source.rig
-    check_detector(config, detector, rig)
-    features = recall(config, detector, source, run)
+    with opened_source(config, builder) as source:
+        rig = source.rig
+        check_detector(config, detector, rig)
+        features = recall(config, detector, source, run)
     return Watched(rig=rig, features=features)
 
 
