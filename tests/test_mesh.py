@@ -1,12 +1,15 @@
 """A coloured mesh of the depth images of a run."""
 
+from contextlib import closing
+
 import numpy as np
 import pytest
 
 from sceneslam.mesh.__main__ import main
 from sceneslam.mesh.mesh import Volume, views
+from sceneslam.storage.folder import RunFolder
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Camera
+from sceneslam.types.rig import Camera, Rig
 from sceneslam.types.trajectory import Trajectory
 
 CAMERA = Camera(size_wh=(80, 60), fx=70.0, fy=70.0, cx=39.5, cy=29.5)
@@ -52,6 +55,29 @@ def test_images_are_taken_a_step_apart_and_only_where_there_is_a_pose():
     late = [Observation(stamp_ns=10**12, depth_m=observations[0].depth_m)]
     empty = [Observation(stamp_ns=10**9, depth_m=np.zeros((60, 80), np.float32))]
     assert not list(views(late, trajectory, CAMERA)) and not list(views(empty, trajectory, CAMERA))
+
+
+class RecordedWall:
+    """A source of the images of the wall."""
+
+    rig = Rig(sensors=frozenset(), camera=CAMERA)
+    __iter__ = drive()[0].__iter__
+
+
+def test_the_next_run_into_the_folder_removes_the_mesh(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sceneslam.mesh.mesh._source", lambda *_: RecordedWall())
+    with closing(RunFolder.claim(tmp_path)) as claimed:
+        drive()[1].write_tum(tmp_path / "trajectory.tum")
+        for _ in range(2):  # its own mesh is replaced
+            assert main([str(tmp_path), "--voxel-m", "0.05"]) == 0
+        assert (tmp_path / "map" / "mesh.ply").is_file()
+        claimed.clear()
+        assert not (tmp_path / "map" / "mesh.ply").exists()
+        drive()[1].write_tum(tmp_path / "trajectory.tum")
+        (tmp_path / "map" / "mesh.ply").write_text("mine")
+        assert main([str(tmp_path), "--voxel-m", "0.05"]) == 2
+    assert (tmp_path / "map" / "mesh.ply").read_text() == "mine"
+    assert "there is a file that no run wrote" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from pathlib import Path
 from sceneslam.config.words import typed_targets
 from sceneslam.mesh.mesh import write_mesh
 from sceneslam.streams import secure_streams
-from sceneslam.types.errors import ConfigError, SceneSlamError
+from sceneslam.types.errors import ConfigError, SceneSlamError, text_of
 
 _VOXEL_M = 0.03
 
@@ -22,8 +22,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not 0.002 <= options.voxel_m <= 1.0:
             raise ConfigError("--voxel-m", options.voxel_m, "0.002 to 1 m")
         meshed = write_mesh(options.run.resolve(), options.voxel_m, _names(options.allowed))
-    except SceneSlamError as error:
-        print(f"error: {error}", file=sys.stderr)
+    except (SceneSlamError, OSError) as error:
+        said = str(error) if isinstance(error, SceneSlamError) else text_of(error)
+        print(f"error: {said}", file=sys.stderr)
         return 2
     print(f"mesh     {meshed.path}: {meshed.triangles} triangles of {meshed.views} depth images")
     return 0

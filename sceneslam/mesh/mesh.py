@@ -19,6 +19,7 @@ from sceneslam.evaluation.association import interpolated
 from sceneslam.interfaces import Live, Source
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
+from sceneslam.types.files import own
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
@@ -53,7 +54,8 @@ def write_mesh(folder: Path, voxel_m: float, allowed: Sequence[str] = ()) -> Mes
 
     The recording is read again; the poses of its images are those of `trajectory.tum`. `allowed`
     names the packages of the user that may hold its source. Raises ConfigError or InputError if
-    the run or its recording cannot be read, or has no depth.
+    the run or its recording cannot be read, or has no depth, FileExistsError if there is a mesh
+    that no run wrote.
     """
     source = _source(folder, allowed)
     camera = source.rig.camera
@@ -62,6 +64,7 @@ def write_mesh(folder: Path, voxel_m: float, allowed: Sequence[str] = ()) -> Mes
     trajectory = Trajectory.read_tum(folder / "trajectory.tum")
     if len(trajectory) < 2:
         raise InputError(f"mesh: the run's trajectory has fewer than two poses: {folder}")
+    path = own(folder / "map" / "mesh.ply")
     volume = Volume(camera, voxel_m)
     count = 0
     for view in views(source, trajectory, camera):
@@ -69,7 +72,6 @@ def write_mesh(folder: Path, voxel_m: float, allowed: Sequence[str] = ()) -> Mes
         count += 1
     if count == 0:
         raise InputError(f"mesh: no depth image has a pose: {folder}")
-    path = folder / "map" / "mesh.ply"
     return Meshed(path=path, views=count, triangles=volume.write(path))
 
 
@@ -124,7 +126,7 @@ class Volume:
         """Write the surface as a binary PLY; return its number of triangles."""
         mesh = self._grid.extract_triangle_mesh(_WEIGHT_MIN)
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(".part.ply")
+        part = own(path.with_suffix(".part.ply"))
         if not self._open3d.t.io.write_triangle_mesh(str(part), mesh):
             raise InputError(f"mesh: cannot be written: {path}")
         part.replace(path)
