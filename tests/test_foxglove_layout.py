@@ -26,12 +26,18 @@ def test_a_layout_that_no_run_wrote_stays(sink, tmp_path):
     assert (tmp_path / LAYOUT).read_text() == "mine"
 
 
+def test_a_layout_that_an_earlier_version_wrote_is_used(sink, tmp_path):
+    sink.open(Rig(sensors=frozenset()), tmp_path)
+    (tmp_path / MARK).write_text("{}\n")  # which did not list it
+    sink.open(Rig(sensors=frozenset()), tmp_path)
+
+
 def test_a_layout_that_cannot_be_written_replaces_none(sink, tmp_path, monkeypatch):
     def fail(descriptor):
         raise OSError("no space left on device")
 
     sink.open(Rig(sensors=frozenset()), tmp_path)
-    before = (tmp_path / LAYOUT).read_text()
+    (tmp_path / LAYOUT).write_text(before := "another")
     assert LAYOUT in owned(tmp_path)
     monkeypatch.setattr("sceneslam.types.files.os.fsync", fail)
     with pytest.raises(OSError, match="no space left"):

@@ -77,7 +77,10 @@ class FoxgloveSink(TopicSink):
         self._rig, self._images = rig, 0
         super().open(rig, folder)
         layout = files("sceneslam.sinks").joinpath(LAYOUT).read_text()
-        with replacing(folder / LAYOUT) as file:
+        path = folder / LAYOUT
+        if path.is_file() and path.read_bytes() == layout.encode():  # old versions did not list it
+            return
+        with replacing(path) as file:
             file.write(layout)
 
     def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
