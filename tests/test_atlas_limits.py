@@ -190,6 +190,15 @@ def test_grids_are_summed_up_to_a_limit_at_the_finer_resolution():
     assert found.resolution_m == 0.5
 
 
+@pytest.mark.parametrize("resolution_m", [5e-324, 1e-19, 1e-6, 1e6, 1e308])
+def test_a_grid_whose_cells_are_of_no_sensible_size_is_left_out_by_name(caplog, resolution_m):
+    good, odd = grid([[1, 2], [3, 4]]), grid(np.ones((30, 30)), resolution_m=resolution_m)
+    layers = [put("b", at(1.0), MapLayers(grid=odd)), put("a", at(), MapLayers(grid=good))]
+    found = fuse(layers, voxel_m=0.1).grid
+    np.testing.assert_array_equal(found.log_odds, good.log_odds)
+    assert found.resolution_m == 0.5 and "the grid of b is left out" in caplog.text
+
+
 def test_points_without_a_colour_are_grey_and_know_their_module():
     cloud = PointLayer(points=np.array([[0, 0, 0], [5, 0, 0]], np.float32))
     colored = replace(cloud, colors_bgr=np.full((2, 3), 7, np.uint8))

@@ -38,12 +38,28 @@ class Placed:
     T_map_laser: NDArray[np.float64] | None = None  # (K, 4, 4) of its scans, if it has any
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _PlacedGrid:
+    """A grid of a session."""
+
+    module: str
+    T_map_local: Transform
+    layer: GridLayer
+    corners: NDArray[np.float64]  # (4, 2) [m], map
+
+    @property
+    def resolution_m(self) -> float:
+        """Return the size of a cell."""
+        return float(self.layer.resolution_m)
+
+
 def fuse(
     placed: Sequence[Placed], *, voxel_m: float, pose_graph: PoseGraphLayer | None = None
 ) -> HybridMap:
     """Return one map of all layers; points are thinned to one per module and voxel.
 
-    A session without points has those of its scans.
+    A session without points has those of its scans. A grid is left out if the map would need too
+    much memory with it.
     """
     modules = tuple(dict.fromkeys(one.module for one in placed))
     points, colors, owners = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)], []
@@ -63,7 +79,7 @@ def fuse(
         points=PointLayer(points=cloud[keep], colors_bgr=color[keep]),
         point_modules=owner[keep],
         modules=modules,
-        grid=_fuse_grids([grid for one in placed for grid in _grids(one)]),
+        grid=_fuse_grids(_fitting([grid for one in placed for grid in _grids(one)], voxel_m)),
         pose_graph=pose_graph,
         landmarks=_join_landmarks([(one.T_map_local, one.layers.landmarks) for one in seen]),
         landmark_modules=_owners(seen, modules),
@@ -81,14 +97,18 @@ def _points(one: Placed) -> PointLayer | None:
     return PointLayer(points=walls(scans, one.T_map_laser))
 
 
-def _grids(one: Placed) -> list[tuple[Transform, GridLayer]]:
+def _grids(one: Placed) -> list[_PlacedGrid]:
     """Return a session's grids with their poses."""
     grid, scans, found = one.layers.grid, one.layers.scans, []
     if grid is not None:
         found.append((one.T_map_local, grid))
     if scans is not None and one.T_map_laser is not None:
         found.append((se3.identity(), drawn(scans, one.T_map_laser)))
-    return found
+    return [
+        _PlacedGrid(module=one.module, T_map_local=T, layer=grid, corners=_corners_map(T, grid))
+        for T, grid in found
+        if grid.log_odds.size
+    ]
 
 
 def _join_landmarks(
@@ -127,26 +147,50 @@ def one_per_voxel(
     return np.sort(first)
 
 
-def _fuse_grids(placed: Sequence[tuple[Transform, GridLayer]]) -> GridLayer | None:
+@np.errstate(over="ignore", invalid="ignore")  # where cells have no sensible size
+def _fitting(placed: Sequence[_PlacedGrid], voxel_m: float) -> list[_PlacedGrid]:
+    """Return the grids that fit into one; those with cells of about `voxel_m` are taken first."""
+    kept: list[_PlacedGrid] = []
+    for one in sorted(placed, key=lambda one: _rank(one, voxel_m)):
+        low, end = _bounds([*kept, one])
+        columns, rows = (end - low).tolist()
+        if 0 < columns * rows <= _CELLS_MAX:
+            kept.append(one)
+        else:
+            why = f"with it the map would have {columns:.4g} x {rows:.4g} cells"
+            _log.warning("the grid of %s is left out: %s", one.module, why)
+    return [one for one in placed if one in kept]
+
+
+def _rank(one: _PlacedGrid, voxel_m: float) -> tuple[float, float]:
+    """Return a sort key: grids with other cells than `voxel_m`, or a far reach, come last."""
+    cell_m = one.resolution_m
+    return max(cell_m / voxel_m, voxel_m / cell_m), float(np.abs(one.corners).max())
+
+
+def _bounds(placed: Sequence[_PlacedGrid]) -> NDArray[np.float64]:
+    """Return the lowest column and row of the grids, and the ends (2, 2), in the finest cells."""
+    corners = np.concatenate([one.corners for one in placed])
+    cell_m = min(one.resolution_m for one in placed)
+    return np.array([np.floor(corners.min(axis=0) / cell_m), np.ceil(corners.max(axis=0) / cell_m)])
+
+
+def _fuse_grids(placed: Sequence[_PlacedGrid]) -> GridLayer | None:
     """Return the sum of the grids' log odds in `map`, at the finest grid's resolution."""
-    placed = [(T, grid) for T, grid in placed if grid.log_odds.size]
     if not placed:
         return None
-    resolution_m = min(grid.resolution_m for _, grid in placed)
-    corners = np.concatenate([_corners_map(T, grid) for T, grid in placed])
-    low = np.floor(corners.min(axis=0) / resolution_m).astype(int)
-    columns, rows = np.ceil(corners.max(axis=0) / resolution_m).astype(int) - low
+    resolution_m = min(one.resolution_m for one in placed)
+    low, end = _bounds(placed)
+    columns, rows = (end - low).astype(int)
     origin_xy_m = (float(low[0] * resolution_m), float(low[1] * resolution_m))
-    if rows * columns > _CELLS_MAX:
-        _log.warning("the grids lie too far apart for one: it would have %d x %d", columns, rows)
-        return None
     total = np.zeros((rows, columns), np.float32)
-    for T_map_local, grid in placed:
-        total += _resample(T_map_local, grid, origin_xy_m, resolution_m, (columns, rows))
+    for one in placed:
+        total += _resample(one.T_map_local, one.layer, origin_xy_m, resolution_m, (columns, rows))
     np.clip(total, -_LOG_ODDS_LIMIT, _LOG_ODDS_LIMIT, out=total)
     return GridLayer(log_odds=total, resolution_m=resolution_m, origin_xy_m=origin_xy_m)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _corners_map(T_map_local: Transform, grid: GridLayer) -> NDArray[np.float64]:
     rows, columns = grid.log_odds.shape
     low = np.array(grid.origin_xy_m)
