@@ -323,15 +323,16 @@ def test_a_graph_that_is_busy_is_given_all_submaps_as_soon_as_it_is_not(monkeypa
 
 
 @pytest.mark.parametrize("is_last", [False, True])
-def test_a_graph_that_fails_in_its_thread_fails_the_run_of_the_mapper(monkeypatch, is_last):
+def test_a_graph_that_fails_in_its_thread_is_named_once_and_not_asked_again(monkeypatch, is_last):
     solving, drive = Solving(monkeypatch), Driving(is_live=True)
     solving.found = ValueError("no graph")
     solving.may_go_on.clear()
     drive.to(*range(4))
     solving.may_go_on.set()
-    with pytest.raises(ValueError, match="no graph"):
-        if is_last:
-            drive.finish()
-        else:
-            drive.own._executor.shutdown()
-            drive.to(4)
+    if not is_last:
+        drive.own._executor.shutdown()
+        drive.to(*range(4, 9))
+    drive.finish()
+    (fault,) = drive.own.faults
+    assert fault.startswith("the graph of the run gets no further loops") and "no graph" in fault
+    assert solving.lengths == [1]

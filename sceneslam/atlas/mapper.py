@@ -82,7 +82,7 @@ class Mapper:
         self._has_refused = False  # a measurement
         self.faults: list[str] = []
         self.was_found = False  # the run was located in the loaded map, at any time
-        self._graph = RunGraph(self._loaded, is_closed)
+        self._graph: RunGraph | None = RunGraph(self._loaded, is_closed)  # None once it failed
         self._solving: tuple[Chain, Future[SolvedRun]] | None = None
         self._kept = 0  # submaps that are as they were given to the graph
         self._solved = SolvedRun.nothing()
@@ -190,17 +190,18 @@ class Mapper:
         if self._localizer is not None:
             self._collect(self._localizer, int(chain.submaps[-1].stamps_ns[-1]))
         chain.remeasure(path)
-        self._graph.forget(self._kept)
         old = np.array(chain.T_run_node)
         fixes = self._localizer.fixes if self._localizer is not None and self.is_placed else []
         start, is_level = self.T_map_run @ old, self._collector.is_level
-        try:
-            self._solved = self._graph.finish(chain, start, path, maps, fixes, is_level=is_level)
-        except Exception as error:  # what was solved during the run is kept
-            _log.info("final solution", exc_info=error)
-            self.faults.append(
-                f"the graph was not solved at the end, its last solution stays: {text_of(error)}"
-            )
+        if self._graph is not None:
+            self._graph.forget(self._kept)
+            try:
+                self._solved = self._graph.finish(
+                    chain, start, path, maps, fixes, is_level=is_level
+                )
+            except Exception as error:
+                self._give_up_graph("the graph was not solved at the end", error)
+        if self._graph is None:  # what was solved during the run is kept
             self._solved = self._last_solved(start)
         self._is_over = True
         self._tell_loops()
@@ -247,7 +248,7 @@ class Mapper:
     def _close_loops(self) -> None:
         """Give the submaps that are complete to the graph, if it is not busy."""
         chain = self._collector.chain
-        if self._solving is not None or len(chain) == self._kept:
+        if self._graph is None or self._solving is not None or len(chain) == self._kept:
             return
         self._graph.forget(self._kept)
         self._kept, chain = len(chain), chain.copy()
@@ -260,7 +261,11 @@ class Mapper:
         if self._solving is None or not self._solving[1].done():
             return
         (chain, solving), self._solving = self._solving, None
-        solved = solving.result()
+        try:
+            solved = solving.result()
+        except Exception as error:
+            self._give_up_graph("the graph of the run gets no further loops", error)
+            return
         kept = min(len(chain), self._kept)  # less, if poses were replaced meanwhile
         self._collector.chain.submaps[:kept] = chain.submaps[:kept]  # views were left out
         if kept < len(chain):
@@ -268,6 +273,12 @@ class Mapper:
         self._is_news |= bool(solved.loops or self._solved.loops)
         self._solved = solved
         self._tell_loops()
+
+    def _give_up_graph(self, what: str, error: Exception) -> None:
+        """Keep the graph's last solution, to which no loops are added any more."""
+        _log.info("graph", exc_info=error)
+        self.faults.append(f"{what}, its last solution stays: {text_of(error)}")
+        self._graph = None
 
     def _last_solved(self, T_map_node: NDArray[np.float64]) -> SolvedRun:
         """Return the last solution during the run, for all of its nodes (N, 4, 4).
