@@ -113,6 +113,7 @@ def test_chronicle_tells_trials_refusals_and_faults():
         situation(50, "try", active="laser"),
         situation(51, "tell", active="rgbd"),
         happened("refused", at, why="lost", **choice),
+        happened("refused", at, why="silent", **{**choice, "to": "depth"}),
         happened("fault", at, what="the wheels fell off"),
         happened("suspect", at, module="rgbd"),
         happened("dropped", at, count=0),
@@ -122,6 +123,7 @@ def test_chronicle_tells_trials_refusals_and_faults():
     assert kinds["“laser” is tried again"] == "decision"
     assert kinds["“rgbd” stays for Dark"] == "decision"
     assert kinds["“laser” was not taken: it was lost itself"] == "decision"
+    assert kinds["“depth” was not taken: it got no data"] == "decision"
     assert kinds["the wheels fell off"] == "fault"
     assert kinds["“rgbd” is rejected"] == "trouble"
     assert sum("dropped" in what for what in kinds) == 1

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from driving import assert_exact, dark_from, drive, events, policy
-from fakes import PERIOD_NS, ExactModule, observation, true_pose
+from fakes import PERIOD_NS, DepthModule, ExactModule, observation, true_pose
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -150,6 +150,13 @@ def test_module_that_is_lost_does_not_replace_one_that_holds():
     assert set(atlas.pose_modules) == {"bright"}
     assert events(log, "refused")[0]["why"] == "lost"
     assert_exact(atlas)
+
+
+def test_module_without_data_does_not_replace_one_that_holds():
+    modules = {"bright": ExactModule(), "dark": DepthModule()}
+    _, atlas, log, _ = drive(modules, scene_at=dark_from(40), handover="rewind")
+    assert set(atlas.pose_modules) == {"bright"} and modules["bright"].activations == 1
+    assert events(log, "refused")[0]["why"] == "silent"
 
 
 def test_module_that_is_lost_replaces_one_that_failed():

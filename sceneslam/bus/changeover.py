@@ -233,8 +233,9 @@ class Changeover:
             return self._refuse(attempt.runner, stamp_ns, "failed")
         if handover is None:
             return None
-        if handover.is_lost and self._can_refuse():
-            return self._refuse(attempt.runner, stamp_ns, "lost")
+        if (handover.is_lost or handover.is_silent) and self._can_refuse():
+            why = "lost" if handover.is_lost else "silent"
+            return self._refuse(attempt.runner, stamp_ns, why)
         self._estimator.accept(handover)
         is_in_vain = self._now.held_ns < round(self._policy.confirm_window_s * 1e9)
         self._candidates.postpone(stamp_ns, is_in_vain=is_in_vain)

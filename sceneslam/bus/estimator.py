@@ -81,8 +81,13 @@ class Estimator:
         if self._policy.handover == "rewind" and not is_trial:
             anchor = self._memory.anchor(since_ns)
         session = self._new_session(runner, anchor.bridge.copy())
-        pace = Pace(self._policy.catch_up)
-        return Handover(session, self._memory, anchor=anchor, pace=pace)
+        return Handover(
+            session,
+            self._memory,
+            anchor=anchor,
+            pace=Pace(self._policy.catch_up),
+            patience_ns=round(self._policy.lost_patience_s * 1e9),
+        )
 
     def accept(self, handover: Handover) -> None:
         """Make a module that has caught up the active one, and shut the old one down."""

@@ -144,7 +144,8 @@ class _Writer:
             self._add(event["stamp_ns"], "decision", what, "It is the table's choice there, too.")
 
     def _tell_refusal(self, event: Event) -> None:
-        why = {"lost": "it was lost itself", "failed": "it failed"}.get(event["why"], event["why"])
+        whys = {"lost": "it was lost itself", "silent": "it got no data", "failed": "it failed"}
+        why = whys.get(event["why"], event["why"])
         self._add(event["stamp_ns"], "decision", f"“{event['to']}” was not taken: {why}")
 
     def _tell_decision(self, event: Event) -> None:
