@@ -44,6 +44,24 @@ def test_the_only_module_is_started_again_at_once():
     assert_exact(atlas)
 
 
+@pytest.mark.parametrize("name", ["is_ready", "is_spent", "note_failure"])
+def test_a_failed_module_that_cannot_tell_whether_it_returns_does_not_return(name, caplog):
+    class Mute(Phoenix):
+        """Has a member that raises once it has failed."""
+
+        def __getattribute__(self, asked):
+            if asked == name and not object.__getattribute__(self, "raises"):
+                raise OSError("the licence server is gone")
+            return object.__getattribute__(self, asked)
+
+    modules = {"bright": Mute(raises={30}), "dark": ExactModule()}
+    _, atlas, log, _ = drive(modules, retry_s=1.0)
+    assert atlas.pose_modules == ("bright",) * 30 + ("dark",) * 70
+    assert len(events(log, "fault")) == 1
+    assert caplog.text.count("slam.bright could not tell whether it can be started again") == 1
+    assert_exact(atlas)
+
+
 @pytest.mark.parametrize("choices", [("bright", "dark"), ("dark", "bright")])
 def test_a_module_that_fails_where_the_scene_changes_ends_before_it_starts_again(choices):
     class Noting(Phoenix):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -48,6 +48,7 @@ class Runner:
         self._starting: Future[None] | None = None
         self._ending: Future[Legacy] | None = None
         self._is_active = False
+        self._may_restart = True
         self._submitted: Observation | None = None  # observation whose answer was not collected yet
         self._module = module
         # Sensors in every set are needed; if the sets share none, any of their sensors will do.
@@ -57,17 +58,15 @@ class Runner:
     @property
     def can_run(self) -> bool:
         """Tell whether the module can be activated at once."""
-        module = self._module
         has_ended = self._ending is None or self._ending.done()
         return not self.is_failed or (
-            has_ended and isinstance(module, Restartable) and module.is_ready
+            has_ended and self._ask_restartable(lambda module: module.is_ready)
         )
 
     @property
     def may_return(self) -> bool:
         """Tell whether the module can be activated, at once or after a wait."""
-        module = self._module
-        return not self.is_failed or (isinstance(module, Restartable) and not module.is_spent)
+        return not self.is_failed or self._ask_restartable(lambda module: not module.is_spent)
 
     @property
     def beside(self) -> str:
@@ -179,9 +178,19 @@ class Runner:
                 yield
         except ModuleError:
             self.is_failed = True
-            if isinstance(self._module, Restartable):
-                self._module.note_failure()
+            self._ask_restartable(lambda module: module.note_failure())
             raise
+
+    def _ask_restartable(self, ask: Callable[[Restartable], object]) -> bool:
+        """Return an answer of a failed module; one that raises is not started again."""
+        try:
+            with self._calling("could not tell whether it can be started again"):
+                module = self._module
+                return self._may_restart and isinstance(module, Restartable) and bool(ask(module))
+        except ModuleError as error:
+            _log.warning(str(error))
+            self._may_restart = False
+            return False
 
     @contextmanager
     def _parting(self, what: str, lost: list[str]) -> Iterator[None]:
