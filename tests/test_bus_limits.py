@@ -334,6 +334,10 @@ def test_a_sensor_is_silent_after_two_of_its_periods():
     assert silent.health is Health.SILENT and not silent.is_held
     assert silent.unheld_since_ns == silent.held_ns == 3 * S // 10 + 1
     assert asked(0, silent_ns=6 * S).is_held and not asked(0, silent_ns=6 * S + 1).is_held
+    after_a_gap = 0, S // 10, 2 * S
+    assert asked(*after_a_gap, silent_ns=22 * S // 10).is_held
+    assert not asked(*after_a_gap, silent_ns=22 * S // 10 + 1).is_held
+    assert asked(*after_a_gap, 4 * S, silent_ns=7 * S).is_held  # it is that slow
     assert asked(silent_ns=5).unheld_since_ns == 5  # it never delivered anything
 
 

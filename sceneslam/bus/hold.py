@@ -38,7 +38,8 @@ class Hold:
         self._covariances = CovarianceMonitor()
         self._revision = 0
         self._fed_ns: int | None = None  # when its sensors last delivered data
-        self._period_ns = silence_ns  # their last interval; at first a guess
+        self._interval_ns = silence_ns  # between their last data; at first a guess
+        self._period_ns = silence_ns  # the shorter of the last two intervals: one may be a gap
 
     @property
     def is_held(self) -> bool:
@@ -86,7 +87,9 @@ class Hold:
 
     def _feed(self, tracking: Tracking) -> None:
         if self._fed_ns is not None:
-            self._period_ns = tracking.stamp_ns - self._fed_ns
+            interval_ns = tracking.stamp_ns - self._fed_ns
+            self._period_ns = min(interval_ns, self._interval_ns)
+            self._interval_ns = interval_ns
         self._fed_ns, self.status = tracking.stamp_ns, tracking.status
         if tracking.status is not TrackingStatus.LOST:  # else its pose is the one before
             self.is_revised = tracking.revision != self._revision
