@@ -338,6 +338,8 @@ def test_a_sensor_is_silent_after_two_of_its_periods():
     assert asked(*after_a_gap, silent_ns=22 * S // 10).is_held
     assert not asked(*after_a_gap, silent_ns=22 * S // 10 + 1).is_held
     assert asked(*after_a_gap, 4 * S, silent_ns=7 * S).is_held  # it is that slow
+    after_a_burst = 0, S // 10, 2 * S // 10, 2 * S // 10 + 1
+    assert asked(*after_a_burst, silent_ns=4 * S // 10 + 1).is_held
     assert asked(silent_ns=5).unheld_since_ns == 5  # it never delivered anything
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections import deque
+from statistics import median_low
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +40,8 @@ class Hold:
         self._covariances = CovarianceMonitor()
         self._revision = 0
         self._fed_ns: int | None = None  # when its sensors last delivered data
-        self._interval_ns = silence_ns  # between their last data; at first a guess
-        self._period_ns = silence_ns  # the shorter of the last two intervals: one may be a gap
+        self._silence_ns = silence_ns  # a guess of their period, until there are intervals
+        self._intervals_ns: deque[int] = deque(maxlen=3)  # between their last data
 
     @property
     def is_held(self) -> bool:
@@ -85,11 +87,16 @@ class Hold:
         self.is_trusted, self.tracking, self.is_asked = False, None, False
         self._judge(observation, None)
 
+    @property
+    def _period_ns(self) -> int:
+        """Return the median of the last intervals: one may be a gap, or of a burst."""
+        if not self._intervals_ns:
+            return self._silence_ns
+        return median_low(self._intervals_ns)
+
     def _feed(self, tracking: Tracking) -> None:
         if self._fed_ns is not None:
-            interval_ns = tracking.stamp_ns - self._fed_ns
-            self._period_ns = min(interval_ns, self._interval_ns)
-            self._interval_ns = interval_ns
+            self._intervals_ns.append(tracking.stamp_ns - self._fed_ns)
         self._fed_ns, self.status = tracking.stamp_ns, tracking.status
         if tracking.status is not TrackingStatus.LOST:  # else its pose is the one before
             self.is_revised = tracking.revision != self._revision
