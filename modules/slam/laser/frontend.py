@@ -23,7 +23,6 @@ from sceneslam.types.planar import (
 )
 from sceneslam.types.se3 import Transform
 
-from .doubt import Doubt
 from .field import LikelihoodField
 from .keyframes import ScanKeyframe, ScanKeyframes
 from .matcher import Match, Matcher, novelty
@@ -80,7 +79,6 @@ class FrontEnd:
     _fit_ns: int | None = field(default=None, init=False)  # scans fitted as usual until then
     _failures: int = field(default=0, init=False)
     _field: LikelihoodField | None = field(default=None, init=False)
-    _doubt: Doubt = field(default_factory=Doubt, init=False)
 
     def track(self, observation: Observation, scan: LaserScan | None) -> Estimate:
         """Return the pose at the observation, corrected by its scan if it has one."""
@@ -114,7 +112,6 @@ class FrontEnd:
         if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
         self._teach(match, T_then_now, motion)
-        self._doubt.add(match, priors)
         estimate = self._hold(observation, compose(match.T_local_base, T_then_now), match)
         if self.keyframes.is_due(match.T_local_base):
             self._extend(match.T_local_base, scan, surfaces)
@@ -190,7 +187,7 @@ class FrontEnd:
             self._seen_pose = match.T_local_base
         return Estimate(
             T_local_base=pose,
-            covariance=self._covariance + self._doubt.covariance(pose),
+            covariance=self._covariance,
             status=TrackingStatus.DEGRADED if weak else TrackingStatus.TRACKING,
             quality_ratio=1.0 if match is None else match.inlier_ratio,
             inliers=0 if match is None else match.inliers,
@@ -228,7 +225,7 @@ class FrontEnd:
         self._pose = predicted
         return Estimate(
             T_local_base=predicted,
-            covariance=self._covariance + self._doubt.covariance(predicted),
+            covariance=self._covariance,
             status=status,
             quality_ratio=0.0,
             inliers=0,

@@ -66,12 +66,6 @@ class Match:
     noise: float  # deviation of the points from the map, relative to the expected one
     probabilities: NDArray[np.float64]  # of the priors, given the scan
 
-    def drawn_to(self, prior: MotionPrior) -> Planar:
-        """Return the difference (3,) of the pose by another prior, by the scan's shape here."""
-        weight = prior.weighed(self.T_local_base)
-        off = -prior.off(self.T_local_base)
-        return np.asarray(np.linalg.solve(self.information + weight, weight @ off))
-
     def cost_with(self, prior: MotionPrior) -> float:
         """Return the cost with another prior, by the shape of the scan's cost here.
 
