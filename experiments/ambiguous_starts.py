@@ -14,13 +14,13 @@ import sys
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.atlas.places.plan_search import is_apart
 from sceneslam.experiments.one_map.relocalization import short_drive
 from sceneslam.testing.floor_plans import DEPTH_LIKE, World, flat
 from sceneslam.types import planar
 from sceneslam.types.planar import Planar
 
 WITHIN_S, CELL_M, HEADINGS = 3.0, 0.1, 120
-APART_M, APART_RAD = 0.4, 0.2  # a nearer pose is the same place
 ALIKE_M = 0.1  # of a beam
 EMPTY_M = DEPTH_LIKE.range_m + 0.3  # what a beam without a return counts as
 BEAMS = slice(None, None, 8)
@@ -74,7 +74,9 @@ class Drive:
         """Return the largest share of the beams that a pose elsewhere predicts."""
         refined = (self._refined(walls, start) for start in self._candidates(walls))
         shares = [
-            (self._off_m(walls, one) < ALIKE_M).mean() for one in refined if self._is_apart(one)
+            (self._off_m(walls, one) < ALIKE_M).mean()
+            for one in refined
+            if is_apart(one, self.start)
         ]
         return float(max(shares, default=0.0))
 
@@ -86,7 +88,7 @@ class Drive:
         for row in np.argsort(off_m, axis=None):
             cell, heading = divmod(int(row), HEADINGS)
             pose = np.array([*walls.cells[cell], headings[heading]])
-            if self._is_apart(pose) and all(_are_apart(pose, one) for one in found):
+            if all(is_apart(pose, one) for one in (self.start, *found)):
                 found.append(pose)
             if len(found) == CANDIDATES:
                 break
@@ -121,14 +123,6 @@ class Drive:
         """Return by how much each beam of each scan differs."""
         due = [walls.ranges(planar.compose(pose, moved), self._angles) for moved in self._moved]
         return np.abs(np.array(due) - np.array(self._ranges))
-
-    def _is_apart(self, pose: Planar) -> bool:
-        return _are_apart(pose, self.start)
-
-
-def _are_apart(first: Planar, second: Planar) -> bool:
-    away_m = float(np.hypot(*(first - second)[:2]))
-    return away_m > APART_M or abs(planar.wrap(float(first[2] - second[2]))) > APART_RAD
 
 
 def _bounded(ranges_m: Floats) -> Floats:

@@ -302,7 +302,7 @@ def test_a_live_run_that_fails_leaves_no_thread_and_says_that_its_map_is_not_sav
     (fault,) = drive.faults
     assert "goes on without submaps and loops, its map is not saved from here on" in fault
     for thread in set(threading.enumerate()) - before:
-        thread.join(5.0)  # it was told to end, and does as soon as it may run
+        thread.join(5.0)  # shut down without a wait: it ends once it is scheduled
     assert set(threading.enumerate()) <= before
 
 

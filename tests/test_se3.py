@@ -91,3 +91,16 @@ def test_a_mean_of_poses_is_weighted_by_information_and_as_certain_as_one_of_the
     same, covariance = se3.mean([first] * 3, [np.eye(6)] * 3)
     np.testing.assert_allclose(same, first, atol=1e-12)
     np.testing.assert_allclose(covariance, np.eye(6), atol=1e-12)
+
+
+def test_a_skew_is_how_far_a_matrix_is_from_a_rotation():
+    turned = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, -0.2, 0.1]))
+    longer, mirrored = turned.copy(), turned.copy()
+    longer[:3, :3] *= 1.1
+    mirrored[:3, 0] *= -1.0
+    np.testing.assert_allclose(
+        se3.skew(np.stack([turned, longer, np.zeros((4, 4)), mirrored])),
+        [0.0, 0.21, 1.0, np.inf],
+        atol=1e-12,
+    )
+    assert se3.skew(turned).shape == () and se3.skew(np.zeros((0, 4, 4))).shape == (0,)

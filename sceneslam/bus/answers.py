@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types import se3
 from sceneslam.types.maps import LAYER_TYPES, GridLayer, MapLayers
 from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.trajectory import Trajectory
@@ -148,9 +149,8 @@ def _check_rigid(name: str, T_a_b: NDArray[np.float64]) -> None:
     """Raise ValueError where a (..., 4, 4) array holds anything but rigid transforms."""
     if not np.isfinite(T_a_b).all():
         raise ValueError(f"{name}: it is not finite")
-    rotations = T_a_b[..., :3, :3]
-    skew = np.abs(np.swapaxes(rotations, -1, -2) @ rotations - np.eye(3)).max(initial=0.0)
-    if skew > _SKEW_MAX or (np.linalg.det(rotations) < 0).any():
+    skew = se3.skew(T_a_b).max(initial=0.0)
+    if skew > _SKEW_MAX:
         raise ValueError(f"{name}: expected a rotation, R^T R is off the identity by {skew:.3g}")
     far_m = np.abs(T_a_b[..., :3, 3]).max(initial=0.0)
     if far_m > _FAR_M or (T_a_b[..., 3, :] != (0, 0, 0, 1)).any():

@@ -92,9 +92,7 @@ class Kitti(StampedScans):
             )
         T_gt_base = np.tile(se3.identity(), (len(rows), 1, 1))
         T_gt_base[:, :3, :] = rows.reshape(-1, 3, 4)
-        rotations = T_gt_base[:, :3, :3]
-        skews = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
-        wrong = np.flatnonzero((skews > _SKEW_MAX) | (np.linalg.det(rotations) < 0))
+        wrong = np.flatnonzero(se3.skew(T_gt_base) > _SKEW_MAX)
         if len(wrong):
             text = read_text(path).splitlines()
             numbers = [n for n, line in enumerate(text, start=1) if line.partition("#")[0].strip()]

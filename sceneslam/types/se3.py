@@ -219,6 +219,16 @@ def chained(T_a_b: Transform, T_b_c: Transform) -> Transform:
     return np.asarray(T_a_c)
 
 
+def skew(T_a_b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return by how much (...) transforms (..., 4, 4) are no rotations; inf for reflections.
+
+    It is the largest entry of |R^T R - I|.
+    """
+    R = T_a_b[..., :3, :3]
+    off = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-2, -1))
+    return np.asarray(np.where(np.linalg.det(R) < 0, np.inf, off))
+
+
 def orthonormal(T_a_b: Transform) -> Transform:
     """Return the transform (4, 4) with an exactly orthonormal rotation."""
     return from_quat_xyzw(T_a_b[..., :3, 3], to_quat_xyzw(T_a_b))

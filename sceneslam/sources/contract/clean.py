@@ -9,6 +9,7 @@ import numpy as np
 
 from sceneslam.ros.pixels import locked
 from sceneslam.sources.faults import FaultLog, at_stamp
+from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Sensor
 from sceneslam.types.se3 import Transform, orthonormal
@@ -95,7 +96,4 @@ def _skew(T_odom_base: Transform) -> float:
     """Return the largest entry of |R^T R - I|; inf for an impossible position."""
     if T_odom_base.shape != (4, 4) or np.abs(T_odom_base[:3, 3]).max() > _FAR_M:
         return np.inf
-    rotation = T_odom_base[:3, :3]
-    if np.linalg.det(rotation) <= 0:
-        return np.inf
-    return float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    return float(se3.skew(T_odom_base))
