@@ -31,7 +31,7 @@ def main(folder: Path) -> None:
 
     def keep(stamp_ns: int) -> None:
         journal.add_local(stamp_ns, pose)
-        journal.add_pose(stamp_ns, pose, "bright", covariance)
+        journal.add_pose(stamp_ns, pose, "bright", covariance, None)
         journal.add_observation(stamp_ns)
         journal.flush()
 

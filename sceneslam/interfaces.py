@@ -184,7 +184,7 @@ class SlamModule(Protocol):
         ...
 
     def track(self, observation: Observation) -> Tracking:
-        """Return T_local_base (4, 4) [m] at the observation, with status and covariance.
+        """Return T_local_base (4, 4) [m] at the observation, with status and covariances.
 
         The observation has at least one of the required sensors; others may be missing. The status
         is LOST if there is no pose; the pose is then the last tracked one. It is never NaN.
@@ -330,11 +330,12 @@ class BackEnd(Protocol):
         T_map_base: Transform,
         module: str,
         covariance: NDArray[np.float64] | None = None,
+        map_covariance: NDArray[np.float64] | None = None,
     ) -> None:
         """Add T_map_base (4, 4) [m] to the trajectory; a stamp has one pose, the first.
 
-        `module` is "" for bridged poses, `covariance` (6, 6) that of T_local_base in base, if the
-        module reports it.
+        `module` is "" for bridged poses; the covariances (6, 6) are those of T_local_base in base,
+        in the module's map and of this map's drift (`Tracking`), if the module reports them.
         """
         ...
 
@@ -451,6 +452,7 @@ class TrajectoryLog(Protocol):
         T_map_base: Transform,
         module: str,
         covariance: NDArray[np.float64] | None,
+        map_covariance: NDArray[np.float64] | None,
     ) -> None:
         """Record a pose of the global trajectory; module "": bridged."""
         ...

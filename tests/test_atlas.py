@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sceneslam.atlas.atlas import Atlas
+from sceneslam.atlas.pose_path import PosePath
 from sceneslam.atlas.save import save_grid, save_map, save_points, save_pose_graph
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.scans.occupancy_grid import drawn, walls
@@ -260,3 +261,14 @@ def test_the_map_of_a_session_whose_poses_were_replaced_is_corrected_as_well():
     for session in range(2):
         atlas.close_session(session, layers, Trajectory.empty())
     np.testing.assert_allclose(atlas.fuse_maps().points.points, [[3.0, 1.0, 0.0]] * 2, atol=1e-6)
+
+
+def test_the_covariance_of_a_map_lasts_until_another_is_reported():
+    path, drifted = PosePath(), np.zeros((6, 6))
+    drifted[5, 5] = 0.01  # of the heading alone
+    path.add(0, se3.identity(), "laser", 0, None, drifted)
+    path.add(1, se3.from_xy_yaw(2.0, 0.0, 0.0), "", 0, None, None)
+    path.add(2, se3.from_xy_yaw(2.0, 0.0, 0.0), "laser", 1, None, None)  # another session
+    of_maps = path.of_maps()
+    assert of_maps[1, 1, 1] == pytest.approx(0.04) and of_maps[1, 5, 5] == pytest.approx(0.01)
+    assert np.isnan(of_maps[2]).all() and (path.known_at(2).of_map == 0).all()

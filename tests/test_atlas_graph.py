@@ -208,6 +208,7 @@ def path_of(T_map_base, sessions, is_bridged, reported):
         sessions=np.array(sessions),
         is_bridged=np.array(is_bridged),
         reported=np.stack([reported] * count),
+        of_maps=np.full((count, 6, 6), np.nan),
     )
 
 

@@ -95,7 +95,13 @@ def driven(rig, observations, **changes):
     for observation in observations:
         tracking = module.track(observation)
         atlas.add_local(tracking.stamp_ns, tracking.T_local_base)
-        atlas.add(tracking.stamp_ns, tracking.T_local_base, "laser", tracking.covariance)
+        atlas.add(
+            tracking.stamp_ns,
+            tracking.T_local_base,
+            "laser",
+            tracking.covariance,
+            tracking.map_covariance,
+        )
         atlas.observe(observation, None)
     atlas.close_session(session, module.get_map(), module.get_trajectory())
     assert atlas.finish() == []

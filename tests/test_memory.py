@@ -19,7 +19,7 @@ def moment(index, *, is_trusted=True, has_pose=True):
         module="a",
         bridge=Bridge(is_active=True),
         turn=None,
-        covariance=None,
+        tracking=None,
         is_trusted=is_trusted,
     )
 

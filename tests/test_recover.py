@@ -18,7 +18,7 @@ from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.recover.__main__ import main
 from sceneslam.recover.recover import _Retold
-from sceneslam.storage.journal import Journal, JournalHeader, read_journal
+from sceneslam.storage.journal import MAGIC, Journal, JournalHeader, read_journal
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.files import AppendedFile
@@ -208,14 +208,14 @@ def test_a_journal_takes_at_most_450_bytes_a_pose(tmp_path):
     journal = Journal(tmp_path / "journal.bin", HEAD)
     for stamp_ns in range(1000):
         journal.add_local(stamp_ns, np.eye(4))
-        journal.add_pose(stamp_ns, np.eye(4), "bright", np.eye(6))
+        journal.add_pose(stamp_ns, np.eye(4), "bright", np.eye(6), None)
         journal.add_observation(stamp_ns)
     journal.close()
     assert 300_000 < (tmp_path / "journal.bin").stat().st_size < 450_000
 
 
 def test_a_journal_that_cannot_be_read_says_so(tmp_path):
-    (tmp_path / "journal.bin").write_bytes(b"SceneSLAM journal 1\nH")
+    (tmp_path / "journal.bin").write_bytes(MAGIC + b"H")
     with pytest.raises(InputError, match="first record"):
         read_journal(tmp_path / "journal.bin", _Retold(Atlas(voxel_m=0.1)))
 

@@ -36,6 +36,7 @@ def path_of(kinds, claim=None, T_step=T_STEP):
         sessions=np.array(sessions[1:]),
         is_bridged=np.array([kind == "-" for kind in kinds]),
         reported=np.array([np.full((6, 6), np.nan) if claim is None else claim] * len(kinds)),
+        of_maps=np.full((len(kinds), 6, 6), np.nan),
     )
 
 

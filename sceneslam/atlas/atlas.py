@@ -185,16 +185,18 @@ class Atlas:
         T_map_base: Transform,
         module: str,
         covariance: Covariance | None = None,
+        map_covariance: Covariance | None = None,
     ) -> None:
         """Add a pose (4, 4) to the global trajectory; further poses of one stamp are ignored.
 
-        `covariance` (6, 6) is that of T_local_base, None if the module does not report it.
+        The covariances (6, 6) are those of T_local_base in the module's map, and of this map's
+        drift; None if the module does not report them.
         """
         if self._journal is not None:
-            self._journal.add_pose(stamp_ns, T_map_base, module, covariance)
+            self._journal.add_pose(stamp_ns, T_map_base, module, covariance, map_covariance)
         session = len(self._sessions) - 1
         self._online.add(stamp_ns, self._in_map(T_map_base))
-        self._path.add(stamp_ns, T_map_base, module, session, covariance)
+        self._path.add(stamp_ns, T_map_base, module, session, covariance, map_covariance)
 
     def rewind(self, stamp_ns: int) -> None:
         """Remove the poses from an instant on, to be replaced; `online` keeps them."""
@@ -269,6 +271,7 @@ class Atlas:
             sessions=np.array(self._path.sessions, np.int64),
             is_bridged=np.array(self._path.modules) == BRIDGED,
             reported=self._path.reported(),
+            of_maps=self._path.of_maps(),
         )
         path = calibrated(
             path,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.submaps.graph import LOADED, marginals
 from sceneslam.atlas.submaps.submap import LENGTH_M, TURN_RAD
-from sceneslam.atlas.uncertainty import MAPPED, Covariance, Drift, drifted
+from sceneslam.atlas.uncertainty import MAPPED, Covariance, Drift, drifted, grown
 from sceneslam.graphs.edge import Edge
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
@@ -34,6 +34,7 @@ class PosedPath:
     sessions: NDArray[np.int64]  # (N,), -1 before the first
     is_bridged: NDArray[np.bool_]  # (N,): without a module
     reported: NDArray[np.float64]  # (N, 6, 6) of T_local_base, in base; NaN: not reported
+    of_maps: NDArray[np.float64]  # (N, 6, 6) of the drift of the module's map, the same way
 
     def claim(self, rows: NDArray[np.int64] | slice) -> Covariance | None:
         """Return the covariance (6, 6) of a map that is placed by these poses, with common errors.
@@ -62,7 +63,7 @@ def covariances(path: PosedPath, *, loops: Sequence[Edge], bridge: Drift) -> NDA
     if not len(T):
         return np.zeros((0, 6, 6))
     moved = _moved(T)
-    beside = _beside(path, moved, bridge)
+    beside, maps = _beside(path, moved, bridge), np.nan_to_num(path.of_maps)
     seams = np.flatnonzero(np.diff(sessions))
     begins = np.flatnonzero(np.diff(np.floor(_submaps(moved)))) + 1
     closed = [row for loop in loops for row in (loop.first, loop.second) if row != LOADED]
@@ -74,6 +75,7 @@ def covariances(path: PosedPath, *, loops: Sequence[Edge], bridge: Drift) -> NDA
             drift = _carried(beside[first], T[first], T[last])
         else:
             drift = drifted(MAPPED, driven) if claim is None else _submaps(driven) * claim
+            drift = drift + grown(maps[first], maps[last], se3.inverse(T[last]) @ T[first])
         drifts[first, last] = drift + _LEAST
     if not any(loop.first == LOADED for loop in loops):
         drifts[LOADED, 0] = _LEAST

@@ -14,6 +14,7 @@ from sceneslam.atlas.revision import SessionTrajectories
 from sceneslam.atlas.rows import Rows
 from sceneslam.atlas.submaps.collector import Known
 from sceneslam.atlas.uncertainty import Covariance
+from sceneslam.types import se3
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.run import BRIDGED, SessionStart
 from sceneslam.types.se3 import Transform
@@ -68,9 +69,9 @@ class PosePath:
     sessions: array[int] = field(
         default_factory=lambda: array("q")
     )  # the open session, -1 before the first
-    _covariances: Rows = field(
-        default_factory=lambda: Rows(len(_NONE))
-    )  # as reported; NaN: not reported
+    # Upper triangles as reported, of the poses in the modules' maps, and of these; NaN: none.
+    _covariances: Rows = field(default_factory=lambda: Rows(len(_NONE)))
+    _maps: Rows = field(default_factory=lambda: Rows(len(_NONE)))
 
     def add(
         self,
@@ -79,12 +80,22 @@ class PosePath:
         module: str,
         session: int,
         covariance: Covariance | None,
+        map_covariance: Covariance | None,
     ) -> None:
-        """Add T_map_base (4, 4) [m] unless its stamp already has a pose."""
+        """Add T_map_base (4, 4) [m] unless its stamp already has a pose.
+
+        `covariance`, `map_covariance` (6, 6): as `Tracking` has them, None: not reported. A pose
+        without the latter takes over that of the session's pose before it.
+        """
         if self.stamps_ns and stamp_ns <= self.stamps_ns[-1]:
             return
-        reported = _NONE if covariance is None else covariance[_UPPER]
-        self._covariances.append(np.clip(reported, -_UNKNOWN, _UNKNOWN))
+        if map_covariance is None and len(self.poses) and session == self.sessions[-1]:
+            before = _square(self._maps[-1])
+            if not np.isnan(before[0, 0]):
+                map_covariance = se3.carried(before, se3.inverse(T_map_base) @ self.poses[-1])
+        for rows, given in ((self._covariances, covariance), (self._maps, map_covariance)):
+            reported = _NONE if given is None else given[_UPPER]
+            rows.append(np.clip(reported, -_UNKNOWN, _UNKNOWN))
         self.stamps_ns.append(stamp_ns)
         self.poses.append(T_map_base)
         self.modules.append(module)
@@ -95,18 +106,13 @@ class PosePath:
         keep = bisect_left(self.stamps_ns, stamp_ns)
         for values in (self.stamps_ns, self.modules, self.sessions):
             del values[keep:]
-        for rows in (self.poses, self._covariances):
+        for rows in (self.poses, self._covariances, self._maps):
             rows.cut(keep)
 
     def covariance_at(self, row: int) -> Covariance | None:
         """Return the covariance (6, 6) that was reported with a pose, None without one."""
-        triangle = self._covariances[row]
-        if np.isnan(triangle[0]):
-            return None
-        covariance = np.empty((6, 6))
-        covariance[_UPPER] = triangle
-        covariance[_UPPER[::-1]] = triangle
-        return covariance
+        covariance = _square(self._covariances[row])
+        return None if np.isnan(covariance[0, 0]) else covariance
 
     def row_at(self, stamp_ns: int) -> int | None:
         """Return the index of the pose at a stamp, None without one."""
@@ -123,6 +129,7 @@ class PosePath:
             session=self.sessions[row],
             module=self.modules[row],
             covariance=self.covariance_at(row),
+            of_map=np.nan_to_num(_square(self._maps[row])),
         )
 
     def session_starts(self) -> list[SessionStart]:
@@ -137,14 +144,29 @@ class PosePath:
         return list(starts.values())
 
     def reported(self) -> NDArray[np.float64]:
-        """Return the reported covariances (N, 6, 6), positive semidefinite; NaN: not reported."""
-        covariances = np.empty((len(self.poses), 6, 6))
-        covariances[:, *_UPPER] = covariances[:, *_UPPER[::-1]] = np.asarray(self._covariances)
-        given = ~np.isnan(covariances[:, 0, 0])
-        values, vectors = np.linalg.eigh(covariances[given])
-        scaled = vectors * np.maximum(values, 0.0)[:, None, :]
-        covariances[given] = scaled @ np.swapaxes(vectors, 1, 2)
-        return covariances
+        """Return the covariances (N, 6, 6) in the modules' maps, as `_semidefinite` has them."""
+        return _semidefinite(self._covariances)
+
+    def of_maps(self) -> NDArray[np.float64]:
+        """Return the covariances (N, 6, 6) of the modules' maps, as `_semidefinite` has them."""
+        return _semidefinite(self._maps)
+
+
+def _semidefinite(rows: Rows) -> NDArray[np.float64]:
+    """Return reported covariances (N, 6, 6), positive semidefinite; NaN: not reported."""
+    covariances = _square(np.asarray(rows))
+    given = ~np.isnan(covariances[:, 0, 0])
+    values, vectors = np.linalg.eigh(covariances[given])
+    scaled = vectors * np.maximum(values, 0.0)[:, None, :]
+    covariances[given] = scaled @ np.swapaxes(vectors, 1, 2)
+    return covariances
+
+
+def _square(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the symmetric matrices (..., 6, 6) of upper triangles (..., 21)."""
+    square = np.empty((*triangles.shape[:-1], 6, 6))
+    square[..., *_UPPER] = square[..., *_UPPER[::-1]] = triangles
+    return square
 
 
 def trajectory_of(stamps_ns: Sequence[int], poses: Rows) -> Trajectory:

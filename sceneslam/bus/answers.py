@@ -55,12 +55,12 @@ def checked_tracking(tracking: object, stamp_ns: int) -> Tracking:
     _check_shape("T_local_base", T_local_base, (4, 4))
     _check_rigid("T_local_base", T_local_base)
     T_local_base.flags.writeable = False
-    covariance = tracking.covariance
-    if covariance is not None:
-        _check_covariance(covariance)
-        covariance = np.array(covariance)
-        covariance.flags.writeable = False
-    return replace(tracking, T_local_base=T_local_base, covariance=covariance)
+    return replace(
+        tracking,
+        T_local_base=T_local_base,
+        covariance=_covariance("covariance", tracking.covariance),
+        map_covariance=_covariance("map_covariance", tracking.map_covariance),
+    )
 
 
 def checked_trajectory(trajectory: object) -> Trajectory:
@@ -157,8 +157,13 @@ def _check_rigid(name: str, T_a_b: NDArray[np.float64]) -> None:
         raise ValueError(f"{name}: expected a place on Earth and a last row of 0 0 0 1")
 
 
-def _check_covariance(covariance: object) -> None:
-    matrix = _of("covariance", covariance, np.ndarray)
-    _check_shape("covariance", matrix, (6, 6))
+def _covariance(name: str, covariance: object) -> NDArray[np.float64] | None:
+    """Return a copy of a covariance (6, 6), None without one."""
+    if covariance is None:
+        return None
+    matrix = np.array(_of(name, covariance, np.ndarray), np.float64)
+    _check_shape(name, matrix, (6, 6))
     if not (np.isfinite(matrix).all() and (matrix.diagonal() >= 0).all()):
-        raise ValueError("covariance: expected finite numbers, none below 0 on the diagonal")
+        raise ValueError(f"{name}: expected finite numbers, none below 0 on the diagonal")
+    matrix.flags.writeable = False
+    return matrix

@@ -121,8 +121,9 @@ class Estimator:
             T_map_base = bridge.predict(each.observation, by_velocity=False, turn=each.turn)
             if T_map_base is None:  # without odometry; the next odometry continues from the last
                 T_map_base = bridge.copy().predict(each.observation, by_velocity=True)
-            given = replace(each, T_map_base=T_map_base, bridge=bridge.copy())
-            bridged.append(replace(given, module=BRIDGED, covariance=None, is_trusted=False))
+            told = replace(each, T_map_base=T_map_base, module=BRIDGED, bridge=bridge.copy())
+            told.is_trusted = False
+            bridged.append(told)
         self._back_end.rewind(untrusted[0].stamp_ns)
         self._put(bridged[:-1], moment.stamp_ns)
         self.session.bridge = bridge
@@ -140,9 +141,15 @@ class Estimator:
 
     def _report(self, moment: BufferedObservation) -> None:
         """Report a pose to the back end."""
-        T_map_base = moment.T_map_base
-        if T_map_base is not None:
-            self._back_end.add(moment.stamp_ns, T_map_base, moment.module, moment.covariance)
+        if moment.T_map_base is not None:
+            known = None if moment.module == BRIDGED else moment.tracking
+            self._back_end.add(
+                moment.stamp_ns,
+                moment.T_map_base,
+                moment.module,
+                None if known is None else known.covariance,
+                None if known is None else known.map_covariance,
+            )
 
     def _rewrite(self, handover: Handover) -> None:
         """Replace the untrusted poses by those of a module that has caught up."""

@@ -173,4 +173,9 @@ class Handover:
             bent = moment.bridge.follow(moment.observation, se3.exp(share * xi))
             moment = self.trail[index] = replace(moment, T_map_base=bent)
             if moment.stamp_ns in self._spared_ns:
-                moment.module, moment.covariance = self.runner.key, tracking.covariance
+                assert self.runner.T_map_local is not None
+                T_local_base = se3.inverse(self.runner.T_map_local) @ bent
+                moment.module = self.runner.key
+                moment.tracking = replace(
+                    tracking, stamp_ns=moment.stamp_ns, T_local_base=T_local_base
+                )

@@ -28,7 +28,8 @@ class Hold:
         self.is_trusted = False  # another module may start from its last pose
         self.wheels_lie = False  # by the module's motion and the robot's inertia
         self.is_asked = False  # it was given the last observation
-        self.tracking: Tracking | None = None  # its answer to that, if usable
+        self.answer: Tracking | None = None  # its answer to that, unless it is lost
+        self.tracking: Tracking | None = None  # the same, if usable
         self.is_revised = False  # its last pose jumped because it corrected its past
         self.unheld_since_ns: int | None = None
         self.held_since_ns: int | None = None
@@ -59,7 +60,7 @@ class Hold:
 
     def ask(self, runner: Runner, observation: Observation) -> Tracking | None:
         """Return a module's answer if its pose may be used; raises ModuleError as the runner."""
-        self.is_trusted, self.tracking, self.is_asked = False, None, True
+        self.is_trusted, self.answer, self.tracking, self.is_asked = False, None, None, True
         if not runner.can_use(observation):
             self.spare(observation)
             if self._fed_ns is None or observation.stamp_ns - self._fed_ns > 2 * self._period_ns:
@@ -71,6 +72,7 @@ class Hold:
         is_tracking = tracking.status is TrackingStatus.TRACKING
         covariance = tracking.covariance if is_tracking else None
         self._judge(observation, None if is_lost else tracking.T_local_base, covariance)
+        self.answer = None if is_lost else tracking
         if is_lost or self.is_suspect:
             self.lose(tracking.stamp_ns)
             return None
@@ -84,7 +86,7 @@ class Hold:
 
     def spare(self, observation: Observation) -> None:
         """Record an observation that is not given to the module."""
-        self.is_trusted, self.tracking, self.is_asked = False, None, False
+        self.is_trusted, self.answer, self.tracking, self.is_asked = False, None, None, False
         self._judge(observation, None)
 
     @property

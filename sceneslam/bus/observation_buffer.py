@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.bus.bridge import Bridge
-from sceneslam.types.observation import Observation
+from sceneslam.types.observation import Observation, Tracking
 from sceneslam.types.se3 import Transform
 
 _BULKY = ("image_bgr", "depth_m", "points_lidar", "point_times_s")
@@ -25,7 +25,7 @@ class BufferedObservation:
     module: str  # the module that gave the pose, BRIDGED without one
     bridge: Bridge  # after the observation
     turn: NDArray[np.float64] | None  # (3, 3) rotation since the previous entry, if trusted
-    covariance: NDArray[np.float64] | None  # (6, 6) of its T_local_base, as the module reports it
+    tracking: Tracking | None  # the active module's answer, also where its pose is not used
     is_trusted: bool  # a module that was not suspect was tracking, as certain as usual
 
     @property

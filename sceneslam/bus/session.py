@@ -127,6 +127,6 @@ class ModuleSession:
             module=BRIDGED if tracking is None else self.key,
             bridge=self.bridge.copy(),
             turn=self.hold.turn if self.is_running else None,
-            covariance=None if tracking is None else tracking.covariance,
+            tracking=self.hold.answer,
             is_trusted=tracking is not None and self.hold.is_trusted,
         )

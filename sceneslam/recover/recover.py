@@ -107,8 +107,9 @@ class _Retold:
         T_map_base: Transform,
         module: str,
         covariance: NDArray[np.float64] | None,
+        map_covariance: NDArray[np.float64] | None,
     ) -> None:
-        self._atlas.add(stamp_ns, T_map_base, module, covariance)
+        self._atlas.add(stamp_ns, T_map_base, module, covariance, map_covariance)
 
     def add_rewind(self, stamp_ns: int) -> None:
         self._atlas.rewind(stamp_ns)

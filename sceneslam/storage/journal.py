@@ -9,12 +9,13 @@
 | `O` | stamp [ns] of an observation |
 | `S` | T_map_local of a new session, key of its module |
 | `L` | stamp, T_local_base of the session |
-| `P` | stamp, T_map_base, covariance (upper triangle, 21; or none), key of the module |
+| `P` | stamp, T_map_base, two covariances (each a byte 1 and 21 numbers, or a byte 0), its module |
 | `R` | stamp from which on poses are taken back |
 | `M` | stamps and T_new_old at which the atlas corrects the poses otherwise than before |
 | `C` | a session's number; stamps and T_local_base as its module revised them at its end |
 
-A pose takes about 410 bytes. The file goes when the run's results are written.
+A pose takes about 410 bytes, 580 with a covariance of the map. The file goes when the run's results
+are written.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
 JOURNAL = "journal.bin"
-MAGIC = b"SceneSLAM journal 1\n"
+MAGIC = b"SceneSLAM journal 2\n"
 _HEAD = struct.Struct("<cII")
 _STAMP = struct.Struct("<q")
 _UPPER = np.triu_indices(6)
@@ -90,10 +91,12 @@ class Journal:
         T_map_base: Transform,
         module: str,
         covariance: NDArray[np.float64] | None,
+        map_covariance: NDArray[np.float64] | None,
     ) -> None:
-        """Record a pose of the global trajectory, T_map_base (4, 4) [m]; covariance in base."""
-        known = b"" if covariance is None else covariance[_UPPER].tobytes()
-        body = _STAMP.pack(stamp_ns) + _pose(T_map_base) + bytes([len(known)]) + known
+        """Record a pose of the global trajectory, T_map_base (4, 4) [m]; covariances in base."""
+        body = _STAMP.pack(stamp_ns) + _pose(T_map_base)
+        for known in (covariance, map_covariance):
+            body += b"\0" if known is None else b"\1" + known[_UPPER].tobytes()
         self._add(b"P", body + module.encode())
 
     def add_rewind(self, stamp_ns: int) -> None:
@@ -186,14 +189,21 @@ def _tell_local(log: TrajectoryLog, body: bytes) -> None:
 
 
 def _tell_pose(log: TrajectoryLog, body: bytes) -> None:
-    rest = body[_STAMP.size + _POSE_BYTES :]
-    known, module = rest[1 : 1 + rest[0]], rest[1 + rest[0] :].decode()
-    covariance: NDArray[np.float64] | None = None
-    if known:
-        covariance = np.zeros((6, 6))
-        covariance[_UPPER] = np.frombuffer(known)
-        covariance.T[_UPPER] = covariance[_UPPER]
-    log.add_pose(_number(body), _transform(body[_STAMP.size :]), module, covariance)
+    covariance, rest = _covariance(body[_STAMP.size + _POSE_BYTES :])
+    map_covariance, module = _covariance(rest)
+    T_map_base = _transform(body[_STAMP.size :])
+    log.add_pose(_number(body), T_map_base, module.decode(), covariance, map_covariance)
+
+
+def _covariance(body: bytes) -> tuple[NDArray[np.float64] | None, bytes]:
+    """Return a covariance (6, 6) at the beginning, None without one, and what follows it."""
+    if not body[0]:
+        return None, body[1:]
+    end = 1 + 8 * len(_UPPER[0])
+    covariance = np.zeros((6, 6))
+    covariance[_UPPER] = np.frombuffer(body[1:end])
+    covariance.T[_UPPER] = covariance[_UPPER]
+    return covariance, body[end:]
 
 
 def _tell_rewind(log: TrajectoryLog, body: bytes) -> None:

@@ -112,7 +112,10 @@ class Tracking:
     stamp_ns: int
     T_local_base: Transform  # the paper's T_local
     status: TrackingStatus
-    covariance: NDArray[np.float64] | None = None  # (6, 6) of se3.log order [m, rad], base frame
+    # (6, 6) of se3.log order [m, rad], base frame: relative to the module's map around the pose.
+    covariance: NDArray[np.float64] | None = None
+    # (6, 6), the same way: what the module knows of how far that map drifted since it began.
+    map_covariance: NDArray[np.float64] | None = None
     quality_ratio: float = 1.0  # 0 (nothing matched) to 1
     inliers: int = 0  # measurements that agree with the pose
     revision: int = 0  # increases when the module corrects its past; the pose may then jump

@@ -23,6 +23,7 @@ from sceneslam.types.planar import (
 )
 from sceneslam.types.se3 import Transform
 
+from .doubt import Doubt
 from .field import LikelihoodField
 from .keyframes import ScanKeyframe, ScanKeyframes
 from .matcher import Match, Matcher, novelty
@@ -43,6 +44,7 @@ class Estimate:
 
     T_local_base: Planar
     covariance: Matrix  # axes of local
+    map_covariance: Matrix  # of the map's drift, the same way
     status: TrackingStatus
     quality_ratio: float
     inliers: int
@@ -79,6 +81,7 @@ class FrontEnd:
     _fit_ns: int | None = field(default=None, init=False)  # scans fitted as usual until then
     _failures: int = field(default=0, init=False)
     _field: LikelihoodField | None = field(default=None, init=False)
+    _doubt: Doubt = field(default_factory=Doubt, init=False)
 
     def track(self, observation: Observation, scan: LaserScan | None) -> Estimate:
         """Return the pose at the observation, corrected by its scan if it has one."""
@@ -112,6 +115,7 @@ class FrontEnd:
         if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
         self._teach(match, T_then_now, motion)
+        self._doubt.add(match, priors)
         estimate = self._hold(observation, compose(match.T_local_base, T_then_now), match)
         if self.keyframes.is_due(match.T_local_base):
             self._extend(match.T_local_base, scan, surfaces)
@@ -188,6 +192,7 @@ class FrontEnd:
         return Estimate(
             T_local_base=pose,
             covariance=self._covariance,
+            map_covariance=self._doubt.covariance(pose),
             status=TrackingStatus.DEGRADED if weak else TrackingStatus.TRACKING,
             quality_ratio=1.0 if match is None else match.inlier_ratio,
             inliers=0 if match is None else match.inliers,
@@ -226,6 +231,7 @@ class FrontEnd:
         return Estimate(
             T_local_base=predicted,
             covariance=self._covariance,
+            map_covariance=self._doubt.covariance(predicted),
             status=status,
             quality_ratio=0.0,
             inliers=0,
@@ -240,6 +246,7 @@ class FrontEnd:
         return Estimate(
             T_local_base=self._held_pose,
             covariance=self._covariance,
+            map_covariance=self._doubt.covariance(self._held_pose),
             status=TrackingStatus.LOST,
             quality_ratio=0.0,
             inliers=0,

@@ -66,16 +66,21 @@ class Match:
     noise: float  # deviation of the points from the map, relative to the expected one
     probabilities: NDArray[np.float64]  # of the priors, given the scan
 
+    def drawn_to(self, prior: MotionPrior) -> Planar:
+        """Return the difference (3,) of the pose that a prior makes, by the scan's shape."""
+        H, pose, weight = self.information, self.T_local_base, prior.weighed(self.T_local_base)
+        pull = difference(self.T_local_alone, pose)
+        return np.asarray(np.linalg.inv(H + weight) @ (H @ pull - weight @ prior.off(pose)))
+
     def cost_with(self, prior: MotionPrior) -> float:
         """Return the cost with another prior, by the shape of the scan's cost here.
 
         Where it leads farther away than that shape is known, the scan says nothing about it.
         """
-        H, pose, weight = self.information, self.T_local_base, prior.weighed(self.T_local_base)
-        pull = difference(self.T_local_alone, pose)
-        step: Planar = np.linalg.inv(H + weight) @ (H @ pull - weight @ prior.off(pose))
+        H, pose, step = self.information, self.T_local_base, self.drawn_to(prior)
         if is_apart(step):
             return self.cost - float(np.log(prior.probability))
+        pull = difference(self.T_local_alone, pose)
         gained = 0.5 * float(pull @ H @ pull - (step - pull) @ H @ (step - pull))
         return self.scan_cost - gained + prior.cost_at(pose + step) - prior.spread_after(H)
 

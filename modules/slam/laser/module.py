@@ -14,13 +14,13 @@ from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import LaserScan, Observation, Tracking, TrackingStatus
-from sceneslam.types.planar import to_transform, turn
+from sceneslam.types.planar import Matrix, spatial_covariance, to_transform, turn
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
 from .frontend import Estimate, FrontEnd, ScanSettings
 from .keyframes import ScanKeyframes
-from .layers import covariance_6, map_layers
+from .layers import map_layers
 from .matcher import Matcher
 from .surface import ScanSurfaceReader
 
@@ -31,6 +31,7 @@ _ABOVE_0 = (
 _NOT_BELOW_0 = "depth_noise_per_m depth_shift_m predict_max_s"
 _AT_LEAST_1 = "beams_min submap_keyframes depth_beams depth_stride_px lidar_beams"
 _RATIO = "inlier_min_ratio degeneracy_ratio"
+_LEVEL_DEVIATION = 0.01  # m and rad: standard deviation of z, roll and pitch on a floor
 
 
 @dataclass(kw_only=True, eq=False)
@@ -112,7 +113,8 @@ class LaserSlam:
             stamp_ns=observation.stamp_ns,
             T_local_base=to_transform(estimate.T_local_base),
             status=estimate.status,
-            covariance=_covariance_base(estimate),
+            covariance=_in_base(estimate, estimate.covariance, level=_LEVEL_DEVIATION**2),
+            map_covariance=_in_base(estimate, estimate.map_covariance, level=0.0),
             quality_ratio=estimate.quality_ratio,
             inliers=estimate.inliers,
         )
@@ -198,9 +200,9 @@ class LaserSlam:
         )
 
 
-def _covariance_base(estimate: Estimate) -> NDArray[np.float64] | None:
+def _in_base(estimate: Estimate, covariance: Matrix, level: float) -> NDArray[np.float64] | None:
     """Return the (6, 6) covariance in base's axes, None without a pose."""
     if estimate.status is TrackingStatus.LOST:
         return None
     G = turn(-float(estimate.T_local_base[2]))
-    return covariance_6(G @ estimate.covariance @ G.T)
+    return spatial_covariance(G @ covariance @ G.T, level)

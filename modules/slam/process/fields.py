@@ -56,6 +56,7 @@ def answers(reply: Fields) -> list[Tracking]:
     T_local_base = _rigid(_of(reply, "T_local_base"), count)
     statuses = _optional(reply, "status", (count,))
     covariances = _optional(reply, "covariance", (count, 6, 6))
+    of_maps = _optional(reply, "map_covariance", (count, 6, 6))
     qualities = _optional(reply, "quality_ratio", (count,))
     inliers = _optional(reply, "inliers", (count,))
     return [
@@ -64,6 +65,7 @@ def answers(reply: Fields) -> list[Tracking]:
             T_local_base=T_local_base[index],
             status=_STATUSES[0] if statuses is None else _status(statuses[index]),
             covariance=None if covariances is None else covariances[index].astype(np.float64),
+            map_covariance=None if of_maps is None else of_maps[index].astype(np.float64),
             quality_ratio=1.0 if qualities is None else float(qualities[index]),
             inliers=0 if inliers is None else int(inliers[index]),
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,8 @@ class Known:
     session: int
     module: str  # BRIDGED if no module gave the pose
     covariance: NDArray[np.float64] | None  # (6, 6), as the module reported it
+    # (6, 6) of the drift of its map
+    of_map: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 # Stamp, scan, the measured vertical direction (3,) in base, and landmarks.
@@ -171,6 +173,7 @@ class Collector:
             module=known.module,
             drift=self._bridge if known.module == BRIDGED else MAPPED,
             reported=known.covariance,
+            of_map=known.of_map,
             up_base=up_base,
             landmarks=landmarks,
         )

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import FloorPlan, draw
-from sceneslam.atlas.uncertainty import Covariance, Drift
+from sceneslam.atlas.uncertainty import Covariance, Drift, grown
 from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar, se3
 from sceneslam.types.planar import Planar
@@ -37,6 +37,8 @@ class KeyPose:
     reported: Covariance | None  # (6, 6) of T_local_base, as the module reported it
     up_base: NDArray[np.float64] | None = None  # (3,), the measured vertical direction, if known
     landmarks: Landmarks | None = None  # that the camera saw
+    # (6, 6) of the drift of the module's map
+    of_map: Covariance = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 class Drawing:
@@ -144,16 +146,21 @@ def motion_covariance(poses: Sequence[KeyPose]) -> Covariance:
     lever_m = 0.5 * float(np.hypot(away[0], away[1]))
     shift_m = float(np.hypot(per_m @ along_m, turn * lever_m))
     variances = np.repeat([shift_m**2, turn**2], 3) + LEAST**2
-    return np.diag(variances) + _grown(poses[0], poses[-1])
+    return np.diag(variances) + _grown(poses)
 
 
-def _grown(first: KeyPose, last: KeyPose) -> Covariance:
-    """Return the growth (6, 6) of a module's covariance between two poses of its session."""
-    if first.session != last.session or first.reported is None or last.reported is None:
-        return np.zeros((6, 6))
+def _grown(poses: Sequence[KeyPose]) -> Covariance:
+    """Return the growth (6, 6) of a module's covariances over its poses, in axes of the last.
+
+    Beyond the end of its session nothing is known of its map.
+    """
+    first, end = poses[0], poses[-1]
+    last = [pose for pose in poses if pose.session == first.session][-1]
     T_last_first = se3.inverse(last.T_map_base) @ first.T_map_base
-    values, vectors = np.linalg.eigh(last.reported - se3.carried(first.reported, T_last_first))
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+    growth = grown(first.of_map, last.of_map, T_last_first)
+    if last is end and first.reported is not None and last.reported is not None:
+        growth = growth + grown(first.reported, last.reported, T_last_first)
+    return se3.carried(growth, se3.inverse(end.T_map_base) @ last.T_map_base)
 
 
 def _planar(first: KeyPose, second: KeyPose) -> Planar:
