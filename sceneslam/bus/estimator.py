@@ -16,7 +16,7 @@ from sceneslam.bus.observation_buffer import BufferedObservation, ObservationBuf
 from sceneslam.bus.pace import Pace
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.runner import Legacy, Runner
-from sceneslam.bus.session import ModuleSession
+from sceneslam.bus.session import ModuleSession, Suspicion
 from sceneslam.interfaces import BackEnd
 from sceneslam.types import se3
 from sceneslam.types.maps import MapLayers
@@ -61,10 +61,16 @@ class Estimator:
         moment = session.advance(observation, by_velocity=by_velocity)
         self._tell(observation.stamp_ns)
         if session.hold.suspect_since_ns is not None and session.fault is None:
-            moment = self._distrust(session.hold.suspect_since_ns, moment)
+            since_ns = max(session.hold.suspect_since_ns, session.from_ns)
+            if was_placed:
+                session.suspicion = Suspicion(since_ns=since_ns, noticed_ns=moment.stamp_ns)
+            moment = self._distrust(since_ns, moment)
         if session.tracking is not None:
-            if not was_placed:
+            if session.suspicion is not None and session.is_acquitted:
+                moment = self._acquit(session.suspicion, moment)
+            elif not was_placed:
                 self._begin_session(moment.stamp_ns, moment.stamp_ns, jump=se3.identity())
+            session.suspicion = None
             self._back_end.add_local(moment.stamp_ns, session.tracking.T_local_base)
         self._report(moment)
         self._memory.add(moment)
@@ -92,7 +98,7 @@ class Estimator:
     def accept(self, handover: Handover) -> None:
         """Make a module that has caught up the active one, and shut the old one down."""
         old, self.session = self.session, handover.session
-        self.session.bridge = old.bridge
+        self.session.bridge, self.session.from_ns = old.bridge, handover.anchor.stamp_ns
         if self.session.is_placed:
             self._rewrite(handover)
         self._tell(self.now_ns)
@@ -124,10 +130,46 @@ class Estimator:
             told = replace(each, T_map_base=T_map_base, module=BRIDGED, bridge=bridge.copy())
             told.is_trusted = False
             bridged.append(told)
-        self._back_end.rewind(untrusted[0].stamp_ns)
-        self._put(bridged[:-1], moment.stamp_ns)
-        self.session.bridge = bridge
-        return bridged[-1]
+        return self._retell(bridged)
+
+    def _acquit(self, suspicion: Suspicion, moment: BufferedObservation) -> BufferedObservation:
+        """Take the remembered poses of a suspicion from the module after all.
+
+        Where it gave no answer, they are interpolated. Return the newest one, with its bridge.
+        """
+        since_ns = max(suspicion.since_ns, self._memory.oldest_ns)
+        before, runner = self._memory.last_until(since_ns), self.active
+        assert before is not None and runner is not None and runner.T_map_local is not None
+        bridge, told = before.bridge.copy(), list[BufferedObservation]()
+        missed, last = list[BufferedObservation](), before
+        for each in [*self._memory.after(since_ns), moment]:
+            answer = each.tracking
+            if answer is None:
+                missed.append(each)
+                continue
+            T_map_base = runner.T_map_local @ answer.T_local_base
+            for one in missed:
+                share = (one.stamp_ns - last.stamp_ns) / (each.stamp_ns - last.stamp_ns)
+                T_map_last = T_map_base if last.T_map_base is None else last.T_map_base
+                T_last_base = se3.inverse(T_map_last) @ T_map_base
+                T_map_one = T_map_last @ se3.exp(share * se3.log(T_last_base))
+                bridge.follow(one.observation, se3.inverse(bridge.T_map_base) @ T_map_one)
+                told.append(replace(one, T_map_base=T_map_one, bridge=bridge.copy()))
+            is_jump = last.tracking is not None and last.tracking.revision != answer.revision
+            bridge.update(each.observation, T_map_base, is_jump=is_jump)
+            last = replace(each, T_map_base=T_map_base, module=runner.key, bridge=bridge.copy())
+            told.append(last)
+            missed = []
+            if suspicion.noticed_ns <= each.stamp_ns < moment.stamp_ns:
+                self._back_end.add_local(each.stamp_ns, answer.T_local_base)
+        return self._retell(told)
+
+    def _retell(self, moments: list[BufferedObservation]) -> BufferedObservation:
+        """Replace the last poses, the newest of which was not told yet; return that."""
+        self._back_end.rewind(moments[0].stamp_ns)
+        self._put(moments[:-1], moments[-1].stamp_ns)
+        self.session.bridge = moments[-1].bridge.copy()
+        return moments[-1]
 
     def _put(self, moments: list[BufferedObservation], stamp_ns: int) -> None:
         """Replace buffered observations by those with corrected poses."""

@@ -45,6 +45,7 @@ class Judgement:
     since_ns: int | None = None  # then: since when it may have been wrong
     turn_agrees: bool = False  # its turn is within the bounds, and so better than the wheels'
     wheels_lie: bool = False  # they disagree with a module that is certain and moves plausibly
+    wheels_jumped: bool = False  # then: their velocity changed as no robot's can
 
 
 # Motions are compared over each: a jump shows in the shorter, a slow slide in the longer.
@@ -105,6 +106,7 @@ class Gate:
         self._way_m, self._turn_rad = 0.0, 0.0
         self._within_since_ns = 0  # since when both have been within bounds
         self._has_jumped = False  # the module has jumped as no robot can, since the two agreed
+        self._have_wheels_jumped = False  # the same of the wheels
         self._is_wheels = False  # the wheels were at fault, since the two agreed
         self._is_acute = False  # the shortest horizon shows a disagreement
         # The newest excesses of distance while the wheels were right.
@@ -184,11 +186,14 @@ class Gate:
             self._within_since_ns = now.stamp_ns
         is_long = now.stamp_ns - self._within_since_ns >= _PROBATION_NS
         if is_long:
-            self._has_jumped = self._is_wheels = False  # they belong to another disagreement
+            # They belong to another disagreement.
+            self._has_jumped = self._have_wheels_jumped = self._is_wheels = False
         apart_m = max(excess.apart_m for excess in excesses)
         if is_wrong and self._is_wheels_fault(found[-1], now, apart_m, deviation_m):
             self._distances, self._usual_excess = RecentMedian(_USUAL_KEPT, width=1), 0.0
-            return Judgement(is_trusted=True, wheels_lie=True)
+            return Judgement(
+                is_trusted=True, wheels_lie=True, wheels_jumped=self._have_wheels_jumped
+            )
         # There is no probation for turns: a module that was wrong and is within the bounds again
         # turns correctly, and the wheels' turn would be worse meanwhile.
         return Judgement(
@@ -206,14 +211,17 @@ class Gate:
         The one at fault changes its velocity abruptly, as no robot can, and the other does not. If
         neither did, a module that is more certain than the wheels is right: wheel errors persist.
         A change of velocity counts if it explains a part of the disagreement of `apart_m` metres.
-        While the module is less certain, what was found last of this disagreement stands.
+        While the module is less certain, what was found last of this disagreement stands; whether
+        the wheels jumped is noted meanwhile.
         """
         wheels_m = _DISTANCE_M + self._wheels.drift_ratio * (now.way_m - then.way_m)
+        by_module, by_wheels = self._jumps(now)
+        least_m_s = max(_JUMP_M_S, _EXPLAINED * apart_m / _STEP_S)
+        self._have_wheels_jumped |= by_wheels > max(least_m_s, _JUMP_RATIO * by_module)
         if deviation_m is not None and deviation_m <= wheels_m and not self._has_jumped:
-            by_module, by_wheels = self._jumps(now)
             # A change of velocity is made of three positions, weighted 1, -2, 1.
             noise_m_s = math.sqrt(6.0) * deviation_m / _STEP_S
-            least_m_s = max(_JUMP_M_S, _JUMP_SIGMAS * noise_m_s, _EXPLAINED * apart_m / _STEP_S)
+            least_m_s = max(least_m_s, _JUMP_SIGMAS * noise_m_s)
             self._has_jumped = by_module > max(least_m_s, _JUMP_RATIO * by_wheels)
             self._is_wheels = not self._has_jumped
         return self._is_wheels

@@ -27,9 +27,11 @@ class Hold:
         self.suspect_since_ns: int | None = None  # where suspicion begins: since when it may err
         self.is_trusted = False  # another module may start from its last pose
         self.wheels_lie = False  # by the module's motion and the robot's inertia
+        self.wheels_jumped = False  # then: their velocity changed as no robot's can
         self.is_asked = False  # it was given the last observation
         self.answer: Tracking | None = None  # its answer to that, unless it is lost
         self.tracking: Tracking | None = None  # the same, if usable
+        self.degraded_ns = -1  # stamp of its last answer that was DEGRADED
         self.is_revised = False  # its last pose jumped because it corrected its past
         self.unheld_since_ns: int | None = None
         self.held_since_ns: int | None = None
@@ -73,6 +75,8 @@ class Hold:
         covariance = tracking.covariance if is_tracking else None
         self._judge(observation, None if is_lost else tracking.T_local_base, covariance)
         self.answer = None if is_lost else tracking
+        if tracking.status is TrackingStatus.DEGRADED:
+            self.degraded_ns = tracking.stamp_ns
         if is_lost or self.is_suspect:
             self.lose(tracking.stamp_ns)
             return None
@@ -123,7 +127,7 @@ class Hold:
             deviation_m=None if covariance is None else _deviation_m(covariance),
         )
         if T_local_base is not None:
-            self.wheels_lie = judgement.wheels_lie
+            self.wheels_lie, self.wheels_jumped = judgement.wheels_lie, judgement.wheels_jumped
         if judgement.is_wrong:
             self.suspect_since_ns = None if self.is_suspect else judgement.since_ns
             self.is_suspect = True

@@ -54,6 +54,11 @@ class ObservationBuffer:
         """Return the newest entry."""
         return self._moments[-1]
 
+    @property
+    def oldest_ns(self) -> int:
+        """Return the stamp of the oldest entry."""
+        return self._moments[0].stamp_ns
+
     def add(self, moment: BufferedObservation) -> None:
         """Add an entry; remove those that are too old."""
         self._append(moment)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.decision import Health
@@ -14,6 +14,14 @@ from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Suspicion:
+    """A disagreement of a module with the wheels, until it is decided which of them was wrong."""
+
+    since_ns: int  # its poses after it may be wrong
+    noticed_ns: int
 
 
 class ModuleSession:
@@ -29,6 +37,9 @@ class ModuleSession:
         self.fault: ModuleError | None = None  # failure at the last observation
         self.stored: list[int] = []  # its sessions in the back end
         self.logged: TrackingStatus | None = None  # its status as last logged
+        self.from_ns = 0  # its poses after it are the module's
+        self.suspicion: Suspicion | None = None
+        self.is_acquitted = False  # the last suspicion ended: the wheels were wrong
 
     @property
     def key(self) -> str:
@@ -101,8 +112,14 @@ class ModuleSession:
         """Return the module's answer if it may be used; raises ModuleError as the runner does."""
         assert self.runner is not None
         tracking = self.hold.ask(self.runner, observation)
+        self.is_acquitted = False
         if self.hold.is_suspect:
             self.is_placed = False  # it is placed anew at the robot's next pose
+        elif tracking is not None and self.suspicion is not None:
+            # Where it was DEGRADED it may have slid, unless the wheels show that it was they.
+            was_held = self.hold.degraded_ns <= self.suspicion.since_ns
+            self.is_acquitted = self.hold.wheels_lie and (was_held or self.hold.wheels_jumped)
+            self.is_placed = self.is_acquitted  # where it was before
         return tracking
 
     def _place(self, observation: Observation, tracking: Tracking) -> Transform:
