@@ -24,6 +24,7 @@ class NearestSurfaces:
 
     points: NDArray[np.float64]  # (N, 2) [m], local
     shape: NDArray[np.float64]  # (N, 3)
+    bend: NDArray[np.float64]  # (N,) [rad^2]
     outward: NDArray[np.float64]  # (N, 2), out of the map: unit vector at a surface's end, else 0
 
 
@@ -68,6 +69,7 @@ class LikelihoodField:
         return NearestSurfaces(
             points=self._points[surface],
             shape=self._shape[surface],
+            bend=self._bend[surface],
             outward=self._outward[surface],
         )
 
@@ -108,6 +110,7 @@ class LikelihoodField:
 
         self._points = np.column_stack([mean(values) for values in surfaces.points.T])
         self._shape = np.column_stack([mean(values) for values in surfaces.shape.T])
+        self._bend = 1.0 / np.bincount(index, weights=1.0 / surfaces.bend, minlength=count)
 
     def _out_of_map(
         self, image: NDArray[np.uint8], occupied: NDArray[np.int64]

@@ -317,11 +317,12 @@ class _Pairs:
         along = ((error - across) ** 2).sum(axis=1)  # a surface's end is farther away
         beyond = near.outward[:, 0] * ex + near.outward[:, 1] * ey
         is_dense = scan_base.spacing_m < field.resolution_m  # else cells between beams are empty
+        certain = 1.0 / (1.0 + near.bend * along * scan_base.weight)
         return cls(
             arms=arms,
             error=error,
-            across=across,
-            shape=near.shape,
+            across=across * certain[:, None],
+            shape=near.shape * certain[:, None],
             is_beyond=(along >= np.maximum(_END_M, 2.0 * scan_base.spacing_m) ** 2)
             | ((beyond >= 0.5 * field.resolution_m) & is_dense),
         )

@@ -13,7 +13,7 @@ from sceneslam.types.observation import LaserScan
 from sceneslam.types.planar import Planar, rotation
 
 _SPAN_M = 0.2  # neighbours along the scan within this distance form a point's surface
-_NEIGHBOURS_MIN = 4  # fewer points do not define a surface
+_NEIGHBOURS_MIN = 2  # fewer points do not define a surface
 _BLOB_RATIO = (0.04, 0.24)  # least to largest variance: up to the first a line, from the second not
 
 Array = NDArray[np.float64]
@@ -26,6 +26,7 @@ class SurfacePoints:
     points: Array  # (N, 2) [m], frame as in the owner's name
     shape: Array  # (N, 3): xx, xy, yy; 0 with too few neighbours
     weight: Array  # (N,) [1/m^2], inverse variance of the range
+    bend: Array  # (N,) [rad^2], variance of the normal's direction
     spacing_m: Array  # (N,), between neighbouring beams
 
     def __len__(self) -> int:
@@ -51,6 +52,7 @@ class SurfacePoints:
             points=self.points @ R.T + T_a_b[:2],
             shape=shape,
             weight=self.weight,
+            bend=self.bend,
             spacing_m=self.spacing_m,
         )
 
@@ -61,6 +63,7 @@ def joined(parts: Sequence[SurfacePoints]) -> SurfacePoints:
         points=np.concatenate([part.points for part in parts]),
         shape=np.concatenate([part.shape for part in parts]),
         weight=np.concatenate([part.weight for part in parts]),
+        bend=np.concatenate([part.bend for part in parts]),
         spacing_m=np.concatenate([part.spacing_m for part in parts]),
     )
 
@@ -87,19 +90,22 @@ class ScanSurfaceReader:
         points_laser = np.column_stack([r * np.cos(angle), r * np.sin(angle)])
         points_base = points_laser @ self.T_base_laser[:2, :2].T + self.T_base_laser[:2, 3]
         spacing = np.maximum(r * abs(scan.angle_step_rad), 1e-4)
+        weight = 1.0 / (self.noise_m + self.noise_per_m * r * r) ** 2
+        shape, extent = _shape(points_base, spacing)
         return SurfacePoints(
             points=points_base,
-            shape=_shape(points_base, spacing),
-            weight=1.0 / (self.noise_m + self.noise_per_m * r * r) ** 2,
+            shape=shape,
+            weight=weight,
+            bend=1.0 / (weight * np.maximum(extent, 1e-6)),
             spacing_m=spacing,
         )
 
 
-def _shape(points: Array, spacing_m: Array) -> Array:
+def _shape(points: Array, spacing_m: Array) -> tuple[Array, Array]:
     """Return each point's shape from the spread of its neighbours along the scan."""
     count = len(points)
     if count == 0:
-        return np.zeros((0, 3))
+        return np.zeros((0, 3)), np.zeros(0)
     step = np.linalg.norm(np.diff(points, axis=0), axis=1)
     # A jump between neighbours is the edge of an object: surfaces end there.
     jump = step > np.maximum(_SPAN_M, 3.0 * np.minimum(spacing_m[1:], spacing_m[:-1]))
@@ -113,9 +119,10 @@ def _shape(points: Array, spacing_m: Array) -> Array:
     sums = np.vstack([np.zeros(5), sums])
     number = high - low
     mean_x, mean_y, xx, xy, yy = ((sums[high] - sums[low]) / number[:, None]).T
-    shape = _shape_of_spread(xx - mean_x**2, xy - mean_x * mean_y, yy - mean_y**2)
+    xx, xy, yy = xx - mean_x**2, xy - mean_x * mean_y, yy - mean_y**2
+    shape = _shape_of_spread(xx, xy, yy)
     shape[number < _NEIGHBOURS_MIN] = 0.0
-    return shape
+    return shape, number * (xx + yy)
 
 
 def _shape_of_spread(xx: Array, xy: Array, yy: Array) -> Array:
