@@ -79,6 +79,20 @@ def test_corridor_takes_the_way_along_it_from_odometry_and_says_so():
     assert variance[0] > 4 * variance[1]
 
 
+@pytest.mark.parametrize("behind_m", [15.0, 20.0])
+def test_two_beams_on_a_far_wall_tell_the_motion_along_a_corridor(behind_m):
+    """The wall ahead is 0.7 m wide: two or three beams of 1 degree see it, and nothing else."""
+    end = np.array([[[behind_m, -0.35], [behind_m, 0.35]]])
+    module = active(replace(LASER_RIG, sensors=frozenset({Sensor.SCAN})))
+    path = np.zeros((40, 3))
+    path[:, 0] = 0.1 * np.maximum(np.arange(40) - 5, 0)
+    seen = {"beams": 181, "fov_rad": np.radians(181.0), "range_max_m": 25.0}
+    rng = np.random.default_rng(0)
+    for observation in drive(np.concatenate([corridor(), end]), path, rng=rng, **seen):
+        tracking = module.track(observation)
+    assert tracking.T_local_base[0, 3] == pytest.approx(path[-1, 0], abs=0.05)
+
+
 def test_corridor_corrects_the_drift_across_it():
     steps = np.arange(80)
     path = np.column_stack([0.06 * steps, 0 * steps, 0 * steps])

@@ -24,7 +24,7 @@ class NearestSurfaces:
 
     points: NDArray[np.float64]  # (N, 2) [m], local
     shape: NDArray[np.float64]  # (N, 3)
-    bend: NDArray[np.float64]  # (N,) [rad^2]
+    normal_variance: NDArray[np.float64]  # (N,) [rad^2]
     outward: NDArray[np.float64]  # (N, 2), out of the map: unit vector at a surface's end, else 0
 
 
@@ -69,7 +69,7 @@ class LikelihoodField:
         return NearestSurfaces(
             points=self._points[surface],
             shape=self._shape[surface],
-            bend=self._bend[surface],
+            normal_variance=self._normal_variance[surface],
             outward=self._outward[surface],
         )
 
@@ -110,7 +110,8 @@ class LikelihoodField:
 
         self._points = np.column_stack([mean(values) for values in surfaces.points.T])
         self._shape = np.column_stack([mean(values) for values in surfaces.shape.T])
-        self._bend = 1.0 / np.bincount(index, weights=1.0 / surfaces.bend, minlength=count)
+        known = np.bincount(index, weights=1.0 / surfaces.normal_variance, minlength=count)
+        self._normal_variance = 1.0 / known
 
     def _out_of_map(
         self, image: NDArray[np.uint8], occupied: NDArray[np.int64]

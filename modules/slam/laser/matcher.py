@@ -40,7 +40,8 @@ _ITERATIONS = (3, 3, 8)  # at most, per kernel
 _CONVERGED = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: a step this small is the last
 _INLIER_M = 0.1
 _END_M = 0.1  # a mapped surface may continue this far, or twice the beams' spacing
-_CORRELATION = 4.0  # neighbouring beams have common errors: information is divided by this
+_CORRELATION = 4.0  # neighbouring beams have common errors: information is divided by this ...
+_APART_M = 0.175  # ... but evidence by as many beams as are within this distance, at most
 _UNEVEN = 3.0  # by so much scans usually fit better or worse than on average
 _SLACK = 2.0  # scans that fit worse by less do not add up
 _USUAL_SCANS = 20.0  # over which that average is taken
@@ -301,8 +302,8 @@ class _Pairs:
 
     arms: NDArray[np.float64]  # (N, 2) [m], from the base, axes of local
     error: NDArray[np.float64]  # (N, 2) [m], from the surface
-    across: NDArray[np.float64]  # (N, 2) [m], of that, across the surface
-    shape: NDArray[np.float64]  # (N, 3)
+    across: NDArray[np.float64]  # (N, 2) [m], of that, across the surface; both of these are
+    shape: NDArray[np.float64]  # (N, 3), reduced where the normal's error adds to the range's
     is_beyond: NDArray[np.bool_]  # (N,), the surface has ended before
 
     @classmethod
@@ -317,7 +318,7 @@ class _Pairs:
         along = ((error - across) ** 2).sum(axis=1)  # a surface's end is farther away
         beyond = near.outward[:, 0] * ex + near.outward[:, 1] * ey
         is_dense = scan_base.spacing_m < field.resolution_m  # else cells between beams are empty
-        certain = 1.0 / (1.0 + near.bend * along * scan_base.weight)
+        certain = 1.0 / (1.0 + near.normal_variance * along * scan_base.weight)
         return cls(
             arms=arms,
             error=error,
@@ -350,10 +351,13 @@ def _residuals(
 
 
 def _scan_cost(scan_base: SurfacePoints, residual: NDArray[np.float64]) -> float:
-    """Return the negative log-likelihood of the points, with a bounded cost per point."""
+    """Return the negative log-likelihood of the points, with a bounded cost per point.
+
+    Beams that are far apart have errors of their own: few of them see the far end of a corridor.
+    """
     squared, limit = residual**2, _KERNELS_M[-1] ** 2
     each = 0.5 * scan_base.weight * limit * squared / (limit + squared)
-    return float(each.sum()) / _CORRELATION
+    return float((each / np.clip(_APART_M / scan_base.spacing_m, 1.0, _CORRELATION)).sum())
 
 
 def _noise(scan_base: SurfacePoints, residual: NDArray[np.float64]) -> float:

@@ -13,7 +13,8 @@ from sceneslam.types.observation import LaserScan
 from sceneslam.types.planar import Planar, rotation
 
 _SPAN_M = 0.2  # neighbours along the scan within this distance form a point's surface
-_NEIGHBOURS_MIN = 2  # fewer points do not define a surface
+_NEIGHBOURS_MIN = 2  # one point alone does not define a surface
+_SPREAD_MIN_M2 = 1e-6  # one point has any direction
 _BLOB_RATIO = (0.04, 0.24)  # least to largest variance: up to the first a line, from the second not
 
 Array = NDArray[np.float64]
@@ -26,7 +27,7 @@ class SurfacePoints:
     points: Array  # (N, 2) [m], frame as in the owner's name
     shape: Array  # (N, 3): xx, xy, yy; 0 with too few neighbours
     weight: Array  # (N,) [1/m^2], inverse variance of the range
-    bend: Array  # (N,) [rad^2], variance of the normal's direction
+    normal_variance: Array  # (N,) [rad^2], of the surface's direction
     spacing_m: Array  # (N,), between neighbouring beams
 
     def __len__(self) -> int:
@@ -52,7 +53,7 @@ class SurfacePoints:
             points=self.points @ R.T + T_a_b[:2],
             shape=shape,
             weight=self.weight,
-            bend=self.bend,
+            normal_variance=self.normal_variance,
             spacing_m=self.spacing_m,
         )
 
@@ -63,7 +64,7 @@ def joined(parts: Sequence[SurfacePoints]) -> SurfacePoints:
         points=np.concatenate([part.points for part in parts]),
         shape=np.concatenate([part.shape for part in parts]),
         weight=np.concatenate([part.weight for part in parts]),
-        bend=np.concatenate([part.bend for part in parts]),
+        normal_variance=np.concatenate([part.normal_variance for part in parts]),
         spacing_m=np.concatenate([part.spacing_m for part in parts]),
     )
 
@@ -91,18 +92,22 @@ class ScanSurfaceReader:
         points_base = points_laser @ self.T_base_laser[:2, :2].T + self.T_base_laser[:2, 3]
         spacing = np.maximum(r * abs(scan.angle_step_rad), 1e-4)
         weight = 1.0 / (self.noise_m + self.noise_per_m * r * r) ** 2
-        shape, extent = _shape(points_base, spacing)
+        shape, spread_m2 = _shape(points_base, spacing)
         return SurfacePoints(
             points=points_base,
             shape=shape,
             weight=weight,
-            bend=1.0 / (weight * np.maximum(extent, 1e-6)),
+            normal_variance=1.0 / (weight * np.maximum(spread_m2, _SPREAD_MIN_M2)),
             spacing_m=spacing,
         )
 
 
 def _shape(points: Array, spacing_m: Array) -> tuple[Array, Array]:
-    """Return each point's shape from the spread of its neighbours along the scan."""
+    """Return each point's shape (N, 3) from the spread of its neighbours along the scan.
+
+    And that spread (N,) [m^2], summed: a line through points has a direction of variance
+    noise^2 / spread (as the slope of a linear regression).
+    """
     count = len(points)
     if count == 0:
         return np.zeros((0, 3)), np.zeros(0)
