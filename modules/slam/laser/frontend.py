@@ -102,16 +102,19 @@ class FrontEnd:
         if self._field is None:
             self._extend(predicted_then, scan, surfaces)
             return self._hold(observation, predicted, None)
-        if self.matcher.misfit == 0.0 or self._fit_ns is None:
+        is_first = self._fit_ns is None
+        if self.matcher.misfit == 0.0 or is_first:  # the velocity is unknown at the first match
             self._fit_ns = before_ns
         motion = motion.since_misfit(self.matcher.misfit, self._since_fit_s(observation))
         priors = [self._prior(known, before, ratio, one) for one in (motion, *motion.alternatives)]
         is_known = motion.is_measured and not motion.is_doubted
         new = novelty(between(self._seen_pose, predicted_then)) if is_known else 1.0
         match = self.matcher.match(surfaces, self._field, priors, novelty=new)
-        if not self._believes(match) and (not is_known or self.matcher.misfit > 0.0):
+        believed = self._believes(match)
+        if (is_first or not believed) and (not is_known or self.matcher.misfit > 0.0):
             again = self._find_again(surfaces, self._field, predicted_then, is_known=is_known)
-            match = again or match
+            if again is not None and (not believed or again.inliers > match.inliers):
+                match = again
         if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
         self._teach(match, T_then_now, motion)

@@ -251,7 +251,7 @@ class Matcher:
         xx, xy, yy = pairs.shape.T
         robust = (kernel_m**2 / (kernel_m**2 + ax * ex + ay * ey)) ** 2
         gate = ~pairs.is_beyond & (ex * ex + ey * ey < (4.0 * kernel_m) ** 2)
-        weight = scan_base.weight * robust * gate / _CORRELATION
+        weight = scan_base.weight * pairs.certain * robust * gate / _CORRELATION
         total = float(weight.sum())
         centre = (weight @ arms) / max(total, 1e-12)
         lx, ly = -(arms[:, 1] - centre[1]), arms[:, 0] - centre[0]  # a point's motion per radian
@@ -302,9 +302,13 @@ class _Pairs:
 
     arms: NDArray[np.float64]  # (N, 2) [m], from the base, axes of local
     error: NDArray[np.float64]  # (N, 2) [m], from the surface
-    across: NDArray[np.float64]  # (N, 2) [m], of that, across the surface; both of these are
-    shape: NDArray[np.float64]  # (N, 3), reduced where the normal's error adds to the range's
+    across: NDArray[np.float64]  # (N, 2) [m], of that, across the surface
+    shape: NDArray[np.float64]  # (N, 3)
+    certain: NDArray[
+        np.float64
+    ]  # (N,), the range's share of the variance: the rest is the normal's
     is_beyond: NDArray[np.bool_]  # (N,), the surface has ended before
+    is_sparse: NDArray[np.bool_]  # (N,), its direction is uncertain between the beams
 
     @classmethod
     def of(cls, scan_base: SurfacePoints, field: LikelihoodField, pose: Planar) -> _Pairs:
@@ -318,12 +322,14 @@ class _Pairs:
         along = ((error - across) ** 2).sum(axis=1)  # a surface's end is farther away
         beyond = near.outward[:, 0] * ex + near.outward[:, 1] * ey
         is_dense = scan_base.spacing_m < field.resolution_m  # else cells between beams are empty
-        certain = 1.0 / (1.0 + near.normal_variance * along * scan_base.weight)
+        known = near.normal_variance * scan_base.weight  # [1/m^2]
         return cls(
             arms=arms,
             error=error,
-            across=across * certain[:, None],
-            shape=near.shape * certain[:, None],
+            across=across,
+            shape=near.shape,
+            certain=1.0 / (1.0 + known * along),
+            is_sparse=known * (2.0 * scan_base.spacing_m) ** 2 > 1.0,
             is_beyond=(along >= np.maximum(_END_M, 2.0 * scan_base.spacing_m) ** 2)
             | ((beyond >= 0.5 * field.resolution_m) & is_dense),
         )
@@ -343,11 +349,11 @@ def _residuals(
     unknown = pairs.shape[:, 0] + pairs.shape[:, 2] == 0
     is_near = far < 4 * _INLIER_M
     is_alone = ~is_near & (far >= 2.0 * scan_base.spacing_m) | pairs.is_beyond
-    evident = np.where(unknown, 0.0, across)
+    evident = np.where(unknown, 0.0, across * np.sqrt(pairs.certain))
     alone = np.flatnonzero(is_alone & ~unknown)
     is_free = field.is_free((pairs.arms + pose[:2])[alone])
     evident[alone] = np.where(is_free, far[alone], noise / np.sqrt(scan_base.weight[alone]))
-    return np.where(is_near & ~unknown, across, far), far, evident
+    return np.where(is_near & ~unknown & ~pairs.is_sparse, across, far), far, evident
 
 
 def _scan_cost(scan_base: SurfacePoints, residual: NDArray[np.float64]) -> float:
