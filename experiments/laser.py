@@ -2,6 +2,7 @@
 
     python experiments/laser.py LOG RELATIONS                     # odometry, no loops, loops
     python experiments/laser.py LOG RELATIONS harder              # the same log made harder
+    python experiments/laser.py LOG RELATIONS pieces LIE SEED     # without loops, wheels that lie
     python experiments/laser.py LOG RELATIONS profile             # where time goes (4,000 scans)
     python experiments/laser.py LOG RELATIONS maps FOLDER         # pictures of the map
 
@@ -25,9 +26,10 @@ import numpy as np
 import yaml
 
 from sceneslam.atlas.atlas import Atlas
-from sceneslam.evaluation.relations import Relations, relation_errors
+from sceneslam.evaluation.relations import Relations, motion_errors, relation_errors
 from sceneslam.modules.slam.laser.module import LaserSlam
 from sceneslam.sources.carmen import Carmen
+from sceneslam.sources.spoilt_odometry import SpoiltOdometry
 from sceneslam.types.errors import InputError
 from sceneslam.types.maps import GridLayer
 from sceneslam.types.observation import Observation
@@ -35,6 +37,8 @@ from sceneslam.types.rig import Rig
 from sceneslam.types.trajectory import Trajectory
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
+PIECE = 300  # scans, each piece begins anew
+CAP_M, LOST_M = 1.0, 0.25  # an error counts at most so much; a relation is lost with more
 HEAD = "| run | trans [m] | rot [deg] | online: trans, rot | x real time | ms: median, p99, max |"
 
 
@@ -187,6 +191,25 @@ def harder(log: Log) -> None:
         print(Run(source.rig, view).row(f"{fov_deg} deg, {range_m} m", log), flush=True)
 
 
+def pieces(log: Log, lie: str, seed: int) -> None:
+    """Print the errors of relations within pieces of the log, driven one by one, without loops."""
+    effects = {**settings("effects/liars.yaml"), "lie": lie, "seed": seed}
+    if lie in ("frozen", "slipping"):
+        effects["lasting_s"] = [5.0, 5.0]
+    source = SpoiltOdometry(log.source, **effects)
+    observations, found = list(source), []
+    for first in range(0, len(observations), PIECE):
+        piece = observations[first : first + PIECE]
+        run = Run(source.rig, piece, has_loops=False)
+        stamps_ns = log.source.logged_ns(run.online.stamps_ns)
+        found.append(motion_errors(run.online.stamped(stamps_ns), log.relations))
+    away_m, turned_deg = np.concatenate(found).T
+    print(
+        f"| {lie}, {seed} | {len(away_m)} | {np.minimum(away_m, CAP_M).mean():.4f} "
+        f"| {turned_deg.mean():.3f} | {(away_m > LOST_M).sum()} |"
+    )
+
+
 def main() -> None:
     """Run one of the commands above."""
     cv2.setNumThreads(1)
@@ -197,6 +220,8 @@ def main() -> None:
     log = Log(source=source, relations=Relations.read(Path(relations)))
     if words == ["harder"]:
         harder(log)
+    elif words[:1] == ["pieces"] and len(words) == 3:
+        pieces(log, words[1], int(words[2]))
     elif words == ["profile"]:
         with cProfile.Profile() as profile:
             Run(source.rig, islice(source, 4000))

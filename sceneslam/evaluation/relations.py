@@ -49,27 +49,16 @@ class Relations:
 def relation_errors(trajectory: Trajectory, relations: Relations) -> dict[str, float | int]:
     """Return mean and standard deviation of the motions' errors, and of their squares.
 
-    A relation is matched when the trajectory has a pose within 0.5 ms of both its instants. The
-    translation error is the length, the rotation error the angle of inv(true) @ estimated.
     Raises InputError when no relation is matched.
     """
-    first = nearest(trajectory.stamps_ns, relations.first_ns)
-    second = nearest(trajectory.stamps_ns, relations.second_ns)
-    off_ns = np.maximum(
-        np.abs(trajectory.stamps_ns[first] - relations.first_ns),
-        np.abs(trajectory.stamps_ns[second] - relations.second_ns),
-    )
-    kept = np.flatnonzero(off_ns <= _SAME_STAMP_S * 1e9)
-    if not len(kept):
+    trans_m, rot_deg = motion_errors(trajectory, relations).T
+    total = len(relations.first_ns)
+    if not len(trans_m):
+        off_s = _ends(trajectory, relations)[2].min() * 1e-9
         raise InputError(
-            f"none of the {len(off_ns)} relations has poses within {_SAME_STAMP_S} s of its "
-            f"stamps (nearest: {off_ns.min() * 1e-9:.3f} s)"
+            f"none of the {total} relations has poses within {_SAME_STAMP_S} s of its "
+            f"stamps (nearest: {off_s:.3f} s)"
         )
-    T_world_base = trajectory.T_world_base
-    T_estimated = se3.inverse(T_world_base[first[kept]]) @ T_world_base[second[kept]]
-    T_error = se3.inverse(relations.T_first_second[kept]) @ T_estimated
-    trans_m = np.linalg.norm(T_error[:, :3, 3], axis=1)
-    rot_deg = np.degrees(se3.rotation_angle_rad(T_error))
     return {
         "trans_mean_m": float(trans_m.mean()),
         "trans_std_m": float(trans_m.std()),
@@ -79,9 +68,35 @@ def relation_errors(trajectory: Trajectory, relations: Relations) -> dict[str, f
         "trans_sq_std": float((trans_m**2).std()),
         "rot_sq_mean": float((rot_deg**2).mean()),
         "rot_sq_std": float((rot_deg**2).std()),
-        "matched": len(kept),
-        "total": len(off_ns),
+        "matched": len(trans_m),
+        "total": total,
     }
+
+
+def motion_errors(trajectory: Trajectory, relations: Relations) -> NDArray[np.float64]:
+    """Return the errors (N, 2) [m, deg] of the N relations that are matched.
+
+    A relation is matched when the trajectory has a pose within 0.5 ms of both its instants. The
+    translation error is the length, the rotation error the angle of inv(true) @ estimated.
+    """
+    first, second, off_ns = _ends(trajectory, relations)
+    kept = np.flatnonzero(off_ns <= _SAME_STAMP_S * 1e9)
+    T_world_base = trajectory.T_world_base
+    T_estimated = se3.inverse(T_world_base[first[kept]]) @ T_world_base[second[kept]]
+    T_error = se3.inverse(relations.T_first_second[kept]) @ T_estimated
+    trans_m = np.linalg.norm(T_error[:, :3, 3], axis=1)
+    return np.column_stack([trans_m, np.degrees(se3.rotation_angle_rad(T_error))])
+
+
+def _ends(trajectory: Trajectory, relations: Relations) -> NDArray[np.int64]:
+    """Return the poses (3, N) nearest to both ends of the relations, and how far off [ns]."""
+    first = nearest(trajectory.stamps_ns, relations.first_ns)
+    second = nearest(trajectory.stamps_ns, relations.second_ns)
+    off_ns = np.maximum(
+        np.abs(trajectory.stamps_ns[first] - relations.first_ns),
+        np.abs(trajectory.stamps_ns[second] - relations.second_ns),
+    )
+    return np.stack([first, second, off_ns])
 
 
 def _row(line: str, path: Path) -> list[float]:

@@ -103,7 +103,7 @@ class FrontEnd:
             self._extend(predicted_then, scan, surfaces)
             return self._hold(observation, predicted, None)
         is_first = self._fit_ns is None
-        if self.matcher.misfit == 0.0 or is_first:  # the velocity is unknown at the first match
+        if self.matcher.misfit == 0.0 or is_first:
             self._fit_ns = before_ns
         motion = motion.since_misfit(self.matcher.misfit, self._since_fit_s(observation))
         priors = [self._prior(known, before, ratio, one) for one in (motion, *motion.alternatives)]
@@ -111,13 +111,18 @@ class FrontEnd:
         new = novelty(between(self._seen_pose, predicted_then)) if is_known else 1.0
         match = self.matcher.match(surfaces, self._field, priors, novelty=new)
         believed = self._believes(match)
+        # At the first match the velocity is unknown, so that without wheels any motion is possible.
         if (is_first or not believed) and (not is_known or self.matcher.misfit > 0.0):
             again = self._find_again(surfaces, self._field, predicted_then, is_known=is_known)
             if again is not None and (not believed or again.inliers > match.inliers):
                 match = again
         if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
-        self._teach(match, T_then_now, motion)
+        if is_known and len(match.probabilities) == 1:
+            self.motion.skip()  # wheels missed this motion, so that it tells no velocity
+            self.motion.slow_down()
+        else:
+            self._teach(match, T_then_now, motion)
         self._doubt.add(match, priors)
         estimate = self._hold(observation, compose(match.T_local_base, T_then_now), match)
         if self.keyframes.is_due(match.T_local_base):

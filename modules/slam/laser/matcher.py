@@ -6,6 +6,9 @@ Directions that the geometry does not constrain are removed from the laser's inf
 Zhang, Kaess, Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016), so
 that there the prior alone decides.
 
+Two beams are a surface: along a corridor, the few that see its far end are often all that tells the
+motion. The direction of such a surface is uncertain, and with it where the surface is between them.
+
 A scan made from a band of heights does not show exact walls: the nearest object in the band changes
 with the viewpoint, for many beams together. Such an error does not average out over beams, nor over
 scans taken from almost the same place.
@@ -41,7 +44,7 @@ _CONVERGED = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: a step this small is the
 _INLIER_M = 0.1
 _END_M = 0.1  # a mapped surface may continue this far, or twice the beams' spacing
 _CORRELATION = 4.0  # neighbouring beams have common errors: information is divided by this ...
-_APART_M = 0.175  # ... but evidence by as many beams as are within this distance, at most
+_APART_M = 0.175  # ... and evidence by the beams in this distance, if fewer: 4 of 1 deg at 2.5 m
 _UNEVEN = 3.0  # by so much scans usually fit better or worse than on average
 _SLACK = 2.0  # scans that fit worse by less do not add up
 _USUAL_SCANS = 20.0  # over which that average is taken
@@ -304,9 +307,7 @@ class _Pairs:
     error: NDArray[np.float64]  # (N, 2) [m], from the surface
     across: NDArray[np.float64]  # (N, 2) [m], of that, across the surface
     shape: NDArray[np.float64]  # (N, 3)
-    certain: NDArray[
-        np.float64
-    ]  # (N,), the range's share of the variance: the rest is the normal's
+    certain: NDArray[np.float64]  # (N,), share of the variance that is not the normal's
     is_beyond: NDArray[np.bool_]  # (N,), the surface has ended before
     is_sparse: NDArray[np.bool_]  # (N,), its direction is uncertain between the beams
 

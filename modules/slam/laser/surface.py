@@ -103,10 +103,10 @@ class ScanSurfaceReader:
 
 
 def _shape(points: Array, spacing_m: Array) -> tuple[Array, Array]:
-    """Return each point's shape (N, 3) from the spread of its neighbours along the scan.
+    """Return each point's shape (N, 3) from its neighbours along the scan, and their spread (N,).
 
-    And that spread (N,) [m^2], summed: a line through points has a direction of variance
-    noise^2 / spread (as the slope of a linear regression).
+    The spread is the sum of the squared distances [m^2] from their mean: the direction of a line
+    through them has the variance noise^2 / spread, as the slope of a linear regression.
     """
     count = len(points)
     if count == 0:
