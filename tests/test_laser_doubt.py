@@ -40,6 +40,7 @@ def matched(probabilities, information=WALLS):
         T_local_alone=np.zeros(3),
         cost=0.0,
         scan_cost=0.0,
+        fit_cost=0.0,
         noise=1.0,
         probabilities=np.array(probabilities),
     )

@@ -8,7 +8,7 @@ from test_laser_world import box, room, scan_at
 
 from sceneslam.modules.slam.laser.field import LikelihoodField
 from sceneslam.modules.slam.laser.free_space import FreeSpace
-from sceneslam.modules.slam.laser.matcher import Matcher
+from sceneslam.modules.slam.laser.matcher import Matcher, _Pairs, _residuals
 from sceneslam.modules.slam.laser.prior import MotionPrior
 from sceneslam.modules.slam.laser.surface import ScanSurfaceReader
 from sceneslam.types import se3
@@ -143,23 +143,44 @@ def test_what_was_not_seen_before_is_no_evidence_against_a_motion():
     assert cost(-0.3, seen) < 0.6 * cost(0.0, seen)
 
 
-def test_normal_of_two_far_beams_is_uncertain():
-    """Two beams 0.35 m apart, with 2 cm of noise, show a wall's direction within 5 degrees."""
+def two_far_beams(ahead_m):
+    """Return what a reader makes of two beams of 1 degree on a wall ahead."""
     reader = ScanSurfaceReader(
         T_base_laser=se3.identity(), range_max_m=25.0, noise_m=0.02, noise_per_m=0.0
     )
-    scan = LaserScan(
-        stamp_ns=0,
-        ranges_m=np.array([20.0, 20.0], np.float32),
-        angle_min_rad=0.0,
-        angle_step_rad=np.radians(1.0),
-        range_min_m=0.05,
-        range_max_m=25.0,
+    angle = np.radians(1.0)
+    return reader.read(
+        LaserScan(
+            stamp_ns=0,
+            ranges_m=np.repeat(np.float32(ahead_m / np.cos(0.5 * angle)), 2),
+            angle_min_rad=-0.5 * angle,
+            angle_step_rad=angle,
+            range_min_m=0.05,
+            range_max_m=25.0,
+        )
     )
-    two = reader.read(scan)
-    spacing_m = 20.0 * np.radians(1.0)
-    assert two.normal_variance == pytest.approx(
-        np.repeat((np.sqrt(2.0) * 0.02 / spacing_m) ** 2, 2), rel=0.01
-    )
-    many = reader.read(scan_at(room(), se3.identity(), stamp_ns=0))
-    assert np.median(many.normal_variance) < 0.3 * two.normal_variance[0]
+
+
+def test_normal_of_two_far_beams_is_uncertain():
+    """Two beams 0.35 m apart, with 2 cm of noise, show a wall's direction within 5 degrees."""
+    two = two_far_beams(20.0)
+    variance = (np.sqrt(2.0) * 0.02 / (20.0 * np.radians(1.0))) ** 2
+    assert two.normal_variance == pytest.approx(np.repeat(variance, 2), rel=0.01)
+
+
+@pytest.mark.parametrize(("aside_m", "ratio"), [(0.0, 1.0), (0.17, 1.0), (0.17, 0.3)])
+def test_pair_off_its_point_is_uncertain_by_the_direction_of_two_beams(aside_m, ratio):
+    """Half of the gap aside, the direction adds half of the range's variance, whatever that is."""
+    two = two_far_beams(20.0)
+    pairs = _Pairs.of(two.with_noise(ratio), LikelihoodField(two, 0.05), np.array([0, aside_m, 0]))
+    away_m = min(aside_m, 20.0 * np.radians(1.0) - aside_m)
+    known = 1.0 / (1.0 + 2.0 * (away_m / (20.0 * np.radians(1.0))) ** 2)
+    assert pairs.certain.min() == pytest.approx(known, abs=0.02)
+    assert pairs.is_sparse.all()
+
+
+def test_points_between_two_beams_do_not_confirm_a_pose():
+    two = two_far_beams(20.0)
+    field = LikelihoodField(two, 0.05)
+    near, _, _ = _residuals(two, field, np.array([0.0, 0.15, 0.0]), 1.0)
+    assert (near > 0.1).all()

@@ -89,7 +89,7 @@ def motion_errors(trajectory: Trajectory, relations: Relations) -> NDArray[np.fl
 
 
 def _ends(trajectory: Trajectory, relations: Relations) -> NDArray[np.int64]:
-    """Return the poses (3, N) nearest to both ends of the relations, and how far off [ns]."""
+    """Return (3, N): the indices of the poses nearest to both ends, and the larger gap [ns]."""
     first = nearest(trajectory.stamps_ns, relations.first_ns)
     second = nearest(trajectory.stamps_ns, relations.second_ns)
     off_ns = np.maximum(

@@ -13,6 +13,7 @@ from sceneslam.types.se3 import Transform
 
 UNKNOWN_VELOCITY = np.array([1.0, 2.0])  # m/s, rad/s: standard deviation of an unknown velocity
 BELIEVED = 0.5  # wheels are not used if they are wrong with this probability
+_CERTAIN = 100.0  # nats: more is the same, and exp(710) is no number
 _RARE = 0.003  # least probability of an alternative: one scan in 300
 
 
@@ -74,7 +75,7 @@ class Motion:
             replace(
                 other,
                 covariance=np.maximum(other.covariance, reach),
-                probability=min(other.probability * math.exp(misfit), BELIEVED),
+                probability=min(other.probability * math.exp(min(misfit, _CERTAIN)), BELIEVED),
             )
             if other.is_unknown
             else other

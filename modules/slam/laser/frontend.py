@@ -27,7 +27,7 @@ from .doubt import Doubt
 from .field import LikelihoodField
 from .keyframes import ScanKeyframe, ScanKeyframes
 from .matcher import Match, Matcher, novelty
-from .prior import MotionPrior
+from .prior import MotionPrior, difference, is_apart
 from .surface import ScanSurfaceReader, SurfacePoints
 from .wide_search import WideSearch
 
@@ -114,12 +114,12 @@ class FrontEnd:
         # At the first match the velocity is unknown, so that without wheels any motion is possible.
         if (is_first or not believed) and (not is_known or self.matcher.misfit > 0.0):
             again = self._find_again(surfaces, self._field, predicted_then, is_known=is_known)
-            if again is not None and (not believed or again.inliers > match.inliers):
+            if again is not None and (not believed or _is_better(again, match)):
                 match = again
         if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
         if is_known and len(match.probabilities) == 1:
-            self.motion.skip()  # wheels missed this motion, so that it tells no velocity
+            self.motion.skip()  # what the wheels missed is a jump, and tells no velocity
             self.motion.slow_down()
         else:
             self._teach(match, T_then_now, motion)
@@ -268,6 +268,12 @@ class FrontEnd:
             self.settings.resolution_m,
             self.keyframes.free(self.settings.T_base_laser, self.settings.range_max_m),
         )
+
+
+def _is_better(match: Match, other: Match) -> bool:
+    """Tell whether a match is another pose than the other, and more of the scan fits there."""
+    is_other = is_apart(difference(match.T_local_base, other.T_local_base))
+    return is_other and match.inliers > other.inliers
 
 
 def _share(stamp_ns: int, before_ns: int | None, now_ns: int) -> float:

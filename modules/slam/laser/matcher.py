@@ -44,7 +44,7 @@ _CONVERGED = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: a step this small is the
 _INLIER_M = 0.1
 _END_M = 0.1  # a mapped surface may continue this far, or twice the beams' spacing
 _CORRELATION = 4.0  # neighbouring beams have common errors: information is divided by this ...
-_APART_M = 0.175  # ... and evidence by the beams in this distance, if fewer: 4 of 1 deg at 2.5 m
+_APART_M = 0.175  # ... and evidence by the beams in this distance, if fewer: 4 of a degree at 2.5 m
 _UNEVEN = 3.0  # by so much scans usually fit better or worse than on average
 _SLACK = 2.0  # scans that fit worse by less do not add up
 _USUAL_SCANS = 20.0  # over which that average is taken
@@ -67,6 +67,7 @@ class Match:
     T_local_alone: Planar  # by the laser alone, except for weak directions
     cost: float  # negative logarithm of the evidence of scan and prior, up to a constant
     scan_cost: float  # of that, the scan's
+    fit_cost: float  # the same if all beams had errors in common
     noise: float  # deviation of the points from the map, relative to the expected one
     probabilities: NDArray[np.float64]  # of the priors, given the scan
 
@@ -115,7 +116,8 @@ class Matcher:
         1 if the prediction is not measured.
         """
         shift_m = self.shift_m / float(np.sqrt(novelty))
-        usual_cost = 0.0 if self._usual is None else self._usual * len(scan_base)
+        alike = _CORRELATION / _alike(scan_base)
+        usual_cost = 0.0 if self._usual is None else self._usual * float(alike.sum())
         best = self._refine(scan_base, field, priors[0].pose, priors[0], shift_m)
         costs = np.array([best.cost, *(best.cost_with(prior) for prior in priors[1:])])
         least = min(best.scan_cost, usual_cost - _UNEVEN)
@@ -152,10 +154,10 @@ class Matcher:
 
     def _compare(self, match: Match, count: int) -> None:
         """Compare how a scan of `count` points fits with the scans before (Page's CUSUM)."""
-        each = match.scan_cost / max(count, 1)
+        each = match.fit_cost / max(count, 1)
         if self._usual is None:
             self._usual = each
-        worse = match.scan_cost - self._usual * count - _SLACK
+        worse = match.fit_cost - self._usual * count - _SLACK
         self.misfit = max(self.misfit + min(worse, _UNEVEN), 0.0)
         self._usual += (each - self._usual) / _USUAL_SCANS
 
@@ -224,7 +226,8 @@ class Matcher:
         count = max(len(scan_base), 1)
         prior, off = expected.weighed(pose), expected.off(pose)
         pull = np.linalg.pinv(H, rcond=1e-9, hermitian=True) @ prior @ off
-        scan_cost = _scan_cost(scan_base, evident)
+        costs = _costs(scan_base, evident)
+        scan_cost = float((costs / _alike(scan_base)).sum())
         return Match(
             T_local_base=pose,
             information=alone,
@@ -236,6 +239,7 @@ class Matcher:
             T_local_alone=pose + pull,
             cost=scan_cost + expected.cost_at(pose) - expected.spread_after(H),
             scan_cost=scan_cost,
+            fit_cost=float(costs.sum()) / _CORRELATION,
             noise=_noise(scan_base, evident),
             probabilities=np.ones(1),
         )
@@ -323,14 +327,15 @@ class _Pairs:
         along = ((error - across) ** 2).sum(axis=1)  # a surface's end is farther away
         beyond = near.outward[:, 0] * ex + near.outward[:, 1] * ey
         is_dense = scan_base.spacing_m < field.resolution_m  # else cells between beams are empty
-        known = near.normal_variance * scan_base.weight  # [1/m^2]
+        # A surface's noise is that of the scan: both are expected, or both are estimated.
+        turn = near.normal_variance * scan_base.weight * scan_base.noise_ratio**2  # [1/m^2]
         return cls(
             arms=arms,
             error=error,
             across=across,
             shape=near.shape,
-            certain=1.0 / (1.0 + known * along),
-            is_sparse=known * (2.0 * scan_base.spacing_m) ** 2 > 1.0,
+            certain=1.0 / (1.0 + turn * along),
+            is_sparse=turn * (2.0 * scan_base.spacing_m) ** 2 > 1.0,
             is_beyond=(along >= np.maximum(_END_M, 2.0 * scan_base.spacing_m) ** 2)
             | ((beyond >= 0.5 * field.resolution_m) & is_dense),
         )
@@ -357,14 +362,18 @@ def _residuals(
     return np.where(is_near & ~unknown & ~pairs.is_sparse, across, far), far, evident
 
 
-def _scan_cost(scan_base: SurfacePoints, residual: NDArray[np.float64]) -> float:
-    """Return the negative log-likelihood of the points, with a bounded cost per point.
-
-    Beams that are far apart have errors of their own: few of them see the far end of a corridor.
-    """
+def _costs(scan_base: SurfacePoints, residual: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the negative log-likelihood of each point alone (N,), which is bounded."""
     squared, limit = residual**2, _KERNELS_M[-1] ** 2
-    each = 0.5 * scan_base.weight * limit * squared / (limit + squared)
-    return float((each / np.clip(_APART_M / scan_base.spacing_m, 1.0, _CORRELATION)).sum())
+    return np.asarray(0.5 * scan_base.weight * limit * squared / (limit + squared))
+
+
+def _alike(scan_base: SurfacePoints) -> NDArray[np.float64]:
+    """Return how many beams (N,) have errors in common with a beam.
+
+    Beams that are far apart have their own: few of them see the far end of a corridor.
+    """
+    return np.clip(_APART_M / scan_base.spacing_m, 1.0, _CORRELATION)
 
 
 def _noise(scan_base: SurfacePoints, residual: NDArray[np.float64]) -> float:

@@ -29,13 +29,14 @@ class SurfacePoints:
     weight: Array  # (N,) [1/m^2], inverse variance of the range
     normal_variance: Array  # (N,) [rad^2], of the surface's direction
     spacing_m: Array  # (N,), between neighbouring beams
+    noise_ratio: float = 1.0  # of the range's deviation, to the one that was expected
 
     def __len__(self) -> int:
         return len(self.points)
 
     def with_noise(self, ratio: float) -> SurfacePoints:
         """Return the points with `ratio` times the standard deviation."""
-        return replace(self, weight=self.weight / ratio**2)
+        return replace(self, weight=self.weight / ratio**2, noise_ratio=self.noise_ratio * ratio)
 
     def moved(self, T_a_b: Planar) -> SurfacePoints:
         """Return the points (N, 2) [m] of frame b in frame a."""
@@ -126,8 +127,9 @@ def _shape(points: Array, spacing_m: Array) -> tuple[Array, Array]:
     mean_x, mean_y, xx, xy, yy = ((sums[high] - sums[low]) / number[:, None]).T
     xx, xy, yy = xx - mean_x**2, xy - mean_x * mean_y, yy - mean_y**2
     shape = _shape_of_spread(xx, xy, yy)
-    shape[number < _NEIGHBOURS_MIN] = 0.0
-    return shape, number * (xx + yy)
+    spread_m2 = number * (xx + yy)
+    shape[(number < _NEIGHBOURS_MIN) | (spread_m2 < _SPREAD_MIN_M2)] = 0.0
+    return shape, spread_m2
 
 
 def _shape_of_spread(xx: Array, xy: Array, yy: Array) -> Array:
