@@ -122,7 +122,7 @@ def test_space_is_free_where_beams_passed_around_it(hangs):
 
 def test_what_was_not_seen_before_is_no_evidence_against_a_motion():
     """A robot that looks ahead moves back, so that more and more of its walls are new."""
-    walls = np.concatenate([box(-20, -1, 40, 1), box(3, -1, 3.5, -0.5), box(5, 0.6, 5.5, 1)])
+    walls = np.concatenate([box(-20, -1, 40, 1), box(3, -1, 3.5, -0.3), box(5, 0.6, 5.5, 1)])
     reader = ScanSurfaceReader(
         T_base_laser=se3.identity(), range_max_m=25.0, noise_m=0.01, noise_per_m=0.0
     )
@@ -140,7 +140,7 @@ def test_what_was_not_seen_before_is_no_evidence_against_a_motion():
         return matcher.match(reader.read(back), field, [prior]).scan_cost
 
     assert cost(-0.3, None) > cost(0.0, None)  # all space is taken as free
-    assert cost(-0.3, seen) < 0.6 * cost(0.0, seen)
+    assert cost(-0.3, seen) < 0.5 * cost(0.0, seen)
 
 
 def two_far_beams(ahead_m):

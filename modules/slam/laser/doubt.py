@@ -40,7 +40,7 @@ class Doubt:
     def add(self, match: Match, priors: Sequence[MotionPrior]) -> None:
         """Add a scan that was matched with these priors."""
         self._carry(match.T_local_base)
-        if len(priors) == 1 or len(match.probabilities) != len(priors):
+        if not match.weighs_sources:
             return  # there is one source, or the pose was found by a wide search
         offs = np.array([match.drawn_to(prior) for prior in priors])
         shares = match.probabilities * (offs[:, :2] ** 2).sum(axis=1)

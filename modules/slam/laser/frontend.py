@@ -118,7 +118,7 @@ class FrontEnd:
                 match = again
         if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
-        if is_known and len(match.probabilities) == 1:
+        if is_known and not match.weighs_sources:
             self.motion.skip()  # what the wheels missed is a jump, and tells no velocity
             self.motion.slow_down()
         else:
@@ -183,7 +183,7 @@ class FrontEnd:
         self.motion.learn(
             to_transform(between(self._held_pose, alone)),
             spatial_covariance(G @ known @ G.T),
-            motion.evidence(match.probabilities) if len(match.probabilities) > 1 else None,
+            motion.evidence(match.probabilities) if match.weighs_sources else None,
         )
 
     def _hold(self, observation: Observation, pose: Planar, match: Match | None) -> Estimate:

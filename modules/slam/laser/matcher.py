@@ -71,6 +71,11 @@ class Match:
     noise: float  # deviation of the points from the map, relative to the expected one
     probabilities: NDArray[np.float64]  # of the priors, given the scan
 
+    @property
+    def weighs_sources(self) -> bool:
+        """Tell whether it compares the sources of motion; a wide search knows none of them."""
+        return len(self.probabilities) > 1
+
     def drawn_to(self, prior: MotionPrior) -> Planar:
         """Return the difference (3,) of the pose that a prior makes, by the scan's shape."""
         H, pose, weight = self.information, self.T_local_base, prior.weighed(self.T_local_base)
@@ -116,8 +121,8 @@ class Matcher:
         1 if the prediction is not measured.
         """
         shift_m = self.shift_m / float(np.sqrt(novelty))
-        alike = _CORRELATION / _alike(scan_base)
-        usual_cost = 0.0 if self._usual is None else self._usual * float(alike.sum())
+        count = float((_CORRELATION / _alike(scan_base)).sum())  # as many points of usual evidence
+        usual_cost = 0.0 if self._usual is None else self._usual * count
         best = self._refine(scan_base, field, priors[0].pose, priors[0], shift_m)
         costs = np.array([best.cost, *(best.cost_with(prior) for prior in priors[1:])])
         least = min(best.scan_cost, usual_cost - _UNEVEN)
@@ -344,10 +349,12 @@ class _Pairs:
 def _residuals(
     scan_base: SurfacePoints, field: LikelihoodField, pose: Planar, noise: float
 ) -> tuple[Planar, Planar, Planar]:
-    """Return the points' distances [m] to the nearest surface, to its nearest point, and the first
-    again as evidence: a point without a surface, in space that nothing saw before, is as likely as
-    one at its surface, by the `noise` relative to the expected one. With sparse beams, a surface is
-    near only by chance.
+    """Return the points' distances [m] as inliers, to the nearest point, and as evidence.
+
+    Inliers: to the nearest surface, or to its point if its direction is uncertain: with sparse
+    beams, a surface is near only by chance. Evidence: to the surface; a point without one, in space
+    that nothing saw before, is as likely as one at its surface, by the `noise` relative to the
+    expected one.
     """
     pairs = _Pairs.of(scan_base, field, pose)
     across = np.sqrt(np.maximum((pairs.across * pairs.error).sum(axis=1), 0.0))

@@ -50,13 +50,7 @@ class SurfacePoints:
                 s * s * xx + 2 * c * s * xy + c * c * yy,
             ]
         )
-        return SurfacePoints(
-            points=self.points @ R.T + T_a_b[:2],
-            shape=shape,
-            weight=self.weight,
-            normal_variance=self.normal_variance,
-            spacing_m=self.spacing_m,
-        )
+        return replace(self, points=self.points @ R.T + T_a_b[:2], shape=shape)
 
 
 def joined(parts: Sequence[SurfacePoints]) -> SurfacePoints:
