@@ -193,17 +193,21 @@ def harder(log: Log) -> None:
 
 def pieces(log: Log, lie: str, seed: int) -> None:
     """Print the errors of relations within pieces of the log, driven one by one, without loops."""
-    effects = {**settings("effects/liars.yaml"), "lie": lie, "seed": seed}
-    if lie in ("frozen", "slipping"):
-        effects["lasting_s"] = [5.0, 5.0]
-    source = SpoiltOdometry(log.source, **effects)
+    lies = yaml.safe_load((CONF / "experiment/liars.yaml").read_text())["liars"]["lies"]
+    lies["none"] = {"lie": "none"}
+    if lie not in lies:
+        raise InputError(f"lie: got {lie!r}, allowed: {', '.join(map(repr, lies))}")
+    source = SpoiltOdometry(
+        log.source, **{**settings("effects/liars.yaml"), "seed": seed, **lies[lie]}
+    )
     observations, found = list(source), []
     for first in range(0, len(observations), PIECE):
-        piece = observations[first : first + PIECE]
-        run = Run(source.rig, piece, has_loops=False)
+        run = Run(source.rig, observations[first : first + PIECE], has_loops=False)
         stamps_ns = log.source.logged_ns(run.online.stamps_ns)
         found.append(motion_errors(run.online.stamped(stamps_ns), log.relations))
     away_m, turned_deg = np.concatenate(found).T
+    print(f"| wheels, seed | relations | trans [m] | rot [deg] | > {LOST_M} m |")
+    print("|---|---|---|---|---|")
     print(
         f"| {lie}, {seed} | {len(away_m)} | {np.minimum(away_m, CAP_M).mean():.4f} "
         f"| {turned_deg.mean():.3f} | {(away_m > LOST_M).sum()} |"
@@ -220,7 +224,7 @@ def main() -> None:
     log = Log(source=source, relations=Relations.read(Path(relations)))
     if words == ["harder"]:
         harder(log)
-    elif words[:1] == ["pieces"] and len(words) == 3:
+    elif len(words) == 3 and words[0] == "pieces" and words[2].isdigit():
         pieces(log, words[1], int(words[2]))
     elif words == ["profile"]:
         with cProfile.Profile() as profile:
@@ -230,6 +234,8 @@ def main() -> None:
         for name, has_loops in (("laser_loops", True), ("laser_no_loops", False)):
             grid = Run(source.rig, source, has_loops=has_loops).map.grid
             draw(grid, Path(words[1]) / f"{name}.png")
+    elif words:
+        sys.exit(__doc__)
     else:
         compare(log)
 
