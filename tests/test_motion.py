@@ -244,6 +244,23 @@ def test_without_wheels_the_velocity_goes_on_and_the_gyro_turns_it():
     assert se3.yaw_rad(motion.T_prev_curr) == pytest.approx(-0.05)
 
 
+@pytest.mark.parametrize(("swing_s", "share"), [(np.inf, [0.85, 0.95]), (1.0, [0.0, 0.1])])
+def test_velocity_that_nothing_measures_lasts_as_long_as_velocities_did_before(swing_s, share):
+    """Driven for 20 s at a steady speed, or to and fro; then nothing is measured for 2 s."""
+    model, blind = MotionModel(FREE), np.diag([1e6, 0.004, 1e-4, 1e-4, 1e-4, 0.002]) ** 2
+    velocities = []
+    for step in range(221):
+        model.predict(Observation(stamp_ns=round(step * PERIOD_S * 1e9)))
+        speed = 0.5 * np.cos(2.0 * np.pi * step * PERIOD_S / swing_s)
+        if 0 < step <= 200:
+            model.learn(se3.from_xy_yaw(speed * PERIOD_S, 0.0, 0.0), SCAN)
+        elif step > 200:
+            model.learn(se3.identity(), blind)
+        velocities.append(model.velocity[0])
+    assert velocities[200] == pytest.approx(0.5, rel=0.01)
+    assert share[0] < velocities[-1] / 0.5 < share[1]
+
+
 def test_first_motion_after_a_stop_is_no_velocity():
     model = MotionModel(FREE)
     model.predict(Observation(stamp_ns=0))
