@@ -25,7 +25,7 @@ _CHANGED = np.array([0.1, 0.1]) ** 2  # (m/s)^2, (rad/s)^2: weight of that begin
 _JUMP = 3.0  # times the acceleration: a larger change of velocity is a jump
 _KEPT_S = 0.5  # longest time that an unmeasured velocity is kept
 _STEP = np.array([1e-4, 1e-4])  # m, rad: least standard deviation of a predicted step
-_FASTEST = np.array([25.0, 20.0])  # m/s, rad/s: with a larger deviation a velocity is unknown
+_FASTEST = np.array([25.0, 20.0])  # m/s, rad/s: deviation of a velocity that was never measured
 _UNUSED = 1e6  # m^2, rad^2: variance of what is not used
 _MISSED = (0.05, 0.1)  # m, rad: standard deviation of a predicted motion before it is learnt
 
@@ -113,20 +113,27 @@ class Inertia:
         self._filter(se3.log(T_before_now) / duration_s, covariance / duration_s**2, duration_s)
 
     def _filter(self, twist_s: NDArray[np.float64], covariance: Matrix, duration_s: float) -> None:
-        unknown = np.diag(np.repeat(_FASTEST**2, 3))
-        seen = unknown @ np.linalg.inv(unknown + covariance)
+        """Take a measured velocity (6,) with its covariance (6, 6).
+
+        In directions that it does not measure the velocity is a first order Markov process.
+        """
+        usual = np.diag(np.repeat(UNKNOWN_VELOCITY**2, 3))
+        seen = usual @ np.linalg.inv(usual + covariance)
+        unseen = np.eye(6) - seen
         is_measured = np.diag(seen).reshape(2, 3).min(axis=1) > 0.5
         self._unmeasured_s = np.where(is_measured, 0.0, self._unmeasured_s)
-        before, expected = self.velocity, unknown
+        before = kept = self.velocity
         if self.is_known:
-            usual = np.repeat((_USUAL[self.has_wheels] * _ACCELERATION * duration_s) ** 2, 3)
-            expected = self._covariance + np.diag(usual)
-        lasts_s = np.clip(self._lasted / self._changed, *_LASTS_S)
-        fading = np.repeat(1.0 - np.exp(-duration_s / lasts_s), 3)
-        kept = before - fading * (before - seen @ before)
+            lasts_s = np.clip(self._lasted / self._changed, *_LASTS_S)
+            fading = np.repeat(1.0 - np.exp(-duration_s / lasts_s), 3)
+            F = np.eye(6) - fading[:, None] * unseen
+            changes = np.repeat((_USUAL[self.has_wheels] * _ACCELERATION * duration_s) ** 2, 3)
+            kept, expected = F @ before, F @ self._covariance @ F.T + np.diag(changes)
+        else:
+            fastest = np.diag(np.repeat(_FASTEST**2, 3))
+            expected = seen @ fastest @ seen.T + unseen @ usual @ unseen.T
         gain = expected @ np.linalg.inv(expected + covariance)
-        # Without wheels a measured velocity is taken as it is: nothing else would contradict it.
-        now = kept + (gain if self.has_wheels else seen) @ (twist_s - kept)
+        now = kept + gain @ (twist_s - kept)
         if self.has_wheels and self.is_known:  # else a jump cannot be detected
             reach = np.repeat(_JUMP * _ACCELERATION * duration_s, 3)
             now = before + np.clip(now - before, -reach, reach)
