@@ -3,8 +3,9 @@
 A robot has inertia, so that its velocity continues: a Kalman filter with a random acceleration. How
 well that predicts a motion is estimated on the way, since it depends on the robot, on the rate of
 the sensors and on how exact their stamps are. So is how long a velocity lasts that nothing
-measures: that of a hand-held camera for 0.5 to 2 s (freiburg1_rpy, RedKitchen), that of robots for
-14 to 70 s (the wheels of Intel and ACES, the reference of MIT CSAIL).
+measures: by the autocorrelation of velocities, that of a hand-held camera for 0.5 to 2 s
+(freiburg1_rpy, RedKitchen), that of robots for 14 to 70 s (the wheels of Intel and ACES, the
+reference of MIT CSAIL; of 5 s apart, 0.69, 0.72 and 0.93).
 """
 
 from __future__ import annotations
