@@ -1,6 +1,7 @@
 """A live run: starting, ending and saving take as long as they like; no observation waits."""
 
 from threading import Event
+from time import sleep
 
 import numpy as np
 from driving import TABLE, assert_exact, dark_from, drive, events
@@ -31,11 +32,16 @@ class Slow(ExactModule):
 
 
 def letting(event, at, then=None):
-    """Return a feed that sets an event at an observation and awaits another soon after."""
+    """Return a feed that sets an event at an observation and awaits another soon after.
+
+    From then on there is time between observations, as there is on a robot.
+    """
 
     def feed(index):
         if index == at:
             event.set()
+        if index > at:
+            sleep(1e-3)
         if index == at + 10 and then is not None:
             assert then.wait(10.0)
         return observation(index)
@@ -88,12 +94,12 @@ def test_module_that_is_called_back_while_it_ends_starts_after_that():
     _, atlas, log, _ = drive(
         modules,
         scene_at=lambda i: "Dark" if 20 <= i < 40 else "Bright",
-        steps=2000,
+        steps=600,
         confirm_window_s=0.5,
         is_live=True,
         feed=letting(may_end, 100),
     )
-    assert len(atlas.trajectory) == 2000
+    assert len(atlas.trajectory) == 600
     assert_exact(atlas)
     assert [one["to"] for one in events(log, "decision")] == ["bright", "dark", "bright"]
     assert events(log, "decision")[-1]["stamp_ns"] >= 100 * PERIOD_NS
