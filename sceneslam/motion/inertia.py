@@ -1,12 +1,12 @@
 """The base's velocity: what it predicts, and how well wheels agree with it.
 
-A robot has inertia, so that its velocity continues. It is a first order Markov process in a Kalman
-filter, of which the wheels are no part: they are compared with it. How well it predicts a motion is
-estimated on the way, since that depends on the robot, on the rate of the sensors and on how exact
-their stamps are. So is the process' time constant, which is how long a velocity lasts that nothing
-measures, and how fast it changes where it is measured: by the autocorrelation of velocities 0.5 to
-2 s for a hand-held camera (freiburg1_rpy, RedKitchen), 14 to 70 s for robots (the wheels of Intel
-and ACES, the reference of MIT CSAIL; of 5 s apart, 0.69, 0.72 and 0.93).
+A robot has inertia, so that its velocity continues. A Kalman filter estimates it from what other
+sensors measure; the wheels are no part of that, but are compared with it. How well it predicts a
+motion is estimated on the way, since that depends on the robot, on the rate of the sensors and on
+how exact their stamps are. So is how long a velocity lasts that nothing measures: by the
+autocorrelation of velocities, that of a hand-held camera for 0.5 to 2 s (freiburg1_rpy,
+RedKitchen), that of robots for 14 to 70 s (the wheels of Intel and ACES, the reference of MIT
+CSAIL; of 5 s apart, 0.69, 0.72 and 0.93).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from sceneslam.motion.trust import NoiseRatio, student_cost
 from sceneslam.types import se3
 
 _ACCELERATION = np.array([1.5, 4.0])  # m/s^2, rad/s^2: largest usual of a robot
+_USUAL = 1 / 3  # of that: its standard deviation, of a robot with wheels
 _LASTS_S = 0.5, 20.0  # shortest and longest time constant of a velocity; it begins with the first
 _CHANGED = np.array([0.1, 0.1]) ** 2  # (m/s)^2, (rad/s)^2: weight of that beginning
 _JUMP = 3.0  # times the acceleration: no more of a change of velocity is taken at once
@@ -77,8 +78,8 @@ class Inertia:
             return np.zeros(2)
         off = se3.inverse(guess.T) @ wheels.T
         missed = np.array([off[0, 3], se3.yaw_rad(off)])
-        changed = self._changes(self._unmeasured_s) * duration_s**2
-        right = self._known(duration_s) + changed + wheels.variance + self.missed**2
+        changed = _USUAL * _ACCELERATION * self._unmeasured_s * duration_s
+        right = self._known(duration_s) + changed**2 + wheels.variance + self.missed**2
         wrong = right + (UNKNOWN_VELOCITY * duration_s) ** 2
         cost_right = student_cost(missed**2 / right, 1) + 0.5 * np.log(right)
         cost_wrong = student_cost(missed**2 / wrong, 1) + 0.5 * np.log(wrong)
@@ -103,7 +104,8 @@ class Inertia:
     def _filter(self, twist_s: NDArray[np.float64], covariance: Matrix, duration_s: float) -> None:
         """Take a measured velocity (6,) with its covariance (6, 6).
 
-        In directions that it does not measure the velocity is a first order Markov process.
+        In directions that are measured it changes by a robot's accelerations; in others it is a
+        first order Markov process, whose variance is that of an unknown velocity in the end.
         """
         usual = np.diag(np.repeat(UNKNOWN_VELOCITY**2, 3))
         seen = usual @ np.linalg.inv(usual + covariance)
@@ -116,9 +118,13 @@ class Inertia:
             self.velocity, self._covariance = _updated(self.velocity, expected, twist_s, covariance)
             self.is_known = True
             return
-        fading = np.repeat(1.0 - np.exp(-duration_s / self._lasts_s), 3)
-        F, Q = np.eye(6) - fading[:, None] * unseen, np.repeat(self._changes(duration_s), 3)
-        expected = F @ self._covariance @ F.T + np.diag(Q)
+        lasts_s = np.clip(self._lasted / self._changed, *_LASTS_S)
+        fading = np.repeat(1.0 - np.exp(-duration_s / lasts_s), 3)
+        F = np.eye(6) - fading[:, None] * unseen
+        accelerated = np.diag(np.repeat((_ACCELERATION * duration_s) ** 2, 3))
+        wandered = usual * (1.0 - (1.0 - fading) ** 2)
+        Q = seen @ accelerated @ seen.T + unseen @ wandered @ unseen.T
+        expected = F @ self._covariance @ F.T + Q
         now, self._covariance = _updated(F @ self.velocity, expected, twist_s, covariance)
         reach = np.repeat(_JUMP * _ACCELERATION * duration_s, 3)
         change = np.clip(now - self.velocity, -reach, reach)
@@ -133,15 +139,6 @@ class Inertia:
         lasting, changed = (_squares(twist) for twist in (self.velocity, change))
         self._lasted = self._lasted + measured_s * lasting
         self._changed = self._changed + (measured_s > 0.0) * changed / 2.0
-
-    @property
-    def _lasts_s(self) -> NDArray[np.float64]:
-        """Return the time constants (2,) [s] of a velocity."""
-        return np.clip(self._lasted / self._changed, *_LASTS_S)
-
-    def _changes(self, duration_s: float | NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the variances (2,) [(m/s)^2, (rad/s)^2] of a velocity's change in that time."""
-        return np.asarray(UNKNOWN_VELOCITY**2 * (1.0 - np.exp(-2.0 * duration_s / self._lasts_s)))
 
     def _known(self, duration_s: float | NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the variances (2,) [m^2, rad^2] of a motion by that of the velocity."""
