@@ -3,10 +3,9 @@
 A robot has inertia, so that its velocity continues. A Kalman filter estimates it from what other
 sensors measure; the wheels are no part of that, but are compared with it. How well it predicts a
 motion is estimated on the way, since that depends on the robot, on the rate of the sensors and on
-how exact their stamps are. So is how long a velocity lasts that nothing measures: by the
-autocorrelation of velocities, that of a hand-held camera for 0.5 to 2 s (freiburg1_rpy,
-RedKitchen), that of robots for 14 to 70 s (the wheels of Intel and ACES, the reference of MIT
-CSAIL; of 5 s apart, 0.69, 0.72 and 0.93).
+how exact their stamps are. So is how long a velocity lasts that nothing measures: that of robots
+for 13 s (the wheels of Intel and ACES) to over a minute (MIT CSAIL), that of a hand-held camera for
+0.4 s (freiburg1_rpy) to 2.5 s (RedKitchen), by the autocorrelations of `experiments/velocities.py`.
 """
 
 from __future__ import annotations
