@@ -262,7 +262,7 @@ def test_velocity_that_nothing_measures_lasts_as_long_as_velocities_did_before(s
 
 
 def test_velocity_without_wheels_is_that_of_several_measurements_where_one_is_uncertain():
-    """A scan that is off by 1 cm would alone tell a velocity that is off by 0.42 m/s."""
+    """A scan that is off by 1 cm would alone tell a velocity that is off by 0.3 m/s."""
     model, rng, off = MotionModel(FREE), np.random.default_rng(1), []
     noisy = np.diag([0.01, 0.01, 1e-4, 1e-4, 1e-4, 0.002]) ** 2
     for step in range(150):
@@ -271,7 +271,7 @@ def test_velocity_without_wheels_is_that_of_several_measurements_where_one_is_un
             seen = np.sqrt(np.diag(noisy)) * rng.standard_normal(6)
             model.learn(se3.from_xy_yaw(0.5 / 30, 0.0, 0.0) @ se3.exp(seen), noisy)
             off.append(model.velocity[:2] - [0.5, 0.0])
-    assert np.sqrt(np.mean(np.square(off[30:]))) < 0.42 / 1.5
+    assert np.sqrt(np.mean(np.square(off[30:]))) < 0.1
 
 
 def test_first_motion_after_a_stop_is_no_velocity():

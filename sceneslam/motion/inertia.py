@@ -1,11 +1,11 @@
 """The base's velocity: what it predicts, and how well wheels agree with it.
 
-A robot has inertia, so that its velocity continues. A Kalman filter estimates it from what other
-sensors measure; the wheels are no part of that, but are compared with it. How well it predicts a
-motion is estimated on the way, since that depends on the robot, on the rate of the sensors and on
-how exact their stamps are. So is how long a velocity lasts that nothing measures: that of robots
-for 13 s (the wheels of Intel and ACES) to over a minute (MIT CSAIL), that of a hand-held camera for
-0.4 s (freiburg1_rpy) to 2.5 s (RedKitchen), by the autocorrelations of `experiments/velocities.py`.
+A robot has inertia, so that its velocity continues: a Kalman filter with a random acceleration. How
+well that predicts a motion is estimated on the way, since it depends on the robot, on the rate of
+the sensors and on how exact their stamps are. So is how long a velocity lasts that nothing
+measures: that of robots for 13 s (the wheels of Intel and ACES) to over a minute (MIT CSAIL), that
+of a hand-held camera for 0.4 s (freiburg1_rpy) to 2.5 s (RedKitchen), by the autocorrelations of
+`experiments/velocities.py`.
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.motion.motion import UNKNOWN_VELOCITY, Step, still
+from sceneslam.motion.motion import BELIEVED, UNKNOWN_VELOCITY, Step, still
 from sceneslam.motion.trust import NoiseRatio, student_cost
 from sceneslam.types import se3
 
 _ACCELERATION = np.array([1.5, 4.0])  # m/s^2, rad/s^2: largest usual of a robot
-_USUAL = 1 / 3  # of that: its standard deviation, of a robot with wheels
+_USUAL = {False: 1.0, True: 1 / 3}  # of that: deviation of the acceleration, by: has wheels
 _LASTS_S = 0.5, 20.0  # shortest and longest time constant of a velocity; it begins with the first
 _CHANGED = np.array([0.1, 0.1]) ** 2  # (m/s)^2, (rad/s)^2: weight of that beginning
-_JUMP = 3.0  # times the acceleration: no more of a change of velocity is taken at once
+_JUMP = 3.0  # times the acceleration: a larger change of velocity is a jump
 _KEPT_S = 0.5  # longest time that an unmeasured velocity is kept
 _STEP = np.array([1e-4, 1e-4])  # m, rad: least standard deviation of a predicted step
 _FASTEST = np.array([25.0, 20.0])  # m/s, rad/s: deviation of a velocity that was never measured
+_UNUSED = 1e6  # m^2, rad^2: variance of what is not used
 _MISSED = (0.05, 0.1)  # m, rad: standard deviation of a predicted motion before it is learnt
 
 Matrix = NDArray[np.float64]
@@ -36,6 +37,7 @@ Matrix = NDArray[np.float64]
 class Inertia:
     """Predicts the motion at constant velocity."""
 
+    has_wheels: bool
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6), init=False)  # (6,)
     is_known: bool = field(default=False, init=False)  # else the velocity is 0
     _covariance: Matrix = field(default_factory=lambda: np.zeros((6, 6)), init=False)
@@ -77,12 +79,23 @@ class Inertia:
             return np.zeros(2)
         off = se3.inverse(guess.T) @ wheels.T
         missed = np.array([off[0, 3], se3.yaw_rad(off)])
-        changed = _USUAL * _ACCELERATION * self._unmeasured_s * duration_s
+        changed = _USUAL[self.has_wheels] * _ACCELERATION * self._unmeasured_s * duration_s
         right = self._known(duration_s) + changed**2 + wheels.variance + self.missed**2
         wrong = right + (UNKNOWN_VELOCITY * duration_s) ** 2
         cost_right = student_cost(missed**2 / right, 1) + 0.5 * np.log(right)
         cost_wrong = student_cost(missed**2 / wrong, 1) + 0.5 * np.log(wrong)
         return np.asarray(cost_right - cost_wrong)
+
+    def noise_of(
+        self, wheels: Step, lying: NDArray[np.float64], duration_s: float
+    ) -> NDArray[np.float64]:
+        """Return the variances (2,) of the wheels' motion, wrong with the probabilities `lying`.
+
+        Wheels that are not believed have no influence.
+        """
+        noise = self.missed**2 + wheels.variance
+        wrong = (UNKNOWN_VELOCITY * duration_s) ** 2
+        return np.where(lying < BELIEVED, noise + lying * wrong, _UNUSED)
 
     def learn(
         self, T_before_now: Matrix, covariance: Matrix, guess: Step, duration_s: float
@@ -103,39 +116,41 @@ class Inertia:
     def _filter(self, twist_s: NDArray[np.float64], covariance: Matrix, duration_s: float) -> None:
         """Take a measured velocity (6,) with its covariance (6, 6).
 
-        In directions that are measured it changes by a robot's accelerations; in others it is a
-        first order Markov process, whose variance is that of an unknown velocity in the end.
+        In directions that it does not measure the velocity is a first order Markov process.
         """
         usual = np.diag(np.repeat(UNKNOWN_VELOCITY**2, 3))
         seen = usual @ np.linalg.inv(usual + covariance)
         unseen = np.eye(6) - seen
         is_measured = np.diag(seen).reshape(2, 3).min(axis=1) > 0.5
         self._unmeasured_s = np.where(is_measured, 0.0, self._unmeasured_s)
-        if not self.is_known:
+        before = kept = self.velocity
+        if self.is_known:
+            lasts_s = np.clip(self._lasted / self._changed, *_LASTS_S)
+            fading = np.repeat(1.0 - np.exp(-duration_s / lasts_s), 3)
+            F = np.eye(6) - fading[:, None] * unseen
+            changes = np.repeat((_USUAL[self.has_wheels] * _ACCELERATION * duration_s) ** 2, 3)
+            kept, expected = F @ before, F @ self._covariance @ F.T + np.diag(changes)
+        else:
             fastest = np.diag(np.repeat(_FASTEST**2, 3))
             expected = seen @ fastest @ seen.T + unseen @ usual @ unseen.T
-            self.velocity, self._covariance = _updated(self.velocity, expected, twist_s, covariance)
-            self.is_known = True
-            return
-        lasts_s = np.clip(self._lasted / self._changed, *_LASTS_S)
-        fading = np.repeat(1.0 - np.exp(-duration_s / lasts_s), 3)
-        F = np.eye(6) - fading[:, None] * unseen
-        accelerated = np.diag(np.repeat((_ACCELERATION * duration_s) ** 2, 3))
-        wandered = usual * (1.0 - (1.0 - fading) ** 2)
-        Q = seen @ accelerated @ seen.T + unseen @ wandered @ unseen.T
-        expected = F @ self._covariance @ F.T + Q
-        now, self._covariance = _updated(F @ self.velocity, expected, twist_s, covariance)
-        reach = np.repeat(_JUMP * _ACCELERATION * duration_s, 3)
-        change = np.clip(now - self.velocity, -reach, reach)
-        self.velocity = self.velocity + change
-        self._time(change, is_measured * duration_s)
+        gain = expected @ np.linalg.inv(expected + covariance)
+        now = kept + gain @ (twist_s - kept)
+        if self.has_wheels and self.is_known:  # else a jump cannot be detected
+            reach = np.repeat(_JUMP * _ACCELERATION * duration_s, 3)
+            now = before + np.clip(now - before, -reach, reach)
+        if self.is_known:
+            self._time(before, now, is_measured * duration_s)
+        self.velocity, self._covariance = now, expected - gain @ expected
+        self.is_known = True
 
-    def _time(self, change: NDArray[np.float64], measured_s: NDArray[np.float64]) -> None:
+    def _time(
+        self, before: NDArray[np.float64], now: NDArray[np.float64], measured_s: NDArray[np.float64]
+    ) -> None:
         """Add a change of velocity (6,) to what its time constants are estimated from.
 
         The change of a first order Markov process over dt has 2 dt / t times the process' variance.
         """
-        lasting, changed = (_squares(twist) for twist in (self.velocity, change))
+        lasting, changed = ((each.reshape(2, 3) ** 2).sum(axis=1) for each in (now, now - before))
         self._lasted = self._lasted + measured_s * lasting
         self._changed = self._changed + (measured_s > 0.0) * changed / 2.0
 
@@ -150,19 +165,3 @@ class Inertia:
             return reach
         changed = (0.5 * _ACCELERATION * unmeasured_s**2) ** 2
         return np.minimum(reach, np.sqrt(self._known(unmeasured_s) + changed))
-
-
-def _updated(
-    expected: NDArray[np.float64],
-    variance: Matrix,
-    measured: NDArray[np.float64],
-    covariance: Matrix,
-) -> tuple[NDArray[np.float64], Matrix]:
-    """Return an expected twist (6,) and its covariance (6, 6), updated by a measured one."""
-    gain = variance @ np.linalg.inv(variance + covariance)
-    return expected + gain @ (measured - expected), variance - gain @ variance
-
-
-def _squares(twist: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the squared norms (2,) of a twist's linear and angular part."""
-    return np.asarray((twist.reshape(2, 3) ** 2).sum(axis=1))

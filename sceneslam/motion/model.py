@@ -21,7 +21,7 @@ from sceneslam.motion.trust import LieDetector, NoiseRatio, evidence_of_a_lie
 from sceneslam.motion.turn_errors import TurnErrors
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Rig
+from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
 
 _STILL_M, _STILL_RAD = 1e-5, 1e-5  # per step: less than one encoder tick
@@ -40,7 +40,7 @@ class MotionModel:
     def __init__(self, rig: Rig) -> None:
         self._wheels, self._gyro = rig.wheels, rig.gyro
         self._floors = np.array([rig.wheels.floor_m, rig.wheels.floor_rad])
-        self._inertia = Inertia()
+        self._inertia = Inertia(Sensor.ODOMETRY in rig.sensors)
         self._noise = [NoiseRatio(rig.wheels.noise_ratio) for _ in range(2)]  # distance, turn
         self._lies = [LieDetector() for _ in range(2)]
         self._turns = TurnErrors(rig.gyro.bias_radps)
@@ -153,7 +153,9 @@ class MotionModel:
             return
         if evidence is not None:
             self._judge(evidence)
-        self._inertia.learn(T_before_now, covariance, guess=guess, duration_s=duration_s)
+        self._inertia.learn(
+            *self._with_wheels(T_before_now, covariance), guess=guess, duration_s=duration_s
+        )
         self._forget()
         if wheels is None:
             return
@@ -197,6 +199,18 @@ class MotionModel:
         """Take the log-likelihood ratios (2,) of distance and turn, wheels wrong against right."""
         for lie, one in zip(self._lies, evidence.tolist(), strict=True):
             lie.judge(one)
+
+    def _with_wheels(
+        self, T_before_now: Transform, covariance: NDArray[np.float64]
+    ) -> tuple[Transform, NDArray[np.float64]]:
+        """Return a measured motion, completed by the wheels where it is weak."""
+        wheels = self._since_wheels
+        if wheels is None:
+            return T_before_now, covariance
+        R = np.diag((self._inertia.noise_of(wheels, self.lying, self._since_s))[[0, 0, 1]])
+        gain = covariance[:, _PLANAR] @ np.linalg.inv(covariance[np.ix_(_PLANAR, _PLANAR)] + R)
+        off = se3.log(se3.inverse(T_before_now) @ wheels.T)[_PLANAR]
+        return T_before_now @ se3.exp(gain @ off), covariance - gain @ covariance[_PLANAR]
 
     def skip(self) -> None:
         """Discard the motion since the last call, which no sensor measured."""
