@@ -49,6 +49,14 @@ def settings(path: str) -> dict[str, object]:
     return values
 
 
+def by_wheels(observations: list[Observation]) -> Trajectory:
+    """Return the trajectory by odometry alone."""
+    return Trajectory(
+        stamps_ns=np.array([one.stamp_ns for one in observations]),
+        T_world_base=np.stack([one.T_odom_base for one in observations]),
+    )
+
+
 def backwards(observations: list[Observation]) -> Iterator[Observation]:
     """Yield the log from its end; stamps are mirrored, and mirrored back by `unmirror`."""
     last_ns = observations[-1].stamp_ns
@@ -156,12 +164,7 @@ def draw(grid: GridLayer, path: Path) -> None:
 def compare(log: Log) -> None:
     """Print odometry, the laser without loops, and with them; and what memory it took."""
     source, observations = log.source, list(log.source)
-    odometry = log.errors(
-        Trajectory(
-            stamps_ns=np.array([one.stamp_ns for one in observations]),
-            T_world_base=np.stack([one.T_odom_base for one in observations]),
-        )
-    )
+    odometry = log.errors(by_wheels(observations))
     print(f"{HEAD}\n|---|---|---|---|---|---|")
     print(
         f"| wheel odometry | {spread(odometry, 'trans', 'm')} "

@@ -14,16 +14,15 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from sceneslam.evaluation.files import read_poses
+from sceneslam.experiments.laser import by_wheels, settings
 from sceneslam.sources.carmen import Carmen
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.trajectory import Trajectory
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
 STEP_S = 0.1
 LAGS_S = 0.5, 1.0, 2.0, 5.0, 10.0
 
@@ -32,13 +31,7 @@ def read(path: Path) -> Trajectory:
     """Return a trajectory, of a log that of its wheels."""
     if path.suffix not in (".clf", ".log"):
         return read_poses(path)
-    settings = yaml.safe_load((CONF / "source/carmen.yaml").read_text())
-    settings.pop("_target_")
-    observations = list(Carmen(**{**settings, "path": str(path)}))
-    return Trajectory(
-        stamps_ns=np.array([one.stamp_ns for one in observations]),
-        T_world_base=np.stack([one.T_odom_base for one in observations]),
-    )
+    return by_wheels(list(Carmen(**{**settings("source/carmen.yaml"), "path": str(path)})))
 
 
 def velocities(trajectory: Trajectory) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
