@@ -133,28 +133,6 @@ def test_alternatives_are_distance_and_turn_by_the_sources_that_are_not_used():
     assert not drive.last.is_doubted
 
 
-def test_wheels_that_lie_about_the_distance_may_lie_about_the_turn():
-    """Wheels that freeze turn no more; while the robot goes straight on nothing tells it."""
-    drive = Drive()
-    for _ in range(100):
-        drive.step()
-    honest = by_inertia_alone(drive.last).probability
-    for _ in range(20):
-        drive.step(factor=0.0)
-    distance, turn = drive.model.lying
-    assert distance > 0.9
-    assert turn < 0.01
-    assert by_inertia_alone(drive.last).probability > 0.2 > 10.0 * honest
-
-
-def by_inertia_alone(motion):
-    return next(
-        one
-        for one in (motion, *motion.alternatives)
-        if one.is_guessed == (True, True) and not one.is_unknown
-    )
-
-
 def test_evidence_is_how_much_more_likely_a_measurement_made_wrong_wheels():
     drive = Drive()
     for _ in range(100):

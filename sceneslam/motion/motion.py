@@ -14,7 +14,6 @@ from sceneslam.types.se3 import Transform
 UNKNOWN_VELOCITY = np.array([1.0, 2.0])  # m/s, rad/s: standard deviation of an unknown velocity
 BELIEVED = 0.5  # wheels are not used if they are wrong with this probability
 _CERTAIN = 100.0  # nats: more is the same, and exp(710) is no number
-_BOTH = 0.3  # wrong turns among wrong distances, as of wheels that freeze; fewer than right ones
 _RARE = 0.003  # least probability of an alternative: one scan in 300
 
 
@@ -113,16 +112,13 @@ def motion_of(
 ) -> Motion:
     """Return the motion with distance and turn by the wheels, unless they are wrong or missing.
 
-    `lying` (2,): the probabilities of that; with a wrong distance the turn may be wrong, too, which
-    nothing has shown yet. `guess` is by inertia; `anywhere` is what a robot of unknown velocity
-    does, the distance if neither wheels nor inertia are right.
+    `lying` (2,): the probabilities of that. `guess` is by inertia; `anywhere` is what a robot of
+    unknown velocity does, the distance if neither wheels nor inertia are right.
     """
     if wheels is None:
         distances, turns = [(guess, 1.0)], [(guess, 1.0)]
     else:
-        distance_lies, turn_lies = lying.tolist()
-        distances = _ranked(wheels, guess, distance_lies)
-        turns = _ranked(wheels, guess, max(turn_lies, _BOTH * distance_lies))
+        distances, turns = (_ranked(wheels, guess, p) for p in lying.tolist())
     distances.append((anywhere, _RARE))
     best, *others = (
         replace(
