@@ -19,6 +19,7 @@ from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
+from sceneslam.views.grey_noise import brightened, grey_noise
 from sceneslam.views.placed_views import Sighting
 from sceneslam.views.view import Landmarks, LandmarkView, LandmarkViewer, PlacedView
 from sceneslam.views.view_finder import ViewFinder
@@ -94,6 +95,25 @@ def test_the_pose_is_by_the_landmarks_of_all_views_of_a_place():
         assert found[1].matches > 2 * found[0].matches
     by_one, by_all = np.sqrt((np.array(off_m) ** 2).mean(axis=0))
     assert by_all < 0.75 * by_one  # a quarter of the variance, beside the image's noise
+
+
+def test_of_landmarks_in_a_small_patch_depths_tell_the_heading():
+    off_rad = []
+    for seed in range(10):
+        rng, patch = np.random.default_rng(seed), place(seed)
+        patch.points_base[:] = rng.uniform([2.5, -0.2, -0.2], [2.6, 0.2, 0.2], (200, 3))
+        view = view_of(patch, ASIDE, noise_px=1.5)
+        precise = view.depth_m + rng.normal(0, 0.002, 200).astype(np.float32)
+        noisy = view.depth_m + rng.normal(0, 0.04, 200).astype(np.float32)
+        found = [
+            finder((HERE, patch)).recognize(replace(view, depth_m=depth_m))
+            for depth_m in (precise, noisy)
+        ]
+        off = [se3.inverse(HERE @ ASIDE) @ one.T_map_base for one in found]
+        off_rad.append([abs(se3.yaw_rad(T)) for T in off])
+    by_precise, by_noisy = np.sqrt((np.array(off_rad) ** 2).mean(axis=0))
+    assert by_precise < 0.003  # 0.002 m of a patch of 0.4 m, over 200 landmarks
+    assert by_precise < 0.5 * by_noisy
 
 
 def test_a_place_is_found_from_afar():
@@ -183,6 +203,53 @@ def test_what_shows_too_little_is_no_view():
 
 
 RIG = Rig(sensors=frozenset({Sensor.IMAGE, Sensor.DEPTH}), camera=CAMERA)
+
+
+def darkened(image, *, electrons, seed=0):
+    """The image with so many photons in white, read noise, and 12 electrons per grey level."""
+    rng = np.random.default_rng(seed)
+    counts = rng.poisson(image[..., 0] / 255.0 * electrons) + rng.normal(0.0, 10.0, image.shape[:2])
+    return np.repeat(np.clip(np.rint(counts / 12.0), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def furnished(seed=3):
+    """An image of things of many sizes and greys."""
+    rng, image = np.random.default_rng(seed), np.full((480, 640, 3), 120, np.uint8)
+    for _ in range(400):
+        x, y = rng.integers(0, [600, 440])
+        width, height = rng.integers(8, 60, 2)
+        image[y : y + height, x : x + width] = rng.integers(40, 255)
+    return image
+
+
+def test_a_place_is_recognized_in_the_dark():
+    viewer, image = LandmarkViewer(CAMERA), furnished()
+    known = finder((HERE, viewer.look(seen(image)).landmarks))
+    night = darkened(image, electrons=100.0)
+    assert np.percentile(night, 99) < 15  # grey levels
+    found = known.recognize(viewer.look(seen(night)))
+    off = se3.inverse(HERE) @ found.T_map_base
+    assert np.linalg.norm(off[:3, 3]) < 0.02 and se3.rotation_angle_rad(off) < 0.005
+    assert found.matches > 100
+
+
+def test_noise_is_no_place():
+    viewer = LandmarkViewer(CAMERA)
+    for electrons in (0.0, 20.0, 100.0):
+        empty = darkened(np.full((480, 640, 3), 255, np.uint8), electrons=electrons)
+        view = viewer.look(seen(empty))
+        assert view is None or len(view.rays) < 100
+
+
+def test_a_bright_image_is_left_as_it_is_and_a_dark_one_has_limited_noise():
+    bright = picture()[..., 0]
+    assert brightened(bright, noise_max=3.0) is bright
+    flat = np.full((480, 640, 3), 255, np.uint8)
+    for electrons in (60.0, 300.0, 1200.0):
+        grey = darkened(flat, electrons=electrons)[..., 0]
+        assert grey_noise(grey) == pytest.approx(grey.std(), rel=0.25)
+        lit = brightened(grey, noise_max=3.0)
+        assert lit.mean() > 1.5 * grey.mean() and lit.std() < 3.6
 
 
 def test_only_a_camera_that_measures_depth_takes_views():

@@ -12,9 +12,11 @@ from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.se3 import Transform
+from sceneslam.views.grey_noise import brightened
 
 _FEATURES = 500  # per image
 _FAST_MIN = 10  # least contrast of a corner
+_NOISE_MAX = 3.0  # a corner's least contrast is three standard deviations
 _FEWEST = 40  # located features of a view; with fewer no place is recognized
 
 
@@ -70,7 +72,8 @@ class LandmarkViewer:
             return None
         if image.shape[1::-1] != tuple(camera.size_wh) or image.shape[:2] != depth_m.shape:
             return None
-        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+        grey = brightened(grey, noise_max=_NOISE_MAX)
         corners, found = self._orb.detectAndCompute(grey, None)
         if len(corners) < _FEWEST:
             return None

@@ -26,6 +26,8 @@ from sceneslam.views.view import Landmarks, LandmarkView
 
 _ERROR_PX, _SIGMA_PX = 3.0, 1.0  # of a match's ray, at most and usually
 _ITERATIONS, _CONFIDENCE = 300, 0.9999
+_PER_MEDIAN = 1.4826  # a normal error's standard deviation, over the median of its magnitude
+_DEPTH_LEAST = 0.1  # of the expected noise of a depth
 _STEPS = 4  # of Gauss-Newton, from a pose that the rays fit already
 _GUIDED_PX = 9.0  # from where a pose by one view of the map expects a landmark of the others
 _SAME_BITS = 50  # descriptors that differ in more show two corners (Mur-Artal et al., T-RO 2015)
@@ -200,7 +202,8 @@ class ViewFinder:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the information (6, 6) and the gradient (6,) of a pose, in the camera's axes.
 
-        A depth that is far off does not count: corners lie on edges.
+        A depth that is far off does not count: corners lie on edges. How noisy the others are, they
+        tell themselves: of landmarks in a small patch, depths measure the heading best.
         """
         at = np.asarray(se3.apply(T_cam_seen, found.points), np.float64)
         x, y, z = at.T
@@ -210,7 +213,10 @@ class ViewFinder:
         by_pose = np.concatenate([np.tile(np.eye(3), (len(z), 1, 1)), -se3.hat(at)], axis=2)
         residual = np.column_stack([at[:, :2] / at[:, 2:] - found.rays, z - found.depth_m])
         sigma_m = landmark_noise_m(z)
-        is_near = (found.depth_m > 0) & (np.abs(residual[:, 2]) <= SIGMAS * sigma_m)
+        missed = np.abs(residual[:, 2]) / sigma_m
+        is_near = (found.depth_m > 0) & (missed <= SIGMAS)
+        if is_near.any():
+            sigma_m *= max(_PER_MEDIAN * float(np.median(missed[is_near])), _DEPTH_LEAST)
         weight = np.full((len(z), 3), (self._camera.fx / _SIGMA_PX) ** 2)
         weight[:, 2] = np.where(is_near, sigma_m**-2, 0.0)
         J = (by_point @ by_pose).reshape(-1, 6)

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.views.grey_noise import grey_noise
+
 from .cores import thread_beside
 
 LEVELS = 8
@@ -124,15 +126,9 @@ class CornerFinder:
         )
 
     def _threshold(self, gray: Image) -> int:
-        """Return the FAST threshold [grey levels]: a multiple of the noise, within limits.
-
-        The noise is the median response of a Laplacian, whose gain on white noise is sqrt(20).
-        """
-        response = 4 * gray[4:-4:8, 4:-4:8].astype(np.int16)
-        for row, column in ((3, 4), (5, 4), (4, 3), (4, 5)):
-            response -= gray[row : row - 8 : 8, column : column - 8 : 8]
-        noise = float(np.median(np.abs(response))) / 0.6745 / np.sqrt(20.0)
-        return int(np.clip(self._noise_ratio * noise, self._threshold_min, _THRESHOLD_MAX))
+        """Return the FAST threshold [grey levels]: a multiple of the noise, within limits."""
+        threshold = self._noise_ratio * grey_noise(gray)
+        return int(np.clip(threshold, self._threshold_min, _THRESHOLD_MAX))
 
     def _detect(
         self, pyramid: Sequence[Image], levels: Sequence[int], threshold: int
