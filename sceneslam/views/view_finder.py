@@ -215,7 +215,7 @@ class ViewFinder:
         sigma_m = landmark_noise_m(z)
         missed = np.abs(residual[:, 2]) / sigma_m
         is_near = (found.depth_m > 0) & (missed <= SIGMAS)
-        if is_near.any():
+        if is_near.sum() >= MATCHES_MIN:
             sigma_m *= max(_PER_MEDIAN * float(np.median(missed[is_near])), _DEPTH_LEAST)
         weight = np.full((len(z), 3), (self._camera.fx / _SIGMA_PX) ** 2)
         weight[:, 2] = np.where(is_near, sigma_m**-2, 0.0)
