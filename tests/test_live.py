@@ -117,10 +117,10 @@ def test_recording_that_is_read_too_slowly_is_played_later_and_says_so():
                 threading.Event().wait(1.2)
             yield observation
 
-    run = Run(slow())
+    run = Run(slow(), settings=LiveSettings(rate=10.0))  # 0.1 s apart: a busy machine takes them
     assert len(run.taken) == 4 and max(run.tally.latencies_ms) < 500
     (behind,) = [one for one in run.events if one["event"] == "behind"]
-    assert behind["by_s"] == pytest.approx(1.19, abs=0.3)
+    assert behind["by_s"] == pytest.approx(1.1, abs=0.3)
 
 
 def test_slowest_pose_is_kept_with_what_its_time_went_to():
