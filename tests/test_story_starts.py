@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 from test_atlas_maps import S, map_of
-from test_views import ASIDE, CAMERA, ELSEWHERE, HERE, RIG, seen
+from test_seen_views import RIG, seen
+from test_views import ASIDE, CAMERA, ELSEWHERE, HERE
 
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.experiments.one_map.relocalization import StoryStarts, together

@@ -24,7 +24,10 @@ def grey_noise(grey: NDArray[np.uint8]) -> float:
 
 
 def brightened(grey: NDArray[np.uint8], *, noise_max: float) -> NDArray[np.uint8]:
-    """Return a dark image (H, W) smoothed, and brighter: its noise is `noise_max` at most."""
+    """Return a dark image (H, W) smoothed, and brighter.
+
+    Its contrast is that of a bright image, or as much as keeps its noise below `noise_max`.
+    """
     brightest = float(np.percentile(grey[::4, ::4], 99.0))
     if brightest >= _DARK:
         return grey
