@@ -9,7 +9,7 @@ from test_atlas_places import S, corner_of, quality, scan_of
 from sceneslam.atlas.places import localizer
 from sceneslam.atlas.places.localizer import LocalizationEvent, Look, MapLocalizer
 from sceneslam.atlas.places.plan_field import PlanField
-from sceneslam.types import planar
+from sceneslam.types import planar, se3
 
 
 class Scripted:
@@ -147,9 +147,55 @@ def test_a_place_that_is_contradicted_three_times_in_a_row_is_withdrawn(monkeypa
     scripted.answer = None
     events = [own.compare([placed(7 + index, 0, 0, 0)]) for index in range(3)]
     assert events == [nothing, nothing, LocalizationEvent.WITHDRAWN]
-    assert own.T_map_run is None and own.fixes == [] and own.is_due(placed(10, 0, 0, 0))
+    assert own.T_map_run is None and own.is_due(placed(10, 0, 0, 0))
     scripted.answer = quality(at=(1.0, 1.0, 0.0))
     assert own.compare([placed(11, 0, 0, 0)]) is nothing  # a first search
+
+
+@pytest.mark.parametrize(
+    ("at", "fixes"),
+    [((3.0, 1.25, 0.0), 2), ((3.0, 1.5, 0.0), 1), ((2.6, 1.0, 0.0), 1), ((3.0, 1.0, 0.3), 1)],
+)
+def test_fixes_stay_if_the_run_is_found_again_where_it_was_expected(monkeypatch, at, fixes):
+    scripted = Scripted(monkeypatch)
+    own = located(scripted, (1.0, 1.0, 0.0), run_at=(0.0, 0.0, 0.0))
+    scripted.answer = None
+    for second in (2, 3, 4):
+        own.compare([placed(second, 0.0, 0.0, 0.0)])
+    assert own.T_map_run is None
+    scripted.answer = quality(at=np.array(at))
+    said = [own.compare([placed(second, 2.0, 0.0, 0.0)]) for second in (10, 11)]
+    assert said[-1] is LocalizationEvent.FOUND and own.T_map_run is not None
+    assert [fix.stamp_ns / S for fix in own.fixes] == [1.0, 11.0][-fixes:]
+
+
+def test_a_run_that_tilts_and_sinks_stays_where_it_was_located(monkeypatch):
+    scripted, sunk = Scripted(monkeypatch), se3.exp(np.array([0.0, 0.0, -1.0, 0.1, 0.1, 0.0]))
+    own = located(scripted, (1.0, 1.0, 0.0), run_at=(0.0, 0.0, 0.0))
+    look = placed(3.0, 0.0, 0.0, 0.0)
+    event = own.compare([replace(look, T_run_base=look.T_run_base @ sunk)])
+    assert event is LocalizationEvent.FIXED
+
+
+def test_a_robot_that_was_withdrawn_stays_so_when_poses_are_replaced(monkeypatch):
+    scripted = Scripted(monkeypatch)
+    own = located(scripted, (1.0, 1.0, 0.0), run_at=(0.0, 0.0, 0.0))
+    scripted.answer = None
+    for second in (2, 3, 4):
+        own.compare([placed(second, 0.0, 0.0, 0.0)])
+    own.rewind(3 * S, lambda stamp_ns: planar.to_transform(np.zeros(3)))
+    assert own.T_map_run is None and len(own.fixes) == 1
+
+
+def test_walls_tell_the_place_and_the_floor_there_the_height(monkeypatch):
+    scripted, climbed = Scripted(monkeypatch), np.array([0.0, 0.0, 0.4, 0.0, 0.0, 0.0])
+    up = planar.to_transform(np.array([4.0, 3.0, 1.0])) @ se3.exp(climbed)
+    own = MapLocalizer(corner_of(), standing=lambda T: up if T[2, 3] == 0 else T)
+    scripted.answer = quality(at=np.array([4.0, 3.0, 1.0]))
+    own.compare([placed(0.0)])
+    assert own.compare([placed(1.0)]) is LocalizationEvent.FOUND
+    np.testing.assert_allclose(own.fixes[0].T_map_base, up, atol=1e-12)
+    np.testing.assert_allclose(own.T_map_run @ placed(1.0).T_run_base, up, atol=1e-12)
 
 
 def test_walls_that_are_neither_right_nor_refuted_are_no_contradiction(monkeypatch):

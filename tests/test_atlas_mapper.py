@@ -26,7 +26,7 @@ class Searched:
     """A localizer that answers as it is told."""
 
     def __init__(self, monkeypatch):
-        monkeypatch.setattr(mapper_of, "MapLocalizer", lambda plan, views: self)
+        monkeypatch.setattr(mapper_of, "MapLocalizer", lambda *_, **__: self)
         self.wants_view = lambda look: False
         self.T_map_run, self.fixes, self.is_late = None, [], False
         self.answer, self.asked = LocalizationEvent.NOTHING, []

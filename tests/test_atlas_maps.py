@@ -18,10 +18,11 @@ from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.maps.__main__ import main
 from sceneslam.maps.inspect import flaws
-from sceneslam.types import planar
+from sceneslam.types import planar, se3
 
 S = 10**9
 WALL = plan_of("#" * 40)
+PITCHED = np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.0])
 
 
 def map_of(*plans, nodes=None, runs=None, pieces=None, edges=()):
@@ -113,6 +114,21 @@ def test_the_plan_of_a_piece_is_that_of_its_submaps_the_newest_last():
     assert text_of(saved.plan()) == [".....", "#...#", "....."]
     assert text_of(saved.plan(newest_wins=False)) == [".....", "#####", "....."]
     assert text_of(saved.plan(1)) == ["##"] and not len(saved.plan(2))
+
+
+def test_a_robot_stands_on_the_floor_of_the_submap_that_begins_nearest():
+    flat, other_piece = se3.identity(), se3.exp(np.array([9.0, 0.0, 2.0, 0.0, 0.0, 0.0]))
+    ramp = se3.exp(np.array([10.0, 0.0, 2.0, 0.0, 0.0, 0.0])) @ se3.exp(PITCHED)
+    saved = replace(
+        map_of(*[WALL] * 3, pieces=[0, 0, 1]), T_map_node=np.stack([flat, ramp, other_piece])
+    )
+    askew = se3.exp(np.array([0.0, 0.0, 1.4, 0.05, 0.02, 0.0]))
+    here, there = (se3.from_xy_yaw(*xy_yaw) for xy_yaw in ((1.0, 2.0, 0.5), (9.0, 0.0, 0.2)))
+    np.testing.assert_allclose(saved.standing(here), here, atol=1e-12)
+    x_m, y_m, _ = planar.from_transform(there @ askew)
+    stood = saved.standing(there @ askew)
+    np.testing.assert_allclose(stood[:3, 2], ramp[:3, 2], atol=1e-12)  # upright on the ramp
+    np.testing.assert_allclose(stood[:3, 3], [x_m, y_m, 2.0 + 0.1 * (10.0 - x_m)], atol=0.01)
 
 
 # What is covered.

@@ -306,7 +306,9 @@ class Mapper:
         plan, finder = self._loaded.plan(), None
         if views and rig.camera is not None and self._views.can_look:
             finder = ViewFinder(rig.camera, views)
-        return MapLocalizer(plan, finder) if len(plan) or finder is not None else None
+        if not len(plan) and finder is None:
+            return None
+        return MapLocalizer(plan, finder, standing=self._loaded.standing)
 
     def _scan(self, observation: Observation) -> KeyScan | None:
         """Return the scan of an observation; None without one, or with an invalid measurement."""

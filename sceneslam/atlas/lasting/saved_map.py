@@ -68,6 +68,17 @@ class SavedMap:
         away_m = np.linalg.norm((self.T_map_node - T_map_base)[:, :3, 3], axis=1)
         return int(np.argmin(np.where(self.pieces == piece, away_m, np.inf)))
 
+    def standing(self, T_map_base: Transform, piece: int = 0) -> Transform:
+        """Return a pose (4, 4) with the height and tilt of a robot on the floor of a piece there.
+
+        That is the floor of the submap that begins nearest to it.
+        """
+        T_map_node = self.T_map_node[self.nearest(T_map_base, piece)]
+        on_floor = planar.between(
+            planar.from_transform(T_map_node), planar.from_transform(T_map_base)
+        )
+        return np.asarray(T_map_node @ planar.to_transform(on_floor))
+
     def seen_from(self, node: int) -> NDArray[np.float64]:
         """Return the poses (N, 4, 4) in the map that the views of a submap were seen from."""
         T_submap_base = [view.T_submap_base for view in self.submaps[node].views]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -76,12 +76,22 @@ class _Guess:
 class MapLocalizer:
     """Compares the last metres of a run with a map: its walls, and what a camera sees in it."""
 
-    def __init__(self, plan: FloorPlan, views: ViewFinder | None = None) -> None:
-        """Take the map's walls, and its views if the run has a camera with depth."""
+    def __init__(
+        self,
+        plan: FloorPlan,
+        views: ViewFinder | None = None,
+        *,
+        standing: Callable[[Transform], Transform] = np.asarray,
+    ) -> None:
+        """Take the map's walls, and its views if the run has a camera with depth.
+
+        `standing` gives a pose (4, 4) the height and tilt of a robot that stands there in the map;
+        without it they stay as they are.
+        """
         self.T_map_run: Transform | None = None  # None until the run was located
         self.fixes: list[Fix] = []
         self._walls = Recognizer(PlanField(plan)) if len(plan) else None
-        self._views = views
+        self._views, self._standing = views, standing
         self._next_walls_ns = self._next_view_ns = 0
         self._fixed_at: Look | None = None
         self._guess: _Guess | None = None  # of the last search that found a place
@@ -109,7 +119,14 @@ class MapLocalizer:
         before, self._guess = self._guess, _Guess(T_map_run=T_map_run, fix=fix)
         if before is None or not _agree(before.T_map_run, T_map_run, newest.T_run_base):
             return LocalizationEvent.NOTHING
-        self._take(newest, _mean(fix, before, newest))
+        fix = _mean(fix, before, newest)
+        if self._fixed_at is not None:
+            # It was located before: there, and it drifted, or somewhere else.
+            T_expected = self.fixes[-1].T_map_base @ se3.inverse(self._fixed_at.T_run_base)
+            T_expected = T_expected @ newest.T_run_base
+            if not _is_within(fix, _window(newest, self._fixed_at, T_expected)):
+                self.fixes = []
+        self._take(newest, fix)
         return LocalizationEvent.FOUND
 
     def rewind(self, stamp_ns: int, path: Path) -> None:
@@ -123,12 +140,13 @@ class MapLocalizer:
         T_run_base = None if fix is None else path(fix.stamp_ns)
         if fix is not None and T_run_base is not None:
             self._fixed_at = Look(stamp_ns=fix.stamp_ns, T_run_base=T_run_base)
-            self.T_map_run = fix.T_map_base @ se3.inverse(T_run_base)
+            if self.T_map_run is not None:
+                self.T_map_run = fix.T_map_base @ se3.inverse(T_run_base)
 
     def _is_time(self, newest: Look, next_ns: int) -> bool:
         """Tell whether the time has come, and a located robot has moved since its last fix."""
         fixed_at = self._fixed_at  # live, another thread may change it
-        if newest.stamp_ns < next_ns or fixed_at is None:
+        if newest.stamp_ns < next_ns or fixed_at is None or self.T_map_run is None:
             return newest.stamp_ns >= next_ns
         away = se3.inverse(fixed_at.T_run_base) @ newest.T_run_base
         is_far = np.linalg.norm(away[:3, 3]) >= _FIX_M
@@ -170,23 +188,15 @@ class MapLocalizer:
             if self._guess is not None and not self._guess.fix.is_by_view:
                 self._guess = None  # two searches by walls have to agree in a row
             return None
-        return _fix(newest, newest.T_run_base, match)
+        return self._fix(newest, newest.T_run_base, match)
 
     def _check(self, latest: Sequence[Look], T_map_base: Transform) -> LocalizationEvent:
         """Compare near the predicted pose; repeated contradictions withdraw the localization."""
         assert self._fixed_at is not None
         newest = latest[-1]
-        away = se3.inverse(self._fixed_at.T_run_base) @ newest.T_run_base
-        moved_m = float(np.linalg.norm(away[:3, 3]))
-        turn_rad = WHEELS.rad_per_m * moved_m
-        turn_rad += WHEELS.rad_per_rad * float(se3.rotation_angle_rad(away))
-        window = SearchWindow(
-            around=planar.from_transform(T_map_base),
-            half_m=_REACH_M + _SIGMAS * WHEELS.per_m * moved_m,
-            half_rad=_REACH_RAD + _SIGMAS * turn_rad,
-        )
+        window = _window(newest, self._fixed_at, T_map_base)
         fix, is_contradicted = self._by_view(newest, T_map_base), False
-        if fix is not None and not _is_within(fix, T_map_base, window):
+        if fix is not None and not _is_within(fix, window):
             fix, is_contradicted = None, True
         if fix is None and self._compares_walls(newest):
             fix, by_walls = self._near_walls(latest, T_map_base, window)
@@ -197,8 +207,8 @@ class MapLocalizer:
         self._doubts = self._doubts + 1 if is_contradicted else 0
         if self._doubts < _DOUBTS:
             return LocalizationEvent.NOTHING
-        self.T_map_run, self._guess, self._fixed_at = None, None, None
-        self._doubts, self._vain, self.fixes = 0, 0, []
+        self.T_map_run, self._guess = None, None
+        self._doubts = self._vain = 0
         return LocalizationEvent.WITHDRAWN
 
     def _near_walls(
@@ -213,11 +223,21 @@ class MapLocalizer:
         field = PlanField(query)
         match = self._walls.recognize(field, window)
         if match is not None:
-            fix = _fix(newest, T_map_base, match)
-            if _is_within(fix, T_map_base, window):
+            fix = self._fix(newest, T_map_base, match)
+            if _is_within(fix, window):
                 return fix, False
         there = register(field, self._walls.field, window.around)
         return None, there.known_ratio >= _KNOWN_MIN and there.is_refuted
+
+    def _fix(self, newest: Look, T_base: Transform, match: PlanRegistration) -> Fix:
+        """Return the pose by walls, near the height and tilt of T_base (4, 4): on a floor there."""
+        T_plane = planar.to_transform(planar.from_transform(T_base))
+        T_near = planar.to_transform(match.T_target_query) @ se3.inverse(T_plane) @ T_base
+        return Fix(
+            stamp_ns=newest.stamp_ns,
+            T_map_base=self._standing(T_near),
+            covariance=on_floor(match.covariance),
+        )
 
     def _take(self, newest: Look, fix: Fix) -> None:
         self.T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
@@ -245,16 +265,6 @@ def _query(latest: Sequence[Look]) -> FloorPlan:
     return draw(scans)
 
 
-def _fix(newest: Look, T_base: Transform, match: PlanRegistration) -> Fix:
-    """Return the pose by walls; height and tilt are those of T_base (4, 4), as it is estimated."""
-    T_plane = planar.to_transform(planar.from_transform(T_base))
-    return Fix(
-        stamp_ns=newest.stamp_ns,
-        T_map_base=planar.to_transform(match.T_target_query) @ se3.inverse(T_plane) @ T_base,
-        covariance=on_floor(match.covariance),
-    )
-
-
 def _agree(first: Transform, second: Transform, T_run_base: Transform) -> bool:
     """Tell whether two estimates of T_map_run put the robot in the same place."""
     off = se3.inverse(first @ T_run_base) @ second @ T_run_base
@@ -270,6 +280,20 @@ def _mean(fix: Fix, before: _Guess, newest: Look) -> Fix:
     return replace(fix, T_map_base=mean, covariance=covariance)
 
 
-def _is_within(fix: Fix, T_map_base: Transform, window: SearchWindow) -> bool:
-    off = se3.inverse(T_map_base) @ fix.T_map_base
-    return se3.is_within(off, window.half_m, window.half_rad)
+def _window(newest: Look, fixed_at: Look, T_map_base: Transform) -> SearchWindow:
+    """Return how far around a pose (4, 4) the robot may be after its way since a fix."""
+    away = se3.inverse(fixed_at.T_run_base) @ newest.T_run_base
+    moved_m = float(np.linalg.norm(away[:3, 3]))
+    turn_rad = WHEELS.rad_per_m * moved_m
+    turn_rad += WHEELS.rad_per_rad * float(se3.rotation_angle_rad(away))
+    return SearchWindow(
+        around=planar.from_transform(T_map_base),
+        half_m=_REACH_M + _SIGMAS * WHEELS.per_m * moved_m,
+        half_rad=_REACH_RAD + _SIGMAS * turn_rad,
+    )
+
+
+def _is_within(fix: Fix, window: SearchWindow) -> bool:
+    """Tell whether a fix is where it may be, in the plane: heights and tilts drift otherwise."""
+    x_m, y_m, yaw_rad = planar.between(window.around, planar.from_transform(fix.T_map_base))
+    return bool(np.hypot(x_m, y_m) <= window.half_m and abs(yaw_rad) <= window.half_rad)
