@@ -2,7 +2,7 @@
 
 import importlib
 import pkgutil
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ from sceneslam.atlas.submaps.graph import Solved, consistent
 from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.atlas.uncertainty import WHEELS
+from sceneslam.graphs.edge import EdgeKind
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import MapLayers, PoseGraphLayer
 from sceneslam.types.trajectory import Trajectory
@@ -47,8 +48,10 @@ class Given:
         return [edge for edge in self.found if edge.second == query.second]
 
     def _consistent(self, loops, nodes, drift):
-        self.measured, self.nodes, self.drift = loops, nodes, drift
-        return list(range(len(loops))) if self.agreeing is None else self.agreeing
+        if loops:
+            self.measured, self.nodes, self.drift = loops, nodes, drift
+        every = list(range(len(loops)))
+        return every if self.agreeing is None else every[: self.agreeing]
 
     def _solve(self, T_map_node, motions, loops, *, fixed, loose, uprights):
         self.motions, self.loops, self.uprights = motions, loops, uprights
@@ -117,17 +120,17 @@ def test_loops_within_a_module_are_motions_of_the_graph(monkeypatch):
     assert (given.fixed, given.loose) == ([0], 1)
 
 
-def test_one_loop_alone_is_not_believed_unless_the_run_was_located(monkeypatch):
+def test_one_loop_alone_is_not_believed_but_one_place_of_the_loaded_map_is(monkeypatch):
     given, own = Given(monkeypatch, found=[loop(0, 2, [6, 0, 0])]), finished()
     assert solved(own).loops == () and given.loops == []
     given.found = [loop(0, 2, [6, 0, 0]), loop(0, 1, [3, 0, 0])]
     found = solved(own).loops
     assert [(one.first, one.second) for one in found] == [(0, 1), (0, 2)]
-    given.agreeing = [1]
+    given.agreeing = 1
     assert solved(own).loops == ()
     fix = Fix(stamp_ns=S, **there(0.5, 0.0))
     (one,) = solved(own, map_of(WALL), fixes=[fix]).loops
-    assert (one.first, one.second) == (1, 2)
+    assert (one.first, one.second) == (0, 1)
     own._level = 0  # a base that does not move on a floor
     given.agreeing = None
     assert [edge.second for edge in solved(own, map_of(WALL), fixes=[fix]).loops] == [1]
@@ -164,6 +167,41 @@ def test_fixes_of_one_submap_are_one_loop_their_mean(monkeypatch):
     np.testing.assert_allclose(mean.covariance, alone.covariance, atol=1e-9)
 
 
+def test_nodes_begin_where_the_last_fix_before_each_puts_them(monkeypatch):
+    given, own = Given(monkeypatch), finished()  # nodes at 0, 3 and 6 m
+    fixes = [Fix(stamp_ns=1 * S, **there(0.5, 1.0)), Fix(stamp_ns=8 * S, **there(4.0, 2.0, 0.5))]
+    solved(own, map_of(WALL), fixes=fixes, T_map_run=at(50.0))
+    off_m = [0.01 + y_m for y_m in (-0.02, -0.02)]  # poses are revised to the left
+    due = [at(0.0, 1.0 + off_m[0]), at(3.0, 1.0 + off_m[1])]
+    due.append(at(4.0, 2.0, 0.5) @ se3.inverse(at(4.0, 0.01)) @ at(6.0))
+    np.testing.assert_allclose(given.nodes[1:], due, atol=1e-9)
+
+
+def test_a_place_of_the_loaded_map_is_not_compared_with_a_loop_of_the_run(monkeypatch):
+    own, compared = finished(), []
+    Given(monkeypatch, found=[loop(0, 2, [6, 0, 0]), loop(0, 1, [3, 0, 0])])
+
+    def noted(loops, nodes, drift):
+        compared.append(len(loops))
+        return list(range(len(loops)))
+
+    monkeypatch.setattr(run_graph, "consistent", noted)
+    fix = Fix(stamp_ns=S, **there(0.5, 0.0))
+    assert len(solved(own, map_of(WALL), fixes=[fix]).loops) == 3
+    assert sorted(compared) == [1, 2]
+
+
+def test_the_loaded_map_may_be_bent_by_what_its_own_path_drifts():
+    motions = [loop(k, k + 1, [3.0, 0.0, 0.0], sigma=0.02) for k in (0, 1, 3)]
+    motions = [replace(motion, kind=EdgeKind.MOTION) for motion in motions]
+    motions.append(loop(1, 2, [9.0, 0.0, 0.0], sigma=0.02))
+    sums = PathDrift.along(motions[::-1], 5).sums
+    np.testing.assert_allclose(sums[[0, 3]], 0.0)  # the first of a run
+    np.testing.assert_allclose(sums[1], sums[4])
+    np.testing.assert_allclose(sums[2], 2 * sums[1])
+    assert (sums[1, 1] > 0).all() and (sums[:, 0] == 0).all()
+
+
 def test_the_first_vertical_direction_gives_that_of_the_map(monkeypatch):
     given, own = Given(monkeypatch), finished()
     tilts = [0.02, 0.05, 0.06]
@@ -179,7 +217,7 @@ def test_the_first_vertical_direction_gives_that_of_the_map(monkeypatch):
 @pytest.mark.parametrize("apart_m", [0.0, 3.0])
 def test_headings_of_loops_agree_within_their_deviation(apart_m):
     nodes = np.array([[0, 0, 0], [0, 0, 0], [10, 0, 0], [10 + apart_m, 0, 0]], float)
-    drift = PathDrift.nothing(4)
+    drift = PathDrift.along([], 4)
     drift.sums[3, 0, 2] = 0.02
     bound = np.sqrt(16.81) * np.hypot(np.sqrt(2) * 0.01, 0.02)
     for sign in (1.0, -1.0):

@@ -67,9 +67,9 @@ def test_the_largest_set_of_loops_that_agree_is_kept():
     nodes = transforms(np.zeros((12, 3)))
     offs = [0.0, 5.0, 0.0, 5.0, 5.0, 9.0]
     loops = [loop(2 * i, 2 * i + 1, [off, 0, 0]) for i, off in enumerate(offs)]
-    assert consistent(loops, nodes, PathDrift.nothing(12)) == [1, 3, 4]
-    assert consistent(loops[:1], nodes, PathDrift.nothing(12)) == [0]
-    assert consistent([], nodes, PathDrift.nothing(12)) == []
+    assert consistent(loops, nodes, PathDrift.along([], 12)) == [1, 3, 4]
+    assert consistent(loops[:1], nodes, PathDrift.along([], 12)) == [0]
+    assert consistent([], nodes, PathDrift.along([], 12)) == []
 
 
 def test_a_motion_in_the_plane_keeps_height_and_tilt_as_a_floor_does():

@@ -63,7 +63,7 @@ def _joined(saved: SavedMap, target: int, piece: int) -> SavedMap | None:
     """Return the map with a piece joined to another, None if it is not recognized there."""
     own = np.flatnonzero(saved.pieces == piece).tolist()
     loops = [*_loops_by_walls(saved, target, own), *_loops_by_views(saved, target, own)]
-    drift = PathDrift.nothing(len(saved.submaps))
+    drift = PathDrift.along(saved.edges, len(saved.submaps))
     agreeing = [loops[index] for index in consistent(loops, saved.T_map_node, drift)]
     if len(agreeing) < _LOOPS_MIN:
         return None

@@ -50,9 +50,13 @@ class PathDrift:
         return cls(sums=np.array(rows).reshape(-1, 2, 3))
 
     @classmethod
-    def nothing(cls, count: int) -> PathDrift:
-        """Return that of submaps whose poses stay."""
-        return cls(sums=np.zeros((count, 2, 3)))
+    def along(cls, motions: Sequence[Edge], count: int) -> PathDrift:
+        """Return that of `count` submaps, each reached from the one before it, if it was."""
+        rows = np.zeros((count, 2, 3))
+        for motion in sorted(motions, key=lambda edge: edge.second):
+            if not motion.is_loop and motion.second == motion.first + 1:
+                rows[motion.second] = summed(rows[motion.first], motion)
+        return cls.of(list(rows))
 
     def after(self, others: PathDrift) -> PathDrift:
         """Return the drift of other submaps, and then of these."""

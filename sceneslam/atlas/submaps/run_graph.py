@@ -17,7 +17,6 @@ from sceneslam.atlas.submaps.graph import (
     Upright,
     consistent,
     fits,
-    settle,
     solve,
 )
 from sceneslam.atlas.submaps.loop_query import NEIGHBOURS, LoopQuery
@@ -90,7 +89,9 @@ class RunGraph:
             start = self._T_map_node if used else np.array(chain.T_run_node)
             solved = Solved(T_map_node=start, accepted=[])
             if used:
-                solved = settle(start, chain.motions, used, _uprights(chain, start, 0))
+                solved = solve(
+                    start, chain.motions, used, fixed=[0], uprights=_uprights(chain, start, 0)
+                )
             self._agreed, self._T_map_node = agreeing, solved.T_map_node
             self._accepted = [used[index] for index in solved.accepted]
         loops = tuple(edge.shifted(self._count) for edge in self._accepted)
@@ -113,26 +114,28 @@ class RunGraph:
         """
         count, ends = self._count, _Ends(chain, path)
         motions = [*chain.motions, *ends.edges_of(closed_loops(maps))]
-        drift = PathDrift.of(chain.drift).after(PathDrift.nothing(count))
-        fixed = self._fix_edges(fixes, ends)
+        drift = PathDrift.of(chain.drift).after(PathDrift.along(self._loaded.edges, count))
         self._place(chain)
         self._search(chain, is_level=is_level)
-        loops = [*fixed, *(edge.shifted(count) for edge in self._found.loops)]
+        T_map_node = ends.placed(fixes, T_map_node)
         nodes = np.concatenate([self._loaded.T_map_node, T_map_node])
-        agreeing = consistent(loops, nodes, drift)
-        if len(agreeing) < 2 and not fixed:
-            agreeing = []  # no other loop agrees with it
+        fixed = self._fix_edges(fixes, ends)
+        found = [edge.shifted(count) for edge in self._found.loops]
+        # No cycle tells whether a place of the loaded map and a loop of the run agree.
+        agreeing = [found[index] for index in consistent(found, nodes, drift)]
+        used = [fixed[index] for index in consistent(fixed, nodes, drift)]
+        used += agreeing if len(agreeing) > 1 else []  # one alone is not believed
         solved = solve(
             nodes,
             [edge.shifted(count) for edge in motions],
-            [loops[index] for index in agreeing],
-            fixed=range(count),
-            loose=count,
+            used,
+            fixed=range(max(count, 1)),
+            loose=count or None,
             uprights=_uprights(chain, T_map_node, count),
         )
         return SolvedRun(
             T_map_node=solved.T_map_node[count:],
-            loops=tuple(loops[agreeing[index]] for index in solved.accepted),
+            loops=tuple(used[index] for index in solved.accepted),
         )
 
     def _agreeing(self) -> list[Edge]:
@@ -223,6 +226,25 @@ class _Ends:
         if T_run_base is None:
             return None
         return node, se3.inverse(self._chain.T_run_node[node]) @ T_run_base
+
+    def placed(self, fixes: Sequence[Fix], T_map_node: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the nodes (N, 4, 4) where the last fix before each, or else the first, puts them.
+
+        Nodes stay at `T_map_node` if no fix has a pose.
+        """
+        stamps_ns, T_map_run = [], []
+        for fix in fixes:
+            found = self.of(fix.stamp_ns)
+            if found is not None:
+                T_run_base = self._chain.T_run_node[found[0]] @ found[1]
+                stamps_ns.append(fix.stamp_ns)
+                T_map_run.append(fix.T_map_base @ se3.inverse(T_run_base))
+        if not stamps_ns:
+            return T_map_node
+        starts_ns = [submap.stamps_ns[0] for submap in self._chain.submaps]
+        last = np.searchsorted(stamps_ns, starts_ns, side="right") - 1
+        T_run_node = np.array(self._chain.T_run_node)
+        return np.asarray(np.array(T_map_run)[np.maximum(last, 0)] @ T_run_node)
 
     def edges_of(self, loops: Sequence[OwnLoop]) -> list[Edge]:
         """Return a module's own loops as edges between submaps, without those within one."""
