@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.spread import spread
+
 _DARK = 128.0  # grey level of the brightest per cent of the pixels
 _SMOOTH_PX = 1.0  # standard deviation of the filter ...
 _LEFT = 0.28  # ... and share of white noise that it leaves: 1 / (2 sqrt(pi)) for one pixel
@@ -20,7 +22,7 @@ def grey_noise(grey: NDArray[np.uint8]) -> float:
     response = 4 * grey[4:-4:8, 4:-4:8].astype(np.int16)
     for row, column in ((3, 4), (5, 4), (4, 3), (4, 5)):
         response -= grey[row : row - 8 : 8, column : column - 8 : 8]
-    return float(np.median(np.abs(response))) / 0.6745 / float(np.sqrt(20.0))
+    return spread(response) / float(np.sqrt(20.0))
 
 
 def brightened(grey: NDArray[np.uint8], *, noise_max: float) -> NDArray[np.uint8]:

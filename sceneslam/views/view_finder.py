@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.spread import spread
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
@@ -26,7 +27,6 @@ from sceneslam.views.view import Landmarks, LandmarkView
 
 _ERROR_PX, _SIGMA_PX = 3.0, 1.0  # of a match's ray, at most and usually
 _ITERATIONS, _CONFIDENCE = 300, 0.9999
-_PER_MEDIAN = 1.4826  # a normal error's standard deviation, over the median of its magnitude
 _DEPTH_LEAST = 0.1  # of the expected noise of a depth
 _STEPS = 4  # of Gauss-Newton, from a pose that the rays fit already
 _GUIDED_PX = 9.0  # from where a pose by one view of the map expects a landmark of the others
@@ -216,7 +216,7 @@ class ViewFinder:
         missed = np.abs(residual[:, 2]) / sigma_m
         is_near = (found.depth_m > 0) & (missed <= SIGMAS)
         if is_near.sum() >= MATCHES_MIN:
-            sigma_m *= max(_PER_MEDIAN * float(np.median(missed[is_near])), _DEPTH_LEAST)
+            sigma_m *= max(spread(missed[is_near]), _DEPTH_LEAST)
         weight = np.full((len(z), 3), (self._camera.fx / _SIGMA_PX) ** 2)
         weight[:, 2] = np.where(is_near, sigma_m**-2, 0.0)
         J = (by_point @ by_pose).reshape(-1, 6)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.spread import spread
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 
@@ -125,10 +126,10 @@ class Tracker:
         if len(rows):
             jacobians = _jacobians(points_view[rows], T_other_view, points[rows], self.K)
             slopes = _slopes(other, row[rows], column[rows])
-            # Noise of grey values: robust standard deviation (1.4826 MAD) of the differences.
+            # Noise of grey values, by the differences.
             missed = other.grey[row[rows], column[rows]] - greys[rows]
             missed = missed - np.median(missed)  # exposure
-            grey_sigma = max(1.4826 * float(np.median(np.abs(missed))), _GREY_SIGMA_MIN)
+            grey_sigma = max(spread(missed), _GREY_SIGMA_MIN)
             # Derivatives of both residuals, grey(pixel) and depth(pixel) - z, over their sigmas
             # (Steinbruecker et al., ICCVW 2011); the information is J' J.
             photometric = np.einsum("ni,nij->nj", slopes[:, 0], jacobians[:, :2]) / grey_sigma

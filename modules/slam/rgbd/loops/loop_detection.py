@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.graphs.edge import Edge, EdgeKind
+from sceneslam.spread import spread
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
@@ -68,7 +69,7 @@ class LoopDetector:
             return None
         ratios = np.array([likeness.ratio for likeness in alike])
         usual = float(np.median(ratios))
-        sigma = 1.4826 * float(np.median(np.abs(ratios - usual)))
+        sigma = spread(ratios - usual)
         if len(alike) >= _FEWEST and ratios[0] < usual + _OUTSTANDING * sigma:
             return None
         return alike[0].place_id
