@@ -234,9 +234,8 @@ class _Ends:
         """
         stamps_ns, T_map_run = [], []
         for fix in fixes:
-            found = self.of(fix.stamp_ns)
-            if found is not None:
-                T_run_base = self._chain.T_run_node[found[0]] @ found[1]
+            T_run_base = self._path(fix.stamp_ns)
+            if T_run_base is not None:
                 stamps_ns.append(fix.stamp_ns)
                 T_map_run.append(fix.T_map_base @ se3.inverse(T_run_base))
         if not stamps_ns:
