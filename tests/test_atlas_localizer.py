@@ -152,6 +152,26 @@ def test_a_place_that_is_contradicted_three_times_in_a_row_is_withdrawn(monkeypa
     assert own.compare([placed(11, 0, 0, 0)]) is nothing  # a first search
 
 
+def test_a_robot_that_drove_a_round_may_be_off_by_what_drifts_on_all_of_it(monkeypatch):
+    scripted = Scripted(monkeypatch)
+    own = located(scripted, (4.0, 3.0, 1.0))
+    corners = [(2.0, 0.0, 0.5), (2.0, 2.0, 1.0), (0.0, 2.0, -0.5), (0.0, 0.0, 0.0)]
+    looks = [
+        placed(2.0 + index, *planar.compose(RUN_AT, np.array(corner)))
+        for index, corner in enumerate(corners)
+    ]
+    scripted.answer = None
+    for count in (1, 3, 4):  # one of them is seen with the next alone
+        own.compare(looks[:count])
+    assert scripted.window.half_m == pytest.approx(0.15 + 0.06 * 8.0)
+    assert scripted.window.half_rad == pytest.approx(0.05 + 0.03 * 8.0 + 0.06 * 3.0)
+    scripted.answer = quality(at=(4.0, 3.0, 1.0))
+    assert own.compare([placed(6.0)]) is LocalizationEvent.FIXED
+    own.rewind(6 * S, lambda stamp_ns: looks[0].T_run_base)
+    own.compare([placed(7.0)])
+    assert scripted.window.half_m == pytest.approx(0.15 + 0.06 * 8.0)  # since the fix before it
+
+
 @pytest.mark.parametrize(
     ("at", "fixes"),
     [((3.0, 1.25, 0.0), 2), ((3.0, 1.5, 0.0), 1), ((2.6, 1.0, 0.0), 1), ((3.0, 1.0, 0.3), 1)],

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,7 @@ class Fix:
     T_map_base: Transform
     covariance: NDArray[np.float64]  # (6, 6) of se3.log order, base frame
     is_by_view: bool = False
+    way: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))  # of the run: m, rad
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -94,6 +96,8 @@ class MapLocalizer:
         self._views, self._standing = views, standing
         self._next_walls_ns = self._next_view_ns = 0
         self._fixed_at: Look | None = None
+        self._seen: Look | None = None  # that was compared last
+        self._way = np.zeros(2)  # of the run up to there: m, rad
         self._guess: _Guess | None = None  # of the last search that found a place
         self._vain = self._doubts = 0
 
@@ -108,6 +112,7 @@ class MapLocalizer:
     def compare(self, latest: Sequence[Look]) -> LocalizationEvent:
         """Compare the latest looks, oldest first, with the map."""
         newest = latest[-1]
+        self._drive(latest)
         if self.T_map_run is not None:
             return self._check(latest, self.T_map_run @ newest.T_run_base)
         fix = self._by_view(newest, None)
@@ -124,7 +129,7 @@ class MapLocalizer:
             # It was located before: there, and it drifted, or somewhere else.
             T_expected = self.fixes[-1].T_map_base @ se3.inverse(self._fixed_at.T_run_base)
             T_expected = T_expected @ newest.T_run_base
-            if not _is_within(fix, _window(newest, self._fixed_at, T_expected)):
+            if not _is_within(fix, self._window(T_expected)):
                 self.fixes = []
         self._take(newest, fix)
         return LocalizationEvent.FOUND
@@ -192,9 +197,8 @@ class MapLocalizer:
 
     def _check(self, latest: Sequence[Look], T_map_base: Transform) -> LocalizationEvent:
         """Compare near the predicted pose; repeated contradictions withdraw the localization."""
-        assert self._fixed_at is not None
         newest = latest[-1]
-        window = _window(newest, self._fixed_at, T_map_base)
+        window = self._window(T_map_base)
         fix, is_contradicted = self._by_view(newest, T_map_base), False
         if fix is not None and not _is_within(fix, window):
             fix, is_contradicted = None, True
@@ -210,6 +214,26 @@ class MapLocalizer:
         self.T_map_run, self._guess = None, None
         self._doubts = self._vain = 0
         return LocalizationEvent.WITHDRAWN
+
+    def _drive(self, latest: Sequence[Look]) -> None:
+        """Add the way from the look that was compared last to the newest one."""
+        seen = latest[-1] if self._seen is None else self._seen
+        newer = [look for look in latest if look.stamp_ns > seen.stamp_ns]
+        for before, after in pairwise([seen, *newer]):
+            step = se3.inverse(before.T_run_base) @ after.T_run_base
+            moved = np.linalg.norm(step[:3, 3]), se3.rotation_angle_rad(step)
+            self._way = self._way + moved
+        self._seen = latest[-1]
+
+    def _window(self, T_map_base: Transform) -> SearchWindow:
+        """Return how far around a pose (4, 4) the robot may be after its way since the last fix."""
+        way_m, turned_rad = self._way - self.fixes[-1].way
+        turn_rad = WHEELS.rad_per_m * way_m + WHEELS.rad_per_rad * turned_rad
+        return SearchWindow(
+            around=planar.from_transform(T_map_base),
+            half_m=float(_REACH_M + _SIGMAS * WHEELS.per_m * way_m),
+            half_rad=float(_REACH_RAD + _SIGMAS * turn_rad),
+        )
 
     def _near_walls(
         self, latest: Sequence[Look], T_map_base: Transform, window: SearchWindow
@@ -242,7 +266,7 @@ class MapLocalizer:
     def _take(self, newest: Look, fix: Fix) -> None:
         self.T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
         self._fixed_at = newest
-        self.fixes.append(fix)
+        self.fixes.append(replace(fix, way=self._way))
         self._doubts = self._vain = 0
         self._next_walls_ns = self._next_view_ns = newest.stamp_ns + _FIX_NS
 
@@ -278,19 +302,6 @@ def _mean(fix: Fix, before: _Guess, newest: Look) -> Fix:
     carried = se3.carried(before.fix.covariance, se3.inverse(T_then_now))
     mean, covariance = se3.mean([fix.T_map_base, T_before], [fix.covariance, carried])
     return replace(fix, T_map_base=mean, covariance=covariance)
-
-
-def _window(newest: Look, fixed_at: Look, T_map_base: Transform) -> SearchWindow:
-    """Return how far around a pose (4, 4) the robot may be after its way since a fix."""
-    away = se3.inverse(fixed_at.T_run_base) @ newest.T_run_base
-    moved_m = float(np.linalg.norm(away[:3, 3]))
-    turn_rad = WHEELS.rad_per_m * moved_m
-    turn_rad += WHEELS.rad_per_rad * float(se3.rotation_angle_rad(away))
-    return SearchWindow(
-        around=planar.from_transform(T_map_base),
-        half_m=_REACH_M + _SIGMAS * WHEELS.per_m * moved_m,
-        half_rad=_REACH_RAD + _SIGMAS * turn_rad,
-    )
 
 
 def _is_within(fix: Fix, window: SearchWindow) -> bool:
