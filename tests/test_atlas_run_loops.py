@@ -12,7 +12,7 @@ from test_atlas_submaps import S, at
 
 from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.atlas.submaps import run_graph
-from sceneslam.atlas.submaps.graph import Agreement, consistent, solve
+from sceneslam.atlas.submaps.graph import Agreement, consistent, settle
 from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.run_graph import RunGraph, SolvedRun
 from sceneslam.types import planar
@@ -26,7 +26,7 @@ class Searched(Given):
     def __init__(self, monkeypatch, found):
         self.found, self.asked, self.queries, self.kept, self.solved = found, [], {}, [], 0
         monkeypatch.setattr(run_graph, self.name, lambda may_close: self)
-        monkeypatch.setattr(run_graph, "solve", self._solve)
+        monkeypatch.setattr(run_graph, "settle", self._settle)
 
     def loops_to(self, query):
         self.asked.append(query.second)
@@ -36,9 +36,9 @@ class Searched(Given):
     def forget(self, count):
         self.kept.append(count)
 
-    def _solve(self, *given, **choices):
+    def _settle(self, *given):
         self.solved += 1
-        return solve(*given, **choices)
+        return settle(*given)
 
 
 class Viewed(Searched):
@@ -188,11 +188,10 @@ def test_loops_that_are_compared_as_they_are_found_agree_as_all_at_once(seed, ke
     assert agreement.largest() == consistent([*left, *loops[:3]], nodes, drift)
 
 
-def test_a_solution_leaves_out_what_does_not_fit():
+def test_a_solution_on_the_way_leaves_out_what_does_not_fit():
     own, wrong = finished(48), loop(1, 6, [14.0, 1.0, 0.0], sigma=0.01)
     loops = [off(0, 5), off(0, 6), wrong, off(1, 7)]
-    nodes = np.array(own.chain.T_run_node)
-    solved = solve(nodes, own.chain.motions, loops, fixed=[0])
+    solved = settle(np.array(own.chain.T_run_node), own.chain.motions, loops)
     assert solved.accepted == [0, 1, 3]
-    alone = solve(nodes, own.chain.motions, [*loops[:2], loops[3]], fixed=[0])
+    alone = settle(np.array(own.chain.T_run_node), own.chain.motions, [*loops[:2], loops[3]])
     np.testing.assert_allclose(solved.T_map_node, alone.T_map_node, atol=1e-3)

@@ -251,7 +251,7 @@ def fail_once_it_has_loops(graph, chain, *, is_level, extend=RunGraph.extend):
 @pytest.mark.parametrize(
     ("name", "fail", "said"),
     [
-        ("RunGraph.finish", lambda *_, **__: 1 / 0, "the graph was not solved at the end"),
+        ("solve", lambda *_, **__: 1 / 0, "the graph was not solved at the end"),
         ("RunGraph.extend", fail_once_it_has_loops, "the graph of the run gets no further"),
     ],
 )

@@ -1,8 +1,8 @@
 """The pose graph: submaps of all modules and runs, and the measured motions between them.
 
 Wrong loops are rejected in two steps: only the largest pairwise consistent set is used (Mangelson
-et al., "Pairwise consistent measurement set maximization", ICRA 2018), and of this those that fit
-worst are left out until all others fit.
+et al., "Pairwise consistent measurement set maximization", ICRA 2018), and its loops are weighed by
+graduated non-convexity (Yang et al., RA-L 2020), which can still reject each of them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _FLOOR = np.array([0.05, 0.02, 0.02]) ** 2  # m, rad: height and tilt between pl
 _TILT_RAD = 0.04  # that modules drift in pitch along a corridor, before gravity corrects them
 _UPRIGHT_RAD = 0.01  # half a degree: of gyro and gravity, and as floors are uneven
 _ROUNDS = 10  # in which the loops that fit worst are left out
-_STEPS, _GAIN_RATIO = 20, 1e-3  # of a solution: its cost falls no further
+_STEPS, _GAIN_RATIO = 20, 1e-3  # of a solution while the run goes on: its cost falls no further
 _VAIN = 50  # starts in a row without a larger clique
 LOADED = -1  # node of a loaded map
 
@@ -60,27 +60,58 @@ def solve(
     loops: Sequence[Edge],
     *,
     fixed: Sequence[int],
-    loose: int | None = None,
+    loose: int,
     uprights: Sequence[Upright] = (),
 ) -> Solved:
     """Return the poses (N, 4, 4) that best fit the motions and the accepted loops.
 
     `fixed` nodes stay; `loose` has a weak prior, so that only a loop to a fixed node moves it.
-    `uprights` hold roll and pitch. Every node must be connected to one of these.
-    Loops that fit worst are left out, and it is solved again. The result is deterministic; other
-    threads run between two steps, as gtsam lets none run within one.
+    `uprights` hold roll and pitch.
+    Every node must be connected to one of these. The result is deterministic.
+    """
+    import gtsam
+
+    if not loops and not uprights:
+        return Solved(T_map_node=T_map_node, accepted=[])
+    graph, values = _problem(T_map_node, motions, uprights)
+    poses = [gtsam.Pose3(T) for T in T_map_node]
+    noise = gtsam.noiseModel.Diagonal.Sigmas(_FIXED[TO_GTSAM])
+    for number in fixed:
+        graph.add(gtsam.PriorFactorPose3(number, poses[number], noise))
+    slack = gtsam.noiseModel.Diagonal.Sigmas((_LOOSE if len(fixed) else _FIXED)[TO_GTSAM])
+    graph.add(gtsam.PriorFactorPose3(loose, poses[loose], slack))
+    trusted = list(range(graph.size()))
+    for edge in loops:
+        graph.add(factor_of(edge))
+    parameters = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
+    parameters.setKnownInliers(trusted)
+    optimizer = gtsam.GncLMOptimizer(graph, values, parameters)
+    optimizer.setInlierCostThresholds(0.5 * _CHI2_6)
+    result = optimizer.optimize()
+    weights = np.asarray(optimizer.getWeights())[len(trusted) :]
+    return Solved(
+        T_map_node=_nodes(result, len(poses)), accepted=np.flatnonzero(weights > 0.5).tolist()
+    )
+
+
+def settle(
+    T_map_node: NDArray[np.float64],
+    motions: Sequence[Edge],
+    loops: Sequence[Edge],
+    uprights: Sequence[Upright] = (),
+) -> Solved:
+    """Return the same for a run that goes on, whose first node stays, from its last solution.
+
+    Loops that fit worst are left out, and it is solved again. Other threads run between two steps:
+    gtsam lets none run within one, nor within the optimizer of `solve`.
     """
     import gtsam
 
     accepted, nodes = list(range(len(loops))), T_map_node
-    if not loops and not uprights:
-        return Solved(T_map_node=nodes, accepted=[])
-    held, slack = (gtsam.noiseModel.Diagonal.Sigmas(one[TO_GTSAM]) for one in (_FIXED, _LOOSE))
-    priors = [(node, held) for node in fixed] + ([] if loose is None else [(loose, slack)])
+    noise = gtsam.noiseModel.Diagonal.Sigmas(_FIXED[TO_GTSAM])
     for _ in range(_ROUNDS):
         graph, values = _problem(nodes, motions, uprights)
-        for node, noise in priors:
-            graph.add(gtsam.PriorFactorPose3(node, gtsam.Pose3(T_map_node[node]), noise))
+        graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(T_map_node[0]), noise))
         for index in accepted:
             graph.add(factor_of(loops[index]))
         nodes = _stepped(gtsam.LevenbergMarquardtOptimizer(graph, values), len(nodes))

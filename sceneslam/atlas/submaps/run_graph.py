@@ -17,6 +17,7 @@ from sceneslam.atlas.submaps.graph import (
     Upright,
     consistent,
     fits,
+    settle,
     solve,
 )
 from sceneslam.atlas.submaps.loop_query import NEIGHBOURS, LoopQuery
@@ -89,9 +90,7 @@ class RunGraph:
             start = self._T_map_node if used else np.array(chain.T_run_node)
             solved = Solved(T_map_node=start, accepted=[])
             if used:
-                solved = solve(
-                    start, chain.motions, used, fixed=[0], uprights=_uprights(chain, start, 0)
-                )
+                solved = settle(start, chain.motions, used, _uprights(chain, start, 0))
             self._agreed, self._T_map_node = agreeing, solved.T_map_node
             self._accepted = [used[index] for index in solved.accepted]
         loops = tuple(edge.shifted(self._count) for edge in self._accepted)
@@ -129,8 +128,8 @@ class RunGraph:
             nodes,
             [edge.shifted(count) for edge in motions],
             used,
-            fixed=range(max(count, 1)),
-            loose=count or None,
+            fixed=range(count),
+            loose=count,
             uprights=_uprights(chain, T_map_node, count),
         )
         return SolvedRun(
