@@ -173,8 +173,18 @@ class OneMapExperiment:
             saved, T_map_gt = load_map_files(folder), _map_of(first)
             every += [self._started(saved, T_map_gt, outcome, seed) for outcome in others]
         for light, is_lit in (("the light", True), ("the dark", False)):
-            found = together([starts.found(is_lit=is_lit) for starts in every])
-            yield from self._judged(f"story in the map of {self._mapped}, in {light}", found)
+            shared, others = (
+                together([starts.found(is_lit=is_lit, is_shared=is_shared) for starts in every])
+                for is_shared in (True, False)
+            )
+            name = f"story in the map of {self._mapped}, in {light}"
+            yield from self._judged(name, shared)
+            yield Figure.at_most(f"{name}: elsewhere, found in a wrong place", others.wrong, 0)
+            self._rows += [
+                [f"{name}: starts", shared.count],
+                [f"{name}: starts where no view of the map was near", others.count],
+                [f"{name}: found of these", others.found],
+            ]
 
     def _started(
         self, saved: SavedMap, T_map_gt: Transform, outcome: TrialResult, seed: int

@@ -21,6 +21,7 @@ from sceneslam.types.planar import Planar
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
+from sceneslam.views.placed_views import are_covered
 
 _STEP_M, _STEP_RAD, _STEP_S = 0.1, 0.2, 0.2  # half a metre, or a radian, per second
 _WRONG_M, _WRONG_RAD = 0.5, 0.2
@@ -40,8 +41,8 @@ class Starts:
 
     @property
     def found_ratio(self) -> float:
-        """Return the share that was found in the right place."""
-        return (self.found - self.wrong) / self.count
+        """Return the share that was found in the right place; 1 of none."""
+        return (self.found - self.wrong) / self.count if self.count else 1.0
 
 
 def together(parts: Sequence[Starts]) -> Starts:
@@ -78,7 +79,8 @@ def random_starts(
 class StoryStarts:
     """Starts at random instants of a story, in the map of another, with all that it measured.
 
-    Poses are those of the run, as reported then, seen from the start.
+    Poses are those of the run, as reported then, seen from the start. Of starts that share geometry
+    with the map, the camera comes to where it sees what one of the map's views shows.
     """
 
     def __init__(
@@ -94,6 +96,8 @@ class StoryStarts:
     ) -> None:
         """Draw the starts. `due` returns the true T_map_base (4, 4) at a stamp [ns]."""
         self._saved, self._rig, self._due = saved, rig, due
+        seen = [saved.seen_from(node) for node in range(len(saved.submaps))]
+        self._seen = np.concatenate(seen)
         self._within_ns = round(within_s * 1e9)
         self._poses = dict(zip(online.stamps_ns.tolist(), online.T_world_base, strict=True))
         late = online.stamps_ns[-1] - self._within_ns
@@ -112,7 +116,10 @@ class StoryStarts:
             return
         while self._waiting and self._waiting[-1] <= stamp_ns:
             self._waiting.pop()
-            self._under_way.append(_Start(self._saved, self._rig, pose, observation))
+            start = _Start(
+                self._saved, self._rig, pose, observation, is_shared=self._shares(stamp_ns)
+            )
+            self._under_way.append(start)
         for start in self._under_way:
             start.observe(observation, pose, self._due)
         is_over = [
@@ -124,9 +131,16 @@ class StoryStarts:
             start for start, over in zip(self._under_way, is_over, strict=True) if not over
         ]
 
-    def found(self, *, is_lit: bool) -> Starts:
-        """Return what became of the starts in the light, or in the dark."""
-        ended = [start for start in self._ended if start.is_lit is is_lit]
+    def _shares(self, begun_ns: int) -> bool:
+        """Tell whether a start comes to where its camera sees what a view of the map shows."""
+        ended_ns = begun_ns + self._within_ns
+        T_true = [self._due(ns) for ns in self._poses if begun_ns <= ns <= ended_ns]
+        return bool(are_covered(np.array(T_true), self._seen).any())
+
+    def found(self, *, is_lit: bool, is_shared: bool) -> Starts:
+        """Return what became of the starts in the light or the dark, that share geometry or not."""
+        kind = (is_lit, is_shared)
+        ended = [start for start in self._ended if (start.is_lit, start.is_shared) == kind]
         return _starts(len(ended), [start.off for start in ended if start.off is not None])
 
 
@@ -134,8 +148,15 @@ class _Start:
     """One start, and by how much it was found beside the truth."""
 
     def __init__(
-        self, saved: SavedMap, rig: Rig, T_online_start: Transform, first: Observation
+        self,
+        saved: SavedMap,
+        rig: Rig,
+        T_online_start: Transform,
+        first: Observation,
+        *,
+        is_shared: bool,
     ) -> None:
+        self.is_shared = is_shared
         self.begun_ns, self._T_online_start = first.stamp_ns, T_online_start
         self.is_lit = first.image_bgr is not None and float(first.image_bgr.mean()) >= _LIT_GREY
         self.off: tuple[float, float] | None = None  # m, rad
