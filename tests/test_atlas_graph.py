@@ -17,7 +17,7 @@ from sceneslam.atlas.covariances import PosedPath, calibrated, covariances
 from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.atlas.places.localizer import Fix
 from sceneslam.atlas.submaps import run_graph
-from sceneslam.atlas.submaps.graph import Solved, consistent
+from sceneslam.atlas.submaps.graph import Solved, consistent, fits, solve
 from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.atlas.uncertainty import WHEELS
@@ -53,7 +53,7 @@ class Given:
         every = list(range(len(loops)))
         return every if self.agreeing is None else every[: self.agreeing]
 
-    def _solve(self, T_map_node, motions, loops, *, fixed, loose, uprights):
+    def _solve(self, T_map_node, motions, loops, *, fixed, loose, places, uprights):
         self.motions, self.loops, self.uprights = motions, loops, uprights
         self.fixed, self.loose = list(fixed), loose
         return Solved(T_map_node=T_map_node, accepted=list(range(len(loops))))
@@ -189,6 +189,23 @@ def test_a_place_of_the_loaded_map_is_not_compared_with_a_loop_of_the_run(monkey
     fix = Fix(stamp_ns=S, **there(0.5, 0.0))
     assert len(solved(own, map_of(WALL), fixes=[fix]).loops) == 3
     assert sorted(compared) == [1, 2]
+
+
+@pytest.mark.parametrize(("off_m", "moved_m"), [(0.5, 0.04), (5.0, 0.04), (0.0, 1e-6)])
+def test_one_place_far_off_hardly_bends_a_run_that_was_found_at_others(off_m, moved_m):
+    straight = [[2.5 * k, 0.0, 0.0] for k in range(9)]
+    nodes = transforms(np.array([[0.0, 0.0, 0.0], *straight]))
+    motions = [loop(1 + k, 2 + k, [2.5, 0.0, 0.0], sigma=0.015) for k in range(8)]
+    places = [
+        loop(0, 1 + k, [x_m, off_m if k == 4 else 0.0, 0.0], sigma=0.01)
+        for k, (x_m, _, _) in enumerate(straight)
+    ]
+    found = solve(nodes, motions, [], fixed=[0], loose=1, places=places)
+    moved = np.linalg.norm((found.T_map_node - nodes)[:, :3, 3], axis=1)
+    assert moved.max() == moved[5] <= moved_m and not found.accepted
+    assert [fits(place, found.T_map_node) for place in places] == [
+        off_m == 0 or k != 4 for k in range(9)
+    ]
 
 
 def test_the_loaded_map_may_be_bent_by_what_its_own_path_drifts():

@@ -22,11 +22,14 @@ def noise_of(covariance: NDArray[np.float64]) -> Any:
     return gtsam.noiseModel.Gaussian.Covariance(covariance[np.ix_(TO_GTSAM, TO_GTSAM)])
 
 
-def factor_of(edge: Edge, noise: Any = None) -> Any:
-    """Return an edge as a factor; its noise is that of its covariance if none is given."""
+def factor_of(edge: Edge, huber_sigmas: float | None = None) -> Any:
+    """Return an edge as a factor; beyond `huber_sigmas`, if given, it weighs less (Huber)."""
     import gtsam
 
-    noise = noise_of(edge.covariance) if noise is None else noise
+    noise = noise_of(edge.covariance)
+    if huber_sigmas is not None:
+        huber = gtsam.noiseModel.mEstimator.Huber.Create(huber_sigmas)
+        noise = gtsam.noiseModel.Robust.Create(huber, noise)
     T_first_second = gtsam.Pose3(edge.T_first_second)
     return gtsam.BetweenFactorPose3(edge.first, edge.second, T_first_second, noise)
 
@@ -43,11 +46,8 @@ def fit(
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for node, pose in T.items():
         values.insert(node, gtsam.Pose3(pose))
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(huber_sigmas)
     for edge in edges:
-        noise = noise_of(edge.covariance)
-        robust = gtsam.noiseModel.Robust.Create(huber, noise) if edge.is_loop else noise
-        graph.add(factor_of(edge, robust))
+        graph.add(factor_of(edge, huber_sigmas if edge.is_loop else None))
     stays = gtsam.noiseModel.Isotropic.Sigma(6, _HELD_SIGMA)
     graph.add(gtsam.PriorFactorPose3(held, gtsam.Pose3(T[held]), stays))
     found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()

@@ -118,24 +118,23 @@ class RunGraph:
         self._search(chain, is_level=is_level)
         T_map_node = ends.placed(fixes, T_map_node)
         nodes = np.concatenate([self._loaded.T_map_node, T_map_node])
-        fixed = self._fix_edges(fixes, ends)
-        found = [edge.shifted(count) for edge in self._found.loops]
         # No cycle tells whether a place of the loaded map and a loop of the run agree.
-        agreeing = [found[index] for index in consistent(found, nodes, drift)]
-        used = [fixed[index] for index in consistent(fixed, nodes, drift)]
-        used += agreeing if len(agreeing) > 1 else []  # one alone is not believed
+        places = self._fix_edges(fixes, ends)
+        places = [places[index] for index in consistent(places, nodes, drift)]
+        loops = [edge.shifted(count) for edge in self._found.loops]
+        loops = [loops[index] for index in consistent(loops, nodes, drift)]
         solved = solve(
             nodes,
             [edge.shifted(count) for edge in motions],
-            used,
+            loops if len(loops) > 1 else [],  # one alone is not believed
             fixed=range(count),
             loose=count,
+            places=places,
             uprights=_uprights(chain, T_map_node, count),
         )
-        return SolvedRun(
-            T_map_node=solved.T_map_node[count:],
-            loops=tuple(used[index] for index in solved.accepted),
-        )
+        accepted = [place for place in places if fits(place, solved.T_map_node)]
+        accepted += [loops[index] for index in solved.accepted]
+        return SolvedRun(T_map_node=solved.T_map_node[count:], loops=tuple(accepted))
 
     def _agreeing(self) -> list[Edge]:
         """Return the loops that agree with each other; one alone is not believed."""
