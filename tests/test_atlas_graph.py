@@ -9,7 +9,7 @@ import pytest
 from planar_poses import transforms
 from test_atlas_limits import loop
 from test_atlas_maps import WALL, map_of
-from test_atlas_submaps import S, at, pitched, run_of
+from test_atlas_submaps import Known, S, at, collector, pitched, run_of
 
 import sceneslam.atlas
 from sceneslam.atlas.atlas import Atlas
@@ -17,7 +17,7 @@ from sceneslam.atlas.covariances import PosedPath, calibrated, covariances
 from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.atlas.places.localizer import Fix
 from sceneslam.atlas.submaps import run_graph
-from sceneslam.atlas.submaps.graph import Solved, consistent, fits, solve
+from sceneslam.atlas.submaps.graph import Solved, consistent, fits, on_floor, solve
 from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.atlas.uncertainty import WHEELS
@@ -55,8 +55,19 @@ class Given:
 
     def _solve(self, T_map_node, motions, loops, *, fixed, loose, places, uprights):
         self.motions, self.loops, self.uprights = motions, loops, uprights
+        self.start, self.places = T_map_node, places
         self.fixed, self.loose = list(fixed), loose
         return Solved(T_map_node=T_map_node, accepted=list(range(len(loops))))
+
+
+class Found:
+    """Loops by walls that are known."""
+
+    def __init__(self, loops):
+        self._loops = loops
+
+    def loops_to(self, query):
+        return [one for one in self._loops if one.second == query.second]
 
 
 def finished(count=18):
@@ -171,10 +182,11 @@ def test_nodes_begin_where_the_last_fix_before_each_puts_them(monkeypatch):
     given, own = Given(monkeypatch), finished()  # nodes at 0, 3 and 6 m
     fixes = [Fix(stamp_ns=1 * S, **there(0.5, 1.0)), Fix(stamp_ns=8 * S, **there(4.0, 2.0, 0.5))]
     solved(own, map_of(WALL), fixes=fixes, T_map_run=at(50.0))
-    off_m = [0.01 + y_m for y_m in (-0.02, -0.02)]  # poses are revised to the left
-    due = [at(0.0, 1.0 + off_m[0]), at(3.0, 1.0 + off_m[1])]
+    due = [at(0.0, 0.99), at(3.0, 0.99)]  # poses are revised by 0.01 m to the left
     due.append(at(4.0, 2.0, 0.5) @ se3.inverse(at(4.0, 0.01)) @ at(6.0))
-    np.testing.assert_allclose(given.nodes[1:], due, atol=1e-9)
+    np.testing.assert_allclose(given.start[1:], due, atol=1e-9)
+    by_motions = [at(50.0 + x_m) for x_m in (0.0, 3.0, 6.0)]
+    np.testing.assert_allclose(given.nodes[1:], by_motions, atol=1e-9)
 
 
 def test_a_place_of_the_loaded_map_is_not_compared_with_a_loop_of_the_run(monkeypatch):
@@ -206,6 +218,52 @@ def test_one_place_far_off_hardly_bends_a_run_that_was_found_at_others(off_m, mo
     assert [fits(place, found.T_map_node) for place in places] == [
         off_m == 0 or k != 4 for k in range(9)
     ]
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.5, 1.0, 3.0])
+def test_a_run_that_comes_back_keeps_its_loops_where_it_is_located_in_a_wrong_place(
+    monkeypatch, off_m
+):
+    def due(stamp_ns):
+        second = stamp_ns // S  # 30 m out, and back beside it
+        return at(0.5 * second) if second <= 60 else at(0.5 * (120 - second), 1.0)
+
+    own = collector(lambda ns: Known(T_map_base=due(ns), session=0, module="a", covariance=None))
+    for second in range(121):
+        own.step_to(due(second * S))
+        own.add(second * S, None)
+    own.finish()
+    nodes, sure = np.stack(own.chain.T_run_node), on_floor(np.diag([0.02, 0.02, 0.005]) ** 2)
+    half, xy_m = len(nodes) // 2, nodes[:, :2, 3]
+    loops = [
+        replace(
+            loop(
+                int(np.argmin(np.linalg.norm(xy_m[:half] - xy_m[second], axis=1))), second, [0] * 3
+            ),
+            covariance=sure,
+        )
+        for second in range(half + 3, len(nodes))
+    ]
+    loops = [
+        replace(one, T_first_second=se3.inverse(nodes[one.first]) @ nodes[one.second])
+        for one in loops
+    ]
+    monkeypatch.setattr(run_graph, "PlanLoops", lambda may_close: Found(loops))
+    fixes = [
+        Fix(
+            stamp_ns=second * S,
+            T_map_base=at(0.0, off_m if second > 100 else 0.0) @ due(second * S),
+            covariance=sure,
+        )
+        for second in range(1, 121, 2)
+    ]
+    loaded = map_of(*[WALL] * 11, nodes=[[3.0 * k, 0.0, 0.0] for k in range(11)])
+    graph = RunGraph(loaded, lambda session: False)
+    solution = graph.finish(own.chain, nodes, due, (), fixes, is_level=True)
+    assert sum(one.first >= 11 for one in solution.loops) >= len(loops) - 1
+    assert np.linalg.norm((solution.T_map_node - nodes)[:, :3, 3], axis=1).max() < 0.1
+    places = sum(one.first < 11 for one in solution.loops)
+    assert (places == len(nodes)) == (off_m == 0.0)
 
 
 def test_the_loaded_map_may_be_bent_by_what_its_own_path_drifts():

@@ -169,7 +169,7 @@ def test_a_robot_that_drove_a_round_may_be_off_by_what_drifts_on_all_of_it(monke
     assert own.compare([placed(6.0)]) is LocalizationEvent.FIXED
     own.rewind(6 * S, lambda stamp_ns: looks[0].T_run_base)
     own.compare([placed(7.0)])
-    assert scripted.window.half_m == pytest.approx(0.15 + 0.06 * 8.0)  # since the fix before it
+    assert scripted.window.half_m == pytest.approx(0.15 + 0.06 * 2.0)  # from where the first is now
 
 
 @pytest.mark.parametrize(

@@ -119,16 +119,24 @@ def test_the_plan_of_a_piece_is_that_of_its_submaps_the_newest_last():
 def test_a_robot_stands_on_the_floor_of_the_submap_that_begins_nearest():
     flat, other_piece = se3.identity(), se3.exp(np.array([9.0, 0.0, 2.0, 0.0, 0.0, 0.0]))
     ramp = se3.exp(np.array([10.0, 0.0, 2.0, 0.0, 0.0, 0.0])) @ se3.exp(PITCHED)
-    saved = replace(
-        map_of(*[WALL] * 3, pieces=[0, 0, 1]), T_map_node=np.stack([flat, ramp, other_piece])
-    )
+    nodes = [flat, flat, flat, ramp, other_piece]
+    saved = replace(map_of(*[WALL] * 5, pieces=[0, 0, 0, 0, 1]), T_map_node=np.stack(nodes))
     askew = se3.exp(np.array([0.0, 0.0, 1.4, 0.05, 0.02, 0.0]))
     here, there = (se3.from_xy_yaw(*xy_yaw) for xy_yaw in ((1.0, 2.0, 0.5), (9.0, 0.0, 0.2)))
     np.testing.assert_allclose(saved.standing(here), here, atol=1e-12)
     x_m, y_m, _ = planar.from_transform(there @ askew)
     stood = saved.standing(there @ askew)
     np.testing.assert_allclose(stood[:3, 2], ramp[:3, 2], atol=1e-12)  # upright on the ramp
-    np.testing.assert_allclose(stood[:3, 3], [x_m, y_m, 2.0 + 0.1 * (10.0 - x_m)], atol=0.01)
+    np.testing.assert_allclose(stood[:2, 3], [x_m, y_m], atol=1e-12)
+    assert stood[2, 3] == pytest.approx(2.0 + 0.1 * (10.0 - x_m), abs=0.01)
+
+
+def test_a_base_that_is_mounted_askew_stands_askew_whichever_way_it_looks():
+    pitched, back = se3.exp(PITCHED), se3.from_xy_yaw(4.0, 0.5, np.pi)
+    nodes = [se3.from_xy_yaw(2.5 * k, 0.0, 0.0) @ pitched for k in range(3)]
+    saved = replace(map_of(*[WALL] * 3), T_map_node=np.stack(nodes))
+    drifted = back @ pitched @ se3.exp(np.array([0.0, 0.0, 0.0, 0.02, 0.03, 0.0]))
+    np.testing.assert_allclose(saved.standing(drifted)[:3, 2], (back @ pitched)[:3, 2], atol=1e-3)
 
 
 # What is covered.

@@ -178,6 +178,7 @@ class OneMapExperiment:
                 for is_shared in (True, False)
             )
             name = f"story in the map of {self._mapped}, in {light}"
+            yield Figure.at_least(f"{name}: starts that share geometry", shared.count, 1)
             yield from self._judged(name, shared)
             yield Figure.at_most(f"{name}: elsewhere, found in a wrong place", others.wrong, 0)
             self._rows += [

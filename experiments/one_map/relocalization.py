@@ -79,8 +79,8 @@ def random_starts(
 class StoryStarts:
     """Starts at random instants of a story, in the map of another, with all that it measured.
 
-    Poses are those of the run, as reported then, seen from the start. Of starts that share geometry
-    with the map, the camera comes to where it sees what one of the map's views shows.
+    Poses are those of the run, as reported then, seen from the start. A start shares geometry with
+    the map if its camera comes to where it sees what a view of the map shows.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class StoryStarts:
     ) -> None:
         """Draw the starts. `due` returns the true T_map_base (4, 4) at a stamp [ns]."""
         self._saved, self._rig, self._due = saved, rig, due
-        seen = [saved.seen_from(node) for node in range(len(saved.submaps))]
+        seen = [saved.seen_from(node) for node in np.flatnonzero(saved.pieces == 0).tolist()]
         self._seen = np.concatenate(seen)
         self._within_ns = round(within_s * 1e9)
         self._poses = dict(zip(online.stamps_ns.tolist(), online.T_world_base, strict=True))

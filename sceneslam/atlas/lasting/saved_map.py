@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan, check_size, join
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.graphs.edge import Edge
-from sceneslam.types import planar
+from sceneslam.motion.tilt import upright
+from sceneslam.types import planar, se3
 from sceneslam.types.maps import PoseGraphLayer
 from sceneslam.types.planar import Planar
 from sceneslam.types.se3 import Transform
@@ -71,13 +72,19 @@ class SavedMap:
     def standing(self, T_map_base: Transform, piece: int = 0) -> Transform:
         """Return a pose (4, 4) with the height and tilt of a robot on the floor of a piece there.
 
-        That is the floor of the submap that begins nearest to it.
+        That is the floor of the submap that begins nearest to it. A base that is mounted askew has
+        the same tilt everywhere.
         """
+        up_base = np.median(self.T_map_node[self.pieces == piece, 2, :3], axis=0)
+        askew = upright(se3.identity(), up_base)
         T_map_node = self.T_map_node[self.nearest(T_map_base, piece)]
-        on_floor = planar.between(
-            planar.from_transform(T_map_node), planar.from_transform(T_map_base)
+        node, base = (
+            planar.from_transform(T @ se3.inverse(askew)) for T in (T_map_node, T_map_base)
         )
-        return np.asarray(T_map_node @ planar.to_transform(on_floor))
+        on_floor = planar.to_transform(planar.between(node, base))
+        stood = T_map_node @ se3.inverse(askew) @ on_floor @ askew
+        stood[:2, 3] = T_map_base[:2, 3]
+        return np.asarray(stood)
 
     def seen_from(self, node: int) -> NDArray[np.float64]:
         """Return the poses (N, 4, 4) in the map that the views of a submap were seen from."""

@@ -64,7 +64,9 @@ class Fix:
     T_map_base: Transform
     covariance: NDArray[np.float64]  # (6, 6) of se3.log order, base frame
     is_by_view: bool = False
-    way: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))  # of the run: m, rad
+    travelled: NDArray[np.float64] = field(
+        default_factory=lambda: np.zeros(2)
+    )  # until then: m, rad
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -97,7 +99,7 @@ class MapLocalizer:
         self._next_walls_ns = self._next_view_ns = 0
         self._fixed_at: Look | None = None
         self._seen: Look | None = None  # that was compared last
-        self._way = np.zeros(2)  # of the run up to there: m, rad
+        self._travelled = np.zeros(2)  # until then: m, rad
         self._guess: _Guess | None = None  # of the last search that found a place
         self._vain = self._doubts = 0
 
@@ -145,12 +147,13 @@ class MapLocalizer:
         T_run_base = None if fix is None else path(fix.stamp_ns)
         if fix is not None and T_run_base is not None:
             self._fixed_at = Look(stamp_ns=fix.stamp_ns, T_run_base=T_run_base)
+            self._seen, self._travelled = self._fixed_at, fix.travelled
             if self.T_map_run is not None:
                 self.T_map_run = fix.T_map_base @ se3.inverse(T_run_base)
 
     def _is_time(self, newest: Look, next_ns: int) -> bool:
         """Tell whether the time has come, and a located robot has moved since its last fix."""
-        fixed_at = self._fixed_at  # live, another thread may change it
+        fixed_at = self._fixed_at
         if newest.stamp_ns < next_ns or fixed_at is None or self.T_map_run is None:
             return newest.stamp_ns >= next_ns
         away = se3.inverse(fixed_at.T_run_base) @ newest.T_run_base
@@ -216,22 +219,22 @@ class MapLocalizer:
         return LocalizationEvent.WITHDRAWN
 
     def _drive(self, latest: Sequence[Look]) -> None:
-        """Add the way from the look that was compared last to the newest one."""
+        """Add the path from the look that was compared last to the newest one."""
         seen = latest[-1] if self._seen is None else self._seen
         newer = [look for look in latest if look.stamp_ns > seen.stamp_ns]
         for before, after in pairwise([seen, *newer]):
             step = se3.inverse(before.T_run_base) @ after.T_run_base
             moved = np.linalg.norm(step[:3, 3]), se3.rotation_angle_rad(step)
-            self._way = self._way + moved
+            self._travelled = self._travelled + moved
         self._seen = latest[-1]
 
     def _window(self, T_map_base: Transform) -> SearchWindow:
-        """Return how far around a pose (4, 4) the robot may be after its way since the last fix."""
-        way_m, turned_rad = self._way - self.fixes[-1].way
-        turn_rad = WHEELS.rad_per_m * way_m + WHEELS.rad_per_rad * turned_rad
+        """Return how far around a pose (4, 4) the robot may be, by its path since the last fix."""
+        path_m, turned_rad = self._travelled - self.fixes[-1].travelled
+        turn_rad = WHEELS.rad_per_m * path_m + WHEELS.rad_per_rad * turned_rad
         return SearchWindow(
             around=planar.from_transform(T_map_base),
-            half_m=float(_REACH_M + _SIGMAS * WHEELS.per_m * way_m),
+            half_m=float(_REACH_M + _SIGMAS * WHEELS.per_m * path_m),
             half_rad=float(_REACH_RAD + _SIGMAS * turn_rad),
         )
 
@@ -266,7 +269,7 @@ class MapLocalizer:
     def _take(self, newest: Look, fix: Fix) -> None:
         self.T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
         self._fixed_at = newest
-        self.fixes.append(replace(fix, way=self._way))
+        self.fixes.append(replace(fix, travelled=self._travelled))
         self._doubts = self._vain = 0
         self._next_walls_ns = self._next_view_ns = newest.stamp_ns + _FIX_NS
 

@@ -68,8 +68,8 @@ def solve(
     """Return the poses (N, 4, 4) that best fit the motions and the accepted loops.
 
     `fixed` nodes stay; `loose` has a weak prior, so that only a loop to a fixed node moves it.
-    `places` are such loops, of a run that was found there again and again: none is rejected, but
-    one that is far off weighs less. `uprights` hold roll and pitch.
+    `places` are such loops, of a run that was found there again and again: at the end none is
+    rejected, but one that is far off weighs less. `uprights` hold roll and pitch.
     Every node must be connected to one of these. The result is deterministic.
     """
     import gtsam
@@ -84,10 +84,8 @@ def solve(
     slack = gtsam.noiseModel.Diagonal.Sigmas((_LOOSE if len(fixed) else _FIXED)[TO_GTSAM])
     graph.add(gtsam.PriorFactorPose3(loose, poses[loose], slack))
     measured = gtsam.NonlinearFactorGraph(graph)
-    for edge in places:
-        graph.add(factor_of(edge))
     trusted = list(range(graph.size()))
-    for edge in loops:
+    for edge in (*loops, *places):
         graph.add(factor_of(edge))
     parameters = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
     parameters.setKnownInliers(trusted)
@@ -95,8 +93,8 @@ def solve(
     optimizer.setInlierCostThresholds(0.5 * _CHI2_6)
     result = optimizer.optimize()
     weights = np.asarray(optimizer.getWeights())[len(trusted) :]
-    accepted = np.flatnonzero(weights > 0.5).tolist()
-    if places:  # the optimizer takes the noise of trusted factors for normal
+    accepted = np.flatnonzero(weights[: len(loops)] > 0.5).tolist()
+    if places:
         for edge in places:
             measured.add(factor_of(edge, _HUBER_SIGMAS))
         for index in accepted:

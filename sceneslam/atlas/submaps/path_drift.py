@@ -51,12 +51,15 @@ class PathDrift:
 
     @classmethod
     def along(cls, motions: Sequence[Edge], count: int) -> PathDrift:
-        """Return that of `count` submaps, each reached from the one before it, if it was."""
+        """Return that of `count` submaps of any runs, by the motions from one to the next.
+
+        Each run begins with no drift; between two runs, differences tell little.
+        """
         rows = np.zeros((count, 2, 3))
         for motion in sorted(motions, key=lambda edge: edge.second):
             if not motion.is_loop and motion.second == motion.first + 1:
                 rows[motion.second] = summed(rows[motion.first], motion)
-        return cls.of(list(rows))
+        return cls(sums=rows)
 
     def after(self, others: PathDrift) -> PathDrift:
         """Return the drift of other submaps, and then of these."""

@@ -106,7 +106,7 @@ class RunGraph:
         *,
         is_level: bool,
     ) -> SolvedRun:
-        """Solve the whole graph, from the initial nodes (N, 4, 4) of the run.
+        """Solve the whole graph; `T_map_node` (N, 4, 4) are the run's nodes by its motions alone.
 
         `path` are the poses as revised by the modules, `maps` theirs, with their own loops, `fixes`
         the places where the run was located in the loaded map.
@@ -116,15 +116,16 @@ class RunGraph:
         drift = PathDrift.of(chain.drift).after(PathDrift.along(self._loaded.edges, count))
         self._place(chain)
         self._search(chain, is_level=is_level)
-        T_map_node = ends.placed(fixes, T_map_node)
+        # The motions alone tell what agrees. No cycle tells it of a place of the loaded map and a
+        # loop of the run.
         nodes = np.concatenate([self._loaded.T_map_node, T_map_node])
-        # No cycle tells whether a place of the loaded map and a loop of the run agree.
         places = self._fix_edges(fixes, ends)
         places = [places[index] for index in consistent(places, nodes, drift)]
         loops = [edge.shifted(count) for edge in self._found.loops]
         loops = [loops[index] for index in consistent(loops, nodes, drift)]
+        T_map_node = ends.placed(fixes, T_map_node)
         solved = solve(
-            nodes,
+            np.concatenate([self._loaded.T_map_node, T_map_node]),
             [edge.shifted(count) for edge in motions],
             loops if len(loops) > 1 else [],  # one alone is not believed
             fixed=range(count),
@@ -213,7 +214,7 @@ class RunGraph:
 
 
 class _Ends:
-    """Finds the submap of a stamp, and base in it."""
+    """Finds the submap of a stamp and base in it, and where fixes put the submaps."""
 
     def __init__(self, chain: Chain, path: Path) -> None:
         self._chain, self._path = chain, path
