@@ -15,7 +15,7 @@ from sceneslam.atlas.submaps.collector import Known
 from sceneslam.atlas.submaps.graph import LOADED
 from sceneslam.experiments.one_map.drive import RIG
 from sceneslam.graphs.edge import EdgeKind
-from sceneslam.types import planar
+from sceneslam.types import planar, se3
 from sceneslam.types.observation import LaserScan, Observation
 
 HERE = planar.to_transform(np.array([1.0, 2.0, 0.5]))
@@ -26,10 +26,14 @@ class Searched:
     """A localizer that answers as it is told."""
 
     def __init__(self, monkeypatch):
-        monkeypatch.setattr(mapper_of, "MapLocalizer", lambda *_, **__: self)
+        monkeypatch.setattr(mapper_of, "MapLocalizer", self._made)
         self.wants_view = lambda look: False
         self.T_map_run, self.fixes, self.is_late = None, [], False
         self.answer, self.asked = LocalizationEvent.NOTHING, []
+
+    def _made(self, plan, views, *, standing):
+        self.standing = standing
+        return self
 
     def is_due(self, look):
         return not self.is_late
@@ -87,6 +91,13 @@ def test_a_robot_at_rest_searches_once_a_second_until_it_was_located(monkeypatch
     np.testing.assert_array_equal(own.T_map_run, HERE)
     observe(9.0)
     assert len(searched.asked) == 4
+
+
+def test_a_located_run_stands_on_the_floor_of_the_loaded_map(monkeypatch):
+    searched = Searched(monkeypatch)
+    looking()
+    sunk = HERE @ se3.exp(np.array([0.0, 0.0, -0.3, 0.1, 0.0, 0.0]))
+    np.testing.assert_allclose(searched.standing(sunk)[2], [0.0, 0.0, 1.0, 0.0], atol=1e-12)
 
 
 def test_a_run_tells_once_after_five_seconds_that_it_was_not_located(monkeypatch):

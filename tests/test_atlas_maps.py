@@ -247,6 +247,14 @@ def test_a_piece_is_joined_where_two_of_its_submaps_agree(monkeypatch):
     assert around == [[0, 1], [-1, 0, 1], [-1, 0]]
 
 
+@pytest.mark.parametrize(("variance", "joined"), [(1e-6, 0), (0.04, 1)])
+def test_a_piece_is_joined_that_its_own_path_may_have_bent(monkeypatch, variance, joined):
+    saved = two_pieces()
+    edges = [replace(one, covariance=variance * np.eye(6)) for one in saved.edges]
+    Found(monkeypatch, [at(9.0, 5.0), None, at(9.0, 7.3)])
+    assert join_pieces(replace(saved, edges=tuple(edges))).joined == joined
+
+
 @pytest.mark.parametrize(
     "answers",
     [
