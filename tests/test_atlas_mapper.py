@@ -182,6 +182,32 @@ def test_loops_lead_between_the_first_poses_of_submaps_or_from_the_loaded_map(mo
     np.testing.assert_allclose(found[1].T_first_second, planar.to_transform(np.array([1.0, 0, 0])))
 
 
+def test_a_submap_stays_where_the_run_was_located_then(monkeypatch):
+    searched = Searched(monkeypatch)
+    own, _, observe = looking(speed_m_s=1.0)  # a submap every 3 m
+    searched.answer, searched.T_map_run = LocalizationEvent.FOUND, HERE
+    for second in range(8):
+        observe(second)
+    first = own.take_correction()
+    assert len(first.stamps_ns) == len(own.saved().submaps) - 1 >= 2
+    np.testing.assert_array_equal(first.T_new_old, [HERE] * len(first.stamps_ns))
+    searched.answer, searched.T_map_run = LocalizationEvent.FIXED, ASIDE
+    for second in range(8, 14):
+        observe(second)
+    second = own.take_correction()
+    old = len(first.stamps_ns)
+    assert len(second.stamps_ns) > old
+    np.testing.assert_array_equal(second.T_new_old[:old], [HERE] * old)
+    np.testing.assert_array_equal(second.T_new_old[old:], [ASIDE] * (len(second.stamps_ns) - old))
+    nodes = own.saved().T_map_node[1:]
+    np.testing.assert_allclose(nodes[0], HERE, atol=1e-12)
+    np.testing.assert_allclose(nodes[-1][:2, :2], ASIDE[:2, :2], atol=1e-12)
+    searched.answer, searched.T_map_run = LocalizationEvent.FOUND, HERE
+    observe(14)
+    found = own.take_correction()
+    np.testing.assert_array_equal(found.T_new_old, [HERE] * len(found.stamps_ns))
+
+
 @pytest.mark.parametrize("is_placed", [True, False])
 def test_a_located_run_is_corrected_into_the_loaded_map(monkeypatch, is_placed):
     searched = Searched(monkeypatch)

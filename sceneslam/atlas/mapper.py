@@ -77,6 +77,7 @@ class Mapper:
         self._rewound_ns: int | None = None  # looks from here on have poses that were replaced
         self._is_level = True  # at the last step
         self._T_map_run: Transform | None = None
+        self._T_map_runs: list[Transform] = []  # per submap, as it was while that was the newest
         self._began_ns: int | None = None
         self._has_told = False
         self._has_refused = False  # a measurement
@@ -121,7 +122,7 @@ class Mapper:
         chain = self._collector.chain
         if self.is_placed or not self._solved.loops:
             stamps_ns = [submap.stamps_ns[0] for submap in chain.submaps] or [0]
-            T_new_old = np.tile(self.T_map_run, (len(stamps_ns), 1, 1))
+            T_new_old = np.array(self._located(len(stamps_ns)))
         else:
             nodes = self._solved.T_map_node
             stamps_ns = [submap.stamps_ns[0] for submap in chain.submaps[: len(nodes)]]
@@ -227,10 +228,11 @@ class Mapper:
         count, pieces = len(self._loaded.submaps), self._loaded.pieces
         own = self._collector.chain
         nodes = [*self._known_nodes()]
-        T_map_run = self.T_map_run
+        T_map_runs = self._located(len(own.T_run_node))
         if nodes:
-            T_map_run = nodes[-1] @ se3.inverse(own.T_run_node[len(nodes) - 1])
-        nodes += [T_map_run @ T for T in own.T_run_node[len(nodes) :]]
+            T_map_runs = [nodes[-1] @ se3.inverse(own.T_run_node[len(nodes) - 1])] * len(T_map_runs)
+        later = list(zip(T_map_runs, own.T_run_node, strict=True))[len(nodes) :]
+        nodes += [T_map_run @ T_run_node for T_map_run, T_run_node in later]
         piece = 0 if self.is_found else int(pieces.max(initial=-1)) + 1
         return SavedMap(
             submaps=(*self._loaded.submaps, *own.submaps),
@@ -242,6 +244,12 @@ class Mapper:
                 *self._solved.loops,
             ),
         )
+
+    def _located(self, count: int) -> list[Transform]:
+        """Return T_map_run (4, 4) of each of `count` submaps; that of the newest is today's."""
+        del self._T_map_runs[max(count - 1, 0) :]
+        self._T_map_runs += [self.T_map_run] * (count - len(self._T_map_runs))
+        return self._T_map_runs
 
     # During the run.
 
@@ -367,6 +375,8 @@ class Mapper:
         assert self._began_ns is not None
         after_s = (stamp_ns - self._began_ns) / 1e9
         self._follow(localizer)
+        if outcome in (LocalizationEvent.FOUND, LocalizationEvent.WITHDRAWN):
+            self._T_map_runs.clear()
         if outcome is LocalizationEvent.FOUND:
             self.was_found = True
             self._note(outcome.value, stamp_ns, after_s=after_s, T_map_run=self.T_map_run.tolist())
