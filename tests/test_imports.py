@@ -37,6 +37,7 @@ ALLOWED = {  # package -> what of ours it may import
         "types",
         "config",
         "scans",
+        "views",
         "evaluation",
         "atlas",
         "testing",

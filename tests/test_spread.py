@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sceneslam.spread import spread
+from sceneslam.types.spread import spread
 
 
 def test_gross_errors_do_not_widen_the_spread():

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.spread import spread
+from sceneslam.types.spread import spread
 
 _DARK = 128.0  # grey level of the brightest per cent of the pixels
 _SMOOTH_PX = 1.0  # standard deviation of the filter ...

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.spread import spread
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
+from sceneslam.types.spread import spread
 from sceneslam.views.placed_views import (
     FLOOR,
     MATCHES_MIN,

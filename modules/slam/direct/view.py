@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.spread import spread
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
+from sceneslam.types.spread import spread
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]

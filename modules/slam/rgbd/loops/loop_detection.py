@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.graphs.edge import Edge, EdgeKind
-from sceneslam.spread import spread
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
+from sceneslam.types.spread import spread
 
 from ..locate.recognition import PlaceRecognizer, Recognition
 from ..map.keyframes import motion_between
