@@ -228,11 +228,12 @@ class Mapper:
         count, pieces = len(self._loaded.submaps), self._loaded.pieces
         own = self._collector.chain
         nodes = [*self._known_nodes()]
-        T_map_runs = self._located(len(own.T_run_node))
         if nodes:
-            T_map_runs = [nodes[-1] @ se3.inverse(own.T_run_node[len(nodes) - 1])] * len(T_map_runs)
-        later = list(zip(T_map_runs, own.T_run_node, strict=True))[len(nodes) :]
-        nodes += [T_map_run @ T_run_node for T_map_run, T_run_node in later]
+            T_map_run = nodes[-1] @ se3.inverse(own.T_run_node[len(nodes) - 1])
+            nodes += [T_map_run @ T_run_node for T_run_node in own.T_run_node[len(nodes) :]]
+        else:
+            located = zip(self._located(len(own)), own.T_run_node, strict=True)
+            nodes = [T_map_run @ T_run_node for T_map_run, T_run_node in located]
         piece = 0 if self.is_found else int(pieces.max(initial=-1)) + 1
         return SavedMap(
             submaps=(*self._loaded.submaps, *own.submaps),
