@@ -11,12 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from statistics import median
 from time import perf_counter_ns
 
 import numpy as np
-import yaml
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.bus.bus import Bus, BusMachine
@@ -24,6 +22,7 @@ from sceneslam.bus.events import EventLog
 from sceneslam.bus.gate import GateSettings
 from sceneslam.bus.pace import PaceSettings
 from sceneslam.bus.policy import Policy
+from sceneslam.experiments.scripts import settings
 from sceneslam.modules.slam.odometry import Odometry
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, SceneVote
@@ -53,11 +52,10 @@ class OneScene:
 
 def policy(*, gate: bool, buffer: bool) -> Policy:
     """Return the shipped policy, with or without its gate and its buffer."""
-    path = Path(__file__).resolve().parents[1] / "conf" / "policy" / "default.yaml"
-    values = yaml.safe_load(path.read_text())
-    settings, pace = values.pop("gate"), values.pop("catch_up")
-    del values["_target_"], settings["_target_"], pace["_target_"]
-    judge = GateSettings(**settings) if gate else None
+    values = settings("policy/default.yaml")
+    limits, pace = values.pop("gate"), values.pop("catch_up")
+    del limits["_target_"], pace["_target_"]
+    judge = GateSettings(**limits) if gate else None
     shipped = Policy(**values, gate=judge, catch_up=PaceSettings(**pace))
     return shipped if buffer else replace(shipped, buffer_s=0.0)
 

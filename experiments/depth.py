@@ -19,15 +19,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 
 from sceneslam.evaluation.accuracy import absolute_errors
+from sceneslam.experiments.scripts import settings
 from sceneslam.modules.slam.depth.module import DepthSlam
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types.observation import Observation
 from sceneslam.types.trajectory import Trajectory
 
-SETTINGS = Path(__file__).resolve().parents[1] / "conf" / "slam" / "depth.yaml"
 KINECT_7SCENES = {"fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0}
 COLUMNS = (
     "recording, frames",
@@ -88,9 +87,7 @@ def errors(poses: Trajectory, truth: Trajectory, play: Play) -> tuple[float, flo
 
 def row(folder: Path, source: TumRgbd, observations: Sequence[Observation], play: Play) -> str:
     """Return one line of the table."""
-    settings = yaml.safe_load(SETTINGS.read_text())
-    settings.pop("_target_")
-    module = DepthSlam(**settings)
+    module = DepthSlam(**settings("slam/depth.yaml"))
     module.activate(source.rig)
     told, spent_ms = [], []
     for observation in arranged(observations, play):

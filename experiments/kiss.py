@@ -14,33 +14,24 @@ import pstats
 import time
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from kiss_icp.kiss_icp import KissICP
 from kiss_icp.mapping import VoxelHashMap
 from kiss_icp.registration import Registration
 
 from sceneslam.evaluation.accuracy import absolute_errors
+from sceneslam.experiments.scripts import settings
 from sceneslam.modules.slam.kiss_icp import KissIcp
 from sceneslam.sources.kitti import Kitti
 from sceneslam.types.trajectory import Trajectory
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
 LIBRARY = (
     (KissICP, "voxelize"),
     (Registration, "align_points_to_map"),
     (VoxelHashMap, "update"),
 )
-
-
-def settings(name: str) -> dict[str, Any]:
-    """Return a component's arguments from its YAML."""
-    values: dict[str, Any] = yaml.safe_load((CONF / name).read_text())
-    del values["_target_"]
-    return values
 
 
 def timed(function: Callable[..., Any], spent_s: list[float]) -> Callable[..., Any]:

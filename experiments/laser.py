@@ -27,6 +27,7 @@ import yaml
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.evaluation.relations import Relations, motion_errors, relation_errors
+from sceneslam.experiments.scripts import CONF, settings
 from sceneslam.modules.slam.laser.module import LaserSlam
 from sceneslam.sources.carmen import Carmen
 from sceneslam.sources.spoilt_odometry import SpoiltOdometry
@@ -36,17 +37,9 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.trajectory import Trajectory
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
 PIECE = 300  # scans, each piece begins anew
 CAP_M, LOST_M = 1.0, 0.25  # an error counts at most so much; a relation is lost with more
 HEAD = "| run | trans [m] | rot [deg] | online: trans, rot | x real time | ms: median, p99, max |"
-
-
-def settings(path: str) -> dict[str, object]:
-    """Return a component's values."""
-    values: dict[str, object] = yaml.safe_load((CONF / path).read_text())
-    values.pop("_target_")
-    return values
 
 
 def by_wheels(observations: list[Observation]) -> Trajectory:

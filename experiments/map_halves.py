@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -19,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from sceneslam.evaluation.accuracy import absolute_errors
+from sceneslam.experiments.scripts import run
 from sceneslam.types.trajectory import Trajectory
 
 GAP_S = 0.01  # between a pose and its truth
@@ -40,13 +40,11 @@ def halved(folder: Path, into: Path) -> list[Path]:
     return halves
 
 
-def run(recording: Path, overrides: list[str], into: Path) -> Path:
+def follow(recording: Path, overrides: list[str], into: Path) -> Path:
     """Run a module alone over a recording; return the folder of the run."""
-    command = [sys.executable, "-m", "sceneslam", "+scenario=single", "slam@slam.only=rgbd"]
-    command += ["source=tum_rgbd", f"source.path={recording}", *overrides]
-    command += [f"hydra.run.dir={into}", "run.report=false", "run.progress=false"]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    return into
+    alone = ["+scenario=single", "slam@slam.only=rgbd", "source=tum_rgbd"]
+    quietly = ["run.report=false", "run.progress=false"]
+    return run(into, *alone, f"source.path={recording}", *overrides, *quietly)
 
 
 def main() -> None:
@@ -57,9 +55,9 @@ def main() -> None:
         first, second = halved(folder, work)
         saved = work / "map"
         runs = [
-            run(first, [*overrides, f"atlas.save={saved}"], work / "first"),
-            run(second, [*overrides, f"atlas.load={saved}"], work / "second"),
-            run(folder, overrides, work / "whole"),
+            follow(first, [*overrides, f"atlas.save={saved}"], work / "first"),
+            follow(second, [*overrides, f"atlas.load={saved}"], work / "second"),
+            follow(folder, overrides, work / "whole"),
         ]
         truth = Trajectory.read_tum(runs[2] / "groundtruth.tum")
         parts = [Trajectory.read_tum(one / "trajectory.tum") for one in runs]

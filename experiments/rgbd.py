@@ -18,22 +18,20 @@ import pstats
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
 from time import perf_counter, process_time, sleep
 
 import cv2
 import numpy as np
-import yaml
 
 from sceneslam.evaluation.accuracy import absolute_errors
+from sceneslam.experiments.scripts import settings
 from sceneslam.modules.slam.rgbd.module import RgbdSlam
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig
 from sceneslam.types.trajectory import Trajectory
 
-CONF = Path(__file__).resolve().parents[1] / "conf" / "slam" / "rgbd.yaml"
 COUNTS = (700, 940, 970, 1030, 1060, 1500)
 GAP_S = 0.01  # between a pose and its truth
 HEAD = (
@@ -77,9 +75,8 @@ def follow(
     **changes,
 ) -> Run:
     """Run the module over observations, of which one comes every period at most."""
-    settings = yaml.safe_load(CONF.read_text()) | {"seed": 0, "is_repeatable": True} | changes
-    del settings["_target_"]
-    module = RgbdSlam(**settings)
+    shipped = settings("slam/rgbd.yaml") | {"seed": 0, "is_repeatable": True}
+    module = RgbdSlam(**(shipped | changes))
     module.activate(rig)
     side_cpu_s = children_cpu_s()
     answers, cpu_ms, wall_ms = [], [], []

@@ -12,21 +12,19 @@ The result is a Markdown table; runs are kept below `outputs/switched_or_alone`.
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+
+from sceneslam.experiments.scripts import run
 
 FOLDER = Path("outputs/switched_or_alone")
 COLUMNS = ("run", "ATE RMSE [m]", "max [m]", "coverage", "correct rate", "x real time")
 
 
-def run(name: str, *overrides: str) -> dict[str, Any]:
-    """Run SceneSLAM and return its metrics; the run's own lines go to standard error."""
-    folder = FOLDER / name
-    command = [sys.executable, "-m", "sceneslam", *overrides, f"hydra.run.dir={folder}"]
-    print(" ".join(command[1:]), file=sys.stderr)
-    subprocess.run(command, stdout=sys.stderr, check=True)
+def measured(name: str, *overrides: str) -> dict[str, Any]:
+    """Run SceneSLAM and return its metrics."""
+    folder = run(FOLDER / name, *overrides)
     metrics: dict[str, Any] = json.loads((folder / "metrics.json").read_text())
     return metrics
 
@@ -46,12 +44,12 @@ def main() -> None:
     source = [word for word in sys.argv[1:] if not word.startswith("dark=")]
     single = ("+scenario=single", *source)
     table = {
-        f"switched: rgbd, then {dark}": run(
+        f"switched: rgbd, then {dark}": measured(
             "switched", "+scenario=bright_to_dark", f"slam@slam.dark={dark}", *source
         ),
-        "rgbd alone": run("rgbd", *single, "slam@slam.only=rgbd"),
-        f"{dark} alone": run(dark, *single, f"slam@slam.only={dark}"),
-        "rgbd alone, all lights on": run("lit", *single, "slam@slam.only=rgbd", "lights=on"),
+        "rgbd alone": measured("rgbd", *single, "slam@slam.only=rgbd"),
+        f"{dark} alone": measured(dark, *single, f"slam@slam.only={dark}"),
+        "rgbd alone, all lights on": measured("lit", *single, "slam@slam.only=rgbd", "lights=on"),
     }
     print("| " + " | ".join(COLUMNS) + " |")
     print("|---" * len(COLUMNS) + "|")

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
 import sys
 import tempfile
 from collections import Counter
@@ -22,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.evaluation.association import interpolated
+from sceneslam.experiments.scripts import run
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
 
@@ -30,13 +30,10 @@ HEAD = "first seed", "second seed", "in the map [mm]", "95 % [mm]", "largest [mm
 HEAD += "on the way [mm]", "ATE in the map [mm]", "ATE alone [mm]", "located", "withdrawn"
 
 
-def run(seed: str, overrides: list[str], into: Path) -> Path:
+def drive(seed: str, overrides: list[str], into: Path) -> Path:
     """Run a tour; return the folder of the run."""
-    command = [sys.executable, "-m", "sceneslam", "+scenario=office_tour", f"seed={seed}"]
-    command += ["source.camera.size_wh=[320,240]", *overrides, f"hydra.run.dir={into}"]
-    command += ["run.report=false", "run.progress=false"]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    return into
+    tour = ["+scenario=office_tour", f"seed={seed}", "source.camera.size_wh=[320,240]"]
+    return run(into, *tour, *overrides, "run.report=false", "run.progress=false")
 
 
 def off_m(first: Path, second: Path, name: str) -> NDArray[np.float64]:
@@ -72,9 +69,9 @@ def main() -> None:
     first_seed, second_seed = sys.argv[1:]
     with tempfile.TemporaryDirectory() as scratch:
         work = Path(scratch)
-        first = run(first_seed, [f"atlas.save={work / 'map'}"], work / "first")
-        second = run(second_seed, [f"atlas.load={work / 'map'}"], work / "second")
-        alone = run(second_seed, [], work / "alone")
+        first = drive(first_seed, [f"atlas.save={work / 'map'}"], work / "first")
+        second = drive(second_seed, [f"atlas.load={work / 'map'}"], work / "second")
+        alone = drive(second_seed, [], work / "alone")
         errors_m, online_m = (
             off_m(first, second, name) for name in ("trajectory", "trajectory_online")
         )
