@@ -32,7 +32,9 @@ ATLAS = "sceneslam.atlas.atlas.Atlas"
 def whole_map():
     nodes = [[0.0, 0.0, 0.0], [1.0, 2.0, 0.5]]
     plans = plan_of("#..", " .#"), plan_of("#")
-    return map_of(*plans, nodes=nodes, pieces=[0, 2], runs=[0, 1], edges=[edge(0, 1)])
+    saved = map_of(*plans, nodes=nodes, pieces=[0, 2], runs=[0, 1], edges=[edge(0, 1)])
+    first, second = saved.submaps
+    return replace(saved, submaps=(replace(first, up=np.array([0.0, 0.6, 0.8])), second))
 
 
 def test_a_map_is_loaded_as_it_was_saved(tmp_path):
@@ -46,6 +48,7 @@ def test_a_map_is_loaded_as_it_was_saved(tmp_path):
         assert (one.run, one.session, one.module) == (other.run, other.session, other.module)
         np.testing.assert_array_equal(one.stamps_ns, other.stamps_ns)
         np.testing.assert_array_equal(one.T_submap_base, other.T_submap_base)
+        np.testing.assert_array_equal(one.up, other.up)
         for name in ("points", "normals", "free", "origin_xy_m"):
             np.testing.assert_array_equal(getattr(one.plan, name), getattr(other.plan, name))
     np.testing.assert_array_equal(found.T_map_node, saved.T_map_node)
@@ -104,9 +107,9 @@ def test_arrays_that_do_not_fit_together_are_named(tmp_path, name, value, said):
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("version", 0, "a map of version 0, only version 2 is known"),
-        ("version", "2", "a map of version '2', only version 2 is known"),
-        ("version", 3, "a map of version 3, a newer SceneSLAM wrote it"),
+        ("version", 0, "a map of version 0, only versions 2 and 3 are known"),
+        ("version", "3", "a map of version '3', only versions 2 and 3 are known"),
+        ("version", 4, "a map of version 4, a newer SceneSLAM wrote it"),
         ("sha256", None, "sha256: missing, the map's map.yaml is not complete"),
         ("cell_m", 0.1, "cell_m: got 0.1, allowed: 0.05"),
         ("modules", "ab", "modules: expected the names"),
@@ -123,6 +126,13 @@ def test_a_head_that_does_not_fit_is_named(tmp_path, key, value, said):
         load_map_files(path.parent)
     with pytest.raises(InputError, match="there is no map, the folder is missing"):
         load_map_files(tmp_path / "none")
+
+
+def test_a_map_of_version_2_is_loaded_which_does_not_know_what_is_up(tmp_path):
+    with_arrays(tmp_path, lambda arrays: arrays.pop("node_up"))
+    head = (tmp_path / HEAD).read_text()
+    (tmp_path / HEAD).write_text(head.replace("version: 3", "version: 2"))
+    assert [submap.up for submap in load_map_files(tmp_path).submaps] == [None, None]
 
 
 @pytest.mark.parametrize(
@@ -199,12 +209,12 @@ def test_a_place_where_no_map_can_be_is_named_before_the_run(tmp_path, path):
             LastingMap(**given, mode="extend", save_every_s=1.0)
 
 
-@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("version", [3, 4])
 def test_a_map_that_another_run_saved_is_kept(tmp_path, version):
     old, new = whole_map(), map_of(WALL)
     first = save_map_files(old, tmp_path)
     head = (tmp_path / HEAD).read_text()
-    (tmp_path / HEAD).write_text(head.replace("version: 2", f"version: {version}"))
+    (tmp_path / HEAD).write_text(head.replace("version: 3", f"version: {version}"))
     assert save_map_files(new, tmp_path).displaced == first.seal
     assert first.displaced is None and f"version: {version}" in (tmp_path / OLD).read_text()
     (tmp_path / OLD).write_text(head)

@@ -182,6 +182,18 @@ def test_loops_lead_between_the_first_poses_of_submaps_or_from_the_loaded_map(mo
     np.testing.assert_allclose(found[1].T_first_second, planar.to_transform(np.array([1.0, 0, 0])))
 
 
+def test_a_map_is_saved_as_the_graph_moved_it_with_the_loops_that_modules_closed(monkeypatch):
+    Searched(monkeypatch)
+    own, _, observe = looking(speed_m_s=1.0)
+    for second in range(20):
+        observe(second)
+    own_loops, moved = (edge(1, 5, kind=EdgeKind.LOOP),), np.array([ASIDE])
+    own._solved = replace(own._solved, T_map_loaded=moved, own_loops=own_loops)
+    saved = own.saved()
+    np.testing.assert_array_equal(saved.T_map_node[0], ASIDE)
+    assert saved.edges[-1] == own_loops[0] and len(saved.edges) == len(saved.submaps) - 1
+
+
 def test_a_submap_stays_where_the_run_was_located_then(monkeypatch):
     searched = Searched(monkeypatch)
     own, _, observe = looking(speed_m_s=1.0)  # a submap every 3 m

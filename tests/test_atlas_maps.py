@@ -247,6 +247,20 @@ def test_a_piece_is_joined_where_two_of_its_submaps_agree(monkeypatch):
     assert around == [[0, 1], [-1, 0, 1], [-1, 0]]
 
 
+def test_a_piece_straightens_the_one_that_it_is_joined_to(monkeypatch):
+    rough = replace(edge(0, 1, (10.0, 0.0, 0.0)), covariance=0.04 * np.eye(6))
+    saved = map_of(
+        *[WALL] * 4,
+        nodes=[[0, 0, 0], [10, 0, 0], [0, 0, 0], [9.6, 0, 0]],
+        pieces=[0, 0, 1, 1],
+        runs=[0, 0, 1, 1],
+        edges=[rough, edge(2, 3, (9.6, 0.0, 0.0))],
+    )
+    Found(monkeypatch, [quality(at=(x_m, 0.0, 0.0), weak=0) for x_m in (0.0, 10.0)])
+    along = join_pieces(saved).map.plane[:, 0]
+    np.testing.assert_allclose(along, [0.0, 9.6, 0.0, 9.6], atol=0.02)
+
+
 @pytest.mark.parametrize(("variance", "joined"), [(1e-6, 0), (0.04, 1)])
 def test_a_piece_is_joined_that_its_own_path_may_have_bent(monkeypatch, variance, joined):
     saved = two_pieces()

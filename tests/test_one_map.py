@@ -117,7 +117,7 @@ def edge_of(first, second, T_first_second, sigma, kind=EdgeKind.LOOP):
 
 def solved(nodes, motions, loops):
     """The solution of a planar graph, and its poses in the plane."""
-    result = solve(transforms(nodes), motions, loops, fixed=(), loose=0)
+    result = solve(transforms(nodes), motions, loops, fixed=(), loose=[0])
     return result, planar.from_transforms(result.T_map_node)
 
 

@@ -91,6 +91,7 @@ class Atlas:
             note=note,
             is_closed=self._closes_loops,
             loaded=loaded,
+            moves_loaded=self._lasting.saves,
             keeps_views=is_looking or self._lasting.saves,
             is_live=is_live,
         )

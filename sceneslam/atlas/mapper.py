@@ -58,12 +58,13 @@ class Mapper:
         loaded: SavedMap | None = None,
         is_closed: Callable[[int], bool] = lambda session: False,
         keeps_views: bool = False,
+        moves_loaded: bool = False,
         is_live: bool = False,
     ) -> None:
         """Begin. `keeps_views`: submaps hold what the camera sees, by which places are recognized.
 
-        `is_closed` tells in which sessions modules close loops themselves. `is_live`: searches run
-        in another thread.
+        `is_closed` tells in which sessions modules close loops themselves. `moves_loaded`: at the
+        end the loaded map is optimised, too. `is_live`: searches run in another thread.
         """
         self._loaded = loaded if loaded is not None else empty_map()
         self._scanner, self._known, self._note = KeyScanner(rig), known, note
@@ -83,7 +84,9 @@ class Mapper:
         self._has_refused = False  # a measurement
         self.faults: list[str] = []
         self.was_found = False  # the run was located in the loaded map, at any time
-        self._graph: RunGraph | None = RunGraph(self._loaded, is_closed)  # None once it failed
+        self._graph: RunGraph | None = RunGraph(
+            self._loaded, is_closed, moves_loaded=moves_loaded
+        )  # None once it failed
         self._solving: tuple[Chain, Future[SolvedRun]] | None = None
         self._kept = 0  # submaps that are as they were given to the graph
         self._solved = SolvedRun.nothing()
@@ -206,7 +209,7 @@ class Mapper:
             self._solved = self._last_solved(start)
         self._is_over = True
         self._tell_loops()
-        if not (self._solved.loops or chain.up_node or self.is_placed):
+        if not (self._solved.loops or chain.is_upright or self.is_placed):
             return Correction.none()
         return Correction(
             stamps_ns=np.array([submap.stamps_ns[0] for submap in chain.submaps], np.int64),
@@ -226,7 +229,8 @@ class Mapper:
     def saved(self) -> SavedMap:
         """Return the loaded map with this run in it: a separate piece if it was not located."""
         count, pieces = len(self._loaded.submaps), self._loaded.pieces
-        own = self._collector.chain
+        own, loaded = self._collector.chain, self._solved.T_map_loaded
+        loaded = self._loaded.T_map_node if loaded is None else loaded
         nodes = [*self._known_nodes()]
         if nodes:
             T_map_run = nodes[-1] @ se3.inverse(own.T_run_node[len(nodes) - 1])
@@ -237,11 +241,12 @@ class Mapper:
         piece = 0 if self.is_found else int(pieces.max(initial=-1)) + 1
         return SavedMap(
             submaps=(*self._loaded.submaps, *own.submaps),
-            T_map_node=np.concatenate([self._loaded.T_map_node, np.reshape(nodes, (-1, 4, 4))]),
+            T_map_node=np.concatenate([loaded, np.reshape(nodes, (-1, 4, 4))]),
             pieces=np.concatenate([pieces, np.full(len(own.submaps), piece, np.int64)]),
             edges=(
                 *self._loaded.edges,
                 *(edge.shifted(count) for edge in own.motions),
+                *self._solved.own_loops,
                 *self._solved.loops,
             ),
         )

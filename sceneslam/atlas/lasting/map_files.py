@@ -31,7 +31,8 @@ from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.files import PART, whole
 from sceneslam.views.view import Landmarks, PlacedView
 
-HEAD, FORMAT, VERSION = "map.yaml", "sceneslam-map", 2
+HEAD, FORMAT, VERSION = "map.yaml", "sceneslam-map", 3
+_WITHOUT_UP = 2  # the version before, which has no `node_up`
 OLD = "map.old.yaml"  # the head of a map that another one took the place of
 _FAR_M = 1e5  # no building is so large
 _ROUNDING = 1e-6  # of a rotation that was composed of many
@@ -42,6 +43,7 @@ _SHAPES: Mapping[str, tuple[str, str, tuple[int, ...]]] = {  # name -> dtype, ro
     "node_module": ("<i8", "submaps", ()),
     "node_piece": ("<i8", "submaps", ()),
     "node_pose": ("<f8", "submaps", (4, 4)),
+    "node_up": ("<f8", "submaps", (3,)),
     "node_scans": ("<i8", "submaps", ()),
     "node_points": ("<i8", "submaps", ()),
     "node_views": ("<i8", "submaps", ()),
@@ -189,6 +191,8 @@ def read_map_files(folder: Path) -> tuple[SavedMap, str]:
             arrays = {name: file[name] for name in file.files}
     except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
         raise InputError(f"the map's arrays cannot be read ({text_of(error)}): {path}") from error
+    if head["version"] == _WITHOUT_UP:
+        arrays["node_up"] = np.zeros((len(arrays.get("node_run", ())), 3))
     _check(arrays, path)
     modules = head.get("modules")
     if not isinstance(modules, list) or arrays["node_module"].max(initial=-1) >= len(modules):
@@ -223,9 +227,10 @@ def _read_head(folder: Path) -> dict[str, Any]:
     if not isinstance(head, dict) or head.get("format") != FORMAT:
         raise InputError(f"not a map of SceneSLAM (format: {FORMAT} is missing): {path}")
     version = head.get("version")
-    if version != VERSION:
+    if version not in (_WITHOUT_UP, VERSION):
         newer = isinstance(version, int) and version > VERSION
-        which = "a newer SceneSLAM wrote it" if newer else f"only version {VERSION} is known"
+        which = f"only versions {_WITHOUT_UP} and {VERSION} are known"
+        which = "a newer SceneSLAM wrote it" if newer else which
         raise InputError(f"a map of version {version!r}, {which}: {path}")
     for key in ("arrays", "sha256"):
         if not isinstance(head.get(key), str):
@@ -310,6 +315,7 @@ def _arrays(saved: SavedMap, modules: list[str]) -> dict[str, NDArray[Any]]:
         "node_module": [modules.index(submap.module) for submap in submaps],
         "node_piece": saved.pieces,
         "node_pose": saved.T_map_node,
+        "node_up": [np.zeros(3) if submap.up is None else submap.up for submap in submaps],
         "node_scans": [len(submap.stamps_ns) for submap in submaps],
         "node_points": [len(plan) for plan in plans],
         "node_views": [len(submap.views) for submap in submaps],
@@ -406,6 +412,7 @@ def _unpacked(arrays: Mapping[str, NDArray[Any]], modules: list[str]) -> SavedMa
                     FloorPlan(points=walls, normals=normals, free=cells, origin_xy_m=(x_m, y_m))
                 ),
                 views=tuple(views[start:end]),
+                up=arrays["node_up"][index] if arrays["node_up"][index].any() else None,
             )
         )
     edges = [

@@ -12,8 +12,9 @@ from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
-from sceneslam.atlas.submaps.graph import consistent, on_floor, solve
+from sceneslam.atlas.submaps.graph import consistent, first_of_parts, on_floor, solve
 from sceneslam.atlas.submaps.path_drift import PathDrift
+from sceneslam.atlas.submaps.uprights import uprights
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar, se3
 from sceneslam.types.se3 import Transform
@@ -61,7 +62,7 @@ def join_pieces(saved: SavedMap) -> Joined:
 
 def _joined(saved: SavedMap, target: int, piece: int) -> SavedMap | None:
     """Return the map with a piece joined to another, None if it is not recognized there."""
-    own = np.flatnonzero(saved.pieces == piece).tolist()
+    own = saved.nodes(piece)
     loops = [*_loops_by_walls(saved, target, own), *_loops_by_views(saved, target, own)]
     drift = PathDrift.along(saved.edges, len(saved.submaps))
     agreeing = [loops[index] for index in consistent(loops, saved.T_map_node, drift)]
@@ -71,7 +72,7 @@ def _joined(saved: SavedMap, target: int, piece: int) -> SavedMap | None:
     seed = agreeing[0]
     at_seed = nodes[seed.first] @ seed.T_first_second
     nodes[own] = at_seed @ se3.inverse(nodes[seed.second]) @ nodes[own]
-    solved = _solve(saved, nodes, own, agreeing)
+    solved = _solve(saved, nodes, saved.nodes(target), own, agreeing)
     pieces = np.where(saved.pieces == piece, target, saved.pieces)
     return replace(saved, T_map_node=solved, pieces=pieces, edges=(*saved.edges, *agreeing))
 
@@ -129,17 +130,23 @@ def _edge_to(
 
 
 def _solve(
-    saved: SavedMap, nodes: NDArray[np.float64], own: Sequence[int], loops: Sequence[Edge]
+    saved: SavedMap,
+    nodes: NDArray[np.float64],
+    around: Sequence[int],
+    own: Sequence[int],
+    loops: Sequence[Edge],
 ) -> NDArray[np.float64]:
-    """Return the optimised nodes (N, 4, 4); those of the other pieces stay."""
-    inside = set(own)
-    motions = [edge for edge in saved.edges if edge.first in inside and edge.second in inside]
+    """Return the optimised nodes (N, 4, 4); those beside the two pieces stay."""
+    moving = [*around, *own]
+    edges = saved.edges_within(moving)
     solved = solve(
         nodes,
-        motions,
+        [edge for edge in edges if not edge.is_loop],
         loops,
-        fixed=[node for node in range(len(nodes)) if node not in inside],
-        loose=own[0],
+        fixed=sorted({*range(len(nodes))} - {*moving} | {*first_of_parts(around, edges)}),
+        loose=first_of_parts(own, edges),
+        places=[edge for edge in edges if edge.is_loop],
+        uprights=uprights(saved.submaps, nodes, moving),
     )
     return solved.T_map_node
 

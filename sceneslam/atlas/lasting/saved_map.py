@@ -64,6 +64,15 @@ class SavedMap:
             for view in submap.views
         ]
 
+    def nodes(self, piece: int = 0) -> list[int]:
+        """Return the nodes of a piece."""
+        return np.flatnonzero(self.pieces == piece).tolist()
+
+    def edges_within(self, nodes: Sequence[int]) -> list[Edge]:
+        """Return the edges whose two ends are among nodes."""
+        inside = set(nodes)
+        return [edge for edge in self.edges if edge.first in inside and edge.second in inside]
+
     def nearest(self, T_map_base: Transform, piece: int = 0) -> int:
         """Return the submap of a piece that begins nearest to a pose (4, 4)."""
         away_m = np.linalg.norm((self.T_map_node - T_map_base)[:, :3, 3], axis=1)

@@ -24,10 +24,14 @@ class Chain:
     T_run_node: list[Transform] = field(default_factory=list)
     motions: list[Edge] = field(default_factory=list)
     drift: list[NDArray[np.float64]] = field(default_factory=list)  # (2, 3) each: `summed`
-    up_node: dict[int, NDArray[np.float64]] = field(default_factory=dict)  # vertical (3,), if known
 
     def __len__(self) -> int:
         return len(self.submaps)
+
+    @property
+    def is_upright(self) -> bool:
+        """Tell whether the vertical direction was measured, anywhere."""
+        return any(submap.up is not None for submap in self.submaps)
 
     def append(self, submap: Submap, T_run_node: Transform, motion: Edge | None) -> None:
         """Add a submap with the motion to it, None for the first."""
@@ -43,7 +47,6 @@ class Chain:
         """Leave the first `count` submaps."""
         del self.submaps[count:], self.T_run_node[count:], self.drift[count:]
         del self.motions[max(count - 1, 0) :]
-        self.up_node = {node: up for node, up in self.up_node.items() if node < count}
 
     def copy(self) -> Chain:
         """Return the chain as it is now."""
@@ -52,7 +55,6 @@ class Chain:
             T_run_node=list(self.T_run_node),
             motions=list(self.motions),
             drift=list(self.drift),
-            up_node=dict(self.up_node),
         )
 
     def node_at(self, stamp_ns: int) -> int:

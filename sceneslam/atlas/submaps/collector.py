@@ -189,8 +189,6 @@ class Collector:
                 covariance=motion_covariance([*before, part[0]]),
                 kind=_kind(before, part[0]),
             )
-        if part[0].up_base is not None:
-            chain.up_node[len(chain)] = part[0].up_base
         chain.append(make_submap(part, self._run), part[0].T_map_base, motion)
 
 

@@ -61,16 +61,17 @@ def solve(
     loops: Sequence[Edge],
     *,
     fixed: Sequence[int],
-    loose: int,
+    loose: Sequence[int],
     places: Sequence[Edge] = (),
     uprights: Sequence[Upright] = (),
 ) -> Solved:
     """Return the poses (N, 4, 4) that best fit the motions and the accepted loops.
 
-    `fixed` nodes stay; `loose` has a weak prior, so that only a loop to a fixed node moves it.
-    `places` are such loops, of a run that was found there again and again: at the end none is
-    rejected, but one that is far off weighs less. `uprights` hold roll and pitch.
-    Every node must be connected to one of these. The result is deterministic.
+    `fixed` nodes stay; `loose` ones have a weak prior, so that loops to others move them.
+    `places` are loops that are known better, from a run that was found there again and again, or
+    from an earlier solution: at the end none is rejected, but one that is far off weighs less.
+    `uprights` hold roll and pitch. Motions must connect every node to one that is fixed or loose.
+    The result is deterministic.
     """
     import gtsam
 
@@ -82,7 +83,8 @@ def solve(
     for number in fixed:
         graph.add(gtsam.PriorFactorPose3(number, poses[number], noise))
     slack = gtsam.noiseModel.Diagonal.Sigmas((_LOOSE if len(fixed) else _FIXED)[TO_GTSAM])
-    graph.add(gtsam.PriorFactorPose3(loose, poses[loose], slack))
+    for number in loose:
+        graph.add(gtsam.PriorFactorPose3(number, poses[number], slack))
     measured = gtsam.NonlinearFactorGraph(graph)
     trusted = list(range(graph.size()))
     for edge in (*loops, *places):
@@ -101,6 +103,27 @@ def solve(
             measured.add(factor_of(loops[index]))
         result = gtsam.LevenbergMarquardtOptimizer(measured, result).optimize()
     return Solved(T_map_node=_nodes(result, len(poses)), accepted=accepted)
+
+
+def first_of_parts(nodes: Sequence[int], edges: Sequence[Edge]) -> list[int]:
+    """Return the first node of each part of `nodes` that edges connect."""
+    neighbours: dict[int, list[int]] = {node: [] for node in nodes}
+    for edge in edges:
+        if edge.first in neighbours and edge.second in neighbours:
+            neighbours[edge.first].append(edge.second)
+            neighbours[edge.second].append(edge.first)
+    firsts, reached = [], set[int]()
+    for node in nodes:
+        if node in reached:
+            continue
+        firsts.append(node)
+        reached.add(node)
+        ends = [node]
+        while ends:
+            near = [other for other in neighbours[ends.pop()] if other not in reached]
+            reached.update(near)
+            ends += near
+    return firsts
 
 
 def settle(

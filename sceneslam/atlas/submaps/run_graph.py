@@ -14,8 +14,8 @@ from sceneslam.atlas.submaps.chain import Chain
 from sceneslam.atlas.submaps.graph import (
     Agreement,
     Solved,
-    Upright,
     consistent,
+    first_of_parts,
     fits,
     settle,
     solve,
@@ -25,9 +25,9 @@ from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops
 from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.plan_loops import PlanLoops
 from sceneslam.atlas.submaps.submap import Submap
+from sceneslam.atlas.submaps.uprights import uprights
 from sceneslam.atlas.submaps.view_loops import ViewLoops
 from sceneslam.graphs.edge import Edge, EdgeKind
-from sceneslam.motion.tilt import upright
 from sceneslam.types import se3
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.se3 import Transform
@@ -39,6 +39,8 @@ class SolvedRun:
 
     T_map_node: NDArray[np.float64]  # (N, 4, 4), as many as the run has submaps
     loops: tuple[Edge, ...]  # nodes of the loaded map are counted first
+    own_loops: tuple[Edge, ...] = ()  # of modules, that were used too
+    T_map_loaded: NDArray[np.float64] | None = None  # nodes (L, 4, 4) of the loaded map, if moved
 
     @classmethod
     def nothing(cls) -> SolvedRun:
@@ -56,10 +58,15 @@ class SolvedRun:
 class RunGraph:
     """Joins the submaps of a run, while it goes on and at its end, there with a loaded map."""
 
-    def __init__(self, loaded: SavedMap, is_closed: Callable[[int], bool]) -> None:
-        """Begin without submaps; `is_closed` tells in which sessions modules close loops."""
+    def __init__(
+        self, loaded: SavedMap, is_closed: Callable[[int], bool], *, moves_loaded: bool = False
+    ) -> None:
+        """Begin without submaps; `is_closed` tells in which sessions modules close loops.
+
+        `moves_loaded`: the loaded map is optimised, too, if the run is found in it.
+        """
         self._loaded, self._count = loaded, len(loaded.submaps)
-        self._is_closed = is_closed
+        self._is_closed, self._moves_loaded = is_closed, moves_loaded
         self._plans, self._views = PlanLoops(self._may_close), ViewLoops(self._may_close)
         self._seen = self._planned = 0  # submaps to which loops were searched, by views and plans
         self._found = Agreement()  # loops between submaps of the run
@@ -90,7 +97,8 @@ class RunGraph:
             start = self._T_map_node if used else np.array(chain.T_run_node)
             solved = Solved(T_map_node=start, accepted=[])
             if used:
-                solved = settle(start, chain.motions, used, _uprights(chain, start, 0))
+                ups = uprights(chain.submaps, start, range(len(chain)))
+                solved = settle(start, chain.motions, used, ups)
             self._agreed, self._T_map_node = agreeing, solved.T_map_node
             self._accepted = [used[index] for index in solved.accepted]
         loops = tuple(edge.shifted(self._count) for edge in self._accepted)
@@ -112,7 +120,7 @@ class RunGraph:
         the places where the run was located in the loaded map.
         """
         count, ends = self._count, _Ends(chain, path)
-        motions = [*chain.motions, *ends.edges_of(closed_loops(maps))]
+        own_loops = [edge.shifted(count) for edge in ends.edges_of(closed_loops(maps))]
         drift = PathDrift.of(chain.drift).after(PathDrift.along(self._loaded.edges, count))
         self._place(chain)
         self._search(chain, is_level=is_level)
@@ -123,19 +131,34 @@ class RunGraph:
         places = [places[index] for index in consistent(places, nodes, drift)]
         loops = [edge.shifted(count) for edge in self._found.loops]
         loops = [loops[index] for index in consistent(loops, nodes, drift)]
-        T_map_node = ends.placed(fixes, T_map_node)
+        nodes = np.concatenate([self._loaded.T_map_node, ends.placed(fixes, T_map_node)])
+        around = self._loaded.nodes() if places else []  # that the run was found among
+        moving = around if self._moves_loaded else []
+        edges = self._loaded.edges_within(moving)
+        firsts = first_of_parts(moving, edges)
         solved = solve(
-            np.concatenate([self._loaded.T_map_node, T_map_node]),
-            [edge.shifted(count) for edge in motions],
+            nodes,
+            [
+                *(edge for edge in edges if not edge.is_loop),
+                *(edge.shifted(count) for edge in chain.motions),
+                *own_loops,
+            ],
             loops if len(loops) > 1 else [],  # one alone is not believed
-            fixed=range(count),
-            loose=count,
-            places=places,
-            uprights=_uprights(chain, T_map_node, count),
+            fixed=sorted({*range(count)} - {*moving} | {*firsts}),
+            loose=[count],
+            places=[*(edge for edge in edges if edge.is_loop), *places],
+            uprights=uprights(
+                [*self._loaded.submaps, *chain.submaps], nodes, [*around, *range(count, len(nodes))]
+            ),
         )
         accepted = [place for place in places if fits(place, solved.T_map_node)]
         accepted += [loops[index] for index in solved.accepted]
-        return SolvedRun(T_map_node=solved.T_map_node[count:], loops=tuple(accepted))
+        return SolvedRun(
+            T_map_node=solved.T_map_node[count:],
+            loops=tuple(accepted),
+            own_loops=tuple(own_loops),
+            T_map_loaded=solved.T_map_node[:count],
+        )
 
     def _agreeing(self) -> list[Edge]:
         """Return the loops that agree with each other; one alone is not believed."""
@@ -262,21 +285,3 @@ class _Ends:
                 )
             )
         return found
-
-
-def _uprights(chain: Chain, T_map_node: NDArray[np.float64], count: int) -> list[Upright]:
-    """Return the vertical directions; the first one gives that of the map.
-
-    Base is level most of the time: a sensor that is mounted askew has the same tilt everywhere.
-    `count` is the number of nodes before those of the run.
-    """
-    nodes, measured = list(chain.up_node), list(chain.up_node.values())
-    if not measured:
-        return []
-    askew = upright(se3.identity(), np.median(measured, axis=0))[:3, :3]
-    ups = [askew @ up_base for up_base in measured]
-    up_map = T_map_node[nodes[0], :3, :3] @ ups[0]
-    return [
-        Upright(node=count + node, up_node=up, up_map=up_map)
-        for node, up in zip(nodes, ups, strict=True)
-    ]

@@ -70,6 +70,7 @@ class Submap:
     T_submap_base: NDArray[np.float64]  # (K, 3)
     drawing: Drawing  # of its plan
     views: tuple[PlacedView, ...] = ()
+    up: NDArray[np.float64] | None = None  # (3,), the measured vertical direction, if known
 
     @property
     def plan(self) -> FloorPlan:
@@ -102,6 +103,7 @@ def make_submap(poses: Sequence[KeyPose], run: int) -> Submap:
             for pose in poses
             if pose.landmarks is not None
         ),
+        up=first.up_base,
     )
 
 
