@@ -12,7 +12,7 @@ from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
-from sceneslam.atlas.submaps.graph import consistent, first_of_parts, on_floor, solve
+from sceneslam.atlas.submaps.graph import consistent, on_floor, solve
 from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.uprights import uprights
 from sceneslam.graphs.edge import Edge, EdgeKind
@@ -137,16 +137,15 @@ def _solve(
     loops: Sequence[Edge],
 ) -> NDArray[np.float64]:
     """Return the optimised nodes (N, 4, 4); those beside the two pieces stay."""
-    moving = [*around, *own]
-    edges = saved.edges_within(moving)
+    target, joined = saved.moving(around), saved.moving(own)
     solved = solve(
         nodes,
-        [edge for edge in edges if not edge.is_loop],
+        [*target.motions, *joined.motions],
         loops,
-        fixed=sorted({*range(len(nodes))} - {*moving} | {*first_of_parts(around, edges)}),
-        loose=first_of_parts(own, edges),
-        places=[edge for edge in edges if edge.is_loop],
-        uprights=uprights(saved.submaps, nodes, moving),
+        fixed=[node for node in target.fixed if node not in own],
+        loose=[node for node in joined.fixed if node in own],
+        places=[*target.loops, *joined.loops],
+        uprights=uprights(saved.submaps, nodes, [*around, *own]),
     )
     return solved.T_map_node
 

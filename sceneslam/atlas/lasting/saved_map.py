@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan, check_size, join
+from sceneslam.atlas.submaps.graph import first_of_parts
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.graphs.edge import Edge
 from sceneslam.motion.tilt import upright
@@ -19,6 +20,15 @@ from sceneslam.types.planar import Planar
 from sceneslam.types.se3 import Transform
 from sceneslam.views.placed_views import are_covered
 from sceneslam.views.view import Landmarks
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MovingPart:
+    """What the graph needs of a map in which some nodes are optimised again."""
+
+    motions: tuple[Edge, ...]  # between these nodes
+    loops: tuple[Edge, ...]
+    fixed: tuple[int, ...]  # the others, and the first node of each part that edges connect
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -68,10 +78,16 @@ class SavedMap:
         """Return the nodes of a piece."""
         return np.flatnonzero(self.pieces == piece).tolist()
 
-    def edges_within(self, nodes: Sequence[int]) -> list[Edge]:
-        """Return the edges whose two ends are among nodes."""
+    def moving(self, nodes: Sequence[int]) -> MovingPart:
+        """Return the edges within nodes, and what holds them."""
         inside = set(nodes)
-        return [edge for edge in self.edges if edge.first in inside and edge.second in inside]
+        edges = [edge for edge in self.edges if edge.first in inside and edge.second in inside]
+        still = {*range(len(self.submaps))} - inside
+        return MovingPart(
+            motions=tuple(edge for edge in edges if not edge.is_loop),
+            loops=tuple(edge for edge in edges if edge.is_loop),
+            fixed=tuple(sorted(still.union(first_of_parts(nodes, edges)))),
+        )
 
     def nearest(self, T_map_base: Transform, piece: int = 0) -> int:
         """Return the submap of a piece that begins nearest to a pose (4, 4)."""

@@ -15,7 +15,6 @@ from sceneslam.atlas.submaps.graph import (
     Agreement,
     Solved,
     consistent,
-    first_of_parts,
     fits,
     settle,
     solve,
@@ -133,23 +132,16 @@ class RunGraph:
         loops = [loops[index] for index in consistent(loops, nodes, drift)]
         nodes = np.concatenate([self._loaded.T_map_node, ends.placed(fixes, T_map_node)])
         around = self._loaded.nodes() if places else []  # that the run was found among
-        moving = around if self._moves_loaded else []
-        edges = self._loaded.edges_within(moving)
-        firsts = first_of_parts(moving, edges)
+        moving = self._loaded.moving(around if self._moves_loaded else [])
+        submaps = [*self._loaded.submaps, *chain.submaps]
         solved = solve(
             nodes,
-            [
-                *(edge for edge in edges if not edge.is_loop),
-                *(edge.shifted(count) for edge in chain.motions),
-                *own_loops,
-            ],
+            [*moving.motions, *(edge.shifted(count) for edge in chain.motions), *own_loops],
             loops if len(loops) > 1 else [],  # one alone is not believed
-            fixed=sorted({*range(count)} - {*moving} | {*firsts}),
+            fixed=moving.fixed,
             loose=[count],
-            places=[*(edge for edge in edges if edge.is_loop), *places],
-            uprights=uprights(
-                [*self._loaded.submaps, *chain.submaps], nodes, [*around, *range(count, len(nodes))]
-            ),
+            places=[*moving.loops, *places],
+            uprights=uprights(submaps, nodes, [*around, *range(count, len(nodes))]),
         )
         accepted = [place for place in places if fits(place, solved.T_map_node)]
         accepted += [loops[index] for index in solved.accepted]
