@@ -120,9 +120,13 @@ class MapLocalizer:
         fix = self._by_view(newest, None)
         if fix is None and self._compares_walls(newest):
             fix = self._by_walls(latest)
-        fix = None if fix is None else self._confirmed(newest, fix)
         if fix is None:
             return LocalizationEvent.NOTHING
+        T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
+        before, self._guess = self._guess, _Guess(T_map_run=T_map_run, fix=fix)
+        if before is None or not _agree(before.T_map_run, T_map_run, newest.T_run_base):
+            return LocalizationEvent.NOTHING
+        fix = _mean(fix, before, newest)
         if self._fixed_at is not None:
             # It was located before: there, and it drifted, or somewhere else.
             T_expected = self.fixes[-1].T_map_base @ se3.inverse(self._fixed_at.T_run_base)
@@ -155,14 +159,6 @@ class MapLocalizer:
         away = se3.inverse(fixed_at.T_run_base) @ newest.T_run_base
         is_far = np.linalg.norm(away[:3, 3]) >= _FIX_M
         return bool(is_far or se3.rotation_angle_rad(away) >= _FIX_RAD)
-
-    def _confirmed(self, newest: Look, fix: Fix) -> Fix | None:
-        """Return the mean of this place and that of the search before, None unless they agree."""
-        T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
-        before, self._guess = self._guess, _Guess(T_map_run=T_map_run, fix=fix)
-        if before is None or not _agree(before.T_map_run, T_map_run, newest.T_run_base):
-            return None
-        return _mean(fix, before, newest)
 
     def _compares_walls(self, newest: Look) -> bool:
         """Tell whether walls are compared; a look with a view may come before it is time."""
@@ -212,8 +208,6 @@ class MapLocalizer:
         if fix is None and self._compares_walls(newest):
             fix, by_walls = self._near_walls(latest, T_map_base, window)
             is_contradicted |= by_walls
-        if fix is not None and not _is_within(fix, _near(T_map_base)):  # it jumps
-            fix = self._confirmed(newest, fix)
         if fix is not None:
             self._take(newest, fix)
             return LocalizationEvent.FIXED
@@ -238,11 +232,10 @@ class MapLocalizer:
         """Return how far around a pose (4, 4) the robot may be, by its path since the last fix."""
         path_m, turned_rad = self._travelled - self.fixes[-1].travelled
         turn_rad = WHEELS.rad_per_m * path_m + WHEELS.rad_per_rad * turned_rad
-        near = _near(T_map_base)
-        return replace(
-            near,
-            half_m=float(near.half_m + _SIGMAS * WHEELS.per_m * path_m),
-            half_rad=float(near.half_rad + _SIGMAS * turn_rad),
+        return SearchWindow(
+            around=planar.from_transform(T_map_base),
+            half_m=float(_REACH_M + _SIGMAS * WHEELS.per_m * path_m),
+            half_rad=float(_REACH_RAD + _SIGMAS * turn_rad),
         )
 
     def _near_walls(
@@ -277,7 +270,6 @@ class MapLocalizer:
         self.T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
         self._fixed_at = newest
         self.fixes.append(replace(fix, travelled=self._travelled))
-        self._guess = None
         self._doubts = self._vain = 0
         self._next_walls_ns = self._next_view_ns = newest.stamp_ns + _FIX_NS
 
@@ -313,12 +305,6 @@ def _mean(fix: Fix, before: _Guess, newest: Look) -> Fix:
     carried = se3.carried(before.fix.covariance, se3.inverse(T_then_now))
     mean, covariance = se3.mean([fix.T_map_base, T_before], [fix.covariance, carried])
     return replace(fix, T_map_base=mean, covariance=covariance)
-
-
-def _near(T_map_base: Transform) -> SearchWindow:
-    """Return where the robot may be around a pose (4, 4) that was known just before."""
-    at = planar.from_transform(T_map_base)
-    return SearchWindow(around=at, half_m=_REACH_M, half_rad=_REACH_RAD)
 
 
 def _is_within(fix: Fix, window: SearchWindow) -> bool:
