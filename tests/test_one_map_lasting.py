@@ -142,10 +142,7 @@ def test_furniture_that_was_moved_is_forgotten_by_an_update(saved, tmp_path):
     settings = {"load": str(folder), "save": str(tmp_path / "map"), "mode": "update"}
     drive = Drive(atlas(**settings)).go(world(moved, 3), true)
     assert drive.faults == []
-    new = load_map_files(tmp_path / "map")
-    earlier = sum(submap.run == 0 for submap in new.submaps)
-    assert earlier < len(load_map_files(folder).submaps)  # where today's show it, they went
-    plan = new.plan()
+    plan = load_map_files(tmp_path / "map").plan()
     corners = [planar.compose(map_of(first), np.array([x, y, 0.0]))[:2] for x, y in
                ((1.0, 1.5), (1.4, 1.0), (1.8, 1.5), (1.4, 2.0))]  # fmt: skip
     for corner in corners:

@@ -13,7 +13,6 @@ from sceneslam.atlas.lasting.map_files import (
     save_map_files,
     seal_of,
 )
-from sceneslam.atlas.lasting.prune import prune
 from sceneslam.atlas.lasting.saved_map import SavedMap, forget_contradicted
 from sceneslam.atlas.mapper import Mapper, Note
 from sceneslam.executors import InStep, executor
@@ -47,7 +46,7 @@ class LastingMap:
         self.faults: list[str] = []
         self._saved_ns: int | None = None
         self._executor: Executor = InStep()
-        self._writing: Future[SavedMap | None] | None = None
+        self._writing: Future[bool] | None = None
         self._seal: str | None = None  # of the map that this run takes the place of
         try:
             if self._load is not None:
@@ -101,33 +100,29 @@ class LastingMap:
         saved = mapper.saved()
         if not saved.submaps and seal_of(self._save) is not None:
             self._fault(f"the run has nothing to save, the map that was in {self._save} stays")
-            return
-        written = self._write(saved, mapper.is_found, is_over=True)
-        if written is not None:
-            note("map_saved", stamp_ns, submaps=len(written.submaps), loops=_loops(written))
+        elif self._write(saved, mapper.is_found):
+            note("map_saved", stamp_ns, submaps=len(saved.submaps), loops=_loops(saved))
 
     def close(self) -> None:
         """Wait for a map that is being saved, and save no other. May be called twice."""
         self._executor.shutdown()
 
-    def _updated(self, saved: SavedMap, is_found: bool, *, is_over: bool = False) -> SavedMap:
-        """Return an updated map without what the run contradicts, at the end also what it shows."""
-        if self._mode != UPDATE or self.loaded is None or not is_found:
-            return saved
-        updated = forget_contradicted(saved, self.loaded.runs)
-        return prune(updated) if is_over else updated
+    def _updated(self, saved: SavedMap, is_found: bool) -> SavedMap:
+        if self._mode == UPDATE and self.loaded is not None and is_found:
+            return forget_contradicted(saved, self.loaded.runs)
+        return saved
 
-    def _write(self, saved: SavedMap, is_found: bool, *, is_over: bool = False) -> SavedMap | None:
-        """Save a map, and return it as it was written; None if that was not possible."""
+    def _write(self, saved: SavedMap, is_found: bool) -> bool:
+        """Save a map; return whether it was possible."""
         assert self._save is not None
         try:
-            updated = self._updated(saved, is_found, is_over=is_over)
+            updated = self._updated(saved, is_found)
             updated.check_size()  # no run could load it again
             files = save_map_files(updated, self._save, known=self._seal)
         except Exception as error:  # the run and its poses do not depend on it
             _log.info("save", exc_info=error)
             self._fault(f"the map could not be saved: {text_of(error)}")
-            return None
+            return False
         if files.displaced is not None:
             kept = f"the map that was in {self._save} is kept, its head is {OLD} there"
             if self._seal is None:
@@ -135,7 +130,7 @@ class LastingMap:
             else:
                 self._fault(f"another run saved its map meanwhile: {kept}")
         self._seal = files.seal
-        return updated
+        return True
 
     def _fault(self, fault: str) -> None:
         if fault not in self.faults:
