@@ -107,8 +107,9 @@ def graph_of(pairs_s, T_from_to):
 def test_loops_of_modules_lead_from_submap_to_submap(monkeypatch):
     given, own = Given(monkeypatch), finished()
     loops = graph_of([(2, 14), (7, 8), (1, 7)], [at(5.0), at(), at(2.0, 1.0, 0.5)])
-    solved(own, maps=[MapLayers(pose_graph=loops)])
+    found = solved(own, maps=[MapLayers(pose_graph=loops)])
     *steps, first, second = given.motions
+    assert found.own_loops == (first, second) and found.loops == ()
     assert [(one.first, one.second) for one in steps] == [(0, 1), (1, 2)]  # (7, 8) is in one
     assert [(one.first, one.second) for one in (first, second)] == [(0, 2), (0, 1)]
     left = at(0.0, 0.01)  # nodes stay where they were, poses are revised

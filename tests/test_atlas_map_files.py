@@ -91,6 +91,8 @@ def with_arrays(folder, harm):
         ("edge_nodes", np.array([[-1, 1]]), "edge_nodes: expected 0 to 1"),
         ("edge_kind", np.array([4]), "edge_kind: expected 0 to 3"),
         ("node_module", np.array([0, 2]), "modules: expected the names that the submaps refer to"),
+        ("node_up", np.full((2, 3), 0.1), "node_up: expected directions of length 1, or 0"),
+        ("node_up", None, "node_up: missing among the map's arrays"),
     ],
 )
 def test_arrays_that_do_not_fit_together_are_named(tmp_path, name, value, said):

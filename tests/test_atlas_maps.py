@@ -248,17 +248,25 @@ def test_a_piece_is_joined_where_two_of_its_submaps_agree(monkeypatch):
 
 
 def test_a_piece_straightens_the_one_that_it_is_joined_to(monkeypatch):
-    rough = replace(edge(0, 1, (10.0, 0.0, 0.0)), covariance=0.04 * np.eye(6))
+    rough = [edge(0, 1, (4.0, 0.0, 0.0)), edge(1, 2, (6.0, 0.0, 0.0))]
+    rough = [replace(one, covariance=0.04 * np.eye(6)) for one in rough]
     saved = map_of(
-        *[WALL] * 4,
-        nodes=[[0, 0, 0], [10, 0, 0], [0, 0, 0], [9.6, 0, 0]],
-        pieces=[0, 0, 1, 1],
-        runs=[0, 0, 1, 1],
-        edges=[rough, edge(2, 3, (9.6, 0.0, 0.0))],
+        *[WALL] * 5,
+        nodes=[[0, 0, 0], [4, 0, 0], [10, 0, 0], [0, 0, 0], [9.6, 0, 0]],
+        pieces=[0, 0, 0, 1, 1],
+        runs=[0, 0, 0, 1, 1],
+        edges=[*rough, edge(3, 4, (9.6, 0.0, 0.0))],
     )
     Found(monkeypatch, [quality(at=(x_m, 0.0, 0.0), weak=0) for x_m in (0.0, 10.0)])
     along = join_pieces(saved).map.plane[:, 0]
-    np.testing.assert_allclose(along, [0.0, 9.6, 0.0, 9.6], atol=0.02)
+    np.testing.assert_allclose(along, [0.0, 3.8, 9.6, 0.0, 9.6], atol=0.02)
+
+
+def test_a_loop_that_no_longer_fits_is_left_out():
+    wrong = edge(0, 1, (5.0, 0.0, 0.0), kind=EdgeKind.LOOP)
+    edges = [edge(0, 1), edge(0, 1, (4.0, 0.0, 0.0)), edge(1, 2, kind=EdgeKind.LOOP), wrong]
+    saved = map_of(*[WALL] * 3, nodes=[[0, 0, 0], [1, 0, 0], [2, 0, 0]], edges=edges)
+    assert list(saved.without_misfits().edges) == edges[:3]
 
 
 @pytest.mark.parametrize(("variance", "joined"), [(1e-6, 0), (0.04, 1)])
@@ -293,10 +301,15 @@ def test_pieces_are_numbered_again_where_one_was_joined(monkeypatch):
 
 def test_what_was_joined_is_looked_for_again(monkeypatch):
     """The first shows one submap of either piece: two agree when they are one piece."""
-    saved = replace(two_pieces(), pieces=np.array([0, 1, 1, 2, 2]))
-    apart = [None] * 4
-    each = [at(9.0, 5.0), at(9.0, 6.0)]
-    Found(monkeypatch, [*apart, *each, *[at(20.0, 5.0 + index) for index in range(4)]])
+    saved = map_of(
+        *[WALL] * 5,
+        nodes=[[0, 0, 0], [10, 0, 0], [11, 0, 0], [0, 0, 0], [1, 0, 0]],
+        pieces=[0, 1, 1, 2, 2],
+        edges=[edge(1, 2), edge(3, 4)],
+    )
+    apart, each = [None] * 4, [at(9.0, 5.0), at(9.0, 6.0)]
+    far = [quality(at=(x_m, 4.0, np.pi), weak=0) for x_m in (15.0, 14.0)]
+    Found(monkeypatch, [*apart, *each, at(20.0, 5.0), at(20.0, 6.0), *far])
     joined = join_pieces(saved)
     assert (joined.joined, joined.apart) == (2, 0) and joined.map.pieces.tolist() == [0] * 5
 

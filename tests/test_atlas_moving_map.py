@@ -9,9 +9,10 @@ from test_atlas_maps import WALL, edge, map_of
 from test_atlas_submaps import Known, S, at, collector, pitched, run_of
 
 from sceneslam.atlas.places.localizer import Fix
-from sceneslam.atlas.submaps.graph import first_of_parts, on_floor
+from sceneslam.atlas.submaps import run_graph
+from sceneslam.atlas.submaps.graph import connected, on_floor
 from sceneslam.atlas.submaps.run_graph import RunGraph
-from sceneslam.atlas.submaps.uprights import uprights
+from sceneslam.atlas.submaps.uprights import straightened, uprights
 
 SURE, ROUGH = on_floor(np.diag([0.02, 0.02, 0.005]) ** 2), on_floor(np.diag([0.3, 0.3, 0.1]) ** 2)
 STRETCH_M = 0.4  # by which the map's second half lies too far ahead
@@ -74,14 +75,12 @@ def test_a_run_straightens_the_map_that_it_was_found_in(last_piece):
 def test_a_map_that_is_not_saved_again_stays_as_it_is():
     loaded = bent_map()
     found = finished(loaded, moves_loaded=False, fixes=seen())
-    np.testing.assert_allclose(found.T_map_loaded, loaded.T_map_node, atol=1e-4)
+    assert found.T_map_loaded is None
     assert abs(found.T_map_node[-1, 0, 3] - 30.0 - STRETCH_M) < 0.1
 
 
 def test_a_run_that_was_not_found_moves_no_map():
-    loaded = bent_map()
-    found = finished(loaded, moves_loaded=True, fixes=[])
-    np.testing.assert_array_equal(found.T_map_loaded, loaded.T_map_node)
+    assert finished(bent_map(), moves_loaded=True, fixes=[]).T_map_loaded is None
 
 
 def test_a_place_of_an_earlier_run_that_contradicts_all_others_hardly_bends_the_map():
@@ -97,25 +96,76 @@ def test_a_place_of_an_earlier_run_that_contradicts_all_others_hardly_bends_the_
     assert np.abs(found.T_map_loaded[:, 0, 3] - loaded.T_map_node[:, 0, 3]).max() < 0.1
 
 
-def test_every_part_that_edges_connect_has_a_first_node():
+def test_what_earlier_runs_recognized_holds_the_map():
+    bent = bent_map()
+    motions = [edge for edge in bent.edges if edge.second < 10]  # the last two hang together by it
+    right = replace(loop(0, 10, [30.0 + STRETCH_M, 0.0, 0.0]), covariance=SURE)
+    fixes = [fix for fix in seen() if fix.stamp_ns < 20 * S]
+    found = finished(replace(bent, edges=(*motions, right)), moves_loaded=True, fixes=fixes)
+    np.testing.assert_allclose(found.T_map_loaded[10, 0, 3], 30.0 + STRETCH_M, atol=0.02)
+    assert found.T_map_loaded[6, 0, 3] < 18.0 + 0.5 * STRETCH_M
+
+
+def test_parts_that_no_edge_connects_are_joined_by_the_run():
+    bent = bent_map()
+    edges = tuple(edge for edge in bent.edges if edge.first != 5)
+    found = finished(replace(bent, edges=edges), moves_loaded=True, fixes=seen())
+    np.testing.assert_allclose(found.T_map_loaded[:11, 0, 3], np.arange(0, 31, 3), atol=0.03)
+    np.testing.assert_array_equal(found.T_map_loaded[0], bent.T_map_node[0])
+
+
+def test_parts_that_edges_connect_are_told_apart():
     edges = [edge(0, 2), edge(5, 2), edge(3, 4), edge(4, 1)]
-    assert first_of_parts([0, 2, 3, 4, 5, 6], edges) == [0, 3, 6]
-    assert first_of_parts([], edges) == []
+    assert connected([0, 2, 3, 4, 5, 6], edges) == [[0, 2, 5], [3, 4], [6]]
+    assert connected([], edges) == []
 
 
-def test_each_run_has_its_own_usual_tilt_and_only_nodes_of_the_map_count():
+def tilted(tilts, run):
+    """Submaps of a run whose base stands pitched by these angles [rad]."""
     own = run_of(18)
     own.finish()
-    tilts = [[0.10, 0.12, 0.10], [-0.2, -0.2, -0.23]]
-    submaps = [
+    return [
         replace(submap, run=run, up=pitched(0, 0, tilt)[2, :3])
-        for run, tilted in enumerate(tilts)
-        for submap, tilt in zip(own.chain.submaps, tilted, strict=True)
+        for submap, tilt in zip(own.chain.submaps, tilts, strict=True)
     ]
+
+
+def test_a_run_is_straightened_by_its_own_usual_tilt():
+    unknown = replace(tilted([0.0, 0.0, 0.0], 0)[0], up=None)
+    submaps = straightened([*tilted([0.10, 0.12, 0.10], 0), unknown])
+    assert submaps[-1].up is None
+    for submap, tilt in zip(submaps, [0.0, 0.02, 0.0], strict=False):
+        np.testing.assert_allclose(submap.up, pitched(0, 0, tilt)[2, :3], atol=1e-9)
+    assert straightened(submaps[-1:]) == submaps[-1:]
+
+
+def test_submaps_are_held_upright_as_the_first_one_is():
+    submaps = [*tilted([0.0, 0.02, 0.01], 0), *tilted([0.03, 0.0, 0.0], 1)]
     nodes = np.stack([pitched(0, 0, 0.0)] * 6)
-    found = uprights(submaps, nodes, [0, 1, 2, 5, 3])
-    assert [one.node for one in found] == [0, 1, 2, 5, 3]
-    for one, tilt in zip(found, [0.0, 0.02, 0.0, -0.015, 0.015], strict=True):
-        np.testing.assert_allclose(one.up_node, pitched(0, 0, tilt)[2, :3], atol=1e-3)
-        np.testing.assert_allclose(one.up_map, [0.0, 0.0, 1.0], atol=1e-9)
+    nodes[5] = pitched(0, 0, 0.1)
+    found = uprights(submaps, nodes, [5, 0, 1])
+    assert [one.node for one in found] == [5, 0, 1]
+    for one, tilt in zip(found, [0.0, 0.0, 0.02], strict=True):
+        np.testing.assert_allclose(one.up_node, pitched(0, 0, tilt)[2, :3], atol=1e-9)
+        np.testing.assert_allclose(one.up_map, pitched(0, 0, -0.1)[2, :3], atol=1e-9)
     assert uprights(submaps, nodes, []) == []
+
+
+@pytest.mark.parametrize(
+    ("moves_loaded", "is_found", "held"), [(True, True, 4), (True, False, 3), (False, True, 3)]
+)
+def test_the_upright_submaps_of_a_map_hold_a_run_if_it_moves(
+    monkeypatch, moves_loaded, is_found, held
+):
+    taken = []
+    given = lambda submaps, nodes, which: taken.extend(which) or []  # noqa: E731
+    monkeypatch.setattr(run_graph, "uprights", given)
+    loaded = map_of(WALL, WALL, pieces=[0, 1])
+    own = run_of(18)
+    own.finish()
+    graph = RunGraph(loaded, lambda session: False, moves_loaded=moves_loaded)
+    fixes = [Fix(stamp_ns=2 * S, T_map_base=due(S), covariance=SURE)] if is_found else []
+    nodes = np.stack(own.chain.T_run_node)
+    found = graph.finish(own.chain, nodes, due, (), fixes, is_level=True)
+    assert taken == [0, 2, 3, 4][-held:]
+    assert (found.T_map_loaded is None) == (held == 3)

@@ -100,6 +100,18 @@ def test_a_live_run_looks_for_itself_and_saves_beside_its_poses(saved, tmp_path,
     assert load_map_files(tmp_path / "map").runs == 2
 
 
+def test_a_run_that_was_found_moves_the_map_that_it_is_saved_in(saved, tmp_path):
+    folder, _ = saved
+    true = through([(0.6, 2.6), (3.0, 2.4), (2.6, 0.7), (0.5, 0.5), (0.4, 2.4), (3.0, 2.2)])
+    drive = Drive(atlas(load=str(folder), save=str(tmp_path / "map"))).go(world(flat(), 3), true)
+    assert drive.faults == []
+    before = load_map_files(folder).T_map_node
+    after = load_map_files(tmp_path / "map").T_map_node[: len(before)]
+    np.testing.assert_array_equal(after[0], before[0])
+    moved_m = np.linalg.norm((after - before)[1:, :3, 3], axis=1)
+    assert moved_m.min() > 1e-6 and moved_m.max() < 0.03
+
+
 def test_the_grid_of_a_run_that_was_found_is_that_of_the_whole_map(saved):
     folder, first = saved
     true = through([(0.6, 2.6), (3.0, 2.4), (3.2, 0.8)])  # of one room

@@ -26,6 +26,7 @@ from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.submaps.graph import LOADED
 from sceneslam.atlas.submaps.own_loops import Path
 from sceneslam.atlas.submaps.run_graph import RunGraph, SolvedRun
+from sceneslam.atlas.submaps.uprights import straightened
 from sceneslam.executors import executor
 from sceneslam.graphs.edge import Edge
 from sceneslam.scans.key_scan import KeyScan, KeyScanner
@@ -239,8 +240,8 @@ class Mapper:
             located = zip(self._located(len(own)), own.T_run_node, strict=True)
             nodes = [T_map_run @ T_run_node for T_map_run, T_run_node in located]
         piece = 0 if self.is_found else int(pieces.max(initial=-1)) + 1
-        return SavedMap(
-            submaps=(*self._loaded.submaps, *own.submaps),
+        saved = SavedMap(
+            submaps=(*self._loaded.submaps, *straightened(own.submaps)),
             T_map_node=np.concatenate([loaded, np.reshape(nodes, (-1, 4, 4))]),
             pieces=np.concatenate([pieces, np.full(len(own.submaps), piece, np.int64)]),
             edges=(
@@ -250,6 +251,7 @@ class Mapper:
                 *self._solved.loops,
             ),
         )
+        return saved.without_misfits() if self._is_over else saved
 
     def _located(self, count: int) -> list[Transform]:
         """Return T_map_run (4, 4) of each of `count` submaps; that of the newest is today's."""

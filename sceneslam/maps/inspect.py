@@ -6,6 +6,7 @@ import numpy as np
 
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import CELL_M
+from sceneslam.atlas.submaps.graph import connected
 from sceneslam.graphs.edge import EdgeKind
 from sceneslam.types import se3
 
@@ -37,8 +38,8 @@ def flaws(saved: SavedMap) -> list[str]:
     """Return a sentence for each inconsistency."""
     found = []
     for piece in np.unique(saved.pieces).tolist():
-        own = set(np.flatnonzero(saved.pieces == piece).tolist())
-        lost = own - _connected(saved, own)
+        own = saved.nodes(piece)
+        lost = set(own) - set(connected(own, saved.edges)[0])
         if lost:
             found.append(f"piece {piece}: no edge connects submaps {_some(lost)} with the rest")
     for number, edge in enumerate(saved.edges):
@@ -57,22 +58,6 @@ def flaws(saved: SavedMap) -> list[str]:
                 f"{np.degrees(np.linalg.norm(off[3:])):.1f} degrees from where it was measured"
             )
     return found
-
-
-def _connected(saved: SavedMap, own: set[int]) -> set[int]:
-    """Return the submaps of `own` that edges connect to the first one."""
-    neighbours: dict[int, set[int]] = {node: set() for node in own}
-    for edge in saved.edges:
-        if edge.first in own and edge.second in own:
-            neighbours[edge.first].add(edge.second)
-            neighbours[edge.second].add(edge.first)
-    reached, waiting = set[int](), [min(own)]
-    while waiting:
-        node = waiting.pop()
-        if node not in reached:
-            reached.add(node)
-            waiting += sorted(neighbours[node] - reached)
-    return reached
 
 
 def _some(nodes: set[int]) -> str:

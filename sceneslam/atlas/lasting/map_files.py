@@ -36,6 +36,7 @@ _WITHOUT_UP = 2  # the version before, which has no `node_up`
 OLD = "map.old.yaml"  # the head of a map that another one took the place of
 _FAR_M = 1e5  # no building is so large
 _ROUNDING = 1e-6  # of a rotation that was composed of many
+_STRAIGHT = 1e-3  # of the length of a direction
 _ARRAYS = "arrays-"  # prefix, followed by the start of their checksum
 _SHAPES: Mapping[str, tuple[str, str, tuple[int, ...]]] = {  # name -> dtype, row of, inner shape
     "node_run": ("<i8", "submaps", ()),
@@ -192,7 +193,7 @@ def read_map_files(folder: Path) -> tuple[SavedMap, str]:
     except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
         raise InputError(f"the map's arrays cannot be read ({text_of(error)}): {path}") from error
     if head["version"] == _WITHOUT_UP:
-        arrays["node_up"] = np.zeros((len(arrays.get("node_run", ())), 3))
+        arrays["node_up"] = np.zeros((np.size(arrays.get("node_run", ())), 3))
     _check(arrays, path)
     modules = head.get("modules")
     if not isinstance(modules, list) or arrays["node_module"].max(initial=-1) >= len(modules):
@@ -264,6 +265,9 @@ def _check(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
     for name in ("node_pose", "node_grid_origin", "scan_pose", "point", "view_pose", "landmark"):
         if np.abs(arrays[name]).max(initial=0.0) > _FAR_M:
             raise InputError(f"{name}: expected at most {_FAR_M:g} m: {path}")
+    lengths = np.linalg.norm(arrays["node_up"], axis=1)
+    if not ((lengths == 0.0) | (np.abs(lengths - 1.0) < _STRAIGHT)).all():
+        raise InputError(f"node_up: expected directions of length 1, or 0: {path}")
     if counts["submaps"] and arrays["node_piece"].min() != 0:
         raise InputError(f"node_piece: expected a submap in piece 0: {path}")
     if (arrays["node_scans"] == 0).any():

@@ -12,7 +12,7 @@ from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
-from sceneslam.atlas.submaps.graph import consistent, on_floor, solve
+from sceneslam.atlas.submaps.graph import Solved, consistent, on_floor, solve
 from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.uprights import uprights
 from sceneslam.graphs.edge import Edge, EdgeKind
@@ -73,8 +73,12 @@ def _joined(saved: SavedMap, target: int, piece: int) -> SavedMap | None:
     at_seed = nodes[seed.first] @ seed.T_first_second
     nodes[own] = at_seed @ se3.inverse(nodes[seed.second]) @ nodes[own]
     solved = _solve(saved, nodes, saved.nodes(target), own, agreeing)
+    if len(solved.accepted) < _LOOPS_MIN:
+        return None
     pieces = np.where(saved.pieces == piece, target, saved.pieces)
-    return replace(saved, T_map_node=solved, pieces=pieces, edges=(*saved.edges, *agreeing))
+    edges = *saved.edges, *(agreeing[index] for index in solved.accepted)
+    joined = replace(saved, T_map_node=solved.T_map_node, pieces=pieces, edges=edges)
+    return joined.without_misfits()
 
 
 def _loops_by_walls(saved: SavedMap, piece: int, own: Sequence[int]) -> list[Edge]:
@@ -135,19 +139,19 @@ def _solve(
     around: Sequence[int],
     own: Sequence[int],
     loops: Sequence[Edge],
-) -> NDArray[np.float64]:
-    """Return the optimised nodes (N, 4, 4); those beside the two pieces stay."""
-    target, joined = saved.moving(around), saved.moving(own)
-    solved = solve(
+) -> Solved:
+    """Return the optimised nodes; those beside the two pieces stay."""
+    moving = saved.moving([*around, *own])
+    is_upright = any(saved.submaps[node].up is not None for node in around)
+    return solve(
         nodes,
-        [*target.motions, *joined.motions],
+        moving.motions,
         loops,
-        fixed=[node for node in target.fixed if node not in own],
-        loose=[node for node in joined.fixed if node in own],
-        places=[*target.loops, *joined.loops],
-        uprights=uprights(saved.submaps, nodes, [*around, *own]),
+        fixed=moving.fixed,
+        loose=moving.loose,
+        places=moving.loops,
+        uprights=uprights(saved.submaps, nodes, [*around, *own]) if is_upright else (),
     )
-    return solved.T_map_node
 
 
 def _renumbered(saved: SavedMap) -> SavedMap:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan, check_size, join
-from sceneslam.atlas.submaps.graph import first_of_parts
+from sceneslam.atlas.submaps.graph import connected, fits
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.graphs.edge import Edge
 from sceneslam.motion.tilt import upright
@@ -28,7 +28,8 @@ class MovingPart:
 
     motions: tuple[Edge, ...]  # between these nodes
     loops: tuple[Edge, ...]
-    fixed: tuple[int, ...]  # the others, and the first node of each part that edges connect
+    fixed: tuple[int, ...]  # all others, and the first of these nodes
+    loose: tuple[int, ...]  # the first node of each part that no edge connects with that one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -79,15 +80,22 @@ class SavedMap:
         return np.flatnonzero(self.pieces == piece).tolist()
 
     def moving(self, nodes: Sequence[int]) -> MovingPart:
-        """Return the edges within nodes, and what holds them."""
+        """Return the edges within nodes, and which nodes hold them."""
         inside = set(nodes)
         edges = [edge for edge in self.edges if edge.first in inside and edge.second in inside]
         still = {*range(len(self.submaps))} - inside
+        firsts = [part[0] for part in connected(nodes, edges)]
         return MovingPart(
             motions=tuple(edge for edge in edges if not edge.is_loop),
             loops=tuple(edge for edge in edges if edge.is_loop),
-            fixed=tuple(sorted(still.union(first_of_parts(nodes, edges)))),
+            fixed=(*sorted(still), *firsts[:1]),
+            loose=tuple(firsts[1:]),
         )
+
+    def without_misfits(self) -> SavedMap:
+        """Return the map without loops that its nodes contradict: their places were similar."""
+        kept = (edge for edge in self.edges if not edge.is_loop or fits(edge, self.T_map_node))
+        return replace(self, edges=tuple(kept))
 
     def nearest(self, T_map_base: Transform, piece: int = 0) -> int:
         """Return the submap of a piece that begins nearest to a pose (4, 4)."""

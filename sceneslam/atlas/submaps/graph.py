@@ -70,8 +70,8 @@ def solve(
     `fixed` nodes stay; `loose` ones have a weak prior, so that loops to others move them.
     `places` are loops that are known better, from a run that was found there again and again, or
     from an earlier solution: at the end none is rejected, but one that is far off weighs less.
-    `uprights` hold roll and pitch. Motions must connect every node to one that is fixed or loose.
-    The result is deterministic.
+    `uprights` hold roll and pitch. Every node must be connected to one that is fixed or loose. The
+    result is deterministic.
     """
     import gtsam
 
@@ -102,28 +102,30 @@ def solve(
         for index in accepted:
             measured.add(factor_of(loops[index]))
         result = gtsam.LevenbergMarquardtOptimizer(measured, result).optimize()
-    return Solved(T_map_node=_nodes(result, len(poses)), accepted=accepted)
+    solved = _nodes(result, len(poses))
+    solved[list(fixed)] = T_map_node[list(fixed)]
+    return Solved(T_map_node=solved, accepted=accepted)
 
 
-def first_of_parts(nodes: Sequence[int], edges: Sequence[Edge]) -> list[int]:
-    """Return the first node of each part of `nodes` that edges connect."""
+def connected(nodes: Sequence[int], edges: Sequence[Edge]) -> list[list[int]]:
+    """Return the parts of `nodes` that edges connect, each as it was reached from its first."""
     neighbours: dict[int, list[int]] = {node: [] for node in nodes}
     for edge in edges:
         if edge.first in neighbours and edge.second in neighbours:
             neighbours[edge.first].append(edge.second)
             neighbours[edge.second].append(edge.first)
-    firsts, reached = [], set[int]()
+    parts, reached = list[list[int]](), set[int]()
     for node in nodes:
         if node in reached:
             continue
-        firsts.append(node)
+        part = [node]
         reached.add(node)
-        ends = [node]
-        while ends:
-            near = [other for other in neighbours[ends.pop()] if other not in reached]
+        for member in part:
+            near = [other for other in neighbours[member] if other not in reached]
             reached.update(near)
-            ends += near
-    return firsts
+            part += dict.fromkeys(near)
+        parts.append(part)
+    return parts
 
 
 def settle(

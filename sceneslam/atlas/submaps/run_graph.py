@@ -24,7 +24,7 @@ from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops
 from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.plan_loops import PlanLoops
 from sceneslam.atlas.submaps.submap import Submap
-from sceneslam.atlas.submaps.uprights import uprights
+from sceneslam.atlas.submaps.uprights import straightened, uprights
 from sceneslam.atlas.submaps.view_loops import ViewLoops
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import se3
@@ -96,7 +96,7 @@ class RunGraph:
             start = self._T_map_node if used else np.array(chain.T_run_node)
             solved = Solved(T_map_node=start, accepted=[])
             if used:
-                ups = uprights(chain.submaps, start, range(len(chain)))
+                ups = uprights(straightened(chain.submaps), start, range(len(chain)))
                 solved = settle(start, chain.motions, used, ups)
             self._agreed, self._T_map_node = agreeing, solved.T_map_node
             self._accepted = [used[index] for index in solved.accepted]
@@ -131,15 +131,15 @@ class RunGraph:
         loops = [edge.shifted(count) for edge in self._found.loops]
         loops = [loops[index] for index in consistent(loops, nodes, drift)]
         nodes = np.concatenate([self._loaded.T_map_node, ends.placed(fixes, T_map_node)])
-        around = self._loaded.nodes() if places else []  # that the run was found among
-        moving = self._loaded.moving(around if self._moves_loaded else [])
-        submaps = [*self._loaded.submaps, *chain.submaps]
+        around = self._loaded.nodes() if places and self._moves_loaded else []
+        moving = self._loaded.moving(around)
+        submaps = [*self._loaded.submaps, *straightened(chain.submaps)]
         solved = solve(
             nodes,
             [*moving.motions, *(edge.shifted(count) for edge in chain.motions), *own_loops],
             loops if len(loops) > 1 else [],  # one alone is not believed
             fixed=moving.fixed,
-            loose=[count],
+            loose=[*moving.loose, count],
             places=[*moving.loops, *places],
             uprights=uprights(submaps, nodes, [*around, *range(count, len(nodes))]),
         )
@@ -149,7 +149,7 @@ class RunGraph:
             T_map_node=solved.T_map_node[count:],
             loops=tuple(accepted),
             own_loops=tuple(own_loops),
-            T_map_loaded=solved.T_map_node[:count],
+            T_map_loaded=solved.T_map_node[:count] if around else None,
         )
 
     def _agreeing(self) -> list[Edge]:

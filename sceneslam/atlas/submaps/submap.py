@@ -70,7 +70,7 @@ class Submap:
     T_submap_base: NDArray[np.float64]  # (K, 3)
     drawing: Drawing  # of its plan
     views: tuple[PlacedView, ...] = ()
-    up: NDArray[np.float64] | None = None  # (3,), the measured vertical direction, if known
+    up: NDArray[np.float64] | None = None  # (3,), the vertical direction, if it was measured
 
     @property
     def plan(self) -> FloorPlan:

@@ -1,8 +1,9 @@
-"""The vertical directions that hold submaps upright, in one map of several runs."""
+"""The vertical directions that hold submaps upright."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,31 +14,30 @@ from sceneslam.motion.tilt import upright
 from sceneslam.types import se3
 
 
+def straightened(submaps: Sequence[Submap]) -> list[Submap]:
+    """Return the submaps of a whole run, their vertical directions without its usual tilt.
+
+    Base is level most of the time: a sensor that is mounted askew has the same tilt everywhere.
+    """
+    measured = [submap.up for submap in submaps if submap.up is not None]
+    if not measured:
+        return list(submaps)
+    askew = upright(se3.identity(), np.median(measured, axis=0))[:3, :3]
+    return [
+        submap if submap.up is None else replace(submap, up=askew @ submap.up) for submap in submaps
+    ]
+
+
 def uprights(
     submaps: Sequence[Submap], T_map_node: NDArray[np.float64], nodes: Sequence[int]
 ) -> list[Upright]:
-    """Return the vertical directions that were measured at `nodes`, which lie in one map.
+    """Return the vertical directions of `nodes`, in one map; the first one gives that of the map.
 
-    The first one gives that of the map. Base is level most of the time: a sensor that is mounted
-    askew has the same tilt in a whole run.
+    Those of the submaps are `straightened`.
     """
-    ups = _straight(submaps, nodes)
+    ups = {node: up for node in nodes if (up := submaps[node].up) is not None}
     if not ups:
         return []
     first, up_first = next(iter(ups.items()))
     up_map = T_map_node[first, :3, :3] @ up_first
     return [Upright(node=node, up_node=up, up_map=up_map) for node, up in ups.items()]
-
-
-def _straight(submaps: Sequence[Submap], nodes: Sequence[int]) -> dict[int, NDArray[np.float64]]:
-    """Return the directions (3,) by node, each without what is usual in its run."""
-    measured: dict[int, dict[int, NDArray[np.float64]]] = {}  # by run, and node
-    for node in nodes:
-        run, up = submaps[node].run, submaps[node].up
-        if up is not None:
-            measured.setdefault(run, {})[node] = up
-    straight = dict[int, NDArray[np.float64]]()
-    for ups in measured.values():
-        askew = upright(se3.identity(), np.median(list(ups.values()), axis=0))[:3, :3]
-        straight |= {node: askew @ up for node, up in ups.items()}
-    return straight
