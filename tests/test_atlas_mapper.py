@@ -188,8 +188,18 @@ def test_a_map_is_saved_as_the_graph_moved_it_with_the_loops_that_modules_closed
     for second in range(20):
         observe(second)
     own_loops, moved = (edge(1, 5, kind=EdgeKind.LOOP),), np.array([ASIDE])
-    own._solved = replace(own._solved, T_map_loaded=moved, own_loops=own_loops)
-    saved = own.saved()
+    wrong = edge(0, 3, (50.0, 0.0, 0.0), EdgeKind.LOOP)
+    own._solved = replace(own._solved, T_map_loaded=moved, own_loops=own_loops, loops=(wrong,))
+    chain = own._collector.chain
+    chain.submaps = [replace(submap, up=np.array([0.0, 0.6, 0.8])) for submap in chain.submaps]
+    assert own.saved().edges[-1] == wrong
+    nodes = chain.T_run_node
+    fitting = replace(own_loops[0], T_first_second=se3.inverse(nodes[0]) @ nodes[4])
+    own._solved, own._is_over = replace(own._solved, own_loops=(fitting,)), True
+    saved, own_loops = own.saved(), (fitting,)
+    np.testing.assert_allclose(
+        [one.up for one in saved.submaps[1:]], [[0, 0, 1]] * len(nodes), atol=1e-9
+    )
     np.testing.assert_array_equal(saved.T_map_node[0], ASIDE)
     assert saved.edges[-1] == own_loops[0] and len(saved.edges) == len(saved.submaps) - 1
 

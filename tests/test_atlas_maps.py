@@ -247,7 +247,10 @@ def test_a_piece_is_joined_where_two_of_its_submaps_agree(monkeypatch):
     assert around == [[0, 1], [-1, 0, 1], [-1, 0]]
 
 
-def test_a_piece_straightens_the_one_that_it_is_joined_to(monkeypatch):
+@pytest.mark.parametrize(
+    ("loops", "middle_m"), [([], 3.8), ([edge(0, 1, (3.5, 0.0, 0.0), kind=EdgeKind.LOOP)], 3.5)]
+)
+def test_a_piece_straightens_the_one_that_it_is_joined_to(monkeypatch, loops, middle_m):
     rough = [edge(0, 1, (4.0, 0.0, 0.0)), edge(1, 2, (6.0, 0.0, 0.0))]
     rough = [replace(one, covariance=0.04 * np.eye(6)) for one in rough]
     saved = map_of(
@@ -255,11 +258,25 @@ def test_a_piece_straightens_the_one_that_it_is_joined_to(monkeypatch):
         nodes=[[0, 0, 0], [4, 0, 0], [10, 0, 0], [0, 0, 0], [9.6, 0, 0]],
         pieces=[0, 0, 0, 1, 1],
         runs=[0, 0, 0, 1, 1],
-        edges=[*rough, edge(3, 4, (9.6, 0.0, 0.0))],
+        edges=[*rough, edge(3, 4, (9.6, 0.0, 0.0)), *loops],
     )
     Found(monkeypatch, [quality(at=(x_m, 0.0, 0.0), weak=0) for x_m in (0.0, 10.0)])
     along = join_pieces(saved).map.plane[:, 0]
-    np.testing.assert_allclose(along, [0.0, 3.8, 9.6, 0.0, 9.6], atol=0.02)
+    np.testing.assert_allclose(along, [0.0, middle_m, 9.6, 0.0, 9.6], atol=0.02)
+
+
+@pytest.mark.parametrize(("is_known", "pitch_rad"), [(True, 0.02), (False, 0.0)])
+def test_pieces_that_are_joined_stand_as_was_measured(monkeypatch, is_known, pitch_rad):
+    saved, found = two_pieces(), [at(9.0, 5.0), None, at(9.0, 7.0)]
+    ups = [se3.exp(np.array([0, 0, 0, 0, -pitch, 0]))[:3, 2] for pitch in (0, 0, 0, 0, 0.03)]
+    known = [is_known, is_known, True, True, True]
+    submaps = [
+        replace(submap, up=up if is_up else None)
+        for submap, up, is_up in zip(saved.submaps, ups, known, strict=True)
+    ]
+    Found(monkeypatch, found)
+    nodes = join_pieces(replace(saved, submaps=tuple(submaps))).map.T_map_node
+    assert abs(-nodes[4, 2, 0] - pitch_rad) < 0.011
 
 
 def test_a_loop_that_no_longer_fits_is_left_out():

@@ -101,7 +101,10 @@ def test_what_earlier_runs_recognized_holds_the_map():
     motions = [edge for edge in bent.edges if edge.second < 10]  # the last two hang together by it
     right = replace(loop(0, 10, [30.0 + STRETCH_M, 0.0, 0.0]), covariance=SURE)
     fixes = [fix for fix in seen() if fix.stamp_ns < 20 * S]
-    found = finished(replace(bent, edges=(*motions, right)), moves_loaded=True, fixes=fixes)
+    nodes = np.array(bent.T_map_node)
+    nodes[10, 0, 3] += 0.2
+    bent = replace(bent, T_map_node=nodes, edges=(*motions, right))
+    found = finished(bent, moves_loaded=True, fixes=fixes)
     np.testing.assert_allclose(found.T_map_loaded[10, 0, 3], 30.0 + STRETCH_M, atol=0.02)
     assert found.T_map_loaded[6, 0, 3] < 18.0 + 0.5 * STRETCH_M
 
