@@ -125,11 +125,11 @@ class RunGraph:
         self._search(chain, is_level=is_level)
         # The motions alone tell what agrees. No cycle tells it of a place of the loaded map and a
         # loop of the run.
-        nodes = np.concatenate([self._loaded.T_map_node, T_map_node])
+        moved = np.concatenate([self._loaded.T_map_node, T_map_node])
         places = self._fix_edges(fixes, ends)
-        places = [places[index] for index in consistent(places, nodes, drift)]
+        places = [places[index] for index in consistent(places, moved, drift)]
         loops = [edge.shifted(count) for edge in self._found.loops]
-        loops = [loops[index] for index in consistent(loops, nodes, drift)]
+        loops = [loops[index] for index in consistent(loops, moved, drift)]
         nodes = np.concatenate([self._loaded.T_map_node, ends.placed(fixes, T_map_node)])
         around = self._loaded.nodes() if places and self._moves_loaded else []
         moving = self._loaded.moving(around)
