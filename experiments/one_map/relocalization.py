@@ -96,7 +96,7 @@ class StoryStarts:
     ) -> None:
         """Draw the starts. `due` returns the true T_map_base (4, 4) at a stamp [ns]."""
         self._saved, self._rig, self._due = saved, rig, due
-        seen = [saved.seen_from(node) for node in np.flatnonzero(saved.pieces == 0).tolist()]
+        seen = [saved.seen_from(node) for node in saved.nodes()]
         self._seen = np.concatenate(seen)
         self._within_ns = round(within_s * 1e9)
         self._poses = dict(zip(online.stamps_ns.tolist(), online.T_world_base, strict=True))

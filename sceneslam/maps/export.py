@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import grid_of
 from sceneslam.atlas.save import save_grid, save_pose_graph
@@ -14,7 +12,7 @@ from sceneslam.atlas.save import save_grid, save_pose_graph
 def export(saved: SavedMap, folder: Path) -> list[Path]:
     """Write `grid.pgm`, `grid.yaml`, `pose_graph.g2o` and `.tum` of the first piece."""
     folder.mkdir(parents=True, exist_ok=True)
-    main = saved.of(np.flatnonzero(saved.pieces == 0).tolist())
+    main = saved.of(saved.nodes())
     grid, graph = folder / "grid.yaml", folder / "pose_graph.g2o"
     save_grid(grid_of(main.plan()), grid)
     save_pose_graph(main.graph(), graph)

@@ -21,7 +21,7 @@ def described(saved: SavedMap) -> list[str]:
         f"edges: {len(saved.edges)}, of them loops: {loops}"
     ]
     for piece in np.unique(saved.pieces).tolist():
-        own = np.flatnonzero(saved.pieces == piece).tolist()
+        own = saved.nodes(piece)
         plan = saved.plan(piece)
         modules = sorted({saved.submaps[node].module or "(bridged)" for node in own})
         rows, columns = plan.free.shape

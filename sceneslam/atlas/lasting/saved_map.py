@@ -67,12 +67,9 @@ class SavedMap:
     def views(self, piece: int = 0) -> list[tuple[Transform, Landmarks]]:
         """Return what a camera saw in a piece, and the poses (4, 4) it was seen from."""
         return [
-            (T_map_node @ view.T_submap_base, view.landmarks)
-            for T_map_node, submap, own in zip(
-                self.T_map_node, self.submaps, self.pieces, strict=True
-            )
-            if own == piece
-            for view in submap.views
+            (self.T_map_node[node] @ view.T_submap_base, view.landmarks)
+            for node in self.nodes(piece)
+            for view in self.submaps[node].views
         ]
 
     def nodes(self, piece: int = 0) -> list[int]:
@@ -154,11 +151,8 @@ class SavedMap:
 
     def _placed(self, piece: int) -> list[tuple[Planar, FloorPlan]]:
         """Return the plans of a piece with their poses in its frame, oldest first."""
-        return [
-            (T, submap.plan)
-            for T, submap, own in zip(self.plane, self.submaps, self.pieces, strict=True)
-            if own == piece
-        ]
+        plane = self.plane
+        return [(plane[node], self.submaps[node].plan) for node in self.nodes(piece)]
 
 
 def empty_map() -> SavedMap:
