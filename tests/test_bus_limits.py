@@ -204,7 +204,7 @@ def test_only_the_uncertainty_along_the_motion_hides_the_scale_of_wheels(along_m
     covariance[:3, :3] = R @ np.diag([along_m**2, across_m**2, across_m**2]) @ R.T
     scale, hold = (
         WheelScale(deviation=0.02, limit=0.03),
-        SimpleNamespace(is_trusted=True, is_revised=False, is_asked=True),
+        SimpleNamespace(is_trusted=True, held_since_ns=0),
     )
     known = {"status": TrackingStatus.TRACKING, "covariance": covariance, "inliers": 100}
     for index in range(161):

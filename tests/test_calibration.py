@@ -41,23 +41,20 @@ def test_bias_that_is_learnt_late_is_taken_off_once(bias):
     assert abs(headings[-1] - headings[1500]) < 0.35 * bias
 
 
-def tracked(T_local_base, *, deviation_m=0.003, inliers=100):
+def tracked(T_local_base, *, deviation_m=0.003, inliers=100, revision=0):
     return Tracking(
         stamp_ns=0,
         T_local_base=T_local_base,
         status=TrackingStatus.TRACKING,
         covariance=None if deviation_m is None else np.eye(6) * deviation_m**2,
         inliers=inliers,
+        revision=revision,
     )
 
 
-def hold_at(x_m, *, is_trusted=True, is_revised=False, is_asked=True, **known):
-    return SimpleNamespace(
-        tracking=tracked(se3.from_xy_yaw(x_m, 0.0, 0.0), **known),
-        is_trusted=is_trusted,
-        is_revised=is_revised,
-        is_asked=is_asked,
-    )
+def hold_at(x_m, *, is_trusted=True, held_since_ns=0, **known):
+    tracking = tracked(se3.from_xy_yaw(x_m, 0.0, 0.0), **known)
+    return SimpleNamespace(tracking=tracking, is_trusted=is_trusted, held_since_ns=held_since_ns)
 
 
 def scale():
@@ -131,9 +128,7 @@ def test_odometry_that_is_back_after_a_gap_has_moved_on_to_scale():
     "told",
     [
         {"is_trusted": False},
-        {"is_revised": True},
         {"inliers": 0},
-        {"is_asked": False},
         {"deviation_m": None},
         {"deviation_m": 0.5},
         {"metres": 0},
@@ -159,10 +154,28 @@ def test_other_activation_begins_anew():
     assert wheels.scale == pytest.approx(1.0, abs=1e-12)
 
 
-def test_module_whose_sensor_speaks_more_seldom_teaches_too():
+@pytest.mark.parametrize("told", ["revision", "held_since_ns"])
+def test_poses_before_and_after_a_correction_or_a_break_are_not_compared(told):
+    wheels, hold = scale(), SimpleNamespace()
+    for index in range(41):
+        x_m, later = 0.05 * index, int(index >= 5)
+        hold.__dict__.update(hold_at(x_m - 0.03 * later, **{told: later}).__dict__)
+        wheels.learn(hold, se3.from_xy_yaw(x_m, 0.0, 0.0), 0.0)
+    assert wheels.scale == pytest.approx(1.0, abs=1e-12)
+
+
+def test_module_that_corrects_its_past_all_the_time_teaches_nothing():
     wheels, hold = scale(), SimpleNamespace()
     for index in range(161):
-        told = hold_at(0.05 * index, is_asked=index % 3 == 0, is_trusted=index % 3 == 0)
+        hold.__dict__.update(hold_at(0.05 * index, revision=index).__dict__)
+        wheels.learn(hold, se3.from_xy_yaw(1.02 * 0.05 * index, 0.0, 0.0), 0.0)
+    assert wheels.scale == 1.0
+
+
+def test_a_span_goes_on_over_poses_that_are_not_trusted():
+    wheels, hold = scale(), SimpleNamespace()
+    for index in range(161):
+        told = hold_at(0.05 * index, is_trusted=index % 3 == 0)
         hold.__dict__.update(told.__dict__)
         wheels.learn(hold, se3.from_xy_yaw(1.02 * 0.05 * index, 0.0, 0.0), 0.0)
     assert wheels.scale == pytest.approx(1 / 1.02, abs=0.003)

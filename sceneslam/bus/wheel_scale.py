@@ -21,8 +21,8 @@ from sceneslam.types.se3 import Transform
 
 _DRIFT = 0.002  # standard deviation of the change between spans: tyres wear, floors change
 _SPAN_M = 0.5  # distance between two poses that are compared
-_TURN_MAX_RAD = 0.3  # largest turn between them: an arc is longer than its chord
-_SLIP = 0.015  # standard deviation of the wheels' slip over a span, independent for each span
+_TURN_MAX_RAD = 1.0  # between them: wheels that turn 2 per cent too far shorten its chord by 0.2
+_SLIP_M = 0.011  # standard deviation of the wheels' slip over 1 m; grows with the square root
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -30,8 +30,17 @@ class _Mark:
     """Where a span begins."""
 
     hold: Hold
-    tracking: Tracking  # the module's answer there, with a covariance
+    held_since_ns: int | None  # the module has tracked without a break since then
+    tracking: Tracking  # its answer there, with a covariance
     T_odom_base: Transform
+
+    def continues(self, mark: _Mark) -> bool:
+        """Tell whether the module's poses here and at the mark can be compared."""
+        return (
+            mark.hold is self.hold
+            and mark.held_since_ns == self.held_since_ns
+            and mark.tracking.revision == self.tracking.revision
+        )
 
 
 class WheelScale:
@@ -59,11 +68,11 @@ class WheelScale:
     def learn(self, hold: Hold, T_odom_base: Transform | None, turned_rad: float) -> None:
         """Compare uncorrected odometry (4, 4) and its turn [rad] with the module's pose."""
         self._turned_rad += turned_rad
-        if not hold.is_asked or T_odom_base is None:
-            return  # one of them has a lower rate
         here = _here(hold, T_odom_base)
+        if here is None:
+            return  # the span goes on
         mark, self._mark = self._mark, here
-        if here is None or mark is None or mark.hold is not hold:
+        if mark is None or not here.continues(mark):
             self._turned_rad = 0.0
             return
         odom_m = float(np.linalg.norm(_way(mark.T_odom_base, here.T_odom_base)))
@@ -74,18 +83,19 @@ class WheelScale:
         else:
             way_m, variance_m2 = _measured(mark, here)
             missed_m = way_m - odom_m * (1.0 + self._error.ratio)
-            self._error.learn(missed_m, odom_m, variance_m2 + (_SLIP * odom_m) ** 2)
+            self._error.learn(missed_m, odom_m, variance_m2 + _SLIP_M**2 * odom_m)
             self._turned_rad = 0.0
 
 
-def _here(hold: Hold, T_odom_base: Transform) -> _Mark | None:
+def _here(hold: Hold, T_odom_base: Transform | None) -> _Mark | None:
     """Return the current pose as a span's end, None unless the module measured it."""
     tracking = hold.tracking
-    if tracking is None or not hold.is_trusted or hold.is_revised:
+    if tracking is None or T_odom_base is None or not hold.is_trusted:
         return None
     if tracking.inliers <= 0 or tracking.covariance is None:
         return None
-    return _Mark(hold=hold, tracking=tracking, T_odom_base=T_odom_base)
+    held_since_ns = hold.held_since_ns
+    return _Mark(hold=hold, held_since_ns=held_since_ns, tracking=tracking, T_odom_base=T_odom_base)
 
 
 def _measured(mark: _Mark, here: _Mark) -> tuple[float, float]:
