@@ -9,6 +9,7 @@ import pytest
 import yaml
 from test_atlas_maps import WALL, S, edge, map_of
 from test_atlas_places import CELL, plan_of
+from test_views import place
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.lasting import lasting_map
@@ -16,6 +17,7 @@ from sceneslam.atlas.lasting.lasting_map import LastingMap
 from sceneslam.atlas.lasting.map_files import (
     HEAD,
     OLD,
+    VERSION,
     SavedFiles,
     load_map_files,
     save_map_files,
@@ -23,8 +25,10 @@ from sceneslam.atlas.lasting.map_files import (
 from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.graphs.edge import EdgeKind
+from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.files import MARK, owned
+from sceneslam.views.view import PlacedView
 
 ATLAS = "sceneslam.atlas.atlas.Atlas"
 
@@ -34,7 +38,9 @@ def whole_map():
     plans = plan_of("#..", " .#"), plan_of("#")
     saved = map_of(*plans, nodes=nodes, pieces=[0, 2], runs=[0, 1], edges=[edge(0, 1)])
     first, second = saved.submaps
-    return replace(saved, submaps=(replace(first, up=np.array([0.0, 0.6, 0.8])), second))
+    seen = PlacedView(stamp_ns=S, T_submap_base=se3.identity(), landmarks=place(1, 5))
+    first = replace(first, up=np.array([0.0, 0.6, 0.8]), views=(seen,))
+    return replace(saved, submaps=(first, second))
 
 
 def test_a_map_is_loaded_as_it_was_saved(tmp_path):
@@ -109,9 +115,9 @@ def test_arrays_that_do_not_fit_together_are_named(tmp_path, name, value, said):
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("version", 0, "a map of version 0, only versions 2 and 3 are known"),
-        ("version", "3", "a map of version '3', only versions 2 and 3 are known"),
-        ("version", 4, "a map of version 4, a newer SceneSLAM wrote it"),
+        ("version", 0, "a map of version 0, only versions 2 to 4 are known"),
+        ("version", "3", "a map of version '3', only versions 2 to 4 are known"),
+        ("version", 5, "a map of version 5, a newer SceneSLAM wrote it"),
         ("sha256", None, "sha256: missing, the map's map.yaml is not complete"),
         ("cell_m", 0.1, "cell_m: got 0.1, allowed: 0.05"),
         ("modules", "ab", "modules: expected the names"),
@@ -130,11 +136,20 @@ def test_a_head_that_does_not_fit_is_named(tmp_path, key, value, said):
         load_map_files(tmp_path / "none")
 
 
-def test_a_map_of_version_2_is_loaded_which_does_not_know_what_is_up(tmp_path):
-    with_arrays(tmp_path, lambda arrays: arrays.pop("node_up"))
+@pytest.mark.parametrize(
+    ("version", "lacks"), [(2, {"node_up", "landmark_deviation"}), (3, {"landmark_deviation"})]
+)
+def test_a_map_of_an_older_version_is_loaded(tmp_path, version, lacks):
+    """It does not know what is up, and a depth camera measured all landmarks."""
+    with_arrays(tmp_path, lambda arrays: [arrays.pop(name) for name in lacks])
     head = (tmp_path / HEAD).read_text()
-    (tmp_path / HEAD).write_text(head.replace("version: 3", "version: 2"))
-    assert [submap.up for submap in load_map_files(tmp_path).submaps] == [None, None]
+    (tmp_path / HEAD).write_text(head.replace(f"version: {VERSION}", f"version: {version}"))
+    loaded, saved = load_map_files(tmp_path).submaps, whole_map().submaps
+    for one, was in zip(loaded, saved, strict=True):
+        assert (one.up is None) == (was.up is None or "node_up" in lacks)
+        for view, seen in zip(one.views, was.views, strict=True):
+            np.testing.assert_array_equal(view.landmarks.deviation_m, seen.landmarks.deviation_m)
+    assert any(submap.views for submap in loaded)
 
 
 @pytest.mark.parametrize(
@@ -146,6 +161,7 @@ def test_a_map_of_version_2_is_loaded_which_does_not_know_what_is_up(tmp_path):
         ("node_scans", [0, 4]),
         ("point", 1e9),
         ("edge_covariance", 0.0),
+        ("landmark_deviation", 0.0),
     ],
 )
 def test_numbers_that_no_map_has_are_named(tmp_path, name, value):
@@ -211,12 +227,12 @@ def test_a_place_where_no_map_can_be_is_named_before_the_run(tmp_path, path):
             LastingMap(**given, mode="extend", save_every_s=1.0)
 
 
-@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize("version", [VERSION, VERSION + 1])
 def test_a_map_that_another_run_saved_is_kept(tmp_path, version):
     old, new = whole_map(), map_of(WALL)
     first = save_map_files(old, tmp_path)
     head = (tmp_path / HEAD).read_text()
-    (tmp_path / HEAD).write_text(head.replace("version: 3", f"version: {version}"))
+    (tmp_path / HEAD).write_text(head.replace(f"version: {VERSION}", f"version: {version}"))
     assert save_map_files(new, tmp_path).displaced == first.seal
     assert first.displaced is None and f"version: {version}" in (tmp_path / OLD).read_text()
     (tmp_path / OLD).write_text(head)

@@ -211,9 +211,9 @@ def damaged(folder, tmp_path, harm):
         (lambda f, a: (f / HEAD).write_text("a: [\n"), "map.yaml cannot be read"),
         (
             lambda f, a: (f / HEAD).write_text(
-                (f / HEAD).read_text().replace("version: 3", "version: 4")
+                (f / HEAD).read_text().replace("version: 4", "version: 5")
             ),
-            "version 4, a newer SceneSLAM wrote it",
+            "version 5, a newer SceneSLAM wrote it",
         ),
         (
             lambda f, a: (f / HEAD).write_text("format: sceneslam-map\nversion: 2\n"),

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_views import CAMERA, ELSEWHERE, HERE, finder
+from test_views import CAMERA, HERE, finder
 
 from sceneslam.atlas.places.view_taker import ViewTaker
 from sceneslam.types import se3
@@ -27,11 +27,20 @@ def seen(image=None, depth_m=2.0):
     return Observation(stamp_ns=5, image_bgr=image, depth_m=depth)
 
 
+def landmarks_of(observation):
+    viewer = LandmarkViewer(CAMERA)
+    view = viewer.look(observation)
+    unknown = np.zeros(len(view.rays))
+    return viewer.landmarks(view, unknown, unknown)
+
+
 def test_corners_have_their_rays_and_their_points_in_base():
     view = LandmarkViewer(CAMERA).look(seen(depth_m=2.0))
     assert len(view.rays) == len(view.depth_m) == len(view.descriptors) > 100
     assert (view.depth_m == 2.0).all()
-    points_cam = se3.apply(se3.inverse(CAMERA.T_base_cam), view.landmarks.points_base)
+    points_cam = se3.apply(
+        se3.inverse(CAMERA.T_base_cam), landmarks_of(seen(depth_m=2.0)).points_base
+    )
     np.testing.assert_allclose(points_cam[:, 2], 2.0, rtol=1e-5)
     np.testing.assert_allclose(points_cam[:, :2], 2.0 * view.rays, atol=1e-5)
     uv_px = view.rays * 500.0 + [320.0, 240.0]
@@ -50,8 +59,8 @@ def test_lenses_bend_no_rays():
 def test_what_shows_too_little_is_no_view():
     viewer = LandmarkViewer(CAMERA)
     assert viewer.look(seen(np.zeros((480, 640, 3), np.uint8))) is None  # dark
-    assert viewer.look(seen(depth_m=0.0)) is None and viewer.look(seen(depth_m=9.0)) is None
-    assert viewer.look(Observation(stamp_ns=0, image_bgr=picture())) is None
+    assert landmarks_of(seen(depth_m=0.0)) is None and landmarks_of(seen(depth_m=9.0)) is None
+    assert landmarks_of(Observation(stamp_ns=0, image_bgr=picture())) is None
     assert viewer.look(Observation(stamp_ns=0, depth_m=np.ones((480, 640), np.float32))) is None
 
 
@@ -77,7 +86,7 @@ def furnished(seed=3):
 
 def test_a_place_is_recognized_in_the_dark():
     viewer, image = LandmarkViewer(CAMERA), furnished()
-    known = finder((HERE, viewer.look(seen(image)).landmarks))
+    known = finder((HERE, landmarks_of(seen(image))))
     night = darkened(image, electrons=100.0)
     assert np.percentile(night, 99) < 15  # grey levels
     found = known.recognize(viewer.look(seen(night)))
@@ -105,26 +114,27 @@ def test_a_bright_image_is_left_as_it_is_and_a_dark_one_has_limited_noise():
         assert lit.mean() > 1.5 * grey.mean() and lit.std() < 3.6
 
 
-def test_only_a_camera_that_measures_depth_takes_views():
+def test_only_a_camera_takes_views():
     assert LandmarkViewer.of(RIG) is not None
-    assert LandmarkViewer.of(replace(RIG, sensors=frozenset({Sensor.IMAGE}))) is None
+    assert LandmarkViewer.of(replace(RIG, sensors=frozenset({Sensor.IMAGE}))) is not None
+    assert LandmarkViewer.of(replace(RIG, sensors=frozenset({Sensor.DEPTH}))) is None
     assert LandmarkViewer.of(replace(RIG, camera=None)) is None
     blind = ViewTaker(replace(RIG, camera=None), is_keeping=True)
     blind.move(0, HERE)
-    assert not blind.is_kept(HERE) and blind.take(seen(), HERE, is_kept=False) is None
+    assert not blind.is_kept(HERE) and blind.take(seen()) is None
 
 
 def test_views_are_kept_a_third_of_a_metre_or_a_quarter_of_a_radian_apart():
     taker = ViewTaker(RIG, is_keeping=True)
     assert taker.is_kept(HERE)
-    assert taker.take(seen(np.zeros((480, 640, 3), np.uint8)), HERE, is_kept=True) is None
+    assert taker.take(seen(np.zeros((480, 640, 3), np.uint8))) is None
     assert taker.is_kept(HERE)  # it was dark
-    taker.take(seen(), HERE, is_kept=True)
+    taker.keep(taker.take(seen()), 0, HERE)
     for away, is_kept in ((0.29, False), (0.31, True)):
         assert taker.is_kept(HERE @ se3.from_xy_yaw(0.0, away, 0.0)) == is_kept
     for turn, is_kept in ((0.24, False), (-0.26, True)):
         assert taker.is_kept(HERE @ se3.from_xy_yaw(0.0, 0.0, turn)) == is_kept
-    taker.take(seen(), ELSEWHERE, is_kept=False)
+    taker.take(seen())
     assert not taker.is_kept(HERE)
     assert not ViewTaker(RIG, is_keeping=False).is_kept(HERE)
 
@@ -137,7 +147,7 @@ def test_views_are_not_kept_in_a_fast_turn_and_carry_its_shear():
         after = HERE @ se3.from_xy_yaw(0.0, 0.0, 0.1 * rate_radps)
         taker.move(11 * 10**8, after)
         assert taker.is_kept(after) == is_kept
-        found = taker.take(seen(), after, is_kept=False)
+        found = taker.take(seen())
         assert found.shear_rad == pytest.approx(0.03 * rate_radps)
 
 

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 from test_atlas_maps import S, map_of
-from test_seen_views import RIG, seen
-from test_views import ASIDE, CAMERA, ELSEWHERE, HERE
+from test_seen_views import RIG, landmarks_of, seen
+from test_views import ASIDE, ELSEWHERE, HERE
 
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.experiments.one_map.relocalization import Starts, StoryStarts, together
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
-from sceneslam.views.view import LandmarkViewer, PlacedView
+from sceneslam.views.view import PlacedView
 
 STAMPS_NS = np.arange(100) * S // 10
 BLACK = np.zeros((480, 640, 3), np.uint8)
@@ -19,8 +19,7 @@ BLACK = np.zeros((480, 640, 3), np.uint8)
 
 def standing(due, *, count):
     """Starts of a robot that stands, in a map of one view; `due`: where it is in truth."""
-    view = LandmarkViewer(CAMERA).look(seen())
-    kept = PlacedView(stamp_ns=0, T_submap_base=ASIDE, landmarks=view.landmarks)
+    kept = PlacedView(stamp_ns=0, T_submap_base=ASIDE, landmarks=landmarks_of(seen()))
     saved = map_of(join([]), nodes=[[2.0, 1.0, 0.4]])
     saved = replace(saved, submaps=(replace(saved.submaps[0], views=(kept,)),))
     online = Trajectory(stamps_ns=STAMPS_NS, T_world_base=np.tile(ELSEWHERE, (100, 1, 1)))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_atlas_maps import map_of
-from test_views import ELSEWHERE, HERE, place
+from test_views import ELSEWHERE, HERE, landmarks_at, place
 
 from sceneslam.atlas.lasting.merge import join_pieces
 from sceneslam.atlas.lasting.saved_map import forget_contradicted
@@ -13,7 +13,7 @@ from sceneslam.atlas.places.floor_plan import join
 from sceneslam.types import se3
 from sceneslam.views.landmark_registration import recognize, register
 from sceneslam.views.placed_views import PlacedViews
-from sceneslam.views.view import Landmarks, PlacedView
+from sceneslam.views.view import PlacedView
 
 TILTED = se3.exp(np.array([0.2, -0.1, 0.3, 0.05, -0.1, 0.3]))
 
@@ -25,7 +25,7 @@ def seen_from(T_place_base, seed, *, noise_m=0.0, wrong=0.0):
     points += rng.normal(0, noise_m, points.shape)
     is_wrong = rng.random(len(points)) < wrong
     points[is_wrong] = rng.uniform(-3, 3, (is_wrong.sum(), 3))
-    return Landmarks(points_base=points.astype(np.float32), descriptors=true.descriptors)
+    return landmarks_at(points, true.descriptors)
 
 
 @pytest.mark.parametrize(("noise_m", "wrong", "off_m"), [(0, 0, 1e-6), (0.02, 0.5, 0.02)])

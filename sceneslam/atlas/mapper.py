@@ -138,6 +138,7 @@ class Mapper:
         before_ns = stamp_ns if self._rewound_ns is None else self._rewound_ns
         self._rewound_ns = min(stamp_ns, before_ns)
         self._collector.rewind(stamp_ns)
+        self._views.rewind(stamp_ns)
         kept = len(self._collector.chain)
         if kept < self._kept:
             self._is_news |= bool(self._solved.loops)
@@ -164,9 +165,11 @@ class Mapper:
         scan = self._scan(observation) if is_scanned and self._is_level else None
         view, is_kept = None, is_step and self._views.is_kept(known.T_map_base)
         if is_kept or is_viewed:
-            view = self._views.take(observation, known.T_map_base, is_kept=is_kept)
+            view = self._views.take(observation)
         if is_step:
-            landmarks = view.landmarks if view is not None and is_kept else None
+            landmarks = None
+            if view is not None and is_kept:
+                landmarks = self._views.keep(view, stamp_ns, known.T_map_base)
             self._collector.add(stamp_ns, scan, up_base, landmarks)
             self._close_loops()
         if scan is None and view is None:

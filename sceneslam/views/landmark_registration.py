@@ -9,17 +9,17 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
+from sceneslam.views.matching import matches
 from sceneslam.views.placed_views import (
     FLOOR,
     MATCHES_MIN,
     SIGMAS,
     PlacedViews,
     Sighting,
-    landmark_noise_m,
-    matches,
 )
 from sceneslam.views.view import Landmarks
 
+_PRECISE_M = 0.1  # standard deviation of a distance: less precise ones tell little of a motion
 _SAMPLES = 300  # of three matches each: one is right with 99.9 % if three of ten matches are
 _ROUNDS = 3  # of the motion by all matches that are right: which ones are depends on it
 
@@ -39,11 +39,12 @@ def recognize(
 def register(T_map_first: Transform, first: Landmarks, second: Landmarks) -> Sighting | None:
     """Return where the second view was taken in the map of the first, None if too few agree."""
     rows, columns = matches(first.descriptors, second.descriptors)
-    if len(rows) < MATCHES_MIN:
+    sigma_m = np.maximum(first.deviation_m[rows], second.deviation_m[columns]).astype(float)
+    is_precise = sigma_m <= _PRECISE_M
+    if is_precise.sum() < MATCHES_MIN:
         return None
+    rows, columns, sigma_m = rows[is_precise], columns[is_precise], sigma_m[is_precise]
     a, b = first.points_base[rows].astype(float), second.points_base[columns].astype(float)
-    far_m = np.maximum(np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1))
-    sigma_m = landmark_noise_m(far_m)
     triples = np.random.default_rng(0).integers(0, len(a), (_SAMPLES, 3))
     tried = _rigid(a[triples], b[triples])
     counts = [np.sum(_off_m(T, a, b) <= SIGMAS * sigma_m) for T in tried]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,11 +16,10 @@ from sceneslam.views.view import Landmarks
 _LIKE = 40  # most similar views that candidates are taken from
 _PLACES, _PER_PLACE = 4, 2  # that are looked at, and views of each
 _PLACE_M = 2.0  # views this near show one place
-_RATIO = 0.8  # of the best match's distance to the second's (Lowe, IJCV 2004)
 _ALIKE = 0.6  # another place with so many of the best one's matches, and nothing is recognized
 _SAME_M, _SAME_RAD = 0.3, 0.15
-_DEVIATION_MAX_M, _DEVIATION_MAX_RAD = 0.03, 0.03  # of a pose: two that agree are no chance
-_NOISE_M, _NOISE_RATIO = 0.017, 0.01  # of a landmark, and of its distance: structured light
+_DEVIATION_MAX_M = 0.03  # of a pose: two that agree are no chance
+_DEVIATION_MAX_RAD = 0.017  # a degree
 _VIEW_M, _VIEW_RAD = 0.5, 0.4  # from a view that shows the same
 SIGMAS = 3.0  # by which two measurements of a landmark differ, at most
 MATCHES_MIN = 25  # right by the pose found; by chance hardly more are than the three it is made of
@@ -39,9 +37,13 @@ class Sighting:
     @property
     def is_certain(self) -> bool:
         """Tell whether another sighting that agrees is no chance."""
+        return self.is_within(_DEVIATION_MAX_M, _DEVIATION_MAX_RAD)
+
+    def is_within(self, deviation_m: float, deviation_rad: float) -> bool:
+        """Tell whether the standard deviations of the pose are at most so large."""
         shift, turn = self.covariance[:3, :3], self.covariance[3:, 3:]
-        is_near = np.linalg.eigvalsh(shift)[-1] <= _DEVIATION_MAX_M**2
-        return bool(is_near and np.linalg.eigvalsh(turn)[-1] <= _DEVIATION_MAX_RAD**2)
+        is_near = np.linalg.eigvalsh(shift)[-1] <= deviation_m**2
+        return bool(is_near and np.linalg.eigvalsh(turn)[-1] <= deviation_rad**2)
 
 
 class PlacedViews:
@@ -129,19 +131,3 @@ def are_covered(views: NDArray[np.float64], others: NDArray[np.float64]) -> NDAr
     off = se3.inverse(views)[:, None] @ others[None]
     is_near = np.linalg.norm(off[..., :3, 3], axis=-1) <= _VIEW_M
     return np.asarray((is_near & (se3.rotation_angle_rad(off) <= _VIEW_RAD)).any(axis=1))
-
-
-def landmark_noise_m(far_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the standard deviations [m] of landmarks at distances [m]."""
-    return _NOISE_M + _NOISE_RATIO * far_m
-
-
-def matches(
-    first: NDArray[np.uint8], second: NDArray[np.uint8]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows of two sets of descriptors (N, 32) that look like the same corners."""
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(first, second, k=2)
-    good = [pair[0] for pair in pairs if pair[0].distance < _RATIO * pair[-1].distance]
-    best = {match.trainIdx: match for match in sorted(good, key=lambda one: -one.distance)}
-    rows = np.array([match.queryIdx for match in best.values()], np.int64)
-    return rows, np.array(list(best), np.int64)

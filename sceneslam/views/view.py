@@ -1,4 +1,4 @@
-"""Features of an image with their points in space, where a depth camera measured them."""
+"""Features of an image, with their points in space where these are known."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ from sceneslam.views.grey_noise import brightened
 
 _FEATURES = 500  # per image
 _FAST_MIN = 10  # least contrast of a corner
+_MARGIN_PX = 16  # half a descriptor's patch: nearer to the border, on every scale, it is cut off
 _NOISE_MAX = 3.0  # a corner's least contrast is three standard deviations
-_FEWEST = 40  # located features of a view; with fewer no place is recognized
+_FEWEST = 40  # features of a view; with fewer no place is recognized
+_NOISE_M, _NOISE_RATIO = 0.017, 0.01  # of a measured depth, and of its distance: structured light
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -25,7 +27,11 @@ class Landmarks:
     """Points that a camera saw, and their ORB descriptors (Rublee et al., ICCV 2011)."""
 
     points_base: NDArray[np.float32]  # (N, 3) [m], base of the view
+    deviation_m: NDArray[np.float32]  # (N,) standard deviations of their distances
     descriptors: NDArray[np.uint8]  # (N, 32)
+
+    def __len__(self) -> int:
+        return len(self.points_base)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,7 +41,6 @@ class LandmarkView:
     rays: NDArray[np.float32]  # (N, 2): x / z and y / z in the camera frame, undistorted
     descriptors: NDArray[np.uint8]  # (N, 32)
     depth_m: NDArray[np.float32]  # (N,), along the optical axis, 0 = missing
-    landmarks: Landmarks  # of the features with a depth
     shear_rad: float = 0.0  # between its first and last row, by the camera's turn
 
 
@@ -53,47 +58,72 @@ class LandmarkViewer:
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
-        self._orb = cv2.ORB.create(nfeatures=_FEATURES, fastThreshold=_FAST_MIN)
+        self._orb = cv2.ORB.create(
+            nfeatures=_FEATURES, fastThreshold=_FAST_MIN, edgeThreshold=_MARGIN_PX
+        )
 
     @classmethod
     def of(cls, rig: Rig) -> LandmarkViewer | None:
-        """Return the viewer of a rig, None without a camera that measures depth."""
-        if rig.camera is None or not {Sensor.IMAGE, Sensor.DEPTH} <= rig.sensors:
+        """Return the viewer of a rig, None without a camera."""
+        if rig.camera is None or Sensor.IMAGE not in rig.sensors:
             return None
         return cls(rig.camera)
 
     def look(self, observation: Observation, *, shear_rad: float = 0.0) -> LandmarkView | None:
         """Return the view of an observation.
 
-        None with too few features, without image or depth, or of another size than the camera's.
+        None with too few features, without an image, or of another size than the camera's.
         """
         image, depth_m, camera = observation.image_bgr, observation.depth_m, self._camera
-        if image is None or depth_m is None:
+        if image is None or image.shape[1::-1] != tuple(camera.size_wh):
             return None
-        if image.shape[1::-1] != tuple(camera.size_wh) or image.shape[:2] != depth_m.shape:
+        if depth_m is not None and depth_m.shape != image.shape[:2]:
             return None
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
         grey = brightened(grey, noise_max=_NOISE_MAX)
         corners, found = self._orb.detectAndCompute(grey, None)
         if len(corners) < _FEWEST:
             return None
-        descriptors = np.asarray(found, np.uint8)
         uv_px = np.array([corner.pt for corner in corners])
-        column, row = np.rint(uv_px).astype(np.int64).T
-        z = depth_m[row, column]
-        z = np.where(camera.measures(z), z, np.float32(0.0))
+        z = np.zeros(len(uv_px), np.float32)
+        if depth_m is not None:
+            column, row = np.rint(uv_px).astype(np.int64).T
+            z = depth_m[row, column]
+            z = np.where(camera.measures(z), z, np.float32(0.0))
         rays = cv2.undistortPoints(uv_px[:, None], camera.K, np.array(camera.distortion))[:, 0]
-        seen = np.flatnonzero(z)
-        if len(seen) < _FEWEST:
-            return None
-        points_cam = np.column_stack([rays[seen], np.ones(len(seen))]) * z[seen, None]
-        points_base = se3.apply(camera.T_base_cam, points_cam)
         return LandmarkView(
             rays=rays.astype(np.float32),
-            descriptors=descriptors,
+            descriptors=np.asarray(found, np.uint8),
             depth_m=z,
-            landmarks=Landmarks(
-                points_base=points_base.astype(np.float32), descriptors=descriptors[seen]
-            ),
             shear_rad=shear_rad,
         )
+
+    def landmarks(
+        self,
+        view: LandmarkView,
+        depth_m: NDArray[np.floating],
+        deviation_m: NDArray[np.floating],
+    ) -> Landmarks | None:
+        """Return the features with a measured depth or else one of `depth_m` (N,), 0 = unknown.
+
+        None with too few.
+        """
+        is_measured = view.depth_m > 0
+        z = np.where(is_measured, view.depth_m, depth_m)
+        known = np.flatnonzero(z)
+        if len(known) < _FEWEST:
+            return None
+        points_cam = np.column_stack([view.rays[known], np.ones(len(known))]) * z[known, None]
+        points_base = se3.apply(self._camera.T_base_cam, points_cam).astype(np.float32)
+        noise_m = np.where(is_measured[known], depth_noise_m(points_base), deviation_m[known])
+        return Landmarks(
+            points_base=points_base,
+            deviation_m=noise_m.astype(np.float32),
+            descriptors=view.descriptors[known],
+        )
+
+
+def depth_noise_m(points: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return the standard deviations (N,) of the distances of points (N, 3) by a depth camera."""
+    far_m = np.linalg.norm(points, axis=1)
+    return np.asarray(_NOISE_M + _NOISE_RATIO * far_m, np.float32)

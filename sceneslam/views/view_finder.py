@@ -14,14 +14,13 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 from sceneslam.types.spread import spread
+from sceneslam.views.matching import matches
 from sceneslam.views.placed_views import (
     FLOOR,
     MATCHES_MIN,
     SIGMAS,
     PlacedViews,
     Sighting,
-    landmark_noise_m,
-    matches,
 )
 from sceneslam.views.view import Landmarks, LandmarkView
 
@@ -32,34 +31,75 @@ _STEPS = 4  # of Gauss-Newton, from a pose that the rays fit already
 _GUIDED_PX = 9.0  # from where a pose by one view of the map expects a landmark of the others
 _SAME_BITS = 50  # descriptors that differ in more show two corners (Mur-Artal et al., T-RO 2015)
 _FOUND_MIN = 0.15  # of the landmarks in view
-_SURFACE_MIN = 0.7  # of the matches with depth, within the tolerance
-_SURFACE_M, _SURFACE_RATIO = 0.05, 0.03  # 5 cm and 3 % of the depth: structured light at 5 m
+_SURFACE_MIN = 0.7  # of the matches with depth
 _NEAR_M = 0.1  # nothing nearer is in view
 _TOGETHER = 12  # views of a place by which a pose is measured: 5,000 landmarks
 _ROUNDS = 2  # of the pose by all views: which matches are right depends on it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Seen:
+    """Landmarks of the map, in one frame."""
+
+    points: NDArray[np.float64]  # (N, 3) [m]
+    deviation_m: NDArray[np.float64]  # (N,), of their distances from where they were seen
+    cameras: NDArray[np.float64]  # (N, 3) [m]: that place
+    descriptors: NDArray[np.uint8]  # (N, 32)
+
+    @classmethod
+    def of(cls, T_base_cam: Transform, views: Sequence[tuple[Transform, Landmarks]]) -> _Seen:
+        """Return the landmarks of one view or more, from poses (4, 4) in the frame."""
+        camera = T_base_cam[:3, 3]
+        points = [se3.apply(T, one.points_base.astype(float)) for T, one in views]
+        cameras = [np.tile(T[:3, :3] @ camera + T[:3, 3], (len(one), 1)) for T, one in views]
+        return cls(
+            points=np.concatenate(points),
+            deviation_m=np.concatenate([one.deviation_m for _, one in views]).astype(float),
+            cameras=np.concatenate(cameras),
+            descriptors=np.concatenate([one.descriptors for _, one in views]),
+        )
+
+    def aside_rad(self, camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far (N,) [rad] errors of the distances move them for a camera at (3,)."""
+        then, now = self.points - self.cameras, self.points - camera
+        lengths = np.linalg.norm(then, axis=1) * (now**2).sum(axis=1)
+        return np.asarray(
+            self.deviation_m
+            * np.linalg.norm(np.cross(then, now), axis=1)
+            / np.maximum(lengths, 1e-9)
+        )
+
+    def __getitem__(self, rows: NDArray[Any]) -> _Seen:
+        return _Seen(
+            points=self.points[rows],
+            deviation_m=self.deviation_m[rows],
+            cameras=self.cameras[rows],
+            descriptors=self.descriptors[rows],
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Matched:
     """Landmarks of the map, and how a view shows them."""
 
-    points: NDArray[np.float64]  # (N, 3) [m]
+    seen: _Seen
     rays: NDArray[np.float64]  # (N, 2)
     depth_m: NDArray[np.float64]  # (N,), 0 = missing
 
     @classmethod
-    def of(
-        cls, points: NDArray[np.floating], view: LandmarkView, columns: NDArray[np.int64]
-    ) -> _Matched:
-        """Return points (N, 3) that are the features `columns` (N,) of a view."""
+    def of(cls, seen: _Seen, view: LandmarkView, columns: NDArray[np.int64]) -> _Matched:
+        """Return landmarks that are the features `columns` (N,) of a view."""
         return cls(
-            points=points.astype(float),
+            seen=seen,
             rays=view.rays[columns].astype(float),
             depth_m=view.depth_m[columns].astype(float),
         )
 
+    def __len__(self) -> int:
+        return len(self.rays)
+
     def __getitem__(self, rows: NDArray[Any]) -> _Matched:
-        return _Matched(points=self.points[rows], rays=self.rays[rows], depth_m=self.depth_m[rows])
+        return _Matched(seen=self.seen[rows], rays=self.rays[rows], depth_m=self.depth_m[rows])
 
 
 class ViewFinder:
@@ -89,40 +129,62 @@ class ViewFinder:
         best = self._refined(view, rough, together)
         return best if best.is_certain else None
 
+    def find(
+        self, view: LandmarkView, expected: Transform, *, half_m: float, half_rad: float
+    ) -> Sighting | None:
+        """Return the pose of a view that is at most so far from the one expected, T_map_base.
+
+        Landmarks are looked for where they are expected, so that more are found than anywhere in
+        the map. They need not be most of those in view, but the pose has to be more certain than
+        what is expected.
+        """
+        near = self._map.near(expected)[:_TOGETHER]
+        if not near:
+            return None
+        found = self._guided(view, expected, near, half_m, half_rad)
+        fitted = self._fitted(found)
+        if fitted is None or not self._is_on_surfaces(*fitted):
+            return None
+        best = self._refined(view, self._sighting(expected, *fitted, view), near)
+        return best if best.is_within(half_m / SIGMAS, half_rad / SIGMAS) else None
+
     def _at(self, number: int, view: LandmarkView) -> Sighting | None:
         """Return the pose by the landmarks of one view of the map."""
         T_map_seen, landmarks = self._map[number]
         rows, columns = matches(landmarks.descriptors, view.descriptors)
-        if len(rows) < MATCHES_MIN:
+        seen = _Seen.of(self._camera.T_base_cam, [(se3.identity(), landmarks)])
+        fitted = self._fitted(_Matched.of(seen[rows], view, columns))
+        if fitted is None or not self._is_verified(landmarks, *fitted):
             return None
-        found = _Matched.of(landmarks.points_base[rows], view, columns)
-        error = _ERROR_PX / self._camera.fx
+        return self._sighting(T_map_seen, *fitted, view)
+
+    def _fitted(self, found: _Matched) -> tuple[Transform, _Matched] | None:
+        """Return the pose that most matches agree on, with these; None if too few do."""
+        if len(found) < MATCHES_MIN:
+            return None
         is_found, turn, shift, inliers = cv2.solvePnPRansac(
-            found.points,
+            found.seen.points,
             found.rays,
             np.eye(3),
             None,
             iterationsCount=_ITERATIONS,
-            reprojectionError=error,
+            reprojectionError=_ERROR_PX / self._camera.fx,
             confidence=_CONFIDENCE,
             flags=cv2.SOLVEPNP_AP3P,
         )
         if not is_found or inliers is None or len(inliers) < MATCHES_MIN:
             return None
         found = found[inliers[:, 0]]
-        rough = np.eye(4)
-        rough[:3, :3], rough[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
-        T_cam_seen = self._optimised(rough, found)
-        if not self._is_verified(T_cam_seen, landmarks, found):
-            return None
-        return self._sighting(T_map_seen, T_cam_seen, found, view)
+        T_cam_seen = np.eye(4)
+        T_cam_seen[:3, :3], T_cam_seen[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+        return self._optimised(T_cam_seen, found), found
 
     def _refined(self, view: LandmarkView, rough: Sighting, near: Sequence[int]) -> Sighting:
         """Return the pose by the landmarks of all views `near` it, if these are more."""
-        found = self._guided(view, rough.T_map_base, near)
+        found = self._guided(view, rough.T_map_base, near, 0.0, _GUIDED_PX / self._camera.fx)
         T_cam_base = se3.inverse(self._camera.T_base_cam)
         for _ in range(_ROUNDS):
-            at = se3.apply(T_cam_base, found.points)
+            at = se3.apply(T_cam_base, found.seen.points)
             off = np.linalg.norm(at[:, :2] / at[:, 2:] - found.rays, axis=1)
             kept = (at[:, 2] > _NEAR_M) & (off <= _ERROR_PX / self._camera.fx)
             if kept.sum() < rough.matches:
@@ -130,38 +192,48 @@ class ViewFinder:
             T_cam_base = self._optimised(T_cam_base, found[kept])
         return self._sighting(rough.T_map_base, T_cam_base, found[kept], view)
 
-    def _guided(self, view: LandmarkView, T_map_base: Transform, near: Sequence[int]) -> _Matched:
+    def _guided(
+        self,
+        view: LandmarkView,
+        T_map_base: Transform,
+        near: Sequence[int],
+        half_m: float,
+        half_rad: float,
+    ) -> _Matched:
         """Return the landmarks of views `near`, in base, that a view shows where expected.
 
-        A corner that several landmarks fit is at their mean.
+        The pose is off by `half_m` and `half_rad` at most. A corner that several landmarks fit is
+        at their mean, weighted by what is known of where they are seen from there.
         """
-        camera = self._camera
-        T_base_seen = [se3.inverse(T_map_base) @ self._map[number][0] for number in near]
-        seen = [self._map[number][1] for number in near]
-        every = np.concatenate(
-            [
-                se3.apply(T, landmarks.points_base.astype(float))
-                for T, landmarks in zip(T_base_seen, seen, strict=True)
-            ]
-        )
-        points_cam = se3.apply(se3.inverse(camera.T_base_cam), every)
+        camera, T_cam_base = self._camera, se3.inverse(self._camera.T_base_cam)
+        views = [(se3.inverse(T_map_base) @ T, one) for T, one in (self._map[n] for n in near)]
+        every = _Seen.of(camera.T_base_cam, views)
+        points_cam = se3.apply(T_cam_base, every.points)
         ahead = np.flatnonzero(points_cam[:, 2] > _NEAR_M)
         due = (points_cam[ahead, :2] / points_cam[ahead, 2:]).astype(np.float32)
-        is_near = np.abs(due[:, None] - view.rays).max(axis=2) <= _GUIDED_PX / camera.fx
+        reach = (half_rad + half_m / points_cam[ahead, 2])[:, None]
+        is_near = np.abs(due[:, None] - view.rays).max(axis=2) <= reach
         guided = self._matcher.match(
-            np.concatenate([landmarks.descriptors for landmarks in seen])[ahead],
-            view.descriptors,
-            is_near.astype(np.uint8),
+            every.descriptors[ahead], view.descriptors, is_near.astype(np.uint8)
         )
         good = [match for match in guided if match.distance <= _SAME_BITS]
-        rows = ahead[np.array([match.queryIdx for match in good], np.int64)]
+        found = every[ahead[np.array([match.queryIdx for match in good], np.int64)]]
         seen_as = np.array([match.trainIdx for match in good], np.int64)
         columns, owner = np.unique(seen_as, return_inverse=True)
-        counts = np.bincount(owner, minlength=len(columns))
-        points = np.stack(
-            [np.bincount(owner, every[rows, axis]) / counts for axis in range(3)], axis=1
+        weight = 1.0 / (
+            (_SIGMA_PX / camera.fx) ** 2 + found.aside_rad(camera.T_base_cam[:3, 3]) ** 2
         )
-        return _Matched.of(points, view, columns)
+        total = np.bincount(owner, weight, minlength=len(columns))
+        each = np.column_stack([found.points, found.deviation_m, found.cameras])
+        mean = np.stack([np.bincount(owner, weight * one) / total for one in each.T], axis=1)
+        first = np.unique(seen_as, return_index=True)[1]
+        seen = _Seen(
+            points=mean[:, :3],
+            deviation_m=mean[:, 3],
+            cameras=mean[:, 4:],
+            descriptors=found.descriptors[first],
+        )
+        return _Matched.of(seen, view, columns)
 
     def _sighting(
         self, T_map_seen: Transform, T_cam_seen: Transform, found: _Matched, view: LandmarkView
@@ -172,22 +244,23 @@ class ViewFinder:
         covariance += view.shear_rad**2 * np.eye(6)  # seen a metre away, a turn is a shift
         T_seen_base = se3.inverse(T_cam_seen) @ se3.inverse(self._camera.T_base_cam)
         return Sighting(
-            T_map_base=T_map_seen @ T_seen_base, covariance=covariance, matches=len(found.points)
+            T_map_base=T_map_seen @ T_seen_base, covariance=covariance, matches=len(found)
         )
 
-    def _is_verified(self, T_cam_seen: Transform, landmarks: Landmarks, found: _Matched) -> bool:
-        """Tell whether most landmarks in view were found, and at the depths measured."""
+    def _is_verified(self, landmarks: Landmarks, T_cam_seen: Transform, found: _Matched) -> bool:
+        """Tell whether enough landmarks in view were found, and at the depths measured."""
         camera, every = self._camera, se3.apply(T_cam_seen, landmarks.points_base.astype(float))
         ahead = every[every[:, 2] > _NEAR_M]
         uv_px = ahead[:, :2] / ahead[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         in_view = ((uv_px >= 0) & (uv_px < camera.size_wh)).all(axis=1)
-        if len(found.points) < _FOUND_MIN * in_view.sum():
-            return False
-        z, seen = se3.apply(T_cam_seen, found.points)[:, 2], found.depth_m > 0
-        if not seen.any():
-            return False
-        off_m = np.abs(z - found.depth_m)[seen]
-        return bool((off_m <= _SURFACE_M + _SURFACE_RATIO * z[seen]).mean() >= _SURFACE_MIN)
+        is_enough = len(found) >= _FOUND_MIN * in_view.sum()
+        return bool(is_enough and self._is_on_surfaces(T_cam_seen, found))
+
+    def _is_on_surfaces(self, T_cam_seen: Transform, found: _Matched) -> bool:
+        """Tell whether landmarks are at the depths measured, as far as there are any."""
+        z, seen = se3.apply(T_cam_seen, found.seen.points)[:, 2], found.depth_m > 0
+        off = np.abs(z - found.depth_m)[seen] / found.seen.deviation_m[seen]
+        return not len(off) or bool((off <= SIGMAS).mean() >= _SURFACE_MIN)
 
     def _optimised(self, T_cam_seen: Transform, found: _Matched) -> Transform:
         """Return the pose (4, 4) that best fits the rays and depths of landmarks."""
@@ -205,19 +278,21 @@ class ViewFinder:
         A depth that is far off does not count: corners lie on edges. How noisy the others are, they
         tell themselves: of landmarks in a small patch, depths measure the heading best.
         """
-        at = np.asarray(se3.apply(T_cam_seen, found.points), np.float64)
+        at = np.asarray(se3.apply(T_cam_seen, found.seen.points), np.float64)
         x, y, z = at.T
         by_point = np.zeros((len(z), 3, 3))
         by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0 / z
         by_point[:, 0, 2], by_point[:, 1, 2], by_point[:, 2, 2] = -x / z**2, -y / z**2, 1.0
         by_pose = np.concatenate([np.tile(np.eye(3), (len(z), 1, 1)), -se3.hat(at)], axis=2)
         residual = np.column_stack([at[:, :2] / at[:, 2:] - found.rays, z - found.depth_m])
-        sigma_m = landmark_noise_m(z)
+        sigma_m = found.seen.deviation_m.copy()
         missed = np.abs(residual[:, 2]) / sigma_m
         is_near = (found.depth_m > 0) & (missed <= SIGMAS)
         if is_near.sum() >= MATCHES_MIN:
             sigma_m *= max(spread(missed[is_near]), _DEPTH_LEAST)
-        weight = np.full((len(z), 3), (self._camera.fx / _SIGMA_PX) ** 2)
+        aside_rad = found.seen.aside_rad(se3.inverse(T_cam_seen)[:3, 3])
+        variance = (_SIGMA_PX / self._camera.fx) ** 2 + aside_rad**2
+        weight = np.tile(1.0 / variance[:, None], 3)
         weight[:, 2] = np.where(is_near, sigma_m**-2, 0.0)
         J = (by_point @ by_pose).reshape(-1, 6)
         weighted = J.T * weight.ravel()

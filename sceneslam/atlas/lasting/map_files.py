@@ -29,10 +29,10 @@ from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.files import PART, whole
-from sceneslam.views.view import Landmarks, PlacedView
+from sceneslam.views.view import Landmarks, PlacedView, depth_noise_m
 
-HEAD, FORMAT, VERSION = "map.yaml", "sceneslam-map", 3
-_WITHOUT_UP = 2  # the version before, which has no `node_up`
+HEAD, FORMAT, VERSION = "map.yaml", "sceneslam-map", 4
+_OLDEST = 2  # that is read; it has no `node_up`, as 3 no `landmark_deviation`
 OLD = "map.old.yaml"  # the head of a map that another one took the place of
 _FAR_M = 1e5  # no building is so large
 _ROUNDING = 1e-6  # of a rotation that was composed of many
@@ -59,6 +59,7 @@ _SHAPES: Mapping[str, tuple[str, str, tuple[int, ...]]] = {  # name -> dtype, ro
     "view_pose": ("<f8", "views", (4, 4)),
     "view_landmarks": ("<i8", "views", ()),
     "landmark": ("<f4", "landmarks", (3,)),
+    "landmark_deviation": ("<f4", "landmarks", ()),
     "descriptor": ("|u1", "landmarks", (32,)),
     "edge_nodes": ("<i8", "edges", (2,)),
     "edge_motion": ("<f8", "edges", (4, 4)),
@@ -192,8 +193,7 @@ def read_map_files(folder: Path) -> tuple[SavedMap, str]:
             arrays = {name: file[name] for name in file.files}
     except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
         raise InputError(f"the map's arrays cannot be read ({text_of(error)}): {path}") from error
-    if head["version"] == _WITHOUT_UP:
-        arrays["node_up"] = np.zeros((np.size(arrays.get("node_run", ())), 3))
+    arrays = _of_older(arrays, head["version"]) | arrays
     _check(arrays, path)
     modules = head.get("modules")
     if not isinstance(modules, list) or arrays["node_module"].max(initial=-1) >= len(modules):
@@ -228,9 +228,9 @@ def _read_head(folder: Path) -> dict[str, Any]:
     if not isinstance(head, dict) or head.get("format") != FORMAT:
         raise InputError(f"not a map of SceneSLAM (format: {FORMAT} is missing): {path}")
     version = head.get("version")
-    if version not in (_WITHOUT_UP, VERSION):
+    if version not in range(_OLDEST, VERSION + 1):
         newer = isinstance(version, int) and version > VERSION
-        which = f"only versions {_WITHOUT_UP} and {VERSION} are known"
+        which = f"only versions {_OLDEST} to {VERSION} are known"
         which = "a newer SceneSLAM wrote it" if newer else which
         raise InputError(f"a map of version {version!r}, {which}: {path}")
     for key in ("arrays", "sha256"):
@@ -239,6 +239,17 @@ def _read_head(folder: Path) -> dict[str, Any]:
     if head.get("cell_m") != CELL_M:
         raise InputError(f"cell_m: got {head.get('cell_m')!r}, allowed: {CELL_M}: {path}")
     return head
+
+
+def _of_older(arrays: Mapping[str, NDArray[Any]], version: int) -> dict[str, NDArray[Any]]:
+    """Return what an older version lacks, as far as its other arrays are what they should be."""
+    added = dict[str, NDArray[Any]]()
+    if version < 3:
+        added["node_up"] = np.zeros((np.size(arrays.get("node_run", ())), 3))
+    landmark = arrays.get("landmark")
+    if version < 4 and landmark is not None and landmark.shape[1:] == (3,):
+        added["landmark_deviation"] = depth_noise_m(landmark)
+    return added
 
 
 def _check(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
@@ -262,6 +273,8 @@ def _check(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
     for name in ("node_run", "node_module", "node_piece", "node_grid_shape"):
         if (arrays[name] < 0).any():
             raise InputError(f"{name}: expected 0 or more: {path}")
+    if (arrays["landmark_deviation"] <= 0.0).any():
+        raise InputError(f"landmark_deviation: expected above 0: {path}")
     for name in ("node_pose", "node_grid_origin", "scan_pose", "point", "view_pose", "landmark"):
         if np.abs(arrays[name]).max(initial=0.0) > _FAR_M:
             raise InputError(f"{name}: expected at most {_FAR_M:g} m: {path}")
@@ -334,6 +347,7 @@ def _arrays(saved: SavedMap, modules: list[str]) -> dict[str, NDArray[Any]]:
         "view_pose": [view.T_submap_base for view in views],
         "view_landmarks": [len(landmarks.points_base) for landmarks in seen],
         "landmark": _joined([one.points_base for one in seen]),
+        "landmark_deviation": _joined([one.deviation_m for one in seen]),
         "descriptor": _joined([one.descriptors for one in seen]),
         "edge_nodes": [(edge.first, edge.second) for edge in edges],
         "edge_motion": [edge.T_first_second for edge in edges],
@@ -380,12 +394,13 @@ def _unpacked(arrays: Mapping[str, NDArray[Any]], modules: list[str]) -> SavedMa
         PlacedView(
             stamp_ns=stamp_ns,
             T_submap_base=T,
-            landmarks=Landmarks(points_base=points, descriptors=bits),
+            landmarks=Landmarks(points_base=points, deviation_m=deviation_m, descriptors=bits),
         )
-        for stamp_ns, T, points, bits in zip(
+        for stamp_ns, T, points, deviation_m, bits in zip(
             arrays["view_stamp_ns"].tolist(),
             arrays["view_pose"],
             parts("landmark", arrays["view_landmarks"]),
+            parts("landmark_deviation", arrays["view_landmarks"]),
             parts("descriptor", arrays["view_landmarks"]),
             strict=True,
         )

@@ -22,6 +22,7 @@ from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar, se3
 from sceneslam.types.planar import Planar
 from sceneslam.types.se3 import Transform
+from sceneslam.views.placed_views import Sighting
 from sceneslam.views.view import LandmarkView
 from sceneslam.views.view_finder import ViewFinder
 
@@ -33,8 +34,12 @@ _FIX_M, _FIX_RAD = 0.5, 0.3  # distance or turn between two comparisons once loc
 _FIX_NS = 10**9  # ... and time
 _AGREE_M, _AGREE_RAD = 0.1, 0.05  # two consecutive searches that agree within this are accepted
 _REACH_M, _REACH_RAD, _SIGMAS = 0.15, 0.05, 3.0  # search window of a fix around the prediction
+_ALIKE_M = 1.0  # nearer, two places do not look alike: in a window no larger, less is enough
 _DOUBTS = 3  # consecutive comparisons that contradict the map: the place was wrong
 _KNOWN_MIN = 0.6
+
+
+_Expected = tuple[Transform, SearchWindow]  # T_map_base (4, 4), and how far off it may be
 
 
 class LocalizationEvent(Enum):
@@ -87,7 +92,7 @@ class MapLocalizer:
         *,
         standing: Callable[[Transform], Transform] = np.asarray,
     ) -> None:
-        """Take the map's walls, and its views if the run has a camera with depth.
+        """Take the map's walls, and its views if the run has a camera.
 
         `standing` gives a pose (4, 4) the height and tilt of a robot that stands there in the map;
         without it they stay as they are.
@@ -166,22 +171,23 @@ class MapLocalizer:
             return False
         return newest.view is None or self.is_due(newest)
 
-    def _by_view(self, newest: Look, around: Transform | None) -> Fix | None:
-        """Return the pose by what the camera sees; near a pose (4, 4) first, if one is given."""
-        if self._views is None or newest.view is None:
+    def _by_view(self, newest: Look, expected: _Expected | None) -> Fix | None:
+        """Return the pose by what the camera sees: where it is expected, or else anywhere."""
+        views, view = self._views, newest.view
+        if views is None or view is None:
             return None
-        self._next_view_ns = newest.stamp_ns + (_AGAIN_NS if around is None else _FIX_NS)
-        seen = None if around is None else self._views.recognize(newest.view, around)
-        if seen is None:
-            seen = self._views.recognize(newest.view)
-        if seen is None:
-            return None
-        return Fix(
-            stamp_ns=newest.stamp_ns,
-            T_map_base=seen.T_map_base,
-            covariance=seen.covariance,
-            is_by_view=True,
-        )
+        self._next_view_ns = newest.stamp_ns + (_AGAIN_NS if expected is None else _FIX_NS)
+        if expected is not None:
+            T_map_base, window = expected
+            half_m, half_rad = window.half_m, window.half_rad
+            if half_m <= _ALIKE_M:
+                seen = views.find(view, T_map_base, half_m=half_m, half_rad=half_rad)
+            else:
+                seen = views.recognize(view, T_map_base)
+            fix = _fix_of(seen, newest)
+            if fix is not None and _is_within(fix, window):
+                return fix
+        return _fix_of(views.recognize(view), newest)
 
     def _by_walls(self, latest: Sequence[Look]) -> Fix | None:
         """Return the pose by the walls around the last metres, searched in all of the map."""
@@ -202,7 +208,7 @@ class MapLocalizer:
         """Compare near the predicted pose; repeated contradictions withdraw the localization."""
         newest = latest[-1]
         window = self._window(T_map_base)
-        fix, is_contradicted = self._by_view(newest, T_map_base), False
+        fix, is_contradicted = self._by_view(newest, (T_map_base, window)), False
         if fix is not None and not _is_within(fix, window):
             fix, is_contradicted = None, True
         if fix is None and self._compares_walls(newest):
@@ -272,6 +278,18 @@ class MapLocalizer:
         self.fixes.append(replace(fix, travelled=self._travelled))
         self._doubts = self._vain = 0
         self._next_walls_ns = self._next_view_ns = newest.stamp_ns + _FIX_NS
+
+
+def _fix_of(seen: Sighting | None, newest: Look) -> Fix | None:
+    """Return what was seen as a fix."""
+    if seen is None:
+        return None
+    return Fix(
+        stamp_ns=newest.stamp_ns,
+        T_map_base=seen.T_map_base,
+        covariance=seen.covariance,
+        is_by_view=True,
+    )
 
 
 def _query(latest: Sequence[Look]) -> FloorPlan:

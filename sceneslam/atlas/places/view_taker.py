@@ -8,7 +8,8 @@ from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
-from sceneslam.views.view import LandmarkView, LandmarkViewer
+from sceneslam.views.triangulation import Triangulation
+from sceneslam.views.view import Landmarks, LandmarkView, LandmarkViewer
 
 _APART_M, _APART_RAD = 0.3, 0.25  # between two views that are kept: 60 kB per metre of path
 _READOUT_S = 0.03  # of a rolling shutter: in a turn, rows see from different directions
@@ -21,6 +22,7 @@ class ViewTaker:
     def __init__(self, rig: Rig, *, is_keeping: bool, is_comparing: bool = False) -> None:
         """`is_keeping`: views are kept in the map; `is_comparing`: with those of a loaded one."""
         self._viewer = LandmarkViewer.of(rig) if is_keeping or is_comparing else None
+        self._triangulation = Triangulation(rig.camera) if rig.camera is not None else None
         self._is_keeping = is_keeping
         self._T_run_kept: Transform | None = None  # of the last view that was kept
         self._last: tuple[int, Transform] | None = None  # stamp and pose
@@ -28,7 +30,7 @@ class ViewTaker:
 
     @property
     def can_look(self) -> bool:
-        """Tell whether there is a camera that measures depth."""
+        """Tell whether there is a camera."""
         return self._viewer is not None
 
     def move(self, stamp_ns: int, T_run_base: Transform) -> None:
@@ -51,13 +53,21 @@ class ViewTaker:
         is_far = np.linalg.norm(away[:3, 3]) >= _APART_M
         return bool(is_far or se3.rotation_angle_rad(away) >= _APART_RAD)
 
-    def take(
-        self, observation: Observation, T_run_base: Transform, *, is_kept: bool
-    ) -> LandmarkView | None:
-        """Return the view of an observation; None with too few features, or without a sensor."""
+    def rewind(self, stamp_ns: int) -> None:
+        """Forget the poses from a stamp on: others replace them."""
+        if self._triangulation is not None:
+            self._triangulation.rewind(stamp_ns)
+
+    def take(self, observation: Observation) -> LandmarkView | None:
+        """Return the view of an observation; None with too few features, or without an image."""
         if self._viewer is None:
             return None
-        view = self._viewer.look(observation, shear_rad=self._shear_rad)
-        if is_kept and view is not None:
-            self._T_run_kept = T_run_base
-        return view
+        return self._viewer.look(observation, shear_rad=self._shear_rad)
+
+    def keep(self, view: LandmarkView, stamp_ns: int, T_run_base: Transform) -> Landmarks | None:
+        """Return the landmarks of a view that is kept; None if too few are located."""
+        assert self._viewer is not None and self._triangulation is not None
+        self._T_run_kept = T_run_base
+        found = self._triangulation.locate(view, T_run_base)
+        self._triangulation.add(view, stamp_ns, T_run_base)
+        return self._viewer.landmarks(view, found.depth_m, found.deviation_m)

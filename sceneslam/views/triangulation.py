@@ -1,0 +1,104 @@
+"""Locate corners without a measured depth: by the motion between views from nearby.
+
+Beyond its range, in sunlight and on black surfaces a depth camera measures nothing, and many a
+robot has none. Two views from known poses locate a corner where their rays meet (Hartley and
+Zisserman, Multiple View Geometry, 2004, ch. 12); the module that tracks knows the poses.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.rig import Camera
+from sceneslam.types.se3 import Transform
+from sceneslam.views.matching import matches
+from sceneslam.views.view import LandmarkView
+
+_BASE_M = 0.2, 3.0  # between two views: least, and most while the path is as good as a map
+_VIEWS = 12  # the last ones, of 0.3 m or a turn each
+_SIGMA_PX = 1.0  # of a corner
+_OFF_PX = 1.5  # from where the other view's ray meets this one's, at most
+_DEVIATION_RATIO = 0.2  # of a depth, at most: a tenth of the way nearer, it is seen 2 per cent off
+_NEAR_M = 0.1  # nothing nearer is in view
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Past:
+    """A view that was kept."""
+
+    view: LandmarkView
+    T_run_cam: Transform
+    stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Located:
+    """Depths along the optical axis (N,) [m], 0 = unknown, and their standard deviations (N,)."""
+
+    depth_m: NDArray[np.float64]
+    deviation_m: NDArray[np.float64]
+
+
+class Triangulation:
+    """Remembers the last views and where they were taken."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._past: deque[_Past] = deque(maxlen=_VIEWS)
+
+    def rewind(self, stamp_ns: int) -> None:
+        """Forget the views from a stamp on: other poses replace theirs."""
+        while self._past and self._past[-1].stamp_ns >= stamp_ns:
+            self._past.pop()
+
+    def add(self, view: LandmarkView, stamp_ns: int, T_run_base: Transform) -> None:
+        """Remember a view and its pose (4, 4)."""
+        T_run_cam = T_run_base @ self._camera.T_base_cam
+        self._past.append(_Past(view=view, T_run_cam=T_run_cam, stamp_ns=stamp_ns))
+
+    def locate(self, view: LandmarkView, T_run_base: Transform) -> Located:
+        """Return where the corners without a depth are, in a view from a pose (4, 4)."""
+        found = Located(depth_m=np.zeros(len(view.rays)), deviation_m=np.zeros(len(view.rays)))
+        T_cam_run = se3.inverse(T_run_base @ self._camera.T_base_cam)
+        left = np.flatnonzero(view.depth_m == 0)
+        for past in self._past:  # the farthest first: its rays meet at the widest angle
+            T_here_there = T_cam_run @ past.T_run_cam
+            if _BASE_M[0] <= np.linalg.norm(T_here_there[:3, 3]) <= _BASE_M[1]:
+                left = self._locate_by(view, past.view, T_here_there, left, found)
+        return found
+
+    def _locate_by(
+        self,
+        here: LandmarkView,
+        there: LandmarkView,
+        T_here_there: Transform,
+        left: NDArray[np.int64],
+        found: Located,
+    ) -> NDArray[np.int64]:
+        """Locate corners `left` (K,) that another view shows, too; return those still left."""
+        rows, columns = matches(here.descriptors[left], there.descriptors)
+        rows = left[rows]
+        a = _directions(here.rays[rows])
+        b = _directions(there.rays[columns]) @ T_here_there[:3, :3].T
+        shift = T_here_there[:3, 3]
+        aa, ab, bb = (np.einsum("ni,ni->n", *pair) for pair in ((a, a), (a, b), (b, b)))
+        across = np.maximum(aa * bb - ab**2, 1e-12)  # squared sine of the angle, times both lengths
+        z = ((a @ shift) * bb - (b @ shift) * ab) / across
+        seen_there = (a * z[:, None] - shift) @ T_here_there[:3, :3]
+        deviation_m = np.abs(z) * np.sqrt(bb / across) * _SIGMA_PX / self._camera.fx
+        ahead = np.maximum(seen_there[:, 2:], _NEAR_M)
+        off = np.abs(seen_there[:, :2] / ahead - there.rays[columns]).max(axis=1, initial=0.0)
+        is_good = (np.minimum(z, seen_there[:, 2]) > _NEAR_M) & (off <= _OFF_PX / self._camera.fx)
+        is_good &= deviation_m <= _DEVIATION_RATIO * z
+        found.depth_m[rows[is_good]] = z[is_good]
+        found.deviation_m[rows[is_good]] = deviation_m[is_good]
+        return np.setdiff1d(left, rows[is_good])
+
+
+def _directions(rays: NDArray[np.float32]) -> NDArray[np.float64]:
+    return np.column_stack([rays.astype(float), np.ones(len(rays))])
