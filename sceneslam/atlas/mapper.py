@@ -158,6 +158,7 @@ class Mapper:
         is_step = self._collector.has_moved(known.T_map_base)
         is_scanned = is_step or self._rests(stamp_ns)
         is_viewed = localizer is not None and self._search is None and localizer.wants_view(look)
+        is_viewed &= is_step or not self.is_placed  # a located run sees walls at the same time
         if not (is_scanned or is_viewed):
             return
         if is_step:

@@ -208,12 +208,13 @@ class MapLocalizer:
         """Compare near the predicted pose; repeated contradictions withdraw the localization."""
         newest = latest[-1]
         window = self._window(T_map_base)
-        fix, is_contradicted = self._by_view(newest, (T_map_base, window)), False
-        if fix is not None and not _is_within(fix, window):
-            fix, is_contradicted = None, True
-        if fix is None and self._compares_walls(newest):
-            fix, by_walls = self._near_walls(latest, T_map_base, window)
-            is_contradicted |= by_walls
+        seen = self._by_view(newest, (T_map_base, window))
+        is_contradicted = seen is not None and not _is_within(seen, window)
+        fix = None if is_contradicted else seen
+        if self._compares_walls(newest):
+            by_walls, are_refuted = self._near_walls(latest, T_map_base, window)
+            is_contradicted |= are_refuted
+            fix = by_walls if fix is None else _joint(by_walls, fix)
         if fix is not None:
             self._take(newest, fix)
             return LocalizationEvent.FIXED
@@ -290,6 +291,22 @@ def _fix_of(seen: Sighting | None, newest: Look) -> Fix | None:
         covariance=seen.covariance,
         is_by_view=True,
     )
+
+
+def _joint(by_walls: Fix | None, by_view: Fix) -> Fix:
+    """Return the pose by walls and, where these leave a direction open, by landmarks, too."""
+    if by_walls is None:
+        return by_view
+    if _deviation_m(by_walls) <= _deviation_m(by_view):
+        return by_walls
+    both = by_walls, by_view
+    mean, covariance = se3.mean([fix.T_map_base for fix in both], [fix.covariance for fix in both])
+    return replace(by_view, T_map_base=mean, covariance=0.5 * covariance)  # their errors differ
+
+
+def _deviation_m(fix: Fix) -> float:
+    """Return the standard deviation of the position on the floor, where it is largest."""
+    return float(np.sqrt(np.linalg.eigvalsh(fix.covariance[:2, :2])[-1]))
 
 
 def _query(latest: Sequence[Look]) -> FloorPlan:
