@@ -11,7 +11,7 @@ from sceneslam.types.se3 import Transform
 from sceneslam.views.triangulation import Triangulation
 from sceneslam.views.view import Landmarks, LandmarkView, LandmarkViewer
 
-_APART_M, _APART_RAD = 0.3, 0.25  # between two views that are kept: 60 kB per metre of path
+_APART_M, _APART_RAD = 0.3, 0.25  # between two views that are kept: up to 80 kB per metre of path
 _READOUT_S = 0.03  # of a rolling shutter: in a turn, rows see from different directions
 _SHEAR_MAX_RAD = 0.015  # a degree: of a view that is kept
 
