@@ -32,7 +32,8 @@ CLAIM = np.diag([4.0, 4.0, 4.0, 1.0, 1.0, 1.0]) * 1e-6
 def there(x_m, y_m, yaw_rad=0.0):
     """A fix at a pose of the map."""
     pose = planar.to_transform(np.array([x_m, y_m, yaw_rad]))
-    return {"T_map_base": pose, "covariance": planar.spatial_covariance(np.eye(3), level=1.0)}
+    covariance = planar.spatial_covariance(np.eye(3), level=1.0)
+    return {"T_map_base": pose, "T_run_base": pose, "covariance": covariance}
 
 
 class Given:
@@ -254,6 +255,7 @@ def test_a_run_that_comes_back_keeps_its_loops_where_it_is_located_in_a_wrong_pl
         Fix(
             stamp_ns=second * S,
             T_map_base=at(0.0, off_m if second > 100 else 0.0) @ due(second * S),
+            T_run_base=due(second * S),
             covariance=sure,
         )
         for second in range(1, 121, 2)

@@ -10,7 +10,7 @@ from test_atlas_maps import WALL, S, edge, map_of
 
 from sceneslam.atlas import mapper as mapper_of
 from sceneslam.atlas.mapper import Mapper
-from sceneslam.atlas.places.localizer import LocalizationEvent
+from sceneslam.atlas.places.localizer import Fix, LocalizationEvent
 from sceneslam.atlas.submaps.collector import Known
 from sceneslam.atlas.submaps.graph import LOADED
 from sceneslam.experiments.one_map.drive import RIG
@@ -247,3 +247,34 @@ def test_a_located_run_is_corrected_into_the_loaded_map(monkeypatch, is_placed):
     poses = np.stack([path(stamp_ns) for stamp_ns in stamps_ns])
     np.testing.assert_allclose(found.apply(stamps_ns, poses), own.T_map_run @ poses, atol=1e-9)
     assert (own.saved().pieces == (0 if is_placed else np.r_[0, [1] * 7])).all()
+
+
+@pytest.mark.parametrize("off_m", [0.0, 3.0])
+def test_a_map_that_is_saved_during_the_run_says_where_that_lies_in_the_loaded_map(
+    monkeypatch, off_m
+):
+    """A run that is killed is connected with the map, but for places that it contradicts."""
+    searched = Searched(monkeypatch)
+    own, _, observe = looking(speed_m_s=1.0)
+    for second in range(20):
+        observe(second)
+    assert not any(edge.is_loop for edge in own.saved().edges)
+    T_run_base = planar.to_transform(np.array([12.0, 0.0, 0.0]))
+    fix = Fix(
+        stamp_ns=12 * S,
+        T_map_base=HERE @ planar.to_transform(np.array([12.0, off_m, 0.0])),
+        T_run_base=T_run_base,
+        covariance=1e-4 * np.eye(6),
+    )
+    searched.fixes, searched.T_map_run = [fix], HERE
+    searched.answer = LocalizationEvent.FOUND
+    observe(20)
+    places = [edge for edge in own.saved().edges if edge.is_loop]
+    if off_m:
+        assert places == []
+        return
+    (place,) = places
+    found = own.saved().T_map_node
+    T_first_second = se3.inverse(found[place.first]) @ found[place.second]
+    np.testing.assert_allclose(place.T_first_second, T_first_second, atol=1e-9)
+    assert place.first == 0 and own.saved().pieces[place.second] == 0

@@ -52,6 +52,7 @@ def seen():
         Fix(
             stamp_ns=second * S,
             T_map_base=at(STRETCH_M if second > 17 else 0.0) @ due(second * S),
+            T_run_base=due(second * S),
             covariance=SURE,
         )
         for second in range(31)
@@ -89,7 +90,12 @@ def test_a_place_of_an_earlier_run_that_contradicts_all_others_hardly_bends_the_
     nodes = [[3.0 * k, 0.0, 0.0] for k in range(11)]
     loaded = map_of(*[WALL] * 11, nodes=nodes, edges=[*straight, wrong])
     fixes = [
-        Fix(stamp_ns=second * S, T_map_base=due(second * S), covariance=SURE)
+        Fix(
+            stamp_ns=second * S,
+            T_map_base=due(second * S),
+            T_run_base=due(second * S),
+            covariance=SURE,
+        )
         for second in range(31)
     ]
     found = finished(loaded, moves_loaded=True, fixes=fixes)
@@ -167,7 +173,11 @@ def test_the_upright_submaps_of_a_map_hold_a_run_if_it_moves(
     own = run_of(18)
     own.finish()
     graph = RunGraph(loaded, lambda session: False, moves_loaded=moves_loaded)
-    fixes = [Fix(stamp_ns=2 * S, T_map_base=due(S), covariance=SURE)] if is_found else []
+    fixes = (
+        [Fix(stamp_ns=2 * S, T_map_base=due(S), T_run_base=due(2 * S), covariance=SURE)]
+        if is_found
+        else []
+    )
     nodes = np.stack(own.chain.T_run_node)
     found = graph.finish(own.chain, nodes, due, (), fixes, is_level=True)
     assert taken == [0, 2, 3, 4][-held:]

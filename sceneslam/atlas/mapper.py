@@ -23,7 +23,7 @@ from sceneslam.atlas.places.view_taker import ViewTaker
 from sceneslam.atlas.submaps.chain import Chain
 from sceneslam.atlas.submaps.collector import Collector, Known
 from sceneslam.atlas.submaps.correction import Correction
-from sceneslam.atlas.submaps.graph import LOADED
+from sceneslam.atlas.submaps.graph import LOADED, fits
 from sceneslam.atlas.submaps.own_loops import Path
 from sceneslam.atlas.submaps.run_graph import RunGraph, SolvedRun
 from sceneslam.atlas.submaps.uprights import straightened
@@ -244,18 +244,27 @@ class Mapper:
             located = zip(self._located(len(own)), own.T_run_node, strict=True)
             nodes = [T_map_run @ T_run_node for T_map_run, T_run_node in located]
         piece = 0 if self.is_found else int(pieces.max(initial=-1)) + 1
+        T_map_node = np.concatenate([loaded, np.reshape(nodes, (-1, 4, 4))])
         saved = SavedMap(
             submaps=(*self._loaded.submaps, *straightened(own.submaps)),
-            T_map_node=np.concatenate([loaded, np.reshape(nodes, (-1, 4, 4))]),
+            T_map_node=T_map_node,
             pieces=np.concatenate([pieces, np.full(len(own.submaps), piece, np.int64)]),
             edges=(
                 *self._loaded.edges,
                 *(edge.shifted(count) for edge in own.motions),
                 *self._solved.own_loops,
                 *self._solved.loops,
+                *(place for place in self._places() if fits(place, T_map_node)),
             ),
         )
         return saved.without_misfits() if self._is_over else saved
+
+    def _places(self) -> list[Edge]:
+        """Return the loops to the loaded map that are not solved yet: the run goes on."""
+        chain, localizer, graph = self._collector.chain, self._localizer, self._graph
+        if self._is_over or not self.is_placed or not len(chain):
+            return []
+        return [] if localizer is None or graph is None else graph.places(chain, localizer.fixes)
 
     def _located(self, count: int) -> list[Transform]:
         """Return T_map_run (4, 4) of each of `count` submaps; that of the newest is today's."""

@@ -67,6 +67,7 @@ class Fix:
 
     stamp_ns: int
     T_map_base: Transform
+    T_run_base: Transform  # as it was known then, or is by now
     covariance: NDArray[np.float64]  # (6, 6) of se3.log order, base frame
     is_by_view: bool = False
     travelled: NDArray[np.float64] = field(
@@ -102,7 +103,6 @@ class MapLocalizer:
         self._walls = Recognizer(PlanField(plan)) if len(plan) else None
         self._views, self._standing = views, standing
         self._next_walls_ns = self._next_view_ns = 0
-        self._fixed_at: Look | None = None
         self._seen: Look | None = None  # that was compared last
         self._travelled = np.zeros(2)  # until then: m, rad
         self._guess: _Guess | None = None  # of the last search that found a place
@@ -132,10 +132,9 @@ class MapLocalizer:
         if before is None or not _agree(before.T_map_run, T_map_run, newest.T_run_base):
             return LocalizationEvent.NOTHING
         fix = _mean(fix, before, newest)
-        if self._fixed_at is not None:
-            # It was located before: there, and it drifted, or somewhere else.
-            T_expected = self.fixes[-1].T_map_base @ se3.inverse(self._fixed_at.T_run_base)
-            T_expected = T_expected @ newest.T_run_base
+        if self.fixes:  # it was located before: there, and it drifted, or somewhere else
+            last = self.fixes[-1]
+            T_expected = last.T_map_base @ se3.inverse(last.T_run_base) @ newest.T_run_base
             if not _is_within(fix, self._window(T_expected)):
                 self.fixes = []
         self._take(newest, fix)
@@ -151,17 +150,17 @@ class MapLocalizer:
         fix = self.fixes[-1] if self.fixes else None
         T_run_base = None if fix is None else path(fix.stamp_ns)
         if fix is not None and T_run_base is not None:
-            self._fixed_at = Look(stamp_ns=fix.stamp_ns, T_run_base=T_run_base)
-            self._seen, self._travelled = self._fixed_at, fix.travelled
+            self.fixes[-1] = replace(fix, T_run_base=T_run_base)
+            self._seen = Look(stamp_ns=fix.stamp_ns, T_run_base=T_run_base)
+            self._travelled = fix.travelled
             if self.T_map_run is not None:
                 self.T_map_run = fix.T_map_base @ se3.inverse(T_run_base)
 
     def _is_time(self, newest: Look, next_ns: int) -> bool:
         """Tell whether the time has come, and a located robot has moved since its last fix."""
-        fixed_at = self._fixed_at
-        if newest.stamp_ns < next_ns or fixed_at is None or self.T_map_run is None:
+        if newest.stamp_ns < next_ns or self.T_map_run is None:
             return newest.stamp_ns >= next_ns
-        away = se3.inverse(fixed_at.T_run_base) @ newest.T_run_base
+        away = se3.inverse(self.fixes[-1].T_run_base) @ newest.T_run_base
         is_far = np.linalg.norm(away[:3, 3]) >= _FIX_M
         return bool(is_far or se3.rotation_angle_rad(away) >= _FIX_RAD)
 
@@ -270,12 +269,12 @@ class MapLocalizer:
         return Fix(
             stamp_ns=newest.stamp_ns,
             T_map_base=self._standing(T_near),
+            T_run_base=newest.T_run_base,
             covariance=on_floor(match.covariance),
         )
 
     def _take(self, newest: Look, fix: Fix) -> None:
         self.T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
-        self._fixed_at = newest
         self.fixes.append(replace(fix, travelled=self._travelled))
         self._doubts = self._vain = 0
         self._next_walls_ns = self._next_view_ns = newest.stamp_ns + _FIX_NS
@@ -288,6 +287,7 @@ def _fix_of(seen: Sighting | None, newest: Look) -> Fix | None:
     return Fix(
         stamp_ns=newest.stamp_ns,
         T_map_base=seen.T_map_base,
+        T_run_base=newest.T_run_base,
         covariance=seen.covariance,
         is_by_view=True,
     )

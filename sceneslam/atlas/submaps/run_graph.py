@@ -152,6 +152,11 @@ class RunGraph:
             T_map_loaded=solved.T_map_node[:count] if around else None,
         )
 
+    def places(self, chain: Chain, fixes: Sequence[Fix]) -> list[Edge]:
+        """Return the loops to the loaded map by the fixes of a run that goes on."""
+        known = {fix.stamp_ns: fix.T_run_base for fix in fixes}
+        return self._fix_edges(fixes, _Ends(chain, known.get))
+
     def _agreeing(self) -> list[Edge]:
         """Return the loops that agree with each other; one alone is not believed."""
         agreeing = self._found.largest()
