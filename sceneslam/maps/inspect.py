@@ -6,9 +6,8 @@ import numpy as np
 
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import CELL_M
-from sceneslam.atlas.submaps.graph import connected
+from sceneslam.atlas.submaps.graph import connected, misfit, off_nodes
 from sceneslam.graphs.edge import EdgeKind
-from sceneslam.types import se3
 
 _CHI2_6 = 22.46  # six degrees of freedom, p = 0.001
 
@@ -50,9 +49,8 @@ def flaws(saved: SavedMap) -> list[str]:
         if np.linalg.eigvalsh(edge.covariance).min() <= 0.0:
             found.append(f"{name}: its covariance is not positive")
             continue
-        lies = se3.inverse(saved.T_map_node[edge.first]) @ saved.T_map_node[edge.second]
-        off = se3.log(se3.inverse(edge.T_first_second) @ lies)
-        if float(off @ np.linalg.solve(edge.covariance, off)) > _CHI2_6:
+        if misfit(edge, saved.T_map_node) > _CHI2_6:
+            off = off_nodes(edge, saved.T_map_node)
             found.append(
                 f"{name}: the submaps lie {np.linalg.norm(off[:3]):.2f} m and "
                 f"{np.degrees(np.linalg.norm(off[3:])):.1f} degrees from where it was measured"

@@ -149,7 +149,7 @@ def settle(
         for index in accepted:
             graph.add(factor_of(loops[index]))
         nodes = _stepped(gtsam.LevenbergMarquardtOptimizer(graph, values), len(nodes))
-        misfits = [_misfit(loops[index], nodes) for index in accepted]
+        misfits = [misfit(loops[index], nodes) for index in accepted]
         limit = max(_CHI2_6, 0.5 * max(misfits, default=0.0))  # a wrong loop bends those around it
         if all(misfit <= limit for misfit in misfits):
             break
@@ -175,13 +175,18 @@ def _stepped(optimizer: Any, count: int) -> NDArray[np.float64]:
 
 def fits(edge: Edge, T_map_node: NDArray[np.float64]) -> bool:
     """Tell whether an edge agrees with the nodes (N, 4, 4)."""
-    return _misfit(edge, T_map_node) <= _CHI2_6
+    return misfit(edge, T_map_node) <= _CHI2_6
 
 
-def _misfit(edge: Edge, T_map_node: NDArray[np.float64]) -> float:
-    """Return the squared deviation of an edge from the nodes, over its covariance."""
+def off_nodes(edge: Edge, T_map_node: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far (6,) an edge is off the nodes (N, 4, 4), in se3.log order [m, rad]."""
     T_first_second = se3.inverse(T_map_node[edge.first]) @ T_map_node[edge.second]
-    off = se3.log(se3.inverse(T_first_second) @ edge.T_first_second)
+    return np.asarray(se3.log(se3.inverse(T_first_second) @ edge.T_first_second))
+
+
+def misfit(edge: Edge, T_map_node: NDArray[np.float64]) -> float:
+    """Return the squared deviation of an edge from the nodes, over its covariance."""
+    off = off_nodes(edge, T_map_node)
     return float(off @ np.linalg.solve(edge.covariance, off))
 
 
