@@ -10,6 +10,7 @@ from sceneslam.atlas.places import localizer
 from sceneslam.atlas.places.localizer import LocalizationEvent, Look, MapLocalizer
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.types import planar, se3
+from sceneslam.views.placed_views import Sighting
 
 
 class Scripted:
@@ -242,3 +243,55 @@ def test_six_metres_or_sixty_scans_are_compared(monkeypatch, count, step_m, comp
     assert len(walls) == compared
     np.testing.assert_allclose(walls[-1], [0.525, 0.025], atol=1e-6)  # in the newest base
     np.testing.assert_allclose(walls[0], [0.525, 0.025 - step_m * (compared - 1)], atol=1e-5)
+
+
+class Eyes:
+    """A finder that sees the robot at a pose of the map, if it is that near."""
+
+    def __init__(self):
+        self.at, self.asked = None, []
+
+    def find(self, view, expected, *, half_m, half_rad):
+        self.asked.append(half_m)
+        off = np.linalg.norm((se3.inverse(expected) @ planar.to_transform(self.at))[:2, 3])
+        return self.recognize(view) if off <= half_m else None
+
+    def recognize(self, view, around=None):
+        pose = planar.to_transform(self.at)
+        return Sighting(T_map_base=pose, covariance=np.eye(6) * 0.02**2, matches=50)
+
+
+def seen_too(second, *run_at):
+    return replace(placed(second, *run_at), view="a view")
+
+
+@pytest.mark.parametrize(("weak", "expected_m"), [(0, 1.1), (1, 0.9)])
+def test_walls_fix_a_run_and_eyes_where_walls_leave_a_direction_open(monkeypatch, weak, expected_m):
+    """In the map, walls see it at 1.1 m, and eyes at 0.9 m."""
+    scripted, eyes = Scripted(monkeypatch), Eyes()
+    own = located(scripted, np.zeros(3), run_at=(0.0, 0.0, 0.0))
+    own._views, eyes.at = eyes, np.array([0.9, 0.0, 0.0])
+    covariance = np.diag([25.0 if weak else 1e-4, 1e-4, 1e-4])
+    scripted.answer = replace(quality(at=[1.1, 0.0, 0.0], weak=weak), covariance=covariance)
+    assert own.compare([seen_too(3.0, 1.0, 0.0, 0.0)]) is LocalizationEvent.FIXED
+    assert in_map(own.T_map_run, [1.0, 0.0, 0.0])[0] == pytest.approx(expected_m, abs=0.01)
+
+
+def test_in_a_corridor_eyes_may_find_the_run_farther_off_than_walls(monkeypatch):
+    """Walls that leave its length open say nothing of how far the run has drifted along it."""
+    scripted, eyes = Scripted(monkeypatch), Eyes()
+    own = located(scripted, np.zeros(3), run_at=(0.0, 0.0, 0.0))
+    own._views = eyes
+    for second in range(2, 22):
+        x_m = float(second)
+        scripted.answer = replace(
+            quality(at=[x_m, 0.0, 0.0], weak=1), covariance=np.diag([25.0, 1e-4, 1e-4])
+        )
+        assert own.compare([placed(second, x_m, 0.0, 0.0)]) is LocalizationEvent.FIXED
+        assert scripted.window.half_m < 0.4
+    eyes.at = np.array([22.4, 0.0, 0.0])
+    scripted.answer = replace(
+        quality(at=[22.0, 0.0, 0.0], weak=1), covariance=np.diag([25.0, 1e-4, 1e-4])
+    )
+    assert own.compare([seen_too(22.0, 22.0, 0.0, 0.0)]) is LocalizationEvent.FIXED
+    assert in_map(own.T_map_run, [22.0, 0.0, 0.0])[0] == pytest.approx(22.4, abs=0.01)

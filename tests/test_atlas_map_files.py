@@ -28,7 +28,7 @@ from sceneslam.graphs.edge import EdgeKind
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.files import MARK, owned
-from sceneslam.views.view import PlacedView
+from sceneslam.views.view import PlacedView, depth_noise_m
 
 ATLAS = "sceneslam.atlas.atlas.Atlas"
 
@@ -38,7 +38,8 @@ def whole_map():
     plans = plan_of("#..", " .#"), plan_of("#")
     saved = map_of(*plans, nodes=nodes, pieces=[0, 2], runs=[0, 1], edges=[edge(0, 1)])
     first, second = saved.submaps
-    seen = PlacedView(stamp_ns=S, T_submap_base=se3.identity(), landmarks=place(1, 5))
+    landmarks = replace(place(1, 5), deviation_m=np.array([0.01, 0.3, 0.02, 1.0, 0.1], np.float32))
+    seen = PlacedView(stamp_ns=S, T_submap_base=se3.identity(), landmarks=landmarks)
     first = replace(first, up=np.array([0.0, 0.6, 0.8]), views=(seen,))
     return replace(saved, submaps=(first, second))
 
@@ -55,6 +56,10 @@ def test_a_map_is_loaded_as_it_was_saved(tmp_path):
         np.testing.assert_array_equal(one.stamps_ns, other.stamps_ns)
         np.testing.assert_array_equal(one.T_submap_base, other.T_submap_base)
         np.testing.assert_array_equal(one.up, other.up)
+        for view, seen in zip(one.views, other.views, strict=True):
+            for name in ("points_base", "deviation_m", "descriptors"):
+                kept, was = (getattr(each.landmarks, name) for each in (view, seen))
+                np.testing.assert_array_equal(kept, was)
         for name in ("points", "normals", "free", "origin_xy_m"):
             np.testing.assert_array_equal(getattr(one.plan, name), getattr(other.plan, name))
     np.testing.assert_array_equal(found.T_map_node, saved.T_map_node)
@@ -148,8 +153,21 @@ def test_a_map_of_an_older_version_is_loaded(tmp_path, version, lacks):
     for one, was in zip(loaded, saved, strict=True):
         assert (one.up is None) == (was.up is None or "node_up" in lacks)
         for view, seen in zip(one.views, was.views, strict=True):
-            np.testing.assert_array_equal(view.landmarks.deviation_m, seen.landmarks.deviation_m)
+            far_m = np.linalg.norm(seen.landmarks.points_base, axis=1)
+            np.testing.assert_allclose(view.landmarks.deviation_m, depth_noise_m(far_m), rtol=1e-6)
     assert any(submap.views for submap in loaded)
+
+
+def test_an_older_map_with_odd_landmarks_is_named_as_a_newer_one(tmp_path):
+    def harm(arrays):
+        arrays.pop("landmark_deviation")
+        arrays["landmark"] = np.full((5, 3), "a")
+
+    with_arrays(tmp_path, harm)
+    head = (tmp_path / HEAD).read_text()
+    (tmp_path / HEAD).write_text(head.replace(f"version: {VERSION}", "version: 3"))
+    with pytest.raises(InputError, match="landmark: expected"):
+        load_map_files(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,10 @@ from test_view_merge import seen_from
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.lasting.saved_map import empty_map
+from sceneslam.atlas.mapper import Mapper
+from sceneslam.atlas.places.view_taker import ViewTaker
 from sceneslam.atlas.submaps.chain import Chain
+from sceneslam.atlas.submaps.collector import Known
 from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.submaps.plan_loops import PlanLoops
 from sceneslam.atlas.submaps.run_graph import RunGraph
@@ -210,3 +213,55 @@ def test_views_are_kept_to_recognize_places_and_in_a_map_that_is_saved(
     assert drive.atlas.finish() == []
     views = [view for one in drive.atlas._mapper.saved().submaps for view in one.views]
     assert (len(views) > 5) if is_kept or is_saved else views == []
+
+
+# A robot whose camera measures no depth.
+
+
+def true_path(stamp_ns):
+    return true_pose((stamp_ns - START_NS) // STEP_NS)
+
+
+def lapped(indices, *, loaded=None, note=lambda *_, **__: None):
+    """A mapper that saw a part of the circle."""
+    mapper = Mapper(
+        replace(SEEING, sensors=frozenset({Sensor.IMAGE, Sensor.ODOMETRY})),
+        known=lambda ns: Known(T_map_base=true_path(ns), session=0, module="a", covariance=None),
+        note=note,
+        loaded=loaded,
+        keeps_views=True,
+    )
+    for index in indices:
+        mapper.observe(replace(look(index), depth_m=None), None)
+    return mapper
+
+
+def test_a_camera_without_depth_finds_itself_in_a_map_of_its_own():
+    mapped = lapped(range(LAP))
+    mapped.finish(true_path, [])
+    saved, events = mapped.saved(), []
+    views = [view for submap in saved.submaps for view in submap.views]
+    assert len(views) > 5
+    assert all((view.landmarks.deviation_m > 0.0).all() for view in views)
+    found = lapped(range(40, 60), loaded=saved, note=lambda event, *_, **__: events.append(event))
+    assert events[0] == "relocalized"
+    off = found.T_map_run  # the run's poses are those of the map
+    assert np.linalg.norm(off[:3, 3]) < 0.03 and se3.rotation_angle_rad(off) < 0.017
+
+
+@pytest.mark.parametrize(("jump_m", "is_located"), [(0.0, True), (0.2, False)])
+def test_no_corner_is_located_across_a_jump_of_the_path(jump_m, is_located):
+    """The path goes on 0.2 m ahead: as if the views were farther apart."""
+    taker = ViewTaker(replace(SEEING, sensors=frozenset({Sensor.IMAGE})), is_keeping=True)
+    for index in range(7):
+        T_run_base = true_pose(index) @ se3.from_xy_yaw(jump_m * (index == 6), 0.0, 0.0)
+        taker.move(START_NS + index * STEP_NS, T_run_base)
+        if index % 2 == 0:
+            found = taker.keep(taker.take(replace(look(index), depth_m=None)), index, T_run_base)
+    assert (found is not None) == is_located
+
+
+def test_an_image_without_depth_is_not_kept_where_others_have_it():
+    taker = ViewTaker(SEEING, is_keeping=True)
+    assert taker.is_kept(look(0), true_pose(0))
+    assert not taker.is_kept(replace(look(0), depth_m=None), true_pose(0))

@@ -121,22 +121,22 @@ def test_only_a_camera_takes_views():
     assert LandmarkViewer.of(replace(RIG, camera=None)) is None
     blind = ViewTaker(replace(RIG, camera=None), is_keeping=True)
     blind.move(0, HERE)
-    assert not blind.is_kept(HERE) and blind.take(seen()) is None
+    assert not blind.is_kept(seen(), HERE) and blind.take(seen()) is None
 
 
 def test_views_are_kept_a_third_of_a_metre_or_a_quarter_of_a_radian_apart():
     taker = ViewTaker(RIG, is_keeping=True)
-    assert taker.is_kept(HERE)
+    assert taker.is_kept(seen(), HERE)
     assert taker.take(seen(np.zeros((480, 640, 3), np.uint8))) is None
-    assert taker.is_kept(HERE)  # it was dark
+    assert taker.is_kept(seen(), HERE)  # it was dark
     taker.keep(taker.take(seen()), 0, HERE)
     for away, is_kept in ((0.29, False), (0.31, True)):
-        assert taker.is_kept(HERE @ se3.from_xy_yaw(0.0, away, 0.0)) == is_kept
+        assert taker.is_kept(seen(), HERE @ se3.from_xy_yaw(0.0, away, 0.0)) == is_kept
     for turn, is_kept in ((0.24, False), (-0.26, True)):
-        assert taker.is_kept(HERE @ se3.from_xy_yaw(0.0, 0.0, turn)) == is_kept
+        assert taker.is_kept(seen(), HERE @ se3.from_xy_yaw(0.0, 0.0, turn)) == is_kept
     taker.take(seen())
-    assert not taker.is_kept(HERE)
-    assert not ViewTaker(RIG, is_keeping=False).is_kept(HERE)
+    assert not taker.is_kept(seen(), HERE)
+    assert not ViewTaker(RIG, is_keeping=False).is_kept(seen(), HERE)
 
 
 def test_views_are_not_kept_in_a_fast_turn_and_carry_its_shear():
@@ -146,7 +146,7 @@ def test_views_are_not_kept_in_a_fast_turn_and_carry_its_shear():
         taker.move(10**9, HERE)
         after = HERE @ se3.from_xy_yaw(0.0, 0.0, 0.1 * rate_radps)
         taker.move(11 * 10**8, after)
-        assert taker.is_kept(after) == is_kept
+        assert taker.is_kept(seen(), after) == is_kept
         found = taker.take(seen())
         assert found.shear_rad == pytest.approx(0.03 * rate_radps)
 

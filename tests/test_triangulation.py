@@ -20,17 +20,18 @@ START = se3.identity()
 def blind(T_wall_base, *, seed=0):
     """The view of a camera without depth, from a pose before the wall."""
     view = view_of(WALL, T_wall_base, noise_px=0.0)
-    noise = np.random.default_rng(seed).normal(0, 0.5 / CAMERA.fx, view.rays.shape)
+    noise = np.random.default_rng(seed).normal(0, 1.0 / CAMERA.fx, view.rays.shape)
     rays = (view.rays + noise).astype(np.float32)
     return replace(view, rays=rays, depth_m=np.zeros_like(view.depth_m))
 
 
-def located(*before, here=START):
-    """What is located in a view from `here`, after views from the poses `before`."""
-    triangulation = Triangulation(CAMERA)
+def located(*before, here=START, seed=0):
+    """What is located in a view from `here`, after views from about the poses `before`."""
+    triangulation, rng = Triangulation(CAMERA), np.random.default_rng(seed)
     for index, T_wall_base in enumerate(before):
-        view = blind(T_wall_base, seed=index + 1)
-        triangulation.add(view, index * S, HERE @ T_wall_base)
+        off = se3.exp(rng.normal(0, np.repeat([0.01, 0.003], 3)))  # of the path
+        view = blind(T_wall_base, seed=10 * seed + index + 1)
+        triangulation.add(view, index * S, HERE @ T_wall_base @ off)
     return triangulation.locate(blind(here), HERE @ here)
 
 
@@ -41,20 +42,22 @@ def true_depths(T_wall_base):
 
 @pytest.mark.parametrize("aside", [se3.from_xy_yaw(0.0, 0.4, 0.1), se3.from_xy_yaw(-1.0, 0.0, 0.0)])
 def test_corners_are_where_the_rays_of_two_views_meet(aside):
-    here = se3.exp(np.array([0.0, 0.0, 0.1, 0.02, -0.05, 0.1]))
-    found = located(aside, here=here)
-    is_known = found.depth_m > 0
-    off = (found.depth_m - true_depths(here))[is_known] / found.deviation_m[is_known]
-    assert is_known.sum() > 0.5 * len(WALL)
-    assert np.median(np.abs(off)) < 1.0 and (np.abs(off) < 4.0).all()
-    assert (found.deviation_m <= 0.2 * found.depth_m).all()
+    here, off, share = se3.exp(np.array([0.0, 0.0, 0.1, 0.02, -0.05, 0.1])), [], []
+    for seed in range(20):
+        found = located(aside, here=here, seed=seed)
+        is_known = found.depth_m > 0
+        share.append(is_known.mean())
+        off += [(found.depth_m - true_depths(here))[is_known] / found.deviation_m[is_known]]
+        assert (found.deviation_m <= 0.4 * found.depth_m).all()
+    assert np.mean(share) > 0.4
+    assert 0.6 < np.sqrt(np.mean(np.concatenate(off) ** 2)) < 1.5
 
 
 def test_a_wider_base_locates_better():
     narrow, wide = (located(se3.from_xy_yaw(0.0, y_m, 0.0)) for y_m in (0.25, 1.0))
     both = located(*(se3.from_xy_yaw(0.0, y_m, 0.0) for y_m in (1.0, 0.25)))
     in_all = (narrow.depth_m > 0) & (wide.depth_m > 0)
-    assert in_all.sum() > 100
+    assert in_all.sum() > 50
     assert (wide.deviation_m[in_all] < 0.5 * narrow.deviation_m[in_all]).all()
     np.testing.assert_array_equal(both.depth_m[in_all], wide.depth_m[in_all])
 

@@ -39,6 +39,16 @@ def test_two_views_are_registered_by_their_landmarks(noise_m, wrong, off_m):
     assert register(HERE, place(1), seen_from(TILTED, 1, wrong=0.95)) is None
 
 
+def test_corners_of_uncertain_distance_are_not_registered():
+    """Of 200 corners 100 are 15 per cent too far away, as motion located them."""
+    rough = place(1)
+    rough.points_base[::2] *= 1.15
+    rough.deviation_m[::2] = 0.15 * np.linalg.norm(rough.points_base[::2], axis=1)
+    found = register(HERE, rough, seen_from(TILTED, 1))
+    off = se3.inverse(HERE @ TILTED) @ found.T_map_base
+    assert found.matches == 100 and np.linalg.norm(off[:3, 3]) < 1e-3
+
+
 def test_places_that_look_alike_are_not_recognized():
     other = seen_from(TILTED, 1)
     known = PlacedViews([(HERE, place(1)), (ELSEWHERE, place(2))])

@@ -28,7 +28,7 @@ HERE, ELSEWHERE = se3.from_xy_yaw(2.0, 1.0, 0.4), se3.from_xy_yaw(-9.0, 4.0, 2.0
 def landmarks_at(points, descriptors):
     """Landmarks that a depth camera measured."""
     points = points.astype(np.float32)
-    noise_m = depth_noise_m(points)
+    noise_m = depth_noise_m(np.linalg.norm(points, axis=1)).astype(np.float32)
     return Landmarks(points_base=points, deviation_m=noise_m, descriptors=descriptors)
 
 
@@ -159,6 +159,50 @@ def test_a_poster_that_hangs_elsewhere_now_is_not_its_old_place():
     assert finder((HERE, around)).recognize(seen) is None
     found = finder((HERE, around)).find(seen, HERE, half_m=0.5, half_rad=0.2)  # it is there
     assert np.linalg.norm((se3.inverse(HERE @ ASIDE) @ found.T_map_base)[:3, 3]) < 0.02
+
+
+def test_a_noisy_depth_camera_is_found_by_landmarks_that_are_known_better():
+    """As those of a map that a camera without depth made, from two sides."""
+    rng, precise = np.random.default_rng(1), place(1)
+    precise = replace(precise, deviation_m=np.full(200, 0.005, np.float32))
+    view = view_of(precise, ASIDE)
+    noisy = view.depth_m + rng.normal(0, depth_noise_m(view.depth_m)).astype(np.float32)
+    view, known = replace(view, depth_m=noisy), finder((HERE, precise))
+    for found in (known.recognize(view), known.find(view, HERE, half_m=0.6, half_rad=0.2)):
+        assert np.linalg.norm((se3.inverse(HERE @ ASIDE) @ found.T_map_base)[:3, 3]) < 0.01
+
+
+def far_off(landmarks, ratio, rows):
+    """Landmarks some of which lie a share of their distance too far away."""
+    points = landmarks.points_base.copy()
+    points[rows] *= 1.0 + ratio
+    deviation_m = landmarks.deviation_m.copy()
+    deviation_m[rows] = ratio * np.linalg.norm(points[rows], axis=1)
+    return replace(landmarks, points_base=points), deviation_m
+
+
+def test_corners_of_uncertain_distance_count_for_less_from_the_side():
+    off_m = {True: [], False: []}
+    for seed in range(5):
+        wrong, deviation_m = far_off(place(seed), 0.1, np.arange(0, 120))
+        view = replace(view_of(place(seed), ASIDE), depth_m=np.zeros(200, np.float32))
+        for is_stated in (True, False):
+            known = replace(wrong, deviation_m=deviation_m) if is_stated else wrong
+            found = finder((HERE, known)).find(view, HERE, half_m=0.6, half_rad=0.3)
+            off = se3.inverse(HERE @ ASIDE) @ found.T_map_base
+            off_m[is_stated].append(np.linalg.norm(off[:3, 3]))
+    assert np.median(off_m[True]) < 0.5 * np.median(off_m[False])
+
+
+def test_views_that_face_elsewhere_do_not_crowd_out_the_one_that_shows_the_place():
+    turned = [
+        (HERE @ se3.from_xy_yaw(0.01 * index, 0.0, np.pi), place(50 + index)) for index in range(15)
+    ]
+    beside = HERE @ se3.from_xy_yaw(-0.3, 0.0, 0.0)
+    seen = view_of(place(1), se3.from_xy_yaw(0.3, 0.0, 0.0))
+    known = finder(*turned, (beside, place(1)))
+    found = known.find(seen, HERE, half_m=0.2, half_rad=0.1)
+    assert np.linalg.norm((se3.inverse(HERE) @ found.T_map_base)[:3, 3]) < 0.02
 
 
 # A run that looks for itself by them.

@@ -158,13 +158,13 @@ class Mapper:
         is_step = self._collector.has_moved(known.T_map_base)
         is_scanned = is_step or self._rests(stamp_ns)
         is_viewed = localizer is not None and self._search is None and localizer.wants_view(look)
-        is_viewed &= is_step or not self.is_placed  # a located run sees walls at the same time
+        is_viewed &= is_step or not self.is_placed  # a fix is by walls first, which come in steps
         if not (is_scanned or is_viewed):
             return
         if is_step:
             self._is_level = self._collector.step_to(known.T_map_base)
         scan = self._scan(observation) if is_scanned and self._is_level else None
-        view, is_kept = None, is_step and self._views.is_kept(known.T_map_base)
+        view, is_kept = None, is_step and self._views.is_kept(observation, known.T_map_base)
         if is_kept or is_viewed:
             view = self._views.take(observation)
         if is_step:

@@ -21,7 +21,7 @@ from sceneslam.types.se3 import Transform
 
 _DRIFT = 0.002  # standard deviation of the change between spans: tyres wear, floors change
 _SPAN_M = 0.5  # distance between two poses that are compared
-_TURN_MAX_RAD = 1.0  # between them: wheels that turn 2 per cent too far shorten its chord by 0.2
+_TURN_MAX_RAD = 1.0  # between them: wheels that turn it 2 % too far shorten the chord by 0.2 %
 _SLIP_M = 0.011  # standard deviation of the wheels' slip over 1 m; grows with the square root
 
 

@@ -15,7 +15,8 @@ from sceneslam.views.view import Landmarks
 
 _LIKE = 40  # most similar views that candidates are taken from
 _PLACES, _PER_PLACE = 4, 2  # that are looked at, and views of each
-_PLACE_M = 2.0  # views this near show one place
+_PLACE_M = 2.0  # views this near show one place ...
+_FACING_RAD = 1.0  # ... if they face the same way: a camera sees as much
 _ALIKE = 0.6  # another place with so many of the best one's matches, and nothing is recognized
 _SAME_M, _SAME_RAD = 0.3, 0.15
 _DEVIATION_MAX_M = 0.03  # of a pose: two that agree are no chance
@@ -78,10 +79,13 @@ class PlacedViews:
         del self._placed[count:]
 
     def near(self, T_map_base: Transform) -> list[int]:
-        """Return the views that were taken near a pose (4, 4), the nearest first."""
-        away_m = [np.linalg.norm((T - T_map_base)[:3, 3]) for T, _ in self._placed]
-        nearest = np.argsort(away_m, kind="stable").tolist()
-        return [number for number in nearest if away_m[number] < _PLACE_M]
+        """Return the views that were taken near a pose (4, 4), facing that way, nearest first."""
+        poses = np.reshape([T for T, _ in self._placed], (-1, 4, 4))
+        away_m = np.linalg.norm((poses - T_map_base)[:, :3, 3], axis=1)
+        turned_rad = se3.rotation_angle_rad(se3.inverse(T_map_base) @ poses)
+        is_near = (away_m < _PLACE_M) & (turned_rad < _FACING_RAD)
+        nearest = np.argsort(away_m, kind="stable")
+        return [int(number) for number in nearest[is_near[nearest]]]
 
     def recognize(
         self,

@@ -17,14 +17,13 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 from sceneslam.views.matching import matches
-from sceneslam.views.view import LandmarkView
+from sceneslam.views.view import NEAR_M, SIGMA_PX, LandmarkView
 
 _BASE_M = 0.2, 3.0  # between two views: least, and most while the path is as good as a map
 _VIEWS = 12  # the last ones, of 0.3 m or a turn each
-_SIGMA_PX = 1.0  # of a corner
+_PATH_M, _PATH_RAD = 0.01, 0.003  # standard deviations of the motion between two views
 _OFF_PX = 1.5  # from where the other view's ray meets this one's, at most
-_DEVIATION_RATIO = 0.2  # of a depth, at most: a tenth of the way nearer, it is seen 2 per cent off
-_NEAR_M = 0.1  # nothing nearer is in view
+_DEVIATION_RATIO = 0.4  # of a depth, at most: from beside where it was seen, it counts for less
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -51,6 +50,10 @@ class Triangulation:
         self._camera = camera
         self._past: deque[_Past] = deque(maxlen=_VIEWS)
 
+    def forget(self) -> None:
+        """Forget all views: the path jumped."""
+        self._past.clear()
+
     def rewind(self, stamp_ns: int) -> None:
         """Forget the views from a stamp on: other poses replace theirs."""
         while self._past and self._past[-1].stamp_ns >= stamp_ns:
@@ -66,9 +69,9 @@ class Triangulation:
         found = Located(depth_m=np.zeros(len(view.rays)), deviation_m=np.zeros(len(view.rays)))
         T_cam_run = se3.inverse(T_run_base @ self._camera.T_base_cam)
         left = np.flatnonzero(view.depth_m == 0)
-        for past in self._past:  # the farthest first: its rays meet at the widest angle
+        for past in self._past:  # the oldest first: its rays meet at the widest angle
             T_here_there = T_cam_run @ past.T_run_cam
-            if _BASE_M[0] <= np.linalg.norm(T_here_there[:3, 3]) <= _BASE_M[1]:
+            if len(left) and _BASE_M[0] <= np.linalg.norm(T_here_there[:3, 3]) <= _BASE_M[1]:
                 left = self._locate_by(view, past.view, T_here_there, left, found)
         return found
 
@@ -87,13 +90,17 @@ class Triangulation:
         b = _directions(there.rays[columns]) @ T_here_there[:3, :3].T
         shift = T_here_there[:3, 3]
         aa, ab, bb = (np.einsum("ni,ni->n", *pair) for pair in ((a, a), (a, b), (b, b)))
-        across = np.maximum(aa * bb - ab**2, 1e-12)  # squared sine of the angle, times both lengths
+        across = np.maximum(aa * bb - ab**2, 1e-12)
         z = ((a @ shift) * bb - (b @ shift) * ab) / across
         seen_there = (a * z[:, None] - shift) @ T_here_there[:3, :3]
-        deviation_m = np.abs(z) * np.sqrt(bb / across) * _SIGMA_PX / self._camera.fx
-        ahead = np.maximum(seen_there[:, 2:], _NEAR_M)
+        sine2 = across / (aa * bb)  # of the angle between the rays
+        far2, there2 = aa * z**2, (seen_there**2).sum(axis=1)
+        ray2 = (SIGMA_PX / self._camera.fx) ** 2
+        variance = ray2 * (far2 * (1.0 - sine2) + there2) + _PATH_RAD**2 * there2 + _PATH_M**2
+        deviation_m = np.sqrt(variance / sine2)
+        ahead = np.maximum(seen_there[:, 2:], NEAR_M)
         off = np.abs(seen_there[:, :2] / ahead - there.rays[columns]).max(axis=1, initial=0.0)
-        is_good = (np.minimum(z, seen_there[:, 2]) > _NEAR_M) & (off <= _OFF_PX / self._camera.fx)
+        is_good = (np.minimum(z, seen_there[:, 2]) > NEAR_M) & (off <= _OFF_PX / self._camera.fx)
         is_good &= deviation_m <= _DEVIATION_RATIO * z
         found.depth_m[rows[is_good]] = z[is_good]
         found.deviation_m[rows[is_good]] = deviation_m[is_good]

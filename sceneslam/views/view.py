@@ -14,6 +14,8 @@ from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.se3 import Transform
 from sceneslam.views.grey_noise import brightened
 
+SIGMA_PX = 1.0  # standard deviation of a corner
+NEAR_M = 0.1  # nothing nearer is in view
 _FEATURES = 500  # per image
 _FAST_MIN = 10  # least contrast of a corner
 _MARGIN_PX = 16  # half a descriptor's patch: nearer to the border, on every scale, it is cut off
@@ -27,7 +29,7 @@ class Landmarks:
     """Points that a camera saw, and their ORB descriptors (Rublee et al., ICCV 2011)."""
 
     points_base: NDArray[np.float32]  # (N, 3) [m], base of the view
-    deviation_m: NDArray[np.float32]  # (N,) standard deviations of their distances
+    deviation_m: NDArray[np.float32]  # (N,) standard deviations of their distances from the camera
     descriptors: NDArray[np.uint8]  # (N, 32)
 
     def __len__(self) -> int:
@@ -115,7 +117,7 @@ class LandmarkViewer:
             return None
         points_cam = np.column_stack([view.rays[known], np.ones(len(known))]) * z[known, None]
         points_base = se3.apply(self._camera.T_base_cam, points_cam).astype(np.float32)
-        noise_m = np.where(is_measured[known], depth_noise_m(points_base), deviation_m[known])
+        noise_m = np.where(is_measured[known], depth_noise_m(z[known]), deviation_m[known])
         return Landmarks(
             points_base=points_base,
             deviation_m=noise_m.astype(np.float32),
@@ -123,7 +125,6 @@ class LandmarkViewer:
         )
 
 
-def depth_noise_m(points: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return the standard deviations (N,) of the distances of points (N, 3) by a depth camera."""
-    far_m = np.linalg.norm(points, axis=1)
-    return np.asarray(_NOISE_M + _NOISE_RATIO * far_m, np.float32)
+def depth_noise_m(far_m: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the standard deviations (N,) of depths (N,) [m] by a depth camera."""
+    return np.asarray(_NOISE_M + _NOISE_RATIO * far_m, np.float64)

@@ -22,9 +22,9 @@ from sceneslam.views.placed_views import (
     PlacedViews,
     Sighting,
 )
-from sceneslam.views.view import Landmarks, LandmarkView
+from sceneslam.views.view import NEAR_M, SIGMA_PX, Landmarks, LandmarkView, depth_noise_m
 
-_ERROR_PX, _SIGMA_PX = 3.0, 1.0  # of a match's ray, at most and usually
+_ERROR_PX = 3.0  # of a match's ray, at most
 _ITERATIONS, _CONFIDENCE = 300, 0.9999
 _DEPTH_LEAST = 0.1  # of the expected noise of a depth
 _STEPS = 4  # of Gauss-Newton, from a pose that the rays fit already
@@ -32,7 +32,6 @@ _GUIDED_PX = 9.0  # from where a pose by one view of the map expects a landmark 
 _SAME_BITS = 50  # descriptors that differ in more show two corners (Mur-Artal et al., T-RO 2015)
 _FOUND_MIN = 0.15  # of the landmarks in view
 _SURFACE_MIN = 0.7  # of the matches with depth
-_NEAR_M = 0.1  # nothing nearer is in view
 _TOGETHER = 12  # views of a place by which a pose is measured: 5,000 landmarks
 _ROUNDS = 2  # of the pose by all views: which matches are right depends on it
 
@@ -186,7 +185,7 @@ class ViewFinder:
         for _ in range(_ROUNDS):
             at = se3.apply(T_cam_base, found.seen.points)
             off = np.linalg.norm(at[:, :2] / at[:, 2:] - found.rays, axis=1)
-            kept = (at[:, 2] > _NEAR_M) & (off <= _ERROR_PX / self._camera.fx)
+            kept = (at[:, 2] > NEAR_M) & (off <= _ERROR_PX / self._camera.fx)
             if kept.sum() < rough.matches:
                 return rough
             T_cam_base = self._optimised(T_cam_base, found[kept])
@@ -209,7 +208,7 @@ class ViewFinder:
         views = [(se3.inverse(T_map_base) @ T, one) for T, one in (self._map[n] for n in near)]
         every = _Seen.of(camera.T_base_cam, views)
         points_cam = se3.apply(T_cam_base, every.points)
-        ahead = np.flatnonzero(points_cam[:, 2] > _NEAR_M)
+        ahead = np.flatnonzero(points_cam[:, 2] > NEAR_M)
         due = (points_cam[ahead, :2] / points_cam[ahead, 2:]).astype(np.float32)
         reach = (half_rad + half_m / points_cam[ahead, 2])[:, None]
         is_near = np.abs(due[:, None] - view.rays).max(axis=2) <= reach
@@ -221,7 +220,7 @@ class ViewFinder:
         seen_as = np.array([match.trainIdx for match in good], np.int64)
         columns, owner = np.unique(seen_as, return_inverse=True)
         weight = 1.0 / (
-            (_SIGMA_PX / camera.fx) ** 2 + found.aside_rad(camera.T_base_cam[:3, 3]) ** 2
+            (SIGMA_PX / camera.fx) ** 2 + found.aside_rad(camera.T_base_cam[:3, 3]) ** 2
         )
         total = np.bincount(owner, weight, minlength=len(columns))
         each = np.column_stack([found.points, found.deviation_m, found.cameras])
@@ -250,7 +249,7 @@ class ViewFinder:
     def _is_verified(self, landmarks: Landmarks, T_cam_seen: Transform, found: _Matched) -> bool:
         """Tell whether enough landmarks in view were found, and at the depths measured."""
         camera, every = self._camera, se3.apply(T_cam_seen, landmarks.points_base.astype(float))
-        ahead = every[every[:, 2] > _NEAR_M]
+        ahead = every[every[:, 2] > NEAR_M]
         uv_px = ahead[:, :2] / ahead[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         in_view = ((uv_px >= 0) & (uv_px < camera.size_wh)).all(axis=1)
         is_enough = len(found) >= _FOUND_MIN * in_view.sum()
@@ -259,7 +258,8 @@ class ViewFinder:
     def _is_on_surfaces(self, T_cam_seen: Transform, found: _Matched) -> bool:
         """Tell whether landmarks are at the depths measured, as far as there are any."""
         z, seen = se3.apply(T_cam_seen, found.seen.points)[:, 2], found.depth_m > 0
-        off = np.abs(z - found.depth_m)[seen] / found.seen.deviation_m[seen]
+        sigma_m = np.hypot(found.seen.deviation_m, depth_noise_m(z))
+        off = (np.abs(z - found.depth_m) / sigma_m)[seen]
         return not len(off) or bool((off <= SIGMAS).mean() >= _SURFACE_MIN)
 
     def _optimised(self, T_cam_seen: Transform, found: _Matched) -> Transform:
@@ -285,13 +285,15 @@ class ViewFinder:
         by_point[:, 0, 2], by_point[:, 1, 2], by_point[:, 2, 2] = -x / z**2, -y / z**2, 1.0
         by_pose = np.concatenate([np.tile(np.eye(3), (len(z), 1, 1)), -se3.hat(at)], axis=2)
         residual = np.column_stack([at[:, :2] / at[:, 2:] - found.rays, z - found.depth_m])
-        sigma_m = found.seen.deviation_m.copy()
+        noise_m = depth_noise_m(z)
+        sigma_m = np.hypot(found.seen.deviation_m, noise_m)
         missed = np.abs(residual[:, 2]) / sigma_m
         is_near = (found.depth_m > 0) & (missed <= SIGMAS)
-        if is_near.sum() >= MATCHES_MIN:
-            sigma_m *= max(spread(missed[is_near]), _DEPTH_LEAST)
+        is_measured = is_near & (found.seen.deviation_m <= 1.5 * noise_m)
+        if is_measured.sum() >= MATCHES_MIN:
+            sigma_m[is_measured] *= max(spread(missed[is_measured]), _DEPTH_LEAST)
         aside_rad = found.seen.aside_rad(se3.inverse(T_cam_seen)[:3, 3])
-        variance = (_SIGMA_PX / self._camera.fx) ** 2 + aside_rad**2
+        variance = (SIGMA_PX / self._camera.fx) ** 2 + aside_rad**2
         weight = np.tile(1.0 / variance[:, None], 3)
         weight[:, 2] = np.where(is_near, sigma_m**-2, 0.0)
         J = (by_point @ by_pose).reshape(-1, 6)

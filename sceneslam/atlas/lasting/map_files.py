@@ -247,8 +247,10 @@ def _of_older(arrays: Mapping[str, NDArray[Any]], version: int) -> dict[str, NDA
     if version < 3:
         added["node_up"] = np.zeros((np.size(arrays.get("node_run", ())), 3))
     landmark = arrays.get("landmark")
-    if version < 4 and landmark is not None and landmark.shape[1:] == (3,):
-        added["landmark_deviation"] = depth_noise_m(landmark)
+    if version < 4 and landmark is not None:  # a depth camera measured all of them
+        is_sound = landmark.dtype == np.float32 and landmark.shape[1:] == (3,)
+        far_m = np.linalg.norm(landmark.astype(float), axis=1) if is_sound else np.zeros(0)
+        added["landmark_deviation"] = depth_noise_m(far_m).astype(np.float32)
     return added
 
 

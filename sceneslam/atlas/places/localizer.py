@@ -34,7 +34,8 @@ _FIX_M, _FIX_RAD = 0.5, 0.3  # distance or turn between two comparisons once loc
 _FIX_NS = 10**9  # ... and time
 _AGREE_M, _AGREE_RAD = 0.1, 0.05  # two consecutive searches that agree within this are accepted
 _REACH_M, _REACH_RAD, _SIGMAS = 0.15, 0.05, 3.0  # search window of a fix around the prediction
-_ALIKE_M = 1.0  # nearer, two places do not look alike: in a window no larger, less is enough
+_APART_M = 1.0  # between places that look alike, at least: in a window no larger, less is enough
+_OPEN_M = 1.0  # standard deviation of a position that is not measured
 _DOUBTS = 3  # consecutive comparisons that contradict the map: the place was wrong
 _KNOWN_MIN = 0.6
 
@@ -73,6 +74,19 @@ class Fix:
     travelled: NDArray[np.float64] = field(
         default_factory=lambda: np.zeros(2)
     )  # until then: m, rad
+    held: NDArray[np.float64] = field(
+        default_factory=lambda: np.zeros(2)
+    )  # the same, until the position was measured last in all directions
+
+    @property
+    def deviation_m(self) -> float:
+        """Return the standard deviation of the position on the floor, where it is largest."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:2, :2])[-1]))
+
+    @property
+    def is_open(self) -> bool:
+        """Tell whether walls leave a direction open, as along a corridor."""
+        return self.deviation_m > _OPEN_M
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -135,7 +149,7 @@ class MapLocalizer:
         if self.fixes:  # it was located before: there, and it drifted, or somewhere else
             last = self.fixes[-1]
             T_expected = last.T_map_base @ se3.inverse(last.T_run_base) @ newest.T_run_base
-            if not _is_within(fix, self._window(T_expected)):
+            if not _is_within(fix, self._window(T_expected, last.held)):
                 self.fixes = []
         self._take(newest, fix)
         return LocalizationEvent.FOUND
@@ -179,7 +193,7 @@ class MapLocalizer:
         if expected is not None:
             T_map_base, window = expected
             half_m, half_rad = window.half_m, window.half_rad
-            if half_m <= _ALIKE_M:
+            if half_m <= _APART_M:
                 seen = views.find(view, T_map_base, half_m=half_m, half_rad=half_rad)
             else:
                 seen = views.recognize(view, T_map_base)
@@ -206,9 +220,10 @@ class MapLocalizer:
     def _check(self, latest: Sequence[Look], T_map_base: Transform) -> LocalizationEvent:
         """Compare near the predicted pose; repeated contradictions withdraw the localization."""
         newest = latest[-1]
-        window = self._window(T_map_base)
-        seen = self._by_view(newest, (T_map_base, window))
-        is_contradicted = seen is not None and not _is_within(seen, window)
+        window = self._window(T_map_base, self.fixes[-1].travelled)
+        wide = self._window(T_map_base, self.fixes[-1].held)
+        seen = self._by_view(newest, (T_map_base, wide))
+        is_contradicted = seen is not None and not _is_within(seen, wide)
         fix = None if is_contradicted else seen
         if self._compares_walls(newest):
             by_walls, are_refuted = self._near_walls(latest, T_map_base, window)
@@ -234,9 +249,9 @@ class MapLocalizer:
             self._travelled = self._travelled + moved
         self._seen = latest[-1]
 
-    def _window(self, T_map_base: Transform) -> SearchWindow:
-        """Return how far around a pose (4, 4) the robot may be, by its path since the last fix."""
-        path_m, turned_rad = self._travelled - self.fixes[-1].travelled
+    def _window(self, T_map_base: Transform, since: NDArray[np.float64]) -> SearchWindow:
+        """Return how far around a pose (4, 4) the robot may be, by its path since then (2,)."""
+        path_m, turned_rad = self._travelled - since
         turn_rad = WHEELS.rad_per_m * path_m + WHEELS.rad_per_rad * turned_rad
         return SearchWindow(
             around=planar.from_transform(T_map_base),
@@ -275,7 +290,8 @@ class MapLocalizer:
 
     def _take(self, newest: Look, fix: Fix) -> None:
         self.T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
-        self.fixes.append(replace(fix, travelled=self._travelled))
+        held = self.fixes[-1].held if fix.is_open and self.fixes else self._travelled
+        self.fixes.append(replace(fix, travelled=self._travelled, held=held))
         self._doubts = self._vain = 0
         self._next_walls_ns = self._next_view_ns = newest.stamp_ns + _FIX_NS
 
@@ -294,19 +310,14 @@ def _fix_of(seen: Sighting | None, newest: Look) -> Fix | None:
 
 
 def _joint(by_walls: Fix | None, by_view: Fix) -> Fix:
-    """Return the pose by walls and, where these leave a direction open, by landmarks, too."""
+    """Return the pose by walls, and by landmarks where those leave a direction open."""
     if by_walls is None:
         return by_view
-    if _deviation_m(by_walls) <= _deviation_m(by_view):
+    if not by_walls.is_open:
         return by_walls
     both = by_walls, by_view
     mean, covariance = se3.mean([fix.T_map_base for fix in both], [fix.covariance for fix in both])
     return replace(by_view, T_map_base=mean, covariance=0.5 * covariance)  # their errors differ
-
-
-def _deviation_m(fix: Fix) -> float:
-    """Return the standard deviation of the position on the floor, where it is largest."""
-    return float(np.sqrt(np.linalg.eigvalsh(fix.covariance[:2, :2])[-1]))
 
 
 def _query(latest: Sequence[Look]) -> FloorPlan:

@@ -6,7 +6,7 @@ import numpy as np
 
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Rig
+from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
 from sceneslam.views.triangulation import Triangulation
 from sceneslam.views.view import Landmarks, LandmarkView, LandmarkViewer
@@ -14,6 +14,7 @@ from sceneslam.views.view import Landmarks, LandmarkView, LandmarkViewer
 _APART_M, _APART_RAD = 0.3, 0.25  # between two views that are kept: up to 80 kB per metre of path
 _READOUT_S = 0.03  # of a rolling shutter: in a turn, rows see from different directions
 _SHEAR_MAX_RAD = 0.015  # a degree: of a view that is kept
+_JUMP_M_S = 1.0  # no robot's velocity changes so much from one image to the next: its pose jumped
 
 
 class ViewTaker:
@@ -26,7 +27,8 @@ class ViewTaker:
         self._is_keeping = is_keeping
         self._T_run_kept: Transform | None = None  # of the last view that was kept
         self._last: tuple[int, Transform] | None = None  # stamp and pose
-        self._shear_rad = 0.0
+        self._shear_rad, self._speed_m_s = 0.0, 0.0
+        self._measures_depth = Sensor.DEPTH in rig.sensors
 
     @property
     def can_look(self) -> bool:
@@ -38,15 +40,21 @@ class ViewTaker:
         if self._viewer is None:
             return
         if self._last is not None:
-            turn_rad = float(se3.rotation_angle_rad(se3.inverse(self._last[1]) @ T_run_base))
+            step = se3.inverse(self._last[1]) @ T_run_base
             elapsed_s = max(stamp_ns - self._last[0], 1) / 1e9
-            self._shear_rad = turn_rad * _READOUT_S / elapsed_s
+            self._shear_rad = float(se3.rotation_angle_rad(step)) * _READOUT_S / elapsed_s
+            speed_m_s = float(np.linalg.norm(step[:3, 3])) / elapsed_s
+            if abs(speed_m_s - self._speed_m_s) > _JUMP_M_S and self._triangulation is not None:
+                self._triangulation.forget()
+            self._speed_m_s = speed_m_s
         self._last = stamp_ns, T_run_base
 
-    def is_kept(self, T_run_base: Transform) -> bool:
-        """Tell whether a view from a pose is to be kept."""
+    def is_kept(self, observation: Observation, T_run_base: Transform) -> bool:
+        """Tell whether the view of an observation from a pose (4, 4) is to be kept."""
         if self._viewer is None or not self._is_keeping or self._shear_rad > _SHEAR_MAX_RAD:
             return False
+        if self._measures_depth and observation.depth_m is None:
+            return False  # the next one has a depth image
         if self._T_run_kept is None:
             return True
         away = se3.inverse(self._T_run_kept) @ T_run_base
@@ -54,7 +62,7 @@ class ViewTaker:
         return bool(is_far or se3.rotation_angle_rad(away) >= _APART_RAD)
 
     def rewind(self, stamp_ns: int) -> None:
-        """Forget the poses from a stamp on: others replace them."""
+        """Forget the views from a stamp on: other poses replace theirs."""
         if self._triangulation is not None:
             self._triangulation.rewind(stamp_ns)
 
