@@ -66,26 +66,28 @@ class Triangulation:
 
     def locate(self, view: LandmarkView, T_run_base: Transform) -> Located:
         """Return where the corners without a depth are, in a view from a pose (4, 4)."""
-        found = Located(depth_m=np.zeros(len(view.rays)), deviation_m=np.zeros(len(view.rays)))
+        depth_m, deviation_m = np.zeros(len(view.rays)), np.zeros(len(view.rays))
         T_cam_run = se3.inverse(T_run_base @ self._camera.T_base_cam)
-        left = np.flatnonzero(view.depth_m == 0)
         for past in self._past:  # the oldest first: its rays meet at the widest angle
+            left = np.flatnonzero((view.depth_m == 0) & (depth_m == 0))
             T_here_there = T_cam_run @ past.T_run_cam
-            if len(left) and _BASE_M[0] <= np.linalg.norm(T_here_there[:3, 3]) <= _BASE_M[1]:
-                left = self._locate_by(view, past.view, T_here_there, left, found)
-        return found
+            base_m = np.linalg.norm(T_here_there[:3, 3])
+            if len(left) and _BASE_M[0] <= base_m <= _BASE_M[1]:
+                rows, *found = self._meetings(view, past.view, T_here_there=T_here_there, rows=left)
+                depth_m[rows], deviation_m[rows] = found
+        return Located(depth_m=depth_m, deviation_m=deviation_m)
 
-    def _locate_by(
+    def _meetings(
         self,
         here: LandmarkView,
         there: LandmarkView,
+        *,
         T_here_there: Transform,
-        left: NDArray[np.int64],
-        found: Located,
-    ) -> NDArray[np.int64]:
-        """Locate corners `left` (K,) that another view shows, too; return those still left."""
-        rows, columns = matches(here.descriptors[left], there.descriptors)
-        rows = left[rows]
+        rows: NDArray[np.int64],
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return which corners `rows` (K,) another view shows, too, and their depths as located."""
+        matched, columns = matches(here.descriptors[rows], there.descriptors)
+        rows = rows[matched]
         a = _directions(here.rays[rows])
         b = _directions(there.rays[columns]) @ T_here_there[:3, :3].T
         shift = T_here_there[:3, 3]
@@ -102,9 +104,7 @@ class Triangulation:
         off = np.abs(seen_there[:, :2] / ahead - there.rays[columns]).max(axis=1, initial=0.0)
         is_good = (np.minimum(z, seen_there[:, 2]) > NEAR_M) & (off <= _OFF_PX / self._camera.fx)
         is_good &= deviation_m <= _DEVIATION_RATIO * z
-        found.depth_m[rows[is_good]] = z[is_good]
-        found.deviation_m[rows[is_good]] = deviation_m[is_good]
-        return np.setdiff1d(left, rows[is_good])
+        return rows[is_good], z[is_good], deviation_m[is_good]
 
 
 def _directions(rays: NDArray[np.float32]) -> NDArray[np.float64]:
