@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_one_map import atlas, world
 
-from sceneslam.atlas.lasting.map_files import HEAD, load_map_files, save_map_files
+from sceneslam.atlas.lasting.map_files import HEAD, VERSION, load_map_files, save_map_files
 from sceneslam.atlas.lasting.saved_map import forget_contradicted
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.experiments.one_map.drive import RIG, Drive, map_of
@@ -211,9 +211,9 @@ def damaged(folder, tmp_path, harm):
         (lambda f, a: (f / HEAD).write_text("a: [\n"), "map.yaml cannot be read"),
         (
             lambda f, a: (f / HEAD).write_text(
-                (f / HEAD).read_text().replace("version: 4", "version: 5")
+                (f / HEAD).read_text().replace(f"version: {VERSION}", f"version: {VERSION + 1}")
             ),
-            "version 5, a newer SceneSLAM wrote it",
+            f"version {VERSION + 1}, a newer SceneSLAM wrote it",
         ),
         (
             lambda f, a: (f / HEAD).write_text("format: sceneslam-map\nversion: 2\n"),
