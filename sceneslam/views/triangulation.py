@@ -17,6 +17,7 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 from sceneslam.views.matching import matches
+from sceneslam.views.rays import closest, directions
 from sceneslam.views.view import NEAR_M, SIGMA_PX, LandmarkView
 
 _BASE_M = 0.2, 3.0  # between two views: least, and most while the path is as good as a map
@@ -88,15 +89,14 @@ class Triangulation:
         """Return which corners `rows` (K,) another view shows, too, and their depths as located."""
         matched, columns = matches(here.descriptors[rows], there.descriptors)
         rows = rows[matched]
-        a = _directions(here.rays[rows])
-        b = _directions(there.rays[columns]) @ T_here_there[:3, :3].T
-        shift = T_here_there[:3, 3]
-        aa, ab, bb = (np.einsum("ni,ni->n", *pair) for pair in ((a, a), (a, b), (b, b)))
-        across = np.maximum(aa * bb - ab**2, 1e-12)
-        z = ((a @ shift) * bb - (b @ shift) * ab) / across
-        seen_there = (a * z[:, None] - shift) @ T_here_there[:3, :3]
-        sine2 = across / (aa * bb)  # of the angle between the rays
-        far2, there2 = aa * z**2, (seen_there**2).sum(axis=1)
+        a = directions(here.rays[rows])
+        b = directions(there.rays[columns]) @ T_here_there[:3, :3].T
+        z, _ = closest(a, b, T_here_there[:3, 3])
+        seen_here = a * z[:, None]
+        seen_there = (seen_here - T_here_there[:3, 3]) @ T_here_there[:3, :3]
+        far2, there2 = (seen_here**2).sum(axis=1), (seen_there**2).sum(axis=1)
+        crossed2 = (np.cross(a, b) ** 2).sum(axis=1)
+        sine2 = np.maximum(crossed2 / ((a**2).sum(axis=1) * (b**2).sum(axis=1)), 1e-12)
         ray2 = (SIGMA_PX / self._camera.fx) ** 2
         variance = ray2 * (far2 * (1.0 - sine2) + there2) + _PATH_RAD**2 * there2 + _PATH_M**2
         deviation_m = np.sqrt(variance / sine2)
@@ -105,7 +105,3 @@ class Triangulation:
         is_good = (np.minimum(z, seen_there[:, 2]) > NEAR_M) & (off <= _OFF_PX / self._camera.fx)
         is_good &= deviation_m <= _DEVIATION_RATIO * z
         return rows[is_good], z[is_good], deviation_m[is_good]
-
-
-def _directions(rays: NDArray[np.float32]) -> NDArray[np.float64]:
-    return np.column_stack([rays.astype(float), np.ones(len(rays))])

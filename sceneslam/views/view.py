@@ -13,6 +13,7 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.se3 import Transform
 from sceneslam.views.grey_noise import brightened
+from sceneslam.views.rays import directions
 
 SIGMA_PX = 1.0  # standard deviation of a corner
 NEAR_M = 0.1  # nothing nearer is in view
@@ -115,7 +116,7 @@ class LandmarkViewer:
         known = np.flatnonzero(z)
         if len(known) < _FEWEST:
             return None
-        points_cam = np.column_stack([view.rays[known], np.ones(len(known))]) * z[known, None]
+        points_cam = directions(view.rays[known]) * z[known, None]
         points_base = se3.apply(self._camera.T_base_cam, points_cam).astype(np.float32)
         noise_m = np.where(is_measured[known], depth_noise_m(z[known]), deviation_m[known])
         return Landmarks(

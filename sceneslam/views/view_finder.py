@@ -27,6 +27,7 @@ from sceneslam.views.view import NEAR_M, SIGMA_PX, Landmarks, LandmarkView, dept
 _ERROR_PX = 3.0  # of a match's ray, at most
 _ITERATIONS, _CONFIDENCE = 300, 0.9999
 _DEPTH_LEAST = 0.1  # of the expected noise of a depth
+_MEASURED = 1.5  # times that noise, at most: a depth camera located it, from a little farther away
 _STEPS = 4  # of Gauss-Newton, from a pose that the rays fit already
 _GUIDED_PX = 9.0  # from where a pose by one view of the map expects a landmark of the others
 _SAME_BITS = 50  # descriptors that differ in more show two corners (Mur-Artal et al., T-RO 2015)
@@ -43,7 +44,6 @@ class _Seen:
     points: NDArray[np.float64]  # (N, 3) [m]
     deviation_m: NDArray[np.float64]  # (N,), of their distances from where they were seen
     cameras: NDArray[np.float64]  # (N, 3) [m]: that place
-    descriptors: NDArray[np.uint8]  # (N, 32)
 
     @classmethod
     def of(cls, T_base_cam: Transform, views: Sequence[tuple[Transform, Landmarks]]) -> _Seen:
@@ -55,25 +55,24 @@ class _Seen:
             points=np.concatenate(points),
             deviation_m=np.concatenate([one.deviation_m for _, one in views]).astype(float),
             cameras=np.concatenate(cameras),
-            descriptors=np.concatenate([one.descriptors for _, one in views]),
         )
 
-    def aside_rad(self, camera: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far (N,) [rad] errors of the distances move them for a camera at (3,)."""
+    def ray_variance(self, camera: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+        """Return the variances (N,) of the rays to them, from a camera at (3,).
+
+        Beside the deviation `sigma` of a ray, errors of the distances move them aside.
+        """
         then, now = self.points - self.cameras, self.points - camera
         lengths = np.linalg.norm(then, axis=1) * (now**2).sum(axis=1)
-        return np.asarray(
-            self.deviation_m
-            * np.linalg.norm(np.cross(then, now), axis=1)
-            / np.maximum(lengths, 1e-9)
-        )
+        crossed = np.linalg.norm(np.cross(then, now), axis=1)
+        aside = self.deviation_m * crossed / np.maximum(lengths, 1e-9)
+        return np.asarray(sigma**2 + aside**2)
 
     def __getitem__(self, rows: NDArray[Any]) -> _Seen:
         return _Seen(
             points=self.points[rows],
             deviation_m=self.deviation_m[rows],
             cameras=self.cameras[rows],
-            descriptors=self.descriptors[rows],
         )
 
 
@@ -96,6 +95,10 @@ class _Matched:
 
     def __len__(self) -> int:
         return len(self.rays)
+
+    def depth_deviation_m(self, z: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return the standard deviations (N,) of depths measured against expected ones `z`."""
+        return np.asarray(np.hypot(self.seen.deviation_m, depth_noise_m(z)))
 
     def __getitem__(self, rows: NDArray[Any]) -> _Matched:
         return _Matched(seen=self.seen[rows], rays=self.rays[rows], depth_m=self.depth_m[rows])
@@ -212,26 +215,17 @@ class ViewFinder:
         due = (points_cam[ahead, :2] / points_cam[ahead, 2:]).astype(np.float32)
         reach = (half_rad + half_m / points_cam[ahead, 2])[:, None]
         is_near = np.abs(due[:, None] - view.rays).max(axis=2) <= reach
-        guided = self._matcher.match(
-            every.descriptors[ahead], view.descriptors, is_near.astype(np.uint8)
-        )
+        descriptors = np.concatenate([one.descriptors for _, one in views])
+        guided = self._matcher.match(descriptors[ahead], view.descriptors, is_near.astype(np.uint8))
         good = [match for match in guided if match.distance <= _SAME_BITS]
         found = every[ahead[np.array([match.queryIdx for match in good], np.int64)]]
         seen_as = np.array([match.trainIdx for match in good], np.int64)
         columns, owner = np.unique(seen_as, return_inverse=True)
-        weight = 1.0 / (
-            (SIGMA_PX / camera.fx) ** 2 + found.aside_rad(camera.T_base_cam[:3, 3]) ** 2
-        )
+        weight = 1.0 / found.ray_variance(camera.T_base_cam[:3, 3], SIGMA_PX / camera.fx)
         total = np.bincount(owner, weight, minlength=len(columns))
         each = np.column_stack([found.points, found.deviation_m, found.cameras])
         mean = np.stack([np.bincount(owner, weight * one) / total for one in each.T], axis=1)
-        first = np.unique(seen_as, return_index=True)[1]
-        seen = _Seen(
-            points=mean[:, :3],
-            deviation_m=mean[:, 3],
-            cameras=mean[:, 4:],
-            descriptors=found.descriptors[first],
-        )
+        seen = _Seen(points=mean[:, :3], deviation_m=mean[:, 3], cameras=mean[:, 4:])
         return _Matched.of(seen, view, columns)
 
     def _sighting(
@@ -258,8 +252,7 @@ class ViewFinder:
     def _is_on_surfaces(self, T_cam_seen: Transform, found: _Matched) -> bool:
         """Tell whether landmarks are at the depths measured, as far as there are any."""
         z, seen = se3.apply(T_cam_seen, found.seen.points)[:, 2], found.depth_m > 0
-        sigma_m = np.hypot(found.seen.deviation_m, depth_noise_m(z))
-        off = (np.abs(z - found.depth_m) / sigma_m)[seen]
+        off = (np.abs(z - found.depth_m) / found.depth_deviation_m(z))[seen]
         return not len(off) or bool((off <= SIGMAS).mean() >= _SURFACE_MIN)
 
     def _optimised(self, T_cam_seen: Transform, found: _Matched) -> Transform:
@@ -285,15 +278,14 @@ class ViewFinder:
         by_point[:, 0, 2], by_point[:, 1, 2], by_point[:, 2, 2] = -x / z**2, -y / z**2, 1.0
         by_pose = np.concatenate([np.tile(np.eye(3), (len(z), 1, 1)), -se3.hat(at)], axis=2)
         residual = np.column_stack([at[:, :2] / at[:, 2:] - found.rays, z - found.depth_m])
-        noise_m = depth_noise_m(z)
-        sigma_m = np.hypot(found.seen.deviation_m, noise_m)
+        sigma_m = found.depth_deviation_m(z)
         missed = np.abs(residual[:, 2]) / sigma_m
         is_near = (found.depth_m > 0) & (missed <= SIGMAS)
-        is_measured = is_near & (found.seen.deviation_m <= 1.5 * noise_m)
+        is_measured = is_near & (found.seen.deviation_m <= _MEASURED * depth_noise_m(z))
         if is_measured.sum() >= MATCHES_MIN:
             sigma_m[is_measured] *= max(spread(missed[is_measured]), _DEPTH_LEAST)
-        aside_rad = found.seen.aside_rad(se3.inverse(T_cam_seen)[:3, 3])
-        variance = (SIGMA_PX / self._camera.fx) ** 2 + aside_rad**2
+        camera = se3.inverse(T_cam_seen)[:3, 3]
+        variance = found.seen.ray_variance(camera, SIGMA_PX / self._camera.fx)
         weight = np.tile(1.0 / variance[:, None], 3)
         weight[:, 2] = np.where(is_near, sigma_m**-2, 0.0)
         J = (by_point @ by_pose).reshape(-1, 6)

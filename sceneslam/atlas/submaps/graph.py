@@ -151,7 +151,7 @@ def settle(
         nodes = _stepped(gtsam.LevenbergMarquardtOptimizer(graph, values), len(nodes))
         misfits = [misfit(loops[index], nodes) for index in accepted]
         limit = max(_CHI2_6, 0.5 * max(misfits, default=0.0))  # a wrong loop bends those around it
-        if all(misfit <= limit for misfit in misfits):
+        if all(each <= limit for each in misfits):
             break
         accepted = [
             index for index, misfit in zip(accepted, misfits, strict=True) if misfit <= limit

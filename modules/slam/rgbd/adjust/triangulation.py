@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
+from sceneslam.views.rays import closest
 
 from ..locate.matching import Matches, match_pairs
 from ..locate.residuals import Sightings, errors
@@ -221,10 +222,7 @@ def _midpoints(new: _Eye, other: _Eye, matches: Matches) -> NDArray[np.float64]:
     a = new.rays[matches.landmark_rows] @ T_local_new[:3, :3].T
     b = other.rays[matches.feature_rows] @ T_local_other[:3, :3].T
     way = T_local_other[:3, 3] - T_local_new[:3, 3]
-    aa, ab, bb = (a * a).sum(1), (a * b).sum(1), (b * b).sum(1)
-    determinant = np.maximum(aa * bb - ab**2, 1e-12)
-    along_a = (bb * (a @ way) - ab * (b @ way)) / determinant
-    along_b = (ab * (a @ way) - aa * (b @ way)) / determinant
+    along_a, along_b = closest(a, b, way)
     ends = T_local_new[:3, 3] + along_a[:, None] * a + T_local_other[:3, 3] + along_b[:, None] * b
     return np.asarray(0.5 * ends)
 
