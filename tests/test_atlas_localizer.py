@@ -10,6 +10,7 @@ from sceneslam.atlas.places import localizer
 from sceneslam.atlas.places.localizer import LocalizationEvent, Look, MapLocalizer
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.types import planar, se3
+from sceneslam.types.rig import Camera
 from sceneslam.views.placed_views import Sighting
 
 
@@ -250,15 +251,19 @@ class Eyes:
 
     def __init__(self):
         self.at, self.asked = None, []
+        self.camera = Camera(size_wh=(64, 48), fx=50.0, fy=50.0, cx=32.0, cy=24.0)
 
     def find(self, view, expected, *, half_m, half_rad):
         self.asked.append(half_m)
-        off = np.linalg.norm((se3.inverse(expected) @ planar.to_transform(self.at))[:2, 3])
+        T_map_cam = planar.to_transform(self.at) @ self.camera.T_base_cam
+        off = np.linalg.norm((T_map_cam - expected)[:2, 3])
         return self.recognize(view) if off <= half_m else None
 
     def recognize(self, view, around=None):
         pose = planar.to_transform(self.at)
-        return Sighting(T_map_base=pose, covariance=np.eye(6) * 0.02**2, matches=50)
+        return Sighting(
+            T_map_cam=pose @ self.camera.T_base_cam, covariance=np.eye(6) * 0.02**2, matches=50
+        )
 
 
 def seen_too(second, *run_at):

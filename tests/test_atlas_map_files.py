@@ -28,6 +28,7 @@ from sceneslam.graphs.edge import EdgeKind
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.files import MARK, owned
+from sceneslam.types.rig import optical_to_rep103
 from sceneslam.views.view import PlacedView, depth_noise_m
 
 ATLAS = "sceneslam.atlas.atlas.Atlas"
@@ -39,7 +40,7 @@ def whole_map():
     saved = map_of(*plans, nodes=nodes, pieces=[0, 2], runs=[0, 1], edges=[edge(0, 1)])
     first, second = saved.submaps
     landmarks = replace(place(1, 5), deviation_m=np.array([0.01, 0.3, 0.02, 1.0, 0.1], np.float32))
-    seen = PlacedView(stamp_ns=S, T_submap_base=se3.identity(), landmarks=landmarks)
+    seen = PlacedView(stamp_ns=S, T_submap_cam=optical_to_rep103(), landmarks=landmarks)
     first = replace(first, up=np.array([0.0, 0.6, 0.8]), views=(seen,))
     return replace(saved, submaps=(first, second))
 
@@ -57,7 +58,7 @@ def test_a_map_is_loaded_as_it_was_saved(tmp_path):
         np.testing.assert_array_equal(one.T_submap_base, other.T_submap_base)
         np.testing.assert_array_equal(one.up, other.up)
         for view, seen in zip(one.views, other.views, strict=True):
-            for name in ("points_base", "deviation_m", "descriptors"):
+            for name in ("points_cam", "deviation_m", "descriptors"):
                 kept, was = (getattr(each.landmarks, name) for each in (view, seen))
                 np.testing.assert_array_equal(kept, was)
         for name in ("points", "normals", "free", "origin_xy_m"):
@@ -120,9 +121,9 @@ def test_arrays_that_do_not_fit_together_are_named(tmp_path, name, value, said):
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("version", 0, "a map of version 0, only versions 2 to 4 are known"),
-        ("version", "3", "a map of version '3', only versions 2 to 4 are known"),
-        ("version", 5, "a map of version 5, a newer SceneSLAM wrote it"),
+        ("version", 0, "a map of version 0, only versions 2 to 5 are known"),
+        ("version", "3", "a map of version '3', only versions 2 to 5 are known"),
+        ("version", 6, "a map of version 6, a newer SceneSLAM wrote it"),
         ("sha256", None, "sha256: missing, the map's map.yaml is not complete"),
         ("cell_m", 0.1, "cell_m: got 0.1, allowed: 0.05"),
         ("modules", "ab", "modules: expected the names"),
@@ -142,10 +143,11 @@ def test_a_head_that_does_not_fit_is_named(tmp_path, key, value, said):
 
 
 @pytest.mark.parametrize(
-    ("version", "lacks"), [(2, {"node_up", "landmark_deviation"}), (3, {"landmark_deviation"})]
+    ("version", "lacks"),
+    [(2, {"node_up", "landmark_deviation"}), (3, {"landmark_deviation"}), (4, set())],
 )
 def test_a_map_of_an_older_version_is_loaded(tmp_path, version, lacks):
-    """It does not know what is up, and a depth camera measured all landmarks."""
+    """It does not know what is up, a depth camera measured all landmarks, and base saw them."""
     with_arrays(tmp_path, lambda arrays: [arrays.pop(name) for name in lacks])
     head = (tmp_path / HEAD).read_text()
     (tmp_path / HEAD).write_text(head.replace(f"version: {VERSION}", f"version: {version}"))
@@ -153,8 +155,16 @@ def test_a_map_of_an_older_version_is_loaded(tmp_path, version, lacks):
     for one, was in zip(loaded, saved, strict=True):
         assert (one.up is None) == (was.up is None or "node_up" in lacks)
         for view, seen in zip(one.views, was.views, strict=True):
-            far_m = np.linalg.norm(seen.landmarks.points_base, axis=1)
-            np.testing.assert_allclose(view.landmarks.deviation_m, depth_noise_m(far_m), rtol=1e-6)
+            far_m = np.linalg.norm(seen.landmarks.points_cam, axis=1)
+            noise_m = seen.landmarks.deviation_m if version == 4 else depth_noise_m(far_m)
+            np.testing.assert_allclose(view.landmarks.deviation_m, noise_m, rtol=1e-6)
+            T_base_cam = optical_to_rep103()
+            np.testing.assert_array_equal(view.T_submap_cam, seen.T_submap_cam @ T_base_cam)
+            points, before = (
+                se3.apply(T, one.landmarks.points_cam.astype(float))
+                for T, one in ((view.T_submap_cam, view), (seen.T_submap_cam, seen))
+            )
+            np.testing.assert_allclose(points, before, atol=1e-6)
     assert any(submap.views for submap in loaded)
 
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_atlas_mapper import SCAN
 from test_atlas_maps import WALL, edge, map_of
-from test_atlas_submaps import RIG, S, at
+from test_atlas_submaps import RIG, S, at, unseen
 
 from sceneslam.atlas.mapper import Mapper
 from sceneslam.atlas.submaps.collector import Collector, Known
@@ -43,7 +43,7 @@ def up_at(stamp_ns):
 
 
 def added(path, stamps_ns=()):
-    own = Collector(RIG, path, 0)
+    own = Collector(RIG, path, 0, unseen)
     for stamp_ns in stamps_ns:
         own.add(stamp_ns, None, up_at(stamp_ns))
     return own

@@ -15,7 +15,7 @@ from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.atlas.mapper import Mapper
 from sceneslam.atlas.places.view_taker import ViewTaker
 from sceneslam.atlas.submaps.chain import Chain
-from sceneslam.atlas.submaps.collector import Known
+from sceneslam.atlas.submaps.collector import Collector, Known
 from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.submaps.plan_loops import PlanLoops
 from sceneslam.atlas.submaps.run_graph import RunGraph
@@ -257,8 +257,67 @@ def test_no_corner_is_located_across_a_jump_of_the_path(jump_m, is_located):
         T_run_base = true_pose(index) @ se3.from_xy_yaw(jump_m * (index == 6), 0.0, 0.0)
         taker.move(START_NS + index * STEP_NS, T_run_base)
         if index % 2 == 0:
-            found = taker.keep(taker.take(replace(look(index), depth_m=None)), index, T_run_base)
+            view = taker.take(replace(look(index), depth_m=None))
+            found = taker.locate(view, START_NS + index * STEP_NS, T_run_base)
     assert (found is not None) == is_located
+
+
+def test_corners_are_located_anew_when_other_poses_replace_those_they_were_seen_from():
+    """The motion between the views was a tenth too long."""
+    taker, scale = (
+        ViewTaker(replace(SEEING, sensors=frozenset({Sensor.IMAGE})), is_keeping=True),
+        [1.1],
+    )
+
+    def path(stamp_ns):
+        T = true_path(stamp_ns).copy()
+        T[:3, 3] *= scale[0]
+        return Known(T_map_base=T, session=0, module="a", covariance=None)
+
+    own = Collector(SEEING, path, 0, taker.locate)
+    for index in range(0, 12, 2):
+        view = taker.take(replace(look(index), depth_m=None))
+        own.add(START_NS + index * STEP_NS, None, None, view)
+    scale[0] = 1.0
+    own.rewind(START_NS + 4 * STEP_NS)
+    own.finish()
+    other = ViewTaker(replace(SEEING, sensors=frozenset({Sensor.IMAGE})), is_keeping=True)
+    due = []
+    for index in range(0, 12, 2):
+        view = other.take(replace(look(index), depth_m=None))
+        ns = START_NS + index * STEP_NS
+        due.append(other.locate(view, ns, true_path(ns)))
+    due = [one for one in due if one is not None]
+    views = [view for submap in own.chain.submaps for view in submap.views]
+    assert len(views) == len(due) > 2
+    for view, one in zip(views, due, strict=True):
+        np.testing.assert_array_equal(view.landmarks.points_cam, one.points_cam)
+
+
+def test_a_robot_whose_camera_is_mounted_elsewhere_finds_itself_in_the_map():
+    """It looks at the same wall over its left shoulder, from 0.3 m above and 0.1 m behind."""
+    mapped = lapped(range(LAP))
+    mapped.finish(true_path, [])
+    T_base_other = se3.from_xy_yaw(-0.1, 0.0, 2.0)  # where the first robot's base is, in the other
+    T_base_other[2, 3] = 0.3
+    mounted = replace(SEEING.camera, T_base_cam=T_base_other @ SEEING.camera.T_base_cam)
+    other = Mapper(
+        replace(SEEING, camera=mounted, sensors=frozenset({Sensor.IMAGE, Sensor.ODOMETRY})),
+        known=lambda ns: Known(
+            T_map_base=true_path(ns) @ se3.inverse(T_base_other),
+            session=0,
+            module="a",
+            covariance=None,
+        ),
+        note=lambda *_, **__: None,
+        loaded=mapped.saved(),
+        keeps_views=True,
+    )
+    for index in range(40, 60):
+        other.observe(replace(look(index), depth_m=None), None)
+    off = other.T_map_run
+    assert other.is_placed
+    assert np.linalg.norm(off[:3, 3]) < 0.03 and se3.rotation_angle_rad(off) < 0.017
 
 
 def test_an_image_without_depth_is_not_kept_where_others_have_it():

@@ -76,8 +76,12 @@ def test_what_a_module_reports_adds_its_growth_within_one_session():
 # Steps and submaps.
 
 
+def unseen(*_):
+    """Locate nothing in a view."""
+
+
 def collector(known=lambda stamp_ns: None, rig=RIG):
-    return Collector(rig, known, 0)
+    return Collector(rig, known, 0, unseen)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -135,7 +139,7 @@ def test_a_submap_ends_after_its_length_its_turn_and_its_session():
     assert [len(part) for part in split(turning)] == [13, 13, 4]
     two = [key_pose(index, at(), session=index // 4) for index in range(6)]
     assert [len(part) for part in split(two)] == [4, 2]
-    third = make_submap(split(ahead)[1], run=3)
+    third = make_submap(split(ahead)[1], 3, se3.identity())
     assert (third.run, third.session, third.module) == (3, 0, "a")
     np.testing.assert_allclose(third.T_submap_base[-1], [2.5, 0.0, 0.0], atol=1e-12)
     assert third.stamps_ns[0] == 11 * S

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_atlas_submaps import RIG, S, at, pitched
+from test_atlas_submaps import RIG, S, at, pitched, unseen
 
 from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.atlas.submaps.collector import Collector, Known
@@ -20,7 +20,7 @@ def test_submaps_stand_upright_however_the_sensor_is_mounted(askew_rad):
     poses = [pitched(min(k, 23 - k), 0.02 * k, turn) for k, turn in enumerate(turns)]
     half_turn = at(0.0, 0.0, np.pi)
     poses = [T if k < 12 else T @ half_turn for k, T in enumerate(poses)]
-    own = Collector(RIG, lambda ns: known_at(poses[ns // S]), 0)
+    own = Collector(RIG, lambda ns: known_at(poses[ns // S]), 0, unseen)
     for index, T in enumerate(poses):
         own.step_to(T)
         own.add(index * S, None, pitched(0.0, 0.0, askew_rad)[:3, 2])

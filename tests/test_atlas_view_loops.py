@@ -7,7 +7,7 @@ import pytest
 from test_atlas_loops import query_of
 from test_atlas_maps import WALL, map_of
 from test_view_merge import seen_from
-from test_views import place
+from test_views import MOUNT, place
 
 from sceneslam.atlas.submaps.view_loops import ViewLoops
 from sceneslam.types import se3
@@ -20,7 +20,7 @@ ANY = 2.0 * np.ones(3)  # deviations: the second submap may lie anywhere near
 
 def viewed(submap, *views):
     """The submap with views (pose in it, landmarks)."""
-    placed = (PlacedView(stamp_ns=0, T_submap_base=T, landmarks=seen) for T, seen in views)
+    placed = (PlacedView(stamp_ns=0, T_submap_cam=T @ MOUNT, landmarks=seen) for T, seen in views)
     return replace(submap, views=tuple(placed))
 
 
@@ -76,9 +76,10 @@ def test_the_covariance_is_that_of_the_view_at_the_submap():
     submaps = two(T_second_view=T_second_view)
     (loop,) = loops_in(submaps, [se3.identity(), ASIDE])
     seen = register(se3.identity(), place(1), submaps[1].views[0].landmarks)
-    expected = se3.carried(seen.covariance, T_second_view)
-    np.testing.assert_allclose(loop.covariance, expected, rtol=1e-6)
-    assert abs(expected[1, 1] / seen.covariance[1, 1] - 1.0) > 0.2
+    at_view = se3.carried(seen.covariance, MOUNT)
+    expected = se3.carried(at_view, T_second_view)
+    np.testing.assert_allclose(loop.covariance, expected, rtol=1e-6, atol=1e-12)
+    assert abs(expected[1, 1] / at_view[1, 1] - 1.0) > 0.2
 
 
 def test_another_place_is_no_loop():
@@ -122,7 +123,7 @@ def test_of_several_views_of_one_submap_the_best_gives_the_loop():
     first, second = two()
     poorer = seen_from(ASIDE, 1, wrong=0.5)
     better = second.views[0].landmarks
-    T = second.views[0].T_submap_base
+    T = second.views[0].T_submap_cam @ se3.inverse(MOUNT)
     submaps = [first, viewed(second, (se3.identity(), poorer), (T, better))]
     (loop,) = loops_in(submaps, [se3.identity(), ASIDE])
     np.testing.assert_allclose(loop.T_first_second, ASIDE, atol=1e-5)

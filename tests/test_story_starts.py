@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from test_atlas_maps import S, map_of
 from test_seen_views import RIG, landmarks_of, seen
-from test_views import ASIDE, ELSEWHERE, HERE
+from test_views import ASIDE, ELSEWHERE, HERE, MOUNT
 
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.experiments.one_map.relocalization import Starts, StoryStarts, together
@@ -19,7 +19,7 @@ BLACK = np.zeros((480, 640, 3), np.uint8)
 
 def standing(due, *, count):
     """Starts of a robot that stands, in a map of one view; `due`: where it is in truth."""
-    kept = PlacedView(stamp_ns=0, T_submap_base=ASIDE, landmarks=landmarks_of(seen()))
+    kept = PlacedView(stamp_ns=0, T_submap_cam=ASIDE @ MOUNT, landmarks=landmarks_of(seen()))
     saved = map_of(join([]), nodes=[[2.0, 1.0, 0.4]])
     saved = replace(saved, submaps=(replace(saved.submaps[0], views=(kept,)),))
     online = Trajectory(stamps_ns=STAMPS_NS, T_world_base=np.tile(ELSEWHERE, (100, 1, 1)))

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_views import CAMERA, place, view_of
+from test_views import CAMERA, MOUNT, place, points_of, view_of
 
 from sceneslam.types import se3
 from sceneslam.views.triangulation import Triangulation
@@ -36,8 +36,7 @@ def located(*before, here=START, seed=0):
 
 
 def true_depths(T_wall_base):
-    T_cam_wall = se3.inverse(T_wall_base @ CAMERA.T_base_cam)
-    return se3.apply(T_cam_wall, WALL.points_base.astype(float))[:, 2]
+    return se3.apply(se3.inverse(T_wall_base @ MOUNT), points_of(WALL))[:, 2]
 
 
 @pytest.mark.parametrize("aside", [se3.from_xy_yaw(0.0, 0.4, 0.1), se3.from_xy_yaw(-1.0, 0.0, 0.0)])

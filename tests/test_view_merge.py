@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_atlas_maps import map_of
-from test_views import ELSEWHERE, HERE, landmarks_at, place
+from test_views import ELSEWHERE, HERE, MOUNT, base_of, landmarks_at, place, points_of
 
 from sceneslam.atlas.lasting.merge import join_pieces
 from sceneslam.atlas.lasting.saved_map import forget_contradicted
@@ -21,7 +21,7 @@ TILTED = se3.exp(np.array([0.2, -0.1, 0.3, 0.05, -0.1, 0.3]))
 def seen_from(T_place_base, seed, *, noise_m=0.0, wrong=0.0):
     """The landmarks of a place as seen from a pose in it; a share of them lies elsewhere."""
     rng, true = np.random.default_rng(seed + 50), place(seed)
-    points = se3.apply(se3.inverse(T_place_base), true.points_base.astype(float))
+    points = se3.apply(se3.inverse(T_place_base), points_of(true))
     points += rng.normal(0, noise_m, points.shape)
     is_wrong = rng.random(len(points)) < wrong
     points[is_wrong] = rng.uniform(-3, 3, (is_wrong.sum(), 3))
@@ -31,53 +31,54 @@ def seen_from(T_place_base, seed, *, noise_m=0.0, wrong=0.0):
 @pytest.mark.parametrize(("noise_m", "wrong", "off_m"), [(0, 0, 1e-6), (0.02, 0.5, 0.02)])
 def test_two_views_are_registered_by_their_landmarks(noise_m, wrong, off_m):
     other = seen_from(TILTED, 1, noise_m=noise_m, wrong=wrong)
-    found = register(HERE, place(1), other)
-    off = se3.log(se3.inverse(HERE @ TILTED) @ found.T_map_base)
+    found = register(HERE @ MOUNT, place(1), other)
+    off = se3.log(se3.inverse(HERE @ TILTED) @ base_of(found))
     assert np.linalg.norm(off[:3]) < off_m and found.matches > (1 - wrong) * 170
-    assert off @ np.linalg.solve(found.covariance, off) < 16.8  # 99 % of six
-    assert register(HERE, place(1), seen_from(TILTED, 2)) is None
-    assert register(HERE, place(1), seen_from(TILTED, 1, wrong=0.95)) is None
+    covariance = se3.carried(found.covariance, MOUNT)
+    assert off @ np.linalg.solve(covariance, off) < 16.8  # 99 % of six
+    assert register(HERE @ MOUNT, place(1), seen_from(TILTED, 2)) is None
+    assert register(HERE @ MOUNT, place(1), seen_from(TILTED, 1, wrong=0.95)) is None
 
 
 def test_corners_of_uncertain_distance_are_not_registered():
     """Of 200 corners 100 are 15 per cent too far away, as motion located them."""
     rough = place(1)
-    rough.points_base[::2] *= 1.15
-    rough.deviation_m[::2] = 0.15 * np.linalg.norm(rough.points_base[::2], axis=1)
-    found = register(HERE, rough, seen_from(TILTED, 1))
-    off = se3.inverse(HERE @ TILTED) @ found.T_map_base
+    rough.points_cam[::2] *= 1.15
+    rough.deviation_m[::2] = 0.15 * np.linalg.norm(rough.points_cam[::2], axis=1)
+    found = register(HERE @ MOUNT, rough, seen_from(TILTED, 1))
+    off = se3.inverse(HERE @ TILTED) @ base_of(found)
     assert found.matches == 100 and np.linalg.norm(off[:3, 3]) < 1e-3
 
 
 def test_places_that_look_alike_are_not_recognized():
     other = seen_from(TILTED, 1)
-    known = PlacedViews([(HERE, place(1)), (ELSEWHERE, place(2))])
+    known = PlacedViews([(HERE @ MOUNT, place(1)), (ELSEWHERE @ MOUNT, place(2))])
     number, seen = recognize(known, other)
     assert number == 0
-    np.testing.assert_allclose(seen.T_map_base, HERE @ TILTED, atol=1e-5)
-    alike = PlacedViews([(HERE, place(1)), (ELSEWHERE, place(1))])
+    np.testing.assert_allclose(base_of(seen), HERE @ TILTED, atol=1e-5)
+    alike = PlacedViews([(HERE @ MOUNT, place(1)), (ELSEWHERE @ MOUNT, place(1))])
     assert recognize(alike, other) is None
     for number, T_map_seen in enumerate((HERE, ELSEWHERE)):
         found, seen = recognize(alike, other, among=[number])
         assert found == number
-        np.testing.assert_allclose(seen.T_map_base, T_map_seen @ TILTED, atol=1e-5)
+        np.testing.assert_allclose(base_of(seen), T_map_seen @ TILTED, atol=1e-5)
     assert recognize(alike, other, among=[]) is None
     assert recognize(PlacedViews([]), other) is None
 
 
 def test_views_that_are_added_moved_and_cut_are_recognized_where_they_are():
-    known, other = PlacedViews([(HERE, place(2))]), seen_from(TILTED, 1)
-    known.add(HERE, place(1))
-    known.move([HERE, ELSEWHERE])
+    known, other = PlacedViews([(HERE @ MOUNT, place(2))]), seen_from(TILTED, 1)
+    known.add(HERE @ MOUNT, place(1))
+    known.move([HERE @ MOUNT, ELSEWHERE @ MOUNT])
     number, seen = recognize(known, other)
     assert (len(known), number) == (2, 1)
-    np.testing.assert_allclose(seen.T_map_base, ELSEWHERE @ TILTED, atol=1e-5)
+    np.testing.assert_allclose(base_of(seen), ELSEWHERE @ TILTED, atol=1e-5)
     known.cut(1)
     assert len(known) == 1 and recognize(known, other) is None
-    known.add(HERE, place(1))
+    known.add(HERE @ MOUNT, place(1))
     number, seen = recognize(known, other)
     assert number == 1
-    np.testing.assert_allclose(seen.T_map_base, HERE @ TILTED, atol=1e-5)
+    np.testing.assert_allclose(base_of(seen), HERE @ TILTED, atol=1e-5)
     with pytest.raises(ValueError, match="argument"):
         known.move([HERE])
 
@@ -90,7 +91,7 @@ def viewed(saved, *views):
             replace(
                 submap,
                 views=tuple(
-                    PlacedView(stamp_ns=number, T_submap_base=T, landmarks=landmarks)
+                    PlacedView(stamp_ns=number, T_submap_cam=T @ MOUNT, landmarks=landmarks)
                     for number, (T, landmarks) in enumerate(own)
                 ),
             )

@@ -22,14 +22,25 @@ from sceneslam.views.view import Landmarks, LandmarkView, PlacedView, depth_nois
 from sceneslam.views.view_finder import ViewFinder
 
 CAMERA = Camera(size_wh=(640, 480), fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+MOUNT = CAMERA.T_base_cam
 HERE, ELSEWHERE = se3.from_xy_yaw(2.0, 1.0, 0.4), se3.from_xy_yaw(-9.0, 4.0, 2.0)
 
 
-def landmarks_at(points, descriptors):
+def landmarks_at(points_base, descriptors):
     """Landmarks that a depth camera measured."""
-    points = points.astype(np.float32)
+    points = se3.apply(se3.inverse(MOUNT), points_base).astype(np.float32)
     noise_m = depth_noise_m(np.linalg.norm(points, axis=1)).astype(np.float32)
-    return Landmarks(points_base=points, deviation_m=noise_m, descriptors=descriptors)
+    return Landmarks(points_cam=points, deviation_m=noise_m, descriptors=descriptors)
+
+
+def points_of(landmarks):
+    """The points (N, 3) [m] in base."""
+    return se3.apply(MOUNT, landmarks.points_cam.astype(float))
+
+
+def base_of(found):
+    """Where base is, by a sighting."""
+    return found.T_map_cam @ se3.inverse(MOUNT)
 
 
 def place(seed, count=200):
@@ -43,8 +54,7 @@ def place(seed, count=200):
 def view_of(landmarks, T_seen_base, *, noise_px=0.5, shown=1.0, farther_m=0.0, shear_rad=0.0):
     """What the camera sees of a place from a pose in it, and other things."""
     rng = np.random.default_rng(7)
-    T_cam_seen = se3.inverse(T_seen_base @ CAMERA.T_base_cam)
-    points_cam = se3.apply(T_cam_seen, landmarks.points_base.astype(float))
+    points_cam = se3.apply(se3.inverse(T_seen_base @ MOUNT), points_of(landmarks))
     is_shown = rng.random(len(points_cam)) < shown
     rays = points_cam[:, :2] / points_cam[:, 2:]
     rays += rng.normal(0, noise_px / 500.0, rays.shape)
@@ -61,7 +71,8 @@ def view_of(landmarks, T_seen_base, *, noise_px=0.5, shown=1.0, farther_m=0.0, s
 
 
 def finder(*placed):
-    return ViewFinder(CAMERA, placed)
+    """A finder of landmarks that were seen from poses of base."""
+    return ViewFinder(CAMERA, [(T @ MOUNT, landmarks) for T, landmarks in placed])
 
 
 ASIDE = se3.exp(np.array([0.3, -0.2, 0.05, 0.02, -0.03, 0.1]))
@@ -71,7 +82,7 @@ def test_a_view_is_recognized_with_the_pose_it_was_seen_from():
     known = finder((HERE, place(1)), (ELSEWHERE, place(2)))
     for T_map_seen, seed in ((HERE, 1), (ELSEWHERE, 2)):
         found = known.recognize(view_of(place(seed), ASIDE))
-        off = se3.inverse(T_map_seen @ ASIDE) @ found.T_map_base
+        off = se3.inverse(T_map_seen @ ASIDE) @ base_of(found)
         assert np.linalg.norm(off[:3, 3]) < 0.01 and se3.rotation_angle_rad(off) < 0.003
         assert found.matches > 150
         deviations = np.sqrt(np.diag(found.covariance))
@@ -86,13 +97,13 @@ def test_the_pose_is_by_the_landmarks_of_all_views_of_a_place():
         parts = []
         for rows in np.array_split(rng.permutation(400), 4):  # each view has a quarter
             T_here_seen = se3.exp(rng.normal(0, 0.2, 6))
-            points = se3.apply(se3.inverse(T_here_seen), true.points_base[rows].astype(float))
+            points = se3.apply(se3.inverse(T_here_seen), points_of(true)[rows])
             points += rng.normal(0, 0.01, points.shape)  # as depth cameras measure
             part = landmarks_at(points, true.descriptors[rows].copy())
             parts.append((HERE @ T_here_seen, part))
         view, T_base_map = view_of(true, ASIDE), se3.inverse(HERE @ ASIDE)
         found = [known.recognize(view) for known in (finder(parts[0]), finder(*parts))]
-        off_m.append([np.linalg.norm((T_base_map @ one.T_map_base)[:3, 3]) for one in found])
+        off_m.append([np.linalg.norm((T_base_map @ base_of(one))[:3, 3]) for one in found])
         assert found[1].matches > 2 * found[0].matches
     by_one, by_all = np.sqrt((np.array(off_m) ** 2).mean(axis=0))
     assert by_all < 0.75 * by_one  # a quarter of the variance, beside the image's noise
@@ -102,7 +113,7 @@ def test_of_landmarks_in_a_small_patch_depths_tell_the_heading():
     off_rad = []
     for seed in range(10):
         rng, patch = np.random.default_rng(seed), place(seed)
-        patch.points_base[:] = rng.uniform([2.5, -0.2, -0.2], [2.6, 0.2, 0.2], (200, 3))
+        patch.points_cam[:] = rng.uniform([-0.2, -0.2, 2.5], [0.2, 0.2, 2.6], (200, 3))
         view = view_of(patch, ASIDE, noise_px=1.5)
         precise = view.depth_m + rng.normal(0, 0.002, 200).astype(np.float32)
         noisy = view.depth_m + rng.normal(0, 0.02, 200).astype(np.float32)
@@ -110,7 +121,7 @@ def test_of_landmarks_in_a_small_patch_depths_tell_the_heading():
             finder((HERE, patch)).recognize(replace(view, depth_m=depth_m))
             for depth_m in (precise, noisy)
         ]
-        off = [se3.inverse(HERE @ ASIDE) @ one.T_map_base for one in found]
+        off = [se3.inverse(HERE @ ASIDE) @ base_of(one) for one in found]
         off_rad.append([abs(se3.yaw_rad(T)) for T in off])
     by_precise, by_noisy = np.sqrt((np.array(off_rad) ** 2).mean(axis=0))
     assert by_precise < 0.003  # 0.002 m of a patch of 0.4 m, over 200 landmarks
@@ -120,7 +131,7 @@ def test_of_landmarks_in_a_small_patch_depths_tell_the_heading():
 def test_a_place_is_found_from_afar():
     far = ASIDE @ se3.from_xy_yaw(-3.0, 0.0, 0.0)  # where no view of the map was taken
     found = finder((HERE, place(1))).recognize(view_of(place(1), far))
-    assert np.linalg.norm((se3.inverse(HERE @ far) @ found.T_map_base)[:3, 3]) < 0.03
+    assert np.linalg.norm((se3.inverse(HERE @ far) @ base_of(found))[:3, 3]) < 0.03
 
 
 def test_two_places_that_look_alike_are_not_recognized():
@@ -149,16 +160,16 @@ def test_what_is_doubtful_is_not_recognized(doubtful, sound):
 
 def test_a_poster_that_hangs_elsewhere_now_is_not_its_old_place():
     wall, seen = place(1), view_of(place(1), ASIDE)
-    poster = landmarks_at(wall.points_base[:40], wall.descriptors[:40])
+    poster = landmarks_at(points_of(wall)[:40], wall.descriptors[:40])
     rest = place(2, 600)  # that was around it
     around = landmarks_at(
-        np.concatenate([poster.points_base, rest.points_base]),
+        np.concatenate([points_of(poster), points_of(rest)]),
         np.concatenate([poster.descriptors, rest.descriptors]),
     )
     assert finder((HERE, poster)).recognize(seen) is not None
     assert finder((HERE, around)).recognize(seen) is None
-    found = finder((HERE, around)).find(seen, HERE, half_m=0.5, half_rad=0.2)  # it is there
-    assert np.linalg.norm((se3.inverse(HERE @ ASIDE) @ found.T_map_base)[:3, 3]) < 0.02
+    found = finder((HERE, around)).find(seen, HERE @ MOUNT, half_m=0.5, half_rad=0.2)  # it is there
+    assert np.linalg.norm((se3.inverse(HERE @ ASIDE) @ base_of(found))[:3, 3]) < 0.02
 
 
 def test_a_noisy_depth_camera_is_found_by_landmarks_that_are_known_better():
@@ -168,17 +179,17 @@ def test_a_noisy_depth_camera_is_found_by_landmarks_that_are_known_better():
     view = view_of(precise, ASIDE)
     noisy = view.depth_m + rng.normal(0, depth_noise_m(view.depth_m)).astype(np.float32)
     view, known = replace(view, depth_m=noisy), finder((HERE, precise))
-    for found in (known.recognize(view), known.find(view, HERE, half_m=0.6, half_rad=0.2)):
-        assert np.linalg.norm((se3.inverse(HERE @ ASIDE) @ found.T_map_base)[:3, 3]) < 0.01
+    for found in (known.recognize(view), known.find(view, HERE @ MOUNT, half_m=0.6, half_rad=0.2)):
+        assert np.linalg.norm((se3.inverse(HERE @ ASIDE) @ base_of(found))[:3, 3]) < 0.01
 
 
 def far_off(landmarks, ratio, rows):
     """Landmarks some of which lie a share of their distance too far away."""
-    points = landmarks.points_base.copy()
+    points = landmarks.points_cam.copy()
     points[rows] *= 1.0 + ratio
     deviation_m = landmarks.deviation_m.copy()
     deviation_m[rows] = ratio * np.linalg.norm(points[rows], axis=1)
-    return replace(landmarks, points_base=points), deviation_m
+    return replace(landmarks, points_cam=points), deviation_m
 
 
 def test_corners_of_uncertain_distance_count_for_less_from_the_side():
@@ -188,8 +199,8 @@ def test_corners_of_uncertain_distance_count_for_less_from_the_side():
         view = replace(view_of(place(seed), ASIDE), depth_m=np.zeros(200, np.float32))
         for is_stated in (True, False):
             known = replace(wrong, deviation_m=deviation_m) if is_stated else wrong
-            found = finder((HERE, known)).find(view, HERE, half_m=0.6, half_rad=0.3)
-            off = se3.inverse(HERE @ ASIDE) @ found.T_map_base
+            found = finder((HERE, known)).find(view, HERE @ MOUNT, half_m=0.6, half_rad=0.3)
+            off = se3.inverse(HERE @ ASIDE) @ base_of(found)
             off_m[is_stated].append(np.linalg.norm(off[:3, 3]))
     assert np.median(off_m[True]) < 0.5 * np.median(off_m[False])
 
@@ -201,8 +212,8 @@ def test_views_that_face_elsewhere_do_not_crowd_out_the_one_that_shows_the_place
     beside = HERE @ se3.from_xy_yaw(-0.3, 0.0, 0.0)
     seen = view_of(place(1), se3.from_xy_yaw(0.3, 0.0, 0.0))
     known = finder(*turned, (beside, place(1)))
-    found = known.find(seen, HERE, half_m=0.2, half_rad=0.1)
-    assert np.linalg.norm((se3.inverse(HERE) @ found.T_map_base)[:3, 3]) < 0.02
+    found = known.find(seen, HERE @ MOUNT, half_m=0.2, half_rad=0.1)
+    assert np.linalg.norm((se3.inverse(HERE) @ base_of(found))[:3, 3]) < 0.02
 
 
 # A run that looks for itself by them.
@@ -212,14 +223,14 @@ class Eyes:
     """A finder that answers as it is told."""
 
     def __init__(self):
-        self.answer = None
+        self.answer, self.camera = None, CAMERA
 
     def find(self, view, expected, *, half_m, half_rad):
         return self.recognize(view)
 
     def recognize(self, view, around=None):
         return self.answer and Sighting(
-            T_map_base=self.answer[0], covariance=1e-4 * np.eye(6), matches=50
+            T_map_cam=self.answer[0] @ MOUNT, covariance=1e-4 * np.eye(6), matches=50
         )
 
 
@@ -277,8 +288,8 @@ def kept_map():
             replace(
                 one,
                 views=(
-                    PlacedView(stamp_ns=7, T_submap_base=HERE, landmarks=place(1)),
-                    PlacedView(stamp_ns=8, T_submap_base=ASIDE, landmarks=place(2, 50)),
+                    PlacedView(stamp_ns=7, T_submap_cam=HERE, landmarks=place(1)),
+                    PlacedView(stamp_ns=8, T_submap_cam=ASIDE, landmarks=place(2, 50)),
                 )[: 2 - number],
             )
             for number, one in enumerate(map_of(join([]), join([])).submaps)
@@ -294,8 +305,8 @@ def test_views_are_saved_with_their_submaps(tmp_path):
     for one, other in zip(found.submaps, saved.submaps, strict=True):
         for view, kept in zip(one.views, other.views, strict=True):
             assert view.stamp_ns == kept.stamp_ns
-            np.testing.assert_array_equal(view.T_submap_base, kept.T_submap_base)
-            for name in ("points_base", "descriptors"):
+            np.testing.assert_array_equal(view.T_submap_cam, kept.T_submap_cam)
+            for name in ("points_cam", "descriptors"):
                 expected = getattr(kept.landmarks, name)
                 np.testing.assert_array_equal(getattr(view.landmarks, name), expected)
     (second,) = found.views(1)
@@ -378,9 +389,7 @@ def test_a_robot_without_a_camera_is_not_found_in_a_map_of_views_alone():
 @pytest.mark.parametrize(("away_m", "turn_rad", "left"), [(0.4, 0.3, 1), (0.6, 0, 2), (0, 0.5, 2)])
 def test_a_submap_goes_when_a_later_one_has_a_view_near_each_of_its(away_m, turn_rad, left):
     view = kept_map().submaps[1].views[0]
-    beside = replace(
-        view, T_submap_base=view.T_submap_base @ se3.from_xy_yaw(0.0, away_m, turn_rad)
-    )
+    beside = replace(view, T_submap_cam=view.T_submap_cam @ se3.from_xy_yaw(0.0, away_m, turn_rad))
     empty = map_of(join([]), join([]))
     submaps = [
         replace(one, views=(seen,)) for one, seen in zip(empty.submaps, (view, beside), strict=True)
@@ -394,7 +403,7 @@ def test_a_loaded_map_is_searched_near_the_expected_pose_first():
     known = finder((HERE, place(1)), (ELSEWHERE, place(1)))
     view = view_of(place(1), ASIDE)
     assert known.recognize(view) is None
-    found = known.recognize(view, ELSEWHERE)
-    off = se3.inverse(ELSEWHERE @ ASIDE) @ found.T_map_base
+    found = known.recognize(view, ELSEWHERE @ MOUNT)
+    off = se3.inverse(ELSEWHERE @ ASIDE) @ base_of(found)
     assert np.linalg.norm(off[:3, 3]) < 0.01
-    assert known.recognize(view, se3.from_xy_yaw(50.0, 0.0, 0.0)) is None
+    assert known.recognize(view, se3.from_xy_yaw(50.0, 0.0, 0.0) @ MOUNT) is None

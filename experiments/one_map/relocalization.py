@@ -134,7 +134,11 @@ class StoryStarts:
     def _shares(self, begun_ns: int) -> bool:
         """Tell whether a start comes to where its camera sees what a view of the map shows."""
         ended_ns = begun_ns + self._within_ns
-        T_true = [self._due(ns) for ns in self._poses if begun_ns <= ns <= ended_ns]
+        camera = self._rig.camera
+        assert camera is not None
+        T_true = [
+            self._due(ns) @ camera.T_base_cam for ns in self._poses if begun_ns <= ns <= ended_ns
+        ]
         return bool(are_covered(np.array(T_true), self._seen).any())
 
     def found(self, *, is_lit: bool, is_shared: bool) -> Starts:

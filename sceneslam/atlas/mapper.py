@@ -69,9 +69,9 @@ class Mapper:
         """
         self._loaded = loaded if loaded is not None else empty_map()
         self._scanner, self._known, self._note = KeyScanner(rig), known, note
-        self._collector = Collector(rig, known, self._loaded.runs)
         views = self._loaded.views()
         self._views = ViewTaker(rig, is_keeping=keeps_views, is_comparing=bool(views))
+        self._collector = Collector(rig, known, self._loaded.runs, self._views.locate)
         self._localizer = self._made_localizer(rig, views)
         self._executor = executor("search", is_live=is_live)
         self._search: Future[LocalizationEvent] | None = None
@@ -138,7 +138,6 @@ class Mapper:
         before_ns = stamp_ns if self._rewound_ns is None else self._rewound_ns
         self._rewound_ns = min(stamp_ns, before_ns)
         self._collector.rewind(stamp_ns)
-        self._views.rewind(stamp_ns)
         kept = len(self._collector.chain)
         if kept < self._kept:
             self._is_news |= bool(self._solved.loops)
@@ -168,10 +167,9 @@ class Mapper:
         if is_kept or is_viewed:
             view = self._views.take(observation)
         if is_step:
-            landmarks = None
             if view is not None and is_kept:
-                landmarks = self._views.keep(view, stamp_ns, known.T_map_base)
-            self._collector.add(stamp_ns, scan, up_base, landmarks)
+                self._views.keep(known.T_map_base)
+            self._collector.add(stamp_ns, scan, up_base, view if is_kept else None)
             self._close_loops()
         if scan is None and view is None:
             return

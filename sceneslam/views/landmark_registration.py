@@ -44,7 +44,7 @@ def register(T_map_first: Transform, first: Landmarks, second: Landmarks) -> Sig
     if is_precise.sum() < MATCHES_MIN:
         return None
     rows, columns, sigma_m = rows[is_precise], columns[is_precise], sigma_m[is_precise]
-    a, b = first.points_base[rows].astype(float), second.points_base[columns].astype(float)
+    a, b = first.points_cam[rows].astype(float), second.points_cam[columns].astype(float)
     triples = np.random.default_rng(0).integers(0, len(a), (_SAMPLES, 3))
     tried = _rigid(a[triples], b[triples])
     counts = [np.sum(_off_m(T, a, b) <= SIGMAS * sigma_m) for T in tried]
@@ -57,7 +57,7 @@ def register(T_map_first: Transform, first: Landmarks, second: Landmarks) -> Sig
     by_motion = np.concatenate([np.tile(np.eye(3), (kept.sum(), 1, 1)), -se3.hat(b[kept])], axis=2)
     weighted = by_motion / sigma_m[kept, None, None]
     covariance = np.linalg.inv(np.einsum("nki,nkj->ij", weighted, weighted)) + FLOOR
-    found = Sighting(T_map_base=T_map_first @ T, covariance=covariance, matches=int(kept.sum()))
+    found = Sighting(T_map_cam=T_map_first @ T, covariance=covariance, matches=int(kept.sum()))
     return found if found.is_certain else None
 
 

@@ -31,8 +31,8 @@ FLOOR = np.diag(np.repeat([0.01, 0.004], 3) ** 2)  # m, rad: of the map's landma
 class Sighting:
     """The pose of a view in the map."""
 
-    T_map_base: Transform
-    covariance: NDArray[np.float64]  # (6, 6) of se3.log order, base frame
+    T_map_cam: Transform
+    covariance: NDArray[np.float64]  # (6, 6) of se3.log order, axes of the camera
     matches: int
 
     @property
@@ -48,13 +48,13 @@ class Sighting:
 
 
 class PlacedViews:
-    """Landmarks of views, with their poses T_map_base (4, 4)."""
+    """Landmarks of views, with their poses T_map_cam (4, 4)."""
 
     def __init__(self, placed: Sequence[tuple[Transform, Landmarks]] = ()) -> None:
         self._placed: list[tuple[Transform, Landmarks]] = []
         self._index = PlaceIndex()
-        for T_map_base, landmarks in placed:
-            self.add(T_map_base, landmarks)
+        for T_map_cam, landmarks in placed:
+            self.add(T_map_cam, landmarks)
 
     def __len__(self) -> int:
         return len(self._placed)
@@ -62,14 +62,14 @@ class PlacedViews:
     def __getitem__(self, number: int) -> tuple[Transform, Landmarks]:
         return self._placed[number]
 
-    def add(self, T_map_base: Transform, landmarks: Landmarks) -> None:
-        """Add a view at T_map_base (4, 4)."""
+    def add(self, T_map_cam: Transform, landmarks: Landmarks) -> None:
+        """Add a view at T_map_cam (4, 4)."""
         self._index.insert(len(self._placed), landmarks.descriptors)
-        self._placed.append((T_map_base, landmarks))
+        self._placed.append((T_map_cam, landmarks))
 
-    def move(self, T_map_base: Sequence[Transform]) -> None:
+    def move(self, T_map_cam: Sequence[Transform]) -> None:
         """Set the poses (4, 4) of all views."""
-        moved = zip(T_map_base, self._placed, strict=True)
+        moved = zip(T_map_cam, self._placed, strict=True)
         self._placed = [(T, landmarks) for T, (_, landmarks) in moved]
 
     def cut(self, count: int) -> None:
@@ -78,11 +78,11 @@ class PlacedViews:
             self._index.remove(number)
         del self._placed[count:]
 
-    def near(self, T_map_base: Transform) -> list[int]:
+    def near(self, T_map_cam: Transform) -> list[int]:
         """Return the views that were taken near a pose (4, 4), facing that way, nearest first."""
         poses = np.reshape([T for T, _ in self._placed], (-1, 4, 4))
-        away_m = np.linalg.norm((poses - T_map_base)[:, :3, 3], axis=1)
-        turned_rad = se3.rotation_angle_rad(se3.inverse(T_map_base) @ poses)
+        away_m = np.linalg.norm((poses - T_map_cam)[:, :3, 3], axis=1)
+        turned_rad = se3.rotation_angle_rad(se3.inverse(T_map_cam) @ poses)
         is_near = (away_m < _PLACE_M) & (turned_rad < _FACING_RAD)
         nearest = np.argsort(away_m, kind="stable")
         return [int(number) for number in nearest[is_near[nearest]]]
@@ -106,7 +106,7 @@ class PlacedViews:
             return None
         number, best = max(found, key=lambda pair: pair[1].matches)
         for _, other in found:
-            off = se3.inverse(best.T_map_base) @ other.T_map_base
+            off = se3.inverse(best.T_map_cam) @ other.T_map_cam
             is_same = se3.is_within(off, _SAME_M, _SAME_RAD)
             if other.matches >= _ALIKE * best.matches and not is_same:
                 return None

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.se3 import Transform
@@ -29,12 +28,12 @@ _NOISE_M, _NOISE_RATIO = 0.017, 0.01  # of a measured depth, and of its distance
 class Landmarks:
     """Points that a camera saw, and their ORB descriptors (Rublee et al., ICCV 2011)."""
 
-    points_base: NDArray[np.float32]  # (N, 3) [m], base of the view
-    deviation_m: NDArray[np.float32]  # (N,) standard deviations of their distances from the camera
+    points_cam: NDArray[np.float32]  # (N, 3) [m]
+    deviation_m: NDArray[np.float32]  # (N,) standard deviations of their distances
     descriptors: NDArray[np.uint8]  # (N, 32)
 
     def __len__(self) -> int:
-        return len(self.points_base)
+        return len(self.points_cam)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,7 +51,7 @@ class PlacedView:
     """What a map keeps of a view."""
 
     stamp_ns: int
-    T_submap_base: Transform  # where it was seen from
+    T_submap_cam: Transform  # where it was seen from
     landmarks: Landmarks
 
 
@@ -117,10 +116,9 @@ class LandmarkViewer:
         if len(known) < _FEWEST:
             return None
         points_cam = directions(view.rays[known]) * z[known, None]
-        points_base = se3.apply(self._camera.T_base_cam, points_cam).astype(np.float32)
         noise_m = np.where(is_measured[known], depth_noise_m(z[known]), deviation_m[known])
         return Landmarks(
-            points_base=points_base,
+            points_cam=points_cam.astype(np.float32),
             deviation_m=noise_m.astype(np.float32),
             descriptors=view.descriptors[known],
         )

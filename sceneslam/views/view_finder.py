@@ -46,11 +46,10 @@ class _Seen:
     cameras: NDArray[np.float64]  # (N, 3) [m]: that place
 
     @classmethod
-    def of(cls, T_base_cam: Transform, views: Sequence[tuple[Transform, Landmarks]]) -> _Seen:
-        """Return the landmarks of one view or more, from poses (4, 4) in the frame."""
-        camera = T_base_cam[:3, 3]
-        points = [se3.apply(T, one.points_base.astype(float)) for T, one in views]
-        cameras = [np.tile(T[:3, :3] @ camera + T[:3, 3], (len(one), 1)) for T, one in views]
+    def of(cls, views: Sequence[tuple[Transform, Landmarks]]) -> _Seen:
+        """Return the landmarks of one view or more, with their cameras' poses (4, 4)."""
+        points = [se3.apply(T, one.points_cam.astype(float)) for T, one in views]
+        cameras = [np.tile(T[:3, 3], (len(one), 1)) for T, one in views]
         return cls(
             points=np.concatenate(points),
             deviation_m=np.concatenate([one.deviation_m for _, one in views]).astype(float),
@@ -111,14 +110,14 @@ class ViewFinder:
     """
 
     def __init__(self, camera: Camera, placed: Sequence[tuple[Transform, Landmarks]]) -> None:
-        """Take views with their poses T_map_base (4, 4)."""
-        self._camera, self._map = camera, PlacedViews(placed)
+        """Take the camera that looks for them, and views with their poses T_map_cam (4, 4)."""
+        self.camera, self._map = camera, PlacedViews(placed)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
 
     def recognize(self, view: LandmarkView, around: Transform | None = None) -> Sighting | None:
         """Return the pose of a view, None if it shows no place of the map, or two alike.
 
-        With `around` (4, 4), T_map_base as it is expected, only what was seen near it counts.
+        With `around` (4, 4), T_map_cam as it is expected, only what was seen near it counts.
         """
         near = None if around is None else self._map.near(around)
         found = self._map.recognize(
@@ -134,7 +133,7 @@ class ViewFinder:
     def find(
         self, view: LandmarkView, expected: Transform, *, half_m: float, half_rad: float
     ) -> Sighting | None:
-        """Return the pose of a view that is at most so far from the one expected, T_map_base.
+        """Return the pose of a view that is at most so far from the one expected, T_map_cam.
 
         Landmarks are looked for where they are expected, so that more are found than anywhere in
         the map. They need not be most of those in view, but the pose has to be more certain than
@@ -154,7 +153,7 @@ class ViewFinder:
         """Return the pose by the landmarks of one view of the map."""
         T_map_seen, landmarks = self._map[number]
         rows, columns = matches(landmarks.descriptors, view.descriptors)
-        seen = _Seen.of(self._camera.T_base_cam, [(se3.identity(), landmarks)])
+        seen = _Seen.of([(se3.identity(), landmarks)])
         fitted = self._fitted(_Matched.of(seen[rows], view, columns))
         if fitted is None or not self._is_verified(landmarks, *fitted):
             return None
@@ -170,7 +169,7 @@ class ViewFinder:
             np.eye(3),
             None,
             iterationsCount=_ITERATIONS,
-            reprojectionError=_ERROR_PX / self._camera.fx,
+            reprojectionError=_ERROR_PX / self.camera.fx,
             confidence=_CONFIDENCE,
             flags=cv2.SOLVEPNP_AP3P,
         )
@@ -183,37 +182,36 @@ class ViewFinder:
 
     def _refined(self, view: LandmarkView, rough: Sighting, near: Sequence[int]) -> Sighting:
         """Return the pose by the landmarks of all views `near` it, if these are more."""
-        found = self._guided(view, rough.T_map_base, near, 0.0, _GUIDED_PX / self._camera.fx)
-        T_cam_base = se3.inverse(self._camera.T_base_cam)
+        found = self._guided(view, rough.T_map_cam, near, 0.0, _GUIDED_PX / self.camera.fx)
+        T_cam_rough = se3.identity()
         for _ in range(_ROUNDS):
-            at = se3.apply(T_cam_base, found.seen.points)
+            at = se3.apply(T_cam_rough, found.seen.points)
             off = np.linalg.norm(at[:, :2] / at[:, 2:] - found.rays, axis=1)
-            kept = (at[:, 2] > NEAR_M) & (off <= _ERROR_PX / self._camera.fx)
+            kept = (at[:, 2] > NEAR_M) & (off <= _ERROR_PX / self.camera.fx)
             if kept.sum() < rough.matches:
                 return rough
-            T_cam_base = self._optimised(T_cam_base, found[kept])
-        return self._sighting(rough.T_map_base, T_cam_base, found[kept], view)
+            T_cam_rough = self._optimised(T_cam_rough, found[kept])
+        return self._sighting(rough.T_map_cam, T_cam_rough, found[kept], view)
 
     def _guided(
         self,
         view: LandmarkView,
-        T_map_base: Transform,
+        T_map_cam: Transform,
         near: Sequence[int],
         half_m: float,
         half_rad: float,
     ) -> _Matched:
-        """Return the landmarks of views `near`, in base, that a view shows where expected.
+        """Return the landmarks of views `near`, from T_map_cam, that a view shows as expected.
 
         The pose is off by `half_m` and `half_rad` at most. A corner that several landmarks fit is
         at their mean, weighted by what is known of where they are seen from there.
         """
-        camera, T_cam_base = self._camera, se3.inverse(self._camera.T_base_cam)
-        views = [(se3.inverse(T_map_base) @ T, one) for T, one in (self._map[n] for n in near)]
-        every = _Seen.of(camera.T_base_cam, views)
-        points_cam = se3.apply(T_cam_base, every.points)
-        ahead = np.flatnonzero(points_cam[:, 2] > NEAR_M)
-        due = (points_cam[ahead, :2] / points_cam[ahead, 2:]).astype(np.float32)
-        reach = (half_rad + half_m / points_cam[ahead, 2])[:, None]
+        views = [(se3.inverse(T_map_cam) @ T, one) for T, one in (self._map[n] for n in near)]
+        every = _Seen.of(views)
+        ahead = np.flatnonzero(every.points[:, 2] > NEAR_M)
+        z = every.points[ahead, 2:]
+        due = (every.points[ahead, :2] / z).astype(np.float32)
+        reach = half_rad + half_m / z
         is_near = np.abs(due[:, None] - view.rays).max(axis=2) <= reach
         descriptors = np.concatenate([one.descriptors for _, one in views])
         guided = self._matcher.match(descriptors[ahead], view.descriptors, is_near.astype(np.uint8))
@@ -221,7 +219,7 @@ class ViewFinder:
         found = every[ahead[np.array([match.queryIdx for match in good], np.int64)]]
         seen_as = np.array([match.trainIdx for match in good], np.int64)
         columns, owner = np.unique(seen_as, return_inverse=True)
-        weight = 1.0 / found.ray_variance(camera.T_base_cam[:3, 3], SIGMA_PX / camera.fx)
+        weight = 1.0 / found.ray_variance(np.zeros(3), SIGMA_PX / self.camera.fx)
         total = np.bincount(owner, weight, minlength=len(columns))
         each = np.column_stack([found.points, found.deviation_m, found.cameras])
         mean = np.stack([np.bincount(owner, weight * one) / total for one in each.T], axis=1)
@@ -233,16 +231,14 @@ class ViewFinder:
     ) -> Sighting:
         """Return the pose T_cam_seen (4, 4) of the camera, by landmarks, in the map."""
         information, _ = self._equations(T_cam_seen, found)
-        covariance = se3.carried(np.linalg.inv(information), self._camera.T_base_cam) + FLOOR
-        covariance += view.shear_rad**2 * np.eye(6)  # seen a metre away, a turn is a shift
-        T_seen_base = se3.inverse(T_cam_seen) @ se3.inverse(self._camera.T_base_cam)
-        return Sighting(
-            T_map_base=T_map_seen @ T_seen_base, covariance=covariance, matches=len(found)
-        )
+        shear = view.shear_rad**2 * np.eye(6)  # seen a metre away, a turn is a shift
+        covariance = np.asarray(np.linalg.inv(information) + FLOOR + shear)
+        T_map_cam = T_map_seen @ se3.inverse(T_cam_seen)
+        return Sighting(T_map_cam=T_map_cam, covariance=covariance, matches=len(found))
 
     def _is_verified(self, landmarks: Landmarks, T_cam_seen: Transform, found: _Matched) -> bool:
         """Tell whether enough landmarks in view were found, and at the depths measured."""
-        camera, every = self._camera, se3.apply(T_cam_seen, landmarks.points_base.astype(float))
+        camera, every = self.camera, se3.apply(T_cam_seen, landmarks.points_cam.astype(float))
         ahead = every[every[:, 2] > NEAR_M]
         uv_px = ahead[:, :2] / ahead[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         in_view = ((uv_px >= 0) & (uv_px < camera.size_wh)).all(axis=1)
@@ -285,7 +281,7 @@ class ViewFinder:
         if is_measured.sum() >= MATCHES_MIN:
             sigma_m[is_measured] *= max(spread(missed[is_measured]), _DEPTH_LEAST)
         camera = se3.inverse(T_cam_seen)[:3, 3]
-        variance = found.seen.ray_variance(camera, SIGMA_PX / self._camera.fx)
+        variance = found.seen.ray_variance(camera, SIGMA_PX / self.camera.fx)
         weight = np.tile(1.0 / variance[:, None], 3)
         weight[:, 2] = np.where(is_near, sigma_m**-2, 0.0)
         J = (by_point @ by_pose).reshape(-1, 6)

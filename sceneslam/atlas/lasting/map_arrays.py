@@ -17,6 +17,7 @@ from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
+from sceneslam.types.rig import optical_to_rep103
 from sceneslam.views.view import Landmarks, PlacedView, depth_noise_m
 
 _FAR_M = 1e5  # no building is so large
@@ -77,9 +78,9 @@ def arrays_of(saved: SavedMap, modules: list[str]) -> dict[str, NDArray[Any]]:
         "normal": _joined([plan.normals for plan in plans]),
         "free_bits": _joined([np.packbits(plan.free) for plan in plans]),
         "view_stamp_ns": [view.stamp_ns for view in views],
-        "view_pose": [view.T_submap_base for view in views],
-        "view_landmarks": [len(landmarks.points_base) for landmarks in seen],
-        "landmark": _joined([one.points_base for one in seen]),
+        "view_pose": [view.T_submap_cam for view in views],
+        "view_landmarks": [len(landmarks) for landmarks in seen],
+        "landmark": _joined([one.points_cam for one in seen]),
         "landmark_deviation": _joined([one.deviation_m for one in seen]),
         "descriptor": _joined([one.descriptors for one in seen]),
         "edge_nodes": [(edge.first, edge.second) for edge in edges],
@@ -121,6 +122,16 @@ def lacking(arrays: Mapping[str, NDArray[Any]], version: int) -> dict[str, NDArr
         far_m = np.linalg.norm(landmark.astype(float), axis=1) if is_sound else np.zeros(0)
         added["landmark_deviation"] = depth_noise_m(far_m).astype(np.float32)
     return added
+
+
+def seen_ahead(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return the views of versions before 5: poses and landmarks were in base.
+
+    Where the camera was mounted is not known; it is taken as if it looked ahead from there.
+    """
+    T_base_cam = optical_to_rep103()
+    landmark = se3.apply(se3.inverse(T_base_cam), arrays["landmark"])
+    return {"view_pose": arrays["view_pose"] @ T_base_cam, "landmark": landmark.astype(np.float32)}
 
 
 def check_arrays(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
@@ -190,8 +201,8 @@ def map_of(arrays: Mapping[str, NDArray[Any]], modules: list[str]) -> SavedMap:
     views = [
         PlacedView(
             stamp_ns=stamp_ns,
-            T_submap_base=T,
-            landmarks=Landmarks(points_base=points, deviation_m=deviation_m, descriptors=bits),
+            T_submap_cam=T,
+            landmarks=Landmarks(points_cam=points, deviation_m=deviation_m, descriptors=bits),
         )
         for stamp_ns, T, points, deviation_m, bits in zip(
             arrays["view_stamp_ns"].tolist(),

@@ -21,14 +21,22 @@ from typing import Any
 import numpy as np
 import yaml
 
-from sceneslam.atlas.lasting.map_arrays import arrays_of, check_arrays, lacking, map_of, packed
+from sceneslam.atlas.lasting.map_arrays import (
+    arrays_of,
+    check_arrays,
+    lacking,
+    map_of,
+    packed,
+    seen_ahead,
+)
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import CELL_M
 from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.files import PART, whole
 
-HEAD, FORMAT, VERSION = "map.yaml", "sceneslam-map", 4
-_OLDEST = 2  # that is read; it has no `node_up`, as 3 no `landmark_deviation`
+HEAD, FORMAT, VERSION = "map.yaml", "sceneslam-map", 5
+_OLDEST = 2  # that is read: without `node_up`; before 4 without `landmark_deviation`
+_IN_BASE = 4  # the last one whose views are in axes of base
 OLD = "map.old.yaml"  # the head of a map that another one took the place of
 _ARRAYS = "arrays-"  # prefix, followed by the start of their checksum
 
@@ -160,6 +168,8 @@ def read_map_files(folder: Path) -> tuple[SavedMap, str]:
         raise InputError(f"the map's arrays cannot be read ({text_of(error)}): {path}") from error
     arrays = lacking(arrays, head["version"]) | arrays
     check_arrays(arrays, path)
+    if head["version"] <= _IN_BASE:
+        arrays |= seen_ahead(arrays)
     modules = head.get("modules")
     if not isinstance(modules, list) or arrays["node_module"].max(initial=-1) >= len(modules):
         raise InputError(f"modules: expected the names that the submaps refer to: {folder / HEAD}")

@@ -106,8 +106,8 @@ def _loops_by_views(saved: SavedMap, piece: int, own: Sequence[int]) -> list[Edg
             saved,
             piece,
             node,
-            found[1].T_map_base @ se3.inverse(view.T_submap_base),
-            se3.carried(found[1].covariance, view.T_submap_base),
+            found[1].T_map_cam @ se3.inverse(view.T_submap_cam),
+            se3.carried(found[1].covariance, view.T_submap_cam),
         )
         for node in own
         for view in saved.submaps[node].views

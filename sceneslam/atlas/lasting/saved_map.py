@@ -65,9 +65,9 @@ class SavedMap:
         check_size(self._placed(0))
 
     def views(self, piece: int = 0) -> list[tuple[Transform, Landmarks]]:
-        """Return what a camera saw in a piece, and the poses (4, 4) it was seen from."""
+        """Return what a camera saw in a piece, and T_map_cam (4, 4) where it was seen from."""
         return [
-            (self.T_map_node[node] @ view.T_submap_base, view.landmarks)
+            (self.T_map_node[node] @ view.T_submap_cam, view.landmarks)
             for node in self.nodes(piece)
             for view in self.submaps[node].views
         ]
@@ -117,9 +117,9 @@ class SavedMap:
         return np.asarray(stood)
 
     def seen_from(self, node: int) -> NDArray[np.float64]:
-        """Return the poses (N, 4, 4) in the map that the views of a submap were seen from."""
-        T_submap_base = [view.T_submap_base for view in self.submaps[node].views]
-        return np.asarray(self.T_map_node[node] @ np.array(T_submap_base).reshape(-1, 4, 4))
+        """Return T_map_cam (N, 4, 4) of the views of a submap."""
+        T_submap_cam = [view.T_submap_cam for view in self.submaps[node].views]
+        return np.asarray(self.T_map_node[node] @ np.array(T_submap_cam).reshape(-1, 4, 4))
 
     def graph(self) -> PoseGraphLayer:
         """Return nodes and edges as a layer."""

@@ -190,17 +190,18 @@ class MapLocalizer:
         if views is None or view is None:
             return None
         self._next_view_ns = newest.stamp_ns + (_AGAIN_NS if expected is None else _FIX_NS)
+        T_base_cam = views.camera.T_base_cam
         if expected is not None:
-            T_map_base, window = expected
+            T_map_cam, window = expected[0] @ T_base_cam, expected[1]
             half_m, half_rad = window.half_m, window.half_rad
             if half_m <= _APART_M:
-                seen = views.find(view, T_map_base, half_m=half_m, half_rad=half_rad)
+                seen = views.find(view, T_map_cam, half_m=half_m, half_rad=half_rad)
             else:
-                seen = views.recognize(view, T_map_base)
-            fix = _fix_of(seen, newest)
+                seen = views.recognize(view, T_map_cam)
+            fix = _fix_of(seen, newest, T_base_cam)
             if fix is not None and _is_within(fix, window):
                 return fix
-        return _fix_of(views.recognize(view), newest)
+        return _fix_of(views.recognize(view), newest, T_base_cam)
 
     def _by_walls(self, latest: Sequence[Look]) -> Fix | None:
         """Return the pose by the walls around the last metres, searched in all of the map."""
@@ -296,15 +297,15 @@ class MapLocalizer:
         self._next_walls_ns = self._next_view_ns = newest.stamp_ns + _FIX_NS
 
 
-def _fix_of(seen: Sighting | None, newest: Look) -> Fix | None:
-    """Return what was seen as a fix."""
+def _fix_of(seen: Sighting | None, newest: Look, T_base_cam: Transform) -> Fix | None:
+    """Return where the camera is as a fix of base."""
     if seen is None:
         return None
     return Fix(
         stamp_ns=newest.stamp_ns,
-        T_map_base=seen.T_map_base,
+        T_map_base=seen.T_map_cam @ se3.inverse(T_base_cam),
         T_run_base=newest.T_run_base,
-        covariance=seen.covariance,
+        covariance=se3.carried(seen.covariance, T_base_cam),
         is_by_view=True,
     )
 

@@ -61,21 +61,24 @@ class ViewTaker:
         is_far = np.linalg.norm(away[:3, 3]) >= _APART_M
         return bool(is_far or se3.rotation_angle_rad(away) >= _APART_RAD)
 
-    def rewind(self, stamp_ns: int) -> None:
-        """Forget the views from a stamp on: other poses replace theirs."""
-        if self._triangulation is not None:
-            self._triangulation.rewind(stamp_ns)
-
     def take(self, observation: Observation) -> LandmarkView | None:
         """Return the view of an observation; None with too few features, or without an image."""
         if self._viewer is None:
             return None
         return self._viewer.look(observation, shear_rad=self._shear_rad)
 
-    def keep(self, view: LandmarkView, stamp_ns: int, T_run_base: Transform) -> Landmarks | None:
-        """Return the landmarks of a view that is kept; None if too few are located."""
-        assert self._viewer is not None and self._triangulation is not None
+    def keep(self, T_run_base: Transform) -> None:
+        """Record that the view from a pose (4, 4) is kept."""
         self._T_run_kept = T_run_base
+
+    def locate(self, view: LandmarkView, stamp_ns: int, T_run_base: Transform) -> Landmarks | None:
+        """Return the landmarks of a view that is kept; None if too few are located.
+
+        Beside the depths measured, the views before locate them. Those from its stamp on are
+        forgotten: other poses replace theirs.
+        """
+        assert self._viewer is not None and self._triangulation is not None
+        self._triangulation.rewind(stamp_ns)
         found = self._triangulation.locate(view, T_run_base)
         self._triangulation.add(view, stamp_ns, T_run_base)
         return self._viewer.landmarks(view, found.depth_m, found.deviation_m)

@@ -24,6 +24,7 @@ class Chain:
     T_run_node: list[Transform] = field(default_factory=list)
     motions: list[Edge] = field(default_factory=list)
     drift: list[NDArray[np.float64]] = field(default_factory=list)  # (2, 3) each: `summed`
+    T_base_cam: Transform = field(default_factory=se3.identity)  # of the camera that saw the views
 
     def __len__(self) -> int:
         return len(self.submaps)
@@ -55,6 +56,7 @@ class Chain:
             T_run_node=list(self.T_run_node),
             motions=list(self.motions),
             drift=list(self.drift),
+            T_base_cam=self.T_base_cam,
         )
 
     def node_at(self, stamp_ns: int) -> int:
@@ -73,7 +75,9 @@ class Chain:
             pose = before if now is None else now
             views = [(view, path(view.stamp_ns)) for view in submap.views]
             moved = tuple(
-                view if T is None else replace(view, T_submap_base=se3.inverse(pose) @ T)
+                view
+                if T is None
+                else replace(view, T_submap_cam=se3.inverse(pose) @ T @ self.T_base_cam)
                 for view, T in views
             )
             poses.append(pose)

@@ -24,7 +24,7 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
-from sceneslam.views.view import Landmarks
+from sceneslam.views.view import Landmarks, LandmarkView
 
 _SETTLED_NS = 20_000_000_000  # a hand-over does not replace older poses (policy.buffer_s)
 _LEVEL_COS = np.cos(np.radians(3.0))  # at this tilt a wall 4 m away is seen 0.2 m higher or lower
@@ -45,17 +45,24 @@ class Known:
     of_map: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)))
 
 
-# Stamp, scan, the measured vertical direction (3,) in base, and landmarks.
-_Step = tuple[int, KeyScan | None, NDArray[np.float64] | None, Landmarks | None]
+# Stamp, scan, the measured vertical direction (3,) in base, and a view to be kept.
+_Step = tuple[int, KeyScan | None, NDArray[np.float64] | None, LandmarkView | None]
+# The corners that are located in a view, by its stamp and pose (4, 4); None with too few.
+Locate = Callable[[LandmarkView, int, Transform], Landmarks | None]
 
 
 class Collector:
     """The submaps of one run so far, and the motions between them."""
 
-    def __init__(self, rig: Rig, known: Callable[[int], Known | None], run: int) -> None:
-        """Begin; `known` returns the current estimate of the pose at a stamp."""
-        self.chain = Chain()
-        self._known, self._run = known, run
+    def __init__(
+        self, rig: Rig, known: Callable[[int], Known | None], run: int, locate: Locate
+    ) -> None:
+        """Begin; `known` returns the current estimate of the pose at a stamp.
+
+        Views are located once their poses are known, and again when others replace these.
+        """
+        self.chain = Chain() if rig.camera is None else Chain(T_base_cam=rig.camera.T_base_cam)
+        self._known, self._run, self._locate = known, run, locate
         wheels = GYRO if Sensor.GYRO in rig.sensors else WHEELS
         self._bridge = wheels if Sensor.ODOMETRY in rig.sensors else VELOCITY
         self._open = OpenSubmap()
@@ -101,14 +108,13 @@ class Collector:
         stamp_ns: int,
         scan: KeyScan | None,
         up_base: NDArray[np.float64] | None = None,
-        landmarks: Landmarks | None = None,
+        view: LandmarkView | None = None,
     ) -> None:
         """Add a step with its scan; that completes the submap before, if it is long enough.
 
-        `up_base` (3,) is the measured vertical direction, None if unknown, as are the `landmarks`
-        in view.
+        `up_base` (3,) is the measured vertical direction, None if unknown; `view` is kept.
         """
-        self._waiting.append((stamp_ns, scan, up_base, landmarks))
+        self._waiting.append((stamp_ns, scan, up_base, view))
         self._take()
 
     def rewind(self, stamp_ns: int) -> None:
@@ -125,7 +131,7 @@ class Collector:
         if len(self._recent) < len(self.chain):
             kept = max(kept, 1)  # older ones stay as they are
         gone = [pose for part in [*self._recent[kept:], growing] for pose in part]
-        steps = [(pose.stamp_ns, pose.scan, pose.up_base, pose.landmarks) for pose in gone]
+        steps = [(pose.stamp_ns, pose.scan, pose.up_base, pose.view) for pose in gone]
         self._waiting = [*steps, *self._waiting]
         self.chain.cut(len(self.chain) - (len(self._recent) - kept))
         del self._recent[kept:]
@@ -160,21 +166,24 @@ class Collector:
         stamp_ns: int,
         scan: KeyScan | None,
         up_base: NDArray[np.float64] | None,
-        landmarks: Landmarks | None,
+        view: LandmarkView | None,
     ) -> KeyPose | None:
         known = self._known(stamp_ns)
         if known is None:
             return None
+        T_map_base = known.T_map_base
+        landmarks = None if view is None else self._locate(view, stamp_ns, T_map_base)
         return KeyPose(
             stamp_ns=stamp_ns,
             scan=scan,
-            T_map_base=known.T_map_base,
+            T_map_base=T_map_base,
             session=known.session,
             module=known.module,
             drift=self._bridge if known.module == BRIDGED else MAPPED,
             reported=known.covariance,
             of_map=known.of_map,
             up_base=up_base,
+            view=view,
             landmarks=landmarks,
         )
 
@@ -189,7 +198,8 @@ class Collector:
                 covariance=motion_covariance([*before, part[0]]),
                 kind=_kind(before, part[0]),
             )
-        chain.append(make_submap(part, self._run), part[0].T_map_base, motion)
+        submap = make_submap(part, self._run, chain.T_base_cam)
+        chain.append(submap, part[0].T_map_base, motion)
 
 
 def _kind(part: list[KeyPose], pose: KeyPose) -> EdgeKind:

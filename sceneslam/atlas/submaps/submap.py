@@ -16,7 +16,7 @@ from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar, se3
 from sceneslam.types.planar import Planar
 from sceneslam.types.se3 import Transform
-from sceneslam.views.view import Landmarks, PlacedView
+from sceneslam.views.view import Landmarks, LandmarkView, PlacedView
 
 LENGTH_M = 2.5  # length of path in a submap: by MAPPED it drifts 1 cm
 TURN_RAD = 2 * np.pi  # or this much turning, after which everything around was seen
@@ -36,7 +36,8 @@ class KeyPose:
     drift: Drift  # of the motion from the one before
     reported: Covariance | None  # (6, 6) of T_local_base, as the module reported it
     up_base: NDArray[np.float64] | None = None  # (3,), the measured vertical direction, if known
-    landmarks: Landmarks | None = None  # that the camera saw
+    view: LandmarkView | None = None  # that the camera saw, of those to be kept
+    landmarks: Landmarks | None = None  # the corners in it that are located from this pose
     # (6, 6) of the drift of the module's map
     of_map: Covariance = field(default_factory=lambda: np.zeros((6, 6)))
 
@@ -82,8 +83,8 @@ class Submap:
         return replace(self, drawing=Drawing(plan))
 
 
-def make_submap(poses: Sequence[KeyPose], run: int) -> Submap:
-    """Return the submap of consecutive poses of one session."""
+def make_submap(poses: Sequence[KeyPose], run: int, T_base_cam: Transform) -> Submap:
+    """Return the submap of consecutive poses of one session, and what a camera saw there."""
     first = poses[0]
     T_submap_base = [_planar(first, pose) for pose in poses]
     placed = zip(T_submap_base, (pose.scan for pose in poses), strict=True)
@@ -97,7 +98,7 @@ def make_submap(poses: Sequence[KeyPose], run: int) -> Submap:
         views=tuple(
             PlacedView(
                 stamp_ns=pose.stamp_ns,
-                T_submap_base=se3.inverse(first.T_map_base) @ pose.T_map_base,
+                T_submap_cam=se3.inverse(first.T_map_base) @ pose.T_map_base @ T_base_cam,
                 landmarks=pose.landmarks,
             )
             for pose in poses

@@ -39,27 +39,27 @@ class ViewLoops:
         none.
         """
         self.forget(query.second)  # what a search that was interrupted left
-        poses = [query.T_run_node[owner] @ view.T_submap_base for owner, view in self._owned]
+        poses = [query.T_run_node[owner] @ view.T_submap_cam for owner, view in self._owned]
         self._views.move(poses)
         known, reach_m = np.reshape(poses, (-1, 4, 4)), self._reach_m(query)
         settled = known[reach_m < GAIN_MIN_M]  # with these, views are not compared
         best: dict[int, tuple[int, Edge]] = {}  # matches and loop, by the earlier submap
         kept: list[tuple[Transform, PlacedView]] = []
         for view in query.submap.views:
-            T_run_base = query.T_run_node[query.second] @ view.T_submap_base
-            if _is_covered(T_run_base, settled):
+            T_run_cam = query.T_run_node[query.second] @ view.T_submap_cam
+            if _is_covered(T_run_cam, settled):
                 continue
-            found = self._recognized(view, T_run_base, known, reach_m)
-            if found is None or not _is_covered(found[1].T_map_base, known[found[0]][None]):
-                kept.append((T_run_base, view))
+            found = self._recognized(view, T_run_cam, known, reach_m)
+            if found is None or not _is_covered(found[1].T_map_cam, known[found[0]][None]):
+                kept.append((T_run_cam, view))
             if found is None:
                 continue
             number, seen = found
             first = self._owned[number][0]
             if seen.matches > best.get(first, (0,))[0]:
                 best[first] = seen.matches, self._edge(number, query.second, view, seen)
-        for T_run_base, view in kept:
-            self._views.add(T_run_base, view.landmarks)
+        for T_run_cam, view in kept:
+            self._views.add(T_run_cam, view.landmarks)
             self._owned.append((query.second, view))
         by_matches = sorted(best.values(), key=lambda each: -each[0])
         return [loop for _, loop in by_matches[:TARGETS]], tuple(view for _, view in kept)
@@ -78,33 +78,33 @@ class ViewLoops:
     def _recognized(
         self,
         view: PlacedView,
-        T_run_base: Transform,
+        T_run_cam: Transform,
         known: NDArray[np.float64],
         reach_m: NDArray[np.float64],
     ) -> tuple[int, Sighting] | None:
         """Return which of the `known` poses (V, 4, 4) a view shows, and from where, if any."""
-        away_m = np.linalg.norm((known - T_run_base)[:, :3, 3], axis=1)
+        away_m = np.linalg.norm((known - T_run_cam)[:, :3, 3], axis=1)
         is_near = (reach_m >= GAIN_MIN_M) & (away_m <= reach_m + _REACH_M)
         found = recognize(self._views, view.landmarks, np.flatnonzero(is_near).tolist())
         if found is None:
             return None
         number, seen = found
-        off_m = float(np.linalg.norm((seen.T_map_base - T_run_base)[:3, 3]))
+        off_m = float(np.linalg.norm((seen.T_map_cam - T_run_cam)[:3, 3]))
         return found if off_m <= reach_m[number] else None
 
     def _edge(self, number: int, second: int, view: PlacedView, seen: Sighting) -> Edge:
         """Return the loop to a submap by one of its views, which shows what view `number` shows."""
         first, known = self._owned[number]
-        T_known_view = se3.inverse(self._views[number][0]) @ seen.T_map_base
+        T_known_view = se3.inverse(self._views[number][0]) @ seen.T_map_cam
         return Edge(
             first=first,
             second=second,
-            T_first_second=known.T_submap_base @ T_known_view @ se3.inverse(view.T_submap_base),
-            covariance=se3.carried(seen.covariance, view.T_submap_base),
+            T_first_second=known.T_submap_cam @ T_known_view @ se3.inverse(view.T_submap_cam),
+            covariance=se3.carried(seen.covariance, view.T_submap_cam),
             kind=EdgeKind.LOOP,
         )
 
 
-def _is_covered(T_map_base: Transform, known: NDArray[np.float64]) -> bool:
+def _is_covered(T_map_cam: Transform, known: NDArray[np.float64]) -> bool:
     """Tell whether a view shows what one of the views at `known` poses (N, 4, 4) shows."""
-    return bool(are_covered(T_map_base[None], known)[0])
+    return bool(are_covered(T_map_cam[None], known)[0])
