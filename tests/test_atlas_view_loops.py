@@ -159,3 +159,18 @@ def test_views_of_a_session_that_closes_its_loops_are_known_where_they_are():
     assert kept == [[True], [True]]  # ASIDE is turned by more than shows the same
     same = two(T_second_view=se3.inverse(ASIDE))
     assert added(ViewLoops(refuses), same, [se3.identity(), ASIDE], ANY)[1] == [[True], [False]]
+
+
+def test_a_rich_view_is_kept_where_a_poor_one_was_taken_before():
+    """As in the light, where the robot came by in the dark."""
+    first, second = two()
+    near = se3.from_xy_yaw(0.1, 0.0, 0.0)
+    submaps = [
+        viewed(first, (se3.identity(), place(2, 60))),
+        viewed(second, (se3.identity(), place(1, 200))),
+    ]
+    _, kept = added(ViewLoops(lambda *_: False), submaps, [se3.identity(), near], 0.0 * ANY)
+    assert kept == [[True], [True]]
+    submaps[0] = viewed(first, (se3.identity(), place(2, 200)))
+    _, kept = added(ViewLoops(lambda *_: False), submaps, [se3.identity(), near], 0.0 * ANY)
+    assert kept == [[True], [False]]

@@ -131,3 +131,11 @@ def test_a_view_goes_where_the_newest_run_has_one_nearby():
     assert len(left.submaps[1].views) == 1
     kept = forget_contradicted(viewed(saved, old, []), 1)
     assert len(kept.submaps[0].views) == 5
+
+
+@pytest.mark.parametrize(("count", "left"), [(90, 1), (110, 0)])
+def test_a_poor_view_takes_the_place_of_none_with_twice_its_landmarks(count, left):
+    flat = join([])
+    saved = map_of(flat, flat, runs=[0, 1])
+    views = [(se3.identity(), place(0, 200))], [(se3.identity(), place(9, count))]
+    assert len(forget_contradicted(viewed(saved, *views), 1).submaps[0].views) == left

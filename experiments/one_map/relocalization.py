@@ -21,7 +21,7 @@ from sceneslam.types.planar import Planar
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
-from sceneslam.views.placed_views import are_covered
+from sceneslam.views.placed_views import are_alike
 
 _STEP_M, _STEP_RAD, _STEP_S = 0.1, 0.2, 0.2  # half a metre, or a radian, per second
 _WRONG_M, _WRONG_RAD = 0.5, 0.2
@@ -96,8 +96,7 @@ class StoryStarts:
     ) -> None:
         """Draw the starts. `due` returns the true T_map_base (4, 4) at a stamp [ns]."""
         self._saved, self._rig, self._due = saved, rig, due
-        seen = [saved.seen_from(node) for node in saved.nodes()]
-        self._seen = np.concatenate(seen)
+        self._seen = np.reshape([T_map_cam for T_map_cam, _ in saved.views()], (-1, 4, 4))
         self._within_ns = round(within_s * 1e9)
         self._poses = dict(zip(online.stamps_ns.tolist(), online.T_world_base, strict=True))
         late = online.stamps_ns[-1] - self._within_ns
@@ -139,7 +138,7 @@ class StoryStarts:
         T_true = [
             self._due(ns) @ camera.T_base_cam for ns in self._poses if begun_ns <= ns <= ended_ns
         ]
-        return bool(are_covered(np.array(T_true), self._seen).any())
+        return bool(are_alike(np.array(T_true), self._seen).any())
 
     def found(self, *, is_lit: bool, is_shared: bool) -> Starts:
         """Return what became of the starts in the light or the dark, that share geometry or not."""

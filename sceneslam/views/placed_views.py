@@ -21,7 +21,8 @@ _ALIKE = 0.6  # another place with so many of the best one's matches, and nothin
 _SAME_M, _SAME_RAD = 0.3, 0.15
 _DEVIATION_MAX_M = 0.03  # of a pose: two that agree are no chance
 _DEVIATION_MAX_RAD = 0.017  # a degree
-_VIEW_M, _VIEW_RAD = 0.5, 0.4  # from a view that shows the same
+_VIEW_M, _VIEW_RAD = 0.5, 0.4  # from a view that shows the same ...
+_AS_MUCH = 0.5  # ... if it has so many landmarks of what it is compared with, at least
 SIGMAS = 3.0  # by which two measurements of a landmark differ, at most
 MATCHES_MIN = 25  # right by the pose found; by chance hardly more are than the three it is made of
 FLOOR = np.diag(np.repeat([0.01, 0.004], 3) ** 2)  # m, rad: of the map's landmarks among each other
@@ -130,8 +131,22 @@ class PlacedViews:
         return bool(np.linalg.norm(at - there) < _PLACE_M)
 
 
-def are_covered(views: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell of each view, by its pose (N, 4, 4), whether one of the others shows the same."""
+def are_covered(
+    views: Sequence[tuple[Transform, Landmarks]], others: Sequence[tuple[Transform, Landmarks]]
+) -> NDArray[np.bool_]:
+    """Tell of each view (N,), with its pose (4, 4), whether one of the others shows as much."""
+    poses, other_poses = (
+        np.reshape([T for T, _ in placed], (-1, 4, 4)) for placed in (views, others)
+    )
+    count, other_count = (
+        np.array([len(landmarks) for _, landmarks in placed]) for placed in (views, others)
+    )
+    is_as_much = other_count[None] >= _AS_MUCH * count[:, None]
+    return np.asarray((are_alike(poses, other_poses) & is_as_much).any(axis=1))
+
+
+def are_alike(views: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell of poses (N, 4, 4) and others (M, 4, 4) which see the same (N, M)."""
     off = se3.inverse(views)[:, None] @ others[None]
     is_near = np.linalg.norm(off[..., :3, 3], axis=-1) <= _VIEW_M
-    return np.asarray((is_near & (se3.rotation_angle_rad(off) <= _VIEW_RAD)).any(axis=1))
+    return np.asarray(is_near & (se3.rotation_angle_rad(off) <= _VIEW_RAD))

@@ -66,9 +66,13 @@ class SavedMap:
 
     def views(self, piece: int = 0) -> list[tuple[Transform, Landmarks]]:
         """Return what a camera saw in a piece, and T_map_cam (4, 4) where it was seen from."""
+        return self.views_of(self.nodes(piece))
+
+    def views_of(self, nodes: Sequence[int]) -> list[tuple[Transform, Landmarks]]:
+        """Return the same of these submaps."""
         return [
             (self.T_map_node[node] @ view.T_submap_cam, view.landmarks)
-            for node in self.nodes(piece)
+            for node in nodes
             for view in self.submaps[node].views
         ]
 
@@ -115,11 +119,6 @@ class SavedMap:
         stood = T_map_node @ se3.inverse(askew) @ on_floor @ askew
         stood[:2, 3] = T_map_base[:2, 3]
         return np.asarray(stood)
-
-    def seen_from(self, node: int) -> NDArray[np.float64]:
-        """Return T_map_cam (N, 4, 4) of the views of a submap."""
-        T_submap_cam = [view.T_submap_cam for view in self.submaps[node].views]
-        return np.asarray(self.T_map_node[node] @ np.array(T_submap_cam).reshape(-1, 4, 4))
 
     def graph(self) -> PoseGraphLayer:
         """Return nodes and edges as a layer."""
@@ -174,14 +173,14 @@ def forget_contradicted(saved: SavedMap, run: int) -> SavedMap:
     piece = int(saved.pieces[newest[0]])
     plane = saved.plane
     today = join([(plane[i], saved.submaps[i].plan) for i in newest])
-    views_today = np.concatenate([saved.seen_from(index) for index in newest])
+    views_today = saved.views_of(newest)
     submaps = list(saved.submaps)
     for index, submap in enumerate(saved.submaps):
         if submap.run == run or saved.pieces[index] != piece:
             continue
         if len(submap.plan):
             submap = submap.with_plan(_without(submap.plan, plane[index], today))
-        is_old = are_covered(saved.seen_from(index), views_today)
+        is_old = are_covered(saved.views_of([index]), views_today)
         views = tuple(compress(submap.views, ~is_old))
         submaps[index] = replace(submap, views=views)
     return replace(saved, submaps=tuple(submaps))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,15 +43,15 @@ class ViewLoops:
         poses = [query.T_run_node[owner] @ view.T_submap_cam for owner, view in self._owned]
         self._views.move(poses)
         known, reach_m = np.reshape(poses, (-1, 4, 4)), self._reach_m(query)
-        settled = known[reach_m < GAIN_MIN_M]  # with these, views are not compared
+        settled = np.flatnonzero(reach_m < GAIN_MIN_M)  # with these, views are not compared
         best: dict[int, tuple[int, Edge]] = {}  # matches and loop, by the earlier submap
         kept: list[tuple[Transform, PlacedView]] = []
         for view in query.submap.views:
             T_run_cam = query.T_run_node[query.second] @ view.T_submap_cam
-            if _is_covered(T_run_cam, settled):
+            if self._covers(settled, T_run_cam, view):
                 continue
             found = self._recognized(view, T_run_cam, known, reach_m)
-            if found is None or not _is_covered(found[1].T_map_cam, known[found[0]][None]):
+            if found is None or not self._covers(found[:1], found[1].T_map_cam, view):
                 kept.append((T_run_cam, view))
             if found is None:
                 continue
@@ -74,6 +75,11 @@ class ViewLoops:
             for first in dict.fromkeys(owner for owner, _ in self._owned)
         }
         return np.array([reach_m[owner] for owner, _ in self._owned])
+
+    def _covers(self, numbers: Iterable[int], T_run_cam: Transform, view: PlacedView) -> bool:
+        """Tell whether one of the views with these numbers shows as much as a new one."""
+        known = [self._views[number] for number in numbers]
+        return bool(are_covered([(T_run_cam, view.landmarks)], known)[0])
 
     def _recognized(
         self,
@@ -103,8 +109,3 @@ class ViewLoops:
             covariance=se3.carried(seen.covariance, view.T_submap_cam),
             kind=EdgeKind.LOOP,
         )
-
-
-def _is_covered(T_map_cam: Transform, known: NDArray[np.float64]) -> bool:
-    """Tell whether a view shows what one of the views at `known` poses (N, 4, 4) shows."""
-    return bool(are_covered(T_map_cam[None], known)[0])
