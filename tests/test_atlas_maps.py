@@ -172,6 +172,14 @@ def test_a_submap_without_later_walls_stays_and_one_without_walls_goes():
     assert len(prune(map_of(WALL, WALL, WALL)).submaps) == 1
 
 
+@pytest.mark.parametrize(("later", "is_covered"), [(9, False), (39, True)])
+def test_a_submap_stays_that_shows_free_space_beyond_later_ones(later, is_covered):
+    """Cells within 0.2 m of a wall are known anyhow."""
+    rows = [["." * free] * 20 + ["#" * 40] for free in (40, later)]
+    first, second = (plan_of(*(row.ljust(40) for row in part)) for part in rows)
+    assert len(prune(map_of(first, second)).submaps) == 1 + (not is_covered)
+
+
 def test_motions_and_loops_through_removed_submaps_are_composed():
     far = [50.0 * index for index in range(4)]
     nodes = [[far[0], 0, 0], [far[1], 0, 0], [far[2], 0, 0], [far[1], 0, 0]]

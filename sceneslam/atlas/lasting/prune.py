@@ -6,19 +6,21 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap
-from sceneslam.atlas.places.floor_plan import join
+from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan, join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.graphs.edge import Edge
 from sceneslam.types import planar
 from sceneslam.views.placed_views import are_covered
 
-_COVERED_RATIO = 0.95  # of a submap's walls, covered by later submaps
+_COVERED_RATIO = 0.95  # of a submap's walls, and of its free cells, shown by later submaps ...
+_NEAR_M = 0.1  # ... two cells away, at most
 
 
 def prune(saved: SavedMap) -> SavedMap:
-    """Return the map without submaps whose walls are covered by later ones of their piece.
+    """Return the map without submaps that later ones of their piece show, too.
 
     The newest stay. Motions and loops through removed submaps are composed.
     """
@@ -36,7 +38,7 @@ def prune(saved: SavedMap) -> SavedMap:
 
 
 def _is_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
-    return _are_walls_covered(saved, node, others) and _are_views_covered(saved, node, others)
+    return _are_views_covered(saved, node, others) and _is_ground_covered(saved, node, others)
 
 
 def _are_views_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
@@ -44,23 +46,34 @@ def _are_views_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
     return bool(are_covered(saved.views_of([node]), saved.views_of(others)).all())
 
 
-def _are_walls_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
-    plan = saved.submaps[node].plan
-    if not len(plan):
+def _is_ground_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
+    """Tell whether others show a submap's walls, and what is free in it."""
+    plan, plane = saved.submaps[node].plan, saved.plane
+    walls, free = plan.points.astype(np.float64), _free_of(plan)
+    ground = np.concatenate([walls, free])
+    if not len(ground):
         return True
-    low, high = plan.points.min(axis=0), plan.points.max(axis=0)
-    reach_m = float(np.linalg.norm(high - low))
-    plane = saved.plane
+    reach_m = float(np.linalg.norm(np.ptp(ground, axis=0)))
     away_m = np.linalg.norm(plane[others, :2] - plane[node, :2], axis=1)
     near = [other for other, far_m in zip(others, away_m, strict=True) if far_m <= 2 * reach_m]
-    placed = [
-        (planar.between(plane[node], plane[other]), saved.submaps[other].plan) for other in near
-    ]
-    shown = join(placed)
+    shown = join(
+        [(planar.between(plane[node], plane[other]), saved.submaps[other].plan) for other in near]
+    )
     if not len(shown):
         return False
-    far_m = PlanField(shown).nearest(plan.points.astype(np.float64)).distance_m
-    return bool((far_m <= 0.1).mean() >= _COVERED_RATIO)  # two cells
+    field = PlanField(shown)
+    is_wall = field.nearest(walls).distance_m <= _NEAR_M
+    return all(
+        not len(one) or one.mean() >= _COVERED_RATIO
+        for one in (is_wall, field.nearest(free).is_known)
+    )
+
+
+def _free_of(plan: FloorPlan) -> NDArray[np.float64]:
+    """Return the centres (N, 2) [m] of a plan's free cells."""
+    rows, columns = np.nonzero(plan.free)
+    centres = (np.column_stack([columns, rows]) + 0.5) * CELL_M + np.array(plan.origin_xy_m)
+    return np.asarray(centres, np.float64)
 
 
 def _without(edges: Sequence[Edge], node: int) -> list[Edge]:
