@@ -85,3 +85,21 @@ def test_predicted_pose_stays_a_rotation_over_many_corrections():
         predictor.correct(T_adjusted @ se3.inverse(T_keyframe))
     rotation = predictor.predict(at(6.0)).T_local_base[:3, :3]
     assert rotation.T @ rotation == pytest.approx(np.eye(3), abs=1e-13)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_variance_is_negative_where_a_sensor_measures_next_to_nothing(seed):
+    """As of a bare wall; rounding leaves an information a little below 0 there."""
+    rng = np.random.default_rng(seed)
+    own, T_local_base = Predictor(WHEELED), se3.identity()
+    for index in range(100):
+        T_local_base = T_local_base @ se3.exp(np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.01]))
+        observation = at(index / 30, T_odom_base=T_local_base)
+        expected = own.predict(observation).covariance
+        assert np.linalg.eigvalsh(expected)[0] > 0.0
+        axes = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+        measured = 10.0 ** rng.uniform(5, 9, 6)
+        measured[: rng.integers(0, 3)] = -3e-6
+        information = (axes * measured) @ axes.T
+        known = np.linalg.inv(np.linalg.inv(expected) + information)
+        own.measure(observation, T_local_base, known, information)

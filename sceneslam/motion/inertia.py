@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sceneslam.motion.motion import BELIEVED, UNKNOWN_VELOCITY, Step, still
 from sceneslam.motion.trust import NoiseRatio, student_cost
 from sceneslam.types import se3
+from sceneslam.types.covariance import updated
 
 _ACCELERATION = np.array([1.5, 4.0])  # m/s^2, rad/s^2: largest usual of a robot
 _USUAL = {False: 1.0, True: 1 / 3}  # of that: deviation of the acceleration, by: has wheels
@@ -140,7 +141,8 @@ class Inertia:
             now = before + np.clip(now - before, -reach, reach)
         if self.is_known:
             self._time(before, now, is_measured * duration_s)
-        self.velocity, self._covariance = now, expected - gain @ expected
+        self.velocity = now
+        self._covariance = updated(expected, gain, np.eye(6), covariance)
         self.is_known = True
 
     def _time(

@@ -20,6 +20,7 @@ from sceneslam.motion.motion import BELIEVED, Motion, Step, motion_of, still
 from sceneslam.motion.trust import LieDetector, NoiseRatio, evidence_of_a_lie
 from sceneslam.motion.turn_errors import TurnErrors
 from sceneslam.types import se3
+from sceneslam.types.covariance import updated
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
@@ -210,7 +211,7 @@ class MotionModel:
         R = np.diag((self._inertia.noise_of(wheels, self.lying, self._since_s))[[0, 0, 1]])
         gain = covariance[:, _PLANAR] @ np.linalg.inv(covariance[np.ix_(_PLANAR, _PLANAR)] + R)
         off = se3.log(se3.inverse(T_before_now) @ wheels.T)[_PLANAR]
-        return T_before_now @ se3.exp(gain @ off), covariance - gain @ covariance[_PLANAR]
+        return T_before_now @ se3.exp(gain @ off), updated(covariance, gain, np.eye(6)[_PLANAR], R)
 
     def skip(self) -> None:
         """Discard the motion since the last call, which no sensor measured."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sceneslam.motion.model import MotionModel
 from sceneslam.motion.motion import Motion
 from sceneslam.types import se3
+from sceneslam.types.covariance import covariance_of
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
@@ -17,8 +18,8 @@ from sceneslam.types.se3 import Transform
 Matrix = NDArray[np.float64]
 
 _FIRST_DEVIATION = 1e-4  # m and rad: of the first pose, which defines `local`
+_UNMEASURED = 0.01  # 1/m^2, 1/rad^2: information in directions that a sensor does not measure
 _COAST_S = 0.5  # after this time without a measurement a predicted pose is lost
-_UNMEASURED = 1e-6  # 1/m^2, 1/rad^2: information in directions that a sensor does not measure
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -82,7 +83,7 @@ class Predictor:
             self.model.skip()
             alone = covariance
         else:
-            alone = np.asarray(np.linalg.inv(information + _UNMEASURED * np.eye(6)))
+            alone = covariance_of(information, unmeasured=_UNMEASURED)
             T_before_now = se3.inverse(self.T_local_measured) @ T_local_base
             carried = se3.carried(self._alone, se3.inverse(T_before_now))
             self.model.learn(T_before_now, alone + carried)

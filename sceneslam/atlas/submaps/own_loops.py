@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types.covariance import covariance_of
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.se3 import Transform
 
 Path = Callable[[int], Transform | None]  # T_run_base at a stamp, None without a pose
 
+_UNMEASURED = 1e-6  # 1/m^2, 1/rad^2: information in a direction that was not measured
 _ROUNDING = np.diag(np.full(6, 1e-6))  # makes a covariance invertible: 1 mm, 1 mrad
-_OPEN = 1e6  # m^2, rad^2: largest variance, of a direction that was not measured
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,7 +35,7 @@ def closed_loops(maps: Sequence[MapLayers]) -> list[OwnLoop]:
             from_ns=int(graph.stamps_ns[first]),
             to_ns=int(graph.stamps_ns[second]),
             T_from_to=T_from_to,
-            covariance=_inverse(information) + _ROUNDING,
+            covariance=covariance_of(information, unmeasured=_UNMEASURED) + _ROUNDING,
         )
         for graph in (layers.pose_graph for layers in maps)
         if graph is not None
@@ -43,9 +44,3 @@ def closed_loops(maps: Sequence[MapLayers]) -> list[OwnLoop]:
         )
         if is_loop
     ]
-
-
-def _inverse(information: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the covariance (6, 6); the information is 0 in directions that were not measured."""
-    values, vectors = np.linalg.eigh(information)
-    return np.asarray((vectors / np.maximum(values, 1.0 / _OPEN)) @ vectors.T)

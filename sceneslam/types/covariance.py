@@ -1,0 +1,26 @@
+"""Covariances that stay positive, also where a direction is not measured."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Matrix = NDArray[np.float64]
+
+
+def covariance_of(information: Matrix, *, unmeasured: float) -> Matrix:
+    """Return the inverse of a symmetric information (N, N), of which `unmeasured` is the least.
+
+    By its eigenvalues, since rounding leaves some below 0 where nothing is measured.
+    """
+    values, vectors = np.linalg.eigh(information)
+    return np.asarray((vectors / np.maximum(values, unmeasured)) @ vectors.T)
+
+
+def updated(before: Matrix, gain: Matrix, seen: Matrix, noise: Matrix) -> Matrix:
+    """Return the covariance (N, N) after a measurement of `seen` (K, N) with its noise (K, K).
+
+    Joseph's form (Bucy and Joseph 1968): no rounding makes it negative. `gain` is (N, K).
+    """
+    left = np.eye(len(before)) - gain @ seen
+    return np.asarray(left @ before @ left.T + gain @ noise @ gain.T)
