@@ -12,7 +12,12 @@ from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.modules.slam.depth.keyframe_map import KeyframeMap
 from sceneslam.modules.slam.depth.localizer import DepthLocalizer
 from sceneslam.modules.slam.depth.module import DepthSlam
-from sceneslam.modules.slam.surfaces.registration import CameraPrior, samples_of
+from sceneslam.modules.slam.depth.pose_graph import DepthPoseGraph
+from sceneslam.modules.slam.surfaces.registration import (
+    CameraPrior,
+    SurfaceRegistration,
+    samples_of,
+)
 from sceneslam.modules.slam.surfaces.surface import DepthSurfaceReader
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types import se3
@@ -261,3 +266,25 @@ def test_start_of_a_real_recording_is_followed_by_depth_alone(
     errors = absolute_errors(estimate, source.ground_truth().trajectory, 0.02)
     assert len(errors.errors_m) == 80
     assert errors.rmse_m < bound_m
+
+
+def test_a_registration_that_hardly_measures_a_direction_leaves_it_to_tracking(monkeypatch):
+    """Along a wall; it finds the second of two keyframes 0.05 m beside where it was tracked."""
+    reader = DepthSurfaceReader(CAMERA)
+    surface = reader.read(depth_image(WALL, se3.identity()))
+    keyframes = KeyframeMap(reader.grid)
+    graph = DepthPoseGraph(keyframes, weak_ratio=0.005)
+    information = np.diag([1 / 0.05**2, 1e6, 1e6, 1e6, 1e6, 1e6])  # axes of the camera
+
+    def beside(samples, prior, known, grid, *, weak_ratio):
+        T_local_cam = prior.T_local_cam @ se3.from_xy_yaw(0.05, 0.0, 0.0)
+        held = samples.localizability()
+        return SurfaceRegistration(T_local_cam, information, held, 1.0, len(samples), len(samples))
+
+    monkeypatch.setattr("sceneslam.modules.slam.depth.pose_graph.register", beside)
+    tracked = [CAMERA.T_base_cam, se3.from_xy_yaw(0.0, 0.2, 0.0) @ CAMERA.T_base_cam]
+    for stamp_ns, T_local_cam in enumerate(tracked):
+        graph.connect(keyframes.add(surface, T_local_cam, stamp_ns=stamp_ns))
+    graph.finish()
+    moved = se3.inverse(tracked[1]) @ keyframes[1].T_local_cam
+    assert 0.0 < moved[0, 3] < 0.005

@@ -19,7 +19,8 @@ _MATCHED_MIN_RATIO = 0.5
 _OVERLAP_MIN_RATIO = 0.25
 _PARTNERS_MAX = 8
 _HUBER_SIGMAS = 3.0
-_LOOSE = 10.0  # information [1/m^2, 1/rad^2] of tracking, and of each edge
+_LOOSE = 10.0  # information [1/m^2, 1/rad^2] of where a registration begins, and of its edge
+_TRACKED = 0.01**2 * np.eye(6)  # m^2, rad^2: covariance of tracking between two keyframes
 
 
 class DepthPoseGraph:
@@ -66,13 +67,13 @@ class DepthPoseGraph:
         self.is_fresh = False
 
     def _chain(self, index: int) -> Edge:
-        """Return the weak edge by tracking, for directions without another constraint."""
+        """Return the edge by tracking, which knows what odometry measured, too."""
         before, this = self._map[index - 1], self._map[index]
         return Edge(
             first=index - 1,
             second=index,
             T_first_second=before.T_cam_local @ this.T_local_cam,
-            covariance=np.eye(6) / _LOOSE,
+            covariance=_TRACKED,
         )
 
     def _register(self, first: int, second: int) -> Edge | None:
