@@ -180,6 +180,14 @@ def test_a_submap_stays_that_shows_free_space_beyond_later_ones(later, is_covere
     assert len(prune(map_of(first, second)).submaps) == 1 + (not is_covered)
 
 
+def test_a_submap_of_free_space_alone_goes_if_a_later_one_shows_it():
+    """As one whose walls were contradicted."""
+    hall, room = plan_of(*["." * 40] * 20), plan_of(*["." * 20] * 20)
+    assert len(prune(map_of(hall, hall)).submaps) == 1
+    assert len(prune(map_of(hall, room)).submaps) == 2
+    assert len(prune(map_of(WALL, hall)).submaps) == 2
+
+
 def test_motions_and_loops_through_removed_submaps_are_composed():
     far = [50.0 * index for index in range(4)]
     nodes = [[far[0], 0, 0], [far[1], 0, 0], [far[2], 0, 0], [far[1], 0, 0]]

@@ -262,36 +262,66 @@ def test_no_corner_is_located_across_a_jump_of_the_path(jump_m, is_located):
     assert (found is not None) == is_located
 
 
-def test_corners_are_located_anew_when_other_poses_replace_those_they_were_seen_from():
+def blind_taker():
+    return ViewTaker(replace(SEEING, sensors=frozenset({Sensor.IMAGE})), is_keeping=True)
+
+
+def followed(taker, path, indices):
+    """Submaps of a path, by stamp, that sees the room from every second of its poses."""
+
+    def known(stamp_ns):
+        return Known(T_map_base=path(stamp_ns), session=0, module="a", covariance=None)
+
+    own = Collector(SEEING, known, 0, taker.locate)
+    for index in indices:
+        stamp_ns = START_NS + index * STEP_NS
+        taker.move(stamp_ns, path(stamp_ns))
+        view = taker.take(replace(look(index), depth_m=None)) if index % 2 == 0 else None
+        own.add(stamp_ns, None, None, view)
+    return own
+
+
+def landmarks_in(own):
+    own.finish()
+    return {view.stamp_ns: view.landmarks for submap in own.chain.submaps for view in submap.views}
+
+
+@pytest.mark.parametrize("since", [4, 30])
+def test_corners_are_located_anew_when_other_poses_replace_those_they_were_seen_from(since):
     """The motion between the views was a tenth too long."""
-    taker, scale = (
-        ViewTaker(replace(SEEING, sensors=frozenset({Sensor.IMAGE})), is_keeping=True),
-        [1.1],
-    )
+    scale, count, taker = [1.1], 40, blind_taker()
 
     def path(stamp_ns):
         T = true_path(stamp_ns).copy()
-        T[:3, 3] *= scale[0]
-        return Known(T_map_base=T, session=0, module="a", covariance=None)
+        T[:3, 3] *= scale[0] if stamp_ns >= START_NS + since * STEP_NS else 1.0
+        return T
 
-    own = Collector(SEEING, path, 0, taker.locate)
-    for index in range(0, 12, 2):
-        view = taker.take(replace(look(index), depth_m=None))
-        own.add(START_NS + index * STEP_NS, None, None, view)
+    own = followed(taker, path, range(count))
     scale[0] = 1.0
-    own.rewind(START_NS + 4 * STEP_NS)
-    own.finish()
-    other = ViewTaker(replace(SEEING, sensors=frozenset({Sensor.IMAGE})), is_keeping=True)
-    due = []
-    for index in range(0, 12, 2):
-        view = other.take(replace(look(index), depth_m=None))
-        ns = START_NS + index * STEP_NS
-        due.append(other.locate(view, ns, true_path(ns)))
-    due = [one for one in due if one is not None]
-    views = [view for submap in own.chain.submaps for view in submap.views]
-    assert len(views) == len(due) > 2
-    for view, one in zip(views, due, strict=True):
-        np.testing.assert_array_equal(view.landmarks.points_cam, one.points_cam)
+    own.rewind(START_NS + since * STEP_NS)
+    taker.rewind(START_NS + since * STEP_NS)
+    found, due = landmarks_in(own), landmarks_in(followed(blind_taker(), true_path, range(count)))
+    assert found.keys() == due.keys() and len(due) > 10
+    for stamp_ns, landmarks in due.items():
+        np.testing.assert_array_equal(found[stamp_ns].points_cam, landmarks.points_cam)
+
+
+@pytest.mark.parametrize("is_rewound", [False, True])
+def test_no_corner_is_located_across_a_jump_also_after_a_rewind(is_rewound):
+    jump = 20
+
+    def path(stamp_ns):
+        is_after = stamp_ns >= START_NS + jump * STEP_NS
+        return se3.from_xy_yaw(0.3 * is_after, 0.0, 0.0) @ true_path(stamp_ns)
+
+    taker = blind_taker()
+    own = followed(taker, path, range(40))
+    if is_rewound:
+        own.rewind(START_NS + 10 * STEP_NS)
+        taker.rewind(START_NS + 10 * STEP_NS)
+    stamps = (np.array(sorted(landmarks_in(own))) - START_NS) // STEP_NS
+    assert (stamps < jump).any() and (stamps > jump + 8).any()
+    assert not ((stamps >= jump) & (stamps <= jump + 2)).any()  # too near to the first after it
 
 
 def test_a_robot_whose_camera_is_mounted_elsewhere_finds_itself_in_the_map():

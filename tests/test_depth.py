@@ -268,8 +268,11 @@ def test_start_of_a_real_recording_is_followed_by_depth_alone(
     assert errors.rmse_m < bound_m
 
 
-def test_a_registration_that_hardly_measures_a_direction_leaves_it_to_tracking(monkeypatch):
-    """Along a wall; it finds the second of two keyframes 0.05 m beside where it was tracked."""
+@pytest.mark.parametrize("is_guessed", [False, True])
+def test_a_registration_that_hardly_measures_a_direction_leaves_it_to_tracking(
+    monkeypatch, is_guessed
+):
+    """Along a wall, unless tracking guessed it; it finds a keyframe 0.05 m from where it was."""
     reader = DepthSurfaceReader(CAMERA)
     surface = reader.read(depth_image(WALL, se3.identity()))
     keyframes = KeyframeMap(reader.grid)
@@ -284,7 +287,9 @@ def test_a_registration_that_hardly_measures_a_direction_leaves_it_to_tracking(m
     monkeypatch.setattr("sceneslam.modules.slam.depth.pose_graph.register", beside)
     tracked = [CAMERA.T_base_cam, se3.from_xy_yaw(0.0, 0.2, 0.0) @ CAMERA.T_base_cam]
     for stamp_ns, T_local_cam in enumerate(tracked):
-        graph.connect(keyframes.add(surface, T_local_cam, stamp_ns=stamp_ns))
+        known = np.diag([0.2**2 if is_guessed else 1e-6, *[1e-6] * 5])
+        graph.connect(keyframes.add(surface, T_local_cam, stamp_ns=stamp_ns), known)
     graph.finish()
     moved = se3.inverse(tracked[1]) @ keyframes[1].T_local_cam
-    assert 0.0 < moved[0, 3] < 0.005
+    low, high = (0.04, 0.05) if is_guessed else (0.0, 0.005)
+    assert low < moved[0, 3] < high

@@ -138,6 +138,7 @@ class Mapper:
         before_ns = stamp_ns if self._rewound_ns is None else self._rewound_ns
         self._rewound_ns = min(stamp_ns, before_ns)
         self._collector.rewind(stamp_ns)
+        self._views.rewind(stamp_ns)
         kept = len(self._collector.chain)
         if kept < self._kept:
             self._is_news |= bool(self._solved.loops)

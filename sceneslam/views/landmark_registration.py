@@ -13,13 +13,13 @@ from sceneslam.views.matching import matches
 from sceneslam.views.placed_views import (
     FLOOR,
     MATCHES_MIN,
+    PRECISE_M,
     SIGMAS,
     PlacedViews,
     Sighting,
 )
 from sceneslam.views.view import Landmarks
 
-_PRECISE_M = 0.1  # standard deviation of a distance: less precise ones tell little of a motion
 _SAMPLES = 300  # of three matches each: one is right with 99.9 % if three of ten matches are
 _ROUNDS = 3  # of the motion by all matches that are right: which ones are depends on it
 
@@ -40,7 +40,7 @@ def register(T_map_first: Transform, first: Landmarks, second: Landmarks) -> Sig
     """Return where the second view was taken in the map of the first, None if too few agree."""
     rows, columns = matches(first.descriptors, second.descriptors)
     sigma_m = np.maximum(first.deviation_m[rows], second.deviation_m[columns]).astype(float)
-    is_precise = sigma_m <= _PRECISE_M
+    is_precise = sigma_m <= PRECISE_M
     if is_precise.sum() < MATCHES_MIN:
         return None
     rows, columns, sigma_m = rows[is_precise], columns[is_precise], sigma_m[is_precise]

@@ -22,7 +22,8 @@ _SAME_M, _SAME_RAD = 0.3, 0.15
 _DEVIATION_MAX_M = 0.03  # of a pose: two that agree are no chance
 _DEVIATION_MAX_RAD = 0.017  # a degree
 _VIEW_M, _VIEW_RAD = 0.5, 0.4  # from a view that shows the same ...
-_AS_MUCH = 0.5  # ... if it has so many landmarks of what it is compared with, at least
+_ENOUGH = 100  # ... if it has as many landmarks, or so many: a quarter of them is MATCHES_MIN
+PRECISE_M = 0.1  # standard deviation of a distance: less precise ones tell little of a motion
 SIGMAS = 3.0  # by which two measurements of a landmark differ, at most
 MATCHES_MIN = 25  # right by the pose found; by chance hardly more are than the three it is made of
 FLOOR = np.diag(np.repeat([0.01, 0.004], 3) ** 2)  # m, rad: of the map's landmarks among each other
@@ -138,11 +139,17 @@ def are_covered(
     poses, other_poses = (
         np.reshape([T for T, _ in placed], (-1, 4, 4)) for placed in (views, others)
     )
-    count, other_count = (
-        np.array([len(landmarks) for _, landmarks in placed]) for placed in (views, others)
+    counts, other_counts = (
+        np.array([_counts(landmarks) for _, landmarks in placed], np.int64).reshape(-1, 1, 2)
+        for placed in (views, others)
     )
-    is_as_much = other_count[None] >= _AS_MUCH * count[:, None]
+    is_as_much = (other_counts[:, 0] >= np.minimum(counts, _ENOUGH)).all(axis=2)
     return np.asarray((are_alike(poses, other_poses) & is_as_much).any(axis=1))
+
+
+def _counts(landmarks: Landmarks) -> tuple[int, int]:
+    """Return how many there are, and how many of them are located precisely."""
+    return len(landmarks), int((landmarks.deviation_m <= PRECISE_M).sum())
 
 
 def are_alike(views: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -22,6 +22,9 @@ from sceneslam.views.view import NEAR_M, SIGMA_PX, LandmarkView
 
 _BASE_M = 0.2, 3.0  # between two views: least, and most while the path is as good as a map
 _VIEWS = 12  # the last ones, of 0.3 m or a turn each
+_KEPT = 80  # views that are remembered: a hand-over replaces the poses of 20 s
+_STEPS = 1000  # the same, in images
+_JUMP_M_S = 1.0  # no robot's velocity changes so much from one image to the next: its path jumped
 _PATH_M, _PATH_RAD = 0.01, 0.003  # standard deviations of the motion between two views
 _OFF_PX = 1.5  # from where the other view's ray meets this one's, at most
 _DEVIATION_RATIO = 0.4  # of a depth, at most: from beside where it was seen, it counts for less
@@ -37,6 +40,16 @@ class _Past:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Step:
+    """A pose of the path, and since when it has not jumped."""
+
+    stamp_ns: int
+    T_run_base: Transform
+    speed_m_s: float
+    began_ns: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Located:
     """Depths along the optical axis (N,) [m], 0 = unknown, and their standard deviations (N,)."""
 
@@ -49,16 +62,28 @@ class Triangulation:
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
-        self._past: deque[_Past] = deque(maxlen=_VIEWS)
-
-    def forget(self) -> None:
-        """Forget all views: the path jumped."""
-        self._past.clear()
+        self._past: deque[_Past] = deque(maxlen=_KEPT)
+        self._steps: deque[_Step] = deque(maxlen=_STEPS)
 
     def rewind(self, stamp_ns: int) -> None:
-        """Forget the views from a stamp on: other poses replace theirs."""
-        while self._past and self._past[-1].stamp_ns >= stamp_ns:
-            self._past.pop()
+        """Forget steps and views from a stamp on: other poses replace theirs."""
+        for kept in (self._past, self._steps):
+            while kept and kept[-1].stamp_ns >= stamp_ns:
+                kept.pop()
+
+    def step(self, stamp_ns: int, T_run_base: Transform) -> None:
+        """Follow the path (4, 4); no corner is located across a jump of it."""
+        self.rewind(stamp_ns)
+        speed_m_s, began_ns = 0.0, stamp_ns
+        if self._steps:
+            last = self._steps[-1]
+            moved_m = float(np.linalg.norm(T_run_base[:3, 3] - last.T_run_base[:3, 3]))
+            speed_m_s = moved_m * 1e9 / (stamp_ns - last.stamp_ns)
+            if abs(speed_m_s - last.speed_m_s) <= _JUMP_M_S:
+                began_ns = last.began_ns
+        self._steps.append(
+            _Step(stamp_ns=stamp_ns, T_run_base=T_run_base, speed_m_s=speed_m_s, began_ns=began_ns)
+        )
 
     def add(self, view: LandmarkView, stamp_ns: int, T_run_base: Transform) -> None:
         """Remember a view and its pose (4, 4)."""
@@ -69,7 +94,9 @@ class Triangulation:
         """Return where the corners without a depth are, in a view from a pose (4, 4)."""
         depth_m, deviation_m = np.zeros(len(view.rays)), np.zeros(len(view.rays))
         T_cam_run = se3.inverse(T_run_base @ self._camera.T_base_cam)
-        for past in self._past:  # the oldest first: its rays meet at the widest angle
+        began_ns = self._steps[-1].began_ns if self._steps else 0
+        latest = [past for past in list(self._past)[-_VIEWS:] if past.stamp_ns >= began_ns]
+        for past in latest:  # the oldest first: its rays meet at the widest angle
             left = np.flatnonzero((view.depth_m == 0) & (depth_m == 0))
             T_here_there = T_cam_run @ past.T_run_cam
             base_m = np.linalg.norm(T_here_there[:3, 3])

@@ -15,7 +15,7 @@ from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
 from ..surfaces.registration import CameraPrior, Samples, SurfaceRegistration, samples_of
-from ..surfaces.surface import DepthSurfaceReader, Surface
+from ..surfaces.surface import DepthSurfaceReader, Doubles, Surface
 from .history import PoseHistory
 from .keyframe_map import KeyframeMap
 from .localizer import DepthLocalizer
@@ -114,7 +114,7 @@ class DepthSlam:
     ) -> Tracking:
         """Make the first keyframe of the session, or after tracking was lost."""
         T_local_cam = prediction.T_local_base @ self._camera.T_base_cam
-        self._add_keyframe(observation, surface, T_local_cam)
+        self._add_keyframe(observation, surface, T_local_cam, prediction.covariance)
         is_first = len(self._map) == 1 and not self._predictor.is_lost
         self._T_local_base = prediction.T_local_base
         self._predictor.measure(observation, self._T_local_base, prediction.covariance)
@@ -172,7 +172,7 @@ class DepthSlam:
         best = overlaps[0]
         self._reference = best.index
         if best.ratio < self.keyframe_overlap_ratio:
-            self._add_keyframe(observation, surface, T_local_cam)
+            self._add_keyframe(observation, surface, T_local_cam, self._predictor.covariance)
             return
         self._map[best.index].fuse(surface, T_local_cam, self._map.grid)
         if self._graph.advance():
@@ -184,10 +184,16 @@ class DepthSlam:
             self._revision += 1
 
     def _add_keyframe(
-        self, observation: Observation, surface: Surface, T_local_cam: se3.Transform
+        self,
+        observation: Observation,
+        surface: Surface,
+        T_local_cam: se3.Transform,
+        covariance: Doubles,
     ) -> None:
+        """Add a keyframe at a pose with its covariance (6, 6), in base."""
         self._reference = self._map.add(surface, T_local_cam, stamp_ns=observation.stamp_ns)
-        self._graph.connect(self._reference)
+        in_cam = se3.carried(covariance, se3.inverse(self._camera.T_base_cam))
+        self._graph.connect(self._reference, in_cam)
 
     def _bridge(
         self, observation: Observation, prediction: Prediction, *, can_coast: bool

@@ -13,6 +13,7 @@ from sceneslam.graphs.factors import fit
 from sceneslam.types import se3
 
 from ..surfaces.registration import CameraPrior, register, samples_of
+from ..surfaces.surface import Doubles
 from .keyframe_map import KeyframeMap
 
 _MATCHED_MIN_RATIO = 0.5
@@ -20,7 +21,7 @@ _OVERLAP_MIN_RATIO = 0.25
 _PARTNERS_MAX = 8
 _HUBER_SIGMAS = 3.0
 _LOOSE = 10.0  # information [1/m^2, 1/rad^2] of where a registration begins, and of its edge
-_TRACKED = 0.01**2 * np.eye(6)  # m^2, rad^2: covariance of tracking between two keyframes
+_TRACKED = 0.01**2 * np.eye(6)  # m^2, rad^2: by which tracking errs beyond what it says
 
 
 class DepthPoseGraph:
@@ -32,10 +33,13 @@ class DepthPoseGraph:
         self._waiting: list[tuple[int, int]] = []
         self.is_fresh = False  # there are new edges since the last optimisation
 
-    def connect(self, index: int) -> None:
-        """Queue registrations of a new keyframe with all overlapping ones."""
+    def connect(self, index: int, covariance: Doubles) -> None:
+        """Queue registrations of a new keyframe with all overlapping ones.
+
+        `covariance` (6, 6) is that of its pose as tracked, cam: large where it was guessed.
+        """
         if index:
-            self._edges.append(self._chain(index))
+            self._edges.append(self._chain(index, covariance))
         samples = samples_of(self._map[index].surface(), self._map.grid)
         overlaps = self._map.overlaps(samples, self._map[index].T_local_cam)
         partners = [o.index for o in overlaps if o.ratio > _OVERLAP_MIN_RATIO and o.index != index]
@@ -66,14 +70,14 @@ class DepthPoseGraph:
             keyframe.move(solved[index])
         self.is_fresh = False
 
-    def _chain(self, index: int) -> Edge:
+    def _chain(self, index: int, covariance: Doubles) -> Edge:
         """Return the edge by tracking, which knows what odometry measured, too."""
         before, this = self._map[index - 1], self._map[index]
         return Edge(
             first=index - 1,
             second=index,
             T_first_second=before.T_cam_local @ this.T_local_cam,
-            covariance=_TRACKED,
+            covariance=_TRACKED + covariance,
         )
 
     def _register(self, first: int, second: int) -> Edge | None:

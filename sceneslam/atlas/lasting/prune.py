@@ -60,13 +60,23 @@ def _is_ground_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
         [(planar.between(plane[node], plane[other]), saved.submaps[other].plan) for other in near]
     )
     if not len(shown):
-        return False
+        return not len(walls) and _is_most(_is_free(shown, free))
     field = PlanField(shown)
     is_wall = field.nearest(walls).distance_m <= _NEAR_M
-    return all(
-        not len(one) or one.mean() >= _COVERED_RATIO
-        for one in (is_wall, field.nearest(free).is_known)
-    )
+    return _is_most(is_wall) and _is_most(field.nearest(free).is_known)
+
+
+def _is_most(shown: NDArray[np.bool_]) -> bool:
+    return not len(shown) or bool(shown.mean() >= _COVERED_RATIO)
+
+
+def _is_free(plan: FloorPlan, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which points (N, 2) lie in free cells of a plan."""
+    cells, (rows, columns) = plan.cells(points), plan.free.shape
+    inside = ((cells >= 0) & (cells < [columns, rows])).all(axis=1)
+    found = np.zeros(len(points), bool)
+    found[inside] = plan.free[cells[inside, 1], cells[inside, 0]]
+    return found
 
 
 def _free_of(plan: FloorPlan) -> NDArray[np.float64]:

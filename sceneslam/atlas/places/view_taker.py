@@ -14,7 +14,6 @@ from sceneslam.views.view import Landmarks, LandmarkView, LandmarkViewer
 _APART_M, _APART_RAD = 0.3, 0.25  # between two views that are kept: up to 80 kB per metre of path
 _READOUT_S = 0.03  # of a rolling shutter: in a turn, rows see from different directions
 _SHEAR_MAX_RAD = 0.015  # a degree: of a view that is kept
-_JUMP_M_S = 1.0  # no robot's velocity changes so much from one image to the next: its pose jumped
 
 
 class ViewTaker:
@@ -27,7 +26,7 @@ class ViewTaker:
         self._is_keeping = is_keeping
         self._T_run_kept: Transform | None = None  # of the last view that was kept
         self._last: tuple[int, Transform] | None = None  # stamp and pose
-        self._shear_rad, self._speed_m_s = 0.0, 0.0
+        self._shear_rad = 0.0
         self._measures_depth = Sensor.DEPTH in rig.sensors
 
     @property
@@ -43,11 +42,9 @@ class ViewTaker:
             step = se3.inverse(self._last[1]) @ T_run_base
             elapsed_s = max(stamp_ns - self._last[0], 1) / 1e9
             self._shear_rad = float(se3.rotation_angle_rad(step)) * _READOUT_S / elapsed_s
-            speed_m_s = float(np.linalg.norm(step[:3, 3])) / elapsed_s
-            if abs(speed_m_s - self._speed_m_s) > _JUMP_M_S and self._triangulation is not None:
-                self._triangulation.forget()
-            self._speed_m_s = speed_m_s
         self._last = stamp_ns, T_run_base
+        if self._triangulation is not None:
+            self._triangulation.step(stamp_ns, T_run_base)
 
     def is_kept(self, observation: Observation, T_run_base: Transform) -> bool:
         """Tell whether the view of an observation from a pose (4, 4) is to be kept."""
@@ -71,14 +68,24 @@ class ViewTaker:
         """Record that the view from a pose (4, 4) is kept."""
         self._T_run_kept = T_run_base
 
-    def locate(self, view: LandmarkView, stamp_ns: int, T_run_base: Transform) -> Landmarks | None:
-        """Return the landmarks of a view that is kept; None if too few are located.
+    def rewind(self, stamp_ns: int) -> None:
+        """Forget what was seen from a stamp on: other poses replace those it was seen from."""
+        if self._triangulation is not None:
+            self._triangulation.rewind(stamp_ns)
 
-        Beside the depths measured, the views before locate them. Those from its stamp on are
-        forgotten: other poses replace theirs.
+    def locate(
+        self, view: LandmarkView | None, stamp_ns: int, T_run_base: Transform
+    ) -> Landmarks | None:
+        """Follow a step (4, 4); return the landmarks of its view, None without or with too few.
+
+        Beside the depths measured, the views before locate them. A stamp may come again, with
+        another pose: what came after it before is forgotten.
         """
+        if self._triangulation is not None:
+            self._triangulation.step(stamp_ns, T_run_base)
+        if view is None:
+            return None
         assert self._viewer is not None and self._triangulation is not None
-        self._triangulation.rewind(stamp_ns)
         found = self._triangulation.locate(view, T_run_base)
         self._triangulation.add(view, stamp_ns, T_run_base)
         return self._viewer.landmarks(view, found.depth_m, found.deviation_m)

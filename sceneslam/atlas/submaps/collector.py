@@ -47,8 +47,8 @@ class Known:
 
 # Stamp, scan, the measured vertical direction (3,) in base, and a view to be kept.
 _Step = tuple[int, KeyScan | None, NDArray[np.float64] | None, LandmarkView | None]
-# The corners that are located in a view, by its stamp and pose (4, 4); None with too few.
-Locate = Callable[[LandmarkView, int, Transform], Landmarks | None]
+# The corners that are located in a step's view, if it has one, by its stamp and pose (4, 4).
+Locate = Callable[[LandmarkView | None, int, Transform], Landmarks | None]
 
 
 class Collector:
@@ -172,7 +172,7 @@ class Collector:
         if known is None:
             return None
         T_map_base = known.T_map_base
-        landmarks = None if view is None else self._locate(view, stamp_ns, T_map_base)
+        landmarks = self._locate(view, stamp_ns, T_map_base)
         return KeyPose(
             stamp_ns=stamp_ns,
             scan=scan,
