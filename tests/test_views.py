@@ -149,7 +149,7 @@ def test_two_places_that_look_alike_are_not_recognized():
     [
         ({"shown": 0.1}, {"shown": 0.5}),  # too few matches
         ({"farther_m": 0.4}, {"farther_m": 0.1}),  # a picture of the place, on another wall
-        ({"shear_rad": 0.02}, {"shear_rad": 0.013}),  # seen in a fast turn
+        ({"shear_rad": 0.035}, {"shear_rad": 0.025}),  # seen in a fast turn
     ],
 )
 def test_what_is_doubtful_is_not_recognized(doubtful, sound):
@@ -361,9 +361,9 @@ def test_a_camera_held_by_hand_finds_itself_in_the_map_of_the_first_half(
         mapper.finish(path, [])
         saved = mapper.saved()
     assert [event for event, _ in events[:1]] == ["relocalized"]
-    assert events[0][1]["after_s"] < 3.2  # 3.07 with a hand that turns fast, 0.2
+    assert events[0][1]["after_s"] < 1.5  # 1.07 with a hand that turns fast, 0.2
     off = se3.inverse(se3.inverse(starts[0]) @ starts[1]) @ located
-    assert np.linalg.norm(off[:3, 3]) < 0.035 and se3.rotation_angle_rad(off) < 0.03
+    assert np.linalg.norm(off[:3, 3]) < 0.05 and se3.rotation_angle_rad(off) < 0.03
     assert (saved.pieces == 0).all()
 
 
