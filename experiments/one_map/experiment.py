@@ -252,8 +252,7 @@ class OneMapExperiment:
         plan = load_map_files(maps / "today").plan()
         T_map_world = map_of(true)
         rim = [planar.compose(T_map_world, np.array([*at, 0.0]))[:2] for at in _rim()]
-        cells = plan.cells(np.array(rim))
-        free = float(plan.free[cells[:, 1], cells[:, 0]].mean())
+        free = float(plan.is_free(np.array(rim)).mean())
         yield Figure.at_least("furniture moved: its old walls that are free afterwards", free, 1.0)
 
     def _drifting(self) -> Iterator[Figure]:

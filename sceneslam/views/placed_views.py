@@ -139,12 +139,14 @@ def are_covered(
     poses, other_poses = (
         np.reshape([T for T, _ in placed], (-1, 4, 4)) for placed in (views, others)
     )
+    alike = are_alike(poses, other_poses)
+    near = np.flatnonzero(alike.any(axis=0))  # of the others; no landmarks of the rest are counted
     counts, other_counts = (
         np.array([_counts(landmarks) for _, landmarks in placed], np.int64).reshape(-1, 1, 2)
-        for placed in (views, others)
+        for placed in (views, [others[number] for number in near.tolist()])
     )
     is_as_much = (other_counts[:, 0] >= np.minimum(counts, _ENOUGH)).all(axis=2)
-    return np.asarray((are_alike(poses, other_poses) & is_as_much).any(axis=1))
+    return np.asarray((alike[:, near] & is_as_much).any(axis=1))
 
 
 def _counts(landmarks: Landmarks) -> tuple[int, int]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap
-from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan, join
+from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.graphs.edge import Edge
 from sceneslam.types import planar
@@ -49,7 +49,7 @@ def _are_views_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
 def _is_ground_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
     """Tell whether others show a submap's walls, and what is free in it."""
     plan, plane = saved.submaps[node].plan, saved.plane
-    walls, free = plan.points.astype(np.float64), _free_of(plan)
+    walls, free = plan.points.astype(np.float64), plan.free_points()
     ground = np.concatenate([walls, free])
     if not len(ground):
         return True
@@ -60,7 +60,7 @@ def _is_ground_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
         [(planar.between(plane[node], plane[other]), saved.submaps[other].plan) for other in near]
     )
     if not len(shown):
-        return not len(walls) and _is_most(_is_free(shown, free))
+        return not len(walls) and _is_most(shown.is_free(free))
     field = PlanField(shown)
     is_wall = field.nearest(walls).distance_m <= _NEAR_M
     return _is_most(is_wall) and _is_most(field.nearest(free).is_known)
@@ -68,22 +68,6 @@ def _is_ground_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
 
 def _is_most(shown: NDArray[np.bool_]) -> bool:
     return not len(shown) or bool(shown.mean() >= _COVERED_RATIO)
-
-
-def _is_free(plan: FloorPlan, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which points (N, 2) lie in free cells of a plan."""
-    cells, (rows, columns) = plan.cells(points), plan.free.shape
-    inside = ((cells >= 0) & (cells < [columns, rows])).all(axis=1)
-    found = np.zeros(len(points), bool)
-    found[inside] = plan.free[cells[inside, 1], cells[inside, 0]]
-    return found
-
-
-def _free_of(plan: FloorPlan) -> NDArray[np.float64]:
-    """Return the centres (N, 2) [m] of a plan's free cells."""
-    rows, columns = np.nonzero(plan.free)
-    centres = (np.column_stack([columns, rows]) + 0.5) * CELL_M + np.array(plan.origin_xy_m)
-    return np.asarray(centres, np.float64)
 
 
 def _without(edges: Sequence[Edge], node: int) -> list[Edge]:

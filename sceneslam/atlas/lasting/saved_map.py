@@ -9,7 +9,7 @@ from itertools import compress
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.atlas.places.floor_plan import CELL_M, FloorPlan, check_size, join
+from sceneslam.atlas.places.floor_plan import FloorPlan, check_size, join
 from sceneslam.atlas.submaps.graph import connected, fits
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.graphs.edge import Edge
@@ -192,7 +192,7 @@ def _without(plan: FloorPlan, T_today_plan: planar.Planar, today: FloorPlan) -> 
     kept = ~_clear(today, points)
     free = plan.free.copy()
     walls = planar.apply(planar.between(T_today_plan, np.zeros(3)), today.points.astype(np.float64))
-    cells = np.floor((walls - np.array(plan.origin_xy_m)) / CELL_M).astype(np.int64)
+    cells = plan.cells(walls)
     rows, columns = free.shape
     inside = ((cells >= 0) & (cells < [columns, rows])).all(axis=1)
     free[cells[inside, 1], cells[inside, 0]] = False

@@ -41,6 +41,20 @@ class FloorPlan:
         cells = np.floor((points - np.array(self.origin_xy_m)) / CELL_M)
         return np.asarray(cells, np.int64)
 
+    def is_free(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Tell which points (N, 2) lie in free cells."""
+        cells, (rows, columns) = self.cells(points), self.free.shape
+        inside = ((cells >= 0) & (cells < [columns, rows])).all(axis=1)
+        found = np.zeros(len(points), bool)
+        found[inside] = self.free[cells[inside, 1], cells[inside, 0]]
+        return found
+
+    def free_points(self) -> NDArray[np.float64]:
+        """Return the centres (N, 2) [m] of the free cells."""
+        rows, columns = np.nonzero(self.free)
+        centres = (np.column_stack([columns, rows]) + 0.5) * CELL_M + np.array(self.origin_xy_m)
+        return np.asarray(centres, np.float64)
+
 
 def empty() -> FloorPlan:
     """Return an empty plan."""

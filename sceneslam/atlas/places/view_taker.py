@@ -22,7 +22,9 @@ class ViewTaker:
     def __init__(self, rig: Rig, *, is_keeping: bool, is_comparing: bool = False) -> None:
         """`is_keeping`: views are kept in the map; `is_comparing`: with those of a loaded one."""
         self._viewer = LandmarkViewer.of(rig) if is_keeping or is_comparing else None
-        self._triangulation = Triangulation(rig.camera) if rig.camera is not None else None
+        self._triangulation: Triangulation | None = None
+        if is_keeping and rig.camera is not None:
+            self._triangulation = Triangulation(rig.camera)
         self._is_keeping = is_keeping
         self._T_run_kept: Transform | None = None  # of the last view that was kept
         self._last: tuple[int, Transform] | None = None  # stamp and pose
