@@ -16,6 +16,7 @@ from sceneslam.types.trajectory import Trajectory
 
 from ..surfaces.registration import CameraPrior, Samples, SurfaceRegistration, samples_of
 from ..surfaces.surface import DepthSurfaceReader, Doubles, Surface
+from .certainty import Certainty
 from .history import PoseHistory
 from .keyframe_map import KeyframeMap
 from .localizer import DepthLocalizer
@@ -61,9 +62,13 @@ class DepthSlam:
         self._camera = rig.camera
         self._reader = DepthSurfaceReader(rig.camera)
         self._map = KeyframeMap(self._reader.grid)
-        self._graph = DepthPoseGraph(self._map, weak_ratio=self.weak_ratio)
+        self._certainty = Certainty()
+        self._graph = DepthPoseGraph(self._map, self._certainty, weak_ratio=self.weak_ratio)
         self._localizer = DepthLocalizer(
-            self._map, matched_min_ratio=self.matched_min_ratio, weak_ratio=self.weak_ratio
+            self._map,
+            self._certainty,
+            matched_min_ratio=self.matched_min_ratio,
+            weak_ratio=self.weak_ratio,
         )
         self._history = PoseHistory(self._map)
         self._predictor = Predictor(rig)
@@ -147,13 +152,15 @@ class DepthSlam:
     ) -> Tracking:
         T_base_cam = self._camera.T_base_cam
         back = se3.adjoint(se3.inverse(T_base_cam))
-        covariance = np.linalg.inv(found.information + self._prior(prediction).information)
+        self._certainty.follow(found, has_wheels=prediction.is_measured)
+        alone = np.linalg.inv(self._certainty.covariance(found, samples))
+        covariance = np.linalg.inv(alone + self._prior(prediction).information)
         self._T_local_base = found.T_local_cam @ se3.inverse(T_base_cam)
         self._predictor.measure(
             observation,
             self._T_local_base,
             se3.carried(covariance, T_base_cam),
-            information=back.T @ found.information @ back,
+            information=back.T @ alone @ back,
         )
         weak = found.localizability.weak_twists(self.weak_ratio)
         self._extend(observation, surface, samples, found.T_local_cam)

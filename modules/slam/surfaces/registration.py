@@ -25,8 +25,9 @@ _GATE_SHRINK = 0.7
 _KERNEL_SIGMAS = 12.0  # threshold of the robust kernel
 _SURFACE_SIGMA_M = 0.001  # smallest standard deviation: roughness of surfaces
 _STEP_MIN = 1e-4  # m and rad: converged
-_CORRELATION = 100.0  # correlated points with the information of one
 _POINTS_MIN = 100
+_BLOCKS = 4  # per image width, in which residuals are summed: fewer err together less
+_NOT_HELD = 1e-9  # share of all information, added to every direction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +37,7 @@ class Samples:
     points: Floats  # (N, 3) [m], cam
     normals: Floats  # (N, 3), cam, smooth
     sigmas_m: Floats  # (N,) standard deviation across the plane
+    blocks: NDArray[np.int64]  # (N,) of the image
 
     def __len__(self) -> int:
         return len(self.points)
@@ -50,7 +52,9 @@ class Samples:
     def thinned(self, count: int) -> Samples:
         """Return about `count` of the samples, spread evenly."""
         rows = slice(None, None, max(1, len(self) // count))
-        return Samples(self.points[rows], self.normals[rows], self.sigmas_m[rows])
+        return Samples(
+            self.points[rows], self.normals[rows], self.sigmas_m[rows], self.blocks[rows]
+        )
 
 
 def samples_of(surface: Surface, grid: Grid, stride: int = 2) -> Samples:
@@ -61,10 +65,13 @@ def samples_of(surface: Surface, grid: Grid, stride: int = 2) -> Samples:
     rows = np.flatnonzero(valid & chosen)
     depth_m = 1.0 / surface.disparity[rows]
     sigmas_m = depth_m * surface.planes[rows, 3] * np.float32(surface.noise_per_m)
+    row, column = np.divmod(rows, grid.width)
+    side = grid.width / _BLOCKS
     return Samples(
         grid.rays[rows] * depth_m[:, None],
         surface.smooth_normals(grid)[rows],
         np.sqrt(sigmas_m**2 + np.float32(_SURFACE_SIGMA_M**2)),
+        np.asarray(_BLOCKS * (row // side) + column // side, np.int64),
     )
 
 
@@ -81,7 +88,10 @@ class SurfaceRegistration:
     """A registered pose and its quality."""
 
     T_local_cam: se3.Transform
-    information: Doubles  # (6, 6) of se3.log order, cam: of the image, 0 along weak directions
+    information: Doubles  # (6, 6) of se3.log order, cam, by points alone: 0 along weak directions
+    common_ratio: float  # by how much residuals pull more than independent ones of their sigma
+    misfit: float  # mean square of the residuals [sigma^2]
+    T_keyframe_cam: Doubles  # (K, 4, 4)
     localizability: Localizability  # by the matched points, cam
     matched_ratio: float  # share of the points in view that match, over all keyframes
     seen: int  # points that any keyframe shows
@@ -95,8 +105,12 @@ def register(
     grid: Grid,
     *,
     weak_ratio: float,
+    common_ratio: float,
 ) -> SurfaceRegistration | None:
-    """Return the camera's pose by registration with keyframes; None if too few points match."""
+    """Return the camera's pose by registration with keyframes; None if too few points match.
+
+    `common_ratio` correlated points have the information of one.
+    """
     held = samples.localizability().held(weak_ratio)
     T_local_cam, gate_m = prior.T_local_cam, _GATE_M[0]
     for _ in range(_ITERATIONS_MAX):
@@ -104,8 +118,8 @@ def register(
         if system.is_matched.sum() < _POINTS_MIN:
             return None
         off = se3.log(se3.inverse(prior.T_local_cam) @ T_local_cam)
-        information = held.T @ system.information @ held + prior.information
-        pull = held.T @ system.pull - prior.information @ off
+        information = held.T @ system.information @ held / common_ratio + prior.information
+        pull = held.T @ system.pull / common_ratio - prior.information @ off
         step = np.asarray(np.linalg.solve(information, pull), np.float64)
         T_local_cam = T_local_cam @ se3.exp(step)
         if gate_m == _GATE_M[1] and np.abs(step).max() < _STEP_MIN:
@@ -113,10 +127,12 @@ def register(
         gate_m = max(_GATE_SHRINK * gate_m, _GATE_M[1])
     matched = samples.localizability(system.is_matched)
     held = matched.held(weak_ratio)
-    information = held.T @ system.information @ held
     return SurfaceRegistration(
         T_local_cam,
-        information,
+        held.T @ system.information @ held,
+        system.common_ratio(),
+        system.misfit / system.pairs_matched,
+        np.stack([keyframe.T_cam_local @ T_local_cam for keyframe in keyframes]),
         matched,
         matched_ratio=system.pairs_matched / max(system.pairs_seen, 1),
         seen=int(system.is_seen.sum()),
@@ -136,13 +152,26 @@ class _System:
         gate_m: float,
         grid: Grid,
     ) -> None:
-        self.information, self.pull = np.zeros((6, 6)), np.zeros(6)
+        self.information, self.pull, self.misfit = np.zeros((6, 6)), np.zeros(6), 0.0
+        self._pulls: list[Floats] = []  # (M, 6) of each keyframe's points
+        self._blocks: list[NDArray[np.int64]] = []
         self.pairs_seen, self.pairs_matched = 0, 0  # of a point and a keyframe
         self.is_seen, self.is_matched = np.zeros((2, len(samples)), np.bool_)
         for keyframe in keyframes:
             self._add(samples, keyframe, keyframe.T_cam_local @ T_local_cam, gate_m, grid)
-        self.information /= _CORRELATION
-        self.pull /= _CORRELATION
+
+    def common_ratio(self) -> float:
+        """Return how much stronger the image's blocks pull than independent points would.
+
+        The mean, over all directions, of a cluster-robust covariance (Liang and Zeger 1986) over
+        that by the points' noise alone; blocks count less the six that the pose takes.
+        """
+        blocks, rows = np.unique(np.concatenate(self._blocks), return_inverse=True)
+        pulls = np.concatenate(self._pulls).T
+        sums = np.stack([np.bincount(rows, pull) for pull in pulls])
+        spare = np.trace(self.information) * _NOT_HELD * np.eye(6)
+        independent = np.linalg.solve(self.information + spare, sums @ sums.T)
+        return float(np.trace(independent) / 6 * len(blocks) / max(len(blocks) - 6, 1))
 
     def _add(
         self,
@@ -162,7 +191,11 @@ class _System:
         kernel = 1.0 / (1.0 + (residuals / (_KERNEL_SIGMAS * sigmas_m)) ** 2) ** 2
         weighted = jacobian * (kernel / sigmas_m**2)[:, None]
         self.information += (jacobian.T @ weighted).astype(np.float64)
-        self.pull -= (weighted.T @ residuals).astype(np.float64)
+        pulls = np.asarray(weighted * residuals[:, None], np.float32)
+        self.pull -= pulls.sum(axis=0, dtype=np.float64)
+        self.misfit += float((kernel * (residuals / sigmas_m) ** 2).sum())
+        self._pulls.append(pulls)
+        self._blocks.append(samples.blocks[rows])
         self.is_seen |= seen
         self.is_matched |= same
         self.pairs_seen += int(seen.sum())

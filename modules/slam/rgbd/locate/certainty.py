@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sceneslam.types.se3 import Transform
 
-from ..loops.pose_graph import motion_covariance
+from ...model_error import Smoothed, model_covariance
 from ..map.landmarks import LandmarkTable
 from ..see.view import View
 from .localizer import VisualFix
@@ -24,7 +24,6 @@ _INDEPENDENT = 1.5  # common ratio of a correct model, at most: 1.0 to 1.7 in si
 # 2.1 to 3.8 on freiburg1_rpy, 1.3 to 2.6 on RedKitchen
 _NOT_HELD = 1e-9  # share of all information, added to every direction
 _AROUND_M = 1.5  # length of five keyframes, adjusted together; beyond, wheels give the scale
-_KEPT = 0.95  # smoothing of the common ratio from image to image
 
 
 class Certainty:
@@ -32,7 +31,7 @@ class Certainty:
 
     def __init__(self, landmarks: LandmarkTable) -> None:
         self._landmarks = landmarks
-        self._common: float | None = None  # `common_ratio`, smoothed over images
+        self._common = Smoothed()  # `common_ratio`
         self._scaled_local = np.zeros(3)  # (3,) [m], the last position with known scale
         self.by_wheels = np.zeros((6, 6))  # share of the last covariance due to wheels
 
@@ -50,22 +49,16 @@ class Certainty:
         the surrounding keyframes is added. The scale error of triangulated landmarks grows from
         the place where depth was seen last.
         """
-        common = self._follow(common_ratio(view, fix))
+        common = max(1.0, self._common.follow(common_ratio(view, fix)))
         measured = fix.estimate.covariance * common
-        motions = motion_covariance(np.stack(T_keyframe_base), np.zeros((6, 6)))
-        model = motions.mean(axis=0) * np.clip(common - _INDEPENDENT, 0.0, 1.0)
-        # A shift compensates a wrong turn, in proportion to the landmarks' distance.
         away_m = self._landmarks.points_local[fix.landmark_ids] - T_local_base[:3, 3]
-        model[:3, :3] += np.median((away_m**2).sum(axis=1)) * model[3:, 3:]
+        away2_m2 = float(np.median((away_m**2).sum(axis=1)))
+        model = model_covariance(np.stack(T_keyframe_base), away2_m2)
+        model *= np.clip(common - _INDEPENDENT, 0.0, 1.0)
         scale = np.zeros((6, 6))
         scale[:3, :3] = self.scale_variance(view, fix, T_local_base)
         self.by_wheels = scale if view.odometry is not None else 0.0 * scale
         return np.asarray(measured + model + scale)
-
-    def _follow(self, ratio: float) -> float:
-        before = ratio if self._common is None else self._common
-        self._common = _KEPT * before + (1.0 - _KEPT) * ratio
-        return max(1.0, self._common)
 
     def scale_variance(
         self, view: View, fix: VisualFix, T_local_base: Transform

@@ -12,10 +12,11 @@ from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 from sceneslam.types.spread import spread
 
+from ...model_error import motion_covariance
 from ..locate.recognition import PlaceRecognizer, Recognition
 from ..map.keyframes import motion_between
 from ..map.visual_map import VisualMap
-from .pose_graph import PoseGraph, motion_covariance
+from .pose_graph import PoseGraph
 
 _RECENT = 5  # newest keyframes, which are never loop candidates
 _OUTSTANDING = 2.0  # sigmas above the similarity of unrelated keyframes

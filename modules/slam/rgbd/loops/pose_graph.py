@@ -7,13 +7,11 @@ from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sceneslam.graphs.edge import Edge
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
-_MODEL_ERROR_RATIO = 0.03  # of a motion: model errors, mainly by wrong intrinsics
 _RADIAN_M = 1.0  # metres that a radian counts in the length of a path
 
 
@@ -129,19 +127,6 @@ class PoseGraph:
             sigma_m=float(np.sqrt(variances[:3].sum())),
             sigma_rad=float(np.sqrt(variances[3:].sum())),
         )
-
-
-def motion_covariance(
-    T_first_second: Transform, measured: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return a measured covariance (6, 6) plus model errors in proportion to the motion.
-
-    Works on stacks (..., 4, 4) too.
-    """
-    moved2 = (T_first_second[..., :3, 3] ** 2).sum(axis=-1)
-    turned2 = se3.rotation_angle_rad(T_first_second) ** 2
-    variances = _MODEL_ERROR_RATIO**2 * np.stack([moved2, turned2], axis=-1)
-    return np.asarray(measured + variances.repeat(3, axis=-1)[..., None] * np.eye(6))
 
 
 def _length(edge: Edge) -> float:

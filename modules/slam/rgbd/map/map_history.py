@@ -13,11 +13,12 @@ from sceneslam.types.maps import LandmarkLayer, PoseGraphLayer
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
+from ...model_error import motion_covariance
 from ..locate.localizer import VisualFix, VisualLocalizer
 from ..locate.recognition import PlaceRecognizer
 from ..loops.loop_closing import VisualLoopCloser
 from ..loops.loop_detection import LoopDetector, Query
-from ..loops.pose_graph import PoseGraph, motion_covariance
+from ..loops.pose_graph import PoseGraph
 from ..see.rectifying_extractor import RectifyingExtractor
 from .frame_log import FrameLog, joined
 from .keyframes import Keyframe, motion_between
