@@ -8,7 +8,6 @@ from sceneslam.types import se3
 
 from ..surfaces.registration import CameraPrior, Samples, SurfaceRegistration, register
 from ..surfaces.surface import Surface
-from .certainty import Certainty
 from .keyframe_map import KeyframeMap
 
 _TOGETHER = 3  # keyframes for one registration
@@ -23,14 +22,9 @@ class DepthLocalizer:
     """Registers images with the keyframes of a map."""
 
     def __init__(
-        self,
-        keyframes: KeyframeMap,
-        certainty: Certainty,
-        *,
-        matched_min_ratio: float,
-        weak_ratio: float,
+        self, keyframes: KeyframeMap, *, matched_min_ratio: float, weak_ratio: float
     ) -> None:
-        self._map, self._certainty = keyframes, certainty
+        self._map = keyframes
         self._matched_min_ratio, self._weak_ratio = matched_min_ratio, weak_ratio
 
     def near(
@@ -70,11 +64,4 @@ class DepthLocalizer:
         overlaps = self._map.overlaps(samples, prior.T_local_cam)
         near = [o.index for o in overlaps[:_TOGETHER] if o.ratio > _USEFUL_OVERLAP]
         keyframes = [self._map[index] for index in near or [overlaps[0].index]]
-        return register(
-            samples,
-            prior,
-            keyframes,
-            self._map.grid,
-            weak_ratio=self._weak_ratio,
-            common_ratio=self._certainty.common_ratio,
-        )
+        return register(samples, prior, keyframes, self._map.grid, weak_ratio=self._weak_ratio)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -62,14 +62,11 @@ class DepthSlam:
         self._camera = rig.camera
         self._reader = DepthSurfaceReader(rig.camera)
         self._map = KeyframeMap(self._reader.grid)
-        self._certainty = Certainty()
-        self._graph = DepthPoseGraph(self._map, self._certainty, weak_ratio=self.weak_ratio)
+        self._graph = DepthPoseGraph(self._map, weak_ratio=self.weak_ratio)
         self._localizer = DepthLocalizer(
-            self._map,
-            self._certainty,
-            matched_min_ratio=self.matched_min_ratio,
-            weak_ratio=self.weak_ratio,
+            self._map, matched_min_ratio=self.matched_min_ratio, weak_ratio=self.weak_ratio
         )
+        self._certainty = Certainty()
         self._history = PoseHistory(self._map)
         self._predictor = Predictor(rig)
         self._T_local_base = se3.identity()
@@ -152,15 +149,14 @@ class DepthSlam:
     ) -> Tracking:
         T_base_cam = self._camera.T_base_cam
         back = se3.adjoint(se3.inverse(T_base_cam))
-        self._certainty.follow(found, has_wheels=prediction.is_measured)
-        alone = np.linalg.inv(self._certainty.covariance(found, samples))
-        covariance = np.linalg.inv(alone + self._prior(prediction).information)
+        self._certainty.follow(found, samples)
+        covariance = np.linalg.inv(found.information + self._prior(prediction).information)
         self._T_local_base = found.T_local_cam @ se3.inverse(T_base_cam)
         self._predictor.measure(
             observation,
             self._T_local_base,
             se3.carried(covariance, T_base_cam),
-            information=back.T @ alone @ back,
+            information=back.T @ found.information @ back,
         )
         weak = found.localizability.weak_twists(self.weak_ratio)
         self._extend(observation, surface, samples, found.T_local_cam)
@@ -217,11 +213,18 @@ class DepthSlam:
     ) -> Tracking:
         if status is not TrackingStatus.LOST and len(self._map):
             self._history.add(observation.stamp_ns, self._reference, self._T_local_base)
-        return self._predictor.tracking(
+        tracking = self._predictor.tracking(
             observation,
             self._T_local_base,
             status,
             quality_ratio=quality_ratio,
             inliers=inliers,
             revision=self._revision,
+        )
+        if tracking.covariance is None:
+            return tracking
+        T_base_cam = self._camera.T_base_cam
+        in_cam = se3.carried(tracking.covariance, se3.inverse(T_base_cam))
+        return replace(
+            tracking, covariance=se3.carried(self._certainty.covariance(in_cam), T_base_cam)
         )

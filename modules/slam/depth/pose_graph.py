@@ -14,22 +14,21 @@ from sceneslam.types import se3
 
 from ..surfaces.registration import CameraPrior, register, samples_of
 from ..surfaces.surface import Doubles
-from .certainty import Certainty
 from .keyframe_map import KeyframeMap
 
 _MATCHED_MIN_RATIO = 0.5
 _OVERLAP_MIN_RATIO = 0.25
 _PARTNERS_MAX = 8
 _HUBER_SIGMAS = 3.0
-_LOOSE = 10.0  # information [1/m^2, 1/rad^2] of where a registration begins
+_LOOSE = 10.0  # information [1/m^2, 1/rad^2] of where a registration begins, and of its edge
 _TRACKED = 0.01**2 * np.eye(6)  # m^2, rad^2: by which tracking errs beyond what it says
 
 
 class DepthPoseGraph:
     """Registrations among keyframes, one per call, to bound the time per frame."""
 
-    def __init__(self, keyframes: KeyframeMap, certainty: Certainty, *, weak_ratio: float) -> None:
-        self._map, self._certainty, self._weak_ratio = keyframes, certainty, weak_ratio
+    def __init__(self, keyframes: KeyframeMap, *, weak_ratio: float) -> None:
+        self._map, self._weak_ratio = keyframes, weak_ratio
         self._edges: list[Edge] = []
         self._waiting: list[tuple[int, int]] = []
         self.is_fresh = False  # there are new edges since the last optimisation
@@ -86,14 +85,7 @@ class DepthPoseGraph:
         grid = self._map.grid
         guess = CameraPrior(other.T_local_cam, _LOOSE * np.eye(6))
         samples = samples_of(other.surface(), grid)
-        found = register(
-            samples,
-            guess,
-            [known],
-            grid,
-            weak_ratio=self._weak_ratio,
-            common_ratio=self._certainty.common_ratio,
-        )
+        found = register(samples, guess, [known], grid, weak_ratio=self._weak_ratio)
         if found is None or found.matched_ratio < _MATCHED_MIN_RATIO:
             return None
         T_first_second = se3.inverse(known.T_local_cam) @ found.T_local_cam
@@ -101,6 +93,6 @@ class DepthPoseGraph:
             first=first,
             second=second,
             T_first_second=T_first_second,
-            covariance=self._certainty.covariance(found, samples),
+            covariance=np.asarray(np.linalg.inv(found.information + _LOOSE * np.eye(6))),
             kind=EdgeKind.LOOP,
         )

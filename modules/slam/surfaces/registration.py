@@ -25,6 +25,7 @@ _GATE_SHRINK = 0.7
 _KERNEL_SIGMAS = 12.0  # threshold of the robust kernel
 _SURFACE_SIGMA_M = 0.001  # smallest standard deviation: roughness of surfaces
 _STEP_MIN = 1e-4  # m and rad: converged
+CORRELATION = 100.0  # correlated points with the information of one
 _POINTS_MIN = 100
 _BLOCKS = 4  # per image width, in which residuals are summed: fewer err together less
 _NOT_HELD = 1e-9  # share of all information, added to every direction
@@ -88,7 +89,7 @@ class SurfaceRegistration:
     """A registered pose and its quality."""
 
     T_local_cam: se3.Transform
-    information: Doubles  # (6, 6) of se3.log order, cam, by points alone: 0 along weak directions
+    information: Doubles  # (6, 6) of se3.log order, cam: of the image, 0 along weak directions
     common_ratio: float  # by how much residuals pull more than independent ones of their sigma
     misfit: float  # mean square of the residuals [sigma^2]
     T_keyframe_cam: Doubles  # (K, 4, 4)
@@ -105,12 +106,8 @@ def register(
     grid: Grid,
     *,
     weak_ratio: float,
-    common_ratio: float,
 ) -> SurfaceRegistration | None:
-    """Return the camera's pose by registration with keyframes; None if too few points match.
-
-    `common_ratio` correlated points have the information of one.
-    """
+    """Return the camera's pose by registration with keyframes; None if too few points match."""
     held = samples.localizability().held(weak_ratio)
     T_local_cam, gate_m = prior.T_local_cam, _GATE_M[0]
     for _ in range(_ITERATIONS_MAX):
@@ -118,8 +115,8 @@ def register(
         if system.is_matched.sum() < _POINTS_MIN:
             return None
         off = se3.log(se3.inverse(prior.T_local_cam) @ T_local_cam)
-        information = held.T @ system.information @ held / common_ratio + prior.information
-        pull = held.T @ system.pull / common_ratio - prior.information @ off
+        information = held.T @ system.information @ held / CORRELATION + prior.information
+        pull = held.T @ system.pull / CORRELATION - prior.information @ off
         step = np.asarray(np.linalg.solve(information, pull), np.float64)
         T_local_cam = T_local_cam @ se3.exp(step)
         if gate_m == _GATE_M[1] and np.abs(step).max() < _STEP_MIN:
@@ -129,7 +126,7 @@ def register(
     held = matched.held(weak_ratio)
     return SurfaceRegistration(
         T_local_cam,
-        held.T @ system.information @ held,
+        held.T @ system.information @ held / CORRELATION,
         system.common_ratio(),
         system.misfit / system.pairs_matched,
         np.stack([keyframe.T_cam_local @ T_local_cam for keyframe in keyframes]),

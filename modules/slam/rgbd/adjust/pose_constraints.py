@@ -24,7 +24,7 @@ _MIN_MATCHED_RATIO = 0.5  # of the common area, on the same surface
 _WEAK_RATIO = 0.005  # localizability below which surfaces do not constrain a direction
 _PRIOR_INFORMATION = 1.0  # [1/m^2] and [1/rad^2]: negligible
 _KEPT = 60  # views, of 0.6 MB each
-_COMMON_RATIO = 33.0  # correlated points of a surface that count as one, beside corners
+_TRUST = 3.0  # weight of a registration's information relative to that of corners
 _HUBER = 3.5  # [sigma], 95 % of six degrees of freedom
 
 
@@ -142,11 +142,10 @@ class DepthConstraints:
             [self._views[one]],
             self._reader.grid,
             weak_ratio=_WEAK_RATIO,
-            common_ratio=_COMMON_RATIO,
         )
         if found is None or found.matched_ratio < _MIN_MATCHED_RATIO:
             return None
-        squares, axes = np.linalg.eigh(found.information / _COMMON_RATIO)
+        squares, axes = np.linalg.eigh(_TRUST * found.information)
         root = np.sqrt(np.maximum(squares, 0.0))[:, None] * axes.T
         return PoseConstraint(
             T_one_other=to_cam @ found.T_local_cam @ self._T_depth_cam,
