@@ -150,8 +150,7 @@ class _System:
         grid: Grid,
     ) -> None:
         self.information, self.pull, self.misfit = np.zeros((6, 6)), np.zeros(6), 0.0
-        self._pulls: list[Floats] = []  # (M, 6) of each keyframe's points
-        self._blocks: list[NDArray[np.int64]] = []
+        self._parts: list[tuple[Floats, Floats, NDArray[np.int64]]] = []  # of each keyframe
         self.pairs_seen, self.pairs_matched = 0, 0  # of a point and a keyframe
         self.is_seen, self.is_matched = np.zeros((2, len(samples)), np.bool_)
         for keyframe in keyframes:
@@ -163,9 +162,10 @@ class _System:
         The mean, over all directions, of a cluster-robust covariance (Liang and Zeger 1986) over
         that by the points' noise alone; blocks count less the six that the pose takes.
         """
-        blocks, rows = np.unique(np.concatenate(self._blocks), return_inverse=True)
-        pulls = np.concatenate(self._pulls).T
-        sums = np.stack([np.bincount(rows, pull) for pull in pulls])
+        parts = [np.concatenate(part) for part in zip(*self._parts, strict=True)]
+        weighted, residuals, of_points = parts
+        blocks, rows = np.unique(of_points, return_inverse=True)
+        sums = np.stack([np.bincount(rows, pull) for pull in (weighted * residuals[:, None]).T])
         spare = np.trace(self.information) * _NOT_HELD * np.eye(6)
         independent = np.linalg.solve(self.information + spare, sums @ sums.T)
         return float(np.trace(independent) / 6 * len(blocks) / max(len(blocks) - 6, 1))
@@ -188,11 +188,9 @@ class _System:
         kernel = 1.0 / (1.0 + (residuals / (_KERNEL_SIGMAS * sigmas_m)) ** 2) ** 2
         weighted = jacobian * (kernel / sigmas_m**2)[:, None]
         self.information += (jacobian.T @ weighted).astype(np.float64)
-        pulls = np.asarray(weighted * residuals[:, None], np.float32)
-        self.pull -= pulls.sum(axis=0, dtype=np.float64)
-        self.misfit += float((kernel * (residuals / sigmas_m) ** 2).sum())
-        self._pulls.append(pulls)
-        self._blocks.append(samples.blocks[rows])
+        self.pull -= (weighted.T @ residuals).astype(np.float64)
+        self._parts.append((np.asarray(weighted, np.float32), residuals, samples.blocks[rows]))
+        self.misfit += float(kernel @ (residuals / sigmas_m) ** 2)
         self.is_seen |= seen
         self.is_matched |= same
         self.pairs_seen += int(seen.sum())
