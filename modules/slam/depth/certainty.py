@@ -12,7 +12,7 @@ _EXPLAINED = 1.0  # mean square of residuals [sigma^2] that noise explains: 0.1 
 # simulations, 2.3 to 6.7 on freiburg1_rpy, 1.2 to 6.9 on RedKitchen
 
 
-class Certainty:
+class DepthCertainty:
     """How much residuals have in common, and whether noise explains them, over the images."""
 
     def __init__(self) -> None:

@@ -16,7 +16,7 @@ from sceneslam.types.trajectory import Trajectory
 
 from ..surfaces.registration import CameraPrior, Samples, SurfaceRegistration, samples_of
 from ..surfaces.surface import DepthSurfaceReader, Doubles, Surface
-from .certainty import Certainty
+from .certainty import DepthCertainty
 from .history import PoseHistory
 from .keyframe_map import KeyframeMap
 from .localizer import DepthLocalizer
@@ -66,7 +66,7 @@ class DepthSlam:
         self._localizer = DepthLocalizer(
             self._map, matched_min_ratio=self.matched_min_ratio, weak_ratio=self.weak_ratio
         )
-        self._certainty = Certainty()
+        self._certainty = DepthCertainty()
         self._history = PoseHistory(self._map)
         self._predictor = Predictor(rig)
         self._T_local_base = se3.identity()
