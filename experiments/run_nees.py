@@ -15,13 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneslam.atlas.uncertainty import read_covariances
-from sceneslam.evaluation.association import interpolated
-from sceneslam.types import se3
-from sceneslam.types.trajectory import Trajectory
+from sceneslam.experiments.handover.consistency import errors_of, normalised
 
-_FLOOR = 1e-4  # m and rad: below, nothing is known of a truth
-_PARTS = (("position", slice(0, 3)), ("rotation", slice(3, 6)))
+_PARTS = (("position [mm]", [0, 1, 2]), ("rotation [mrad]", [3, 4, 5]))
 
 
 def main(folders: list[str]) -> None:
@@ -29,21 +25,16 @@ def main(folders: list[str]) -> None:
     print("| run | of | error, claimed: RMS | NEES / expectation: mean, median |")
     print("| --- | --- | --- | --- |")
     for folder in map(Path, folders):
-        run = Trajectory.read_tum(folder / "trajectory.tum")
-        truth = Trajectory.read_tum(folder / "groundtruth.tum")
-        stamps_ns = run.stamps_ns
-        known = (stamps_ns >= truth.stamps_ns[0]) & (stamps_ns <= truth.stamps_ns[-1])
-        poses = run.T_world_base[known]
-        true = interpolated(truth, stamps_ns[known]).T_world_base
-        errors = se3.log(se3.inverse(poses) @ poses[0] @ se3.inverse(true[0]) @ true)[1:]
-        claimed = read_covariances(folder / "trajectory_covariance.txt")[1][known][1:]
-        for name, axes in _PARTS:
-            off, allowed = errors[:, axes], claimed[:, axes, axes] + _FLOOR**2 * np.eye(3)
-            nees = np.einsum("ni,nij,nj->n", off, np.linalg.inv(allowed), off) / 3
-            sizes = (off**2).sum(axis=1), np.trace(allowed, axis1=1, axis2=2)
-            error, claim = (1e3 * np.sqrt(size.mean()) for size in sizes)
-            figures = f"{error:.1f}, {claim:.1f} | {nees.mean():.3g}, {np.median(nees):.3g}"
-            print(f"| {folder.name} | {name} [{'mm' if axes.start == 0 else 'mrad'}] | {figures} |")
+        _, errors, covariances = (of[1:] for of in errors_of(folder))  # the first is 0
+        variances = np.diagonal(covariances, axis1=1, axis2=2)
+        for part, axes in _PARTS:
+            nees = normalised(errors, covariances, axes) / len(axes)
+            squares = errors[:, axes] ** 2, variances[:, axes]
+            error, claimed = (1e3 * np.sqrt(each.sum(axis=1).mean()) for each in squares)
+            print(
+                f"| {folder.name} | {part} | {error:.1f}, {claimed:.1f} "
+                f"| {nees.mean():.3g}, {np.median(nees):.3g} |"
+            )
 
 
 if __name__ == "__main__":

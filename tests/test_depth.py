@@ -74,7 +74,7 @@ def test_points_that_err_together_count_as_few():
         found.append(register(samples, prior, [known], reader.grid, weak_ratio=0.005))
     assert found[0].common_ratio < 20.0
     assert found[1].common_ratio > 10.0 * found[0].common_ratio
-    certain, uncertain = DepthCertainty(), DepthCertainty()
+    certain, uncertain = DepthCertainty(T), DepthCertainty(T)
     certain.follow(found[0], samples)
     np.testing.assert_allclose(certain.covariance(np.eye(6)), np.eye(6))
     uncertain.follow(found[1], samples)

@@ -81,21 +81,12 @@ def _summary(ratios: Sequence[NDArray[np.float64]], degrees: int) -> list[str | 
 
 
 def _nees(outcome: TrialResult) -> dict[tuple[str, str], NDArray[np.float64]]:
-    """Return the NEES of each part, at every pose before and after the first hand-over.
-
-    Estimate and truth begin at the same pose, at which nothing is off.
-    """
-    stamps_ns, covariances = read_covariances(outcome.folder / "trajectory_covariance.txt")
-    estimate = outcome.trajectory
-    assert np.array_equal(stamps_ns, estimate.stamps_ns)
-    truth = Trajectory.read_tum(outcome.folder / "groundtruth.tum")
-    T_gt_base = interpolated(truth, stamps_ns).T_world_base
-    T_map_true = estimate.T_world_base[0] @ se3.inverse(T_gt_base[0]) @ T_gt_base
-    errors = se3.log(se3.inverse(estimate.T_world_base) @ T_map_true)
+    """Return the NEES of each part, at every pose before and after the first hand-over."""
+    stamps_ns, errors, covariances = errors_of(outcome.folder)
     seam = int(np.searchsorted(stamps_ns, _handover_ns(outcome.folder)))
     rows = {"before": slice(1, seam), "after": slice(seam, None)}
     return {
-        (part, stretch): _normalised(errors[rows[stretch]], covariances[rows[stretch]], axes)
+        (part, stretch): normalised(errors[rows[stretch]], covariances[rows[stretch]], axes)
         for part, axes in _PARTS.items()
         for stretch in _STRETCHES
     }
@@ -108,9 +99,30 @@ def _handover_ns(folder: Path) -> int:
     return int(starts[1]["stamp_ns"])
 
 
-def _normalised(
+def errors_of(
+    folder: Path,
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return a run's stamps (N,), errors (N, 6) and covariances (N, 6, 6) where truth is known.
+
+    Of se3.log order [m, rad], in base. Estimate and truth begin at the same pose, at which nothing
+    is off.
+    """
+    stamps_ns, covariances = read_covariances(folder / "trajectory_covariance.txt")
+    estimate = Trajectory.read_tum(folder / "trajectory.tum")
+    truth = Trajectory.read_tum(folder / "groundtruth.tum")
+    assert np.array_equal(stamps_ns, estimate.stamps_ns)
+    known = (stamps_ns >= truth.stamps_ns[0]) & (stamps_ns <= truth.stamps_ns[-1])
+    T_map_base = estimate.T_world_base[known]
+    T_gt_base = interpolated(truth, stamps_ns[known]).T_world_base
+    T_map_true = T_map_base[0] @ se3.inverse(T_gt_base[0]) @ T_gt_base
+    errors = se3.log(se3.inverse(T_map_base) @ T_map_true)
+    return stamps_ns[known], errors, covariances[known]
+
+
+def normalised(
     errors: NDArray[np.float64], covariances: NDArray[np.float64], axes: Sequence[int]
 ) -> NDArray[np.float64]:
+    """Return the NEES (N,) of `axes`, as many as these in the mean where covariances are right."""
     known = covariances[:, axes][:, :, axes] + _FLOOR**2 * np.eye(len(axes))
     off = errors[:, axes]
     return np.asarray(np.einsum("ni,nij,nj->n", off, np.linalg.inv(known), off))

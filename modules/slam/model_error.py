@@ -1,4 +1,4 @@
-"""Errors of a camera's model, which grow with the motion between two views.
+"""Errors of a camera's model: how residuals show them, and how they grow with motion.
 
 Wrong intrinsics, a shutter that reads row by row and stamps that are late leave residuals that no
 noise explains, and errors in proportion to how far the camera moved and turned.
@@ -14,6 +14,7 @@ from sceneslam.types.se3 import Transform
 
 _RATIO = 0.03  # of a motion, mainly by wrong intrinsics
 _KEPT = 0.95  # smoothing from image to image
+_NOT_HELD = 1e-9  # share of all information, added to every direction
 
 
 class Smoothed:
@@ -27,6 +28,22 @@ class Smoothed:
         before = now if self.value is None else self.value
         self.value = _KEPT * before + (1.0 - _KEPT) * now
         return self.value
+
+
+def summed(pulls: NDArray[np.floating], blocks: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the sums (6, B) of residuals' pulls (6, N) on a pose by block (N,), 0 and above."""
+    return np.stack([np.bincount(blocks, row) for row in pulls])
+
+
+def squared(pulls: NDArray[np.floating], information: NDArray[np.float64]) -> float:
+    """Return the squares of pulls (6, N) in units of what independent residuals do: 6 in all.
+
+    Of sums by block it is the trace of a cluster-robust covariance (Liang and Zeger 1986) over that
+    by `information` (6, 6).
+    """
+    # Residuals alone do not constrain every pose, e.g. corners on a line.
+    root = np.linalg.cholesky(information + _NOT_HELD * np.trace(information) * np.eye(6))
+    return float((np.linalg.solve(root, pulls) ** 2).sum())
 
 
 def motion_covariance(

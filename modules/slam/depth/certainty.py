@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from sceneslam.types import se3
+
 from ..model_error import Smoothed, model_covariance
 from ..surfaces.registration import CORRELATION, Samples, SurfaceRegistration
 from ..surfaces.surface import Doubles
@@ -15,7 +17,8 @@ _EXPLAINED = 1.0  # mean square of residuals [sigma^2] that noise explains: 0.1 
 class DepthCertainty:
     """How much residuals have in common, and whether noise explains them, over the images."""
 
-    def __init__(self) -> None:
+    def __init__(self, T_base_cam: se3.Transform) -> None:
+        self._T_base_cam = T_base_cam
         self._common, self._misfit = Smoothed(), Smoothed()
         self._ratio, self._model = 1.0, np.zeros((6, 6))
 
@@ -28,8 +31,9 @@ class DepthCertainty:
         self._ratio = max(1.0, self._common.follow(found.common_ratio) / CORRELATION)
         away2_m2 = float(np.median((samples.points**2).sum(axis=1)))
         share = float(np.clip(self._misfit.follow(found.misfit) - _EXPLAINED, 0.0, 1.0))
-        self._model = share * model_covariance(found.T_keyframe_cam, away2_m2)
+        model = share * model_covariance(found.T_keyframe_cam, away2_m2)
+        self._model = se3.carried(model, self._T_base_cam)
 
     def covariance(self, tracked: Doubles) -> Doubles:
-        """Return the covariance (6, 6) of a pose beside the map, in cam, by that of tracking."""
+        """Return the covariance (6, 6) of a pose beside the map, in base, by that of tracking."""
         return np.asarray(self._ratio * tracked + self._model)

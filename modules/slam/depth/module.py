@@ -66,7 +66,7 @@ class DepthSlam:
         self._localizer = DepthLocalizer(
             self._map, matched_min_ratio=self.matched_min_ratio, weak_ratio=self.weak_ratio
         )
-        self._certainty = DepthCertainty()
+        self._certainty = DepthCertainty(rig.camera.T_base_cam)
         self._history = PoseHistory(self._map)
         self._predictor = Predictor(rig)
         self._T_local_base = se3.identity()
@@ -223,8 +223,4 @@ class DepthSlam:
         )
         if tracking.covariance is None:
             return tracking
-        T_base_cam = self._camera.T_base_cam
-        in_cam = se3.carried(tracking.covariance, se3.inverse(T_base_cam))
-        return replace(
-            tracking, covariance=se3.carried(self._certainty.covariance(in_cam), T_base_cam)
-        )
+        return replace(tracking, covariance=self._certainty.covariance(tracking.covariance))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sceneslam.types import se3
 
 from ..degeneracy import Localizability, localizability
+from ..model_error import squared, summed
 from .keyframe import FACING_COS, SurfaceKeyframe
 from .surface import Doubles, Floats, Grid, Surface
 
@@ -28,7 +29,6 @@ _STEP_MIN = 1e-4  # m and rad: converged
 CORRELATION = 100.0  # correlated points with the information of one
 _POINTS_MIN = 100
 _BLOCKS = 4  # per image width, in which residuals are summed: fewer err together less
-_NOT_HELD = 1e-9  # share of all information, added to every direction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +92,7 @@ class SurfaceRegistration:
     information: Doubles  # (6, 6) of se3.log order, cam: of the image, 0 along weak directions
     common_ratio: float  # by how much residuals pull more than independent ones of their sigma
     misfit: float  # mean square of the residuals [sigma^2]
-    T_keyframe_cam: Doubles  # (K, 4, 4)
+    T_keyframe_cam: Doubles  # (K, 4, 4) from each keyframe
     localizability: Localizability  # by the matched points, cam
     matched_ratio: float  # share of the points in view that match, over all keyframes
     seen: int  # points that any keyframe shows
@@ -128,7 +128,7 @@ def register(
         T_local_cam,
         held.T @ system.information @ held / CORRELATION,
         system.common_ratio(),
-        system.misfit / system.pairs_matched,
+        system.misfit(),
         np.stack([keyframe.T_cam_local @ T_local_cam for keyframe in keyframes]),
         matched,
         matched_ratio=system.pairs_matched / max(system.pairs_seen, 1),
@@ -149,8 +149,9 @@ class _System:
         gate_m: float,
         grid: Grid,
     ) -> None:
-        self.information, self.pull, self.misfit = np.zeros((6, 6)), np.zeros(6), 0.0
-        self._parts: list[tuple[Floats, Floats, NDArray[np.int64]]] = []  # of each keyframe
+        self.information, self.pull = np.zeros((6, 6)), np.zeros(6)
+        self._blocks = samples.blocks
+        self._parts: list[tuple[Floats, Floats, Floats, NDArray[np.intp]]] = []  # of keyframes
         self.pairs_seen, self.pairs_matched = 0, 0  # of a point and a keyframe
         self.is_seen, self.is_matched = np.zeros((2, len(samples)), np.bool_)
         for keyframe in keyframes:
@@ -159,16 +160,18 @@ class _System:
     def common_ratio(self) -> float:
         """Return how much stronger the image's blocks pull than independent points would.
 
-        The mean, over all directions, of a cluster-robust covariance (Liang and Zeger 1986) over
-        that by the points' noise alone; blocks count less the six that the pose takes.
+        The mean over all directions; blocks count less the six that the pose takes.
         """
-        parts = [np.concatenate(part) for part in zip(*self._parts, strict=True)]
-        weighted, residuals, of_points = parts
-        blocks, rows = np.unique(of_points, return_inverse=True)
-        sums = np.stack([np.bincount(rows, pull) for pull in (weighted * residuals[:, None]).T])
-        spare = np.trace(self.information) * _NOT_HELD * np.eye(6)
-        independent = np.linalg.solve(self.information + spare, sums @ sums.T)
-        return float(np.trace(independent) / 6 * len(blocks) / max(len(blocks) - 6, 1))
+        pulls = [weights * residuals * rows.T for weights, residuals, rows, _ in self._parts]
+        blocks = self._blocks[np.concatenate([points for *_, points in self._parts])]
+        together = squared(summed(np.hstack(pulls), blocks), self.information)
+        count = int(np.count_nonzero(np.bincount(blocks)))
+        return together / 6 * count / max(count - 6, 1)
+
+    def misfit(self) -> float:
+        """Return the mean square of the residuals [sigma^2], robust."""
+        squares = (float(weights @ residuals**2) for weights, residuals, *_ in self._parts)
+        return sum(squares) / self.pairs_matched
 
     def _add(
         self,
@@ -186,11 +189,11 @@ class _System:
         sigmas_m, residuals = samples.sigmas_m[rows], residuals[rows]
         # Robust weights (Geman and McClure), then the normal equations J' W J and -J' W r.
         kernel = 1.0 / (1.0 + (residuals / (_KERNEL_SIGMAS * sigmas_m)) ** 2) ** 2
-        weighted = jacobian * (kernel / sigmas_m**2)[:, None]
+        weights = np.asarray(kernel / sigmas_m**2, np.float32)
+        weighted = jacobian * weights[:, None]
         self.information += (jacobian.T @ weighted).astype(np.float64)
         self.pull -= (weighted.T @ residuals).astype(np.float64)
-        self._parts.append((np.asarray(weighted, np.float32), residuals, samples.blocks[rows]))
-        self.misfit += float(kernel @ (residuals / sigmas_m) ** 2)
+        self._parts.append((weights, residuals, jacobian, rows))
         self.is_seen |= seen
         self.is_matched |= same
         self.pairs_seen += int(seen.sum())

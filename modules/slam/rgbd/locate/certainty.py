@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sceneslam.types.se3 import Transform
 
-from ...model_error import Smoothed, model_covariance
+from ...model_error import Smoothed, model_covariance, squared, summed
 from ..map.landmarks import LandmarkTable
 from ..see.view import View
 from .localizer import VisualFix
@@ -22,7 +22,6 @@ from .pose_solver import Linearised
 _CELLS = 8  # per image width, in which residuals are summed
 _INDEPENDENT = 1.5  # common ratio of a correct model, at most: 1.0 to 1.7 in simulations,
 # 2.1 to 3.8 on freiburg1_rpy, 1.3 to 2.6 on RedKitchen
-_NOT_HELD = 1e-9  # share of all information, added to every direction
 _AROUND_M = 1.5  # length of five keyframes, adjusted together; beyond, wheels give the scale
 
 
@@ -83,13 +82,9 @@ def common_ratio(view: View, fix: VisualFix) -> float:
     """
     seen: Linearised = fix.estimate.linearised
     pulls = (seen.jacobian * seen.residuals).reshape(6, 2, -1).sum(axis=1)  # (6, N)
-    normal = seen.jacobian @ seen.jacobian.T
-    # Pixels alone do not constrain every pose, e.g. corners on a line; their depths may.
-    root = np.linalg.cholesky(normal + _NOT_HELD * np.trace(normal) * np.eye(6))
-    pulls = np.linalg.solve(root, pulls)
     side_px = view.gray.shape[1] / _CELLS
     columns, rows = np.floor(view.features.uv_px[fix.feature_rows].T / side_px).astype(np.int64)
     columns -= columns.min()
-    flat = (rows - rows.min()) * (columns.max() + 1) + columns
-    sums = np.stack([np.bincount(flat, row) for row in pulls])
-    return float((sums**2).sum() / max((pulls**2).sum(), 1e-12))
+    blocks = (rows - rows.min()) * (columns.max() + 1) + columns
+    normal = seen.jacobian @ seen.jacobian.T
+    return squared(summed(pulls, blocks), normal) / max(squared(pulls, normal), 1e-12)
