@@ -115,8 +115,8 @@ def register(
         if system.is_matched.sum() < _POINTS_MIN:
             return None
         off = se3.log(se3.inverse(prior.T_local_cam) @ T_local_cam)
-        information = held.T @ system.information @ held / CORRELATION + prior.information
-        pull = held.T @ system.pull / CORRELATION - prior.information @ off
+        information = held.T @ system.information @ held + prior.information
+        pull = held.T @ system.pull - prior.information @ off
         step = np.asarray(np.linalg.solve(information, pull), np.float64)
         T_local_cam = T_local_cam @ se3.exp(step)
         if gate_m == _GATE_M[1] and np.abs(step).max() < _STEP_MIN:
@@ -124,9 +124,10 @@ def register(
         gate_m = max(_GATE_SHRINK * gate_m, _GATE_M[1])
     matched = samples.localizability(system.is_matched)
     held = matched.held(weak_ratio)
+    information = held.T @ system.information @ held
     return SurfaceRegistration(
         T_local_cam,
-        held.T @ system.information @ held / CORRELATION,
+        information,
         system.common_ratio(),
         system.misfit(),
         np.stack([keyframe.T_cam_local @ T_local_cam for keyframe in keyframes]),
@@ -156,6 +157,8 @@ class _System:
         self.is_seen, self.is_matched = np.zeros((2, len(samples)), np.bool_)
         for keyframe in keyframes:
             self._add(samples, keyframe, keyframe.T_cam_local @ T_local_cam, gate_m, grid)
+        self.information /= CORRELATION
+        self.pull /= CORRELATION
 
     def common_ratio(self) -> float:
         """Return how much stronger the image's blocks pull than independent points would.
@@ -164,7 +167,7 @@ class _System:
         """
         pulls = [weights * residuals * rows.T for weights, residuals, rows, _ in self._parts]
         blocks = self._blocks[np.concatenate([points for *_, points in self._parts])]
-        together = squared(summed(np.hstack(pulls), blocks), self.information)
+        together = squared(summed(np.hstack(pulls), blocks), self.information * CORRELATION)
         count = int(np.count_nonzero(np.bincount(blocks)))
         return together / 6 * count / max(count - 6, 1)
 
