@@ -14,6 +14,7 @@ from sceneslam.modules.slam.depth.keyframe_map import KeyframeMap
 from sceneslam.modules.slam.depth.localizer import DepthLocalizer
 from sceneslam.modules.slam.depth.module import DepthSlam
 from sceneslam.modules.slam.depth.pose_graph import DepthPoseGraph
+from sceneslam.modules.slam.model_error import squared
 from sceneslam.modules.slam.surfaces.keyframe import SurfaceKeyframe
 from sceneslam.modules.slam.surfaces.registration import (
     CameraPrior,
@@ -79,6 +80,12 @@ def test_points_that_err_together_count_as_few():
     np.testing.assert_allclose(certain.covariance(np.eye(6)), np.eye(6))
     uncertain.follow(found[1], samples)
     assert uncertain.covariance(np.eye(6))[0, 0] > 1.5
+
+
+def test_pulls_are_measured_where_rounding_leaves_an_information_below_zero():
+    information = np.diag([1e6, 1e6, 1e6, 1e6, 1.0, -0.1])
+    pulls = np.diag([1e3, 1e3, 1e3, 1e3, 0.0, 0.0])
+    assert squared(pulls, information) == pytest.approx(4.0, rel=1e-6)
 
 
 def test_hand_held_motion_is_found_without_any_light():

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
+from sceneslam.types.covariance import covariance_of
 from sceneslam.types.se3 import Transform
 
 _RATIO = 0.03  # of a motion, mainly by wrong intrinsics
@@ -41,9 +42,10 @@ def squared(pulls: NDArray[np.floating], information: NDArray[np.float64]) -> fl
     Of sums by block it is the trace of a cluster-robust covariance (Liang and Zeger 1986) over that
     by `information` (6, 6).
     """
-    # Residuals alone do not constrain every pose, e.g. corners on a line.
-    root = np.linalg.cholesky(information + _NOT_HELD * np.trace(information) * np.eye(6))
-    return float((np.linalg.solve(root, pulls) ** 2).sum())
+    # Residuals alone do not constrain every pose, e.g. corners on a line; rounding goes below 0.
+    spare = _NOT_HELD * float(np.trace(information))
+    covariance = covariance_of(information + spare * np.eye(6), unmeasured=spare)
+    return float(np.einsum("in,ij,jn->", pulls, covariance, pulls, optimize=True))
 
 
 def motion_covariance(
