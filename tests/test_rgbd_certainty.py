@@ -9,7 +9,7 @@ from rgbd_features import features_at, random_descriptors
 from test_rgbd import drive, make
 from test_rgbd_mono import IMAGES, error_m, images
 
-from sceneslam.modules.slam.rgbd.locate.certainty import Certainty, common_ratio
+from sceneslam.modules.slam.rgbd.locate.certainty import Certainty, common_ratio, noise_ratio
 from sceneslam.modules.slam.rgbd.locate.pose_solver import Linearised
 from sceneslam.types import se3
 from sceneslam.types.observation import TrackingStatus
@@ -75,6 +75,20 @@ def test_what_neighbouring_residuals_have_in_common_widens_the_covariance():
     assert far == pytest.approx(np.hypot(near, 0.03), rel=0.01)  # no noise explains 3 %
     turned = sigma_m(1.0, from_keyframe_m=0.0, turned_rad=0.5)
     assert turned == pytest.approx(np.hypot(near, 0.03 * 0.5 * 2.0), rel=0.01)
+
+
+def test_noise_is_as_large_as_residuals_show():
+    view, fix = sighting(bend=1.0)
+    seen = fix.estimate.linearised
+    rough, fine = (replace(seen, residuals=size * seen.residuals) for size in (1.0, 0.1))
+    covariances = []
+    for linearised in (rough, fine):
+        fix.estimate.linearised = linearised
+        certainty = Certainty(landmarks_with(0.0))
+        beside = [se3.from_xy_yaw(1.0, 0.0, 0.0)]
+        covariances.append(certainty.covariance(view, fix, se3.identity(), beside))
+    assert noise_ratio(fix) < 0.02
+    assert covariances[1][0, 0] < 0.1 * covariances[0][0, 0]  # what is in common is small, too
 
 
 def test_a_scale_that_nothing_holds_counts_from_where_depth_was_seen_last():
