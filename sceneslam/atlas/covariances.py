@@ -98,24 +98,32 @@ def calibrated(
     `trajectories` (T_local_base) and their `modules` are by session. Two modules that processed
     the same observations differ by both their errors; the expected share of each, given what both
     claim, is held against its claim: one step of expectation maximisation of variance components.
+    A variance is the geometric mean of what is claimed and seen: the claim counts as one submap, a
+    difference as the submaps that both drove through.
     """
     claims = path.claims()
-    ratios: dict[str, list[float]] = {module: [] for module in modules}
+    submaps, logs = dict.fromkeys(modules, 1.0), dict.fromkeys(modules, 0.0)
     for old, new in pairwise(range(len(claims))):
-        apart = _difference(trajectories[old], trajectories[new])
+        found = _difference(trajectories[old], trajectories[new])
         a, b = claims[old], claims[new]
-        if apart is None or a is None or b is None:
+        if found is None or a is None or b is None:
             continue
+        apart, compared = found
         for session, claim in ((old, a), (new, b)):
             gain = claim @ np.linalg.inv(a + b)
             expected = gain @ apart @ gain.T + claim - gain @ claim
-            ratios[modules[session]].append(float(np.trace(np.linalg.solve(claim, expected))) / 6)
-    scales = np.array([np.mean(ratios[module] or 1.0) for module in modules] + [1.0])
+            ratio = np.trace(np.linalg.solve(claim, expected)) / 6
+            submaps[modules[session]] += compared
+            logs[modules[session]] += compared * float(np.log(ratio))
+    scales = np.exp([*(logs[module] / submaps[module] for module in modules), 0.0])
     return replace(path, reported=path.reported * scales[path.sessions][:, None, None])
 
 
-def _difference(a: Trajectory, b: Trajectory) -> Covariance | None:
-    """Return the covariance (6, 6) of two modules' difference per pose, None without motion."""
+def _difference(a: Trajectory, b: Trajectory) -> tuple[Covariance, float] | None:
+    """Return the covariance (6, 6) of two modules' difference per pose, and over how many submaps.
+
+    None without motion.
+    """
     _, rows_a, rows_b = np.intersect1d(a.stamps_ns, b.stamps_ns, return_indices=True)
     T_a, T_b = a.T_world_base[rows_a], b.T_world_base[rows_b]
     submaps = _submaps(_moved(T_a))
@@ -125,7 +133,7 @@ def _difference(a: Trajectory, b: Trajectory) -> Covariance | None:
     noise = np.diff(off, axis=0)  # between poses so near one another that nothing drifts
     drift = off.T @ off - noise.T @ noise  # the first difference is 0
     values, vectors = np.linalg.eigh(drift / (2.0 * np.minimum(submaps, 1.0)).sum())
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T), float(submaps[-1])
 
 
 def _moved(T_map_base: NDArray[np.float64]) -> NDArray[np.float64]:
