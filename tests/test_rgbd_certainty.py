@@ -77,18 +77,30 @@ def test_what_neighbouring_residuals_have_in_common_widens_the_covariance():
     assert turned == pytest.approx(np.hypot(near, 0.03 * 0.5 * 2.0), rel=0.01)
 
 
-def test_noise_is_as_large_as_residuals_show():
-    view, fix = sighting(bend=1.0)
+@pytest.mark.parametrize(
+    ("size", "noise"), [(0.6, 0.36 / 0.84), (0.1, 1.0 / 12.0), (0.0, 1.0 / 12.0), (2.0, 1.0)]
+)
+def test_noise_is_as_large_as_residuals_show(size, noise):
+    view, fix = sighting(bend=0.0)
     seen = fix.estimate.linearised
-    rough, fine = (replace(seen, residuals=size * seen.residuals) for size in (1.0, 0.1))
-    covariances = []
-    for linearised in (rough, fine):
-        fix.estimate.linearised = linearised
+    fix.estimate.linearised = replace(seen, residuals=size * seen.residuals)
+    certainty = Certainty(landmarks_with(0.0))
+    covariance = certainty.covariance(view, fix, se3.identity(), [se3.identity()])
+    assert covariance[0, 0] == pytest.approx(1e-6 * noise, rel=0.3)
+    assert noise_ratio(fix) == pytest.approx(size**2 / 0.84, rel=0.1)
+
+
+def test_what_fine_residuals_have_in_common_is_no_wrong_model():
+    def model_m(size):
+        view, fix = sighting(bend=1.0)
+        seen = fix.estimate.linearised
+        fix.estimate.linearised = replace(seen, residuals=size * seen.residuals)
         certainty = Certainty(landmarks_with(0.0))
         beside = [se3.from_xy_yaw(1.0, 0.0, 0.0)]
-        covariances.append(certainty.covariance(view, fix, se3.identity(), beside))
-    assert noise_ratio(fix) < 0.02
-    assert covariances[1][0, 0] < 0.1 * covariances[0][0, 0]  # what is in common is small, too
+        return np.sqrt(certainty.covariance(view, fix, se3.identity(), beside)[0, 0])
+
+    assert model_m(1.0) == pytest.approx(0.03, rel=0.02)
+    assert model_m(0.1) < 0.5 * 0.03
 
 
 def test_a_scale_that_nothing_holds_counts_from_where_depth_was_seen_last():

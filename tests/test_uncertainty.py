@@ -166,12 +166,29 @@ def test_a_claim_is_held_against_the_difference_at_the_handover():
     np.testing.assert_array_equal(resting.reported, path.reported)
 
 
-def test_a_short_comparison_says_little_of_a_claim():
+@pytest.mark.parametrize(("poses", "ratio"), [(5, 0.227), (20, 0.0127), (101, 7.9e-4)])
+def test_a_comparison_says_the_more_of_a_claim_the_longer_it_is(poses, ratio):
     path = path_of("0" * 20 + "1" * 20, CLAIM)
-    path.reported[20:] *= 1e4
-    long, short = (calibrated(path, "ab", differing(0.002, poses=poses)) for poses in (20, 5))
-    ratios = [one.reported[-1, 0, 0] / path.reported[-1, 0, 0] for one in (long, short)]
-    assert ratios[0] < 0.02 < 0.2 < ratios[1] < 1.0
+    path.reported[20:] *= 1e4  # of which 1e-4 is seen, over n submaps: 1e-4 ** (n / (1 + n))
+    found = calibrated(path, "ab", differing(0.002, poses=poses)).reported[-1, 0, 0]
+    assert found / path.reported[-1, 0, 0] == pytest.approx(ratio, rel=0.1)
+
+
+def test_a_module_that_rests_is_compared_with_none():
+    path = path_of("0" * 20 + "1" * 20, CLAIM)
+    moving, resting = differing(0.002)[0], differing(0.002, np.eye(4))[0]
+    for pair in ([moving, resting], [resting, moving]):
+        np.testing.assert_array_equal(calibrated(path, "ab", pair).reported, path.reported)
+
+
+@pytest.mark.parametrize("certain", [0.0, 1e-9, 1e-4])
+def test_claims_of_any_size_are_compared(certain):
+    path = path_of("0" * 20 + "1" * 20, certain * np.eye(6))
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(6, 6)))[0]
+    path.reported[20:] = turn @ np.diag(np.logspace(2, 10, 6)) @ turn.T
+    found = calibrated(path, "ab", differing(0.0)).reported
+    assert np.isfinite(found).all()
+    assert found[-1, 0, 0] > 0.0
 
 
 def test_a_run_logs_how_certain_every_session_was_where_it_began():

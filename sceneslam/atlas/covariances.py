@@ -109,10 +109,10 @@ def calibrated(
         if found is None or a is None or b is None:
             continue
         apart, compared = found
-        for session, claim in ((old, a), (new, b)):
-            gain = claim @ np.linalg.inv(a + b)
-            expected = gain @ apart @ gain.T + claim - gain @ claim
-            ratio = np.trace(np.linalg.solve(claim, expected)) / 6
+        weight = np.linalg.inv(a + b)
+        for session, claim, other in ((old, a, b), (new, b, a)):
+            # The trace of claim^-1 times the expectation, without differences of what is alike.
+            ratio = np.trace(weight @ (apart @ weight @ claim + other)) / 6
             submaps[modules[session]] += compared
             logs[modules[session]] += compared * float(np.log(ratio))
     scales = np.exp([*(logs[module] / submaps[module] for module in modules), 0.0])
@@ -126,7 +126,7 @@ def _difference(a: Trajectory, b: Trajectory) -> tuple[Covariance, float] | None
     """
     _, rows_a, rows_b = np.intersect1d(a.stamps_ns, b.stamps_ns, return_indices=True)
     T_a, T_b = a.T_world_base[rows_a], b.T_world_base[rows_b]
-    submaps = _submaps(_moved(T_a))
+    submaps = np.minimum(_submaps(_moved(T_a)), _submaps(_moved(T_b)))
     if not len(rows_a) or submaps[-1] < _MOVED_MIN:
         return None
     off = se3.log(se3.inverse(se3.inverse(T_a[0]) @ T_a) @ se3.inverse(T_b[0]) @ T_b)
