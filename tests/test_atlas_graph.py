@@ -359,6 +359,7 @@ def test_claims_are_scaled_by_the_drift_between_two_modules_beyond_their_noise()
     drift = off_m**2 * ((steps**2).sum() - (count - 1))
     per_submap = drift / (2.0 * np.minimum(steps * 0.5 / 2.5, 1.0).sum())
     ratio = (per_submap / 4.0 / CLAIM[0, 0] + 3.0) / 6.0
+    ratio **= 0.8 / (1.0 + 0.8)  # seen over 2 m of 2.5, beside what is claimed
     np.testing.assert_allclose(found, [CLAIM * ratio] * 2 * count, rtol=1e-3, atol=1e-12)
 
 
