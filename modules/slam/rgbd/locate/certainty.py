@@ -22,11 +22,8 @@ from .pose_solver import Linearised
 _CELLS = 8  # per image width, in which residuals are summed
 _INDEPENDENT = 1.5  # common ratio of a correct model, mostly: 1.0 to 1.9 in simulations, 1.5 to
 # 4.6 on freiburg1_rpy, 1.7 to 3.8 on RedKitchen (10 to 90 % of the images)
-_IN_COMMON = 0.5  # variance [sigma^2] in common that shows a model as wrong as cameras' models are
 _AGREEING = 0.84  # mean square of normal residuals that agree: within their 95 % limit
-_FINEST = (
-    1.0 / 12.0
-)  # px^2, as of corners to the pixel; an image like the last one has no residuals
+_FINEST = 0.1**2  # px^2: corners are hardly located better; an image like the last has no residuals
 _AROUND_M = 1.5  # length of five keyframes, adjusted together; beyond, wheels give the scale
 
 
@@ -60,7 +57,7 @@ class Certainty:
         away_m = self._landmarks.points_local[fix.landmark_ids] - T_local_base[:3, 3]
         away2_m2 = float(np.median((away_m**2).sum(axis=1)))
         model = model_covariance(np.stack(T_keyframe_base), away2_m2)
-        model *= np.clip(noise * (common - _INDEPENDENT) / _IN_COMMON, 0.0, 1.0) ** 2
+        model *= np.clip(noise * (common - _INDEPENDENT), 0.0, 1.0)
         scale = np.zeros((6, 6))
         scale[:3, :3] = self.scale_variance(view, fix, T_local_base)
         self.by_wheels = scale if view.odometry is not None else 0.0 * scale
