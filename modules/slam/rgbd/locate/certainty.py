@@ -23,7 +23,7 @@ _CELLS = 8  # per image width, in which residuals are summed
 _INDEPENDENT = 1.5  # common ratio of a correct model, mostly: 1.0 to 1.9 in simulations, 1.5 to
 # 4.6 on freiburg1_rpy, 1.7 to 3.8 on RedKitchen (10 to 90 % of the images)
 _AGREEING = 0.84  # mean square of normal residuals that agree: within their 95 % limit
-_FINEST = 0.03**2  # px^2, less than measured at rest (0.04 px); an image like the last has none
+_FINEST = 9e-4  # least of `noise_ratio`, for an image like the last; 0.006 is measured at rest
 _AROUND_M = 1.5  # length of five keyframes, adjusted together; beyond, wheels give the scale
 
 
@@ -84,8 +84,7 @@ def noise_ratio(fix: VisualFix) -> float:
     It is the variance of unit weight, as in the adjustment of networks; pixels' sigmas are those of
     poor images: 0.2 in simulations, 0.5 to 0.6 on recordings.
     """
-    residuals = fix.estimate.linearised.residuals
-    return float(residuals @ residuals) / max(len(residuals) - 6, 1) / _AGREEING
+    return fix.estimate.linearised.pixel_variance / _AGREEING
 
 
 def common_ratio(view: View, fix: VisualFix) -> float:

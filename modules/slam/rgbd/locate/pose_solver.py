@@ -48,6 +48,11 @@ class Linearised:
     sigma_px: NDArray[np.float64]  # (N,)
     normal: NDArray[np.float64]  # (6, 6), of a twist of the camera, depths included
 
+    @property
+    def pixel_variance(self) -> float:
+        """Return the variance of the residuals [sigma^2], given that the pose took six of them."""
+        return float(self.residuals @ self.residuals) / (len(self.residuals) - 6)
+
     def follow(self, moved: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the camera's twist (6,) if the pixels move by `moved` (2 N,) sigmas."""
         return np.asarray(np.linalg.solve(self.normal, self.jacobian @ moved))
@@ -131,22 +136,22 @@ class PoseSolver:
         slopes = end.errors.rows(np.ones((3, 1)))[:6]
         by_pixel = slopes[:, :2, inliers].reshape(6, -1)
         by_depth = slopes[:, 2, end.depth_inliers]
+        linearised = Linearised(
+            residuals=residuals,
+            jacobian=by_pixel,
+            sigma_px=measured.seen.sigma_px[inliers],
+            normal=by_pixel @ by_pixel.T + by_depth @ by_depth.T,
+        )
         # If the errors are larger than their sigmas, the covariance is scaled up.
-        pixel_variance = float(residuals @ residuals) / (len(residuals) - 6)
         covariance = se3.carried(np.linalg.inv(end.normal), self._camera.T_base_cam)
-        covariance *= max(1.0, pixel_variance)
+        covariance *= max(1.0, linearised.pixel_variance)
         return PoseEstimate(
             T_local_base=se3.orthonormal(end.T_local_cam @ self._T_cam_base),
             covariance=0.5 * (covariance + covariance.T),
             inliers=inliers,
             depth_inliers=end.depth_inliers,
             depth_agreement_ratio=_share(end.depth_inliers, inliers & measured.seen.measures_depth),
-            linearised=Linearised(
-                residuals=residuals,
-                jacobian=by_pixel,
-                sigma_px=measured.seen.sigma_px[inliers],
-                normal=by_pixel @ by_pixel.T + by_depth @ by_depth.T,
-            ),
+            linearised=linearised,
         )
 
     def _descend(
