@@ -157,6 +157,30 @@ def test_unknown_view_is_lost_and_the_known_one_is_found_again():
     assert np.linalg.norm(found[-1].T_local_base[:3, 3] - expected) < 0.01
 
 
+@pytest.mark.parametrize("gap_images", [60, 120])
+def test_after_a_gap_another_room_is_not_taken_for_the_known_one(gap_images):
+    module = active()
+    track(module, ROOM, [handheld(index) for index in range(30)])
+    first = 30 + gap_images
+    other = (
+        np.array(ROOM) * [1, 1, 1, 1.15] + [0, 0, 0, 0.12] * np.resize([1, -1], len(ROOM))[:, None]
+    )
+    lost = track(module, other, [handheld(first + i) for i in range(10)], first=first)
+    assert TrackingStatus.TRACKING not in {tracking.status for tracking in lost[2:]}
+
+
+def test_after_a_gap_the_camera_is_found_where_it_is():
+    before = [handheld(index) for index in range(60)]
+    after = [handheld(10 + index) for index in range(10)]
+    module = active()
+    track(module, ROOM, before)
+    trackings = track(module, ROOM, after, first=180)
+    assert {tracking.status for tracking in trackings} == {TrackingStatus.TRACKING}
+    for tracking, T in zip(trackings, after, strict=True):
+        off = se3.inverse(se3.inverse(before[0]) @ T) @ tracking.T_local_base
+        assert np.linalg.norm(off[:3, 3]) < 0.02
+
+
 @pytest.mark.parametrize(("known_ratio", "is_found"), [(0.3, False), (0.7, True)])
 def test_a_view_is_found_again_by_three_keyframes_if_they_show_its_larger_part(
     known_ratio, is_found
@@ -169,8 +193,8 @@ def test_a_view_is_found_again_by_three_keyframes_if_they_show_its_larger_part(
         keyframes.add(reader.read(known_m), CAMERA.T_base_cam, stamp_ns=stamp_ns)
     image = reader.read(image_m)
     localizer = DepthLocalizer(keyframes, matched_min_ratio=0.4, weak_ratio=0.005)
-    expected = CameraPrior(CAMERA.T_base_cam, np.eye(6))
-    found = localizer.alike(samples_of(image, reader.grid), image, expected)
+    vague = CameraPrior(CAMERA.T_base_cam, np.eye(6))
+    found = localizer.locate(samples_of(image, reader.grid), image, vague, None)
     assert (found is not None) is is_found
 
 

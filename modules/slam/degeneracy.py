@@ -40,6 +40,12 @@ class Localizability:
         strong = self.directions[:, self.ratios >= ratio_min]
         return np.asarray(np.linalg.solve(self.scale, strong @ strong.T @ self.scale))
 
+    def reach_m(self, covariance: Doubles, ratio_min: float) -> float:
+        """Return the points' deviation by a pose's covariance (6, 6) along what is not weak."""
+        seen = self.directions[:, self.ratios >= ratio_min].T @ self.scale
+        moved = seen @ covariance @ seen.T
+        return float(np.sqrt(max(np.linalg.eigvalsh(moved).max(initial=0.0), 0.0)))
+
 
 def localizability(
     points: NDArray[np.floating], normals: NDArray[np.floating], weights: NDArray[np.floating]

@@ -130,8 +130,7 @@ class DepthSlam:
         before = None
         if not prediction.is_measured:
             before = self._predictor.T_local_measured @ self._camera.T_base_cam
-        found = self._localizer.near(samples, prior, before)
-        return found or self._localizer.alike(samples, surface, prior)
+        return self._localizer.locate(samples, surface, prior, before)
 
     def _prior(self, prediction: Prediction) -> CameraPrior:
         T_cam_base = se3.inverse(self._camera.T_base_cam)

@@ -204,7 +204,11 @@ class _System:
 
 
 def compare(
-    samples: Samples, keyframe: SurfaceKeyframe, T_key_cam: se3.Transform, gate_m: float, grid: Grid
+    samples: Samples,
+    keyframe: SurfaceKeyframe | Surface,
+    T_key_cam: se3.Transform,
+    gate_m: float,
+    grid: Grid,
 ) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
     """Return residuals (N,) [m], normals (N, 3), and whether points are in view and match (N,)."""
     T = T_key_cam.astype(np.float32)
