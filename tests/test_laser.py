@@ -161,6 +161,40 @@ def test_no_return_and_no_odometry_is_lost_and_found_again():
     assert errors(path, trackings)[-1, 0] < 0.02
 
 
+def test_after_seconds_without_scans_and_wheels_the_robot_is_found_where_it_is():
+    """It turned round and went on in the meantime."""
+    path = loop_path(160)[[*range(60), *range(100, 160)]]
+    late = drive(room(), path, rng=np.random.default_rng(7))
+    late[60:] = [_later(observation, 4_000_000_000) for observation in late[60:]]
+    module = active()
+    trackings = [module.track(observation) for observation in late]
+    assert {tracking.status for tracking in trackings} == {TrackingStatus.TRACKING}
+    assert errors(path, trackings)[:, 0].max() < 0.03
+
+
+def test_after_seconds_without_scans_and_wheels_a_place_that_looks_alike_is_not_believed():
+    """Niches every two metres: it may be at any of them."""
+    niches = [box(2.0 * k, 1.0, 2.0 * k + 0.8, 1.6)[1:] for k in range(-9, 10)]
+    walls = np.concatenate([box(-30, -1, 30, 3), *niches])
+    path = np.zeros((60, 3))
+    path[:30, 0] = 0.1 * np.arange(30)
+    path[30:, 0] = path[29, 0] + 3.0 + 0.02 * np.arange(30)
+    view = {"range_max_m": 5.0, "beams": 720}
+    late = drive(walls, path, rng=np.random.default_rng(7), **view)
+    late[30:] = [_later(observation, 4_000_000_000) for observation in late[30:]]
+    module = active()
+    trackings = [module.track(observation) for observation in late]
+    assert {tracking.status for tracking in trackings[:30]} == {TrackingStatus.TRACKING}
+    assert {tracking.status for tracking in trackings[30:]} == {TrackingStatus.LOST}
+
+
+def _later(observation, by_ns):
+    stamp_ns = observation.stamp_ns + by_ns
+    return replace(
+        observation, stamp_ns=stamp_ns, scan=replace(observation.scan, stamp_ns=stamp_ns)
+    )
+
+
 def test_no_return_with_odometry_is_degraded_and_goes_on():
     path = loop_path(160)
     observations = drive(room(), path, odometry=path, rng=np.random.default_rng(8))

@@ -25,6 +25,7 @@ from sceneslam.types.se3 import Transform
 
 from .doubt import Doubt
 from .field import LikelihoodField
+from .free_space import FreeSpace
 from .keyframes import ScanKeyframe, ScanKeyframes
 from .matcher import Match, Matcher, novelty
 from .prior import MotionPrior, difference, is_apart
@@ -33,7 +34,14 @@ from .wide_search import WideSearch
 
 _OVERLAP_MIN_RATIO = 0.5  # with less, the map does not cover this place yet
 _FAILURES_MAX = 10  # consecutive failed matches before mapping continues from dead reckoning
-_LOST_WINDOW_M, _LOST_WINDOW_RAD, _LOST_SCORE_MIN = 3.0, 0.8, 0.5
+_REACH_SIGMAS = 2.0
+_ASTRAY = np.array([3.0, 0.8])  # m, rad: least window where a scan contradicts the prediction
+_WIDEST = np.array([5.0, np.pi])  # m, rad: farther away, the latest submaps show little
+_LOST_SCORE_MIN = 0.5
+_APART_M, _APART_RAD = 0.3, 0.1  # two poses of one scan are different places
+_SURE = 10.0  # nats: a pose so much less likely than the best is none
+_REFUTED_RATIO = 0.03  # largest share of points where the other sees through
+_FOUND_MIN_RATIO = 0.7  # of the beams near the map
 _UNSEEN = np.diag([1e-2, 1e-2, 1e-1])  # 1/m^2, 1/rad^2: information in unconstrained directions
 _DEVIATION_MIN = np.array([1e-3, 1e-3, 5e-4])  # m, m, rad: least standard deviation of a pose
 
@@ -110,13 +118,15 @@ class FrontEnd:
         is_known = motion.is_measured and not motion.is_doubted
         new = novelty(between(self._seen_pose, predicted_then)) if is_known else 1.0
         match = self.matcher.match(surfaces, self._field, priors, novelty=new)
-        believed = self._believes(match)
         # At the first match the velocity is unknown, so that without wheels any motion is possible.
+        is_vague = not is_known and not is_first and self._is_vague(match)
+        believed = self._believes(match) and not is_vague
         if (is_first or not believed) and (not is_known or self.matcher.misfit > 0.0):
-            again = self._find_again(surfaces, self._field, predicted_then, is_known=is_known)
+            window = self._window(is_known=is_known, is_vague=is_vague)
+            again = self._find_again(scan, surfaces, self._field, predicted_then, window)
             if again is not None and (not believed or _is_better(again, match)):
-                match = again
-        if not self._believes(match):
+                match, believed = again, self._believes(again)
+        if not believed:
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
         if is_known and not match.weighs_sources:
             self.motion.skip()  # what the wheels missed is a jump, and tells no velocity
@@ -145,28 +155,65 @@ class FrontEnd:
         surfaces = self.reader.read(scan)
         return surfaces if len(surfaces) >= self.settings.beams_min else None
 
-    def _find_again(
-        self, surfaces: SurfacePoints, field: LikelihoodField, predicted: Planar, *, is_known: bool
-    ) -> Match | None:
-        """Return the match of a wide search: any motion is possible.
+    def _is_vague(self, match: Match) -> bool:
+        """Tell whether the robot may be outside of the matcher's window around the prediction.
+
+        Directions that the scan does not measure follow the prediction, and may be as vague.
+        """
+        H = match.information
+        held = np.linalg.pinv(H, rcond=1e-9, hermitian=True) @ H
+        reach = _reach(held @ self._covariance @ held.T)
+        return bool((reach > [self.matcher.window_m, self.matcher.window_rad]).any())
+
+    def _window(self, *, is_known: bool, is_vague: bool) -> Planar:
+        """Return how far (2,) [m, rad] from the prediction to search.
 
         `is_known`: the wheels predict the motion, and the scan contradicts them.
         """
-        assert self._stamp_ns is not None
-        turned_rad = float(np.sqrt(self._covariance[2, 2]))
-        if is_known and self._held_ns is not None:
-            turned_rad = float(UNKNOWN_VELOCITY[1]) * (self._stamp_ns - self._held_ns) * 1e-9
-        found = WideSearch(field).find(
+        reach = _reach(self._covariance)
+        if is_vague:
+            return np.asarray(np.minimum(reach, _WIDEST))
+        if is_known and self._held_ns is not None and self._stamp_ns is not None:
+            reach = _REACH_SIGMAS * UNKNOWN_VELOCITY * (self._stamp_ns - self._held_ns) * 1e-9
+        return np.asarray(np.clip(reach, _ASTRAY, [_ASTRAY[0], _WIDEST[1]]))
+
+    def _find_again(
+        self,
+        scan: LaserScan,
+        surfaces: SurfacePoints,
+        field: LikelihoodField,
+        predicted: Planar,
+        window: Planar,
+    ) -> Match | None:
+        """Return the match of a wide search: the one pose that fits, None if there are more."""
+        window_m, window_rad = window.tolist()
+        starts = WideSearch(field).find(
             surfaces.points,
             predicted,
-            window_m=_LOST_WINDOW_M,
-            window_rad=float(np.clip(2.0 * turned_rad, _LOST_WINDOW_RAD, np.pi)),
+            window_m=window_m,
+            window_rad=window_rad,
             score_min=_LOST_SCORE_MIN,
         )
-        if found is None or not found.is_unique:
+        deviation = np.array([window_m, window_m, window_rad]) / _REACH_SIGMAS
+        prior = MotionPrior.of(predicted, np.diag(deviation**2))
+        matches = [self.matcher.refine(surfaces, field, start, prior) for start in starts]
+        best = min(matches, key=lambda match: match.cost, default=None)
+        if best is None or any(_is_rival(match, best) for match in matches):
             return None
-        prior = np.diag(np.array([_LOST_WINDOW_M, _LOST_WINDOW_M, _LOST_WINDOW_RAD]) ** 2)
-        return self.matcher.refine(surfaces, field, found.T_submap_base, prior)
+        return None if self._is_refuted(best, scan, surfaces, field) else best
+
+    def _is_refuted(
+        self, match: Match, scan: LaserScan, surfaces: SurfacePoints, field: LikelihoodField
+    ) -> bool:
+        """Tell whether scan or map has surfaces where the other saw through."""
+        if match.inlier_ratio < _FOUND_MIN_RATIO:
+            return True
+        settings, pose = self.settings, match.T_local_base
+        there = surfaces.moved(pose)
+        seen = FreeSpace([scan], [pose], settings.T_base_laser, settings.range_max_m)
+        view = LikelihoodField(there, settings.resolution_m, seen)
+        ratios = field.refuted_ratio(there.points), view.refuted_ratio(field.points)
+        return max(ratios) > _REFUTED_RATIO
 
     def _believes(self, match: Match) -> bool:
         return (
@@ -246,10 +293,14 @@ class FrontEnd:
         )
 
     def _lose(self) -> Estimate:
-        """Stay at the last tracked pose, and search the whole window from now on."""
+        """Stay at the last tracked pose; the robot may be anywhere that it can have come to."""
         self._pose = self._held_pose
-        window = np.array([self.matcher.window_m, self.matcher.window_m, self.matcher.window_rad])
-        self._covariance = np.diag(window**2)
+        lost_s = 0.0
+        if self._stamp_ns is not None and self._held_ns is not None:
+            lost_s = (self._stamp_ns - self._held_ns) * 1e-9
+        self._covariance = (
+            np.diag((UNKNOWN_VELOCITY * lost_s)[[0, 0, 1]] ** 2) + self._held_covariance
+        )
         self.motion.stop()
         return Estimate(
             T_local_base=self._held_pose,
@@ -270,10 +321,23 @@ class FrontEnd:
         )
 
 
+def _reach(covariance: Matrix) -> Planar:
+    """Return how far (2,) [m, rad] a pose may be from the prediction with its covariance."""
+    position_m2 = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+    return np.asarray(_REACH_SIGMAS * np.sqrt([max(position_m2, 0.0), covariance[2, 2]]))
+
+
 def _is_better(match: Match, other: Match) -> bool:
     """Tell whether a match is another pose than the other, and more of the scan fits there."""
     is_other = is_apart(difference(match.T_local_base, other.T_local_base))
     return is_other and match.inliers > other.inliers
+
+
+def _is_rival(match: Match, best: Match) -> bool:
+    """Tell whether a match is another pose than the best, and not much less likely."""
+    off = difference(match.T_local_base, best.T_local_base)
+    is_other = np.hypot(*off[:2]) > _APART_M or abs(off[2]) > _APART_RAD
+    return bool(is_other) and match.cost < best.cost + _SURE
 
 
 def _share(stamp_ns: int, before_ns: int | None, now_ns: int) -> float:
