@@ -19,7 +19,7 @@ WALL = ((1, 0, 0, 2.0),)  # (normal, distance) [m] of planes n @ X = d around th
 CORRIDOR = ((0, 1, 0, 1.0), (0, -1, 0, 1.0), (0, 0, 1, 1.2), (0, 0, -1, 1.0))
 
 
-def _cave(count=20):
+def cave(count=20):
     """Return planes on all sides, 2 to 2.4 m away: whatever part is seen holds a camera."""
     height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
     angle = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
@@ -28,7 +28,7 @@ def _cave(count=20):
     return np.column_stack([across * np.cos(angle), across * np.sin(angle), height, distance])
 
 
-ROOM = _cave()
+ROOM = cave()
 
 
 def depth_image(planes, T_room_base, *, seed=0, noise_per_m=NOISE_PER_M, camera=CAMERA):

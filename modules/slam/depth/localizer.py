@@ -28,7 +28,7 @@ _FAR = 100.0  # largest squared Mahalanobis distance to the prediction: ten sigm
 _REACH_M = 0.15  # deviation of the prediction up to which points lie near their own surfaces
 _SURE_RATIO = 0.8  # smallest share of points that match
 _SEEN_RATIO = 0.4  # smallest share of the image that the map shows
-_REFUTED_RATIO = 0.05  # largest share of points that stand where the other view sees through
+_REFUTED_RATIO = 0.03  # largest share of points that stand where the other view sees through
 _SAME_M = 0.05  # from a surface; refuted points are farther in front of it
 _APART_M = 0.15  # two poses of one image are different places
 
