@@ -1,0 +1,145 @@
+"""Print where a module says to be after seconds without any data, without wheels and gyro.
+
+    python experiments/gaps.py MODULE [OVERRIDES]
+
+The overrides choose a recording as for a run, backwards with `backwards` before them:
+
+    python experiments/gaps.py laser source=carmen source.path=LOG
+    python experiments/gaps.py depth backwards source=tum_rgbd source.path=FOLDER
+
+A gap begins at each of 15 instants of the first 5000 observations, and ends after 1.5, 4 or 10 s.
+A module is found again with its first pose that is not LOST, of 60 observations; five later that is
+judged, by the ground truth, or where there is none by what the same module says with wheels, gyro
+and no gap. The result is a Markdown table.
+"""
+
+from __future__ import annotations
+
+import copy
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Any, cast
+
+import numpy as np
+from hydra import compose, initialize_config_module
+from numpy.typing import NDArray
+from omegaconf import OmegaConf
+
+from sceneslam.config.component import ComponentBuilder
+from sceneslam.evaluation.association import interpolated
+from sceneslam.interfaces import SlamModule, Source
+from sceneslam.sources.contract.ordered import Ordered
+from sceneslam.types import se3
+from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.rig import Sensor
+
+GAPS_S = (1.5, 4.0, 10.0)
+STARTS, OBSERVATIONS = 15, 5000
+PATIENCE, JUDGED_AFTER = 60, 5  # observations
+WRONG_M, WRONG_RAD = 0.3, 0.2
+
+
+@dataclass(frozen=True)
+class Return:
+    """The module's answer after a gap."""
+
+    status: TrackingStatus
+    error_m: float
+    error_rad: float
+
+    @property
+    def is_wrong(self) -> bool:
+        """Tell whether it says to be at another place."""
+        return self.error_m > WRONG_M or self.error_rad > WRONG_RAD
+
+
+def build(name: str, overrides: Sequence[str]) -> ComponentBuilder:
+    """Return what makes the source and the module."""
+    words = ["+scenario=single", f"slam@slam.only={name}", *overrides]
+    with initialize_config_module("sceneslam.conf", version_base="1.3"):
+        config = OmegaConf.to_container(compose("config", overrides=words), resolve=True)
+    return ComponentBuilder(cast(dict[str, Any], config))
+
+
+def backwards(observations: Sequence[Observation]) -> list[Observation]:
+    """Return the observations in the opposite order; samples of gyro and wheels are not turned."""
+    ends_ns = observations[0].stamp_ns + observations[-1].stamp_ns
+    turned = []
+    for one in reversed(observations):
+        scan = one.scan and replace(one.scan, stamp_ns=ends_ns - one.scan.stamp_ns)
+        turned.append(replace(one, stamp_ns=ends_ns - one.stamp_ns, scan=scan))
+    return turned
+
+
+def alone(observation: Observation) -> Observation:
+    """Return an observation without wheels and inertial sensors."""
+    return replace(observation, T_odom_base=None, gyro_base=None, accelerometer_base=None)
+
+
+def reference(
+    module: SlamModule, source: Source, observations: Sequence[Observation]
+) -> NDArray[np.float64]:
+    """Return the poses (N, 4, 4) that answers are held against."""
+    truth = source.ground_truth()
+    if truth is None or not len(truth.trajectory):
+        module.activate(source.rig)
+        return np.array([module.track(one).T_local_base for one in observations])
+    stamps_ns = np.array([one.stamp_ns for one in observations])
+    return interpolated(truth.trajectory, np.sort(stamps_ns)).T_world_base
+
+
+def returned(
+    module: SlamModule, observations: Sequence[Observation], T: NDArray[np.float64], last: Tracking
+) -> Return | None:
+    """Return the answer of a module that goes on here; None if it stays lost.
+
+    `T` (N + 1, 4, 4) are the right poses, of the last answer `last` before the gap first.
+    """
+    since = 0
+    for observation, T_true in zip(observations, T[1:], strict=True):
+        answer = module.track(observation)
+        since += since > 0 or answer.status is not TrackingStatus.LOST
+        if since > JUDGED_AFTER:
+            moved = se3.inverse(last.T_local_base) @ answer.T_local_base
+            off = se3.inverse(se3.inverse(T[0]) @ T_true) @ moved
+            turn_rad = float(se3.rotation_angle_rad(off))
+            return Return(answer.status, float(np.linalg.norm(off[:3, 3])), turn_rad)
+    return None
+
+
+def main(name: str, *words: str) -> None:
+    """Play the recording once, and a copy of the module after each gap."""
+    is_backwards = "backwards" in words
+    builder = build(name, [word for word in words if word != "backwards"])
+    source = Ordered(builder.make("source", Source))
+    observations = list(islice(source, OBSERVATIONS))
+    T = reference(builder.make("slam.only", SlamModule), source, observations)
+    if is_backwards:
+        observations, T = backwards(observations), T[::-1]
+    stamps_s = 1e-9 * np.array([one.stamp_ns for one in observations])
+    module = builder.make("slam.only", SlamModule)
+    bare = source.rig.sensors - {Sensor.ODOMETRY, Sensor.GYRO, Sensor.ACCELEROMETER}
+    module.activate(replace(source.rig, sensors=bare))
+    starts = set(np.linspace(0.25, 0.9, STARTS) * len(observations) // 1)
+    returns: dict[float, list[Return | None]] = {gap_s: [] for gap_s in GAPS_S}
+    answer = module.track(alone(observations[0]))
+    for index, observation in enumerate(observations[1:], 1):
+        for gap_s in GAPS_S if index in starts else ():
+            first = int(np.searchsorted(stamps_s, stamps_s[index - 1] + gap_s))
+            after = slice(first, first + PATIENCE)
+            chosen = [alone(one) for one in observations[after]]
+            right = np.concatenate([T[index - 1 : index], T[after]])
+            if len(chosen) == PATIENCE:
+                returns[gap_s].append(returned(copy.deepcopy(module), chosen, right, answer))
+        answer = module.track(alone(observation))
+    print("| gap [s] | gaps | found | wrong |\n| --- | --- | --- | --- |")
+    for gap_s, some in returns.items():
+        found = [one for one in some if one is not None]
+        wrong = sum(one.is_wrong for one in found)
+        print(f"| {gap_s:g} | {len(some)} | {len(found)} | {wrong} |", flush=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
