@@ -52,6 +52,11 @@ class Doubt:
         else:
             self._now = self._now + np.sqrt(match.probabilities[other]) * off
 
+    def jump(self, match: Match, covariance: Matrix) -> None:
+        """Add that of a scan (3, 3), axes of local, which was matched at one place of several."""
+        self._carry(match.T_local_base)
+        self._before = self._before + covariance
+
     def _carry(self, pose: Planar) -> None:
         """Move to another pose: a heading in doubt moves what comes after it."""
         (x_m, y_m), self._at_m = pose[:2] - self._at_m, np.array(pose[:2])

@@ -118,23 +118,27 @@ class FrontEnd:
         is_known = motion.is_measured and not motion.is_doubted
         new = novelty(between(self._seen_pose, predicted_then)) if is_known else 1.0
         match = self.matcher.match(surfaces, self._field, priors, novelty=new)
+        believed = self._believes(match)
+        vague = self._vague(match) if not is_known and not is_first else None
         # At the first match the velocity is unknown, so that without wheels any motion is possible.
-        is_vague = not is_known and not is_first and self._is_vague(match)
-        believed = self._believes(match) and not is_vague
-        if (is_first or not believed) and (not is_known or self.matcher.misfit > 0.0):
-            window = self._window(is_known=is_known, is_vague=is_vague)
+        is_open = is_first or vague is not None or not believed
+        if is_open and (not is_known or self.matcher.misfit > 0.0):
+            window = self._window(is_known=is_known, is_vague=vague is not None)
             again = self._find_again(scan, surfaces, self._field, predicted_then, window)
-            if again is not None and (not believed or _is_better(again, match)):
-                match, believed = again, self._believes(again)
-        if not believed:
+            if again is not None and (not is_first or not believed or _is_better(again, match)):
+                match, vague = again, None
+        if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
-        if is_known and not match.weighs_sources:
-            self.motion.skip()  # what the wheels missed is a jump, and tells no velocity
+        if vague is not None or (is_known and not match.weighs_sources):
+            self.motion.skip()  # a jump tells no velocity
             self.motion.slow_down()
         else:
             self._teach(match, T_then_now, motion)
         self._doubt.add(match, priors)
-        estimate = self._hold(observation, compose(match.T_local_base, T_then_now), match)
+        if vague is not None:  # the likeliest place, not the only one
+            self._doubt.jump(match, vague)
+        pose = compose(match.T_local_base, T_then_now)
+        estimate = self._hold(observation, pose, match, is_guess=vague is not None)
         if self.keyframes.is_due(match.T_local_base):
             self._extend(match.T_local_base, scan, surfaces)
         return estimate
@@ -155,15 +159,17 @@ class FrontEnd:
         surfaces = self.reader.read(scan)
         return surfaces if len(surfaces) >= self.settings.beams_min else None
 
-    def _is_vague(self, match: Match) -> bool:
-        """Tell whether the robot may be outside of the matcher's window around the prediction.
+    def _vague(self, match: Match) -> Matrix | None:
+        """Return the covariance of the prediction where that is vague, else None.
 
-        Directions that the scan does not measure follow the prediction, and may be as vague.
+        The robot may then be outside of the matcher's window. Directions that the scan does not
+        measure follow the prediction, and do not count.
         """
         H = match.information
         held = np.linalg.pinv(H, rcond=1e-9, hermitian=True) @ H
-        reach = _reach(held @ self._covariance @ held.T)
-        return bool((reach > [self.matcher.window_m, self.matcher.window_rad]).any())
+        covariance = np.asarray(held @ self._covariance @ held.T)
+        window = self.matcher.window_m, self.matcher.window_rad
+        return covariance if (_reach(covariance) > window).any() else None
 
     def _window(self, *, is_known: bool, is_vague: bool) -> Planar:
         """Return how far (2,) [m, rad] from the prediction to search.
@@ -233,9 +239,11 @@ class FrontEnd:
             motion.evidence(match.probabilities) if match.weighs_sources else None,
         )
 
-    def _hold(self, observation: Observation, pose: Planar, match: Match | None) -> Estimate:
+    def _hold(
+        self, observation: Observation, pose: Planar, match: Match | None, *, is_guess: bool = False
+    ) -> Estimate:
         """Accept a pose that was measured by a scan."""
-        weak = match is not None and match.weak_directions > 0
+        weak = is_guess or (match is not None and match.weak_directions > 0)
         if match is None:
             self.motion.skip()
         self._pose, self._held_pose, self._held_ns = pose, pose, observation.stamp_ns
