@@ -192,7 +192,7 @@ def test_a_view_is_found_again_by_three_keyframes_if_they_show_its_larger_part(
     image = reader.read(image_m)
     localizer = DepthLocalizer(keyframes, matched_min_ratio=0.4, weak_ratio=0.005)
     vague = CameraPrior(CAMERA.T_base_cam, np.eye(6))
-    found = localizer.locate(samples_of(image, reader.grid), image, vague, None)
+    found = localizer.locate(samples_of(image, reader.grid), image, vague, None, after_gap=True)
     assert (found is not None) is is_found
 
 

@@ -67,6 +67,10 @@ class Predictor:
             return 0.0
         return (observation.stamp_ns - self._measured_ns) * 1e-9
 
+    def is_long_unmeasured(self, observation: Observation) -> bool:
+        """Tell whether the last measured pose is so old that a predicted one is lost."""
+        return self.unmeasured_s(observation) > _COAST_S
+
     def measure(
         self,
         observation: Observation,
@@ -112,8 +116,8 @@ class Predictor:
         With odometry it is DEGRADED; else at the last velocity, for a short time and if
         `can_coast`, TRACKING; else LOST.
         """
-        is_brief = self.unmeasured_s(observation) <= _COAST_S
-        if prediction.is_measured or (can_coast and is_brief):
+        can_coast = can_coast and not self.is_long_unmeasured(observation)
+        if prediction.is_measured or can_coast:
             self.coast(prediction)
             is_known = prediction.is_measured
             return TrackingStatus.DEGRADED if is_known else TrackingStatus.TRACKING

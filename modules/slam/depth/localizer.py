@@ -30,7 +30,7 @@ _SURE_RATIO = 0.8  # smallest share of points that match
 _SEEN_RATIO = 0.4  # smallest share of the image that the map shows
 _REFUTED_RATIO = 0.03  # largest share of points that stand where the other view sees through
 _SAME_M = 0.05  # from a surface; refuted points are farther in front of it
-_APART_M = 0.15  # two poses of one image are different places
+_APART = 0.15  # m, rad: two poses of one image are different places
 
 
 class DepthLocalizer:
@@ -48,13 +48,15 @@ class DepthLocalizer:
         surface: Surface,
         prior: CameraPrior,
         T_local_cam_before: se3.Transform | None,
+        *,
+        after_gap: bool,
     ) -> SurfaceRegistration | None:
         """Return the camera's pose, None where it is not certain.
 
-        A vague prediction is near other surfaces than the image's own: then the pose must be
-        verified, wherever the search for it began.
+        After a gap, a vague prediction is near other surfaces than the image's own: then the pose
+        must be verified, wherever the search for it began.
         """
-        if self._is_vague(samples, prior):
+        if after_gap and self._is_vague(samples, prior):
             return self._search(samples, surface, prior, near=True)
         found = self._near(samples, prior, T_local_cam_before)
         return found or self._search(samples, surface, prior, near=False)
@@ -104,7 +106,7 @@ class DepthLocalizer:
             if off @ expected.information @ off < _FAR:
                 sure.append(there)
         best = max(sure, key=lambda one: one.matched_ratio, default=None)
-        if best is None or any(_apart_m(best, one) > _APART_M for one in sure):
+        if best is None or any(_is_apart(best, one) for one in sure):
             return None
         return best
 
@@ -145,5 +147,6 @@ def _verdicts(
     return np.array([is_same.sum(), is_refuted.sum()], np.float64)
 
 
-def _apart_m(one: SurfaceRegistration, other: SurfaceRegistration) -> float:
-    return float(np.linalg.norm(one.T_local_cam[:3, 3] - other.T_local_cam[:3, 3]))
+def _is_apart(one: SurfaceRegistration, other: SurfaceRegistration) -> bool:
+    off = se3.log(se3.inverse(one.T_local_cam) @ other.T_local_cam)
+    return bool(np.linalg.norm(off[:3]) > _APART or np.linalg.norm(off[3:]) > _APART)

@@ -34,11 +34,15 @@ from .wide_search import WideSearch
 
 _OVERLAP_MIN_RATIO = 0.5  # with less, the map does not cover this place yet
 _FAILURES_MAX = 10  # consecutive failed matches before mapping continues from dead reckoning
+_LOST_WINDOW_M, _LOST_WINDOW_RAD, _LOST_SCORE_MIN = 3.0, 0.8, 0.5
+_ALIKE_RATIO = 0.85  # a second pose with this share of the best score makes it ambiguous
+# After a gap: experiments/laser.md, "After seconds without scans".
 _REACH_SIGMAS = 2.0
-_ASTRAY = np.array([3.0, 0.8])  # m, rad: least window where a scan contradicts the prediction
 _WIDEST = np.array([5.0, np.pi])  # m, rad: farther away, the latest submaps show little
-_LOST_SCORE_MIN = 0.5
-_APART_M, _APART_RAD = 0.3, 0.1  # two poses of one scan are different places
+_ANY_HEADING = np.pi / np.sqrt(
+    3.0
+)  # rad: standard deviation of a heading of which nothing is known
+_RIVAL_M, _RIVAL_RAD = 0.3, 0.1  # two poses of one scan are different places
 _SURE = 10.0  # nats: a pose so much less likely than the best is none
 _REFUTED_RATIO = 0.03  # largest share of points where the other sees through
 _FOUND_MIN_RATIO = 0.7  # of the beams near the map
@@ -87,6 +91,7 @@ class FrontEnd:
     _held_ns: int | None = field(default=None, init=False)
     _seen_pose: Planar = field(default_factory=lambda: np.zeros(3), init=False)  # of its scan
     _fit_ns: int | None = field(default=None, init=False)  # scans fitted as usual until then
+    _is_guess: bool = field(default=False, init=False)  # the held pose is one of several
     _failures: int = field(default=0, init=False)
     _field: LikelihoodField | None = field(default=None, init=False)
     _doubt: Doubt = field(default_factory=Doubt, init=False)
@@ -119,26 +124,29 @@ class FrontEnd:
         new = novelty(between(self._seen_pose, predicted_then)) if is_known else 1.0
         match = self.matcher.match(surfaces, self._field, priors, novelty=new)
         believed = self._believes(match)
-        vague = self._vague(match) if not is_known and not is_first else None
+        vague = None if is_known else self._vague(match, observation)
         # At the first match the velocity is unknown, so that without wheels any motion is possible.
-        is_open = is_first or vague is not None or not believed
-        if is_open and (not is_known or self.matcher.misfit > 0.0):
-            window = self._window(is_known=is_known, is_vague=vague is not None)
-            again = self._find_again(scan, surfaces, self._field, predicted_then, window)
-            if again is not None and (not is_first or not believed or _is_better(again, match)):
-                match, vague = again, None
+        if (is_first or not believed) and (not is_known or self.matcher.misfit > 0.0):
+            again = self._find_again(surfaces, self._field, predicted_then, is_known=is_known)
+            if again is not None and (not believed or _is_better(again, match)):
+                match = again
+        is_found = False
+        if vague is not None:
+            sure = self._find_sure(scan, surfaces, self._field, predicted_then, match)
+            is_found, match = sure is not None, sure or match
         if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
-        if vague is not None or (is_known and not match.weighs_sources):
+        is_guess = vague is not None and not is_found
+        if (is_found and self._is_guess) or (is_known and not match.weighs_sources):
             self.motion.skip()  # a jump tells no velocity
             self.motion.slow_down()
         else:
             self._teach(match, T_then_now, motion)
         self._doubt.add(match, priors)
-        if vague is not None:  # the likeliest place, not the only one
+        if vague is not None and is_guess:
             self._doubt.jump(match, vague)
         pose = compose(match.T_local_base, T_then_now)
-        estimate = self._hold(observation, pose, match, is_guess=vague is not None)
+        estimate = self._hold(observation, pose, match, is_guess=is_guess)
         if self.keyframes.is_due(match.T_local_base):
             self._extend(match.T_local_base, scan, surfaces)
         return estimate
@@ -159,41 +167,66 @@ class FrontEnd:
         surfaces = self.reader.read(scan)
         return surfaces if len(surfaces) >= self.settings.beams_min else None
 
-    def _vague(self, match: Match) -> Matrix | None:
-        """Return the covariance of the prediction where that is vague, else None.
+    def _vague(self, match: Match, observation: Observation) -> Matrix | None:
+        """Return the covariance of a prediction that is vague after a gap between scans, else None.
 
         The robot may then be outside of the matcher's window. Directions that the scan does not
         measure follow the prediction, and do not count.
         """
+        if self._held_ns is None:
+            return None
+        if observation.stamp_ns - self._held_ns <= self.settings.predict_max_s * 1e9:
+            return None
         H = match.information
         held = np.linalg.pinv(H, rcond=1e-9, hermitian=True) @ H
-        covariance = np.asarray(held @ self._covariance @ held.T)
+        covariance = held @ self._covariance @ held.T
         window = self.matcher.window_m, self.matcher.window_rad
-        return covariance if (_reach(covariance) > window).any() else None
+        if not (_reach(covariance) > window).any():
+            return None
+        turn_rad = max(float(np.sqrt(covariance[2, 2])), 1e-9)
+        bounded = np.diag([1.0, 1.0, min(_ANY_HEADING / turn_rad, 1.0)])
+        return np.asarray(bounded @ covariance @ bounded)
 
-    def _window(self, *, is_known: bool, is_vague: bool) -> Planar:
-        """Return how far (2,) [m, rad] from the prediction to search.
+    def _find_again(
+        self, surfaces: SurfacePoints, field: LikelihoodField, predicted: Planar, *, is_known: bool
+    ) -> Match | None:
+        """Return the match of a wide search: any motion is possible.
 
         `is_known`: the wheels predict the motion, and the scan contradicts them.
         """
-        reach = _reach(self._covariance)
-        if is_vague:
-            return np.asarray(np.minimum(reach, _WIDEST))
-        if is_known and self._held_ns is not None and self._stamp_ns is not None:
-            reach = _REACH_SIGMAS * UNKNOWN_VELOCITY * (self._stamp_ns - self._held_ns) * 1e-9
-        return np.asarray(np.clip(reach, _ASTRAY, [_ASTRAY[0], _WIDEST[1]]))
+        assert self._stamp_ns is not None
+        turned_rad = float(np.sqrt(self._covariance[2, 2]))
+        if is_known and self._held_ns is not None:
+            turned_rad = float(UNKNOWN_VELOCITY[1]) * (self._stamp_ns - self._held_ns) * 1e-9
+        found = WideSearch(field).find(
+            surfaces.points,
+            predicted,
+            window_m=_LOST_WINDOW_M,
+            window_rad=float(np.clip(2.0 * turned_rad, _LOST_WINDOW_RAD, np.pi)),
+            score_min=_LOST_SCORE_MIN,
+        )
+        if not found or any(one.score >= _ALIKE_RATIO * found[0].score for one in found[1:]):
+            return None
+        start, spread = found[0].T_submap_base, [_LOST_WINDOW_M, _LOST_WINDOW_M, _LOST_WINDOW_RAD]
+        prior = MotionPrior.of(start, np.diag(np.array(spread) ** 2))
+        return self.matcher.refine(surfaces, field, start, prior)
 
-    def _find_again(
+    def _find_sure(
         self,
         scan: LaserScan,
         surfaces: SurfacePoints,
         field: LikelihoodField,
         predicted: Planar,
-        window: Planar,
+        match: Match,
     ) -> Match | None:
-        """Return the match of a wide search: the one pose that fits, None if there are more."""
+        """Return the one match where the robot may be after a gap, None if there are more.
+
+        By the scan's evidence, and if neither it nor the map sees through the other. `match` is
+        what is near the prediction.
+        """
+        window = np.clip(_reach(self._covariance), [_LOST_WINDOW_M, _LOST_WINDOW_RAD], _WIDEST)
         window_m, window_rad = window.tolist()
-        starts = WideSearch(field).find(
+        found = WideSearch(field).find(
             surfaces.points,
             predicted,
             window_m=window_m,
@@ -202,9 +235,10 @@ class FrontEnd:
         )
         deviation = np.array([window_m, window_m, window_rad]) / _REACH_SIGMAS
         prior = MotionPrior.of(predicted, np.diag(deviation**2))
+        starts = [match.T_local_base, *(one.T_submap_base for one in found)]
         matches = [self.matcher.refine(surfaces, field, start, prior) for start in starts]
-        best = min(matches, key=lambda match: match.cost, default=None)
-        if best is None or any(_is_rival(match, best) for match in matches):
+        best = min(matches, key=lambda match: match.cost)
+        if any(_is_rival(one, best) for one in matches):
             return None
         return None if self._is_refuted(best, scan, surfaces, field) else best
 
@@ -247,7 +281,7 @@ class FrontEnd:
         if match is None:
             self.motion.skip()
         self._pose, self._held_pose, self._held_ns = pose, pose, observation.stamp_ns
-        self._failures = 0
+        self._failures, self._is_guess = 0, is_guess
         if match is not None:
             self._covariance = match.covariance + np.diag(_DEVIATION_MIN**2)
             self._held_covariance = self._covariance
@@ -344,7 +378,7 @@ def _is_better(match: Match, other: Match) -> bool:
 def _is_rival(match: Match, best: Match) -> bool:
     """Tell whether a match is another pose than the best, and not much less likely."""
     off = difference(match.T_local_base, best.T_local_base)
-    is_other = np.hypot(*off[:2]) > _APART_M or abs(off[2]) > _APART_RAD
+    is_other = np.hypot(*off[:2]) > _RIVAL_M or abs(off[2]) > _RIVAL_RAD
     return bool(is_other) and match.cost < best.cost + _SURE
 
 

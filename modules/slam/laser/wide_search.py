@@ -23,8 +23,16 @@ _POINTS = 100  # of the scan; more do not change the result
 _BEAM = 32  # nodes of the first descent, whose best score bounds the second
 _NODES_MAX = 4000  # best nodes kept per level
 _ALIKE_RATIO = 0.7  # a pose with this share of the best score, at least, ...
-_APART_M, _APART_RAD = 0.4, 0.15  # and this far away from better ones, is another one
+_APART_M, _APART_RAD = 0.5, 0.15  # and this far away from better ones, is another one
 _POSES_MAX = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Found:
+    """A pose that fits."""
+
+    T_submap_base: Planar
+    score: float  # 0 to 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -69,8 +77,8 @@ class WideSearch:
         window_m: float,
         window_rad: float,
         score_min: float,
-    ) -> list[Planar]:
-        """Return the poses (3,) of points (N, 2) [m] near `around` that fit, the best first."""
+    ) -> list[Found]:
+        """Return the poses near `around` where points (N, 2) [m] fit, the best first."""
         points = points_base[:: max(1, len(points_base) // _POINTS)]
         radius_m = float(np.median(np.linalg.norm(points, axis=1))) + 0.1
         step_rad = self._cell_m / radius_m
@@ -133,14 +141,15 @@ class WideSearch:
             bound[part] = np.take(grid.reshape(-1), row * columns + column).mean(axis=1)
         return _Nodes(turn=turn, x=x, y=y, bound=bound)
 
-    def _peaks(self, leaves: _Nodes, yaws: NDArray[np.float64], around: Planar) -> list[Planar]:
+    def _peaks(self, leaves: _Nodes, yaws: NDArray[np.float64], around: Planar) -> list[Found]:
         """Return the poses of the best leaves that are apart."""
-        peaks: list[Planar] = []
+        peaks: list[Found] = []
         while len(leaves.turn) and len(peaks) < _POSES_MAX:
             best = int(np.argmax(leaves.bound))
-            yaw, x, y = yaws[leaves.turn[best]], leaves.x[best], leaves.y[best]
-            peaks.append(np.array([*(around[:2] + self._cell_m * np.array([x, y])), wrap(yaw)]))
+            yaw, x, y = float(yaws[leaves.turn[best]]), leaves.x[best], leaves.y[best]
+            pose = np.array([*(around[:2] + self._cell_m * np.array([x, y])), wrap(yaw)])
+            peaks.append(Found(T_submap_base=pose, score=float(leaves.bound[best])))
             away_m = self._cell_m * np.hypot(leaves.x - x, leaves.y - y)
-            away_rad = np.abs(yaws[leaves.turn] - yaw)
+            away_rad = np.abs(np.remainder(yaws[leaves.turn] - yaw + np.pi, 2 * np.pi) - np.pi)
             leaves = leaves.at(np.flatnonzero((away_m > _APART_M) | (away_rad > _APART_RAD)))
         return peaks
