@@ -167,6 +167,28 @@ def test_after_a_gap_another_room_is_not_taken_for_the_known_one(gap_images):
     assert {tracking.status for tracking in lost} == {TrackingStatus.LOST}
 
 
+def test_somebody_who_walks_by_does_not_end_tracking_at_ten_images_a_second():
+    module = active()
+    statuses = set()
+    for index in range(20):
+        observation = observe(ROOM, se3.identity(), index, rate_hz=10.0)
+        walker = observation.depth_m.copy()
+        walker[:, 30 * index % 240 : 30 * index % 240 + 60] = 1.4
+        statuses.add(module.track(replace(observation, depth_m=walker)).status)
+    assert statuses == {TrackingStatus.TRACKING}
+
+
+def test_after_a_gap_a_corner_like_another_is_not_taken_for_it():
+    """A square room: after a turn by 90 degrees it looks the same."""
+    square = [(1, 0, 0, 2.0), (-1, 0, 0, 2.0), (0, 1, 0, 2.0), (0, -1, 0, 2.0), (0, 0, 1, 0.7)]
+    turns = [np.pi / 4 + min(index, 56) * np.pi / 112 for index in range(60)]
+    module = active()
+    before = track(module, square, [se3.from_xy_yaw(0.0, 0.0, turn) for turn in turns])
+    assert before[-1].status is TrackingStatus.TRACKING
+    after = track(module, square, [se3.from_xy_yaw(0.0, 0.0, 5 * np.pi / 4)] * 5, first=160)
+    assert {tracking.status for tracking in after} == {TrackingStatus.LOST}
+
+
 def test_after_a_gap_the_camera_is_found_where_it_is():
     before = [handheld(index) for index in range(60)]
     after = [handheld(10 + index) for index in range(10)]
