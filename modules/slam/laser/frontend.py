@@ -91,7 +91,8 @@ class FrontEnd:
     _held_ns: int | None = field(default=None, init=False)
     _seen_pose: Planar = field(default_factory=lambda: np.zeros(3), init=False)  # of its scan
     _fit_ns: int | None = field(default=None, init=False)  # scans fitted as usual until then
-    _is_guess: bool = field(default=False, init=False)  # the held pose is one of several
+    # Of a place that was taken after a gap, until the next scan is matched: then it is final.
+    _unsure: Matrix | None = field(default=None, init=False)
     _failures: int = field(default=0, init=False)
     _field: LikelihoodField | None = field(default=None, init=False)
     _doubt: Doubt = field(default_factory=Doubt, init=False)
@@ -124,30 +125,35 @@ class FrontEnd:
         new = novelty(between(self._seen_pose, predicted_then)) if is_known else 1.0
         match = self.matcher.match(surfaces, self._field, priors, novelty=new)
         believed = self._believes(match)
-        vague = None if is_known else self._vague(match, observation)
+        gap = None if is_known else self._vague(match, observation)
         # At the first match the velocity is unknown, so that without wheels any motion is possible.
         if (is_first or not believed) and (not is_known or self.matcher.misfit > 0.0):
             again = self._find_again(surfaces, self._field, predicted_then, is_known=is_known)
             if again is not None and (not believed or _is_better(again, match)):
                 match = again
+        guessed, self._unsure = self._unsure, None
+        vague = guessed if gap is None and not is_known else gap
         is_found = False
         if vague is not None:
-            sure = self._find_sure(scan, surfaces, self._field, predicted_then, match)
+            sure = self._find_sure(scan, surfaces, self._field, predicted_then, match, vague)
             is_found, match = sure is not None, sure or match
         if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
-        is_guess = vague is not None and not is_found
-        if (is_found and self._is_guess) or (is_known and not match.weighs_sources):
+        is_jump = is_found and guessed is not None
+        if is_jump or (is_known and not match.weighs_sources):
             self.motion.skip()  # a jump tells no velocity
             self.motion.slow_down()
         else:
             self._teach(match, T_then_now, motion)
+        if is_jump:
+            self._doubt.settle()
         self._doubt.add(match, priors)
-        if vague is not None and is_guess:
-            self._doubt.jump(match, vague)
+        if gap is not None and not is_found:
+            self._doubt.jump(match, gap)
+            self._unsure = gap
         pose = compose(match.T_local_base, T_then_now)
-        estimate = self._hold(observation, pose, match, is_guess=is_guess)
-        if self.keyframes.is_due(match.T_local_base):
+        estimate = self._hold(observation, pose, match)
+        if self._unsure is None and self.keyframes.is_due(match.T_local_base):
             self._extend(match.T_local_base, scan, surfaces)
         return estimate
 
@@ -218,13 +224,14 @@ class FrontEnd:
         field: LikelihoodField,
         predicted: Planar,
         match: Match,
+        vague: Matrix,
     ) -> Match | None:
         """Return the one match where the robot may be after a gap, None if there are more.
 
         By the scan's evidence, and if neither it nor the map sees through the other. `match` is
-        what is near the prediction.
+        what is near the prediction, `vague` (3, 3) how uncertain that is.
         """
-        window = np.clip(_reach(self._covariance), [_LOST_WINDOW_M, _LOST_WINDOW_RAD], _WIDEST)
+        window = np.clip(_reach(vague), [_LOST_WINDOW_M, _LOST_WINDOW_RAD], _WIDEST)
         window_m, window_rad = window.tolist()
         found = WideSearch(field).find(
             surfaces.points,
@@ -273,15 +280,14 @@ class FrontEnd:
             motion.evidence(match.probabilities) if match.weighs_sources else None,
         )
 
-    def _hold(
-        self, observation: Observation, pose: Planar, match: Match | None, *, is_guess: bool = False
-    ) -> Estimate:
+    def _hold(self, observation: Observation, pose: Planar, match: Match | None) -> Estimate:
         """Accept a pose that was measured by a scan."""
-        weak = is_guess or (match is not None and match.weak_directions > 0)
+        is_weak = match is not None and match.weak_directions > 0
+        weak = is_weak or self._unsure is not None
         if match is None:
             self.motion.skip()
         self._pose, self._held_pose, self._held_ns = pose, pose, observation.stamp_ns
-        self._failures, self._is_guess = 0, is_guess
+        self._failures = 0
         if match is not None:
             self._covariance = match.covariance + np.diag(_DEVIATION_MIN**2)
             self._held_covariance = self._covariance
