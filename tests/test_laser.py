@@ -21,7 +21,6 @@ SETTINGS = yaml.safe_load(
     (Path(__file__).resolve().parent.parent / "conf/slam/laser.yaml").read_text()
 )
 SETTINGS.pop("_target_")
-TRACKING = TrackingStatus.TRACKING
 LASER_RIG = Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser())
 
 
@@ -160,46 +159,6 @@ def test_no_return_and_no_odometry_is_lost_and_found_again():
     np.testing.assert_array_equal(trackings[71].T_local_base, trackings[70].T_local_base)
     assert trackings[-1].status is TrackingStatus.TRACKING
     assert errors(path, trackings)[-1, 0] < 0.02
-
-
-def test_after_seconds_without_scans_and_wheels_the_robot_is_found_where_it_is():
-    """It turned round and went on in the meantime."""
-    path = loop_path(160)[[*range(60), *range(100, 160)]]
-    late = drive(room(), path, rng=np.random.default_rng(7))
-    late[60:] = [_later(observation, 4_000_000_000) for observation in late[60:]]
-    module = active()
-    trackings = [module.track(observation) for observation in late]
-    assert {tracking.status for tracking in trackings} == {TrackingStatus.TRACKING}
-    assert errors(path, trackings)[:, 0].max() < 0.03
-
-
-def test_after_seconds_without_scans_and_wheels_the_covariance_holds_places_that_look_alike():
-    """Niches every two metres: it may be at any of them."""
-    niches = [box(2.0 * k, 1.0, 2.0 * k + 0.8, 1.6)[1:] for k in range(-9, 10)]
-    walls = np.concatenate([box(-30, -1, 30, 3), *niches])
-    path = np.zeros((90, 3))
-    path[:30, 0] = 0.1 * np.arange(30)
-    path[30:, 0] = path[29, 0] + 3.0 + 0.02 * np.arange(60)
-    view = {"range_max_m": 5.0, "beams": 720}
-    late = drive(walls, path, rng=np.random.default_rng(7), **view)
-    late[30:] = [_later(observation, 4_000_000_000) for observation in late[30:]]
-    module = active()
-    trackings = [module.track(observation) for observation in late]
-    statuses = [tracking.status for tracking in trackings]
-    assert statuses == [*[TRACKING] * 30, TrackingStatus.DEGRADED, *[TRACKING] * 59]
-    off_m = errors(path, trackings)[30:, 0]
-    assert off_m.min() > 0.5  # it took the nearest niche
-    said = [tracking.covariance + tracking.map_covariance for tracking in trackings[30:]]
-    deviation_m = np.sqrt([np.linalg.eigvalsh(one[:2, :2])[-1] for one in said])
-    assert (off_m < 2.0 * deviation_m).all()
-    assert deviation_m.max() < 6.0  # 4.1 s at 1 m/s, and 1.2 m on at any heading
-
-
-def _later(observation, by_ns):
-    stamp_ns = observation.stamp_ns + by_ns
-    return replace(
-        observation, stamp_ns=stamp_ns, scan=replace(observation.scan, stamp_ns=stamp_ns)
-    )
 
 
 def test_no_return_with_odometry_is_degraded_and_goes_on():

@@ -26,7 +26,6 @@ class Doubt:
     """
 
     _before: Matrix = field(default_factory=lambda: np.zeros((3, 3)), init=False)
-    _jumped: Matrix = field(default_factory=lambda: np.zeros((3, 3)), init=False)
     _now: Planar = field(default_factory=lambda: np.zeros(3), init=False)
     _at_m: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2), init=False)
 
@@ -36,7 +35,7 @@ class Doubt:
         That pose is where the robot is from now on.
         """
         self._carry(pose)
-        return np.asarray(self._before + self._jumped + np.outer(self._now, self._now))
+        return np.asarray(self._before + np.outer(self._now, self._now))
 
     def add(self, match: Match, priors: Sequence[MotionPrior]) -> None:
         """Add a scan that was matched with these priors."""
@@ -49,22 +48,12 @@ class Doubt:
         other = int(np.argmax(shares))
         off = offs[other]
         if np.hypot(off[0], off[1]) < _APART_M and abs(off[2]) < _APART_RAD:
-            self._before, self._now = self._before + np.outer(self._now, self._now), np.zeros(3)
+            self._before, self._now = self.covariance(match.T_local_base), np.zeros(3)
         else:
             self._now = self._now + np.sqrt(match.probabilities[other]) * off
-
-    def jump(self, match: Match, covariance: Matrix) -> None:
-        """Add that of a scan (3, 3), axes of local, which was matched at one place of several."""
-        self._carry(match.T_local_base)
-        self._before, self._jumped = self._before + self._jumped, covariance
-
-    def settle(self) -> None:
-        """Take the last jump back: since then one place is certain."""
-        self._jumped = np.zeros((3, 3))
 
     def _carry(self, pose: Planar) -> None:
         """Move to another pose: a heading in doubt moves what comes after it."""
         (x_m, y_m), self._at_m = pose[:2] - self._at_m, np.array(pose[:2])
         G = np.array([[1.0, 0.0, -y_m], [0.0, 1.0, x_m], [0.0, 0.0, 1.0]])
         self._before, self._now = G @ self._before @ G.T, G @ self._now
-        self._jumped = G @ self._jumped @ G.T

@@ -25,7 +25,6 @@ from sceneslam.types.se3 import Transform
 
 from .doubt import Doubt
 from .field import LikelihoodField
-from .free_space import FreeSpace
 from .keyframes import ScanKeyframe, ScanKeyframes
 from .matcher import Match, Matcher, novelty
 from .prior import MotionPrior, difference, is_apart
@@ -35,17 +34,6 @@ from .wide_search import WideSearch
 _OVERLAP_MIN_RATIO = 0.5  # with less, the map does not cover this place yet
 _FAILURES_MAX = 10  # consecutive failed matches before mapping continues from dead reckoning
 _LOST_WINDOW_M, _LOST_WINDOW_RAD, _LOST_SCORE_MIN = 3.0, 0.8, 0.5
-_ALIKE_RATIO = 0.85  # a second pose with this share of the best score makes it ambiguous
-# After a gap: experiments/laser.md, "After seconds without scans".
-_REACH_SIGMAS = 2.0
-_WIDEST = np.array([5.0, np.pi])  # m, rad: farther away, the latest submaps show little
-_ANY_HEADING = np.pi / np.sqrt(
-    3.0
-)  # rad: standard deviation of a heading of which nothing is known
-_RIVAL_M, _RIVAL_RAD = 0.3, 0.1  # two poses of one scan are different places
-_SURE = 10.0  # nats: a pose so much less likely than the best is none
-_REFUTED_RATIO = 0.03  # largest share of points where the other sees through
-_FOUND_MIN_RATIO = 0.7  # of the beams near the map
 _UNSEEN = np.diag([1e-2, 1e-2, 1e-1])  # 1/m^2, 1/rad^2: information in unconstrained directions
 _DEVIATION_MIN = np.array([1e-3, 1e-3, 5e-4])  # m, m, rad: least standard deviation of a pose
 
@@ -91,8 +79,6 @@ class FrontEnd:
     _held_ns: int | None = field(default=None, init=False)
     _seen_pose: Planar = field(default_factory=lambda: np.zeros(3), init=False)  # of its scan
     _fit_ns: int | None = field(default=None, init=False)  # scans fitted as usual until then
-    # Of a place that was taken after a gap, until the next scan is matched: then it is final.
-    _unsure: Matrix | None = field(default=None, init=False)
     _failures: int = field(default=0, init=False)
     _field: LikelihoodField | None = field(default=None, init=False)
     _doubt: Doubt = field(default_factory=Doubt, init=False)
@@ -125,35 +111,21 @@ class FrontEnd:
         new = novelty(between(self._seen_pose, predicted_then)) if is_known else 1.0
         match = self.matcher.match(surfaces, self._field, priors, novelty=new)
         believed = self._believes(match)
-        gap = None if is_known else self._vague(match, observation)
         # At the first match the velocity is unknown, so that without wheels any motion is possible.
         if (is_first or not believed) and (not is_known or self.matcher.misfit > 0.0):
             again = self._find_again(surfaces, self._field, predicted_then, is_known=is_known)
             if again is not None and (not believed or _is_better(again, match)):
                 match = again
-        guessed, self._unsure = self._unsure, None
-        vague = guessed if gap is None and not is_known else gap
-        is_found = False
-        if vague is not None:
-            sure = self._find_sure(scan, surfaces, self._field, predicted_then, match, vague)
-            is_found, match = sure is not None, sure or match
         if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
-        is_jump = is_found and guessed is not None
-        if is_jump or (is_known and not match.weighs_sources):
-            self.motion.skip()  # a jump tells no velocity
+        if is_known and not match.weighs_sources:
+            self.motion.skip()  # what the wheels missed is a jump, and tells no velocity
             self.motion.slow_down()
         else:
             self._teach(match, T_then_now, motion)
-        if is_jump:
-            self._doubt.settle()
         self._doubt.add(match, priors)
-        if gap is not None and not is_found:
-            self._doubt.jump(match, gap)
-            self._unsure = gap
-        pose = compose(match.T_local_base, T_then_now)
-        estimate = self._hold(observation, pose, match)
-        if self._unsure is None and self.keyframes.is_due(match.T_local_base):
+        estimate = self._hold(observation, compose(match.T_local_base, T_then_now), match)
+        if self.keyframes.is_due(match.T_local_base):
             self._extend(match.T_local_base, scan, surfaces)
         return estimate
 
@@ -173,26 +145,6 @@ class FrontEnd:
         surfaces = self.reader.read(scan)
         return surfaces if len(surfaces) >= self.settings.beams_min else None
 
-    def _vague(self, match: Match, observation: Observation) -> Matrix | None:
-        """Return the covariance of a prediction that is vague after a gap between scans, else None.
-
-        The robot may then be outside of the matcher's window. Directions that the scan does not
-        measure follow the prediction, and do not count.
-        """
-        if self._held_ns is None:
-            return None
-        if observation.stamp_ns - self._held_ns <= self.settings.predict_max_s * 1e9:
-            return None
-        H = match.information
-        held = np.linalg.pinv(H, rcond=1e-9, hermitian=True) @ H
-        covariance = held @ self._covariance @ held.T
-        window = self.matcher.window_m, self.matcher.window_rad
-        if not (_reach(covariance) > window).any():
-            return None
-        turn_rad = max(float(np.sqrt(covariance[2, 2])), 1e-9)
-        bounded = np.diag([1.0, 1.0, min(_ANY_HEADING / turn_rad, 1.0)])
-        return np.asarray(bounded @ covariance @ bounded)
-
     def _find_again(
         self, surfaces: SurfacePoints, field: LikelihoodField, predicted: Planar, *, is_known: bool
     ) -> Match | None:
@@ -211,56 +163,10 @@ class FrontEnd:
             window_rad=float(np.clip(2.0 * turned_rad, _LOST_WINDOW_RAD, np.pi)),
             score_min=_LOST_SCORE_MIN,
         )
-        if not found or any(one.score >= _ALIKE_RATIO * found[0].score for one in found[1:]):
+        if found is None or not found.is_unique:
             return None
-        start, spread = found[0].T_submap_base, [_LOST_WINDOW_M, _LOST_WINDOW_M, _LOST_WINDOW_RAD]
-        prior = MotionPrior.of(start, np.diag(np.array(spread) ** 2))
-        return self.matcher.refine(surfaces, field, start, prior)
-
-    def _find_sure(
-        self,
-        scan: LaserScan,
-        surfaces: SurfacePoints,
-        field: LikelihoodField,
-        predicted: Planar,
-        match: Match,
-        vague: Matrix,
-    ) -> Match | None:
-        """Return the one match where the robot may be after a gap, None if there are more.
-
-        By the scan's evidence, and if neither it nor the map sees through the other. `match` is
-        what is near the prediction, `vague` (3, 3) how uncertain that is.
-        """
-        window = np.clip(_reach(vague), [_LOST_WINDOW_M, _LOST_WINDOW_RAD], _WIDEST)
-        window_m, window_rad = window.tolist()
-        found = WideSearch(field).find(
-            surfaces.points,
-            predicted,
-            window_m=window_m,
-            window_rad=window_rad,
-            score_min=_LOST_SCORE_MIN,
-        )
-        deviation = np.array([window_m, window_m, window_rad]) / _REACH_SIGMAS
-        prior = MotionPrior.of(predicted, np.diag(deviation**2))
-        starts = [match.T_local_base, *(one.T_submap_base for one in found)]
-        matches = [self.matcher.refine(surfaces, field, start, prior) for start in starts]
-        best = min(matches, key=lambda match: match.cost)
-        if any(_is_rival(one, best) for one in matches):
-            return None
-        return None if self._is_refuted(best, scan, surfaces, field) else best
-
-    def _is_refuted(
-        self, match: Match, scan: LaserScan, surfaces: SurfacePoints, field: LikelihoodField
-    ) -> bool:
-        """Tell whether scan or map has surfaces where the other saw through."""
-        if match.inlier_ratio < _FOUND_MIN_RATIO:
-            return True
-        settings, pose = self.settings, match.T_local_base
-        there = surfaces.moved(pose)
-        seen = FreeSpace([scan], [pose], settings.T_base_laser, settings.range_max_m)
-        view = LikelihoodField(there, settings.resolution_m, seen)
-        ratios = field.refuted_ratio(there.points), view.refuted_ratio(field.points)
-        return max(ratios) > _REFUTED_RATIO
+        prior = np.diag(np.array([_LOST_WINDOW_M, _LOST_WINDOW_M, _LOST_WINDOW_RAD]) ** 2)
+        return self.matcher.refine(surfaces, field, found.T_submap_base, prior)
 
     def _believes(self, match: Match) -> bool:
         return (
@@ -282,8 +188,7 @@ class FrontEnd:
 
     def _hold(self, observation: Observation, pose: Planar, match: Match | None) -> Estimate:
         """Accept a pose that was measured by a scan."""
-        is_weak = match is not None and match.weak_directions > 0
-        weak = is_weak or self._unsure is not None
+        weak = match is not None and match.weak_directions > 0
         if match is None:
             self.motion.skip()
         self._pose, self._held_pose, self._held_ns = pose, pose, observation.stamp_ns
@@ -341,14 +246,10 @@ class FrontEnd:
         )
 
     def _lose(self) -> Estimate:
-        """Stay at the last tracked pose; the robot may be anywhere that it can have come to."""
+        """Stay at the last tracked pose, and search the whole window from now on."""
         self._pose = self._held_pose
-        lost_s = 0.0
-        if self._stamp_ns is not None and self._held_ns is not None:
-            lost_s = (self._stamp_ns - self._held_ns) * 1e-9
-        self._covariance = (
-            np.diag((UNKNOWN_VELOCITY * lost_s)[[0, 0, 1]] ** 2) + self._held_covariance
-        )
+        window = np.array([self.matcher.window_m, self.matcher.window_m, self.matcher.window_rad])
+        self._covariance = np.diag(window**2)
         self.motion.stop()
         return Estimate(
             T_local_base=self._held_pose,
@@ -369,23 +270,10 @@ class FrontEnd:
         )
 
 
-def _reach(covariance: Matrix) -> Planar:
-    """Return how far (2,) [m, rad] a pose may be from the prediction with its covariance."""
-    position_m2 = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
-    return np.asarray(_REACH_SIGMAS * np.sqrt([max(position_m2, 0.0), covariance[2, 2]]))
-
-
 def _is_better(match: Match, other: Match) -> bool:
     """Tell whether a match is another pose than the other, and more of the scan fits there."""
     is_other = is_apart(difference(match.T_local_base, other.T_local_base))
     return is_other and match.inliers > other.inliers
-
-
-def _is_rival(match: Match, best: Match) -> bool:
-    """Tell whether a match is another pose than the best, and not much less likely."""
-    off = difference(match.T_local_base, best.T_local_base)
-    is_other = np.hypot(*off[:2]) > _RIVAL_M or abs(off[2]) > _RIVAL_RAD
-    return bool(is_other) and match.cost < best.cost + _SURE
 
 
 def _share(stamp_ns: int, before_ns: int | None, now_ns: int) -> float:
