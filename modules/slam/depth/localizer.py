@@ -93,22 +93,27 @@ class DepthLocalizer:
         `near`: or by the prediction, which then also tells what the image does not measure. It has
         to be consistent with the motion.
         """
-        found = [self._settled(samples, expected)] if near else []
-        for index in self._map.alike(surface, _ALIKE):
-            there = self._settled(samples, CameraPrior(self._map[index].T_local_cam, np.eye(6)))
-            if there is not None and there.localizability.ratios[0] >= self._weak_ratio:
-                found.append(there)
-        sure = []
-        for there in found:
-            if there is None or not self._is_verified(there, samples, surface):
-                continue
-            off = se3.log(se3.inverse(expected.T_local_cam) @ there.T_local_cam)
-            if off @ expected.information @ off < _FAR:
-                sure.append(there)
+        found = [self._by_similar(samples, index) for index in self._map.alike(surface, _ALIKE)]
+        if near:
+            found.insert(0, self._settled(samples, expected))
+        sure = [
+            one
+            for one in found
+            if one is not None
+            and _is_expected(one, expected)
+            and self._is_verified(one, samples, surface)
+        ]
         best = max(sure, key=lambda one: one.matched_ratio, default=None)
         if best is None or any(_is_apart(best, one) for one in sure):
             return None
         return best
+
+    def _by_similar(self, samples: Samples, index: int) -> SurfaceRegistration | None:
+        """Return the pose from a keyframe's, None where the image does not measure all of it."""
+        there = self._settled(samples, CameraPrior(self._map[index].T_local_cam, np.eye(6)))
+        if there is None or there.localizability.ratios[0] < self._weak_ratio:
+            return None
+        return there
 
     def _settled(self, samples: Samples, start: CameraPrior) -> SurfaceRegistration | None:
         """Return the pose from a start that may be far off: other keyframes overlap with it."""
@@ -145,6 +150,12 @@ def _verdicts(
     residuals, _, is_seen, is_same = compare(samples, other, T_other_cam, _SAME_M, grid)
     is_refuted = is_seen & (residuals < -_SAME_M)
     return np.array([is_same.sum(), is_refuted.sum()], np.float64)
+
+
+def _is_expected(found: SurfaceRegistration, expected: CameraPrior) -> bool:
+    """Tell whether a pose is consistent with the prediction."""
+    off = se3.log(se3.inverse(expected.T_local_cam) @ found.T_local_cam)
+    return bool(off @ expected.information @ off < _FAR)
 
 
 def _is_apart(one: SurfaceRegistration, other: SurfaceRegistration) -> bool:

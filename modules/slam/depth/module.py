@@ -94,8 +94,7 @@ class DepthSlam:
             return self._bridge(observation, prediction, can_coast=False)
         if not len(self._map):
             return self._start(observation, surface, samples, prediction)
-        after_gap = self._predictor.is_long_unmeasured(observation)
-        found = self._locate(samples, surface, prediction, after_gap=after_gap)
+        found = self._locate(observation, samples, surface, prediction)
         if found is None:
             return self._bridge(observation, prediction, can_coast=False)
         return self._hold(observation, surface, samples, prediction, found)
@@ -125,12 +124,13 @@ class DepthSlam:
         return self._answer(observation, status, 1.0, len(samples))
 
     def _locate(
-        self, samples: Samples, surface: Surface, prediction: Prediction, *, after_gap: bool
+        self, observation: Observation, samples: Samples, surface: Surface, prediction: Prediction
     ) -> SurfaceRegistration | None:
         prior = self._prior(prediction)
         before = None
         if not prediction.is_measured:
             before = self._predictor.T_local_measured @ self._camera.T_base_cam
+        after_gap = self._predictor.is_long_unmeasured(observation)
         return self._localizer.locate(samples, surface, prior, before, after_gap=after_gap)
 
     def _prior(self, prediction: Prediction) -> CameraPrior:
