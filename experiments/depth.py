@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from sceneslam.evaluation.accuracy import absolute_errors
-from sceneslam.experiments.scripts import settings
+from sceneslam.experiments.scripts import backwards, settings
 from sceneslam.modules.slam.depth.module import DepthSlam
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types.observation import Observation
@@ -66,12 +66,8 @@ def open_source(folder: Path) -> TumRgbd:
 def arranged(observations: Sequence[Observation], play: Play) -> list[Observation]:
     """Return the depth images alone, in the order and at the rate of the play."""
     chosen = observations[:: play.step]
-    if not play.is_reversed:
-        return [replace(one, image_bgr=None) for one in chosen]
-    ends_ns = chosen[0].stamp_ns + chosen[-1].stamp_ns
-    return [
-        replace(one, image_bgr=None, stamp_ns=ends_ns - one.stamp_ns) for one in reversed(chosen)
-    ]
+    dark = [replace(one, image_bgr=None) for one in chosen]
+    return backwards(dark) if play.is_reversed else dark
 
 
 def errors(poses: Trajectory, truth: Trajectory, play: Play) -> tuple[float, float]:

@@ -8,10 +8,10 @@ The overrides choose a recording as for a run, backwards with `backwards` before
     python experiments/gaps.py depth backwards source=tum_rgbd source.path=FOLDER
 
 A gap begins at each of 15 instants of the first 5000 observations, and ends after 1.5, 4 or 10 s.
-A module is found again with its first pose that is not LOST, of 60 observations; five later that is
-judged, by the ground truth, or where there is none by what the same module says with wheels, gyro
-and no gap: `wrong` by more than 0.3 m or 0.2 rad, and `unsaid` if that is also beyond three
-deviations of its covariances. The result is a Markdown table.
+A module is found again with its first pose that is not LOST, of 60 observations. The fifth after it
+is compared with the ground truth, or without one with the same module's where there are wheels,
+gyro and no gap: `wrong` above 0.3 m or 0.2 rad, `inconsistent` if that is also beyond three
+standard deviations of its covariances. The result is a Markdown table.
 """
 
 from __future__ import annotations
@@ -21,17 +21,13 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any, cast
 
 import numpy as np
-from hydra import compose, initialize_config_module
 from numpy.typing import NDArray
-from omegaconf import OmegaConf
 
-from sceneslam.config.component import ComponentBuilder
 from sceneslam.evaluation.association import interpolated
+from sceneslam.experiments.scripts import backwards, single
 from sceneslam.interfaces import SlamModule, Source
-from sceneslam.sources.contract.ordered import Ordered
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Sensor
@@ -55,27 +51,9 @@ class Return:
         return bool((self.error > WRONG).any())
 
     @property
-    def is_unsaid(self) -> bool:
-        """Tell whether its covariances do not hold that."""
+    def is_inconsistent(self) -> bool:
+        """Tell whether that is beyond its covariances, too."""
         return bool((self.error > np.maximum(WRONG, 3.0 * self.deviation)).any())
-
-
-def build(name: str, overrides: Sequence[str]) -> ComponentBuilder:
-    """Return what makes the source and the module."""
-    words = ["+scenario=single", f"slam@slam.only={name}", *overrides]
-    with initialize_config_module("sceneslam.conf", version_base="1.3"):
-        config = OmegaConf.to_container(compose("config", overrides=words), resolve=True)
-    return ComponentBuilder(cast(dict[str, Any], config))
-
-
-def backwards(observations: Sequence[Observation]) -> list[Observation]:
-    """Return the observations in the opposite order; samples of gyro and wheels are not turned."""
-    ends_ns = observations[0].stamp_ns + observations[-1].stamp_ns
-    turned = []
-    for one in reversed(observations):
-        scan = one.scan and replace(one.scan, stamp_ns=ends_ns - one.scan.stamp_ns)
-        turned.append(replace(one, stamp_ns=ends_ns - one.stamp_ns, scan=scan))
-    return turned
 
 
 def alone(observation: Observation) -> Observation:
@@ -125,8 +103,7 @@ def returned(
 def main(name: str, *words: str) -> None:
     """Play the recording once, and a copy of the module after each gap."""
     is_backwards = "backwards" in words
-    builder = build(name, [word for word in words if word != "backwards"])
-    source = Ordered(builder.make("source", Source))
+    source, builder = single(name, *(word for word in words if word != "backwards"))
     observations = list(islice(source, OBSERVATIONS))
     T = reference(builder.make("slam.only", SlamModule), source, observations)
     if is_backwards:
@@ -147,11 +124,12 @@ def main(name: str, *words: str) -> None:
             if len(chosen) == PATIENCE:
                 returns[gap_s].append(returned(copy.deepcopy(module), chosen, right, answer))
         answer = module.track(alone(observation))
-    print("| gap [s] | gaps | found | wrong | unsaid |\n| --- | --- | --- | --- | --- |")
+    print("| gap [s] | gaps | found | wrong | inconsistent |\n| --- | --- | --- | --- | --- |")
     for gap_s, some in returns.items():
         found = [one for one in some if one is not None]
-        wrong, unsaid = sum(one.is_wrong for one in found), sum(one.is_unsaid for one in found)
-        print(f"| {gap_s:g} | {len(some)} | {len(found)} | {wrong} | {unsaid} |", flush=True)
+        wrong = sum(one.is_wrong for one in found)
+        beyond = sum(one.is_inconsistent for one in found)
+        print(f"| {gap_s:g} | {len(some)} | {len(found)} | {wrong} | {beyond} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ import cProfile
 import pstats
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
 from time import perf_counter, process_time, sleep
 
@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 
 from sceneslam.evaluation.accuracy import absolute_errors
-from sceneslam.experiments.scripts import settings
+from sceneslam.experiments.scripts import backwards, settings
 from sceneslam.modules.slam.rgbd.module import RgbdSlam
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
@@ -124,12 +124,11 @@ def row(name: str, run: Run, truth: Trajectory) -> str:
     )
 
 
-def backwards(observations: list[Observation], truth: Trajectory):
-    """Return the recording from its end, with stamps that rise."""
-    turn_ns = observations[0].stamp_ns + observations[-1].stamp_ns
-    turned = [replace(o, stamp_ns=turn_ns - o.stamp_ns) for o in reversed(observations)]
-    return turned, Trajectory(
-        stamps_ns=(turn_ns - truth.stamps_ns)[::-1].copy(),
+def mirrored(truth: Trajectory, observations: list[Observation]) -> Trajectory:
+    """Return the true poses of the observations backwards."""
+    ends_ns = observations[0].stamp_ns + observations[-1].stamp_ns
+    return Trajectory(
+        stamps_ns=(ends_ns - truth.stamps_ns)[::-1].copy(),
         T_world_base=truth.T_world_base[::-1].copy(),
     )
 
@@ -140,8 +139,8 @@ def table(source: TumRgbd, truth: Trajectory) -> None:
     print(row("as it is", follow(source.rig, iter(source)), truth), flush=True)
     peaks_mb = [getrusage(who).ru_maxrss / 1024 for who in (RUSAGE_SELF, RUSAGE_CHILDREN)]
     observations = list(source)
-    turned, turned_truth = backwards(observations, truth)
-    print(row("backwards", follow(source.rig, turned), turned_truth), flush=True)
+    turned = follow(source.rig, backwards(observations))
+    print(row("backwards", turned, mirrored(truth, observations)), flush=True)
     print(row("every second image", follow(source.rig, observations[::2]), truth), flush=True)
     print(row("as it is, at 30 Hz", follow(source.rig, observations, period_s=1 / 30), truth))
     shown = " + ".join(f"{mb:.0f}" for mb in peaks_mb)

@@ -17,21 +17,18 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from itertools import islice
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
-from hydra import compose, initialize_config_module
 from numpy.typing import NDArray
-from omegaconf import OmegaConf
 
-from sceneslam.config.component import ComponentBuilder
 from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.evaluation.alignment import align
 from sceneslam.evaluation.association import interpolated
+from sceneslam.experiments.scripts import single
 from sceneslam.interfaces import SlamModule, Source
 from sceneslam.modules.slam.rgbd.map.keyframes import KeyframeStore
 from sceneslam.modules.slam.rgbd.module import RgbdSlam
-from sceneslam.sources.contract.ordered import Ordered
 from sceneslam.types import se3
 from sceneslam.types.maps import PoseGraphLayer
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
@@ -53,11 +50,7 @@ def build(
     overrides: Iterable[str], module_name: str = "rgbd"
 ) -> tuple[Source, RgbdSlam, Trajectory]:
     """Return a source, the module made ready for it, and the true poses."""
-    words = ["+scenario=single", f"slam@slam.only={module_name}", *overrides]
-    with initialize_config_module("sceneslam.conf", version_base="1.3"):
-        config = OmegaConf.to_container(compose("config", overrides=words), resolve=True)
-    builder = ComponentBuilder(cast(dict[str, Any], config))
-    source = Ordered(builder.make("source", Source))
+    source, builder = single(module_name, *overrides)
     module = cast(RgbdSlam, builder.make("slam.only", SlamModule))
     module.activate(source.rig)
     truth = source.ground_truth()
