@@ -75,7 +75,7 @@ def _check(policy: Policy, now: Situation, logged: Any) -> list[str]:
 
 
 def _situation(event: Event) -> Situation:
-    values = {field.name: event[field.name] for field in fields(Situation)}
+    values = {field.name: event[field.name] for field in fields(Situation) if field.name in event}
     values |= {"health": Health(values["health"]), "trial": StandbyTrial(values["trial"])}
     values |= {key: tuple(values[key]) for key in ("choices", "served_choices")}
     return Situation(**values | {"tried": frozenset(values["tried"])})

@@ -9,12 +9,13 @@ from test_atlas_places import S, corner_of, quality, scan_of
 from sceneslam.atlas.places import localizer
 from sceneslam.atlas.places.localizer import LocalizationEvent, Look, MapLocalizer
 from sceneslam.atlas.places.plan_field import PlanField
+from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.types import planar, se3
 from sceneslam.types.rig import Camera
 from sceneslam.views.placed_views import Sighting
 
 
-class Scripted:
+class Scripted(Recognizer):
     """A recognizer that answers as it is told, and keeps what it was asked."""
 
     def __init__(self, monkeypatch):

@@ -13,6 +13,7 @@ from sceneslam.atlas.lasting.merge import join_pieces
 from sceneslam.atlas.lasting.prune import prune
 from sceneslam.atlas.lasting.saved_map import SavedMap, forget_contradicted
 from sceneslam.atlas.places.floor_plan import join
+from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.graphs.edge import Edge, EdgeKind
@@ -219,7 +220,7 @@ def test_what_was_connected_stays_so_whatever_is_removed(seed):
 # What is joined.
 
 
-class Found:
+class Found(Recognizer):
     """A recognizer of pieces that finds each plan where it is told."""
 
     def __init__(self, monkeypatch, answers):

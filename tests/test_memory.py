@@ -9,9 +9,16 @@ from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.observation_buffer import BufferedObservation, ObservationBuffer
 from sceneslam.bus.recent import CovarianceMonitor
 from sceneslam.types import se3
+from sceneslam.types.observation import Tracking, TrackingStatus
 
 
-def moment(index, *, is_trusted=True, has_pose=True):
+def tracked(index):
+    return Tracking(
+        stamp_ns=index * PERIOD_NS, T_local_base=se3.identity(), status=TrackingStatus.TRACKING
+    )
+
+
+def moment(index, *, is_trusted=True, has_pose=True, is_tracked=True):
     image = np.zeros((100, 100, 3), np.uint8)  # 30 kB
     return BufferedObservation(
         observation=replace(observation(index), image_bgr=image),
@@ -19,7 +26,7 @@ def moment(index, *, is_trusted=True, has_pose=True):
         module="a",
         bridge=Bridge(is_active=True),
         turn=None,
-        tracking=None,
+        tracking=tracked(index) if is_tracked else None,
         is_trusted=is_trusted,
     )
 
@@ -49,6 +56,14 @@ def test_memory_thins_old_images_and_keeps_every_moment():
 def test_memory_of_a_run_with_one_module_holds_one_image():
     moments = filled(20, keeps_sensors=False).after(-1)
     assert [m.observation.image_bgr is not None for m in moments] == [False] * 19 + [True]
+
+
+def test_memory_of_one_module_holds_the_images_since_it_was_lost():
+    memory = filled(20, keeps_sensors=False, is_tracked=lambda index: index < 12)
+    held = [m.observation.image_bgr is not None for m in memory.after(-1)]
+    assert held == [False] * 11 + [True] * 9
+    memory.add(moment(20))
+    assert [m.observation.image_bgr is not None for m in memory.after(-1)] == [False] * 20 + [True]
 
 
 def test_anchor_is_the_newest_trusted_moment_before_the_scene_began():

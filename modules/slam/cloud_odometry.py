@@ -109,7 +109,7 @@ class CloudOdometry(ABC):
             overlap_ratio >= self.overlap_min_ratio
             and self._is_plausible(observation, prediction, T_local_icp)
         ):
-            return self._bridge(observation, prediction, can_coast=False)
+            return self._bridge(observation, prediction, can_coast=False, can_begin=True)
         shape = self._icp.localizability()
         self._T_local_base = self._fuse(observation, prediction, T_local_icp, shape)
         self._icp.accept(prediction.T_local_base, self._T_local_base)
@@ -177,7 +177,12 @@ class CloudOdometry(ABC):
         )
 
     def _bridge(
-        self, observation: Observation, prediction: Prediction, *, can_coast: bool
+        self,
+        observation: Observation,
+        prediction: Prediction,
+        *,
+        can_coast: bool,
+        can_begin: bool = False,
     ) -> Tracking:
         """Return the pose by odometry, or shortly by constant velocity, else LOST."""
         can_coast = can_coast and self._has_map
@@ -185,4 +190,6 @@ class CloudOdometry(ABC):
         is_lost = status is TrackingStatus.LOST
         kept = self._predictor.T_local_measured if is_lost else prediction.T_local_base
         self._T_local_base = kept
-        return self._predictor.tracking(observation, self._T_local_base, status)
+        return self._predictor.tracking(
+            observation, self._T_local_base, status, can_begin=can_begin
+        )

@@ -72,7 +72,7 @@ def covariances(path: PosedPath, *, loops: Sequence[Edge], bridge: Drift) -> NDA
     for first, last in pairwise(rows):
         claim, driven = path.claim(slice(first, last)), moved[last] - moved[first]
         if sessions[first] != sessions[last]:  # one begins where the other ended
-            drift = _carried(beside[first], T[first], T[last])
+            drift = _carried(beside[first], T[first], T[last]) + maps[last]
         else:
             drift = drifted(MAPPED, driven) if claim is None else _submaps(driven) * claim
             drift = drift + grown(maps[first], maps[last], se3.inverse(T[last]) @ T[first])

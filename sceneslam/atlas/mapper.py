@@ -125,13 +125,11 @@ class Mapper:
         self._is_news = False
         chain = self._collector.chain
         if self.is_placed or not self._solved.loops:
-            stamps_ns = [submap.stamps_ns[0] for submap in chain.submaps] or [0]
-            T_new_old = np.array(self._located(len(stamps_ns)))
+            T_new_old = np.array(self._located(max(len(chain), 1)))
         else:
             nodes = self._solved.T_map_node
-            stamps_ns = [submap.stamps_ns[0] for submap in chain.submaps[: len(nodes)]]
             T_new_old = nodes @ se3.inverse(np.array(chain.T_run_node[: len(nodes)]))
-        return Correction(stamps_ns=np.array(stamps_ns, np.int64), T_new_old=T_new_old)
+        return self._correction(T_new_old)
 
     def rewind(self, stamp_ns: int) -> None:
         """Remove what was made of poses from a stamp on: they are replaced."""
@@ -215,10 +213,7 @@ class Mapper:
         self._tell_loops()
         if not (self._solved.loops or chain.is_upright or self.is_placed):
             return Correction.none()
-        return Correction(
-            stamps_ns=np.array([submap.stamps_ns[0] for submap in chain.submaps], np.int64),
-            T_new_old=self._solved.T_map_node @ se3.inverse(old),
-        )
+        return self._correction(self._solved.T_map_node @ se3.inverse(old))
 
     def loops(self, stamps_ns: NDArray[np.int64]) -> list[Edge]:
         """Return the accepted loops between rows of the path with these stamps (N,)."""
@@ -307,6 +302,23 @@ class Mapper:
         _log.info("graph", exc_info=error)
         self.faults.append(f"{what}, its last solution stays: {text_of(error)}")
         self._graph = None
+
+    def _correction(self, T_new_old: NDArray[np.float64]) -> Correction:
+        """Return the correction by those of the first submaps (N, 4, 4).
+
+        A piece of the run moves alone: from the end of the one before to its beginning they jump.
+        """
+        chain = self._collector.chain
+        stamps_ns = [int(submap.stamps_ns[0]) for submap in chain.submaps[: len(T_new_old)]] or [0]
+        knots = dict(zip(stamps_ns, T_new_old, strict=True))
+        for start in chain.starts[1:]:
+            if start < len(stamps_ns) and (known := self._known(stamps_ns[start])) is not None:
+                knots.setdefault(known.begun_ns - 1, T_new_old[start - 1])
+                knots.setdefault(known.begun_ns, T_new_old[start])
+        return Correction(
+            stamps_ns=np.array(sorted(knots), np.int64),
+            T_new_old=np.array([knots[stamp_ns] for stamp_ns in sorted(knots)]),
+        )
 
     def _last_solved(self, T_map_node: NDArray[np.float64]) -> SolvedRun:
         """Return the last solution during the run, for all of its nodes (N, 4, 4).

@@ -130,6 +130,7 @@ class PosePath:
             module=self.modules[row],
             covariance=self.covariance_at(row),
             of_map=np.nan_to_num(_square(self._maps[row])),
+            begun_ns=self.stamps_ns[bisect_left(self.sessions, self.sessions[row])],
         )
 
     def session_starts(self) -> list[SessionStart]:

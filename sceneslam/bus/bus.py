@@ -255,6 +255,7 @@ class Bus:
             trial=self._changeover.trial,
             retry_ns=self._candidates.retry_ns,
             may_return=bool(self._candidates.returning(self.scene)),
+            adrift_since_ns=hold.adrift_since_ns,
         )
 
     def _send(self, event: str, stamp_ns: int) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from sceneslam.bus.decision import Decision, Situation, StandbyTrial
+from sceneslam.bus.decision import Decision, Health, Situation, StandbyTrial
 from sceneslam.bus.estimator import Estimator
 from sceneslam.bus.events import EventLog
 from sceneslam.bus.handover import Handover
@@ -88,6 +88,7 @@ class _Attempt:
     is_trial: bool = False  # it began on standby beside the fallback
     is_begun: bool = False  # it is being started, or was
     handover: Handover | None = None  # None until it has started
+    from_ns: int | None = None  # it begins anew with this observation
 
 
 class Changeover:
@@ -138,11 +139,14 @@ class Changeover:
         while self._attempt is not None or self._queue:
             if self._attempt is None:
                 runner = self._runners[self._queue.pop(0)]
+                from_ns = None
                 if runner is self._estimator.active:
-                    if not runner.is_failed:
+                    if not runner.is_failed and self._verdict.reason != Health.LOST:
                         break  # the active module stays, as the fallback
+                    from_ns = self._now.adrift_since_ns
                     self._estimator.retire()  # before it is started again
                 self._attempt = self._start(runner, stamp_ns)
+                self._attempt.from_ns = from_ns
             is_accepted = self._lead(self._attempt, stamp_ns)
             if is_accepted is None:
                 return None
@@ -253,7 +257,9 @@ class Changeover:
         if attempt.handover is None:
             if not runner.has_started():
                 return None
-            attempt.handover = self._estimator.begin(runner, self._since_ns, is_trial=is_trial)
+            attempt.handover = self._estimator.begin(
+                runner, self._since_ns, is_trial=is_trial, from_ns=attempt.from_ns
+            )
         has_caught_up = attempt.handover.advance(None if is_trial else self._limit)
         return attempt.handover if has_caught_up else None
 

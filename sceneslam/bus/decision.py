@@ -52,6 +52,7 @@ class Situation:
     trial: StandbyTrial
     retry_ns: int  # when the first choice may be tried again
     may_return: bool  # a failed module will return: the run may go on without any
+    adrift_since_ns: int | None = None  # since when the active one is lost where it could begin
 
 
 class Action(StrEnum):
@@ -105,7 +106,8 @@ def _decide_on_loss(policy: Policy, now: Situation) -> Decision:
 
     Modules that were tried may be tried again in two cases: the active one had tracked for a
     window before it was lost, or no other module is left and it has been lost for a window. The
-    window doubles each time, so that modules do not alternate.
+    window doubles each time, so that modules do not alternate. A module that sees enough, and for
+    long nothing of its map, begins anew where no other takes over.
     """
     lost_ns = now.stamp_ns - now.unheld_since_ns
     window_ns = round(policy.confirm_window_s * 1e9)
@@ -118,11 +120,19 @@ def _decide_on_loss(policy: Policy, now: Situation) -> Decision:
         left, rounds = others, 0
     elif not left and lost_ns >= window_ns << now.rounds:
         left, rounds = others, now.rounds + 1
+    if _is_adrift(policy, now):
+        left = (*left, now.active)  # anew, with an empty map
     is_over = now.health is Health.FAILED or lost_ns >= _patience_ns(policy, now)
     is_waiting = not left and not now.active and now.may_return
     if not is_over or is_waiting or (not left and now.health is not Health.FAILED):
         return GO_ON
     return Decision(action=Action.SWITCH, to=left, reason=now.health.value, rounds=rounds)
+
+
+def _is_adrift(policy: Policy, now: Situation) -> bool:
+    if now.health is not Health.LOST or now.adrift_since_ns is None:
+        return False
+    return now.stamp_ns - now.adrift_since_ns >= round(policy.retry_s * 1e9)
 
 
 def _patience_ns(policy: Policy, now: Situation) -> int:

@@ -77,15 +77,25 @@ class Estimator:
         if session.fault is not None:
             self._log.add_fault(moment.stamp_ns, str(session.fault))
 
-    def begin(self, runner: Runner, since_ns: int | None, *, is_trial: bool) -> Handover:
+    def begin(
+        self,
+        runner: Runner,
+        since_ns: int | None,
+        *,
+        is_trial: bool,
+        from_ns: int | None = None,
+    ) -> Handover:
         """Begin to hand over to a module that has started.
 
         `since_ns`: when the scene that calls for it began, None for another reason. A trial begins
-        now, whatever the kind of hand-over.
+        now, whatever the kind of hand-over. `from_ns`: the first observation that it gets, where
+        none before it is of use.
         """
         anchor = self._memory.newest
         if self._policy.handover == "rewind" and not is_trial:
             anchor = self._memory.anchor(since_ns)
+        if from_ns is not None:
+            anchor = self._memory.after(from_ns - 1)[0]
         session = self._new_session(runner, anchor.bridge.copy())
         return Handover(
             session,

@@ -34,6 +34,7 @@ class Hold:
         self.degraded_ns = -1  # stamp of its last answer that was DEGRADED
         self.is_revised = False  # its last pose jumped because it corrected its past
         self.unheld_since_ns: int | None = None
+        self.adrift_since_ns: int | None = None  # since when it is lost where it could begin a map
         self.held_since_ns: int | None = None
         self.held_ns = 0  # how long it had tracked without a break before that
         self.turn: NDArray[np.float64] | None = None  # its last (3, 3) rotation, if trusted
@@ -104,7 +105,13 @@ class Hold:
         if self._fed_ns is not None:
             self._intervals_ns.append(tracking.stamp_ns - self._fed_ns)
         self._fed_ns, self.status = tracking.stamp_ns, tracking.status
-        if tracking.status is not TrackingStatus.LOST:  # else its pose is the one before
+        if tracking.status is TrackingStatus.LOST:  # its pose is the one before
+            if not tracking.can_begin:
+                self.adrift_since_ns = None
+            elif self.adrift_since_ns is None:
+                self.adrift_since_ns = tracking.stamp_ns
+        else:
+            self.adrift_since_ns = None
             self.is_revised = tracking.revision != self._revision
             self._revision = tracking.revision
 

@@ -65,8 +65,8 @@ class ObservationBuffer:
         old_ns = moment.stamp_ns - self._span_ns - 1
         del self._moments[: _count(self._moments, old_ns)]
         self._drop(slice(0, _count(self._full, old_ns)))
-        if not self._keeps_sensors and len(self._full) > 1:
-            self._strip(-2)
+        while not self._keeps_sensors and moment.tracking is not None and len(self._full) > 1:
+            self._strip(0)
         while self._bytes > self._limit_bytes and len(self._full) > 2:
             self._strip(self._least_missed())
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.decision import Health
 from sceneslam.bus.hold import Hold
 from sceneslam.bus.observation_buffer import BufferedObservation
 from sceneslam.bus.runner import Runner
 from sceneslam.types import se3
+from sceneslam.types.covariance import wandered
 from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.run import BRIDGED
@@ -40,6 +44,8 @@ class ModuleSession:
         self.from_ns = 0  # its poses after it are the module's
         self.suspicion: Suspicion | None = None
         self.is_acquitted = False  # the last suspicion ended: the wheels were wrong
+        # Where it was placed, and the covariance (6, 6) of that: the motion to it was not measured.
+        self._guess: tuple[Transform, NDArray[np.float64]] | None = None
 
     @property
     def key(self) -> str:
@@ -77,7 +83,9 @@ class ModuleSession:
             else:
                 self.hold.spare(observation)
             if self.tracking is not None:
-                return self._moment(observation, self._place(observation, self.tracking))
+                T_map_tracked = self._place(observation, self.tracking)
+                self.tracking = self._doubted(self.tracking)
+                return self._moment(observation, T_map_tracked)
         except ModuleError as error:
             self.fault, self.tracking = error, None
         if not self.is_running:
@@ -126,13 +134,25 @@ class ModuleSession:
         """Return T_map_base; a module's first pose is the bridged one, handed over (Eq. 1)."""
         assert self.runner is not None
         if not self.is_placed:
-            self.bridge.predict(observation, by_velocity=True)
+            self._guess = None
+            if self.bridge.predict(observation, by_velocity=True) is None:
+                unknown = wandered(self.bridge.unknown_s(observation.stamp_ns))
+                self._guess = tracking.T_local_base, unknown
             self.runner.place(self.bridge.T_map_base @ se3.inverse(tracking.T_local_base))
             self.is_placed = True
         assert self.runner.T_map_local is not None
         T_map_base = self.runner.T_map_local @ tracking.T_local_base
         self.bridge.update(observation, T_map_base, is_jump=self.hold.is_revised)
         return T_map_base
+
+    def _doubted(self, tracking: Tracking) -> Tracking:
+        """Return an answer whose map's covariance includes that of where it was placed."""
+        if self._guess is None:
+            return tracking
+        T_local_placed, unknown = self._guess
+        T_base_placed = se3.inverse(tracking.T_local_base) @ T_local_placed
+        known = np.zeros((6, 6)) if tracking.map_covariance is None else tracking.map_covariance
+        return replace(tracking, map_covariance=known + se3.carried(unknown, T_base_placed))
 
     def _moment(
         self, observation: Observation, T_map_base: Transform | None
@@ -144,6 +164,6 @@ class ModuleSession:
             module=BRIDGED if tracking is None else self.key,
             bridge=self.bridge.copy(),
             turn=self.hold.turn if self.is_running else None,
-            tracking=self.hold.answer,
+            tracking=self.hold.answer if tracking is None else tracking,
             is_trusted=tracking is not None and self.hold.is_trusted,
         )

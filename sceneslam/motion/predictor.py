@@ -133,6 +133,7 @@ class Predictor:
         quality_ratio: float = 0.0,
         inliers: int = 0,
         revision: int = 0,
+        can_begin: bool = False,
     ) -> Tracking:
         """Return the answer with a pose (4, 4); the covariance is the predictor's unless LOST."""
         return Tracking(
@@ -143,6 +144,7 @@ class Predictor:
             quality_ratio=quality_ratio,
             inliers=inliers,
             revision=revision,
+            can_begin=can_begin and status is TrackingStatus.LOST,
         )
 
     def correct(self, T_new_old: Transform) -> None:

@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
 
+_WALK_M_PER_S, _TURN_RAD_PER_S = 1.0, 1.0  # standard deviations of a sensor that is carried
+
 
 def covariance_of(information: Matrix, *, unmeasured: float) -> Matrix:
     """Return the inverse of a symmetric information (N, N), of which `unmeasured` is the least.
@@ -15,6 +17,11 @@ def covariance_of(information: Matrix, *, unmeasured: float) -> Matrix:
     """
     values, vectors = np.linalg.eigh(information)
     return np.asarray((vectors / np.maximum(values, unmeasured)) @ vectors.T)
+
+
+def wandered(lost_s: float) -> Matrix:
+    """Return the covariance (6, 6) [m, rad] of the motion in a time of which nothing is known."""
+    return np.diag(np.repeat([_WALK_M_PER_S, _TURN_RAD_PER_S], 3) * lost_s) ** 2
 
 
 def updated(before: Matrix, gain: Matrix, seen: Matrix, noise: Matrix) -> Matrix:

@@ -119,3 +119,4 @@ class Tracking:
     quality_ratio: float = 1.0  # 0 (nothing matched) to 1
     inliers: int = 0  # measurements that agree with the pose
     revision: int = 0  # increases when the module corrects its past; the pose may then jump
+    can_begin: bool = False  # of a LOST answer: the sensors show enough to begin a map here

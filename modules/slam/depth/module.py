@@ -96,7 +96,8 @@ class DepthSlam:
             return self._start(observation, surface, samples, prediction)
         found = self._locate(observation, samples, surface, prediction)
         if found is None:
-            return self._bridge(observation, prediction, can_coast=False)
+            can_begin = bool(samples.localizability().ratios[0] >= self.weak_ratio)
+            return self._bridge(observation, prediction, can_coast=False, can_begin=can_begin)
         return self._hold(observation, surface, samples, prediction, found)
 
     def get_trajectory(self) -> Trajectory:
@@ -199,17 +200,28 @@ class DepthSlam:
         self._graph.connect(self._reference, in_cam)
 
     def _bridge(
-        self, observation: Observation, prediction: Prediction, *, can_coast: bool
+        self,
+        observation: Observation,
+        prediction: Prediction,
+        *,
+        can_coast: bool,
+        can_begin: bool = False,
     ) -> Tracking:
         """Return the pose by odometry, or shortly by constant velocity, else LOST."""
         can_coast = can_coast and len(self._map) > 0
         status = self._predictor.bridge(observation, prediction, can_coast=can_coast)
         if status is not TrackingStatus.LOST:
             self._T_local_base = prediction.T_local_base
-        return self._answer(observation, status, 0.0, 0)
+        return self._answer(observation, status, 0.0, 0, can_begin=can_begin)
 
     def _answer(
-        self, observation: Observation, status: TrackingStatus, quality_ratio: float, inliers: int
+        self,
+        observation: Observation,
+        status: TrackingStatus,
+        quality_ratio: float,
+        inliers: int,
+        *,
+        can_begin: bool = False,
     ) -> Tracking:
         if status is not TrackingStatus.LOST and len(self._map):
             self._history.add(observation.stamp_ns, self._reference, self._T_local_base)
@@ -220,6 +232,7 @@ class DepthSlam:
             quality_ratio=quality_ratio,
             inliers=inliers,
             revision=self._revision,
+            can_begin=can_begin,
         )
         if tracking.covariance is None:
             return tracking

@@ -107,7 +107,8 @@ class DirectSlam:
             return self._hold(observation, prediction, view, found)
         if prediction.is_measured:
             return self._begin(observation, prediction, view)
-        return self._bridge(observation, prediction, can_coast=False)
+        can_begin = bool(np.count_nonzero(view.depth_m) >= _PIXELS_MIN)
+        return self._bridge(observation, prediction, can_coast=False, can_begin=can_begin)
 
     def get_trajectory(self) -> Trajectory:
         """Return no poses: nothing is revised."""
@@ -200,7 +201,12 @@ class DirectSlam:
         self._keyframes.add(observation.stamp_ns, view, self._T_local_key, information)
 
     def _bridge(
-        self, observation: Observation, prediction: Prediction, *, can_coast: bool
+        self,
+        observation: Observation,
+        prediction: Prediction,
+        *,
+        can_coast: bool,
+        can_begin: bool = False,
     ) -> Tracking:
         """Return the pose by odometry, or shortly by constant velocity, else LOST."""
         can_coast = can_coast and self._key is not None
@@ -208,4 +214,6 @@ class DirectSlam:
         is_lost = status is TrackingStatus.LOST
         kept = self._predictor.T_local_measured if is_lost else prediction.T_local_base
         self._T_local_base = kept
-        return self._predictor.tracking(observation, self._T_local_base, status)
+        return self._predictor.tracking(
+            observation, self._T_local_base, status, can_begin=can_begin
+        )

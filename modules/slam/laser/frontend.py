@@ -48,6 +48,7 @@ class Estimate:
     status: TrackingStatus
     quality_ratio: float
     inliers: int
+    can_begin: bool = False  # lost, and the scan is enough to begin a map
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,7 +214,7 @@ class FrontEnd:
             return self._guess(predicted, TrackingStatus.TRACKING)
         if motion.is_measured:
             return self._guess(predicted, TrackingStatus.DEGRADED)
-        return self._lose()
+        return self._lose(can_begin=False)
 
     def _distrust(
         self,
@@ -227,7 +228,7 @@ class FrontEnd:
         """Continue without the match: by dead reckoning, or else as lost."""
         self._failures += 1
         if not motion.is_measured:
-            return self._lose()
+            return self._lose(can_begin=True)
         unknown = match.overlap_ratio < _OVERLAP_MIN_RATIO or self._failures >= _FAILURES_MAX
         if unknown and self.keyframes.is_due(predicted):
             self._extend(predicted, scan, surfaces)
@@ -245,7 +246,7 @@ class FrontEnd:
             inliers=0,
         )
 
-    def _lose(self) -> Estimate:
+    def _lose(self, *, can_begin: bool) -> Estimate:
         """Stay at the last tracked pose, and search the whole window from now on."""
         self._pose = self._held_pose
         window = np.array([self.matcher.window_m, self.matcher.window_m, self.matcher.window_rad])
@@ -258,6 +259,7 @@ class FrontEnd:
             status=TrackingStatus.LOST,
             quality_ratio=0.0,
             inliers=0,
+            can_begin=can_begin,
         )
 
     def _extend(self, T_local_base: Planar, scan: LaserScan, surfaces: SurfacePoints) -> None:

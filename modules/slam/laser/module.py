@@ -117,6 +117,7 @@ class LaserSlam:
             map_covariance=_in_base(estimate, estimate.map_covariance, level=0.0),
             quality_ratio=estimate.quality_ratio,
             inliers=estimate.inliers,
+            can_begin=estimate.can_begin,
         )
 
     def get_trajectory(self) -> Trajectory:

@@ -91,8 +91,8 @@ def _loops_by_walls(saved: SavedMap, piece: int, own: Sequence[int]) -> list[Edg
         around = own[max(row - _AROUND, 0) : row + _AROUND + 1]
         near = [index for index in around if saved.submaps[index].run == saved.submaps[node].run]
         query = join([(planar.between(plane[node], plane[i]), saved.submaps[i].plan) for i in near])
-        match = target.recognize(PlanField(query), None) if len(query) else None
-        if match is not None and not match.weak_directions:
+        match = target.locate(query)
+        if match is not None:
             T_map_node = planar.to_transform(match.T_target_query)
             found.append(_edge_to(saved, piece, node, T_map_node, on_floor(match.covariance)))
     return found

@@ -206,13 +206,12 @@ class MapLocalizer:
     def _by_walls(self, latest: Sequence[Look]) -> Fix | None:
         """Return the pose by the walls around the last metres, searched in all of the map."""
         assert self._walls is not None
-        newest, query = latest[-1], _query(latest)
-        match = self._walls.recognize(PlanField(query), None) if len(query) else None
-        is_found = match is not None and not match.weak_directions
-        self._vain = 0 if is_found else self._vain + 1
+        newest = latest[-1]
+        match = self._walls.locate(_query(latest))
+        self._vain = 0 if match is not None else self._vain + 1
         period_s = _PERIOD_S * 2.0 ** min(self._vain // _PATIENCE, _DOUBLINGS)
         self._next_walls_ns = newest.stamp_ns + round(period_s * 1e9)
-        if match is None or not is_found:
+        if match is None:
             if self._guess is not None and not self._guess.fix.is_by_view:
                 self._guess = None  # two searches by walls have to agree in a row
             return None

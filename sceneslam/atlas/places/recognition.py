@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sceneslam.atlas.places.floor_plan import FloorPlan
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.plan_search import PlanSearch, SearchWindow, is_apart
 from sceneslam.atlas.places.registration import PlanRegistration, register
@@ -53,6 +54,11 @@ class Recognizer:
             and not one.is_refuted
         ]
         return None if rivals else best
+
+    def locate(self, plan: FloorPlan) -> PlanRegistration | None:
+        """Return where in all of the target a plan lies; None if walls leave a direction open."""
+        match = self.recognize(PlanField(plan), None) if len(plan) else None
+        return None if match is None or match.weak_directions else match
 
     def _candidates(self, query: PlanField, window: SearchWindow | None) -> list[PlanRegistration]:
         if window is not None and window.half_m <= _NEAR_M and window.half_rad <= _NEAR_RAD:

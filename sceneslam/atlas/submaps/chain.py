@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from sceneslam.atlas.submaps.own_loops import Path
 from sceneslam.atlas.submaps.path_drift import summed
 from sceneslam.atlas.submaps.submap import Submap
-from sceneslam.graphs.edge import Edge
+from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
+
+_GUESSED_M = 0.4  # as after half a second of unknown motion: nothing else errs by so much
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -33,6 +35,11 @@ class Chain:
     def is_upright(self) -> bool:
         """Tell whether the vertical direction was measured, anywhere."""
         return any(submap.up is not None for submap in self.submaps)
+
+    @property
+    def starts(self) -> list[int]:
+        """Return the submaps with which a piece begins: nothing measured the motion to it."""
+        return [0, *(motion.second for motion in self.motions if _is_guessed(motion))]
 
     def append(self, submap: Submap, T_run_node: Transform, motion: Edge | None) -> None:
         """Add a submap with the motion to it, None for the first."""
@@ -88,3 +95,7 @@ class Chain:
             replace(edge, T_first_second=se3.inverse(poses[edge.first]) @ poses[edge.second])
             for edge in self.motions
         ]
+
+
+def _is_guessed(motion: Edge) -> bool:
+    return motion.kind is EdgeKind.HANDOVER and bool(motion.covariance[0, 0] > _GUESSED_M**2)

@@ -43,6 +43,7 @@ class Known:
     covariance: NDArray[np.float64] | None  # (6, 6), as the module reported it
     # (6, 6) of the drift of its map
     of_map: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)))
+    begun_ns: int = 0  # first pose of the session
 
 
 # Stamp, scan, the measured vertical direction (3,) in base, and a view to be kept.

@@ -36,6 +36,7 @@ class LoopQuery:
     T_run_node: NDArray[np.float64]  # (N, 4, 4)
     plane: NDArray[np.float64]  # (N, 3), the nodes in the plane [m, m, rad]
     drift: PathDrift
+    starts: Sequence[int]  # with these a piece begins: the motion to them is hardly known
 
     @classmethod
     def of(cls, chain: Chain, second: int) -> LoopQuery:
@@ -46,6 +47,7 @@ class LoopQuery:
             T_run_node=np.array(chain.T_run_node),
             plane=planar.from_transforms(chain.T_run_node),
             drift=PathDrift.of(chain.drift),
+            starts=chain.starts,
         )
 
     def to(self, second: int) -> LoopQuery:
@@ -56,6 +58,11 @@ class LoopQuery:
     def submap(self) -> Submap:
         """Return the submap to which loops are searched."""
         return self.submaps[self.second]
+
+    @property
+    def start(self) -> int:
+        """Return the submap with which the piece of `second` begins."""
+        return max(start for start in self.starts if start <= self.second)
 
     def reach_m(self, first: int | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return how far [m] (...) the submap may be off, as seen from earlier ones (...)."""

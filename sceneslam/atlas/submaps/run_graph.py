@@ -22,12 +22,13 @@ from sceneslam.atlas.submaps.graph import (
 from sceneslam.atlas.submaps.loop_query import NEIGHBOURS, LoopQuery
 from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops
 from sceneslam.atlas.submaps.path_drift import PathDrift
+from sceneslam.atlas.submaps.piece_loops import PieceLoops
 from sceneslam.atlas.submaps.plan_loops import PlanLoops
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.atlas.submaps.uprights import straightened, uprights
 from sceneslam.atlas.submaps.view_loops import ViewLoops
 from sceneslam.graphs.edge import Edge, EdgeKind
-from sceneslam.types import se3
+from sceneslam.types import planar, se3
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.se3 import Transform
 
@@ -67,11 +68,13 @@ class RunGraph:
         self._loaded, self._count = loaded, len(loaded.submaps)
         self._is_closed, self._moves_loaded = is_closed, moves_loaded
         self._plans, self._views = PlanLoops(self._may_close), ViewLoops(self._may_close)
+        self._pieces = PieceLoops()
         self._seen = self._planned = 0  # submaps to which loops were searched, by views and plans
         self._found = Agreement()  # loops between submaps of the run
         self._agreed: list[Edge] = []  # of these, used in the last solution
         self._accepted: list[Edge] = []  # of these, not rejected by it
         self._T_map_node = np.zeros((0, 4, 4))  # the last solution
+        self._starts: frozenset[int] = frozenset()  # submaps with which a piece begins
 
     def forget(self, count: int) -> None:
         """Forget all submaps but the first `count`: others took their place."""
@@ -82,6 +85,7 @@ class RunGraph:
         self._found.cut(count)
         self._accepted = [edge for edge in self._accepted if edge.second < count]
         self._plans.forget(count)
+        self._pieces.forget(count)
         self._views.forget(count)
 
     def extend(self, chain: Chain, *, is_level: bool) -> SolvedRun:
@@ -178,12 +182,15 @@ class RunGraph:
     def _search(self, chain: Chain, *, is_level: bool) -> None:
         """Look for loops to the submaps that were not searched yet; plans show a level floor."""
         loops, query = list[Edge](), LoopQuery.of(chain, self._seen)
+        self._starts = frozenset(query.starts)
+        plane = planar.from_transforms(self._T_map_node)
         for second in range(self._seen, len(chain)):
             found, views = self._views.loops_to(query.to(second))
             loops += found
             chain.submaps[second] = replace(chain.submaps[second], views=views)
         for second in range(self._planned, len(chain) if is_level else 0):
             loops += self._plans.loops_to(query.to(second))
+            loops += self._pieces.loops_to(query.to(second), plane)
         self._seen, self._planned = len(chain), len(chain) if is_level else self._planned
         if loops:
             self._found.add(loops, query.T_run_node, query.drift)
@@ -192,7 +199,7 @@ class RunGraph:
         """Tell whether a loop may lead from a submap to a later one: not within closed sessions."""
         a, b = submaps[first], submaps[second]
         if (a.run, a.session) != (b.run, b.session):
-            return second - first > 1
+            return second - first > 1 or second in self._starts
         return second - first > 2 * NEIGHBOURS and not self._is_closed(a.session)
 
     def _fix_edges(self, fixes: Sequence[Fix], ends: _Ends) -> list[Edge]:

@@ -155,7 +155,7 @@ def motion_covariance(poses: Sequence[KeyPose]) -> Covariance:
 def _grown(poses: Sequence[KeyPose]) -> Covariance:
     """Return the growth (6, 6) of a module's covariances over its poses, in axes of the last.
 
-    Beyond the end of its session nothing is known of its map.
+    Beyond the end of its session, it is what is known of the next one's map.
     """
     first, end = poses[0], poses[-1]
     last = [pose for pose in poses if pose.session == first.session][-1]
@@ -163,7 +163,8 @@ def _grown(poses: Sequence[KeyPose]) -> Covariance:
     growth = grown(first.of_map, last.of_map, T_last_first)
     if last is end and first.reported is not None and last.reported is not None:
         growth = growth + grown(first.reported, last.reported, T_last_first)
-    return se3.carried(growth, se3.inverse(end.T_map_base) @ last.T_map_base)
+    carried = se3.carried(growth, se3.inverse(end.T_map_base) @ last.T_map_base)
+    return carried if last is end else carried + end.of_map
 
 
 def _planar(first: KeyPose, second: KeyPose) -> Planar:

@@ -44,7 +44,8 @@ class ViewLoops:
         self._views.move(poses)
         known, reach_m = np.reshape(poses, (-1, 4, 4)), self._reach_m(query)
         settled = np.flatnonzero(reach_m < GAIN_MIN_M)  # with these, views are not compared
-        best: dict[int, tuple[int, Edge]] = {}  # matches and loop, by the earlier submap
+        # Matches and loop, by the earlier submap; in another piece every view counts.
+        best: dict[tuple[int, int], tuple[int, Edge]] = {}
         kept: list[tuple[Transform, PlacedView]] = []
         for view in query.submap.views:
             T_run_cam = query.T_run_node[query.second] @ view.T_submap_cam
@@ -57,8 +58,9 @@ class ViewLoops:
                 continue
             number, seen = found
             first = self._owned[number][0]
-            if seen.matches > best.get(first, (0,))[0]:
-                best[first] = seen.matches, self._edge(number, query.second, view, seen)
+            place = first, view.stamp_ns if first < query.start else 0
+            if seen.matches > best.get(place, (0,))[0]:
+                best[place] = seen.matches, self._edge(number, query.second, view, seen)
         for T_run_cam, view in kept:
             self._views.add(T_run_cam, view.landmarks)
             self._owned.append((query.second, view))

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from sceneslam.graphs.edge import Edge
 from sceneslam.types import se3
+from sceneslam.types.covariance import wandered
 from sceneslam.types.se3 import Transform
 
 from ..loops.pose_graph import PoseGraph
-
-_WALK_M_PER_S, _TURN_RAD_PER_S = 1.0, 1.0  # standard deviations of a lost camera's motion
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,8 +37,7 @@ class Segments:
 
     def begin(self, keyframe_id: int, T_local_base: Transform, *, lost_s: float) -> None:
         """Begin a segment by a keyframe at an assumed pose, after `lost_s` without a pose."""
-        sigmas = lost_s * np.repeat([_WALK_M_PER_S, _TURN_RAD_PER_S], 3)
-        guess = _Guess(T_local_base=T_local_base.copy(), covariance=np.diag(sigmas**2))
+        guess = _Guess(T_local_base=T_local_base.copy(), covariance=wandered(lost_s))
         self._guesses[keyframe_id] = guess
 
     def replace(self, gone: int, heir: int) -> None:

@@ -1,0 +1,87 @@
+"""Loop closure to earlier pieces of a run: nothing tells how they lie to the piece that grows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.atlas.places.floor_plan import join
+from sceneslam.atlas.places.plan_field import PlanField
+from sceneslam.atlas.places.recognition import Recognizer
+from sceneslam.atlas.places.registration import PlanRegistration
+from sceneslam.atlas.submaps.graph import on_floor
+from sceneslam.atlas.submaps.loop_query import LoopQuery
+from sceneslam.graphs.edge import Edge, EdgeKind
+from sceneslam.types import planar
+
+_SPAN = 3  # newest submaps that are compared, 7.5 m of path: as a run with a loaded map
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Piece:
+    """The plan of an earlier piece, and where its submaps lie in it."""
+
+    first: int
+    plane: NDArray[np.float64]  # (K, 3)
+    recognizer: Recognizer
+
+
+class PieceLoops:
+    """Finds the newest submaps in earlier pieces, wherever that is."""
+
+    def __init__(self) -> None:
+        self._pieces: dict[tuple[int, int], _Piece] = {}
+
+    def forget(self, count: int) -> None:
+        """Forget all submaps but the first `count`."""
+        self._pieces = {ends: one for ends, one in self._pieces.items() if ends[1] <= count}
+
+    def loops_to(self, query: LoopQuery, plane: NDArray[np.float64]) -> list[Edge]:
+        """Return the loop to a submap, none if more than one place fits.
+
+        `plane` (N, 3) are the submaps as they were solved last.
+        """
+        starts = [start for start in query.starts if start <= query.second]
+        if len(starts) == 1:
+            return []
+        newest = range(max(starts[-1], query.second - _SPAN + 1), query.second + 1)
+        placed = [
+            (planar.between(query.plane[query.second], query.plane[one]), query.submaps[one].plan)
+            for one in newest
+        ]
+        plan, found = join(placed), list[Edge]()
+        for ends in pairwise(starts):
+            piece = self._piece(ends, query, plane)
+            match = piece.recognizer.locate(plan)
+            if match is not None:
+                found.append(_edge(piece, match, query.second))
+        return found if len(found) == 1 else []
+
+    def _piece(self, ends: tuple[int, int], query: LoopQuery, plane: NDArray[np.float64]) -> _Piece:
+        """Return a piece; where its submaps lie is not updated."""
+        if ends not in self._pieces:
+            own = slice(*ends)
+            plans = [submap.plan for submap in query.submaps[own]]
+            plan = join(list(zip(plane[own], plans, strict=True)))
+            self._pieces[ends] = _Piece(
+                first=ends[0], plane=plane[own].copy(), recognizer=Recognizer(PlanField(plan))
+            )
+        return self._pieces[ends]
+
+
+def _edge(piece: _Piece, match: PlanRegistration, second: int) -> Edge:
+    """Return the loop from the nearest submap of a piece."""
+    away_m = np.hypot(*(piece.plane - match.T_target_query)[:, :2].T)
+    nearest = int(np.argmin(away_m))
+    return Edge(
+        first=piece.first + nearest,
+        second=second,
+        T_first_second=planar.to_transform(
+            planar.between(piece.plane[nearest], match.T_target_query)
+        ),
+        covariance=on_floor(match.covariance),
+        kind=EdgeKind.LOOP,
+    )

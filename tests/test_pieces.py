@@ -1,0 +1,85 @@
+"""A robot that was carried to somewhere else: both pieces become one map where it comes back."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planar_poses import transforms
+from test_laser_loop import PERIOD_NS, STEP_M, VIEW, furnished, laps, settings
+from test_laser_world import box, corridor, drive
+
+from sceneslam.atlas.atlas import Atlas
+from sceneslam.modules.slam.laser.module import LaserSlam
+from sceneslam.types import se3
+from sceneslam.types.covariance import wandered
+from sceneslam.types.maps import MapLayers
+from sceneslam.types.rig import Laser, Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
+
+RIG = Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser())
+LOST_S = 10.0
+
+
+def carried(walls, first, second):
+    """Return atlas and loops after two paths (x, y, yaw); nothing was measured between them."""
+    atlas, loops = Atlas(voxel_m=0.05), []
+    atlas.open(RIG, lambda event, stamp_ns, **more: event == "loop" and loops.append(more))
+    T_map_base, start_ns = se3.identity(), 0
+    for path, lost_s in ((first, 0.0), (second, LOST_S)):
+        start_ns += round(lost_s * 1e9)
+        module = LaserSlam(**settings())
+        module.activate(RIG)
+        rng = np.random.default_rng(3)
+        seen = drive(walls, path, odometry=path, rng=rng, period_ns=PERIOD_NS, **VIEW)
+        session, T_map_local = atlas.begin_session("laser", T_map_base), T_map_base
+        for one in seen:
+            answer = module.track(one)
+            stamp_ns, T_local_base = start_ns + one.stamp_ns, answer.T_local_base
+            unknown = se3.carried(wandered(lost_s), se3.inverse(T_local_base))
+            T_map_base = T_map_local @ T_local_base
+            atlas.add_local(stamp_ns, T_local_base)
+            atlas.add(
+                stamp_ns, T_map_base, "laser", answer.covariance, answer.map_covariance + unknown
+            )
+            atlas.observe(_at(one, stamp_ns), None)
+        start_ns = stamp_ns + PERIOD_NS
+        atlas.close_session(session, MapLayers(), Trajectory.empty())
+    assert atlas.finish() == []
+    return atlas, loops
+
+
+def _at(observation, stamp_ns):
+    scan = replace(observation.scan, stamp_ns=stamp_ns)
+    return replace(observation, stamp_ns=stamp_ns, scan=scan)
+
+
+def errors_m(atlas, path):
+    """Return how far each pose is off, in the frame of the first."""
+    T_true = transforms(path)
+    T_true = se3.inverse(T_true[0]) @ T_true
+    return np.linalg.norm((atlas.trajectory.T_world_base - T_true)[:, :3, 3], axis=1)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_pieces_are_joined_where_the_robot_comes_back(turned):
+    path, lap = laps(2), len(laps(1))
+    first, second = path[: lap // 2], path[lap // 4 + lap // 2 : lap + lap // 2]
+    if turned:  # it comes back the other way round
+        second = second[::-1]
+    atlas, loops = carried(furnished(np.random.default_rng(0)), first, second)
+    assert loops
+    errors = errors_m(atlas, np.concatenate([first, second]))
+    assert errors.max() < 0.3  # the first piece alone drifts by 0.24 m
+    sigmas = np.sqrt(np.diagonal(atlas.covariances(has_odometry=True), axis1=1, axis2=2))
+    assert sigmas[-1, [0, 1, 5]].max() < 0.1 and sigmas.max() < 0.2 * LOST_S
+
+
+def test_pieces_stay_apart_where_places_look_alike():
+    """A corridor that repeats itself every metre, and shows no end."""
+    boxes = [box(x - 0.15, 0.85, x + 0.15, 1.15) for x in range(-20, 80)]
+    walls = np.concatenate([corridor(), *boxes])
+    ahead = np.array([(STEP_M * step, 0.0, 0.0) for step in range(80)])
+    atlas, loops = carried(walls, ahead, ahead + np.array([30.0, 0.0, 0.0]))
+    assert not loops
+    sigmas = np.sqrt(np.diagonal(atlas.covariances(has_odometry=True), axis1=1, axis2=2))
+    assert sigmas[-1, :2].min() > 0.9 * LOST_S
