@@ -6,6 +6,7 @@ import pytest
 from evaluation_runs import (
     SETTINGS,
     START_NS,
+    first_events,
     happened,
     relabel,
     shift_from,
@@ -16,7 +17,10 @@ from evaluation_runs import (
     without,
 )
 
+from sceneslam.evaluation.chronicle import chronicle
 from sceneslam.evaluation.metrics import evaluate
+from sceneslam.evaluation.story import tell
+from sceneslam.evaluation.summary import summary_lines
 from sceneslam.types import se3
 from sceneslam.types.run import RunResult
 from sceneslam.types.truth import GroundTruth, SceneChange
@@ -144,3 +148,28 @@ def test_module_that_could_not_be_activated_has_no_seam():
     first, second = evaluate(run, true_loop(), settings=SETTINGS)["switches"]
     assert (first["jump_m"], first["gap_s"]) == (None, None)
     assert (second["gap_s"], second["jump_m"] < 0.01) == (0.0, True)
+
+
+def began_anew() -> RunResult:
+    """`rgbd` is lost from pose 60 on, and begins anew at 80 with what it saw from pose 65 on."""
+    run = relabel(switched_run(), slice(0, 200), "rgbd")
+    at_ns, from_ns = (int(stamps(200)[index]) for index in (80, 65))
+    lost = {"scene": "Bright", "from_": "rgbd", "to": "rgbd", "reason": "lost"}
+    told = [
+        happened("decision", at_ns, **lost),
+        happened("handover", at_ns, module="rgbd", kind="rewind", from_ns=from_ns, jump_m=0.0),
+    ]
+    run = replace(run, events=[*first_events(), *told])
+    run = shift_from(run, 65, se3.from_xy_yaw(0.3, 0.0, 0.0))
+    return without(run, slice(60, 65))
+
+
+def test_seam_of_a_module_that_begins_anew_lies_where_its_new_poses_begin():
+    metrics = evaluate(began_anew(), true_loop(), settings=SETTINGS)
+    (switch,) = metrics["switches"]
+    assert switch["jump_m"] == pytest.approx(0.3, abs=0.005)
+    assert switch["gap_s"] == pytest.approx(0.5)
+    assert "“rgbd” began anew, because “rgbd” had lost track" in " ".join(tell(metrics))
+    assert any("rgbd began anew (lost: " in line for line in summary_lines(metrics))
+    entries = chronicle(began_anew(), metrics["switches"], value_label="mean of grey")
+    assert entries[-1].what == "“rgbd” begins anew"

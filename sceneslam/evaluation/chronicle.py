@@ -153,6 +153,8 @@ class _Writer:
             self._end_trouble(event["stamp_ns"])
         replaced = event.get("from")
         what = f"“{event['to']}” takes over from “{replaced}”" if replaced else ""
+        if replaced == event["to"]:
+            what = f"“{replaced}” begins anew"
         switch = self._switches.get((event["stamp_ns"], event["to"]), {})
         mine = [e for e in self._events if e["stamp_ns"] == event["stamp_ns"]]
         details = why_chosen(event, self._situation, mine, switch, self._origin_ns)

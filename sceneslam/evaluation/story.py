@@ -57,10 +57,9 @@ def _names(keys: list[str]) -> str:
 
 def _change(metrics: Metrics, switch: dict[str, Any]) -> str:
     why = _WHY.get(switch["reason"], switch["reason"]).format(**switch)
-    text = (
-        f"At {seconds(metrics, switch['stamp_ns']):.1f} s “{switch['to']}” took over from "
-        f"“{switch['from']}”, because {why}"
-    )
+    is_same = switch["from"] == switch["to"]
+    what = "began anew" if is_same else f"took over from “{switch['from']}”"
+    text = f"At {seconds(metrics, switch['stamp_ns']):.1f} s “{switch['to']}” {what}, because {why}"
     if switch["confirm_delay_s"] is not None:
         text += f", {switch['confirm_delay_s']:.2f} s after it really changed"
     if switch["jump_m"] is None:

@@ -77,8 +77,11 @@ def _switch_lines(metrics: Metrics, room: int) -> list[str]:
 def _switch_line(metrics: Metrics, switch: dict[str, Any]) -> str:
     delay_s = switch["confirm_delay_s"]
     delay = "" if delay_s is None else f", {delay_s:.2f} s after the change"
+    what = f"{switch['from']} -> {switch['to']}"
+    if switch["from"] == switch["to"]:
+        what = f"{switch['to']} began anew"
     return (
-        f"{seconds(metrics, switch['stamp_ns']):.1f} s: {switch['from']} -> {switch['to']} "
+        f"{seconds(metrics, switch['stamp_ns']):.1f} s: {what} "
         f"({switch['reason']}: {switch['scene']}){delay}, "
         f"jump {number(switch['jump_m'], 3, ' m')} {degrees(switch['jump_rad'])}, "
         f"gap {number(switch['gap_s'], 2, ' s')}"
