@@ -145,3 +145,70 @@ def test_status_of_a_module_that_begins_anew_is_logged():
     assert statuses == [one.value for one in (TrackingStatus.TRACKING, TrackingStatus.LOST)] + [
         TrackingStatus.TRACKING.value
     ]
+
+
+def test_a_module_that_finds_itself_before_another_has_started_keeps_its_map():
+    """It is lost for 2.2 s; the other, which takes a second to start, is lost, too."""
+
+    class Covered(ExactModule):
+        def track(self, observation):
+            return replace(super().track(observation), can_begin=True)
+
+    bright, dark = Covered(lost=range(30, 52)), ExactModule(lost=range(1000))
+    options = {"startup_s": {"dark": 1.0}, "retry_s": 2.0, "lost_patience_s": 2.05}
+    _, atlas, log, _ = drive({"bright": bright, "dark": dark}, handover="rewind", **options)
+    (refused,) = events(log, "refused")
+    assert (refused["to"], refused["stamp_ns"]) == ("dark", 61 * PERIOD_NS)
+    assert bright.activations == 1 and atlas.pose_modules[-1] == "bright"
+
+
+def test_a_module_that_is_lost_again_gets_as_long_to_find_itself():
+    class Blind(ExactModule):
+        def track(self, observation):
+            if observation.stamp_ns >= GAP_NS + FIRST * PERIOD_NS:
+                self.lost.add(observation.stamp_ns // PERIOD_NS)
+            return replace(super().track(observation), can_begin=True)
+
+    _, _, log, _ = carried(Blind(), steps=FIRST + 70)
+    decided_s = [event["stamp_ns"] / 1e9 for event in events(log, "decision")[1:]]
+    assert len(decided_s) == 3 and np.diff(decided_s).min() >= 2.0
+
+
+def test_silence_is_no_time_in_which_it_saw_enough():
+    def silent(index):
+        return (
+            replace(feed(index), image_bgr=None) if index in range(FIRST + 1, 80) else feed(index)
+        )
+
+    module = Carried()
+    _, atlas, _, _ = carried(module, steps=110, feed=silent)
+    assert module.activations == 2
+    assert atlas.session_starts()[1].stamp_ns == 80 * PERIOD_NS + GAP_NS
+
+
+def test_a_first_choice_that_returns_is_as_certain_of_its_place_as_the_fallback():
+    class Weak(ExactModule):
+        def track(self, observation):
+            return replace(super().track(observation), status=TrackingStatus.DEGRADED)
+
+    modules = {"bright": ExactModule(lost=range(20, 75)), "dark": Weak()}
+    options = {"retry_s": 2.0, "handover": "rewind", "has_odometry": False, "steps": 200}
+    _, atlas, _, _ = drive(modules, **options)
+    assert atlas.pose_modules[-1] == "bright" and len(atlas.session_starts()) == 3
+    sigmas = np.sqrt(np.diagonal(atlas.covariances(has_odometry=False), axis1=1, axis2=2))
+    assert sigmas.max() < 0.2
+
+
+def test_what_a_map_drifted_before_the_module_was_placed_is_no_doubt_about_its_place():
+    """As of a module that tracked on trial for seconds."""
+
+    class Drifting(ExactModule):
+        def track(self, observation):
+            drift = np.eye(6) * (observation.stamp_ns / 1e9) ** 2
+            return replace(super().track(observation), map_covariance=drift)
+
+    modules = {"bright": ExactModule(lost=range(50, 1000)), "dark": Drifting()}
+    _, atlas, _, _ = drive(modules, has_odometry=False, handover="rewind")
+    first = atlas.session_starts()[1].row
+    of_maps = np.diagonal(atlas._path.of_maps(), axis1=1, axis2=2).max(axis=1)
+    assert of_maps[first] < 1.2 and of_maps[-1] > 50.0  # m^2: 5.0^2 - 4.9^2, not 5.0^2

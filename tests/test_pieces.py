@@ -9,6 +9,9 @@ from test_laser_loop import PERIOD_NS, STEP_M, VIEW, furnished, laps, settings
 from test_laser_world import box, corridor, drive
 
 from sceneslam.atlas.atlas import Atlas
+from sceneslam.atlas.lasting.saved_map import empty_map
+from sceneslam.atlas.submaps.run_graph import RunGraph
+from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.modules.slam.laser.module import LaserSlam
 from sceneslam.types import se3
 from sceneslam.types.covariance import wandered
@@ -83,3 +86,15 @@ def test_pieces_stay_apart_where_places_look_alike():
     assert not loops
     sigmas = np.sqrt(np.diagonal(atlas.covariances(has_odometry=True), axis1=1, axis2=2))
     assert sigmas[-1, :2].min() > 0.9 * LOST_S
+
+
+def test_one_loop_between_two_pieces_is_not_believed_whatever_loops_there_are_within_them():
+    graph, cov = RunGraph(empty_map(), lambda session: False), np.diag(np.full(6, 1e-4))
+    graph._starts = frozenset([0, 10])
+    within, across, again = (
+        Edge(first=a, second=b, T_first_second=np.eye(4), covariance=cov, kind=EdgeKind.LOOP)
+        for a, b in ((0, 5), (2, 15), (3, 16))
+    )
+    assert graph._believed([within, across]) == [within]
+    assert graph._believed([within, across, again]) == [within, across, again]
+    assert graph._believed([within]) == [] and graph._believed([across]) == []

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.submaps.graph import LOADED, marginals
 from sceneslam.atlas.submaps.submap import LENGTH_M, TURN_RAD
-from sceneslam.atlas.uncertainty import MAPPED, Covariance, Drift, drifted, grown
+from sceneslam.atlas.uncertainty import MAPPED, Covariance, Drift, drifted
 from sceneslam.graphs.edge import Edge
 from sceneslam.types import se3
+from sceneslam.types.covariance import grown
 from sceneslam.types.trajectory import Trajectory
 
 _LEAST = 1e-10 * np.eye(6)  # (10 um, 10 urad)^2: keeps the graph well-conditioned

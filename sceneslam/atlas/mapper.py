@@ -153,7 +153,7 @@ class Mapper:
         if localizer is not None:
             self._collect(localizer, stamp_ns)
         look = Look(stamp_ns=stamp_ns, T_run_base=known.T_map_base)
-        is_step = self._collector.has_moved(known.T_map_base)
+        is_step = self._collector.has_moved(known)
         is_scanned = is_step or self._rests(stamp_ns)
         is_viewed = localizer is not None and self._search is None and localizer.wants_view(look)
         is_viewed &= is_step or not self.is_placed  # a fix is by walls first, which come in steps

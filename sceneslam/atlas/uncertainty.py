@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.types import se3
 from sceneslam.types.files import replacing
-from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import parse_stamp_ns
 
 Covariance = NDArray[np.float64]  # (6, 6): T_true = T_told @ exp(xi), xi in base as se3.log has it
@@ -51,12 +49,6 @@ def drifted(drift: Drift, moved: NDArray[np.float64]) -> NDArray[np.float64]:
     shift2 = (drift.per_m * length_m) ** 2 + turn2 * (0.5 * length_m) ** 2
     variances = np.stack([shift2, turn2], axis=-1).repeat(3, axis=-1)
     return np.asarray(variances[..., None] * np.eye(6))
-
-
-def grown(first: Covariance, last: Covariance, T_last_first: Transform) -> Covariance:
-    """Return the growth (6, 6) of a covariance between two poses of one map, in the last's axes."""
-    values, vectors = np.linalg.eigh(last - se3.carried(first, T_last_first))
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def write_covariances(

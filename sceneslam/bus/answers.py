@@ -45,6 +45,7 @@ def checked_tracking(tracking: object, stamp_ns: int) -> Tracking:
     tracking = _of("track's answer", tracking, Tracking)
     _of("status", tracking.status, TrackingStatus)
     _of("revision", tracking.revision, int)
+    _of("can_begin", tracking.can_begin, bool)
     if tracking.stamp_ns != stamp_ns:
         raise ValueError(f"stamp_ns: expected {stamp_ns}, got {tracking.stamp_ns}")
     if not 0.0 <= tracking.quality_ratio <= 1.0:

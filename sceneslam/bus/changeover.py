@@ -141,9 +141,10 @@ class Changeover:
                 runner = self._runners[self._queue.pop(0)]
                 from_ns = None
                 if runner is self._estimator.active:
-                    if not runner.is_failed and self._verdict.reason != Health.LOST:
+                    from_ns = self._estimator.session.hold.adrift_since_ns
+                    is_adrift = self._verdict.reason == Health.LOST and from_ns is not None
+                    if not runner.is_failed and not is_adrift:
                         break  # the active module stays, as the fallback
-                    from_ns = self._now.adrift_since_ns
                     self._estimator.retire()  # before it is started again
                 self._attempt = self._start(runner, stamp_ns)
                 self._attempt.from_ns = from_ns

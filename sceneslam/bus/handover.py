@@ -98,7 +98,7 @@ class Handover:
         self.anchor, self.trail, self.tracked = anchor, [], [last]
         bridge = self.session.bridge = anchor.bridge.copy()
         with self._timed():
-            self.runner.place(bridge.T_map_base @ se3.inverse(last.T_local_base))
+            self.session.settle(last, bridge.T_map_base)
         self._first_cost_ns = self._cost_ns
 
     @contextmanager

@@ -68,6 +68,7 @@ class Hold:
             self.spare(observation)
             if self._fed_ns is None or observation.stamp_ns - self._fed_ns > 2 * self._period_ns:
                 self.lose(observation.stamp_ns)
+                self.adrift_since_ns = None
             return None
         tracking = runner.track(observation)
         self._feed(tracking)

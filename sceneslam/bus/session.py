@@ -13,7 +13,7 @@ from sceneslam.bus.hold import Hold
 from sceneslam.bus.observation_buffer import BufferedObservation
 from sceneslam.bus.runner import Runner
 from sceneslam.types import se3
-from sceneslam.types.covariance import wandered
+from sceneslam.types.covariance import grown, wandered
 from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.run import BRIDGED
@@ -44,8 +44,8 @@ class ModuleSession:
         self.from_ns = 0  # its poses after it are the module's
         self.suspicion: Suspicion | None = None
         self.is_acquitted = False  # the last suspicion ended: the wheels were wrong
-        # Where it was placed, and the covariance (6, 6) of that: the motion to it was not measured.
-        self._guess: tuple[Transform, NDArray[np.float64]] | None = None
+        # The answer at which it was placed, and the covariance (6, 6) of a place that was guessed.
+        self._placed: tuple[Tracking, NDArray[np.float64] | None] | None = None
 
     @property
     def key(self) -> str:
@@ -134,10 +134,10 @@ class ModuleSession:
         """Return T_map_base; a module's first pose is the bridged one, handed over (Eq. 1)."""
         assert self.runner is not None
         if not self.is_placed:
-            self._guess = None
+            unknown = None
             if self.bridge.predict(observation, by_velocity=True) is None:
                 unknown = wandered(self.bridge.unknown_s(observation.stamp_ns))
-                self._guess = tracking.T_local_base, unknown
+            self._placed = tracking, unknown
             self.runner.place(self.bridge.T_map_base @ se3.inverse(tracking.T_local_base))
             self.is_placed = True
         assert self.runner.T_map_local is not None
@@ -145,14 +145,27 @@ class ModuleSession:
         self.bridge.update(observation, T_map_base, is_jump=self.hold.is_revised)
         return T_map_base
 
+    def settle(self, last: Tracking, T_map_base: Transform) -> None:
+        """Place the module, which has tracked on trial, where the robot is known to be."""
+        assert self.runner is not None
+        self._placed = last, None
+        self.runner.place(T_map_base @ se3.inverse(last.T_local_base))
+
     def _doubted(self, tracking: Tracking) -> Tracking:
-        """Return an answer whose map's covariance includes that of where it was placed."""
-        if self._guess is None:
-            return tracking
-        T_local_placed, unknown = self._guess
-        T_base_placed = se3.inverse(tracking.T_local_base) @ T_local_placed
-        known = np.zeros((6, 6)) if tracking.map_covariance is None else tracking.map_covariance
-        return replace(tracking, map_covariance=known + se3.carried(unknown, T_base_placed))
+        """Return an answer whose map's covariance counts from where the module was placed.
+
+        What its map drifted before is no part of it; how uncertain that place is, is.
+        """
+        assert self._placed is not None
+        placed, unknown = self._placed
+        drift, before = tracking.map_covariance, placed.map_covariance
+        T_base_placed = se3.inverse(tracking.T_local_base) @ placed.T_local_base
+        if drift is not None and before is not None and before.any():
+            drift = grown(before, drift, T_base_placed)
+        if unknown is not None:
+            carried = se3.carried(unknown, T_base_placed)
+            drift = carried if drift is None else drift + carried
+        return replace(tracking, map_covariance=drift)
 
     def _moment(
         self, observation: Observation, T_map_base: Transform | None

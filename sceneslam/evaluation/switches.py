@@ -80,7 +80,7 @@ def find_seam(result: RunResult, decision: Event) -> Seam | None:
     """
     modules = np.array(result.modules, dtype=object)
     stamps_ns = result.trajectory.stamps_ns
-    if decision["from"] == decision["to"]:  # it began anew
+    if decision["from"] == decision["to"] and decision["reason"] == "lost":  # it began anew
         begun_ns = _same_stamp(result.events, "handover", decision).get("from_ns", 0)
         after = int(np.searchsorted(stamps_ns, begun_ns))
         return Seam(before=after - 1, after=after) if 0 < after < len(stamps_ns) else None

@@ -45,6 +45,7 @@ class Inertia:
     _unmeasured_s: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2), init=False)
     _changed: NDArray[np.float64] = field(default_factory=_CHANGED.copy, init=False)
     _lasted: NDArray[np.float64] = field(default_factory=lambda: _LASTS_S[0] * _CHANGED, init=False)
+    _measured_s: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2), init=False)
     _missed: list[NoiseRatio] = field(
         default_factory=lambda: [NoiseRatio(missed) for missed in _MISSED], init=False
     )
@@ -70,6 +71,18 @@ class Inertia:
         """Return the motion of a robot whose velocity is unknown."""
         variance = np.array([(UNKNOWN_VELOCITY[0] * duration_s) ** 2, guess.variance[1]])
         return replace(guess, variance=np.maximum(variance, guess.variance))
+
+    def wandered(self, duration_s: float) -> NDArray[np.float64]:
+        """Return how far (2,) [m, rad] the robot may be from a prediction, as it has moved so far.
+
+        The standard deviation of what a first order Markov process adds up to, from a known
+        velocity on (Uhlenbeck and Ornstein, 1930). At first an unknown velocity counts as a second.
+        """
+        lasts_s = np.clip(self._lasted / self._changed, *_LASTS_S)
+        square = (UNKNOWN_VELOCITY**2 + self._lasted) / (1.0 + self._measured_s)
+        x = duration_s / lasts_s
+        spread = 2.0 * x - 3.0 + 4.0 * np.exp(-x) - np.exp(-2.0 * x)
+        return np.asarray(lasts_s * np.sqrt(square * np.maximum(spread, 0.0)))
 
     def evidence(self, wheels: Step, guess: Step, duration_s: float) -> NDArray[np.float64]:
         """Return the log-likelihood ratios (2,) of the wheels' motion: wheels wrong against right.
@@ -154,6 +167,7 @@ class Inertia:
         """
         lasting, changed = ((each.reshape(2, 3) ** 2).sum(axis=1) for each in (now, now - before))
         self._lasted = self._lasted + measured_s * lasting
+        self._measured_s = self._measured_s + measured_s
         self._changed = self._changed + (measured_s > 0.0) * changed / 2.0
 
     def _known(self, duration_s: float | NDArray[np.float64]) -> NDArray[np.float64]:

@@ -83,6 +83,13 @@ class MotionModel:
         """Return the base's twist (6,) [m/s, rad/s] in se3.log order, 0 if unknown."""
         return self._inertia.velocity
 
+    def wandered(self, duration_s: float) -> NDArray[np.float64]:
+        """Return how far (2,) [m, rad] the robot may be from where it would be without a change.
+
+        As it has moved so far, after a time in which nothing measured its motion.
+        """
+        return self._inertia.wandered(duration_s)
+
     def predict(self, observation: Observation) -> Motion:
         """Return the motion from the last observation to this one, which becomes the last."""
         before_ns, self._stamp_ns = self._stamp_ns, observation.stamp_ns

@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types import se3
+from sceneslam.types.se3 import Transform
+
 Matrix = NDArray[np.float64]
 
 _WALK_M_PER_S, _TURN_RAD_PER_S = 1.0, 1.0  # standard deviations of a sensor that is carried
@@ -22,6 +25,12 @@ def covariance_of(information: Matrix, *, unmeasured: float) -> Matrix:
 def wandered(lost_s: float) -> Matrix:
     """Return the covariance (6, 6) [m, rad] of the motion in a time of which nothing is known."""
     return np.diag(np.repeat([_WALK_M_PER_S, _TURN_RAD_PER_S], 3) * lost_s) ** 2
+
+
+def grown(first: Matrix, last: Matrix, T_last_first: Transform) -> Matrix:
+    """Return the growth (6, 6) of a covariance between two poses of one map, in the last's axes."""
+    values, vectors = np.linalg.eigh(last - se3.carried(first, T_last_first))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def updated(before: Matrix, gain: Matrix, seen: Matrix, noise: Matrix) -> Matrix:

@@ -12,6 +12,7 @@ from .free_space import FreeSpace
 from .surface import SurfacePoints
 
 _REACH_M = 0.3  # the likelihood falls to 0 at this distance from a surface
+_SAME_M = 0.15  # from a surface: on it
 _MARGIN_CELLS = 8
 _AROUND_CELLS = 2  # neighbourhood that shows whether a surface continues or ends
 _POST = 1.1  # trace of the shape: 1 for a line; above, it also constrains along itself
@@ -61,6 +62,13 @@ class LikelihoodField:
         if self._free is None:
             return np.ones(len(points_local), bool)
         return self._free.contains(points_local)
+
+    def refuted_ratio(self, points_local: NDArray[np.float64]) -> float:
+        """Return the share of points (N, 2) [m] in free space, of those and those on surfaces."""
+        away_m = np.linalg.norm(points_local - self.nearest(points_local).points, axis=1)
+        same = int((away_m < _SAME_M).sum())
+        free = int(self.is_free(points_local[away_m >= _SAME_M]).sum())
+        return free / max(free + same, 1)
 
     def nearest(self, points_local: NDArray[np.float64]) -> NearestSurfaces:
         """Return the nearest surfaces of points (N, 2) [m]."""

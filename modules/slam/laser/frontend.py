@@ -28,12 +28,12 @@ from .field import LikelihoodField
 from .keyframes import ScanKeyframe, ScanKeyframes
 from .matcher import Match, Matcher, novelty
 from .prior import MotionPrior, difference, is_apart
+from .relocalizer import ScanRelocalizer
 from .surface import ScanSurfaceReader, SurfacePoints
-from .wide_search import WideSearch
 
 _OVERLAP_MIN_RATIO = 0.5  # with less, the map does not cover this place yet
 _FAILURES_MAX = 10  # consecutive failed matches before mapping continues from dead reckoning
-_LOST_WINDOW_M, _LOST_WINDOW_RAD, _LOST_SCORE_MIN = 3.0, 0.8, 0.5
+_REACH_SIGMAS = 2.0  # after a gap the robot may be so far from a prediction
 _UNSEEN = np.diag([1e-2, 1e-2, 1e-1])  # 1/m^2, 1/rad^2: information in unconstrained directions
 _DEVIATION_MIN = np.array([1e-3, 1e-3, 5e-4])  # m, m, rad: least standard deviation of a pose
 
@@ -69,6 +69,7 @@ class FrontEnd:
 
     settings: ScanSettings
     matcher: Matcher
+    relocalizer: ScanRelocalizer
     motion: MotionModel
     reader: ScanSurfaceReader
     keyframes: ScanKeyframes
@@ -80,6 +81,7 @@ class FrontEnd:
     _held_ns: int | None = field(default=None, init=False)
     _seen_pose: Planar = field(default_factory=lambda: np.zeros(3), init=False)  # of its scan
     _fit_ns: int | None = field(default=None, init=False)  # scans fitted as usual until then
+    _is_lost: bool = field(default=False, init=False)
     _failures: int = field(default=0, init=False)
     _field: LikelihoodField | None = field(default=None, init=False)
     _doubt: Doubt = field(default_factory=Doubt, init=False)
@@ -112,15 +114,25 @@ class FrontEnd:
         new = novelty(between(self._seen_pose, predicted_then)) if is_known else 1.0
         match = self.matcher.match(surfaces, self._field, priors, novelty=new)
         believed = self._believes(match)
+        reach = None if motion.is_measured else self._reach(match, observation)
+        if reach is not None:
+            again = self.relocalizer.anywhere(
+                scan, surfaces, self._field, predicted_then, reach, match
+            )
+            if again is None:
+                return self._lose(can_begin=True)
+            match = again
         # At the first match the velocity is unknown, so that without wheels any motion is possible.
-        if (is_first or not believed) and (not is_known or self.matcher.misfit > 0.0):
-            again = self._find_again(surfaces, self._field, predicted_then, is_known=is_known)
+        elif (is_first or not believed) and (not is_known or self.matcher.misfit > 0.0):
+            again = self.relocalizer.near(
+                surfaces, self._field, predicted_then, self._turned_rad(is_known=is_known)
+            )
             if again is not None and (not believed or _is_better(again, match)):
                 match = again
         if not self._believes(match):
             return self._distrust(observation, predicted, motion, match, scan, surfaces)
-        if is_known and not match.weighs_sources:
-            self.motion.skip()  # what the wheels missed is a jump, and tells no velocity
+        if self._is_lost or (is_known and not match.weighs_sources):
+            self.motion.skip()  # a jump, also where the wheels missed it, tells no velocity
             self.motion.slow_down()
         else:
             self._teach(match, T_then_now, motion)
@@ -146,28 +158,32 @@ class FrontEnd:
         surfaces = self.reader.read(scan)
         return surfaces if len(surfaces) >= self.settings.beams_min else None
 
-    def _find_again(
-        self, surfaces: SurfacePoints, field: LikelihoodField, predicted: Planar, *, is_known: bool
-    ) -> Match | None:
-        """Return the match of a wide search: any motion is possible.
+    def _reach(self, match: Match, observation: Observation) -> Planar | None:
+        """Return how far (2,) [m, rad] the robot may be from a prediction that is vague, else None.
 
-        `is_known`: the wheels predict the motion, and the scan contradicts them.
+        After a gap between scans it may be outside of the matcher's window. Directions that the
+        scan does not measure follow the prediction, and do not count.
         """
-        assert self._stamp_ns is not None
-        turned_rad = float(np.sqrt(self._covariance[2, 2]))
-        if is_known and self._held_ns is not None:
-            turned_rad = float(UNKNOWN_VELOCITY[1]) * (self._stamp_ns - self._held_ns) * 1e-9
-        found = WideSearch(field).find(
-            surfaces.points,
-            predicted,
-            window_m=_LOST_WINDOW_M,
-            window_rad=float(np.clip(2.0 * turned_rad, _LOST_WINDOW_RAD, np.pi)),
-            score_min=_LOST_SCORE_MIN,
-        )
-        if found is None or not found.is_unique:
+        if self._held_ns is None:
             return None
-        prior = np.diag(np.array([_LOST_WINDOW_M, _LOST_WINDOW_M, _LOST_WINDOW_RAD]) ** 2)
-        return self.matcher.refine(surfaces, field, found.T_submap_base, prior)
+        if observation.stamp_ns - self._held_ns <= self.settings.predict_max_s * 1e9:
+            return None
+        H = match.information
+        held = np.linalg.pinv(H, rcond=1e-9, hermitian=True) @ H
+        covariance = held @ self._covariance @ held.T
+        position_m2 = max(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]), 0.0)
+        usual = self.motion.wandered((observation.stamp_ns - self._held_ns) * 1e-9)
+        known = np.sqrt([position_m2, covariance[2, 2]])
+        reach = _REACH_SIGMAS * np.minimum(known, usual)
+        is_within = reach <= (self.matcher.window_m, self.matcher.window_rad)
+        return None if is_within.all() else np.asarray(reach)
+
+    def _turned_rad(self, *, is_known: bool) -> float:
+        """Return how far [rad] it may have turned; `is_known`: as the wheels did not, if at all."""
+        assert self._stamp_ns is not None
+        if is_known and self._held_ns is not None:
+            return float(UNKNOWN_VELOCITY[1]) * (self._stamp_ns - self._held_ns) * 1e-9
+        return float(np.sqrt(self._covariance[2, 2]))
 
     def _believes(self, match: Match) -> bool:
         return (
@@ -193,7 +209,7 @@ class FrontEnd:
         if match is None:
             self.motion.skip()
         self._pose, self._held_pose, self._held_ns = pose, pose, observation.stamp_ns
-        self._failures = 0
+        self._failures, self._is_lost = 0, False
         if match is not None:
             self._covariance = match.covariance + np.diag(_DEVIATION_MIN**2)
             self._held_covariance = self._covariance
@@ -247,10 +263,13 @@ class FrontEnd:
         )
 
     def _lose(self, *, can_begin: bool) -> Estimate:
-        """Stay at the last tracked pose, and search the whole window from now on."""
-        self._pose = self._held_pose
-        window = np.array([self.matcher.window_m, self.matcher.window_m, self.matcher.window_rad])
-        self._covariance = np.diag(window**2)
+        """Stay at the last tracked pose; the robot may be anywhere that it can have come to."""
+        self._pose, self._is_lost = self._held_pose, True
+        lost_s = 0.0
+        if self._stamp_ns is not None and self._held_ns is not None:
+            lost_s = (self._stamp_ns - self._held_ns) * 1e-9
+        moved = (UNKNOWN_VELOCITY * lost_s)[[0, 0, 1]]
+        self._covariance = np.diag(moved**2) + self._held_covariance
         self.motion.stop()
         return Estimate(
             T_local_base=self._held_pose,

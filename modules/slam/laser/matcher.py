@@ -167,11 +167,11 @@ class Matcher:
         self._usual += (each - self._usual) / _USUAL_SCANS
 
     def refine(
-        self, scan_base: SurfacePoints, field: LikelihoodField, start: Planar, prior: Matrix
+        self, scan_base: SurfacePoints, field: LikelihoodField, start: Planar, prior: MotionPrior
     ) -> Match:
-        """Return the pose of a scan, without search, from `start` (3,) with covariance (3, 3)."""
+        """Return the pose of a scan, without search, from `start` (3,)."""
         scan_base = scan_base.with_noise(self.noise.ratio)
-        return self._refine(scan_base, field, start, MotionPrior.of(start, prior), self.shift_m)
+        return self._refine(scan_base, field, start, prior, self.shift_m)
 
     def _search(
         self, scan_base: SurfacePoints, field: LikelihoodField, priors: Sequence[MotionPrior]

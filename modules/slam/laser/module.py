@@ -22,6 +22,7 @@ from .frontend import Estimate, FrontEnd, ScanSettings
 from .keyframes import ScanKeyframes
 from .layers import map_layers
 from .matcher import Matcher
+from .relocalizer import ScanRelocalizer
 from .surface import ScanSurfaceReader
 
 _ABOVE_0 = (
@@ -185,6 +186,12 @@ class LaserSlam:
                 T_base_laser=self._T_base_laser,
             ),
             matcher=matcher,
+            relocalizer=ScanRelocalizer(
+                matcher=matcher,
+                range_max_m=self.range_max_m,
+                resolution_m=self.resolution_m,
+                T_base_laser=self._T_base_laser,
+            ),
             motion=MotionModel(rig),
             reader=ScanSurfaceReader(
                 T_base_laser=self._T_base_laser,

@@ -21,18 +21,17 @@ _CELL_M = 0.1  # the finest shift, at least; the refinement starts from there
 _LEVELS = 4  # shifts of 0.1, 0.2, 0.4, 0.8 m
 _POINTS = 100  # of the scan; more do not change the result
 _BEAM = 32  # nodes of the first descent, whose best score bounds the second
-_NODES_MAX = 4000  # best nodes kept per level; with more, the result is ambiguous
-_ALIKE_RATIO = 0.85  # a second pose with this share of the best score, at least
-_APART_M, _APART_RAD = 0.5, 0.15  # this far away, makes the result ambiguous
+_NODES_MAX = 4000  # best nodes kept per level
+_APART_M, _APART_RAD = 0.5, 0.15  # and this far away from better ones, is another one
+_POSES_MAX = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Found:
-    """The most likely pose in a window."""
+    """A pose that fits."""
 
     T_submap_base: Planar
     score: float  # 0 to 1
-    is_unique: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,8 +76,9 @@ class WideSearch:
         window_m: float,
         window_rad: float,
         score_min: float,
-    ) -> Found | None:
-        """Return the best pose (3,) of points (N, 2) [m] near `around`, submap; None without."""
+        alike_ratio: float,
+    ) -> list[Found]:
+        """Return the poses near `around` where points (N, 2) [m] fit, the best first."""
         points = points_base[:: max(1, len(points_base) // _POINTS)]
         radius_m = float(np.median(np.linalg.norm(points, axis=1))) + 0.1
         step_rad = self._cell_m / radius_m
@@ -90,11 +90,9 @@ class WideSearch:
         cells = np.floor(local / self._cell_m).astype(np.int32) - self._origin.astype(np.int32)
         roots = self._roots(cells, window_m)
         first = self._descend(cells, roots, 0.0, _BEAM)
-        limit = max(score_min, _ALIKE_RATIO * float(first.bound.max(initial=0.0)))
+        limit = max(score_min, alike_ratio * float(first.bound.max(initial=0.0)))
         leaves = self._descend(cells, roots, limit, _NODES_MAX)
-        if not len(leaves.turn):
-            return None
-        return self._judge(leaves, yaws, around)
+        return self._peaks(leaves, yaws, around)
 
     def _roots(self, cells: NDArray[np.int32], window_m: float) -> _Nodes:
         size = 2 ** (_LEVELS - 1)
@@ -143,15 +141,15 @@ class WideSearch:
             bound[part] = np.take(grid.reshape(-1), row * columns + column).mean(axis=1)
         return _Nodes(turn=turn, x=x, y=y, bound=bound)
 
-    def _judge(self, leaves: _Nodes, yaws: NDArray[np.float64], around: Planar) -> Found:
-        best = int(np.argmax(leaves.bound))
-        score = float(leaves.bound[best])
-        away_m = self._cell_m * np.hypot(leaves.x - leaves.x[best], leaves.y - leaves.y[best])
-        away_rad = np.abs(yaws[leaves.turn] - yaws[leaves.turn[best]])
-        other = (away_m > _APART_M) | (away_rad > _APART_RAD)
-        shift_m = self._cell_m * np.array([leaves.x[best], leaves.y[best]])
-        return Found(
-            T_submap_base=np.array([*(around[:2] + shift_m), wrap(float(yaws[leaves.turn[best]]))]),
-            score=score,
-            is_unique=bool((leaves.bound[other] < _ALIKE_RATIO * score).all()),
-        )
+    def _peaks(self, leaves: _Nodes, yaws: NDArray[np.float64], around: Planar) -> list[Found]:
+        """Return the poses of the best leaves that are apart."""
+        peaks: list[Found] = []
+        while len(leaves.turn) and len(peaks) < _POSES_MAX:
+            best = int(np.argmax(leaves.bound))
+            yaw, x, y = float(yaws[leaves.turn[best]]), leaves.x[best], leaves.y[best]
+            pose = np.array([*(around[:2] + self._cell_m * np.array([x, y])), wrap(yaw)])
+            peaks.append(Found(T_submap_base=pose, score=float(leaves.bound[best])))
+            away_m = self._cell_m * np.hypot(leaves.x - x, leaves.y - y)
+            away_rad = np.abs(np.remainder(yaws[leaves.turn] - yaw + np.pi, 2 * np.pi) - np.pi)
+            leaves = leaves.at(np.flatnonzero((away_m > _APART_M) | (away_rad > _APART_RAD)))
+        return peaks

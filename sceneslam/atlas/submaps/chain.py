@@ -39,7 +39,8 @@ class Chain:
     @property
     def starts(self) -> list[int]:
         """Return the submaps with which a piece begins: nothing measured the motion to it."""
-        return [0, *(motion.second for motion in self.motions if _is_guessed(motion))]
+        seams = [motion for motion in self.motions if motion.kind is EdgeKind.HANDOVER]
+        return [0, *(seam.second for seam in seams if is_guessed(seam.covariance))]
 
     def append(self, submap: Submap, T_run_node: Transform, motion: Edge | None) -> None:
         """Add a submap with the motion to it, None for the first."""
@@ -97,5 +98,6 @@ class Chain:
         ]
 
 
-def _is_guessed(motion: Edge) -> bool:
-    return motion.kind is EdgeKind.HANDOVER and bool(motion.covariance[0, 0] > _GUESSED_M**2)
+def is_guessed(covariance: NDArray[np.float64]) -> bool:
+    """Tell whether a motion with this covariance (6, 6) is hardly known."""
+    return bool(covariance[0, 0] > _GUESSED_M**2)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.atlas.submaps.chain import Chain
+from sceneslam.atlas.submaps.chain import Chain, is_guessed
 from sceneslam.atlas.submaps.submap import (
     STEP_M,
     STEP_RAD,
@@ -70,6 +70,7 @@ class Collector:
         self._recent: list[list[KeyPose]] = []  # of the newest submaps, oldest first
         self._waiting: list[_Step] = []  # for their poses
         self._last: Transform | None = None  # pose of the last step
+        self._session = -1  # of the last pose
         self._up = np.zeros(3)  # of the base, the mean over the last steps
         self._level = self._count = 0
 
@@ -78,11 +79,12 @@ class Collector:
         """Tell whether the base moves on a floor."""
         return self._level >= _LEVEL_RATIO * self._count
 
-    def has_moved(self, T_run_base: Transform) -> bool:
-        """Tell whether it is time for a step."""
-        if self._last is None:
+    def has_moved(self, known: Known) -> bool:
+        """Tell whether it is time for a step: at the latest when a piece of the run begins."""
+        before, self._session = self._session, known.session
+        if self._last is None or (known.session != before and is_guessed(known.of_map)):
             return True
-        step = se3.inverse(self._last) @ T_run_base
+        step = se3.inverse(self._last) @ known.T_map_base
         is_far = np.linalg.norm(step[:3, 3]) >= STEP_M
         return bool(is_far or se3.rotation_angle_rad(step) >= STEP_RAD)
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.atlas.places.floor_plan import join
+from sceneslam.atlas.places.floor_plan import FloorPlan, join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.places.registration import PlanRegistration
@@ -16,7 +16,10 @@ from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.submaps.loop_query import LoopQuery
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar
+from sceneslam.types.errors import InputError
+from sceneslam.types.planar import Planar
 
+_LARGEST = 8  # earlier pieces that are searched, by their submaps: each takes a tenth of a second
 _SPAN = 3  # newest submaps that are compared, 7.5 m of path: as a run with a loaded map
 
 
@@ -26,7 +29,7 @@ class _Piece:
 
     first: int
     plane: NDArray[np.float64]  # (K, 3)
-    recognizer: Recognizer
+    recognizer: Recognizer | None  # None: it shows no walls, or is too large to draw
 
 
 class PieceLoops:
@@ -53,9 +56,12 @@ class PieceLoops:
             for one in newest
         ]
         plan, found = join(placed), list[Edge]()
-        for ends in pairwise(starts):
+        by_size = sorted(pairwise(starts), key=lambda ends: ends[0] - ends[1])
+        largest = by_size[:_LARGEST]
+        self._pieces = {ends: one for ends, one in self._pieces.items() if ends in largest}
+        for ends in largest:
             piece = self._piece(ends, query, plane)
-            match = piece.recognizer.locate(plan)
+            match = None if piece.recognizer is None else piece.recognizer.locate(plan)
             if match is not None:
                 found.append(_edge(piece, match, query.second))
         return found if len(found) == 1 else []
@@ -65,11 +71,20 @@ class PieceLoops:
         if ends not in self._pieces:
             own = slice(*ends)
             plans = [submap.plan for submap in query.submaps[own]]
-            plan = join(list(zip(plane[own], plans, strict=True)))
             self._pieces[ends] = _Piece(
-                first=ends[0], plane=plane[own].copy(), recognizer=Recognizer(PlanField(plan))
+                first=ends[0],
+                plane=plane[own].copy(),
+                recognizer=_recognizer(list(zip(plane[own], plans, strict=True))),
             )
         return self._pieces[ends]
+
+
+def _recognizer(placed: list[tuple[Planar, FloorPlan]]) -> Recognizer | None:
+    try:
+        plan = join(placed)
+    except InputError:
+        return None
+    return Recognizer(PlanField(plan)) if len(plan) else None
 
 
 def _edge(piece: _Piece, match: PlanRegistration, second: int) -> Edge:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -133,7 +135,8 @@ class RunGraph:
         places = self._fix_edges(fixes, ends)
         places = [places[index] for index in consistent(places, moved, drift)]
         loops = [edge.shifted(count) for edge in self._found.loops]
-        loops = [loops[index] for index in consistent(loops, moved, drift)]
+        agreeing = [self._found.loops[index] for index in consistent(loops, moved, drift)]
+        loops = [edge.shifted(count) for edge in self._believed(agreeing)]
         nodes = np.concatenate([self._loaded.T_map_node, ends.placed(fixes, T_map_node)])
         around = self._loaded.nodes() if places and self._moves_loaded else []
         moving = self._loaded.moving(around)
@@ -141,7 +144,7 @@ class RunGraph:
         solved = solve(
             nodes,
             [*moving.motions, *(edge.shifted(count) for edge in chain.motions), *own_loops],
-            loops if len(loops) > 1 else [],  # one alone is not believed
+            loops,
             fixed=moving.fixed,
             loose=[*moving.loose, count],
             places=[*moving.loops, *places],
@@ -163,8 +166,25 @@ class RunGraph:
 
     def _agreeing(self) -> list[Edge]:
         """Return the loops that agree with each other; one alone is not believed."""
-        agreeing = self._found.largest()
-        return [self._found.loops[index] for index in agreeing] if len(agreeing) > 1 else []
+        return self._believed([self._found.loops[index] for index in self._found.largest()])
+
+    def _believed(self, loops: Sequence[Edge]) -> list[Edge]:
+        """Return the loops but those that are alone between two pieces of the run.
+
+        Nothing measured how these lie, so that no other loop contradicts or confirms one.
+        """
+        starts = sorted(self._starts)
+        pieces = [
+            tuple(bisect_right(starts, node) for node in (loop.first, loop.second))
+            for loop in loops
+        ]
+        counts = Counter(pieces)
+        kept = zip(loops, pieces, strict=True)
+        return [
+            loop
+            for loop, ends in kept
+            if counts[ends] > 1 or (len(loops) > 1 and ends[0] == ends[1])
+        ]
 
     def _is_used(self, loop: Edge) -> bool:
         return loop not in self._agreed or fits(loop, self._T_map_node)

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import FloorPlan, draw
-from sceneslam.atlas.uncertainty import Covariance, Drift, grown
+from sceneslam.atlas.uncertainty import Covariance, Drift
 from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar, se3
+from sceneslam.types.covariance import grown
 from sceneslam.types.planar import Planar
 from sceneslam.types.se3 import Transform
 from sceneslam.views.view import Landmarks, LandmarkView, PlacedView
