@@ -161,8 +161,8 @@ class FrontEnd:
     def _reach(self, match: Match, observation: Observation) -> Planar | None:
         """Return how far (2,) [m, rad] the robot may be from a prediction that is vague, else None.
 
-        After a gap between scans it may be outside of the matcher's window. Directions that the
-        scan does not measure follow the prediction, and do not count.
+        After a gap between scans it may be outside of the matcher's window, by how it has moved so
+        far. Directions that the scan does not measure follow the prediction, and do not count.
         """
         if self._held_ns is None:
             return None
@@ -174,9 +174,9 @@ class FrontEnd:
         position_m2 = max(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]), 0.0)
         usual = self.motion.wandered((observation.stamp_ns - self._held_ns) * 1e-9)
         known = np.sqrt([position_m2, covariance[2, 2]])
-        reach = _REACH_SIGMAS * np.minimum(known, usual)
-        is_within = reach <= (self.matcher.window_m, self.matcher.window_rad)
-        return None if is_within.all() else np.asarray(reach)
+        near = _REACH_SIGMAS * np.minimum(known, usual)
+        is_within = near <= (self.matcher.window_m, self.matcher.window_rad)
+        return None if is_within.all() else np.asarray(_REACH_SIGMAS * known)
 
     def _turned_rad(self, *, is_known: bool) -> float:
         """Return how far [rad] it may have turned; `is_known`: as the wheels did not, if at all."""
