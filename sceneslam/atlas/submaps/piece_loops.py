@@ -42,10 +42,10 @@ class PieceLoops:
         """Forget all submaps but the first `count`."""
         self._pieces = {ends: one for ends, one in self._pieces.items() if ends[1] <= count}
 
-    def loops_to(self, query: LoopQuery, plane: NDArray[np.float64]) -> list[Edge]:
+    def loops_to(self, query: LoopQuery, T_map_node: NDArray[np.float64]) -> list[Edge]:
         """Return the loop to a submap, none if more than one place fits.
 
-        `plane` (N, 3) are the submaps as they were solved last.
+        `T_map_node` (N, 4, 4) are the submaps as they were solved last.
         """
         starts = [start for start in query.starts if start <= query.second]
         if len(starts) == 1:
@@ -60,21 +60,24 @@ class PieceLoops:
         largest = by_size[:_LARGEST]
         self._pieces = {ends: one for ends, one in self._pieces.items() if ends in largest}
         for ends in largest:
-            piece = self._piece(ends, query, plane)
+            piece = self._piece(ends, query, T_map_node)
             match = None if piece.recognizer is None else piece.recognizer.locate(plan)
             if match is not None:
                 found.append(_edge(piece, match, query.second))
         return found if len(found) == 1 else []
 
-    def _piece(self, ends: tuple[int, int], query: LoopQuery, plane: NDArray[np.float64]) -> _Piece:
+    def _piece(
+        self, ends: tuple[int, int], query: LoopQuery, T_map_node: NDArray[np.float64]
+    ) -> _Piece:
         """Return a piece; where its submaps lie is not updated."""
         if ends not in self._pieces:
             own = slice(*ends)
+            plane = planar.from_transforms(T_map_node[own])
             plans = [submap.plan for submap in query.submaps[own]]
             self._pieces[ends] = _Piece(
                 first=ends[0],
-                plane=plane[own].copy(),
-                recognizer=_recognizer(list(zip(plane[own], plans, strict=True))),
+                plane=plane,
+                recognizer=_recognizer(list(zip(plane, plans, strict=True))),
             )
         return self._pieces[ends]
 

@@ -30,7 +30,7 @@ from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.atlas.submaps.uprights import straightened, uprights
 from sceneslam.atlas.submaps.view_loops import ViewLoops
 from sceneslam.graphs.edge import Edge, EdgeKind
-from sceneslam.types import planar, se3
+from sceneslam.types import se3
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.se3 import Transform
 
@@ -203,14 +203,13 @@ class RunGraph:
         """Look for loops to the submaps that were not searched yet; plans show a level floor."""
         loops, query = list[Edge](), LoopQuery.of(chain, self._seen)
         self._starts = frozenset(query.starts)
-        plane = planar.from_transforms(self._T_map_node)
         for second in range(self._seen, len(chain)):
             found, views = self._views.loops_to(query.to(second))
             loops += found
             chain.submaps[second] = replace(chain.submaps[second], views=views)
         for second in range(self._planned, len(chain) if is_level else 0):
             loops += self._plans.loops_to(query.to(second))
-            loops += self._pieces.loops_to(query.to(second), plane)
+            loops += self._pieces.loops_to(query.to(second), self._T_map_node)
         self._seen, self._planned = len(chain), len(chain) if is_level else self._planned
         if loops:
             self._found.add(loops, query.T_run_node, query.drift)
