@@ -207,7 +207,7 @@ def test_a_robot_that_was_withdrawn_stays_so_when_poses_are_replaced(monkeypatch
     for second in (2, 3, 4):
         own.compare([placed(second, 0.0, 0.0, 0.0)])
     own.rewind(3 * S, lambda stamp_ns: planar.to_transform(np.zeros(3)))
-    assert own.T_map_run is None and len(own.fixes) == 1
+    assert own.T_map_run is None and not own.fixes
 
 
 def test_walls_tell_the_place_and_the_floor_there_the_height(monkeypatch):
@@ -301,3 +301,34 @@ def test_in_a_corridor_eyes_may_find_the_run_farther_off_than_walls(monkeypatch)
     )
     assert own.compare([seen_too(22.0, 22.0, 0.0, 0.0)]) is LocalizationEvent.FIXED
     assert in_map(own.T_map_run, [22.0, 0.0, 0.0])[0] == pytest.approx(22.4, abs=0.01)
+
+
+def test_where_a_piece_begins_the_robot_may_be_anywhere_and_earlier_places_count(monkeypatch):
+    scripted = Scripted(monkeypatch)
+    own = located(scripted, (1.0, 1.0, 0.0), run_at=(0.0, 0.0, 0.0))
+    first = own.T_map_run
+    own.restart(5 * S)
+    assert own.is_due(placed(5.0)) and not own.is_located  # though it is where it was located
+    assert [fix.stamp_ns for fix in own.fixes] == [1 * S]
+    scripted.answer = quality(at=(4.0, 3.0, 1.0))
+    said = [own.compare([placed(second, 0.0, 0.0, 0.0)]) for second in (5, 6)]
+    assert scripted.window is None and said[-1] is LocalizationEvent.FOUND
+    np.testing.assert_allclose(in_map(own.T_map_run, [0.0] * 3), [4.0, 3.0, 1.0], atol=1e-9)
+    assert [fix.stamp_ns / S for fix in own.fixes] == [1.0, 6.0]
+    own.rewind(4 * S, lambda stamp_ns: se3.identity())  # before the piece: it is the first again
+    assert own.is_located and [fix.stamp_ns / S for fix in own.fixes] == [1.0]
+    np.testing.assert_allclose(own.T_map_run, first, atol=1e-9)
+
+
+def test_a_piece_that_is_withdrawn_lies_where_the_one_before_puts_it(monkeypatch):
+    scripted = Scripted(monkeypatch)
+    own = located(scripted, (1.0, 1.0, 0.0), run_at=(0.0, 0.0, 0.0))
+    first = own.T_map_run
+    own.restart(5 * S)
+    scripted.answer = quality(at=(1.0, 1.2, 0.0))
+    said = [own.compare([placed(second, 0.0, 0.0, 0.0)]) for second in (5, 6)]
+    scripted.answer = None  # in front of free space
+    said += [own.compare([placed(second, 0.0, 0.0, 0.0)]) for second in (7, 8, 9)]
+    assert said[1] is LocalizationEvent.FOUND and said[-1] is LocalizationEvent.WITHDRAWN
+    np.testing.assert_allclose(own.T_map_run, first, atol=1e-9)
+    assert [fix.stamp_ns / S for fix in own.fixes] == [1.0]

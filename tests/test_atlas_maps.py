@@ -95,7 +95,7 @@ def test_nothing_is_forgotten_of_other_pieces_or_far_away():
         both = map_of(old, today, nodes=[node, [0, 0, 0]], runs=[0, 1])
         assert len(forget_contradicted(both, 1).submaps[0].plan) == 3
     node = [CELL, 2 * CELL, 0.0]
-    for pieces, count in (([1, 0], 3), ([1, 1], 0)):
+    for pieces, count in (([1, 0], 3), ([1, 1], 3), ([0, 0], 0)):
         both = map_of(old, today, nodes=[node, [0, 0, 0]], runs=[0, 1], pieces=pieces)
         assert len(forget_contradicted(both, 1).submaps[0].plan) == count
 

@@ -9,6 +9,7 @@ from test_laser_loop import PERIOD_NS, STEP_M, VIEW, furnished, laps, settings
 from test_laser_world import box, corridor, drive
 
 from sceneslam.atlas.atlas import Atlas
+from sceneslam.atlas.lasting.map_files import read_map_files
 from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.graphs.edge import Edge, EdgeKind
@@ -23,12 +24,13 @@ RIG = Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser())
 LOST_S = 10.0
 
 
-def carried(walls, first, second):
-    """Return atlas and loops after two paths (x, y, yaw); nothing was measured between them."""
-    atlas, loops = Atlas(voxel_m=0.05), []
+def carried(walls, *paths, **lasting):
+    """Return atlas and loops after paths (x, y, yaw); nothing was measured between two of them."""
+    atlas, loops = Atlas(voxel_m=0.05, **lasting), []
     atlas.open(RIG, lambda event, stamp_ns, **more: event == "loop" and loops.append(more))
     T_map_base, start_ns = se3.identity(), 0
-    for path, lost_s in ((first, 0.0), (second, LOST_S)):
+    for number, path in enumerate(paths):
+        lost_s = LOST_S if number else 0.0
         start_ns += round(lost_s * 1e9)
         module = LaserSlam(**settings())
         module.activate(RIG)
@@ -75,6 +77,42 @@ def test_pieces_are_joined_where_the_robot_comes_back(turned):
     assert errors.max() < 0.3  # the first piece alone drifts by 0.24 m
     sigmas = np.sqrt(np.diagonal(atlas.covariances(has_odometry=True), axis1=1, axis2=2))
     assert sigmas[-1, [0, 1, 5]].max() < 0.1 and sigmas.max() < 0.2 * LOST_S
+
+
+@pytest.fixture(scope="module")
+def ring_map(tmp_path_factory):
+    """A map of the ring, saved by a run of one lap, and the ring."""
+    folder, walls = tmp_path_factory.mktemp("ring") / "map", furnished(np.random.default_rng(0))
+    carried(walls, laps(1), save=str(folder))
+    return folder, walls
+
+
+@pytest.mark.parametrize("from_share", [0.25, 0.5])
+def test_in_a_loaded_map_every_piece_is_found_and_none_moves_another(ring_map, from_share):
+    folder, walls = ring_map
+    path, lap = laps(2), len(laps(1))
+    start = round((1.0 + from_share) * lap)
+    first, second = path[: lap // 2], path[start : start + lap // 2]
+    atlas, loops = carried(walls, first, second, load=str(folder))
+    assert any(loop["in_loaded_map"] for loop in loops)
+    T_true = transforms(np.concatenate([first, second]))
+    T_true = se3.inverse(T_true[0]) @ T_true  # the loaded map begins there, too
+    off_m = np.linalg.norm((atlas.trajectory.T_world_base - T_true)[:, :3, 3], axis=1)
+    assert off_m.max() < 0.4  # the map is off by 0.3 m
+    online = atlas.online.T_world_base
+    late_m = np.linalg.norm((online - T_true)[:, :3, 3], axis=1)[len(first) + 95 :]
+    assert late_m.max() < 0.4  # it was found within 9.5 s
+
+
+def test_pieces_that_nothing_joins_are_saved_as_pieces_the_largest_first(tmp_path):
+    walls, path, lap = furnished(np.random.default_rng(0)), laps(1), len(laps(1))
+    first, second = path[: lap // 6], path[lap // 2 : lap]
+    atlas, loops = carried(walls, first, second, save=str(tmp_path / "map"))
+    saved, _ = read_map_files(tmp_path / "map")
+    assert not loops
+    later = [one.stamps_ns[0] > int(LOST_S * 1e9) for one in saved.submaps]
+    assert 0 < later.index(True) < len(later) / 2 and list(saved.pieces) == [not x for x in later]
+    assert all(saved.pieces[edge.first] == saved.pieces[edge.second] for edge in saved.edges)
 
 
 def test_pieces_stay_apart_where_places_look_alike():

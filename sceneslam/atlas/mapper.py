@@ -8,6 +8,7 @@ looked for.
 from __future__ import annotations
 
 import logging
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
@@ -77,6 +78,7 @@ class Mapper:
         self._search: Future[LocalizationEvent] | None = None
         self._recent: list[Look] = []  # with a scan
         self._rewound_ns: int | None = None  # looks from here on have poses that were replaced
+        self._restart_ns: int | None = None  # a piece begins here, and the localizer is to be told
         self._is_level = True  # at the last step
         self._T_map_run: Transform | None = None
         self._T_map_runs: list[Transform] = []  # per submap, as it was while that was the newest
@@ -111,6 +113,11 @@ class Mapper:
         return self.is_placed or not self._loaded.submaps
 
     @property
+    def _is_located(self) -> bool:
+        """Tell whether the newest pose is where it was located in the loaded map."""
+        return self._localizer is not None and self._localizer.is_located
+
+    @property
     def T_map_run(self) -> Transform:
         """Return T_map_run (4, 4) in the loaded map; the identity until the run was located."""
         return se3.identity() if self._T_map_run is None else self._T_map_run
@@ -135,6 +142,8 @@ class Mapper:
         """Remove what was made of poses from a stamp on: they are replaced."""
         before_ns = stamp_ns if self._rewound_ns is None else self._rewound_ns
         self._rewound_ns = min(stamp_ns, before_ns)
+        if self._restart_ns is not None and stamp_ns <= self._restart_ns:
+            self._restart_ns = None
         self._collector.rewind(stamp_ns)
         self._views.rewind(stamp_ns)
         kept = len(self._collector.chain)
@@ -150,13 +159,15 @@ class Mapper:
         stamp_ns, localizer = observation.stamp_ns, self._localizer
         self._views.move(stamp_ns, known.T_map_base)
         self._collect_loops()
+        is_begun = self._collector.has_begun(known)
         if localizer is not None:
+            self._restart_ns = known.begun_ns if is_begun else self._restart_ns
             self._collect(localizer, stamp_ns)
         look = Look(stamp_ns=stamp_ns, T_run_base=known.T_map_base)
-        is_step = self._collector.has_moved(known)
+        is_step = is_begun or self._collector.has_moved(known)
         is_scanned = is_step or self._rests(stamp_ns)
         is_viewed = localizer is not None and self._search is None and localizer.wants_view(look)
-        is_viewed &= is_step or not self.is_placed  # a fix is by walls first, which come in steps
+        is_viewed &= is_step or not self._is_located  # a fix is by walls first, which come in steps
         if not (is_scanned or is_viewed):
             return
         if is_step:
@@ -197,7 +208,7 @@ class Mapper:
             self._collect(self._localizer, int(chain.submaps[-1].stamps_ns[-1]))
         chain.remeasure(path)
         old = np.array(chain.T_run_node)
-        fixes = self._localizer.fixes if self._localizer is not None and self.is_placed else []
+        fixes = [] if self._localizer is None else self._localizer.fixes
         start, is_level = self.T_map_run @ old, self._collector.is_level
         if self._graph is not None:
             self._graph.forget(self._kept)
@@ -226,10 +237,13 @@ class Mapper:
         ]
 
     def saved(self) -> SavedMap:
-        """Return the loaded map with this run in it: a separate piece if it was not located."""
-        count, pieces = len(self._loaded.submaps), self._loaded.pieces
-        own, loaded = self._collector.chain, self._solved.T_map_loaded
-        loaded = self._loaded.T_map_node if loaded is None else loaded
+        """Return the loaded map with this run in it.
+
+        What nothing joins is a separate piece: of the run, or all of a run that was not located.
+        """
+        count, own = len(self._loaded.submaps), self._collector.chain
+        moved = self._solved.T_map_loaded
+        loaded = self._loaded.T_map_node if moved is None else moved
         nodes = [*self._known_nodes()]
         if nodes:
             T_map_run = nodes[-1] @ se3.inverse(own.T_run_node[len(nodes) - 1])
@@ -237,12 +251,11 @@ class Mapper:
         else:
             located = zip(self._located(len(own)), own.T_run_node, strict=True)
             nodes = [T_map_run @ T_run_node for T_map_run, T_run_node in located]
-        piece = 0 if self.is_found else int(pieces.max(initial=-1)) + 1
         T_map_node = np.concatenate([loaded, np.reshape(nodes, (-1, 4, 4))])
         saved = SavedMap(
             submaps=(*self._loaded.submaps, *straightened(own.submaps)),
             T_map_node=T_map_node,
-            pieces=np.concatenate([pieces, np.full(len(own.submaps), piece, np.int64)]),
+            pieces=np.concatenate([self._loaded.pieces, self._own_pieces()]),
             edges=(
                 *self._loaded.edges,
                 *(edge.shifted(count) for edge in own.motions),
@@ -251,7 +264,24 @@ class Mapper:
                 *(place for place in self._places() if fits(place, T_map_node)),
             ),
         )
+        saved = saved.without_guesses()
         return saved.without_misfits() if self._is_over else saved
+
+    def _own_pieces(self) -> NDArray[np.int64]:
+        """Return the piece of each submap of the run, by the parts that loops join.
+
+        The first is what was located in the loaded map; without one, the part with most submaps.
+        """
+        chain, count = self._collector.chain, len(self._loaded.submaps)
+        loops = [*self._solved.own_loops, *self._solved.loops]
+        parts = chain.parts([loop.shifted(-count) for loop in loops])
+        fixes = [] if self._localizer is None else self._localizer.fixes
+        located = {chain.node_at(fix.stamp_ns) for fix in fixes}
+        pieces, piece = np.zeros(len(chain), np.int64), int(self._loaded.pieces.max(initial=-1)) + 1
+        for part in parts:
+            if located.isdisjoint(part):
+                pieces[part], piece = piece, piece + 1
+        return pieces
 
     def _places(self) -> list[Edge]:
         """Return the loops to the loaded map that are not solved yet: the run goes on."""
@@ -262,9 +292,19 @@ class Mapper:
 
     def _located(self, count: int) -> list[Transform]:
         """Return T_map_run (4, 4) of each of `count` submaps; that of the newest is today's."""
-        del self._T_map_runs[max(count - 1, 0) :]
+        del self._T_map_runs[max(count - 1, self._before_piece()) :]
         self._T_map_runs += [self.T_map_run] * (count - len(self._T_map_runs))
         return self._T_map_runs
+
+    @property
+    def _piece_ns(self) -> int:
+        """Return the stamp with which the piece begins that is located now."""
+        return 0 if self._localizer is None else self._localizer.piece_ns
+
+    def _before_piece(self) -> int:
+        """Return how many submaps lie before the piece that is located now."""
+        submaps = self._collector.chain.submaps
+        return bisect_left(submaps, self._piece_ns, key=lambda one: int(one.stamps_ns[0]))
 
     # During the run.
 
@@ -315,6 +355,8 @@ class Mapper:
             if start < len(stamps_ns) and (known := self._known(stamps_ns[start])) is not None:
                 knots.setdefault(known.begun_ns - 1, T_new_old[start - 1])
                 knots.setdefault(known.begun_ns, T_new_old[start])
+        if self.is_placed and stamps_ns[-1] < self._piece_ns:  # its first submap grows
+            knots |= {self._piece_ns - 1: T_new_old[-1], self._piece_ns: self.T_map_run}
         return Correction(
             stamps_ns=np.array(sorted(knots), np.int64),
             T_new_old=np.array([knots[stamp_ns] for stamp_ns in sorted(knots)]),
@@ -364,7 +406,7 @@ class Mapper:
 
     def _rests(self, stamp_ns: int) -> bool:
         """Tell whether a robot at rest should search the map."""
-        if self.is_found or not self._recent:
+        if not self._loaded.submaps or self._is_located or not self._recent:
             return False
         return stamp_ns - self._recent[-1].stamp_ns >= _REST_NS
 
@@ -392,6 +434,10 @@ class Mapper:
             localizer.rewind(self._rewound_ns, self._pose_at)
             self._rewound_ns = None
             self._follow(localizer)
+        if self._search is None and self._restart_ns is not None:
+            localizer.restart(self._restart_ns)
+            self._recent = [look for look in self._recent if look.stamp_ns >= self._restart_ns]
+            self._restart_ns, self._began_ns, self._has_told = None, None, False
 
     def _pose_at(self, stamp_ns: int) -> Transform | None:
         known = self._known(stamp_ns)
@@ -399,6 +445,8 @@ class Mapper:
 
     def _follow(self, localizer: MapLocalizer) -> None:
         """Take the localizer's estimate of where the run lies in the loaded map."""
+        before = self._before_piece()
+        self._T_map_runs += [self.T_map_run] * (before - len(self._T_map_runs))
         self._is_news |= localizer.T_map_run is not self._T_map_run
         self._T_map_run = localizer.T_map_run
 
@@ -408,13 +456,13 @@ class Mapper:
         after_s = (stamp_ns - self._began_ns) / 1e9
         self._follow(localizer)
         if outcome in (LocalizationEvent.FOUND, LocalizationEvent.WITHDRAWN):
-            self._T_map_runs.clear()
+            del self._T_map_runs[self._before_piece() :]
         if outcome is LocalizationEvent.FOUND:
             self.was_found = True
             self._note(outcome.value, stamp_ns, after_s=after_s, T_map_run=self.T_map_run.tolist())
         elif outcome is LocalizationEvent.WITHDRAWN:
             self._note(outcome.value, stamp_ns, after_s=after_s)
-        elif not self.is_found and not self._has_told and after_s * 1e9 >= _UNFOUND_NS:
+        elif not self._is_located and not self._has_told and after_s * 1e9 >= _UNFOUND_NS:
             self._note("not_relocalized", stamp_ns, after_s=after_s)
             self._has_told = True
 

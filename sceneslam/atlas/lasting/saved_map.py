@@ -98,6 +98,12 @@ class SavedMap:
         kept = (edge for edge in self.edges if not edge.is_loop or fits(edge, self.T_map_node))
         return replace(self, edges=tuple(kept))
 
+    def without_guesses(self) -> SavedMap:
+        """Return the map without the edges between two pieces: nothing measured those."""
+        pieces = self.pieces
+        kept = (edge for edge in self.edges if pieces[edge.first] == pieces[edge.second])
+        return replace(self, edges=tuple(kept))
+
     def nearest(self, T_map_base: Transform, piece: int = 0) -> int:
         """Return the submap of a piece that begins nearest to a pose (4, 4)."""
         away_m = np.linalg.norm((self.T_map_node - T_map_base)[:, :3, 3], axis=1)
@@ -164,19 +170,19 @@ def empty_map() -> SavedMap:
 def forget_contradicted(saved: SavedMap, run: int) -> SavedMap:
     """Return the map without walls of earlier runs that stand where `run` saw free space.
 
+    That is in the first piece, which runs load.
     Likewise free cells of earlier runs are removed where this run saw a wall. Within one cell, the
     registration's accuracy, nothing is removed. Earlier views go where this run has one nearby.
     """
-    newest = [index for index, submap in enumerate(saved.submaps) if submap.run == run]
+    newest = [index for index in saved.nodes() if saved.submaps[index].run == run]
     if not newest:
         return saved
-    piece = int(saved.pieces[newest[0]])
     plane = saved.plane
     today = join([(plane[i], saved.submaps[i].plan) for i in newest])
     views_today = saved.views_of(newest)
     submaps = list(saved.submaps)
     for index, submap in enumerate(saved.submaps):
-        if submap.run == run or saved.pieces[index] != piece:
+        if submap.run == run or saved.pieces[index] != 0:
             continue
         if len(submap.plan):
             submap = submap.with_plan(_without(submap.plan, plane[index], today))

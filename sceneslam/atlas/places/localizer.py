@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -113,7 +114,9 @@ class MapLocalizer:
         without it they stay as they are.
         """
         self.T_map_run: Transform | None = None  # None until the run was located
-        self.fixes: list[Fix] = []
+        self.is_located = False  # in its present piece
+        self._fixes: list[Fix] = []
+        self._starts_ns = [0]  # here pieces of the run begin: nothing measured the motion to them
         self._walls = Recognizer(PlanField(plan)) if len(plan) else None
         self._views, self._standing = views, standing
         self._next_walls_ns = self._next_view_ns = 0
@@ -130,11 +133,27 @@ class MapLocalizer:
         """Tell whether it is time to compare a view at the newest look."""
         return self._views is not None and self._is_time(newest, self._next_view_ns)
 
+    @property
+    def fixes(self) -> list[Fix]:
+        """Return where the run was located, without a place that was contradicted since."""
+        return self._fixes if self.is_located else self._earlier
+
+    @property
+    def piece_ns(self) -> int:
+        """Return the stamp with which the present piece of the run begins, 0 for the first."""
+        return self._starts_ns[-1]
+
+    def restart(self, stamp_ns: int) -> None:
+        """Search everywhere again: nothing measured the motion to the pose at a stamp."""
+        self._starts_ns.append(stamp_ns)
+        self.is_located, self._guess, self._seen = False, None, None
+        self._vain = self._doubts = self._next_walls_ns = self._next_view_ns = 0
+
     def compare(self, latest: Sequence[Look]) -> LocalizationEvent:
         """Compare the latest looks, oldest first, with the map."""
         newest = latest[-1]
         self._drive(latest)
-        if self.T_map_run is not None:
+        if self.is_located and self.T_map_run is not None:
             return self._check(latest, self.T_map_run @ newest.T_run_base)
         fix = self._by_view(newest, None)
         if fix is None and self._compares_walls(newest):
@@ -146,35 +165,51 @@ class MapLocalizer:
         if before is None or not _agree(before.T_map_run, T_map_run, newest.T_run_base):
             return LocalizationEvent.NOTHING
         fix = _mean(fix, before, newest)
-        if self.fixes:  # it was located before: there, and it drifted, or somewhere else
-            last = self.fixes[-1]
+        if self._own:  # it was located before: there, and it drifted, or somewhere else
+            last = self._own[-1]
             T_expected = last.T_map_base @ se3.inverse(last.T_run_base) @ newest.T_run_base
             if not _is_within(fix, self._window(T_expected, last.held)):
-                self.fixes = []
+                self._fixes = self._earlier
         self._take(newest, fix)
         return LocalizationEvent.FOUND
 
     def rewind(self, stamp_ns: int, path: Path) -> None:
         """Forget what was found by poses that `path` replaced from a stamp on.
 
-        The first fix stays: the run was located.
+        The first fix of a piece stays: it was located.
         """
         self._guess, self._doubts = None, 0
-        self.fixes = [fix for fix in self.fixes if fix.stamp_ns < stamp_ns] or self.fixes[:1]
-        fix = self.fixes[-1] if self.fixes else None
+        kept = bisect_left(self._starts_ns, stamp_ns, lo=1)
+        if kept < len(self._starts_ns):
+            del self._starts_ns[kept:]
+            self._fixes = [fix for fix in self._fixes if fix.stamp_ns < stamp_ns]
+            self.is_located = bool(self._own)
+        own = [fix for fix in self._own if fix.stamp_ns < stamp_ns] or self._own[:1]
+        self._fixes = [*self._earlier, *own]
+        fix = own[-1] if own else None
         T_run_base = None if fix is None else path(fix.stamp_ns)
         if fix is not None and T_run_base is not None:
-            self.fixes[-1] = replace(fix, T_run_base=T_run_base)
+            self._fixes[-1] = replace(fix, T_run_base=T_run_base)
             self._seen = Look(stamp_ns=fix.stamp_ns, T_run_base=T_run_base)
             self._travelled = fix.travelled
-            if self.T_map_run is not None:
+            if self.is_located:
                 self.T_map_run = fix.T_map_base @ se3.inverse(T_run_base)
+
+    @property
+    def _own(self) -> list[Fix]:
+        """Return the fixes of the present piece."""
+        return [fix for fix in self._fixes if fix.stamp_ns >= self.piece_ns]
+
+    @property
+    def _earlier(self) -> list[Fix]:
+        """Return those of the pieces before it."""
+        return [fix for fix in self._fixes if fix.stamp_ns < self.piece_ns]
 
     def _is_time(self, newest: Look, next_ns: int) -> bool:
         """Tell whether the time has come, and a located robot has moved since its last fix."""
-        if newest.stamp_ns < next_ns or self.T_map_run is None:
+        if newest.stamp_ns < next_ns or not self.is_located:
             return newest.stamp_ns >= next_ns
-        away = se3.inverse(self.fixes[-1].T_run_base) @ newest.T_run_base
+        away = se3.inverse(self._fixes[-1].T_run_base) @ newest.T_run_base
         is_far = np.linalg.norm(away[:3, 3]) >= _FIX_M
         return bool(is_far or se3.rotation_angle_rad(away) >= _FIX_RAD)
 
@@ -220,8 +255,8 @@ class MapLocalizer:
     def _check(self, latest: Sequence[Look], T_map_base: Transform) -> LocalizationEvent:
         """Compare near the predicted pose; repeated contradictions withdraw the localization."""
         newest = latest[-1]
-        window = self._window(T_map_base, self.fixes[-1].travelled)
-        wide = self._window(T_map_base, self.fixes[-1].held)
+        window = self._window(T_map_base, self._fixes[-1].travelled)
+        wide = self._window(T_map_base, self._fixes[-1].held)
         seen = self._by_view(newest, (T_map_base, wide))
         is_contradicted = seen is not None and not _is_within(seen, wide)
         fix = None if is_contradicted else seen
@@ -235,7 +270,9 @@ class MapLocalizer:
         self._doubts = self._doubts + 1 if is_contradicted else 0
         if self._doubts < _DOUBTS:
             return LocalizationEvent.NOTHING
-        self.T_map_run, self._guess = None, None
+        self.is_located, self._guess = False, None
+        last = self._earlier[-1:]
+        self.T_map_run = last[0].T_map_base @ se3.inverse(last[0].T_run_base) if last else None
         self._doubts = self._vain = 0
         return LocalizationEvent.WITHDRAWN
 
@@ -289,9 +326,9 @@ class MapLocalizer:
         )
 
     def _take(self, newest: Look, fix: Fix) -> None:
-        self.T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
-        held = self.fixes[-1].held if fix.is_open and self.fixes else self._travelled
-        self.fixes.append(replace(fix, travelled=self._travelled, held=held))
+        self.T_map_run, self.is_located = fix.T_map_base @ se3.inverse(newest.T_run_base), True
+        held = self._own[-1].held if fix.is_open and self._own else self._travelled
+        self._fixes.append(replace(fix, travelled=self._travelled, held=held))
         self._doubts = self._vain = 0
         self._next_walls_ns = self._next_view_ns = newest.stamp_ns + _FIX_NS
 

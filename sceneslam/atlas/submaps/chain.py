@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.atlas.submaps.graph import connected
 from sceneslam.atlas.submaps.own_loops import Path
 from sceneslam.atlas.submaps.path_drift import summed
 from sceneslam.atlas.submaps.submap import Submap
@@ -41,6 +43,12 @@ class Chain:
         """Return the submaps with which a piece begins: nothing measured the motion to it."""
         seams = [motion for motion in self.motions if motion.kind is EdgeKind.HANDOVER]
         return [0, *(seam.second for seam in seams if is_guessed(seam.covariance))]
+
+    def parts(self, loops: Sequence[Edge]) -> list[list[int]]:
+        """Return the submaps of each part that motions or loops join, the largest part first."""
+        seams = set(self.starts)
+        known = [motion for motion in self.motions if motion.second not in seams]
+        return sorted(connected(range(len(self)), [*known, *loops]), key=len, reverse=True)
 
     def append(self, submap: Submap, T_run_node: Transform, motion: Edge | None) -> None:
         """Add a submap with the motion to it, None for the first."""

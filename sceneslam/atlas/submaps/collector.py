@@ -79,10 +79,14 @@ class Collector:
         """Tell whether the base moves on a floor."""
         return self._level >= _LEVEL_RATIO * self._count
 
-    def has_moved(self, known: Known) -> bool:
-        """Tell whether it is time for a step: at the latest when a piece of the run begins."""
+    def has_begun(self, known: Known) -> bool:
+        """Tell whether a piece of the run begins: nothing measured the motion to this pose."""
         before, self._session = self._session, known.session
-        if self._last is None or (known.session != before and is_guessed(known.of_map)):
+        return before not in (-1, known.session) and is_guessed(known.of_map)
+
+    def has_moved(self, known: Known) -> bool:
+        """Tell whether it is time for a step."""
+        if self._last is None:
             return True
         step = se3.inverse(self._last) @ known.T_map_base
         is_far = np.linalg.norm(step[:3, 3]) >= STEP_M
