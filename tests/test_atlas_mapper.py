@@ -253,7 +253,10 @@ def test_a_located_run_is_corrected_into_the_loaded_map(monkeypatch, is_placed):
     kept = len(events)
     path = lambda stamp_ns: planar.to_transform(np.array([stamp_ns / S, 0.0, 0.0]))  # noqa: E731
     found = own.finish(path, [])
-    assert len(found.stamps_ns) == (7 if is_placed else 0) and [event for event, *_ in events[kept:]] == ["loop"] * is_placed
+    assert (
+        len(found.stamps_ns) == (7 if is_placed else 0)
+        and [event for event, *_ in events[kept:]] == ["loop"] * is_placed
+    )
     stamps_ns = np.arange(20) * S
     poses = np.stack([path(stamp_ns) for stamp_ns in stamps_ns])
     np.testing.assert_allclose(found.apply(stamps_ns, poses), own.T_map_run @ poses, atol=1e-9)

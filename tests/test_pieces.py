@@ -107,7 +107,7 @@ def test_in_a_loaded_map_every_piece_is_found_and_none_moves_another(ring_map, f
 def test_pieces_that_nothing_joins_are_saved_as_pieces_the_largest_first(tmp_path):
     walls, path, lap = furnished(np.random.default_rng(0)), laps(1), len(laps(1))
     first, second = path[: lap // 6], path[lap // 2 : lap]
-    atlas, loops = carried(walls, first, second, save=str(tmp_path / "map"))
+    _, loops = carried(walls, first, second, save=str(tmp_path / "map"))
     saved, _ = read_map_files(tmp_path / "map")
     assert not loops
     later = [one.stamps_ns[0] > int(LOST_S * 1e9) for one in saved.submaps]

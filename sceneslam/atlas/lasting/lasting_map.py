@@ -6,6 +6,8 @@ import logging
 from concurrent.futures import Executor, Future
 from pathlib import Path
 
+import numpy as np
+
 from sceneslam.atlas.lasting.map_files import (
     OLD,
     check_map_folder,
@@ -102,6 +104,15 @@ class LastingMap:
             self._fault(f"the run has nothing to save, the map that was in {self._save} stays")
         elif self._write(saved, mapper.is_found):
             note("map_saved", stamp_ns, submaps=len(saved.submaps), loops=_loops(saved))
+            apart = len(np.unique(saved.pieces)) - 1
+            if apart:
+                _log.warning(
+                    "the map %s has %d piece%s that nothing joined to the first: a run that loads "
+                    "it searches that one alone, `python -m sceneslam.maps merge` tries to join them",
+                    self._save,
+                    apart,
+                    "s" * (apart > 1),
+                )
 
     def close(self) -> None:
         """Wait for a map that is being saved, and save no other. May be called twice."""

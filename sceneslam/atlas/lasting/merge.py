@@ -10,14 +10,12 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import join
-from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.submaps.graph import Solved, consistent, on_floor, solve
 from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.uprights import uprights
-from sceneslam.graphs.edge import Edge, EdgeKind
+from sceneslam.graphs.edge import Edge
 from sceneslam.types import planar, se3
-from sceneslam.types.se3 import Transform
 from sceneslam.views.landmark_registration import recognize
 from sceneslam.views.placed_views import PlacedViews
 
@@ -83,18 +81,18 @@ def _joined(saved: SavedMap, target: int, piece: int) -> SavedMap | None:
 
 def _loops_by_walls(saved: SavedMap, piece: int, own: Sequence[int]) -> list[Edge]:
     """Return loops from a piece to the submaps `own` of another piece, by their walls."""
-    plane, walls = saved.plane, saved.plan(piece)
-    if not len(walls):
+    plane, target = saved.plane, Recognizer.of(saved.plan(piece))
+    if target is None:
         return []
-    target, found = Recognizer(PlanField(walls)), []
+    found = []
     for row, node in enumerate(own):
         around = own[max(row - _AROUND, 0) : row + _AROUND + 1]
         near = [index for index in around if saved.submaps[index].run == saved.submaps[node].run]
         query = join([(planar.between(plane[node], plane[i]), saved.submaps[i].plan) for i in near])
         match = target.locate(query)
         if match is not None:
-            T_map_node = planar.to_transform(match.T_target_query)
-            found.append(_edge_to(saved, piece, node, T_map_node, on_floor(match.covariance)))
+            T_map_node = saved.standing(planar.to_transform(match.T_target_query), piece)
+            found.append(saved.loop_to(T_map_node, on_floor(match.covariance), node, piece=piece))
     return found
 
 
@@ -102,35 +100,16 @@ def _loops_by_views(saved: SavedMap, piece: int, own: Sequence[int]) -> list[Edg
     """Return the same by what a camera saw, a loop per view that was recognized."""
     known = PlacedViews(saved.views(piece))
     return [
-        _edge_to(
-            saved,
-            piece,
-            node,
+        saved.loop_to(
             found[1].T_map_cam @ se3.inverse(view.T_submap_cam),
             se3.carried(found[1].covariance, view.T_submap_cam),
+            node,
+            piece=piece,
         )
         for node in own
         for view in saved.submaps[node].views
         if (found := recognize(known, view.landmarks)) is not None
     ]
-
-
-def _edge_to(
-    saved: SavedMap,
-    piece: int,
-    node: int,
-    T_map_node: Transform,
-    covariance: NDArray[np.float64],
-) -> Edge:
-    """Return the loop to a node at T_map_node (4, 4) from a piece's nearest one."""
-    first = saved.nearest(T_map_node, piece)
-    return Edge(
-        first=first,
-        second=node,
-        T_first_second=se3.inverse(saved.T_map_node[first]) @ T_map_node,
-        covariance=covariance,
-        kind=EdgeKind.LOOP,
-    )
 
 
 def _solve(

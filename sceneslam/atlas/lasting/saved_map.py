@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sceneslam.atlas.places.floor_plan import FloorPlan, check_size, join
 from sceneslam.atlas.submaps.graph import connected, fits
 from sceneslam.atlas.submaps.submap import Submap
-from sceneslam.graphs.edge import Edge
+from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.motion.tilt import upright
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import PoseGraphLayer
@@ -108,6 +108,28 @@ class SavedMap:
         """Return the submap of a piece that begins nearest to a pose (4, 4)."""
         away_m = np.linalg.norm((self.T_map_node - T_map_base)[:, :3, 3], axis=1)
         return int(np.argmin(np.where(self.pieces == piece, away_m, np.inf)))
+
+    def loop_to(
+        self,
+        T_map_node: Transform,
+        covariance: NDArray[np.float64],
+        node: int,
+        *,
+        piece: int = 0,
+        first: int = 0,
+    ) -> Edge:
+        """Return the loop to a node at a pose (4, 4) from the nearest submap of a piece.
+
+        Submaps are counted from `first`. The covariance (6, 6) is in the axes of the node.
+        """
+        nearest = self.nearest(T_map_node, piece)
+        return Edge(
+            first=first + nearest,
+            second=node,
+            T_first_second=se3.inverse(self.T_map_node[nearest]) @ T_map_node,
+            covariance=covariance,
+            kind=EdgeKind.LOOP,
+        )
 
     def standing(self, T_map_base: Transform, piece: int = 0) -> Transform:
         """Return a pose (4, 4) with the height and tilt of a robot on the floor of a piece there.

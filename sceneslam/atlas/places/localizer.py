@@ -117,7 +117,7 @@ class MapLocalizer:
         self.is_located = False  # in its present piece
         self._fixes: list[Fix] = []
         self._starts_ns = [0]  # here pieces of the run begin: nothing measured the motion to them
-        self._walls = Recognizer(PlanField(plan)) if len(plan) else None
+        self._walls = Recognizer.of(plan)
         self._views, self._standing = views, standing
         self._next_walls_ns = self._next_view_ns = 0
         self._seen: Look | None = None  # that was compared last

@@ -26,6 +26,11 @@ class Recognizer:
     def __init__(self, target: PlanField) -> None:
         self.field, self._search = target, PlanSearch(target)
 
+    @classmethod
+    def of(cls, plan: FloorPlan) -> Recognizer | None:
+        """Return the recognizer in a plan, None if that shows no walls."""
+        return cls(PlanField(plan)) if len(plan) else None
+
     def recognize(
         self, query: PlanField, window: SearchWindow | None, *, known_min: float = _KNOWN_MIN
     ) -> PlanRegistration | None:

@@ -8,16 +8,14 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.atlas.places.floor_plan import FloorPlan, join
-from sceneslam.atlas.places.plan_field import PlanField
+from sceneslam.atlas.lasting.saved_map import SavedMap
+from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.recognition import Recognizer
-from sceneslam.atlas.places.registration import PlanRegistration
 from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.submaps.loop_query import LoopQuery
-from sceneslam.graphs.edge import Edge, EdgeKind
+from sceneslam.graphs.edge import Edge
 from sceneslam.types import planar
 from sceneslam.types.errors import InputError
-from sceneslam.types.planar import Planar
 
 _LARGEST = 8  # earlier pieces that are searched, by their submaps: each takes a tenth of a second
 _SPAN = 3  # newest submaps that are compared, 7.5 m of path: as a run with a loaded map
@@ -25,11 +23,25 @@ _SPAN = 3  # newest submaps that are compared, 7.5 m of path: as a run with a lo
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Piece:
-    """The plan of an earlier piece, and where its submaps lie in it."""
+    """An earlier piece as a map."""
 
-    first: int
-    plane: NDArray[np.float64]  # (K, 3)
-    recognizer: Recognizer | None  # None: it shows no walls, or is too large to draw
+    first: int  # submap of the run
+    map: SavedMap
+    walls: Recognizer | None  # None: it shows none, or is too large to draw
+
+    def loop_to(self, query: LoopQuery) -> Edge | None:
+        """Return the loop to the submap `query.second` if the newest are recognized here."""
+        newest = range(max(query.start, query.second - _SPAN + 1), query.second + 1)
+        placed = [
+            (planar.between(query.plane[query.second], query.plane[one]), query.submaps[one].plan)
+            for one in newest
+        ]
+        match = None if self.walls is None else self.walls.locate(join(placed))
+        if match is None:
+            return None
+        T_map_node = self.map.standing(planar.to_transform(match.T_target_query))
+        covariance = on_floor(match.covariance)
+        return self.map.loop_to(T_map_node, covariance, query.second, first=self.first)
 
 
 class PieceLoops:
@@ -48,58 +60,28 @@ class PieceLoops:
         `T_map_node` (N, 4, 4) are the submaps as they were solved last.
         """
         starts = [start for start in query.starts if start <= query.second]
-        if len(starts) == 1:
-            return []
-        newest = range(max(starts[-1], query.second - _SPAN + 1), query.second + 1)
-        placed = [
-            (planar.between(query.plane[query.second], query.plane[one]), query.submaps[one].plan)
-            for one in newest
-        ]
-        plan, found = join(placed), list[Edge]()
         by_size = sorted(pairwise(starts), key=lambda ends: ends[0] - ends[1])
         largest = by_size[:_LARGEST]
         self._pieces = {ends: one for ends, one in self._pieces.items() if ends in largest}
-        for ends in largest:
-            piece = self._piece(ends, query, T_map_node)
-            match = None if piece.recognizer is None else piece.recognizer.locate(plan)
-            if match is not None:
-                found.append(_edge(piece, match, query.second))
+        for ends in largest:  # where its submaps lie in a piece is not updated
+            if ends not in self._pieces:
+                self._pieces[ends] = _piece(ends, query, T_map_node)
+        loops = [self._pieces[ends].loop_to(query) for ends in largest]
+        found = [loop for loop in loops if loop is not None]
         return found if len(found) == 1 else []
 
-    def _piece(
-        self, ends: tuple[int, int], query: LoopQuery, T_map_node: NDArray[np.float64]
-    ) -> _Piece:
-        """Return a piece; where its submaps lie is not updated."""
-        if ends not in self._pieces:
-            own = slice(*ends)
-            plane = planar.from_transforms(T_map_node[own])
-            plans = [submap.plan for submap in query.submaps[own]]
-            self._pieces[ends] = _Piece(
-                first=ends[0],
-                plane=plane,
-                recognizer=_recognizer(list(zip(plane, plans, strict=True))),
-            )
-        return self._pieces[ends]
 
-
-def _recognizer(placed: list[tuple[Planar, FloorPlan]]) -> Recognizer | None:
-    try:
-        plan = join(placed)
-    except InputError:
-        return None
-    return Recognizer(PlanField(plan)) if len(plan) else None
-
-
-def _edge(piece: _Piece, match: PlanRegistration, second: int) -> Edge:
-    """Return the loop from the nearest submap of a piece."""
-    away_m = np.hypot(*(piece.plane - match.T_target_query)[:, :2].T)
-    nearest = int(np.argmin(away_m))
-    return Edge(
-        first=piece.first + nearest,
-        second=second,
-        T_first_second=planar.to_transform(
-            planar.between(piece.plane[nearest], match.T_target_query)
-        ),
-        covariance=on_floor(match.covariance),
-        kind=EdgeKind.LOOP,
+def _piece(ends: tuple[int, int], query: LoopQuery, T_map_node: NDArray[np.float64]) -> _Piece:
+    own = slice(*ends)
+    submaps = tuple(query.submaps[own])
+    piece = SavedMap(
+        submaps=submaps,
+        T_map_node=T_map_node[own],
+        pieces=np.zeros(len(submaps), np.int64),
+        edges=(),
     )
+    try:
+        walls = Recognizer.of(piece.plan())
+    except InputError:
+        walls = None
+    return _Piece(first=ends[0], map=piece, walls=walls)

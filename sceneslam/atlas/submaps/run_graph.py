@@ -249,13 +249,10 @@ class RunGraph:
 
     def _fix_edge(self, fix: Fix, node: int, T_base_node: Transform) -> Edge:
         """Return the loop to a node from the nearest submap of the loaded map."""
-        nodes, first = self._loaded.T_map_node, self._loaded.nearest(fix.T_map_base)
-        return Edge(
-            first=first,
-            second=self._count + node,
-            T_first_second=se3.inverse(nodes[first]) @ fix.T_map_base @ T_base_node,
-            covariance=se3.carried(fix.covariance, se3.inverse(T_base_node)),
-            kind=EdgeKind.LOOP,
+        return self._loaded.loop_to(
+            fix.T_map_base @ T_base_node,
+            se3.carried(fix.covariance, se3.inverse(T_base_node)),
+            self._count + node,
         )
 
 
