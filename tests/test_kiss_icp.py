@@ -264,7 +264,7 @@ def test_noise_does_not_move_the_pose_along_what_is_not_seen():
     assert {tracking.status for tracking in trackings} == {TrackingStatus.DEGRADED}
     assert abs(trackings[-1].T_local_base[0, 3]) < 0.1
     dragged, _ = walk(active(weak_ratio=0.0), ends=False, odometry=False)
-    assert abs(dragged[-1].T_local_base[0, 3]) > 0.3  # neither at rest nor the 1.9 m walked
+    assert abs(dragged[-1].T_local_base[0, 3]) > 0.2  # neither at rest nor the 1.9 m walked
     deviations = [np.sqrt(tracking.covariance[0, 0]) for tracking in trackings]
     assert np.diff(deviations).min() > -0.01  # but for what single clouds seem to hold
     assert deviations[-1] > 2 * deviations[1]
@@ -274,3 +274,13 @@ def test_ends_of_the_corridor_hold_it():
     trackings, poses = walk(active(), ends=True, odometry=True)
     assert {tracking.status for tracking in trackings} == {TrackingStatus.TRACKING}
     assert worst_error_m(trackings, poses) < 0.06
+
+
+def test_the_velocity_is_known_by_clouds_alone():
+    """By it points are deskewed, and scans found that come after others were lost."""
+    far = replace(RIG, lidar=Lidar(range_m=(0.5, 100.0)))
+    module, (observations, poses) = active(far), drive(40, speed_m=0.5)
+    for observation in observations:
+        module.track(observation)
+    right = se3.log(se3.inverse(poses[-2]) @ poses[-1])[:3] / 0.1  # 5 m/s
+    assert np.linalg.norm(module._predictor.model.velocity[:3] - right) < 0.5
