@@ -284,3 +284,22 @@ def test_the_velocity_is_known_by_clouds_alone():
         module.track(observation)
     right = se3.log(se3.inverse(poses[-2]) @ poses[-1])[:3] / 0.1  # 5 m/s
     assert np.linalg.norm(module._predictor.model.velocity[:3] - right) < 0.5
+
+
+@pytest.mark.parametrize("lost", [4, 20])
+def test_after_seconds_without_clouds_the_pose_is_right_or_lost(lost):
+    module, (observations, poses) = active(), drive(60)
+    for observation in observations[:20]:
+        module.track(observation)
+    first = 20 + lost
+    answers = [module.track(observation) for observation in observations[first : first + 5]]
+    if lost == 4:
+        assert {answer.status for answer in answers} == {TrackingStatus.TRACKING}
+        moved = [se3.inverse(poses[0]) @ pose for pose in poses[first : first + 5]]
+        off_m = [
+            answer.T_local_base[:3, 3] - T[:3, 3] for answer, T in zip(answers, moved, strict=True)
+        ]
+        assert np.linalg.norm(off_m, axis=1).max() < 0.05
+    else:  # it may have turned by half a turn since then
+        assert {answer.status for answer in answers} == {TrackingStatus.LOST}
+        assert all(answer.can_begin for answer in answers)

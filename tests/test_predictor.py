@@ -22,10 +22,10 @@ def measure(predictor, observation, T_local_base):
     predictor.measure(observation, T_local_base, SEEN, np.linalg.inv(SEEN))
 
 
-def walking():
-    """Return a predictor of a camera that is carried forward by 1 m/s, at 0.2 s."""
+def walking(until_s=0.2):
+    """Return a predictor of a camera that is carried forward by 1 m/s."""
     predictor = Predictor(HELD)
-    for index in range(3):
+    for index in range(round(10 * until_s) + 1):
         measure(predictor, at(0.1 * index), se3.from_xy_yaw(0.1 * index, 0, 0))
     return predictor
 
@@ -33,6 +33,7 @@ def walking():
 def test_base_goes_on_at_constant_velocity_and_no_longer_than_that_is_known():
     assert walking().predict(at(0.3)).T_local_base[0, 3] == pytest.approx(0.3, abs=0.01)
     assert walking().predict(at(5.0)).T_local_base[0, 3] == pytest.approx(0.7, abs=0.01)
+    assert walking(4.0).predict(at(5.0)).T_local_base[0, 3] == pytest.approx(4.9, abs=0.05)
 
 
 def test_base_that_is_lost_without_wheels_is_expected_where_it_was():

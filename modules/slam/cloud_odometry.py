@@ -19,7 +19,7 @@ from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
 from .cloud_map import CloudMap
-from .clouds import CloudReader
+from .clouds import Cloud, CloudReader
 from .degeneracy import Localizability
 
 _POINTS_MIN = 50  # fewer do not constrain six degrees of freedom
@@ -27,6 +27,7 @@ _DEPTH_VOXEL_M = 0.1
 # Deviation of what two clouds say of the motion between them, over that of their poses: most of the
 # error is that of the map, which both share. 0.05 to 0.14 voxels from one cloud to the next.
 _STEP_RATIO = 0.25
+_SIGMAS = 2.0  # of the robot's motion since the last cloud: how far a guess may be off
 _DIFFUSE = 1e6  # prediction's covariance in units of a cloud's, if ICP decides alone
 
 
@@ -104,6 +105,9 @@ class CloudOdometry(ABC):
             return self._bridge(observation, prediction, can_coast=True)
         if len(cloud) < _POINTS_MIN:
             return self._bridge(observation, prediction, can_coast=False)
+        capture_m = self._icp.capture_m
+        if self._has_map and self._may_be_off_m(cloud, observation, prediction) > capture_m:
+            return self._bridge(observation, prediction, can_coast=False, can_begin=True)
         T_local_icp = self._icp.register(cloud, prediction.T_local_base, observation)
         if T_local_icp is None or not np.isfinite(T_local_icp).all():
             return self._bridge(observation, prediction, can_coast=False)
@@ -164,6 +168,17 @@ class CloudOdometry(ABC):
         steps = information / _STEP_RATIO**2
         self._predictor.measure(observation, T_local_base, covariance, steps)
         return T_local_base
+
+    def _may_be_off_m(
+        self, cloud: Cloud, observation: Observation, prediction: Prediction
+    ) -> float:
+        """Return how far [m] points may be off the prediction, after a time without a pose."""
+        if prediction.is_measured or not self._predictor.is_long_unmeasured(observation):
+            return 0.0
+        unmeasured_s = self._predictor.unmeasured_s(observation)
+        moved_m, turned_rad = self._predictor.model.wandered(unmeasured_s)
+        arm_m = np.median(np.linalg.norm(cloud, axis=1))
+        return float(_SIGMAS * np.hypot(moved_m, arm_m * turned_rad))
 
     def _is_plausible(
         self, observation: Observation, prediction: Prediction, T_local_icp: se3.Transform

@@ -90,6 +90,7 @@ class _GenzMap(CloudMap):
             min_motion_th=motion_min_m,
             max_range=range_max_m,
         )
+        self.capture_m = initial_threshold_m
 
     def register(
         self, cloud: Cloud, T_local_guess: se3.Transform, observation: Observation

@@ -74,6 +74,7 @@ class _KissMap(CloudMap):
             ),
         )
         self._odometry: Any = KissICP(config)
+        self.capture_m = initial_threshold_m
         super().__init__(voxel_m=voxel_m, range_max_m=range_max_m)
 
     def register(

@@ -25,7 +25,6 @@ _USUAL = {False: 1.0, True: 1 / 3}  # of that: deviation of the acceleration, by
 _LASTS_S = 0.5, 20.0  # shortest and longest time constant of a velocity; it begins with the first
 _CHANGED = np.array([0.1, 0.1]) ** 2  # (m/s)^2, (rad/s)^2: weight of that beginning
 _JUMP = 3.0  # times the acceleration: a larger change of velocity is a jump
-_KEPT_S = 0.5  # longest time that an unmeasured velocity is kept
 _STEP = np.array([1e-4, 1e-4])  # m, rad: least standard deviation of a predicted step
 _FASTEST = np.array([25.0, 20.0])  # m/s, rad/s: deviation of a velocity that was never measured
 _UNUSED = 1e6  # m^2, rad^2: variance of what is not used
@@ -55,6 +54,12 @@ class Inertia:
         """Return the estimated standard deviations (2,) [m, rad] of a predicted motion."""
         return np.array([noise.ratio for noise in self._missed])
 
+    @property
+    def _lasts_s(self) -> NDArray[np.float64]:
+        """Return the time constants (2,) [s] of a velocity: none longer than it was measured."""
+        longest_s = np.clip(self._measured_s, *_LASTS_S)
+        return np.clip(self._lasted / self._changed, _LASTS_S[0], longest_s)
+
     def reset(self) -> None:
         """Reset the velocity."""
         self.velocity, self._covariance = np.zeros(6), np.zeros((6, 6))
@@ -64,7 +69,8 @@ class Inertia:
         """Return the motion of the next `duration_s`."""
         before_s, self._unmeasured_s = self._unmeasured_s, self._unmeasured_s + duration_s
         variance = self._reach(self._unmeasured_s) ** 2 - self._reach(before_s) ** 2 + _STEP**2
-        T_now_next = se3.exp(self.velocity * min(duration_s, _KEPT_S))
+        lasts_s = np.repeat(self._lasts_s, 3)
+        T_now_next = se3.exp(self.velocity * lasts_s * -np.expm1(-duration_s / lasts_s))
         return replace(still(), T=T_now_next, variance=variance)
 
     def anywhere(self, guess: Step, duration_s: float) -> Step:
@@ -78,7 +84,7 @@ class Inertia:
         The standard deviation of what a first order Markov process adds up to, from a known
         velocity on (Uhlenbeck and Ornstein, 1930). At first an unknown velocity counts as a second.
         """
-        lasts_s = np.clip(self._lasted / self._changed, *_LASTS_S)
+        lasts_s = self._lasts_s
         square = (UNKNOWN_VELOCITY**2 + self._lasted) / (1.0 + self._measured_s)
         x = duration_s / lasts_s
         spread = 2.0 * x - 3.0 + 4.0 * np.exp(-x) - np.exp(-2.0 * x)
@@ -139,8 +145,7 @@ class Inertia:
         self._unmeasured_s = np.where(is_measured, 0.0, self._unmeasured_s)
         before = kept = self.velocity
         if self.is_known:
-            lasts_s = np.clip(self._lasted / self._changed, *_LASTS_S)
-            fading = np.repeat(1.0 - np.exp(-duration_s / lasts_s), 3)
+            fading = np.repeat(-np.expm1(-duration_s / self._lasts_s), 3)
             F = np.eye(6) - fading[:, None] * unseen
             changes = np.repeat((_USUAL[self.has_wheels] * _ACCELERATION * duration_s) ** 2, 3)
             kept, expected = F @ before, F @ self._covariance @ F.T + np.diag(changes)

@@ -108,7 +108,7 @@ class LastingMap:
             if apart:
                 _log.warning(
                     "the map %s has %d piece%s that nothing joined to the first: a run that loads "
-                    "it searches that one alone, `python -m sceneslam.maps merge` tries to join them",
+                    "it searches that one alone; `python -m sceneslam.maps merge` may join them",
                     self._save,
                     apart,
                     "s" * (apart > 1),
