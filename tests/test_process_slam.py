@@ -23,7 +23,7 @@ from sceneslam.experiments.programs.case import run_case
 from sceneslam.experiments.programs.hostile import KINDS, plan
 from sceneslam.interfaces import ClosesLoops
 from sceneslam.modules.slam.process.__main__ import FOLDER, build
-from sceneslam.modules.slam.process.fields import layers
+from sceneslam.modules.slam.process.fields import answers, layers
 from sceneslam.modules.slam.process.module import ProcessSlam
 from sceneslam.modules.slam.process.protocol import (
     HEAD_BYTES,
@@ -283,3 +283,10 @@ def test_a_program_is_run_only_where_the_command_line_allows_it():
         check_node(node, "slam.only", allow=["sh"])
     with pytest.raises(ConfigError, match=r"slam.only.command: got 7, allowed: a list, each text"):
         check_node(node | {"command": 7}, "slam.only", allow=["./mine"])
+
+
+@pytest.mark.parametrize("more", [{}, {"can_begin": np.array([True, False])}])
+def test_a_program_that_is_lost_may_say_that_it_could_begin(more):
+    reply = {"stamps_ns": np.array([1, 2]), "T_local_base": np.tile(np.eye(4), (2, 1, 1))}
+    lost = answers({**reply, "status": np.array([2, 2]), **more})
+    assert [one.can_begin for one in lost] == [bool(more), False]

@@ -59,6 +59,7 @@ def answers(reply: Fields) -> list[Tracking]:
     of_maps = _optional(reply, "map_covariance", (count, 6, 6))
     qualities = _optional(reply, "quality_ratio", (count,))
     inliers = _optional(reply, "inliers", (count,))
+    can_begin = _optional(reply, "can_begin", (count,))
     return [
         Tracking(
             stamp_ns=int(stamps_ns[index]),
@@ -68,6 +69,7 @@ def answers(reply: Fields) -> list[Tracking]:
             map_covariance=None if of_maps is None else of_maps[index].astype(np.float64),
             quality_ratio=1.0 if qualities is None else float(qualities[index]),
             inliers=0 if inliers is None else int(inliers[index]),
+            can_begin=False if can_begin is None else bool(can_begin[index]),
         )
         for index in range(count)
     ]
