@@ -15,7 +15,7 @@ from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.modules.slam.laser.module import LaserSlam
 from sceneslam.types import se3
-from sceneslam.types.covariance import wandered
+from sceneslam.types.covariance import unknown_motion
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.rig import Laser, Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
@@ -40,7 +40,7 @@ def carried(walls, *paths, **lasting):
         for one in seen:
             answer = module.track(one)
             stamp_ns, T_local_base = start_ns + one.stamp_ns, answer.T_local_base
-            unknown = se3.carried(wandered(lost_s), se3.inverse(T_local_base))
+            unknown = se3.carried(unknown_motion(lost_s), se3.inverse(T_local_base))
             T_map_base = T_map_local @ T_local_base
             atlas.add_local(stamp_ns, T_local_base)
             atlas.add(

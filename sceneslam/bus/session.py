@@ -13,7 +13,7 @@ from sceneslam.bus.hold import Hold
 from sceneslam.bus.observation_buffer import BufferedObservation
 from sceneslam.bus.runner import Runner
 from sceneslam.types import se3
-from sceneslam.types.covariance import grown, wandered
+from sceneslam.types.covariance import grown, unknown_motion
 from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.run import BRIDGED
@@ -136,7 +136,7 @@ class ModuleSession:
         if not self.is_placed:
             unknown = None
             if self.bridge.predict(observation, by_velocity=True) is None:
-                unknown = wandered(self.bridge.unknown_s(observation.stamp_ns))
+                unknown = unknown_motion(self.bridge.unknown_s(observation.stamp_ns))
             self._placed = tracking, unknown
             self.runner.place(self.bridge.T_map_base @ se3.inverse(tracking.T_local_base))
             self.is_placed = True

@@ -15,10 +15,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.motion.motion import BELIEVED, UNKNOWN_VELOCITY, Step, still
+from sceneslam.motion.motion import BELIEVED, Step, still
 from sceneslam.motion.trust import NoiseRatio, student_cost
 from sceneslam.types import se3
-from sceneslam.types.covariance import updated
+from sceneslam.types.covariance import UNKNOWN_VELOCITY, updated
 
 _ACCELERATION = np.array([1.5, 4.0])  # m/s^2, rad/s^2: largest usual of a robot
 _USUAL = {False: 1.0, True: 1 / 3}  # of that: deviation of the acceleration, by: has wheels

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
+from sceneslam.types.covariance import UNKNOWN_VELOCITY
 from sceneslam.types.se3 import Transform
 
-UNKNOWN_VELOCITY = np.array([1.0, 2.0])  # m/s, rad/s: standard deviation of an unknown velocity
 BELIEVED = 0.5  # wheels are not used if they are wrong with this probability
 _CERTAIN = 100.0  # nats: more is the same, and exp(710) is no number
 _RARE = 0.003  # least probability of an alternative: one scan in 300

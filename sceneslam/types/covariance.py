@@ -10,7 +10,8 @@ from sceneslam.types.se3 import Transform
 
 Matrix = NDArray[np.float64]
 
-_WALK_M_PER_S, _TURN_RAD_PER_S = 1.0, 1.0  # standard deviations of a sensor that is carried
+UNKNOWN_VELOCITY = np.array([1.0, 2.0])  # m/s, rad/s: standard deviations, of robots and by hand
+_ANY_RAD = np.pi / np.sqrt(3.0)  # standard deviation of an angle that may be any
 
 
 def covariance_of(information: Matrix, *, unmeasured: float) -> Matrix:
@@ -22,9 +23,10 @@ def covariance_of(information: Matrix, *, unmeasured: float) -> Matrix:
     return np.asarray((vectors / np.maximum(values, unmeasured)) @ vectors.T)
 
 
-def wandered(lost_s: float) -> Matrix:
+def unknown_motion(lost_s: float) -> Matrix:
     """Return the covariance (6, 6) [m, rad] of the motion in a time of which nothing is known."""
-    return np.diag(np.repeat([_WALK_M_PER_S, _TURN_RAD_PER_S], 3) * lost_s) ** 2
+    deviations = np.minimum(UNKNOWN_VELOCITY * lost_s, [np.inf, _ANY_RAD])
+    return np.diag(np.repeat(deviations, 3)) ** 2
 
 
 def grown(first: Matrix, last: Matrix, T_last_first: Transform) -> Matrix:

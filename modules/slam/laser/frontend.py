@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sceneslam.motion.model import MotionModel
-from sceneslam.motion.motion import UNKNOWN_VELOCITY, Motion
+from sceneslam.motion.motion import Motion
+from sceneslam.types.covariance import UNKNOWN_VELOCITY
 from sceneslam.types.observation import LaserScan, Observation, TrackingStatus
 from sceneslam.types.planar import (
     Matrix,

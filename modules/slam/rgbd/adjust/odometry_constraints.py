@@ -12,9 +12,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from sceneslam.motion.motion import UNKNOWN_VELOCITY
 from sceneslam.motion.predictor import Prediction
 from sceneslam.types import se3
+from sceneslam.types.covariance import UNKNOWN_VELOCITY
 from sceneslam.types.se3 import Transform
 
 from ..locate.localizer import VisualFix

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sceneslam.graphs.edge import Edge
 from sceneslam.types import se3
-from sceneslam.types.covariance import wandered
+from sceneslam.types.covariance import unknown_motion
 from sceneslam.types.se3 import Transform
 
 from ..loops.pose_graph import PoseGraph
@@ -37,7 +37,7 @@ class Segments:
 
     def begin(self, keyframe_id: int, T_local_base: Transform, *, lost_s: float) -> None:
         """Begin a segment by a keyframe at an assumed pose, after `lost_s` without a pose."""
-        guess = _Guess(T_local_base=T_local_base.copy(), covariance=wandered(lost_s))
+        guess = _Guess(T_local_base=T_local_base.copy(), covariance=unknown_motion(lost_s))
         self._guesses[keyframe_id] = guess
 
     def replace(self, gone: int, heir: int) -> None:
