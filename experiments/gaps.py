@@ -1,8 +1,8 @@
 """Print where a module says to be after seconds without any data, without wheels and gyro.
 
-    python experiments/gaps.py MODULE [OVERRIDES]
+    python experiments/gaps.py MODULE [backwards] [--gaps SECONDS,...] [--of OBSERVATIONS] [OVERRIDES]
 
-The overrides choose a recording as for a run, backwards with `backwards` before them:
+The overrides choose a recording as for a run:
 
     python experiments/gaps.py laser source=carmen source.path=LOG
     python experiments/gaps.py depth backwards source=tum_rgbd source.path=FOLDER
@@ -16,9 +16,9 @@ standard deviations of its covariances. The result is a Markdown table.
 
 from __future__ import annotations
 
+import argparse
 import copy
-import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
@@ -32,7 +32,7 @@ from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Sensor
 
-GAPS_S = (1.5, 4.0, 10.0)
+GAPS_S = "1.5,4,10"
 STARTS, OBSERVATIONS = 15, 5000
 PATIENCE, JUDGED_AFTER = 60, 5  # observations
 WRONG = np.array([0.3, 0.2])  # m, rad
@@ -100,30 +100,49 @@ def returned(
     return None
 
 
-def main(name: str, *words: str) -> None:
+def copied(
+    module: SlamModule, started: Callable[[], SlamModule], before: Sequence[Observation]
+) -> SlamModule:
+    """Return a module in the same state; one that cannot be copied sees all again."""
+    try:
+        return copy.deepcopy(module)
+    except TypeError:  # a library's object
+        again = started()
+        for observation in before:
+            again.track(observation)
+        return again
+
+
+def main(name: str, overrides: Sequence[str], gaps_s: Sequence[float], patience: int) -> None:
     """Play the recording once, and a copy of the module after each gap."""
-    is_backwards = "backwards" in words
-    source, builder = single(name, *(word for word in words if word != "backwards"))
+    is_backwards = "backwards" in overrides
+    source, builder = single(name, *(word for word in overrides if word != "backwards"))
     observations = list(islice(source, OBSERVATIONS))
     T = reference(builder.make("slam.only", SlamModule), source, observations)
     if is_backwards:
         observations, T = backwards(observations), T[::-1]
+    observations = [alone(observation) for observation in observations]
     stamps_s = 1e-9 * np.array([one.stamp_ns for one in observations])
-    module = builder.make("slam.only", SlamModule)
     bare = source.rig.sensors - {Sensor.ODOMETRY, Sensor.GYRO, Sensor.ACCELEROMETER}
-    module.activate(replace(source.rig, sensors=bare))
+
+    def started() -> SlamModule:
+        module = builder.make("slam.only", SlamModule)
+        module.activate(replace(source.rig, sensors=bare))
+        return module
+
     starts = set(np.linspace(0.25, 0.9, STARTS) * len(observations) // 1)
-    returns: dict[float, list[Return | None]] = {gap_s: [] for gap_s in GAPS_S}
-    answer = module.track(alone(observations[0]))
+    returns: dict[float, list[Return | None]] = {gap_s: [] for gap_s in gaps_s}
+    module = started()
+    answer = module.track(observations[0])
     for index, observation in enumerate(observations[1:], 1):
-        for gap_s in GAPS_S if index in starts else ():
+        for gap_s in gaps_s if index in starts else ():
             first = int(np.searchsorted(stamps_s, stamps_s[index - 1] + gap_s))
-            after = slice(first, first + PATIENCE)
-            chosen = [alone(one) for one in observations[after]]
+            after = slice(first, first + patience)
             right = np.concatenate([T[index - 1 : index], T[after]])
-            if len(chosen) == PATIENCE:
-                returns[gap_s].append(returned(copy.deepcopy(module), chosen, right, answer))
-        answer = module.track(alone(observation))
+            if len(right) == patience + 1:
+                again = copied(module, started, observations[:index])
+                returns[gap_s].append(returned(again, observations[after], right, answer))
+        answer = module.track(observation)
     print("| gap [s] | gaps | found | wrong | inconsistent |\n| --- | --- | --- | --- | --- |")
     for gap_s, some in returns.items():
         found = [one for one in some if one is not None]
@@ -133,6 +152,9 @@ def main(name: str, *words: str) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) < 2:
-        sys.exit(__doc__)
-    main(*sys.argv[1:])
+    parser = argparse.ArgumentParser(usage=__doc__)
+    parser.add_argument("module")
+    parser.add_argument("--gaps", default=GAPS_S)
+    parser.add_argument("--of", type=int, default=PATIENCE)
+    known, words = parser.parse_known_args()
+    main(known.module, words, [float(gap_s) for gap_s in known.gaps.split(",")], known.of)

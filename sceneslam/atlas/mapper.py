@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map
-from sceneslam.atlas.places.localizer import LocalizationEvent, Look, MapLocalizer
+from sceneslam.atlas.places.localizer import Fix, LocalizationEvent, Look, MapLocalizer
 from sceneslam.atlas.places.view_taker import ViewTaker
 from sceneslam.atlas.submaps.chain import Chain
 from sceneslam.atlas.submaps.collector import Collector, Known
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.submaps.graph import LOADED, fits
 from sceneslam.atlas.submaps.own_loops import Path
-from sceneslam.atlas.submaps.run_graph import RunGraph, SolvedRun
+from sceneslam.atlas.submaps.run_graph import RunGraph, SolvedRun, places
 from sceneslam.atlas.submaps.uprights import straightened
 from sceneslam.executors import executor
 from sceneslam.graphs.edge import Edge
@@ -81,6 +81,7 @@ class Mapper:
         self._restart_ns: int | None = None  # a piece begins here, and the localizer is to be told
         self._is_level = True  # at the last step
         self._T_map_run: Transform | None = None
+        self._fixes: list[Fix] = []  # by which it is so
         self._T_map_runs: list[Transform] = []  # per submap, as it was while that was the newest
         self._began_ns: int | None = None
         self._has_told = False
@@ -147,6 +148,7 @@ class Mapper:
         self._collector.rewind(stamp_ns)
         self._views.rewind(stamp_ns)
         kept = len(self._collector.chain)
+        del self._T_map_runs[kept:]
         if kept < self._kept:
             self._is_news |= bool(self._solved.loops)
             self._kept, self._solved = kept, self._solved.cut(kept, len(self._loaded.submaps))
@@ -208,18 +210,17 @@ class Mapper:
             self._collect(self._localizer, int(chain.submaps[-1].stamps_ns[-1]))
         chain.remeasure(path)
         old = np.array(chain.T_run_node)
-        fixes = [] if self._localizer is None else self._localizer.fixes
         start, is_level = self.T_map_run @ old, self._collector.is_level
         if self._graph is not None:
             self._graph.forget(self._kept)
             try:
                 self._solved = self._graph.finish(
-                    chain, start, path, maps, fixes, is_level=is_level
+                    chain, start, path, maps, self._fixes, is_level=is_level
                 )
             except Exception as error:
                 self._give_up_graph("the graph was not solved at the end", error)
         if self._graph is None:  # what was solved during the run is kept
-            self._solved = self._last_solved(start)
+            self._solved = self._last_solved(np.array(self._located(len(chain))) @ old)
         self._is_over = True
         self._tell_loops()
         if not (self._solved.loops or chain.is_upright or self.is_placed):
@@ -252,49 +253,52 @@ class Mapper:
             located = zip(self._located(len(own)), own.T_run_node, strict=True)
             nodes = [T_map_run @ T_run_node for T_map_run, T_run_node in located]
         T_map_node = np.concatenate([loaded, np.reshape(nodes, (-1, 4, 4))])
+        loops = [
+            *self._solved.own_loops,
+            *self._solved.loops,
+            *(place for place in self._places() if fits(place, T_map_node)),
+        ]
         saved = SavedMap(
             submaps=(*self._loaded.submaps, *straightened(own.submaps)),
             T_map_node=T_map_node,
-            pieces=np.concatenate([self._loaded.pieces, self._own_pieces()]),
+            pieces=np.concatenate([self._loaded.pieces, self._own_pieces(loops)]),
             edges=(
                 *self._loaded.edges,
                 *(edge.shifted(count) for edge in own.motions),
-                *self._solved.own_loops,
-                *self._solved.loops,
-                *(place for place in self._places() if fits(place, T_map_node)),
+                *loops,
             ),
         )
         saved = saved.without_guesses()
         return saved.without_misfits() if self._is_over else saved
 
-    def _own_pieces(self) -> NDArray[np.int64]:
+    def _own_pieces(self, loops: Sequence[Edge]) -> NDArray[np.int64]:
         """Return the piece of each submap of the run, by the parts that loops join.
 
-        The first is what was located in the loaded map; without one, the part with most submaps.
+        The first is what loops lead to from the loaded map; without one, the part with most
+        submaps.
         """
         chain, count = self._collector.chain, len(self._loaded.submaps)
-        loops = [*self._solved.own_loops, *self._solved.loops]
-        parts = chain.parts([loop.shifted(-count) for loop in loops])
-        fixes = [] if self._localizer is None else self._localizer.fixes
-        located = {chain.node_at(fix.stamp_ns) for fix in fixes}
+        own = [loop.shifted(-count) for loop in loops]
+        located = {loop.second for loop in own if loop.first < 0}
         pieces, piece = np.zeros(len(chain), np.int64), int(self._loaded.pieces.max(initial=-1)) + 1
-        for part in parts:
+        for part in chain.parts(own):
             if located.isdisjoint(part):
                 pieces[part], piece = piece, piece + 1
         return pieces
 
     def _places(self) -> list[Edge]:
-        """Return the loops to the loaded map that are not solved yet: the run goes on."""
-        chain, localizer, graph = self._collector.chain, self._localizer, self._graph
-        if self._is_over or not self.is_placed or not len(chain):
-            return []
-        return [] if localizer is None or graph is None else graph.places(chain, localizer.fixes)
+        """Return the loops to the loaded map that are not solved: the run goes on, or it failed."""
+        is_solved = self._is_over and self._graph is not None
+        chain = self._collector.chain
+        return [] if is_solved or not len(chain) else places(self._loaded, chain, self._fixes)
 
     def _located(self, count: int) -> list[Transform]:
         """Return T_map_run (4, 4) of each of `count` submaps; that of the newest is today's."""
-        del self._T_map_runs[max(count - 1, self._before_piece()) :]
-        self._T_map_runs += [self.T_map_run] * (count - len(self._T_map_runs))
-        return self._T_map_runs
+        runs, before = self._T_map_runs, min(self._before_piece(), count)
+        del runs[max(count - 1, before) :]
+        runs += runs[-1:] * (before - len(runs))  # of an earlier piece: as it was located last
+        runs += [self.T_map_run] * (count - len(runs))
+        return runs
 
     @property
     def _piece_ns(self) -> int:
@@ -448,7 +452,7 @@ class Mapper:
         before = self._before_piece()
         self._T_map_runs += [self.T_map_run] * (before - len(self._T_map_runs))
         self._is_news |= localizer.T_map_run is not self._T_map_run
-        self._T_map_run = localizer.T_map_run
+        self._T_map_run, self._fixes = localizer.T_map_run, localizer.fixes
 
     def _take(self, outcome: LocalizationEvent, localizer: MapLocalizer, stamp_ns: int) -> None:
         """Process the result of a comparison with the map."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -78,6 +77,7 @@ class Fix:
     held: NDArray[np.float64] = field(
         default_factory=lambda: np.zeros(2)
     )  # the same, until the position was measured last in all directions
+    piece_ns: int = 0  # here its piece of the run begins
 
     @property
     def deviation_m(self) -> float:
@@ -88,6 +88,15 @@ class Fix:
     def is_open(self) -> bool:
         """Tell whether walls leave a direction open, as along a corridor."""
         return self.deviation_m > _OPEN_M
+
+
+class _Piece:
+    """A part of the run: nothing measured the motion to its first pose."""
+
+    def __init__(self, begun_ns: int) -> None:
+        self.begun_ns = begun_ns
+        self.fixes: list[Fix] = []  # also those of a place that was withdrawn
+        self.T_map_run: Transform | None = None  # None until it was located, or where withdrawn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -113,10 +122,7 @@ class MapLocalizer:
         `standing` gives a pose (4, 4) the height and tilt of a robot that stands there in the map;
         without it they stay as they are.
         """
-        self.T_map_run: Transform | None = None  # None until the run was located
-        self.is_located = False  # in its present piece
-        self._fixes: list[Fix] = []
-        self._starts_ns = [0]  # here pieces of the run begin: nothing measured the motion to them
+        self._pieces = [_Piece(0)]  # the last one goes on
         self._walls = Recognizer.of(plan)
         self._views, self._standing = views, standing
         self._next_walls_ns = self._next_view_ns = 0
@@ -134,27 +140,44 @@ class MapLocalizer:
         return self._views is not None and self._is_time(newest, self._next_view_ns)
 
     @property
-    def fixes(self) -> list[Fix]:
-        """Return where the run was located, without a place that was contradicted since."""
-        return self._fixes if self.is_located else self._earlier
+    def T_map_run(self) -> Transform | None:
+        """Return T_map_run (4, 4) of the last piece that was located, None before the first."""
+        return next(
+            (one.T_map_run for one in self._pieces[::-1] if one.T_map_run is not None), None
+        )
+
+    @property
+    def is_located(self) -> bool:
+        """Tell whether the present piece is."""
+        return self._piece.T_map_run is not None
 
     @property
     def piece_ns(self) -> int:
         """Return the stamp with which the present piece of the run begins, 0 for the first."""
-        return self._starts_ns[-1]
+        return self._piece.begun_ns
+
+    @property
+    def fixes(self) -> list[Fix]:
+        """Return where the run was located, without places that were contradicted since."""
+        return [fix for one in self._pieces if one.T_map_run is not None for fix in one.fixes]
+
+    @property
+    def _piece(self) -> _Piece:
+        return self._pieces[-1]
 
     def restart(self, stamp_ns: int) -> None:
         """Search everywhere again: nothing measured the motion to the pose at a stamp."""
-        self._starts_ns.append(stamp_ns)
-        self.is_located, self._guess, self._seen = False, None, None
+        self._pieces.append(_Piece(stamp_ns))
+        self._guess = self._seen = None
         self._vain = self._doubts = self._next_walls_ns = self._next_view_ns = 0
 
     def compare(self, latest: Sequence[Look]) -> LocalizationEvent:
         """Compare the latest looks, oldest first, with the map."""
         newest = latest[-1]
         self._drive(latest)
-        if self.is_located and self.T_map_run is not None:
-            return self._check(latest, self.T_map_run @ newest.T_run_base)
+        piece = self._piece
+        if piece.T_map_run is not None:
+            return self._check(latest, piece.T_map_run @ newest.T_run_base)
         fix = self._by_view(newest, None)
         if fix is None and self._compares_walls(newest):
             fix = self._by_walls(latest)
@@ -165,11 +188,11 @@ class MapLocalizer:
         if before is None or not _agree(before.T_map_run, T_map_run, newest.T_run_base):
             return LocalizationEvent.NOTHING
         fix = _mean(fix, before, newest)
-        if self._own:  # it was located before: there, and it drifted, or somewhere else
-            last = self._own[-1]
+        if piece.fixes:  # it was located before: there, and it drifted, or somewhere else
+            last = piece.fixes[-1]
             T_expected = last.T_map_base @ se3.inverse(last.T_run_base) @ newest.T_run_base
             if not _is_within(fix, self._window(T_expected, last.held)):
-                self._fixes = self._earlier
+                piece.fixes = []
         self._take(newest, fix)
         return LocalizationEvent.FOUND
 
@@ -179,37 +202,24 @@ class MapLocalizer:
         The first fix of a piece stays: it was located.
         """
         self._guess, self._doubts = None, 0
-        kept = bisect_left(self._starts_ns, stamp_ns, lo=1)
-        if kept < len(self._starts_ns):
-            del self._starts_ns[kept:]
-            self._fixes = [fix for fix in self._fixes if fix.stamp_ns < stamp_ns]
-            self.is_located = bool(self._own)
-        own = [fix for fix in self._own if fix.stamp_ns < stamp_ns] or self._own[:1]
-        self._fixes = [*self._earlier, *own]
-        fix = own[-1] if own else None
+        kept = [one for one in self._pieces[1:] if one.begun_ns < stamp_ns]
+        self._pieces = [*self._pieces[:1], *kept]
+        piece = self._piece
+        piece.fixes = [fix for fix in piece.fixes if fix.stamp_ns < stamp_ns] or piece.fixes[:1]
+        fix = piece.fixes[-1] if piece.fixes else None
         T_run_base = None if fix is None else path(fix.stamp_ns)
         if fix is not None and T_run_base is not None:
-            self._fixes[-1] = replace(fix, T_run_base=T_run_base)
+            piece.fixes[-1] = replace(fix, T_run_base=T_run_base)
             self._seen = Look(stamp_ns=fix.stamp_ns, T_run_base=T_run_base)
             self._travelled = fix.travelled
-            if self.is_located:
-                self.T_map_run = fix.T_map_base @ se3.inverse(T_run_base)
-
-    @property
-    def _own(self) -> list[Fix]:
-        """Return the fixes of the present piece."""
-        return [fix for fix in self._fixes if fix.stamp_ns >= self.piece_ns]
-
-    @property
-    def _earlier(self) -> list[Fix]:
-        """Return those of the pieces before it."""
-        return [fix for fix in self._fixes if fix.stamp_ns < self.piece_ns]
+            if piece.T_map_run is not None:
+                piece.T_map_run = fix.T_map_base @ se3.inverse(T_run_base)
 
     def _is_time(self, newest: Look, next_ns: int) -> bool:
         """Tell whether the time has come, and a located robot has moved since its last fix."""
         if newest.stamp_ns < next_ns or not self.is_located:
             return newest.stamp_ns >= next_ns
-        away = se3.inverse(self._fixes[-1].T_run_base) @ newest.T_run_base
+        away = se3.inverse(self._piece.fixes[-1].T_run_base) @ newest.T_run_base
         is_far = np.linalg.norm(away[:3, 3]) >= _FIX_M
         return bool(is_far or se3.rotation_angle_rad(away) >= _FIX_RAD)
 
@@ -255,8 +265,8 @@ class MapLocalizer:
     def _check(self, latest: Sequence[Look], T_map_base: Transform) -> LocalizationEvent:
         """Compare near the predicted pose; repeated contradictions withdraw the localization."""
         newest = latest[-1]
-        window = self._window(T_map_base, self._fixes[-1].travelled)
-        wide = self._window(T_map_base, self._fixes[-1].held)
+        window = self._window(T_map_base, self._piece.fixes[-1].travelled)
+        wide = self._window(T_map_base, self._piece.fixes[-1].held)
         seen = self._by_view(newest, (T_map_base, wide))
         is_contradicted = seen is not None and not _is_within(seen, wide)
         fix = None if is_contradicted else seen
@@ -270,9 +280,7 @@ class MapLocalizer:
         self._doubts = self._doubts + 1 if is_contradicted else 0
         if self._doubts < _DOUBTS:
             return LocalizationEvent.NOTHING
-        self.is_located, self._guess = False, None
-        last = self._earlier[-1:]
-        self.T_map_run = last[0].T_map_base @ se3.inverse(last[0].T_run_base) if last else None
+        self._piece.T_map_run = self._guess = None
         self._doubts = self._vain = 0
         return LocalizationEvent.WITHDRAWN
 
@@ -326,9 +334,11 @@ class MapLocalizer:
         )
 
     def _take(self, newest: Look, fix: Fix) -> None:
-        self.T_map_run, self.is_located = fix.T_map_base @ se3.inverse(newest.T_run_base), True
-        held = self._own[-1].held if fix.is_open and self._own else self._travelled
-        self._fixes.append(replace(fix, travelled=self._travelled, held=held))
+        piece = self._piece
+        piece.T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
+        held = piece.fixes[-1].held if fix.is_open and piece.fixes else self._travelled
+        fix = replace(fix, travelled=self._travelled, held=held, piece_ns=piece.begun_ns)
+        piece.fixes.append(fix)
         self._doubts = self._vain = 0
         self._next_walls_ns = self._next_view_ns = newest.stamp_ns + _FIX_NS
 

@@ -19,6 +19,9 @@ from sceneslam.types.se3 import Transform
 
 _GUESSED_M = 0.4  # as after half a second of unknown motion: nothing else errs by so much
 
+# m^2, rad^2: a robot that was carried may be anywhere, but a piece that nothing joins has to stay.
+_NOTHING = np.diag(np.repeat([100.0, 10.0], 3)) ** 2
+
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Chain:
@@ -43,6 +46,15 @@ class Chain:
         """Return the submaps with which a piece begins: nothing measured the motion to it."""
         seams = [motion for motion in self.motions if motion.kind is EdgeKind.HANDOVER]
         return [0, *(seam.second for seam in seams if is_guessed(seam.covariance))]
+
+    @property
+    def ties(self) -> list[Edge]:
+        """Return the motions, of which those to where a piece begins hold nothing in its place."""
+        seams = set(self.starts)
+        return [
+            replace(motion, covariance=_NOTHING) if motion.second in seams else motion
+            for motion in self.motions
+        ]
 
     def parts(self, loops: Sequence[Edge]) -> list[list[int]]:
         """Return the submaps of each part that motions or loops join, the largest part first."""

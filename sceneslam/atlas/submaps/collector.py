@@ -82,7 +82,10 @@ class Collector:
     def has_begun(self, known: Known) -> bool:
         """Tell whether a piece of the run begins: nothing measured the motion to this pose."""
         before, self._session = self._session, known.session
-        return before not in (-1, known.session) and is_guessed(known.of_map)
+        if before in (-1, known.session):
+            return False
+        first = self._known(known.begun_ns)
+        return is_guessed((known if first is None else first).of_map)
 
     def has_moved(self, known: Known) -> bool:
         """Tell whether it is time for a step."""

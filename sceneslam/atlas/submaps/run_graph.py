@@ -6,6 +6,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,7 +104,7 @@ class RunGraph:
             solved = Solved(T_map_node=start, accepted=[])
             if used:
                 ups = uprights(straightened(chain.submaps), start, range(len(chain)))
-                solved = settle(start, chain.motions, used, ups)
+                solved = settle(start, chain.ties, used, ups)
             self._agreed, self._T_map_node = agreeing, solved.T_map_node
             self._accepted = [used[index] for index in solved.accepted]
         loops = tuple(edge.shifted(self._count) for edge in self._accepted)
@@ -132,8 +133,7 @@ class RunGraph:
         # The motions alone tell what agrees. No cycle tells it of a place of the loaded map and a
         # loop of the run.
         moved = np.concatenate([self._loaded.T_map_node, T_map_node])
-        places = self._fix_edges(fixes, ends)
-        places = [places[index] for index in consistent(places, moved, drift)]
+        places = _agreeing_places(_places(self._loaded, fixes, ends), chain, moved, drift)
         loops = [edge.shifted(count) for edge in self._found.loops]
         agreeing = [self._found.loops[index] for index in consistent(loops, moved, drift)]
         loops = [edge.shifted(count) for edge in self._believed(agreeing)]
@@ -143,7 +143,7 @@ class RunGraph:
         submaps = [*self._loaded.submaps, *straightened(chain.submaps)]
         solved = solve(
             nodes,
-            [*moving.motions, *(edge.shifted(count) for edge in chain.motions), *own_loops],
+            [*moving.motions, *(edge.shifted(count) for edge in chain.ties), *own_loops],
             loops,
             fixed=moving.fixed,
             loose=[*moving.loose, count],
@@ -158,11 +158,6 @@ class RunGraph:
             own_loops=tuple(own_loops),
             T_map_loaded=solved.T_map_node[:count] if around else None,
         )
-
-    def places(self, chain: Chain, fixes: Sequence[Fix]) -> list[Edge]:
-        """Return the loops to the loaded map by the fixes of a run that goes on."""
-        known = {fix.stamp_ns: fix.T_run_base for fix in fixes}
-        return self._fix_edges(fixes, _Ends(chain, known.get))
 
     def _agreeing(self) -> list[Edge]:
         """Return the loops that agree with each other; one alone is not believed."""
@@ -221,39 +216,53 @@ class RunGraph:
             return second - first > 1 or second in self._starts
         return second - first > 2 * NEIGHBOURS and not self._is_closed(a.session)
 
-    def _fix_edges(self, fixes: Sequence[Fix], ends: _Ends) -> list[Edge]:
-        """Return the loops from the loaded map's submaps to the run's, one per run submap.
 
-        It is the mean of all its fixes, and as certain as one: they share their errors.
-        """
-        edges: dict[int, list[Edge]] = {}
-        for fix in fixes:
-            found = ends.of(fix.stamp_ns)
-            if found is not None:
-                node, T_node_base = found
-                edges.setdefault(node, []).append(
-                    self._fix_edge(fix, node, se3.inverse(T_node_base))
-                )
-        return [self._mean(same) for same in edges.values()]
+def places(loaded: SavedMap, chain: Chain, fixes: Sequence[Fix]) -> list[Edge]:
+    """Return the loops to a loaded map by the fixes of a run that goes on."""
+    known = {fix.stamp_ns: fix.T_run_base for fix in fixes}
+    return _places(loaded, fixes, _Ends(chain, known.get))
 
-    def _mean(self, edges: Sequence[Edge]) -> Edge:
-        """Return the mean of loops to one submap, weighted by their information."""
-        nodes, start = self._loaded.T_map_node, edges[0]
-        mean, covariance = se3.mean(
-            [nodes[edge.first] @ edge.T_first_second for edge in edges],
-            [edge.covariance for edge in edges],
-        )
-        return replace(
-            start, T_first_second=se3.inverse(nodes[start.first]) @ mean, covariance=covariance
-        )
 
-    def _fix_edge(self, fix: Fix, node: int, T_base_node: Transform) -> Edge:
-        """Return the loop to a node from the nearest submap of the loaded map."""
-        return self._loaded.loop_to(
-            fix.T_map_base @ T_base_node,
-            se3.carried(fix.covariance, se3.inverse(T_base_node)),
-            self._count + node,
-        )
+def _places(loaded: SavedMap, fixes: Sequence[Fix], ends: _Ends) -> list[Edge]:
+    """Return the loops from the loaded map's submaps to the run's, one per run submap.
+
+    It is the mean of all its fixes, and as certain as one: they share their errors.
+    """
+    edges: dict[int, list[Edge]] = {}
+    for fix in fixes:
+        found = ends.of(fix.stamp_ns, fix.piece_ns)
+        if found is not None:
+            node, T_node_base = found
+            T_base_node = se3.inverse(T_node_base)
+            covariance = se3.carried(fix.covariance, T_node_base)
+            place = loaded.loop_to(
+                fix.T_map_base @ T_base_node, covariance, len(loaded.submaps) + node
+            )
+            edges.setdefault(node, []).append(place)
+    return [_mean(loaded.T_map_node, same) for same in edges.values()]
+
+
+def _mean(T_map_node: NDArray[np.float64], edges: Sequence[Edge]) -> Edge:
+    """Return the mean of loops to one submap, weighted by their information."""
+    start = edges[0]
+    mean, covariance = se3.mean(
+        [T_map_node[edge.first] @ edge.T_first_second for edge in edges],
+        [edge.covariance for edge in edges],
+    )
+    T_first_second = se3.inverse(T_map_node[start.first]) @ mean
+    return replace(start, T_first_second=T_first_second, covariance=covariance)
+
+
+def _agreeing_places(
+    places: Sequence[Edge], chain: Chain, T_map_node: NDArray[np.float64], drift: PathDrift
+) -> list[Edge]:
+    """Return the places that agree, in each piece of the run: nothing measured how those lie."""
+    first = len(T_map_node) - len(chain)
+    agreeing = list[Edge]()
+    for start, end in pairwise([*chain.starts, len(chain)]):
+        own = [place for place in places if start <= place.second - first < end]
+        agreeing += [own[index] for index in consistent(own, T_map_node, drift)]
+    return agreeing
 
 
 class _Ends:
@@ -262,10 +271,13 @@ class _Ends:
     def __init__(self, chain: Chain, path: Path) -> None:
         self._chain, self._path = chain, path
 
-    def of(self, stamp_ns: int) -> tuple[int, Transform] | None:
-        """Return the node and T_node_base (4, 4), None without a pose."""
+    def of(self, stamp_ns: int, piece_ns: int = 0) -> tuple[int, Transform] | None:
+        """Return the node and T_node_base (4, 4), None without a pose.
+
+        Nor if the submap that lies in the same piece, which begins at `piece_ns`, still grows.
+        """
         node, T_run_base = self._chain.node_at(stamp_ns), self._path(stamp_ns)
-        if T_run_base is None:
+        if T_run_base is None or self._chain.submaps[node].stamps_ns[0] < piece_ns:
             return None
         return node, se3.inverse(self._chain.T_run_node[node]) @ T_run_base
 
