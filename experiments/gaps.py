@@ -1,6 +1,6 @@
 """Print where a module says to be after seconds without any data, without wheels and gyro.
 
-    python experiments/gaps.py MODULE [backwards] [--gaps SECONDS,...] [--of OBSERVATIONS] [OVERRIDES]
+    python experiments/gaps.py MODULE [backwards] [--gaps SECONDS,...] [--of COUNT] [OVERRIDES]
 
 The overrides choose a recording as for a run:
 

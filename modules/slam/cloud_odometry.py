@@ -28,6 +28,9 @@ _DEPTH_VOXEL_M = 0.1
 # error is that of the map, which both share. 0.05 to 0.14 voxels from one cloud to the next.
 _STEP_RATIO = 0.25
 _SIGMAS = 2.0  # of the robot's motion since the last cloud: how far a guess may be off
+_INTERVAL_S, _SHARE = 1.0, 0.1  # usual interval of clouds at first, and weight of the newest
+_INTERRUPTED = 3.0  # times the usual interval between two poses
+_SAME_RATIO = 0.9  # of a cloud in known voxels: it shows what was seen before the interruption
 _DIFFUSE = 1e6  # prediction's covariance in units of a cloud's, if ICP decides alone
 
 
@@ -85,7 +88,7 @@ class CloudOdometry(ABC):
         self._noise = np.repeat(noise, 3)  # variances of a registration
         self._predictor = Predictor(rig)
         self._T_local_base = se3.identity()
-        self._has_map = False
+        self._has_map, self._interval_s = False, _INTERVAL_S
 
     def set_pose(self, T_map_local: se3.Transform) -> None:  # noqa: B027
         """Do nothing: poses are reported in `local`."""
@@ -105,9 +108,6 @@ class CloudOdometry(ABC):
             return self._bridge(observation, prediction, can_coast=True)
         if len(cloud) < _POINTS_MIN:
             return self._bridge(observation, prediction, can_coast=False)
-        capture_m = self._icp.capture_m
-        if self._has_map and self._may_be_off_m(cloud, observation, prediction) > capture_m:
-            return self._bridge(observation, prediction, can_coast=False, can_begin=True)
         T_local_icp = self._icp.register(cloud, prediction.T_local_base, observation)
         if T_local_icp is None or not np.isfinite(T_local_icp).all():
             return self._bridge(observation, prediction, can_coast=False)
@@ -115,6 +115,7 @@ class CloudOdometry(ABC):
         if self._has_map and not (
             overlap_ratio >= self.overlap_min_ratio
             and self._is_plausible(observation, prediction, T_local_icp)
+            and (overlap_ratio >= _SAME_RATIO or self._is_near(cloud, observation, prediction))
         ):
             return self._bridge(observation, prediction, can_coast=False, can_begin=True)
         shape = self._icp.localizability()
@@ -166,19 +167,26 @@ class CloudOdometry(ABC):
         off = se3.log(se3.inverse(prediction.T_local_base) @ T_local_icp)
         T_local_base = np.asarray(prediction.T_local_base @ se3.exp(gain @ off))
         steps = information / _STEP_RATIO**2
+        interval_s = self._predictor.unmeasured_s(observation)
+        self._interval_s += _SHARE * (interval_s - self._interval_s)
         self._predictor.measure(observation, T_local_base, covariance, steps)
         return T_local_base
 
-    def _may_be_off_m(
-        self, cloud: Cloud, observation: Observation, prediction: Prediction
-    ) -> float:
-        """Return how far [m] points may be off the prediction, after a time without a pose."""
-        if prediction.is_measured or not self._predictor.is_long_unmeasured(observation):
-            return 0.0
+    def _is_near(self, cloud: Cloud, observation: Observation, prediction: Prediction) -> bool:
+        """Tell whether no point may be taken for another, after a time without a pose."""
         unmeasured_s = self._predictor.unmeasured_s(observation)
+        is_usual = unmeasured_s <= _INTERRUPTED * self._interval_s
+        if (
+            prediction.is_measured
+            or is_usual
+            or not self._predictor.is_long_unmeasured(observation)
+        ):
+            return True
+        assert self._icp is not None
         moved_m, turned_rad = self._predictor.model.wandered(unmeasured_s)
         arm_m = np.median(np.linalg.norm(cloud, axis=1))
-        return float(_SIGMAS * np.hypot(moved_m, arm_m * turned_rad))
+        off_m = _SIGMAS * np.hypot(moved_m, arm_m * turned_rad)
+        return bool(off_m <= self._icp.capture_m)
 
     def _is_plausible(
         self, observation: Observation, prediction: Prediction, T_local_icp: se3.Transform

@@ -41,6 +41,7 @@ class Inertia:
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6), init=False)  # (6,)
     is_known: bool = field(default=False, init=False)  # else the velocity is 0
     _covariance: Matrix = field(default_factory=lambda: np.zeros((6, 6)), init=False)
+    _since_s: float = field(default=0.0, init=False)  # since the velocity was set
     _unmeasured_s: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2), init=False)
     _changed: NDArray[np.float64] = field(default_factory=_CHANGED.copy, init=False)
     _lasted: NDArray[np.float64] = field(default_factory=lambda: _LASTS_S[0] * _CHANGED, init=False)
@@ -62,15 +63,17 @@ class Inertia:
 
     def reset(self) -> None:
         """Reset the velocity."""
-        self.velocity, self._covariance = np.zeros(6), np.zeros((6, 6))
+        self.velocity, self._covariance, self._since_s = np.zeros(6), np.zeros((6, 6)), 0.0
         self.is_known = False
 
     def predict(self, duration_s: float) -> Step:
         """Return the motion of the next `duration_s`."""
         before_s, self._unmeasured_s = self._unmeasured_s, self._unmeasured_s + duration_s
         variance = self._reach(self._unmeasured_s) ** 2 - self._reach(before_s) ** 2 + _STEP**2
-        lasts_s = np.repeat(self._lasts_s, 3)
-        T_now_next = se3.exp(self.velocity * lasts_s * -np.expm1(-duration_s / lasts_s))
+        lasts_s, since_s = np.repeat(self._lasts_s, 3), self._since_s
+        self._since_s += duration_s
+        left_s = lasts_s * (np.exp(-since_s / lasts_s) - np.exp(-self._since_s / lasts_s))
+        T_now_next = se3.exp(self.velocity * left_s)
         return replace(still(), T=T_now_next, variance=variance)
 
     def anywhere(self, guess: Step, duration_s: float) -> Step:
@@ -159,7 +162,7 @@ class Inertia:
             now = before + np.clip(now - before, -reach, reach)
         if self.is_known:
             self._time(before, now, is_measured * duration_s)
-        self.velocity = now
+        self.velocity, self._since_s = now, 0.0
         self._covariance = updated(expected, gain, np.eye(6), covariance)
         self.is_known = True
 
