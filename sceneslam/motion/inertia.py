@@ -25,6 +25,7 @@ _USUAL = {False: 1.0, True: 1 / 3}  # of that: deviation of the acceleration, by
 _LASTS_S = 0.5, 20.0  # shortest and longest time constant of a velocity; it begins with the first
 _CHANGED = np.array([0.1, 0.1]) ** 2  # (m/s)^2, (rad/s)^2: weight of that beginning
 _JUMP = 3.0  # times the acceleration: a larger change of velocity is a jump
+_KEPT_S = 0.5  # for so long an unmeasured velocity is kept as it is
 _STEP = np.array([1e-4, 1e-4])  # m, rad: least standard deviation of a predicted step
 _FASTEST = np.array([25.0, 20.0])  # m/s, rad/s: deviation of a velocity that was never measured
 _UNUSED = 1e6  # m^2, rad^2: variance of what is not used
@@ -41,7 +42,6 @@ class Inertia:
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6), init=False)  # (6,)
     is_known: bool = field(default=False, init=False)  # else the velocity is 0
     _covariance: Matrix = field(default_factory=lambda: np.zeros((6, 6)), init=False)
-    _since_s: float = field(default=0.0, init=False)  # since the velocity was set
     _unmeasured_s: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2), init=False)
     _changed: NDArray[np.float64] = field(default_factory=_CHANGED.copy, init=False)
     _lasted: NDArray[np.float64] = field(default_factory=lambda: _LASTS_S[0] * _CHANGED, init=False)
@@ -57,23 +57,29 @@ class Inertia:
 
     @property
     def _lasts_s(self) -> NDArray[np.float64]:
-        """Return the time constants (2,) [s] of a velocity: none longer than it was measured."""
-        longest_s = np.clip(self._measured_s, *_LASTS_S)
-        return np.clip(self._lasted / self._changed, _LASTS_S[0], longest_s)
+        """Return the time constants (2,) [s] of a velocity that nothing measures."""
+        return np.clip(self._lasted / self._changed, *_LASTS_S)
+
+    def _kept_s(self, duration_s: float) -> NDArray[np.float64]:
+        """Return for how long (2,) [s] of a time the robot goes on at its velocity.
+
+        In a gap as a first order Markov process does, in the mean, whose time constant is no longer
+        than it was observed; a short time it goes on.
+        """
+        lasts_s = np.minimum(self._lasts_s, np.clip(self._measured_s, *_LASTS_S))
+        kept_s = -lasts_s * np.expm1(-duration_s / lasts_s)
+        return np.asarray(np.maximum(kept_s, min(duration_s, _KEPT_S)))
 
     def reset(self) -> None:
         """Reset the velocity."""
-        self.velocity, self._covariance, self._since_s = np.zeros(6), np.zeros((6, 6)), 0.0
+        self.velocity, self._covariance = np.zeros(6), np.zeros((6, 6))
         self.is_known = False
 
     def predict(self, duration_s: float) -> Step:
         """Return the motion of the next `duration_s`."""
         before_s, self._unmeasured_s = self._unmeasured_s, self._unmeasured_s + duration_s
         variance = self._reach(self._unmeasured_s) ** 2 - self._reach(before_s) ** 2 + _STEP**2
-        lasts_s, since_s = np.repeat(self._lasts_s, 3), self._since_s
-        self._since_s += duration_s
-        left_s = lasts_s * (np.exp(-since_s / lasts_s) - np.exp(-self._since_s / lasts_s))
-        T_now_next = se3.exp(self.velocity * left_s)
+        T_now_next = se3.exp(self.velocity * np.repeat(self._kept_s(duration_s), 3))
         return replace(still(), T=T_now_next, variance=variance)
 
     def anywhere(self, guess: Step, duration_s: float) -> Step:
@@ -148,7 +154,7 @@ class Inertia:
         self._unmeasured_s = np.where(is_measured, 0.0, self._unmeasured_s)
         before = kept = self.velocity
         if self.is_known:
-            fading = np.repeat(-np.expm1(-duration_s / self._lasts_s), 3)
+            fading = np.repeat(1.0 - np.exp(-duration_s / self._lasts_s), 3)
             F = np.eye(6) - fading[:, None] * unseen
             changes = np.repeat((_USUAL[self.has_wheels] * _ACCELERATION * duration_s) ** 2, 3)
             kept, expected = F @ before, F @ self._covariance @ F.T + np.diag(changes)
@@ -162,7 +168,7 @@ class Inertia:
             now = before + np.clip(now - before, -reach, reach)
         if self.is_known:
             self._time(before, now, is_measured * duration_s)
-        self.velocity, self._since_s = now, 0.0
+        self.velocity = now
         self._covariance = updated(expected, gain, np.eye(6), covariance)
         self.is_known = True
 
