@@ -303,3 +303,16 @@ def test_after_seconds_without_clouds_the_pose_is_right_or_lost(lost):
     else:  # it may have turned by half a turn since then
         assert {answer.status for answer in answers} == {TrackingStatus.LOST}
         assert all(answer.can_begin for answer in answers)
+
+
+def test_a_sensor_that_is_slow_or_was_covered_is_not_lost():
+    (observations, poses), module = drive(12), active()
+    slow = [replace(one, stamp_ns=6 * one.stamp_ns) for one in observations]
+    answers = [module.track(one) for one in slow]  # every 0.6 s
+    assert {answer.status for answer in answers} == {TrackingStatus.TRACKING}
+    assert worst_error_m(answers, poses) < 0.05
+    module, same = active(), observations[0]
+    for index in range(150):
+        points = same.points_lidar[:10] if 100 <= index < 140 else same.points_lidar
+        answer = module.track(replace(same, stamp_ns=index * 100_000_000, points_lidar=points))
+    assert answer.status is TrackingStatus.TRACKING

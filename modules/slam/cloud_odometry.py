@@ -175,12 +175,9 @@ class CloudOdometry(ABC):
     def _is_near(self, cloud: Cloud, observation: Observation, prediction: Prediction) -> bool:
         """Tell whether no point may be taken for another, after a time without a pose."""
         unmeasured_s = self._predictor.unmeasured_s(observation)
-        is_usual = unmeasured_s <= _INTERRUPTED * self._interval_s
-        if (
-            prediction.is_measured
-            or is_usual
-            or not self._predictor.is_long_unmeasured(observation)
-        ):
+        is_interrupted = self._predictor.is_long_unmeasured(observation)
+        is_interrupted &= unmeasured_s > _INTERRUPTED * self._interval_s
+        if prediction.is_measured or not is_interrupted:
             return True
         assert self._icp is not None
         moved_m, turned_rad = self._predictor.model.wandered(unmeasured_s)
