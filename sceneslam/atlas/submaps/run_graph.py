@@ -133,7 +133,7 @@ class RunGraph:
         # The motions alone tell what agrees. No cycle tells it of a place of the loaded map and a
         # loop of the run.
         moved = np.concatenate([self._loaded.T_map_node, T_map_node])
-        places = _agreeing_places(_places(self._loaded, fixes, ends), chain, moved, drift)
+        places = _agreeing(_places(self._loaded, fixes, ends), chain, moved, drift)
         loops = [edge.shifted(count) for edge in self._found.loops]
         agreeing = [self._found.loops[index] for index in consistent(loops, moved, drift)]
         loops = [edge.shifted(count) for edge in self._believed(agreeing)]
@@ -253,7 +253,7 @@ def _mean(T_map_node: NDArray[np.float64], edges: Sequence[Edge]) -> Edge:
     return replace(start, T_first_second=T_first_second, covariance=covariance)
 
 
-def _agreeing_places(
+def _agreeing(
     places: Sequence[Edge], chain: Chain, T_map_node: NDArray[np.float64], drift: PathDrift
 ) -> list[Edge]:
     """Return the places that agree, in each piece of the run: nothing measured how those lie."""
