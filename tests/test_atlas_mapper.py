@@ -29,7 +29,8 @@ class Searched:
         monkeypatch.setattr(mapper_of, "MapLocalizer", self._made)
         self.wants_view = lambda look: False
         self.T_map_run, self.fixes, self.is_late = None, [], False
-        self.answer, self.asked, self.piece_ns = LocalizationEvent.NOTHING, [], 0
+        self.answer, self.asked = LocalizationEvent.NOTHING, []
+        self.piece_ns, self.pieces_ns = 0, [0]
         self.is_located = False
 
     def _made(self, plan, views, *, standing):
@@ -140,7 +141,7 @@ class Busy(Executor):
 def test_what_a_live_run_finds_by_its_last_search_counts(monkeypatch):
     searched = Searched(monkeypatch)
     own, events, observe = looking(speed_m_s=1.0)
-    own._executor = Busy()
+    own._executor = own._search._executor = Busy()
     observe(1.0)
     searched.answer, searched.T_map_run = LocalizationEvent.FOUND, HERE
     correction = own.finish(lambda stamp_ns: None, [])

@@ -14,8 +14,9 @@ from sceneslam.atlas.budget import Budget
 from sceneslam.atlas.covariances import PosedPath, calibrated, covariances
 from sceneslam.atlas.fusion import Placed, fuse
 from sceneslam.atlas.lasting.lasting_map import EXTEND, LastingMap
-from sceneslam.atlas.mapper import Mapper, Note
+from sceneslam.atlas.mapper import Mapper
 from sceneslam.atlas.places.floor_plan import grid_of
+from sceneslam.atlas.places.map_search import Note
 from sceneslam.atlas.pose_path import OpenSession, PoseLog, PosePath, trajectory_of
 from sceneslam.atlas.revision import Revised, revise
 from sceneslam.atlas.submaps.correction import Correction

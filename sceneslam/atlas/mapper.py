@@ -1,4 +1,4 @@
-"""The back end of a run: submaps, their pose graph, and localization in a loaded map.
+"""The back end of a run: its submaps, their pose graph, and the loaded map that they continue.
 
 The graph is spatial. Places are recognized by floor plans of level scans and by what a camera sees,
 whatever module was active; only within the sessions of a module that closes loops itself are none
@@ -8,7 +8,6 @@ looked for.
 from __future__ import annotations
 
 import logging
-from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
@@ -19,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map
-from sceneslam.atlas.places.localizer import Fix, LocalizationEvent, Look, MapLocalizer
+from sceneslam.atlas.places.localizer import Look, MapLocalizer
+from sceneslam.atlas.places.map_search import MapSearch, Note
 from sceneslam.atlas.places.view_taker import ViewTaker
 from sceneslam.atlas.submaps.chain import Chain
 from sceneslam.atlas.submaps.collector import Collector, Known
@@ -41,11 +41,6 @@ from sceneslam.views.view import Landmarks
 from sceneslam.views.view_finder import ViewFinder
 
 _log = logging.getLogger(__name__)
-_REST_NS = 1_000_000_000  # between two searches in the map while the robot stands
-_UNFOUND_NS = 5_000_000_000  # after this time a run reports that it was not located
-_RECENT = 80  # newest looks with a scan that the localizer gets
-
-Note = Callable[..., None]  # event, stamp_ns, and its fields
 
 
 class Mapper:
@@ -73,21 +68,12 @@ class Mapper:
         views = self._loaded.views()
         self._views = ViewTaker(rig, is_keeping=keeps_views, is_comparing=bool(views))
         self._collector = Collector(rig, known, self._loaded.runs, self._views.locate)
-        self._localizer = self._made_localizer(rig, views)
         self._executor = executor("search", is_live=is_live)
-        self._search: Future[LocalizationEvent] | None = None
-        self._recent: list[Look] = []  # with a scan
-        self._rewound_ns: int | None = None  # looks from here on have poses that were replaced
-        self._restart_ns: int | None = None  # a piece begins here, and the localizer is to be told
+        localizer = self._made_localizer(rig, views)
+        self._search = MapSearch(localizer, self._executor, self._pose_at, note)
         self._is_level = True  # at the last step
-        self._T_map_run: Transform | None = None
-        self._fixes: list[Fix] = []  # by which it is so
-        self._T_map_runs: list[Transform] = []  # per submap, as it was while that was the newest
-        self._began_ns: int | None = None
-        self._has_told = False
         self._has_refused = False  # a measurement
         self.faults: list[str] = []
-        self.was_found = False  # the run was located in the loaded map, at any time
         self._graph: RunGraph | None = RunGraph(
             self._loaded, is_closed, moves_loaded=moves_loaded
         )  # None once it failed
@@ -101,7 +87,12 @@ class Mapper:
     @property
     def is_placed(self) -> bool:
         """Tell whether the run was located in a loaded map."""
-        return self._T_map_run is not None
+        return self._search.is_placed
+
+    @property
+    def was_found(self) -> bool:
+        """Tell whether the run was located in the loaded map at any time."""
+        return self._search.was_found
 
     @property
     def has_submaps(self) -> bool:
@@ -114,26 +105,22 @@ class Mapper:
         return self.is_placed or not self._loaded.submaps
 
     @property
-    def _is_located(self) -> bool:
-        """Tell whether the newest pose is where it was located in the loaded map."""
-        return self._localizer is not None and self._localizer.is_located
-
-    @property
     def T_map_run(self) -> Transform:
         """Return T_map_run (4, 4) in the loaded map; the identity until the run was located."""
-        return se3.identity() if self._T_map_run is None else self._T_map_run
+        return self._search.T_map_run
 
     def take_correction(self) -> Correction | None:
         """Return the correction of the poses by loops or the loaded map, None if it is as before.
 
         That of the newest submap holds for the newest pose, too.
         """
-        if not self._is_news:
+        is_located_anew = self._search.take_news()
+        if not (self._is_news or is_located_anew):
             return None
         self._is_news = False
         chain = self._collector.chain
         if self.is_placed or not self._solved.loops:
-            T_new_old = np.array(self._located(max(len(chain), 1)))
+            T_new_old = np.array(self._T_map_runs() or [self.T_map_run])
         else:
             nodes = self._solved.T_map_node
             T_new_old = nodes @ se3.inverse(np.array(chain.T_run_node[: len(nodes)]))
@@ -141,14 +128,10 @@ class Mapper:
 
     def rewind(self, stamp_ns: int) -> None:
         """Remove what was made of poses from a stamp on: they are replaced."""
-        before_ns = stamp_ns if self._rewound_ns is None else self._rewound_ns
-        self._rewound_ns = min(stamp_ns, before_ns)
-        if self._restart_ns is not None and stamp_ns <= self._restart_ns:
-            self._restart_ns = None
+        self._search.rewind(stamp_ns)
         self._collector.rewind(stamp_ns)
         self._views.rewind(stamp_ns)
         kept = len(self._collector.chain)
-        del self._T_map_runs[kept:]
         if kept < self._kept:
             self._is_news |= bool(self._solved.loops)
             self._kept, self._solved = kept, self._solved.cut(kept, len(self._loaded.submaps))
@@ -158,18 +141,18 @@ class Mapper:
         known = self._known(observation.stamp_ns)
         if known is None:
             return
-        stamp_ns, localizer = observation.stamp_ns, self._localizer
+        stamp_ns, search = observation.stamp_ns, self._search
         self._views.move(stamp_ns, known.T_map_base)
         self._collect_loops()
         is_begun = self._collector.has_begun(known)
-        if localizer is not None:
-            self._restart_ns = known.begun_ns if is_begun else self._restart_ns
-            self._collect(localizer, stamp_ns)
+        if is_begun:
+            search.restart(known.begun_ns)
+        search.collect(stamp_ns)
         look = Look(stamp_ns=stamp_ns, T_run_base=known.T_map_base)
         is_step = is_begun or self._collector.has_moved(known)
-        is_scanned = is_step or self._rests(stamp_ns)
-        is_viewed = localizer is not None and self._search is None and localizer.wants_view(look)
-        is_viewed &= is_step or not self._is_located  # a fix is by walls first, which come in steps
+        is_scanned = is_step or search.rests(stamp_ns)
+        is_viewed = search.wants_view(look)
+        is_viewed &= is_step or not search.is_located  # fixes are by walls first, in steps
         if not (is_scanned or is_viewed):
             return
         if is_step:
@@ -183,13 +166,8 @@ class Mapper:
                 self._views.keep(known.T_map_base)
             self._collector.add(stamp_ns, scan, up_base, view if is_kept else None)
             self._close_loops()
-        if scan is None and view is None:
-            return
-        if self._began_ns is None:
-            self._began_ns = stamp_ns
-        if localizer is not None:
-            look = replace(look, scan=scan, view=view if is_viewed else None)
-            self._localize(localizer, look)
+        if scan is not None or view is not None:
+            search.look(replace(look, scan=scan, view=view if is_viewed else None))
 
     def close(self) -> None:
         """Begin no other search; one that is running goes on, and nothing takes its result."""
@@ -206,8 +184,7 @@ class Mapper:
         chain = self._collector.chain
         if not len(chain):
             return Correction.none()
-        if self._localizer is not None:
-            self._collect(self._localizer, int(chain.submaps[-1].stamps_ns[-1]))
+        self._search.collect(int(chain.submaps[-1].stamps_ns[-1]))
         chain.remeasure(path)
         old = np.array(chain.T_run_node)
         start, is_level = self.T_map_run @ old, self._collector.is_level
@@ -215,12 +192,12 @@ class Mapper:
             self._graph.forget(self._kept)
             try:
                 self._solved = self._graph.finish(
-                    chain, start, path, maps, self._fixes, is_level=is_level
+                    chain, start, path, maps, self._search.fixes, is_level=is_level
                 )
             except Exception as error:
                 self._give_up_graph("the graph was not solved at the end", error)
         if self._graph is None:  # what was solved during the run is kept
-            self._solved = self._last_solved(np.array(self._located(len(chain))) @ old)
+            self._solved = self._last_solved(np.array(self._T_map_runs()) @ old)
         self._is_over = True
         self._tell_loops()
         if not (self._solved.loops or chain.is_upright or self.is_placed):
@@ -250,7 +227,7 @@ class Mapper:
             T_map_run = nodes[-1] @ se3.inverse(own.T_run_node[len(nodes) - 1])
             nodes += [T_map_run @ T_run_node for T_run_node in own.T_run_node[len(nodes) :]]
         else:
-            located = zip(self._located(len(own)), own.T_run_node, strict=True)
+            located = zip(self._T_map_runs(), own.T_run_node, strict=True)
             nodes = [T_map_run @ T_run_node for T_map_run, T_run_node in located]
         T_map_node = np.concatenate([loaded, np.reshape(nodes, (-1, 4, 4))])
         loops = [
@@ -290,25 +267,14 @@ class Mapper:
         """Return the loops to the loaded map that are not solved: the run goes on, or it failed."""
         is_solved = self._is_over and self._graph is not None
         chain = self._collector.chain
-        return [] if is_solved or not len(chain) else places(self._loaded, chain, self._fixes)
+        if is_solved or not len(chain):
+            return []
+        return places(self._loaded, chain, self._search.fixes)
 
-    def _located(self, count: int) -> list[Transform]:
-        """Return T_map_run (4, 4) of each of `count` submaps; that of the newest is today's."""
-        runs, before = self._T_map_runs, min(self._before_piece(), count)
-        del runs[max(count - 1, before) :]
-        runs += runs[-1:] * (before - len(runs))  # of an earlier piece: as it was located last
-        runs += [self.T_map_run] * (count - len(runs))
-        return runs
-
-    @property
-    def _piece_ns(self) -> int:
-        """Return the stamp with which the piece begins that is located now."""
-        return 0 if self._localizer is None else self._localizer.piece_ns
-
-    def _before_piece(self) -> int:
-        """Return how many submaps lie before the piece that is located now."""
+    def _T_map_runs(self) -> list[Transform]:
+        """Return T_map_run (4, 4) of each submap."""
         submaps = self._collector.chain.submaps
-        return bisect_left(submaps, self._piece_ns, key=lambda one: int(one.stamps_ns[0]))
+        return self._search.T_map_runs([int(submap.stamps_ns[0]) for submap in submaps])
 
     # During the run.
 
@@ -359,8 +325,9 @@ class Mapper:
             if start < len(stamps_ns) and (known := self._known(stamps_ns[start])) is not None:
                 knots.setdefault(known.begun_ns - 1, T_new_old[start - 1])
                 knots.setdefault(known.begun_ns, T_new_old[start])
-        if self.is_placed and stamps_ns[-1] < self._piece_ns:  # its first submap grows
-            knots |= {self._piece_ns - 1: T_new_old[-1], self._piece_ns: self.T_map_run}
+        piece_ns = self._search.piece_ns
+        if self.is_placed and stamps_ns[-1] < piece_ns:  # its first submap grows
+            knots |= {piece_ns - 1: T_new_old[-1], piece_ns: self.T_map_run}
         return Correction(
             stamps_ns=np.array(sorted(knots), np.int64),
             T_new_old=np.array([knots[stamp_ns] for stamp_ns in sorted(knots)]),
@@ -408,67 +375,9 @@ class Mapper:
             self._has_refused = True
             return None
 
-    def _rests(self, stamp_ns: int) -> bool:
-        """Tell whether a robot at rest should search the map."""
-        if not self._loaded.submaps or self._is_located or not self._recent:
-            return False
-        return stamp_ns - self._recent[-1].stamp_ns >= _REST_NS
-
-    def _localize(self, localizer: MapLocalizer, look: Look) -> None:
-        """Compare a look with the map, if it is time and no search is running."""
-        latest = [*self._recent[1 - _RECENT :], look]
-        if look.scan is not None:
-            self._recent = latest
-        if self._search is not None:
-            return
-        if look.view is not None or (look.scan is not None and localizer.is_due(look)):
-            self._search = self._executor.submit(localizer.compare, tuple(latest))
-            self._collect(localizer, look.stamp_ns)
-        else:
-            self._take(LocalizationEvent.NOTHING, localizer, look.stamp_ns)
-
-    def _collect(self, localizer: MapLocalizer, stamp_ns: int) -> None:
-        """Take the result of a search, if there is one, and between two the replaced poses."""
-        if self._search is not None and self._search.done():
-            search, self._search = self._search, None
-            self._take(search.result(), localizer, stamp_ns)
-        if self._search is None and self._rewound_ns is not None:
-            recent = [(look, self._pose_at(look.stamp_ns)) for look in self._recent]
-            self._recent = [replace(look, T_run_base=T) for look, T in recent if T is not None]
-            localizer.rewind(self._rewound_ns, self._pose_at)
-            self._rewound_ns = None
-            self._follow(localizer)
-        if self._search is None and self._restart_ns is not None:
-            localizer.restart(self._restart_ns)
-            self._recent = [look for look in self._recent if look.stamp_ns >= self._restart_ns]
-            self._restart_ns, self._began_ns, self._has_told = None, None, False
-
     def _pose_at(self, stamp_ns: int) -> Transform | None:
         known = self._known(stamp_ns)
         return None if known is None else known.T_map_base
-
-    def _follow(self, localizer: MapLocalizer) -> None:
-        """Take the localizer's estimate of where the run lies in the loaded map."""
-        before = self._before_piece()
-        self._T_map_runs += [self.T_map_run] * (before - len(self._T_map_runs))
-        self._is_news |= localizer.T_map_run is not self._T_map_run
-        self._T_map_run, self._fixes = localizer.T_map_run, localizer.fixes
-
-    def _take(self, outcome: LocalizationEvent, localizer: MapLocalizer, stamp_ns: int) -> None:
-        """Process the result of a comparison with the map."""
-        assert self._began_ns is not None
-        after_s = (stamp_ns - self._began_ns) / 1e9
-        self._follow(localizer)
-        if outcome in (LocalizationEvent.FOUND, LocalizationEvent.WITHDRAWN):
-            del self._T_map_runs[self._before_piece() :]
-        if outcome is LocalizationEvent.FOUND:
-            self.was_found = True
-            self._note(outcome.value, stamp_ns, after_s=after_s, T_map_run=self.T_map_run.tolist())
-        elif outcome is LocalizationEvent.WITHDRAWN:
-            self._note(outcome.value, stamp_ns, after_s=after_s)
-        elif not self._is_located and not self._has_told and after_s * 1e9 >= _UNFOUND_NS:
-            self._note("not_relocalized", stamp_ns, after_s=after_s)
-            self._has_told = True
 
     def _tell_loops(self) -> None:
         """Report the loops that are new."""

@@ -152,6 +152,11 @@ class MapLocalizer:
         return self._piece.T_map_run is not None
 
     @property
+    def pieces_ns(self) -> list[int]:
+        """Return the stamp with which each piece of the run begins."""
+        return [one.begun_ns for one in self._pieces]
+
+    @property
     def piece_ns(self) -> int:
         """Return the stamp with which the present piece of the run begins, 0 for the first."""
         return self._piece.begun_ns
