@@ -283,6 +283,28 @@ def test_walls_fix_a_run_and_eyes_where_walls_leave_a_direction_open(monkeypatch
     assert in_map(own.T_map_run, [1.0, 0.0, 0.0])[0] == pytest.approx(expected_m, abs=0.01)
 
 
+@pytest.mark.parametrize(("walls_m", "found_m"), [(1.0, 1.0), (None, 0.9)])
+def test_where_eyes_find_the_run_walls_fix_it(monkeypatch, walls_m, found_m):
+    scripted, eyes = Scripted(monkeypatch), Eyes()
+    own, eyes.at = MapLocalizer(corner_of()), np.array([0.9, -5.0, 0.0])  # nothing is known there
+    own._views = eyes
+    if walls_m is not None:
+        at = [walls_m, -5.0, 0.0]
+        monkeypatch.setattr(Scripted, "locate", lambda own, plan: None)  # not without the eyes
+        scripted.answer = replace(quality(at=at), covariance=1e-4 * np.eye(3))
+    said = [own.compare([seen_too(second, 0.0, 0.0, 0.0)]) for second in (0, 1)]
+    assert said[-1] is LocalizationEvent.FOUND
+    assert in_map(own.T_map_run, [0.0] * 3)[0] == pytest.approx(found_m, abs=0.01)
+
+
+def test_eyes_do_not_find_the_run_where_walls_refute_it(monkeypatch):
+    scripted, eyes = Scripted(monkeypatch), Eyes()
+    own, eyes.at = MapLocalizer(corner_of()), np.array([1.0, 1.0, 0.0])  # in front of free space
+    own._views, scripted.answer = eyes, None
+    said = [own.compare([seen_too(second, 0.0, 0.0, 0.0)]) for second in (0, 1, 2)]
+    assert said == [LocalizationEvent.NOTHING] * 3 and not own.is_located
+
+
 def test_in_a_corridor_eyes_may_find_the_run_farther_off_than_walls(monkeypatch):
     """Walls that leave its length open say nothing of how far the run has drifted along it."""
     scripted, eyes = Scripted(monkeypatch), Eyes()

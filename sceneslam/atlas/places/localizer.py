@@ -192,7 +192,9 @@ class MapLocalizer:
         before, self._guess = self._guess, _Guess(T_map_run=T_map_run, fix=fix)
         if before is None or not _agree(before.T_map_run, T_map_run, newest.T_run_base):
             return LocalizationEvent.NOTHING
-        fix = _mean(fix, before, newest)
+        fix = self._settled(_mean(fix, before, newest), latest)
+        if fix is None:
+            return LocalizationEvent.NOTHING
         if piece.fixes:  # it was located before: there, and it drifted, or somewhere else
             last = piece.fixes[-1]
             T_expected = last.T_map_base @ se3.inverse(last.T_run_base) @ newest.T_run_base
@@ -266,6 +268,14 @@ class MapLocalizer:
                 self._guess = None  # two searches by walls have to agree in a row
             return None
         return self._fix(newest, newest.T_run_base, match)
+
+    def _settled(self, fix: Fix, latest: Sequence[Look]) -> Fix | None:
+        """Return a place by landmarks with what the walls say there, None if they contradict it."""
+        if not fix.is_by_view or self._walls is None:
+            return fix
+        window = self._window(fix.T_map_base, self._travelled)
+        by_walls, are_refuted = self._near_walls(latest, fix.T_map_base, window)
+        return None if are_refuted else _joint(by_walls, fix)
 
     def _check(self, latest: Sequence[Look], T_map_base: Transform) -> LocalizationEvent:
         """Compare near the predicted pose; repeated contradictions withdraw the localization."""
