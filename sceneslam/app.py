@@ -16,7 +16,7 @@ import cv2
 from sceneslam.config.build import RunParts, build
 from sceneslam.config.provenance import save_config
 from sceneslam.evaluation.metrics import Metrics
-from sceneslam.evaluation.summary import summary_lines
+from sceneslam.evaluation.report.summary import summary_lines
 from sceneslam.interrupts import StopRequests, stop_requests
 from sceneslam.loop import RunLoop
 from sceneslam.results import Results

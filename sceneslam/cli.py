@@ -30,7 +30,7 @@ from sceneslam.config.settings import DETECT_ONLY
 from sceneslam.config.words import check_trust, how_to_quote, is_override, readable, shortened
 from sceneslam.detection.run import detect
 from sceneslam.doctor import examine
-from sceneslam.evaluation.summary import summary_lines
+from sceneslam.evaluation.report.summary import summary_lines
 from sceneslam.evaluation.verdict import verdict_lines
 from sceneslam.experiment import run_experiment
 from sceneslam.storage.folder import give_back

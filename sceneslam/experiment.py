@@ -29,8 +29,8 @@ from sceneslam.config.resolve import resolved
 from sceneslam.config.settings import DETECT_ONLY
 from sceneslam.config.words import check_trust
 from sceneslam.detection.run import detect
+from sceneslam.evaluation.report.verdict_page import Asked, Ran, write_verdict_page
 from sceneslam.evaluation.verdict import write_verdict
-from sceneslam.evaluation.verdict_page import Asked, Ran, write_verdict_page
 from sceneslam.interfaces import Experiment
 from sceneslam.interrupts import terminate_with
 from sceneslam.types.errors import ConfigError, InputError

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from sceneslam.evaluation.moments import change_of
+from sceneslam.evaluation.report.moments import change_of
 from sceneslam.types.observation import Observation
 from sceneslam.types.run import Event, KeyMoment
 

@@ -16,7 +16,7 @@ import numpy as np
 from sceneslam.atlas.save import save_map
 from sceneslam.atlas.uncertainty import write_covariances
 from sceneslam.evaluation.metrics import Metrics, evaluate, write_metrics
-from sceneslam.evaluation.report import write_report
+from sceneslam.evaluation.report.run_page import write_report
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.interfaces import Source
 from sceneslam.sources.wrapped import logged_ns

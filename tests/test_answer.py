@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from evaluation_runs import SETTINGS, poseless_run, switched_run, true_loop
 
-from sceneslam.evaluation.answer import answer
 from sceneslam.evaluation.metrics import evaluate
 from sceneslam.evaluation.names import module_names, renamed
+from sceneslam.evaluation.report.answer import answer
 
 
 def told(**changes):

@@ -244,7 +244,7 @@ def test_a_figure_that_no_memory_is_left_for_costs_no_other_result(tmp_path, mon
     def draw(*_):
         raise MemoryError
 
-    monkeypatch.setattr("sceneslam.evaluation.figures.draw_map", draw)
+    monkeypatch.setattr("sceneslam.evaluation.figures.run_figures.draw_map", draw)
     finished = run(config(), tmp_path)
     assert finished.faults == ("the figure map could not be drawn: MemoryError",)
     assert not (tmp_path / "figures" / "map.png").exists()
@@ -256,7 +256,7 @@ def test_a_page_that_no_memory_is_left_for_costs_the_page_alone(tmp_path, monkey
     def fill(*_):
         raise MemoryError
 
-    monkeypatch.setattr("sceneslam.evaluation.report.fill_page", fill)
+    monkeypatch.setattr("sceneslam.evaluation.report.run_page.fill_page", fill)
     finished = run(config(), tmp_path)
     assert finished.faults == ("the report could not all be saved: MemoryError",)
     assert (tmp_path / "metrics.json").exists() and (tmp_path / "map" / "points.ply").exists()

@@ -10,8 +10,8 @@ from evaluation_runs import (
     true_loop,
 )
 
-from sceneslam.evaluation.chronicle import chronicle
 from sceneslam.evaluation.metrics import evaluate
+from sceneslam.evaluation.report.chronicle import chronicle
 
 
 def tell(run, truth=None):

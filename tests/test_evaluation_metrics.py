@@ -23,9 +23,9 @@ from hypothesis import strategies as st
 
 from sceneslam.evaluation.association import interpolated, select
 from sceneslam.evaluation.metrics import coverage, evaluate, write_metrics
+from sceneslam.evaluation.report.story import tell
+from sceneslam.evaluation.report.summary import summary_lines
 from sceneslam.evaluation.settings import EvaluationSettings
-from sceneslam.evaluation.story import tell
-from sceneslam.evaluation.summary import summary_lines
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.truth import GroundTruth
 

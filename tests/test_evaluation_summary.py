@@ -14,8 +14,8 @@ from evaluation_runs import (
 )
 
 from sceneslam.evaluation.metrics import evaluate
-from sceneslam.evaluation.story import tell
-from sceneslam.evaluation.summary import summary_lines
+from sceneslam.evaluation.report.story import tell
+from sceneslam.evaluation.report.summary import summary_lines
 from sceneslam.types.run import Event, RunResult
 
 

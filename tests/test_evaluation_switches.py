@@ -17,10 +17,10 @@ from evaluation_runs import (
     without,
 )
 
-from sceneslam.evaluation.chronicle import chronicle
 from sceneslam.evaluation.metrics import evaluate
-from sceneslam.evaluation.story import tell
-from sceneslam.evaluation.summary import summary_lines
+from sceneslam.evaluation.report.chronicle import chronicle
+from sceneslam.evaluation.report.story import tell
+from sceneslam.evaluation.report.summary import summary_lines
 from sceneslam.types import se3
 from sceneslam.types.run import RunResult
 from sceneslam.types.truth import GroundTruth, SceneChange

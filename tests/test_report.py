@@ -20,11 +20,11 @@ from evaluation_runs import (
     true_loop,
 )
 
-from sceneslam.evaluation.figure_features import feature_limits
-from sceneslam.evaluation.figure_time import draw_timeline
-from sceneslam.evaluation.figures import write_figures
+from sceneslam.evaluation.figures.features import feature_limits
+from sceneslam.evaluation.figures.run_figures import write_figures
+from sceneslam.evaluation.figures.time import draw_timeline
 from sceneslam.evaluation.metrics import evaluate
-from sceneslam.evaluation.report import write_report
+from sceneslam.evaluation.report.run_page import write_report
 from sceneslam.types.run import KeyMoment, RunResult
 from sceneslam.types.truth import GroundTruth
 

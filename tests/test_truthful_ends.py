@@ -13,7 +13,7 @@ from ros_recordings import make_source
 from test_preflight import CAMERA, write_folder
 
 from sceneslam.app import run
-from sceneslam.evaluation.summary import summary_lines
+from sceneslam.evaluation.report.summary import summary_lines
 from sceneslam.ros.writer import ObservationWriter
 from sceneslam.sources.bag.frames import FrameTree
 from sceneslam.sources.bag.recording import ChunkedRecording

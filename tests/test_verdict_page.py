@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sceneslam.evaluation.verdict_page import Asked, Ran, write_verdict_page
+from sceneslam.evaluation.report.verdict_page import Asked, Ran, write_verdict_page
 from sceneslam.types.experiment import Figure, Table, Trial, Verdict
 
 ASKED = Asked(

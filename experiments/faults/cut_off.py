@@ -34,7 +34,12 @@ from sceneslam.types.trajectory import Trajectory
 
 KINDS = ("kill", "terminate", "hang up", "closed streams", "full streams", "broken pipe", "disk")
 _FOREIGN = ("notes.txt", "trajectory_gps.tum", "figures/fig1.png", "map/survey.pgm")
-_PRELOAD = [__name__, "sceneslam.evaluation.figures", "matplotlib.figure", "mcap.writer"]
+_PRELOAD = [
+    __name__,
+    "sceneslam.evaluation.figures.run_figures",
+    "matplotlib.figure",
+    "mcap.writer",
+]
 _DISK_KB = (1200, 6000)
 _BAG = str(files("sceneslam.conf").joinpath("source/rosbag.yaml"))
 _PATIENCE_S = 120.0

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sceneslam.evaluation.correctness import CorrectLimits
-from sceneslam.evaluation.figure_paths import draw_paths
+from sceneslam.evaluation.figures.paths import draw_paths
 from sceneslam.experiments.matrix.cell import Cell, Judge, deviation, mean, rows_of
 from sceneslam.experiments.matrix.figure import draw_errors, draw_sweep
 from sceneslam.experiments.matrix.oracle import best_of

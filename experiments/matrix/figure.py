@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sceneslam.evaluation import figure_style as look
+from sceneslam.evaluation.figures import style as look
 from sceneslam.experiments.matrix.cell import Cell
 from sceneslam.experiments.matrix.sweep import Setting
 

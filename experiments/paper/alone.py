@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
 
-from sceneslam.evaluation import figure_style as look
+from sceneslam.evaluation.figures import style as look
 from sceneslam.experiments.paper.images import draw_rooms
 from sceneslam.experiments.paper.runs import keep_figure, number
 from sceneslam.experiments.paper.views import cloud_of, draw_third_person, read_ply

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.evaluation import figure_style as look
 from sceneslam.evaluation.comparison import Difference, compare
+from sceneslam.evaluation.figures import style as look
 from sceneslam.experiments.paper.runs import number
 from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_above, check_some

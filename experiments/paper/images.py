@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from omegaconf import OmegaConf
 
 from sceneslam.config.component import ComponentBuilder
-from sceneslam.evaluation import figure_style as look
 from sceneslam.evaluation.association import interpolated
+from sceneslam.evaluation.figures import style as look
 from sceneslam.experiments.paper.views import Cloud, draw_third_person
 from sceneslam.interfaces import Source
 from sceneslam.types import se3

@@ -14,7 +14,7 @@ import numpy as np
 
 from sceneslam.evaluation.association import select
 from sceneslam.evaluation.comparison import Difference, compare
-from sceneslam.evaluation.figure_paths import draw_paths
+from sceneslam.evaluation.figures.paths import draw_paths
 from sceneslam.experiments.paper.runs import number
 from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_above, check_among, check_some

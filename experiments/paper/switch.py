@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from sceneslam.evaluation import figure_style as look
+from sceneslam.evaluation.figures import style as look
 from sceneslam.experiments.paper.runs import keep_figure, number
 from sceneslam.experiments.paper.views import cloud_of, draw_third_person, modules_of, read_ply
 from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.evaluation import figure_style as look
+from sceneslam.evaluation.figures import style as look
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
 

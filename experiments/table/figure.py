@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from sceneslam.evaluation import figure_style as look
+from sceneslam.evaluation.figures import style as look
 from sceneslam.experiments.table.evidence import Evidence
 
 

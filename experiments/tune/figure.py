@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneslam.evaluation import figure_style as look
+from sceneslam.evaluation.figures import style as look
 
 
 def draw_search(path: Path, scores: Sequence[float], *, default: float) -> None:

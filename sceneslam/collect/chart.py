@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 
-from sceneslam.evaluation.figure_style import PALETTE
+from sceneslam.evaluation.figures.style import PALETTE
 
 _WIDTH, _HEIGHT = 480, 280
 _DOTS_MAX = 30  # dots per line; more would hide it

@@ -8,8 +8,8 @@ from itertools import groupby
 from sceneslam.collect.chart import Line, Point, draw_front, draw_lines, front
 from sceneslam.collect.rows import Row, Value
 from sceneslam.collect.summary import SEED, Group, mean_of
-from sceneslam.evaluation.figure_style import PALETTE
-from sceneslam.evaluation.markup import figure
+from sceneslam.evaluation.figures.style import PALETTE
+from sceneslam.evaluation.report.markup import figure
 
 _SHOWN = {  # metric -> name of the axis
     "ate_rmse_m": "ATE RMSE [m]",

@@ -11,8 +11,8 @@ from sceneslam.collect.curves import charts
 from sceneslam.collect.overview import FIRST
 from sceneslam.collect.rows import Row, Value, swept_keys
 from sceneslam.collect.summary import Group, Mean
-from sceneslam.evaluation.markup import bullets, tiles
-from sceneslam.evaluation.page import fill_page
+from sceneslam.evaluation.report.markup import bullets, tiles
+from sceneslam.evaluation.report.page import fill_page
 
 _ROWS_MAX = 2000
 _ERRORS_MAX = 20

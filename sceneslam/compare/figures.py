@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from sceneslam.compare.runs import Run
-from sceneslam.evaluation import figure_style as look
 from sceneslam.evaluation.accuracy import absolute_errors
-from sceneslam.evaluation.figure_paths import draw_paths
+from sceneslam.evaluation.figures import style as look
+from sceneslam.evaluation.figures.paths import draw_paths
 
 
 def paths(path: Path, runs: Sequence[Run]) -> bool:

@@ -10,10 +10,10 @@ from typing import Any
 
 from sceneslam.compare import figures
 from sceneslam.compare.runs import Run, differing
-from sceneslam.evaluation import markup
 from sceneslam.evaluation.comparison import compare
-from sceneslam.evaluation.page import fill_page
-from sceneslam.evaluation.summary import degrees, number, percent
+from sceneslam.evaluation.report import markup
+from sceneslam.evaluation.report.page import fill_page
+from sceneslam.evaluation.report.summary import degrees, number, percent
 from sceneslam.types.errors import InputError
 
 _SHOWN_SETTINGS = 40

@@ -22,8 +22,8 @@ from sceneslam.detection.features import RecordingFeatures
 from sceneslam.detection.recall import recall
 from sceneslam.evaluation.detection import score_detection
 from sceneslam.evaluation.metrics import Metrics, write_metrics
+from sceneslam.evaluation.report.summary import number
 from sceneslam.evaluation.settings import EvaluationSettings
-from sceneslam.evaluation.summary import number
 from sceneslam.evaluation.switches import true_scene
 from sceneslam.interfaces import FeatureDetector
 from sceneslam.types.observation import UNSURE, SceneVote

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
-from sceneslam.evaluation.summary import summary_lines
+from sceneslam.evaluation.report.summary import summary_lines
 from sceneslam.recover.recover import recover
 from sceneslam.storage.folder import RunFolder
 from sceneslam.storage.journal import JOURNAL

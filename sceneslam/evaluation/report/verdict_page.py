@@ -8,9 +8,9 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from sceneslam.evaluation import markup
-from sceneslam.evaluation.page import fill_page
-from sceneslam.evaluation.summary import number, percent
+from sceneslam.evaluation.report import markup
+from sceneslam.evaluation.report.page import fill_page
+from sceneslam.evaluation.report.summary import number, percent
 from sceneslam.evaluation.verdict import promised, rounded
 from sceneslam.types.experiment import Figure, Trial, Verdict
 
@@ -56,7 +56,9 @@ def write_verdict_page(folder: Path, asked: Asked, verdict: Verdict, runs: Seque
         "command": escape(asked.command),
         "config": escape(asked.config_yaml),
     }
-    return fill_page(folder / "report.html", "sceneslam.evaluation", "verdict.html", values)
+    return fill_page(
+        folder / "report.html", "sceneslam.evaluation.report", "verdict_page.html", values
+    )
 
 
 def _kept(figures: Sequence[Figure]) -> str:

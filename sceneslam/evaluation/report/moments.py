@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import cv2
 
-from sceneslam.evaluation import markup
+from sceneslam.evaluation.report import markup
 from sceneslam.types.run import Event, KeyMoment
 
 _QUALITY = 80  # of the images in the page (JPEG)

@@ -8,17 +8,17 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from sceneslam.evaluation import markup
-from sceneslam.evaluation.answer import Answer, answer
-from sceneslam.evaluation.chronicle import Entry, chronicle
-from sceneslam.evaluation.figure_features import feature_limits
-from sceneslam.evaluation.figures import write_figures
+from sceneslam.evaluation.figures.features import feature_limits
+from sceneslam.evaluation.figures.run_figures import write_figures
 from sceneslam.evaluation.metrics import Metrics
-from sceneslam.evaluation.moments import pictures
 from sceneslam.evaluation.names import module_names, renamed
-from sceneslam.evaluation.page import fill_page
-from sceneslam.evaluation.story import tell
-from sceneslam.evaluation.summary import degrees, number, percent, seconds
+from sceneslam.evaluation.report import markup
+from sceneslam.evaluation.report.answer import Answer, answer
+from sceneslam.evaluation.report.chronicle import Entry, chronicle
+from sceneslam.evaluation.report.moments import pictures
+from sceneslam.evaluation.report.page import fill_page
+from sceneslam.evaluation.report.story import tell
+from sceneslam.evaluation.report.summary import degrees, number, percent, seconds
 from sceneslam.types.run import RunResult
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
@@ -91,7 +91,7 @@ def write_report(
         "versions": markup.table(["part", "version"], [[*item] for item in versions.items()]),
         "config": escape(config_yaml),
     }
-    return fill_page(folder / "report.html", "sceneslam.evaluation", "report.html", values)
+    return fill_page(folder / "report.html", "sceneslam.evaluation.report", "run_page.html", values)
 
 
 def _seen(result: RunResult) -> str:

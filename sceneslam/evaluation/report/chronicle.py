@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sceneslam.evaluation.reasons import why_chosen
+from sceneslam.evaluation.report.reasons import why_chosen
 from sceneslam.types.run import Event, RunResult
 
 _SHORT_S = 0.5  # shorter trouble is only counted

@@ -13,7 +13,7 @@ from sceneslam.types.files import replacing
 def fill_page(path: Path, package: str, template: str, values: Mapping[str, str]) -> Path:
     """Fill a package's template, including the style; return the page's path."""
     page = Template(files(package).joinpath(template).read_text("utf-8"))
-    style = files("sceneslam.evaluation").joinpath("page.css").read_text("utf-8")
+    style = files("sceneslam.evaluation.report").joinpath("page.css").read_text("utf-8")
     with replacing(path, encoding="utf-8") as file:
         file.write(page.substitute(values, style=style))
     return path

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.evaluation import figure_style as look
 from sceneslam.evaluation.association import interpolated
+from sceneslam.evaluation.figures import style as look
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
 

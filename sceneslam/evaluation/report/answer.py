@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from sceneslam.evaluation.metrics import Metrics
-from sceneslam.evaluation.summary import number, percent
+from sceneslam.evaluation.report.summary import number, percent
 
 _SHARE = 0.01  # of the observations: a smaller share gives no advice
 _CORRECT = 0.99  # of the time

@@ -6,7 +6,7 @@ from typing import Any
 
 from sceneslam.evaluation.gaps import in_words
 from sceneslam.evaluation.metrics import Metrics
-from sceneslam.evaluation.summary import degrees, number, percent, seconds
+from sceneslam.evaluation.report.summary import degrees, number, percent, seconds
 
 _TOLD_SWITCHES = 8
 _WHY = {

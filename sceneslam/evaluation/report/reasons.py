@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from sceneslam.evaluation.summary import degrees, number
+from sceneslam.evaluation.report.summary import degrees, number
 from sceneslam.types.run import Event
 
 _HEALTH = {

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.evaluation import figure_style as look
 from sceneslam.evaluation.accuracy import AbsoluteErrors
+from sceneslam.evaluation.figures import style as look
 from sceneslam.types.run import RunResult
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory

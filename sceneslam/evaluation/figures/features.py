@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sceneslam.evaluation import figure_style as look
+from sceneslam.evaluation.figures import style as look
 from sceneslam.types.run import RunResult
 from sceneslam.types.truth import GroundTruth
 

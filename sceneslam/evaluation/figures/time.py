@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.evaluation import figure_style as look
+from sceneslam.evaluation.figures import style as look
 from sceneslam.evaluation.switches import is_switch
 from sceneslam.types.run import Event, RunResult
 from sceneslam.types.truth import GroundTruth

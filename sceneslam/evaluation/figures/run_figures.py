@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.evaluation import figure_style as look
 from sceneslam.evaluation.accuracy import AbsoluteErrors, absolute_errors
 from sceneslam.evaluation.comparison import compare
-from sceneslam.evaluation.figure_features import Limits, draw_features
-from sceneslam.evaluation.figure_map import draw_map, draw_path
-from sceneslam.evaluation.figure_pose import draw_error_path, draw_pose
-from sceneslam.evaluation.figure_time import draw_posterior, draw_series, draw_timeline, draw_votes
-from sceneslam.evaluation.figure_view import draw_view
+from sceneslam.evaluation.figures import style as look
+from sceneslam.evaluation.figures.features import Limits, draw_features
+from sceneslam.evaluation.figures.map import draw_map, draw_path
+from sceneslam.evaluation.figures.pose import draw_error_path, draw_pose
+from sceneslam.evaluation.figures.time import draw_posterior, draw_series, draw_timeline, draw_votes
+from sceneslam.evaluation.figures.view import draw_view
 from sceneslam.types import se3
 from sceneslam.types.errors import text_of
 from sceneslam.types.run import RunResult
