@@ -29,7 +29,7 @@ from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.resolve import resolved
 from sceneslam.detection.decide import confirm
 from sceneslam.interfaces import FeatureDetector
-from sceneslam.sources.dim_sensor import DimSensor
+from sceneslam.sources.changes.dim_sensor import DimSensor
 from sceneslam.types.observation import Observation, SceneVote
 from sceneslam.types.rig import Rig, Sensor
 

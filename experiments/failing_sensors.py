@@ -20,8 +20,8 @@ from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.resolve import resolved
 from sceneslam.detection.decide import confirm
 from sceneslam.interfaces import FeatureDetector, Source
-from sceneslam.sources.failing_sensor import FailingSensor
-from sceneslam.sources.failures import FAILURES, scene_of
+from sceneslam.sources.changes.failing_sensor import FailingSensor
+from sceneslam.sources.changes.failures import FAILURES, scene_of
 from sceneslam.sources.simulator.stories import STORIES
 from sceneslam.types.observation import Observation, SceneVote
 from sceneslam.types.truth import GroundTruth

@@ -30,7 +30,7 @@ from sceneslam.evaluation.relations import Relations, motion_errors, relation_er
 from sceneslam.experiments.scripts import CONF, settings
 from sceneslam.modules.slam.laser.module import LaserSlam
 from sceneslam.sources.carmen import Carmen
-from sceneslam.sources.spoilt_odometry import SpoiltOdometry
+from sceneslam.sources.changes.spoilt_odometry import SpoiltOdometry
 from sceneslam.types.errors import InputError
 from sceneslam.types.maps import GridLayer
 from sceneslam.types.observation import Observation

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rgbd_loop import build, camera_only
 
 from sceneslam.evaluation.association import interpolated
-from sceneslam.sources.dim_sensor import DimSensor
+from sceneslam.sources.changes.dim_sensor import DimSensor
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.trajectory import Trajectory

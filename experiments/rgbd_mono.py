@@ -17,7 +17,7 @@ from rgbd_loop import MAX_GAP_S, build, camera_only, follow
 
 from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.evaluation.association import interpolated
-from sceneslam.sources.failing_sensor import FailingSensor
+from sceneslam.sources.changes.failing_sensor import FailingSensor
 from sceneslam.types import se3
 from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.trajectory import Trajectory

@@ -19,7 +19,7 @@ from sceneslam.evaluation.metrics import Metrics, evaluate, write_metrics
 from sceneslam.evaluation.report.run_page import write_report
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.interfaces import Source
-from sceneslam.sources.wrapped import logged_ns
+from sceneslam.sources.changes.wrapped import logged_ns
 from sceneslam.types.errors import text_of
 from sceneslam.types.run import RunResult
 from sceneslam.types.trajectory import Trajectory

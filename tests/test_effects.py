@@ -13,9 +13,9 @@ from ros_recordings import make_source
 from test_source_ordered import Listed
 
 from sceneslam.interfaces import Source
-from sceneslam.sources.dim_sensor import DimSensor
-from sceneslam.sources.effects import LightsOut
-from sceneslam.sources.light_schedule import LightSchedule
+from sceneslam.sources.changes.dim_sensor import DimSensor
+from sceneslam.sources.changes.effects import LightsOut
+from sceneslam.sources.changes.light_schedule import LightSchedule
 from sceneslam.sources.spanned import TimeSpan
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation

@@ -7,7 +7,7 @@ import pytest
 from test_effects import film, lights_out
 
 from sceneslam.modules.detectors.light_mean import LightMean, light_mean
-from sceneslam.sources.exposure_times import ExposureTimes
+from sceneslam.sources.changes.exposure_times import ExposureTimes
 from sceneslam.types.errors import ConfigError, InputError
 
 GREY = np.random.default_rng(0).integers(100, 161, (120, 160, 3), dtype=np.uint8)

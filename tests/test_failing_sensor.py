@@ -12,8 +12,8 @@ from test_source_ordered import Listed
 
 from sceneslam.modules.detectors.lens import Dirt
 from sceneslam.modules.detectors.rules import Rules
-from sceneslam.sources.failing_sensor import FailingSensor
-from sceneslam.sources.failures import FAILURES, scene_of
+from sceneslam.sources.changes.failing_sensor import FailingSensor
+from sceneslam.sources.changes.failures import FAILURES, scene_of
 from sceneslam.testing.room import RIG, observation_at
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError

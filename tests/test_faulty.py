@@ -12,8 +12,8 @@ from fakes import RIG, ClosingModule, ExactModule, FakeSource, observation
 
 from sceneslam.interfaces import SlamModule, Source
 from sceneslam.modules.slam.faulty import FaultyModule
+from sceneslam.sources.changes.faulty import FaultySource
 from sceneslam.sources.contract.ordered import Ordered
-from sceneslam.sources.faulty import FaultySource
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.fault_plan import FaultPlan
 from sceneslam.types.observation import TrackingStatus

@@ -7,7 +7,7 @@ import pytest
 from fakes import FakeSource
 from test_source_ordered import Listed
 
-from sceneslam.sources.laps import Laps
+from sceneslam.sources.changes.laps import Laps
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import LaserScan

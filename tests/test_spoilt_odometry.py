@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from sceneslam.sources.spoilt_odometry import SpoiltOdometry
+from sceneslam.sources.changes.spoilt_odometry import SpoiltOdometry
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation

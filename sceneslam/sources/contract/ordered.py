@@ -8,11 +8,11 @@ from numbers import Integral
 from typing import Any
 
 from sceneslam.interfaces import Source
+from sceneslam.sources.changes.wrapped import Wrapped
 from sceneslam.sources.contract.clean import cleaned
 from sceneslam.sources.contract.odometer import Odometer
 from sceneslam.sources.contract.rests import Rests
 from sceneslam.sources.faults import FaultLog, at_stamp
-from sceneslam.sources.wrapped import Wrapped
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
 from sceneslam.types.trajectory import STAMP_MAX_NS

@@ -8,10 +8,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from sceneslam.interfaces import LiveFeed, Source
+from sceneslam.sources.changes.wrapped import Wrapped
 from sceneslam.sources.contract.clean import cleaned
 from sceneslam.sources.contract.odometer import Odometer
 from sceneslam.sources.faults import FaultLog, at_stamp
-from sceneslam.sources.wrapped import Wrapped
 from sceneslam.types.observation import Observation
 from sceneslam.types.run import Event
 from sceneslam.types.truth import GroundTruth

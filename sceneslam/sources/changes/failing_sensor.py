@@ -8,8 +8,8 @@ from itertools import groupby
 import numpy as np
 
 from sceneslam.interfaces import Source
-from sceneslam.sources.failures import FAILURES, scene_of
-from sceneslam.sources.wrapped import Wrapped
+from sceneslam.sources.changes.failures import FAILURES, scene_of
+from sceneslam.sources.changes.wrapped import Wrapped
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
 from sceneslam.types.ranges import check_among, check_least

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sceneslam.interfaces import Source
-from sceneslam.sources.wrapped import Wrapped
+from sceneslam.sources.changes.wrapped import Wrapped
 from sceneslam.types import se3
 from sceneslam.types.fault_plan import FaultPlan
 from sceneslam.types.observation import Observation

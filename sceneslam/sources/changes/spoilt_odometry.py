@@ -10,7 +10,7 @@ import numpy as np
 
 from sceneslam.interfaces import Source
 from sceneslam.ros.pixels import locked
-from sceneslam.sources.wrapped import Wrapped
+from sceneslam.sources.changes.wrapped import Wrapped
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.interfaces import Source
-from sceneslam.sources.wrapped import Wrapped
+from sceneslam.sources.changes.wrapped import Wrapped
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.input_files import given_path, read_text
 from sceneslam.types.observation import Observation

@@ -10,9 +10,9 @@ import numpy as np
 
 from sceneslam.interfaces import Source
 from sceneslam.ros.pixels import locked
-from sceneslam.sources.dim_sensor import DimSensor
-from sceneslam.sources.light_schedule import LightSchedule, check_steps
-from sceneslam.sources.wrapped import Wrapped
+from sceneslam.sources.changes.dim_sensor import DimSensor
+from sceneslam.sources.changes.light_schedule import LightSchedule, check_steps
+from sceneslam.sources.changes.wrapped import Wrapped
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
 from sceneslam.types.trajectory import Trajectory

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from sceneslam.interfaces import Source
+from sceneslam.sources.changes.wrapped import Wrapped
 from sceneslam.sources.spanned import TimeSpan
-from sceneslam.sources.wrapped import Wrapped
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.ranges import check_least

@@ -1,0 +1,1 @@
+"""Sources that wrap another one and change what it gives."""
