@@ -18,12 +18,12 @@ import numpy as np
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.bus.bus import Bus, BusMachine
-from sceneslam.bus.events import EventLog
-from sceneslam.bus.gate import GateSettings
+from sceneslam.bus.judging.gate import GateSettings
 from sceneslam.bus.pace import PaceSettings
 from sceneslam.bus.policy import Policy
 from sceneslam.experiments.scripts import settings
 from sceneslam.modules.slam.odometry import Odometry
+from sceneslam.storage.events import EventLog
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, SceneVote
 from sceneslam.types.rig import Rig, Sensor

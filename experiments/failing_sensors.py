@@ -14,7 +14,7 @@ import numpy as np
 from hydra import compose, initialize_config_module
 
 from sceneslam.bus.policy import Policy
-from sceneslam.bus.scene_filter import ConfirmedScene
+from sceneslam.bus.scene.scene_filter import ConfirmedScene
 from sceneslam.config.build import make_source
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.resolve import resolved

@@ -14,7 +14,7 @@ from time import process_time_ns
 
 import numpy as np
 
-from sceneslam.bus.events import EventLog
+from sceneslam.storage.events import EventLog
 from sceneslam.storage.journal import Journal, JournalHeader
 from sceneslam.storage.syncing import Syncing
 

@@ -19,7 +19,7 @@ from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from numpy.typing import NDArray
 
-from sceneslam.bus.gate import Gate, GateSettings, Judgement
+from sceneslam.bus.judging.gate import Gate, GateSettings, Judgement
 from sceneslam.config.resolve import resolved
 from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.evaluation.correctness import CorrectLimits, correct_rate

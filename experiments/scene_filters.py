@@ -14,8 +14,8 @@ from itertools import product
 
 import numpy as np
 
-from sceneslam.bus.bayes_filter import BayesFilter, BayesSettings
-from sceneslam.bus.scene_filter import SceneFilter, WindowFilter
+from sceneslam.bus.scene.bayes_filter import BayesFilter, BayesSettings
+from sceneslam.bus.scene.scene_filter import SceneFilter, WindowFilter
 from sceneslam.evaluation.detection import score_detection
 from sceneslam.types.observation import SceneVote
 from sceneslam.types.truth import GroundTruth, SceneChange

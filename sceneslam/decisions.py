@@ -12,7 +12,8 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from sceneslam.bus.decision import GO_ON, Health, Situation, StandbyTrial, decide, in_json
+from sceneslam.bus.decision import GO_ON, Situation, StandbyTrial, decide, in_json
+from sceneslam.bus.judging.hold import Health
 from sceneslam.bus.policy import Policy
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.types.errors import InputError, SceneSlamError

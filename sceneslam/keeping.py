@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sceneslam.bus.events import EventLog
 from sceneslam.config.build import RunParts
 from sceneslam.results import Results
+from sceneslam.storage.events import EventLog
 from sceneslam.storage.journal import JOURNAL, Journal, JournalHeader
 from sceneslam.storage.reserve import Reserve
 from sceneslam.storage.syncing import Syncing

@@ -17,7 +17,6 @@ from tqdm import tqdm
 
 from sceneslam.atlas.save import save_map
 from sceneslam.bus.bus import Bus
-from sceneslam.bus.events import log_uncertainty
 from sceneslam.config.build import RunParts
 from sceneslam.config.settings import LIVE
 from sceneslam.engine.live import LiveTally, Spent, run_live
@@ -32,6 +31,7 @@ from sceneslam.results import Results
 from sceneslam.sources.survey.preflight import preflight
 from sceneslam.sources.survey.survey import Surveyed
 from sceneslam.sources.survey.tally import Tally
+from sceneslam.storage.events import log_uncertainty
 from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.maps import HybridMap, PointLayer
 from sceneslam.types.observation import Observation

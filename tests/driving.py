@@ -5,10 +5,10 @@ from fakes import PERIOD_NS, RIG, ScriptedDetector, observation, true_pose
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.bus.bus import Bus
-from sceneslam.bus.events import EventLog
-from sceneslam.bus.gate import GateSettings
+from sceneslam.bus.judging.gate import GateSettings
 from sceneslam.bus.pace import PaceSettings
 from sceneslam.bus.policy import Policy
+from sceneslam.storage.events import EventLog
 from sceneslam.types import se3
 
 GATE = GateSettings(sigmas=3.0)

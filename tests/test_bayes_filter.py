@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from sceneslam.bus.bayes_filter import BayesFilter, BayesSettings
-from sceneslam.bus.scene_filter import WindowFilter
+from sceneslam.bus.scene.bayes_filter import BayesFilter, BayesSettings
+from sceneslam.bus.scene.scene_filter import WindowFilter
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import UNSURE, SceneVote
 

@@ -8,7 +8,8 @@ from driving import drive, events, policy
 from fakes import PERIOD_NS, ExactModule, observation, true_pose
 from test_bus_decisions import NOW_NS, S, situation
 
-from sceneslam.bus.decision import Action, Health, decide
+from sceneslam.bus.decision import Action, decide
+from sceneslam.bus.judging.hold import Health
 from sceneslam.types import se3
 from sceneslam.types.observation import TrackingStatus
 from sceneslam.types.run import BRIDGED

@@ -3,7 +3,8 @@
 import pytest
 from driving import policy
 
-from sceneslam.bus.decision import Action, Health, Situation, StandbyTrial, decide
+from sceneslam.bus.decision import Action, Situation, StandbyTrial, decide
+from sceneslam.bus.judging.hold import Health
 from sceneslam.types.errors import ConfigError
 
 S = 10**9

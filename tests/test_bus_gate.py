@@ -7,7 +7,8 @@ import pytest
 from driving import GATE, drive, events, policy
 from fakes import PERIOD_NS, RIG, TWIST, ExactModule, observation, true_pose
 
-from sceneslam.bus.decision import Action, Health, Situation, StandbyTrial, decide
+from sceneslam.bus.decision import Action, Situation, StandbyTrial, decide
+from sceneslam.bus.judging.hold import Health
 from sceneslam.types import se3
 from sceneslam.types.rig import Sensor
 from sceneslam.types.run import BRIDGED

@@ -11,15 +11,14 @@ from fakes import PERIOD_NS, RIG, ExactModule, observation
 
 from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.changeover import Candidates
-from sceneslam.bus.decision import Health
-from sceneslam.bus.events import EventLog, log_uncertainty
-from sceneslam.bus.gate import Gate, GateSettings, Judgement
-from sceneslam.bus.hold import Hold
-from sceneslam.bus.recent import CovarianceMonitor, RecentMedian
-from sceneslam.bus.runner import Runner
+from sceneslam.bus.judging.gate import Gate, GateSettings, Judgement
+from sceneslam.bus.judging.hold import Health, Hold
+from sceneslam.bus.judging.recent import CovarianceMonitor, RecentMedian
+from sceneslam.bus.judging.runner import Runner
+from sceneslam.bus.judging.wheel_scale import WheelScale
 from sceneslam.bus.session import ModuleSession
-from sceneslam.bus.wheel_scale import WheelScale
 from sceneslam.executors import InStep
+from sceneslam.storage.events import EventLog, log_uncertainty
 from sceneslam.types import se3
 from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Tracking, TrackingStatus
@@ -245,7 +244,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch):
     clock = Clock()
-    for module in ("bus", "handover", "runner", "watch"):
+    for module in ("bus", "handover", "judging.runner", "scene.watch"):
         monkeypatch.setattr(f"sceneslam.bus.{module}.perf_counter_ns", clock)
     return clock
 

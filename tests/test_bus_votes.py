@@ -9,9 +9,9 @@ import pytest
 from driving import events
 from fakes import ScriptedDetector, observation
 
-from sceneslam.bus.events import EventLog
-from sceneslam.bus.scene_filter import WindowFilter
-from sceneslam.bus.watch import Watch
+from sceneslam.bus.scene.scene_filter import WindowFilter
+from sceneslam.bus.scene.watch import Watch
+from sceneslam.storage.events import EventLog
 from sceneslam.types.observation import SceneVote
 
 S = 10**9

@@ -5,13 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from driving import GATE, events, policy
+from driving import GATE, events
 from driving import drive as drive_bus
 from fakes import ExactModule, observation
 
-from sceneslam.bus.dead_reckoning import DeadReckoning
-from sceneslam.bus.events import EventLog
-from sceneslam.bus.wheel_scale import WheelScale
+from sceneslam.bus.judging.dead_reckoning import DeadReckoning
+from sceneslam.bus.judging.wheel_scale import WheelScale
+from sceneslam.storage.events import EventLog
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
@@ -31,7 +31,7 @@ def seen(index, x_m, rates, *, has_odometry=True):
 
 @pytest.mark.parametrize("bias", [0.005, 0.02, 0.04])
 def test_bias_that_is_learnt_late_is_taken_off_once(bias):
-    reckoning = DeadReckoning(policy(), RIG)
+    reckoning = DeadReckoning(RIG, None)
     x_m, headings = 0.0, []
     for index in range(3000):
         rests = 1500 <= index < 1530
@@ -94,7 +94,7 @@ def test_wheels_that_change_are_followed():
 
 def taught(odometry, *, by="bright", to="dark", steps=160):
     """Return a reckoning that a module has taught, and what the odometry of the other module is."""
-    reckoning, hold, corrected = DeadReckoning(policy(gate=GATE), RIG), hold_at(0.0), []
+    reckoning, hold, corrected = DeadReckoning(RIG, GATE), hold_at(0.0), []
     for index in range(steps):
         reckoning.correct(seen(index, odometry(index), BIAS), by)
         hold.__dict__.update(hold_at(0.05 * index).__dict__)
@@ -194,7 +194,7 @@ def test_arcs_teach_nothing():
 
 
 def test_what_was_learnt_is_in_the_log_once():
-    reckoning, log, hold = DeadReckoning(policy(gate=GATE), RIG), EventLog(), hold_at(0.0)
+    reckoning, log, hold = DeadReckoning(RIG, GATE), EventLog(), hold_at(0.0)
     for index in range(300):
         x_m = 0.05 * max(index - 60, 0)
         reckoning.correct(seen(index, 1.02 * x_m, BIAS), "one")
@@ -208,7 +208,7 @@ def test_what_was_learnt_is_in_the_log_once():
 
 
 def test_unwatched_module_teaches_no_scale():
-    reckoning, hold = DeadReckoning(policy(gate=None), RIG), hold_at(0.0)
+    reckoning, hold = DeadReckoning(RIG, None), hold_at(0.0)
     for index in range(100):
         last = reckoning.correct(seen(index, 1.02 * 0.05 * index, np.zeros(3)), "")
         hold.tracking = tracked(se3.from_xy_yaw(0.05 * index, 0.0, 0.0))

@@ -8,7 +8,7 @@ from driving import GATE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneslam.bus.gate import Gate, GateSettings
+from sceneslam.bus.judging.gate import Gate, GateSettings
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.rig import Wheels

@@ -9,8 +9,8 @@ from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.budget import Budget, thin
 from sceneslam.atlas.pose_path import OpenSession
 from sceneslam.atlas.rows import Rows
-from sceneslam.bus.events import EventLog
 from sceneslam.engine.slowest import Slowest
+from sceneslam.storage.events import EventLog
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import LandmarkLayer, MapLayers, PointLayer, ScanLayer

@@ -6,8 +6,8 @@ import numpy as np
 from fakes import PERIOD_NS, observation
 
 from sceneslam.bus.bridge import Bridge
+from sceneslam.bus.judging.recent import CovarianceMonitor
 from sceneslam.bus.observation_buffer import BufferedObservation, ObservationBuffer
-from sceneslam.bus.recent import CovarianceMonitor
 from sceneslam.types import se3
 from sceneslam.types.observation import Tracking, TrackingStatus
 

@@ -9,7 +9,7 @@ from fakes import ExactModule, observation
 
 from sceneslam.atlas.fusion import Placed, fuse
 from sceneslam.atlas.save import save_points
-from sceneslam.bus.answers import checked_layers, checked_tracking, checked_trajectory
+from sceneslam.bus.judging.answers import checked_layers, checked_tracking, checked_trajectory
 from sceneslam.types import se3
 from sceneslam.types.maps import (
     LAYER_TYPES,

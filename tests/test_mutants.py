@@ -116,7 +116,7 @@ def test_a_table_of_the_top_level_is_a_table(changes, key):
         ("policy.gate.sigmas=-1", "policy.gate.sigmas"),
         ("evaluation.correct_limit_m=inf", "evaluation.correct_limit_m"),
         ("policy.gate=many", "policy.gate"),
-        ("policy.gate._target_=sceneslam.bus.gate.Gate", "policy.gate.sigmas"),
+        ("policy.gate._target_=sceneslam.bus.judging.gate.Gate", "policy.gate.sigmas"),
         ("slam.bright.cloud_voxel_m=nan", "slam.bright.cloud_voxel_m"),
         ("source.camera.fov_deg=wide", "source.camera.fov_deg"),
         ("source.camera.rate_hz=true", "source.camera.rate_hz"),

@@ -9,7 +9,7 @@ from driving import policy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sceneslam.bus.scene_filter import WindowFilter
+from sceneslam.bus.scene.scene_filter import WindowFilter
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import UNSURE, SceneVote
 

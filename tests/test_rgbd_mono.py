@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_rgbd import drive, make
 
-from sceneslam.bus.runner import Runner
+from sceneslam.bus.judging.runner import Runner
 from sceneslam.executors import InStep
 from sceneslam.testing.room import observation_at
 from sceneslam.types import se3

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from driving import policy
 
-from sceneslam.bus.dead_reckoning import DeadReckoning
+from sceneslam.bus.judging.dead_reckoning import DeadReckoning
 from sceneslam.motion.model import MotionModel
 from sceneslam.motion.tilt import Tilt, up_by, upright
 from sceneslam.types import se3
@@ -40,7 +39,7 @@ def climb(*, has_gravity, rest_s=2.0):
 
 
 def reckoned(**measured):
-    reckoning = DeadReckoning(policy(), RIG)
+    reckoning = DeadReckoning(RIG, None)
     return [reckoning.correct(one, "").T_odom_base for one in climb(**measured)]
 
 

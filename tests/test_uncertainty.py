@@ -15,8 +15,8 @@ from sceneslam.atlas.uncertainty import (
     read_covariances,
     write_covariances,
 )
-from sceneslam.bus.events import log_uncertainty
 from sceneslam.graphs.edge import Edge, EdgeKind
+from sceneslam.storage.events import log_uncertainty
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
 

@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.bus.scene_filter import WindowFilter
+from sceneslam.bus.scene.scene_filter import WindowFilter
 from sceneslam.modules.detectors.grey_mean import GreyMean
 from sceneslam.types.experiment import TrialResult
 from sceneslam.types.ranges import check_between, check_least, check_some

@@ -1,6 +1,7 @@
 """The `odometry` SLAM module: dead reckoning by odometry, without a map.
 
-In a run, the odometry of an observation has the gyro's turn already (`bus/dead_reckoning.py`).
+In a run, the odometry of an observation has the gyro's turn already
+(`bus/judging/dead_reckoning.py`).
 """
 
 from __future__ import annotations

@@ -9,15 +9,16 @@ from time import perf_counter_ns
 from statemachine import State, StateMachine
 
 from sceneslam.bus.changeover import Candidates, Changeover, Outcome
-from sceneslam.bus.dead_reckoning import DeadReckoning
-from sceneslam.bus.decision import Action, Decision, DecisionLog, Health, Situation, decide
+from sceneslam.bus.decision import Action, Decision, DecisionLog, Situation, decide
 from sceneslam.bus.estimator import Estimator
-from sceneslam.bus.events import EventLog
+from sceneslam.bus.judging.dead_reckoning import DeadReckoning
+from sceneslam.bus.judging.hold import Health
+from sceneslam.bus.judging.runner import Runner
 from sceneslam.bus.policy import Policy
-from sceneslam.bus.runner import Runner
-from sceneslam.bus.watch import Watch
+from sceneslam.bus.scene.watch import Watch
 from sceneslam.executors import executor
 from sceneslam.interfaces import BackEnd, Detector, SlamModule
+from sceneslam.storage.events import EventLog
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Vector
@@ -94,7 +95,7 @@ class Bus:
             scene_filter=policy.make_scene_filter(detector.scenes),
         )
         self.detector_us = self._watch.spent_us  # time that each vote took
-        self._reckoning = DeadReckoning(policy, rig)
+        self._reckoning = DeadReckoning(rig, policy.gate if policy.handover != "cold" else None)
         self._estimator = Estimator(
             policy=policy, rig=rig, back_end=back_end, log=log, has_choice=len(modules) > 1
         )

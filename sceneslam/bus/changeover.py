@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from sceneslam.bus.decision import Decision, Health, Situation, StandbyTrial
+from sceneslam.bus.decision import Decision, Situation, StandbyTrial
 from sceneslam.bus.estimator import Estimator
-from sceneslam.bus.events import EventLog
 from sceneslam.bus.handover import Handover
+from sceneslam.bus.judging.hold import Health
+from sceneslam.bus.judging.runner import Runner
 from sceneslam.bus.policy import Policy
-from sceneslam.bus.runner import Runner
+from sceneslam.storage.events import EventLog
 from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig

@@ -11,18 +11,9 @@ from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from sceneslam.bus.events import EventLog
+from sceneslam.bus.judging.hold import Health
 from sceneslam.bus.policy import Policy
-
-
-class Health(StrEnum):
-    """How reliable the active module's pose is."""
-
-    HELD = "held"
-    LOST = "lost"  # the module reports it
-    SILENT = "silent"  # its sensors have delivered no data for longer than usual
-    SUSPECT = "suspect"  # its motion disagrees with independent measurements
-    FAILED = "failed"  # it violated its contract and was stopped
+from sceneslam.storage.events import EventLog
 
 
 class StandbyTrial(StrEnum):

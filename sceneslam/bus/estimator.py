@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 
 from sceneslam.bus.bridge import Bridge
-from sceneslam.bus.events import EventLog
-from sceneslam.bus.gate import Gate
 from sceneslam.bus.handover import Handover
-from sceneslam.bus.hold import Hold
+from sceneslam.bus.judging.gate import Gate
+from sceneslam.bus.judging.hold import Hold
+from sceneslam.bus.judging.runner import Legacy, Runner
 from sceneslam.bus.observation_buffer import BufferedObservation, ObservationBuffer
 from sceneslam.bus.pace import Pace
 from sceneslam.bus.policy import Policy
-from sceneslam.bus.runner import Legacy, Runner
 from sceneslam.bus.session import ModuleSession, Suspicion
 from sceneslam.interfaces import BackEnd
+from sceneslam.storage.events import EventLog
 from sceneslam.types import se3
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
-from sceneslam.bus.bayes_filter import BayesFilter, BayesSettings
-from sceneslam.bus.gate import GateSettings
+from sceneslam.bus.judging.gate import GateSettings
 from sceneslam.bus.pace import PaceSettings
-from sceneslam.bus.scene_filter import SceneFilter, WindowFilter
+from sceneslam.bus.scene.bayes_filter import BayesFilter, BayesSettings
+from sceneslam.bus.scene.scene_filter import SceneFilter, WindowFilter
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.run import HANDOVERS
 

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.bus.bridge import Bridge
-from sceneslam.bus.decision import Health
-from sceneslam.bus.hold import Hold
+from sceneslam.bus.judging.hold import Health, Hold
+from sceneslam.bus.judging.runner import Runner
 from sceneslam.bus.observation_buffer import BufferedObservation
-from sceneslam.bus.runner import Runner
 from sceneslam.types import se3
 from sceneslam.types.covariance import grown, unknown_motion
 from sceneslam.types.errors import ModuleError

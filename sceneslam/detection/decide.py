@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from sceneslam.bus.policy import Policy
-from sceneslam.bus.scene_filter import ConfirmedScene, SceneFilter
+from sceneslam.bus.scene.scene_filter import ConfirmedScene, SceneFilter
 from sceneslam.detection.features import RecordingFeatures, failures_named
 from sceneslam.interfaces import FeatureDetector
 from sceneslam.types.observation import SceneVote

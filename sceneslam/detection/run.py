@@ -8,10 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from sceneslam.bus.events import EventLog
 from sceneslam.bus.policy import Policy
-from sceneslam.bus.scene_filter import ConfirmedScene
-from sceneslam.bus.watch import log_vote
+from sceneslam.bus.scene.scene_filter import ConfirmedScene
+from sceneslam.bus.scene.watch import log_vote
 from sceneslam.config.build import check_detector, check_no_map, opened_source
 from sceneslam.config.check import check_keys
 from sceneslam.config.component import ComponentBuilder
@@ -26,6 +25,7 @@ from sceneslam.evaluation.report.summary import number
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.evaluation.switches import true_scene
 from sceneslam.interfaces import FeatureDetector
+from sceneslam.storage.events import EventLog
 from sceneslam.types.observation import UNSURE, SceneVote
 from sceneslam.types.rig import Rig
 from sceneslam.types.truth import GroundTruth

@@ -11,9 +11,9 @@ from numbers import Real
 from time import perf_counter_ns
 from typing import Any
 
-from sceneslam.bus.events import EventLog
-from sceneslam.bus.scene_filter import ConfirmedScene, SceneFilter
+from sceneslam.bus.scene.scene_filter import ConfirmedScene, SceneFilter
 from sceneslam.interfaces import Detector
+from sceneslam.storage.events import EventLog
 from sceneslam.types.errors import ModuleError, text_of
 from sceneslam.types.observation import UNSURE, Observation, SceneVote
 from sceneslam.types.rig import Rig

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.bus.hold import Hold
+from sceneslam.bus.judging.hold import Hold
 from sceneslam.motion.distance_error import DistanceError
 from sceneslam.types import se3
 from sceneslam.types.observation import Tracking

@@ -11,12 +11,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.bus.events import EventLog
-from sceneslam.bus.hold import Hold
-from sceneslam.bus.policy import Policy
-from sceneslam.bus.wheel_scale import WheelScale
+from sceneslam.bus.judging.gate import GateSettings
+from sceneslam.bus.judging.hold import Hold
+from sceneslam.bus.judging.wheel_scale import WheelScale
 from sceneslam.motion.model import MotionModel
 from sceneslam.motion.tilt import Tilt, upright
+from sceneslam.storage.events import EventLog
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
@@ -31,10 +31,10 @@ class DeadReckoning:
     Modules calibrate the wheels' scale only, and only where a gate checks them.
     """
 
-    def __init__(self, policy: Policy, rig: Rig) -> None:
-        self._learns = policy.gate is not None and policy.handover != "cold"
+    def __init__(self, rig: Rig, gate: GateSettings | None) -> None:
+        self._learns = gate is not None
         self._drift = rig.wheels.drift_ratio
-        self._limit = _OF_GATE * self._drift * (policy.gate.sigmas if policy.gate else 0.0)
+        self._limit = _OF_GATE * self._drift * (gate.sigmas if gate else 0.0)
         self.up_base: Vector | None = None  # (3,) upward direction, None: unknown
         self._motion = MotionModel(rig) if Sensor.GYRO in rig.sensors else None
         self._tilt = Tilt(self._motion) if self._motion is not None else None

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.bus.recent import RecentMedian
+from sceneslam.bus.judging.recent import RecentMedian
 from sceneslam.types import se3
 from sceneslam.types.ranges import check_above
 from sceneslam.types.rig import Wheels

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.bus.scene_filter import ConfirmedScene
+from sceneslam.bus.scene.scene_filter import ConfirmedScene
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import UNSURE, SceneVote
 

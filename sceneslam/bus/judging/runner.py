@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from time import perf_counter_ns
 
-from sceneslam.bus.answers import checked_layers, checked_tracking, checked_trajectory
+from sceneslam.bus.judging.answers import checked_layers, checked_tracking, checked_trajectory
 from sceneslam.interfaces import Concurrent, Restartable, SlamModule
 from sceneslam.types.errors import ModuleError, text_of
 from sceneslam.types.maps import MapLayers

@@ -4,18 +4,28 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from enum import StrEnum
 from statistics import median_low
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.bus.decision import Health
-from sceneslam.bus.gate import Gate
-from sceneslam.bus.recent import CovarianceMonitor
-from sceneslam.bus.runner import Runner
+from sceneslam.bus.judging.gate import Gate
+from sceneslam.bus.judging.recent import CovarianceMonitor
+from sceneslam.bus.judging.runner import Runner
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.se3 import Transform
+
+
+class Health(StrEnum):
+    """How reliable the active module's pose is."""
+
+    HELD = "held"
+    LOST = "lost"  # the module reports it
+    SILENT = "silent"  # its sensors have delivered no data for longer than usual
+    SUSPECT = "suspect"  # its motion disagrees with independent measurements
+    FAILED = "failed"  # it violated its contract and was stopped
 
 
 class Hold:

@@ -1,0 +1,1 @@
+"""Whether a module tracks, and whether its motion is believed."""

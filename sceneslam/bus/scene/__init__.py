@@ -1,0 +1,1 @@
+"""Which scene the robot is in, by the votes of the detector."""
