@@ -267,6 +267,14 @@ class Eyes:
         )
 
 
+def seeing(monkeypatch, at):
+    """A localizer whose camera sees the robot at a pose (3,), and its recognizer by walls."""
+    scripted, eyes = Scripted(monkeypatch), Eyes()
+    own, eyes.at = MapLocalizer(corner_of()), np.array(at)
+    own._views = eyes
+    return own, scripted
+
+
 def seen_too(second, *run_at):
     return replace(placed(second, *run_at), view="a view")
 
@@ -284,25 +292,43 @@ def test_walls_fix_a_run_and_eyes_where_walls_leave_a_direction_open(monkeypatch
 
 
 @pytest.mark.parametrize(("walls_m", "found_m"), [(1.0, 1.0), (None, 0.9)])
-def test_where_eyes_find_the_run_walls_fix_it(monkeypatch, walls_m, found_m):
-    scripted, eyes = Scripted(monkeypatch), Eyes()
-    own, eyes.at = MapLocalizer(corner_of()), np.array([0.9, -5.0, 0.0])  # nothing is known there
-    own._views = eyes
+def test_where_a_view_finds_the_run_walls_fix_it(monkeypatch, walls_m, found_m):
+    own, scripted = seeing(monkeypatch, [0.9, -5.0, 0.0])  # where nothing is known
     if walls_m is not None:
         at = [walls_m, -5.0, 0.0]
-        monkeypatch.setattr(Scripted, "locate", lambda own, plan: None)  # not without the eyes
+        monkeypatch.setattr(Scripted, "locate", lambda own, plan: None)  # not without the view
         scripted.answer = replace(quality(at=at), covariance=1e-4 * np.eye(3))
     said = [own.compare([seen_too(second, 0.0, 0.0, 0.0)]) for second in (0, 1)]
     assert said[-1] is LocalizationEvent.FOUND
     assert in_map(own.T_map_run, [0.0] * 3)[0] == pytest.approx(found_m, abs=0.01)
 
 
-def test_eyes_do_not_find_the_run_where_walls_refute_it(monkeypatch):
-    scripted, eyes = Scripted(monkeypatch), Eyes()
-    own, eyes.at = MapLocalizer(corner_of()), np.array([1.0, 1.0, 0.0])  # in front of free space
-    own._views, scripted.answer = eyes, None
+def test_a_view_that_walls_refute_is_as_none(monkeypatch):
+    own, _ = seeing(monkeypatch, [1.0, 1.0, 0.0])  # in front of free space
     said = [own.compare([seen_too(second, 0.0, 0.0, 0.0)]) for second in (0, 1, 2)]
     assert said == [LocalizationEvent.NOTHING] * 3 and not own.is_located
+    monkeypatch.setattr(Scripted, "locate", lambda own, plan: quality(at=(4.0, 3.0, 1.0)))
+    looks = [seen_too(second, 0.0, 0.0, 0.0) for second in (10.0, 10.2, 10.4, 10.6, 10.8)]
+    assert LocalizationEvent.FOUND in [own.compare([look]) for look in looks]
+    np.testing.assert_allclose(in_map(own.T_map_run, [0.0] * 3), [4.0, 3.0, 1.0], atol=1e-9)
+
+
+def test_a_view_from_a_tilted_camera_keeps_its_height_and_tilt(monkeypatch):
+    own, scripted = seeing(monkeypatch, [0.0, -5.0, 0.0])
+    tilted = se3.exp(np.array([0.0, -5.0, 0.1, 0.0, 0.2, 0.0]))
+    monkeypatch.setattr(Scripted, "locate", lambda own, plan: None)
+    at = planar.from_transform(tilted)
+    scripted.answer = replace(quality(at=at), covariance=1e-4 * np.eye(3))
+    own._standing = lambda T: planar.to_transform(planar.from_transform(T))
+    sighting = Sighting(
+        T_map_cam=tilted @ own._views.camera.T_base_cam, covariance=np.eye(6) * 4e-4, matches=50
+    )
+    own._views.recognize = lambda view, around=None: sighting
+    for second in (1, 2):
+        look = Look(stamp_ns=second * S, T_run_base=tilted, view="a view")
+        said = own.compare([placed(0.0, 0.0, -5.0, 0.0), look])
+    assert said is LocalizationEvent.FOUND
+    np.testing.assert_allclose(own.T_map_run, np.eye(4), atol=1e-3)
 
 
 def test_in_a_corridor_eyes_may_find_the_run_farther_off_than_walls(monkeypatch):

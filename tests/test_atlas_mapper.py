@@ -43,7 +43,7 @@ class Searched:
     def compare(self, latest):
         self.asked.append([look.stamp_ns / S for look in latest])
         self.is_located = self.T_map_run is not None
-        if self.is_located and not self.fixes:
+        if self.is_located and (not self.fixes or self.answer is LocalizationEvent.FIXED):
             T, at = latest[-1].T_run_base, latest[-1].stamp_ns
             fix = Fix(
                 stamp_ns=at,

@@ -16,7 +16,6 @@ from sceneslam.atlas.fusion import Placed, fuse
 from sceneslam.atlas.lasting.lasting_map import EXTEND, LastingMap
 from sceneslam.atlas.mapper import Mapper
 from sceneslam.atlas.places.floor_plan import grid_of
-from sceneslam.atlas.places.map_search import Note
 from sceneslam.atlas.pose_path import OpenSession, PoseLog, PosePath, trajectory_of
 from sceneslam.atlas.revision import Revised, revise
 from sceneslam.atlas.submaps.correction import Correction
@@ -26,7 +25,7 @@ from sceneslam.types.errors import ConfigError, InputError, text_of
 from sceneslam.types.maps import HybridMap, MapLayers
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
-from sceneslam.types.run import BRIDGED, Session, SessionStart
+from sceneslam.types.run import BRIDGED, Note, Session, SessionStart
 from sceneslam.types.se3 import Transform, Vector
 from sceneslam.types.trajectory import Trajectory
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map
 from sceneslam.atlas.places.localizer import Look, MapLocalizer
-from sceneslam.atlas.places.map_search import MapSearch, Note
+from sceneslam.atlas.places.map_search import MapSearch
 from sceneslam.atlas.places.view_taker import ViewTaker
 from sceneslam.atlas.submaps.chain import Chain
 from sceneslam.atlas.submaps.collector import Collector, Known
@@ -36,6 +36,7 @@ from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
+from sceneslam.types.run import Note
 from sceneslam.types.se3 import Transform, Vector
 from sceneslam.views.view import Landmarks
 from sceneslam.views.view_finder import ViewFinder
@@ -70,7 +71,7 @@ class Mapper:
         self._collector = Collector(rig, known, self._loaded.runs, self._views.locate)
         self._executor = executor("search", is_live=is_live)
         localizer = self._made_localizer(rig, views)
-        self._search = MapSearch(localizer, self._executor, self._pose_at, note)
+        self._search = MapSearch(localizer, executor=self._executor, path=self._pose_at, note=note)
         self._is_level = True  # at the last step
         self._has_refused = False  # a measurement
         self.faults: list[str] = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NewType
 
@@ -17,6 +17,7 @@ BRIDGED = ""  # the module of a pose that no module gave
 HANDOVERS = ("cold", "warm", "rewind")  # how a pose can pass from module to module
 # A program and its arguments: code, that only the command line can allow.
 Command = NewType("Command", list[str])
+Note = Callable[..., None]  # is told an event: its kind, `stamp_ns`, and its own keys
 Event = Mapping[str, Any]  # one line of events.jsonl: `event` (kind), `stamp_ns`, and its own keys
 
 

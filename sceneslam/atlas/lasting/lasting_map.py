@@ -17,9 +17,9 @@ from sceneslam.atlas.lasting.map_files import (
 )
 from sceneslam.atlas.lasting.saved_map import SavedMap, forget_contradicted
 from sceneslam.atlas.mapper import Mapper
-from sceneslam.atlas.places.map_search import Note
 from sceneslam.executors import InStep, executor
 from sceneslam.types.errors import ConfigError, InputError, text_of
+from sceneslam.types.run import Note
 
 _log = logging.getLogger(__name__)
 

@@ -183,7 +183,7 @@ class MapLocalizer:
         piece = self._piece
         if piece.T_map_run is not None:
             return self._check(latest, piece.T_map_run @ newest.T_run_base)
-        fix = self._by_view(newest, None)
+        fix = self._with_walls(self._by_view(newest, None), latest)
         if fix is None and self._compares_walls(newest):
             fix = self._by_walls(latest)
         if fix is None:
@@ -192,9 +192,7 @@ class MapLocalizer:
         before, self._guess = self._guess, _Guess(T_map_run=T_map_run, fix=fix)
         if before is None or not _agree(before.T_map_run, T_map_run, newest.T_run_base):
             return LocalizationEvent.NOTHING
-        fix = self._settled(_mean(fix, before, newest), latest)
-        if fix is None:
-            return LocalizationEvent.NOTHING
+        fix = _mean(fix, before, newest)
         if piece.fixes:  # it was located before: there, and it drifted, or somewhere else
             last = piece.fixes[-1]
             T_expected = last.T_map_base @ se3.inverse(last.T_run_base) @ newest.T_run_base
@@ -269,13 +267,13 @@ class MapLocalizer:
             return None
         return self._fix(newest, newest.T_run_base, match)
 
-    def _settled(self, fix: Fix, latest: Sequence[Look]) -> Fix | None:
-        """Return a place by landmarks with what the walls say there, None if they contradict it."""
-        if not fix.is_by_view or self._walls is None:
-            return fix
-        window = self._window(fix.T_map_base, self._travelled)
-        by_walls, are_refuted = self._near_walls(latest, fix.T_map_base, window)
-        return None if are_refuted else _joint(by_walls, fix)
+    def _with_walls(self, by_view: Fix | None, latest: Sequence[Look]) -> Fix | None:
+        """Return a place by landmarks as the walls there tell it, None where they contradict it."""
+        if by_view is None or self._walls is None:
+            return by_view
+        window = self._window(by_view.T_map_base, self._travelled)
+        by_walls, are_refuted = self._near_walls(latest, by_view.T_map_base, window)
+        return None if are_refuted else replace(_joint(by_walls, by_view), is_by_view=True)
 
     def _check(self, latest: Sequence[Look], T_map_base: Transform) -> LocalizationEvent:
         """Compare near the predicted pose; repeated contradictions withdraw the localization."""
@@ -286,6 +284,7 @@ class MapLocalizer:
         is_contradicted = seen is not None and not _is_within(seen, wide)
         fix = None if is_contradicted else seen
         if self._compares_walls(newest):
+            self._next_walls_ns = newest.stamp_ns + _FIX_NS
             by_walls, are_refuted = self._near_walls(latest, T_map_base, window)
             is_contradicted |= are_refuted
             fix = by_walls if fix is None else _joint(by_walls, fix)
@@ -325,7 +324,6 @@ class MapLocalizer:
         """Return the pose by the walls in a window, and whether they contradict its centre."""
         assert self._walls is not None
         newest, query = latest[-1], _query(latest)
-        self._next_walls_ns = newest.stamp_ns + _FIX_NS
         if not len(query):
             return None, False
         field = PlanField(query)
@@ -338,12 +336,15 @@ class MapLocalizer:
         return None, there.known_ratio >= _KNOWN_MIN and there.is_refuted
 
     def _fix(self, newest: Look, T_base: Transform, match: PlanRegistration) -> Fix:
-        """Return the pose by walls, near the height and tilt of T_base (4, 4): on a floor there."""
+        """Return the pose by walls, near the height and tilt of T_base (4, 4): on a floor there.
+
+        A look without a scan keeps these: it may be tilted.
+        """
         T_plane = planar.to_transform(planar.from_transform(T_base))
         T_near = planar.to_transform(match.T_target_query) @ se3.inverse(T_plane) @ T_base
         return Fix(
             stamp_ns=newest.stamp_ns,
-            T_map_base=self._standing(T_near),
+            T_map_base=T_near if newest.scan is None else self._standing(T_near),
             T_run_base=newest.T_run_base,
             covariance=on_floor(match.covariance),
         )

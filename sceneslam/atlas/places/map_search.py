@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 from itertools import pairwise
@@ -12,13 +12,12 @@ from itertools import pairwise
 from sceneslam.atlas.places.localizer import Fix, LocalizationEvent, Look, MapLocalizer
 from sceneslam.atlas.submaps.own_loops import Path
 from sceneslam.types import se3
+from sceneslam.types.run import Note
 from sceneslam.types.se3 import Transform
 
 _REST_NS = 1_000_000_000  # between two searches while the robot stands
 _UNFOUND_NS = 5_000_000_000  # after this time a run reports that it was not located
 _RECENT = 80  # newest looks with a scan that the localizer gets
-
-Note = Callable[..., None]  # event, stamp_ns, and its fields
 
 
 class MapSearch:
@@ -28,7 +27,7 @@ class MapSearch:
     """
 
     def __init__(
-        self, localizer: MapLocalizer | None, executor: Executor, path: Path, note: Note
+        self, localizer: MapLocalizer | None, *, executor: Executor, path: Path, note: Note
     ) -> None:
         """Begin; without a localizer nothing is found. `path` gives the run's poses as they are."""
         self._localizer, self._executor = localizer, executor
@@ -46,7 +45,7 @@ class MapSearch:
 
     @property
     def is_placed(self) -> bool:
-        """Tell whether any piece of the run was located."""
+        """Tell whether any piece of the run is located, by what was not withdrawn."""
         return bool(self._found)
 
     @property
@@ -67,7 +66,7 @@ class MapSearch:
     def T_map_runs(self, starts_ns: Sequence[int]) -> list[Transform]:
         """Return T_map_run (4, 4) of submaps with these first stamps (N,).
 
-        It is as it was while that submap was the newest of its piece.
+        It is as it was before the next one of the same piece began; the newest has today's.
         """
         pieces_ns = [0] if self._localizer is None else self._localizer.pieces_ns
         runs = []
@@ -150,7 +149,7 @@ class MapSearch:
         assert self._began_ns is not None
         after_s = (stamp_ns - self._began_ns) / 1e9
         if outcome is LocalizationEvent.FIXED:
-            self._follow(localizer, stamp_ns)
+            self._follow(localizer, localizer.fixes[-1].stamp_ns)
         elif outcome is LocalizationEvent.FOUND:
             self._follow(localizer, localizer.piece_ns)
             self.was_found = True
@@ -164,10 +163,7 @@ class MapSearch:
 
     def _follow(self, localizer: MapLocalizer, from_ns: int) -> None:
         """Take the localizer's estimate of where the run lies, for poses from a stamp on."""
-        before = [one for one in self._found if one[0] < from_ns]
         self._is_news |= bool(self._found) or localizer.is_located
-        self._found, self.fixes = before, localizer.fixes
+        self._found, self.fixes = [one for one in self._found if one[0] < from_ns], localizer.fixes
         if localizer.is_located and localizer.T_map_run is not None:
-            is_first = not before or before[-1][0] < localizer.piece_ns
-            begin_ns = localizer.piece_ns if is_first else from_ns
-            self._found.append((begin_ns, localizer.T_map_run))
+            self._found.append((from_ns, localizer.T_map_run))
