@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import yaml
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
@@ -88,3 +89,14 @@ def test_every_slam_module_is_listed_with_its_licence_and_what_it_needs():
     rows = {line.split("`")[1]: line.split("|") for line in page.splitlines() if line[:3] == "| `"}
     for module in options("slam"):
         assert all(cell.strip() for cell in rows[module][1:-1]), module
+
+
+@pytest.mark.parametrize("group", ["effects", "policy"])
+def test_targets_of_earlier_configurations_are_found_where_they_are_now(group):
+    for option in options(group):
+        config = composed(f"{group}={option}", "source=two_rooms")
+        now = OmegaConf.to_yaml(config[group])
+        for folder in ("sources.changes.", "bus.judging.", "bus.scene."):
+            now = now.replace(folder, folder.partition(".")[0] + ".")
+        for key, node, positional in nodes({group: yaml.safe_load(now)}):
+            check_node(node, key, allow=[], positional=positional)

@@ -53,6 +53,14 @@ _MOST = {  # largest plausible values by unit; larger ones overflow or never end
 }
 
 
+_CHANGES = ("effects", "exposure_times", "failing_sensor", "faulty", "laps", "spoilt_odometry")
+_MOVED = {  # modules of targets that a run's `config.yaml`, or one of a user's, may still name
+    "sceneslam.bus.bayes_filter": "sceneslam.bus.scene.bayes_filter",
+    "sceneslam.bus.gate": "sceneslam.bus.judging.gate",
+    **{f"sceneslam.sources.{name}": f"sceneslam.sources.changes.{name}" for name in _CHANGES},
+}
+
+
 class _Nothing:
     """Placeholder in error messages for a value that was not given."""
 
@@ -164,8 +172,9 @@ def locate(target: object, key: str, allow: Sequence[str]) -> Callable[..., obje
     if not isinstance(target, str) or not target.startswith(prefixes):
         where = f"a name under {' or '.join(prefixes)}"
         raise ConfigError(key, target, f"{where} ({_how_to_allow(str(target))})")
+    module, _, name = target.rpartition(".")
     try:
-        found = pkgutil.resolve_name(target)
+        found = pkgutil.resolve_name(f"{_MOVED.get(module, module)}.{name}")
     except Exception as error:
         reason = first_line(error)
         raise ConfigError(key, target, f"a class that can be imported ({reason})") from error
