@@ -183,7 +183,9 @@ class MapLocalizer:
         piece = self._piece
         if piece.T_map_run is not None:
             return self._check(latest, piece.T_map_run @ newest.T_run_base)
-        fix = self._with_walls(self._by_view(newest, None), latest)
+        fix = self._by_view(newest, None)
+        if fix is not None and self._with_walls(fix, latest) is None:
+            fix = None
         if fix is None and self._compares_walls(newest):
             fix = self._by_walls(latest)
         if fix is None:
@@ -192,7 +194,9 @@ class MapLocalizer:
         before, self._guess = self._guess, _Guess(T_map_run=T_map_run, fix=fix)
         if before is None or not _agree(before.T_map_run, T_map_run, newest.T_run_base):
             return LocalizationEvent.NOTHING
-        fix = _mean(fix, before, newest)
+        fix = self._with_walls(_mean(fix, before, newest), latest)
+        if fix is None:
+            return LocalizationEvent.NOTHING
         if piece.fixes:  # it was located before: there, and it drifted, or somewhere else
             last = piece.fixes[-1]
             T_expected = last.T_map_base @ se3.inverse(last.T_run_base) @ newest.T_run_base
@@ -267,13 +271,13 @@ class MapLocalizer:
             return None
         return self._fix(newest, newest.T_run_base, match)
 
-    def _with_walls(self, by_view: Fix | None, latest: Sequence[Look]) -> Fix | None:
+    def _with_walls(self, fix: Fix, latest: Sequence[Look]) -> Fix | None:
         """Return a place by landmarks as the walls there tell it, None where they contradict it."""
-        if by_view is None or self._walls is None:
-            return by_view
-        window = self._window(by_view.T_map_base, self._travelled)
-        by_walls, are_refuted = self._near_walls(latest, by_view.T_map_base, window)
-        return None if are_refuted else replace(_joint(by_walls, by_view), is_by_view=True)
+        if not fix.is_by_view or self._walls is None:
+            return fix
+        window = self._window(fix.T_map_base, self._travelled)
+        by_walls, are_refuted = self._near_walls(latest, fix.T_map_base, window)
+        return None if are_refuted else _joint(by_walls, fix)
 
     def _check(self, latest: Sequence[Look], T_map_base: Transform) -> LocalizationEvent:
         """Compare near the predicted pose; repeated contradictions withdraw the localization."""
