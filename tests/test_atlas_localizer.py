@@ -325,7 +325,7 @@ def test_a_view_from_a_tilted_camera_keeps_its_height_and_tilt(monkeypatch):
     )
     own._views.recognize = lambda view, around=None: sighting
     for second in (1, 2):
-        look = Look(stamp_ns=second * S, T_run_base=tilted, view="a view")
+        look = Look(stamp_ns=second * S, T_run_base=tilted, view="a view", is_level=False)
         said = own.compare([placed(0.0, 0.0, -5.0, 0.0), look])
     assert said is LocalizationEvent.FOUND
     np.testing.assert_allclose(own.T_map_run, np.eye(4), atol=1e-3)

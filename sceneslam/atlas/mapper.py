@@ -168,7 +168,9 @@ class Mapper:
             self._collector.add(stamp_ns, scan, up_base, view if is_kept else None)
             self._close_loops()
         if scan is not None or view is not None:
-            search.look(replace(look, scan=scan, view=view if is_viewed else None))
+            is_level = self._is_level and self._collector.is_level
+            view = view if is_viewed else None
+            search.look(replace(look, scan=scan, view=view, is_level=is_level))
 
     def close(self) -> None:
         """Begin no other search; one that is running goes on, and nothing takes its result."""

@@ -60,6 +60,7 @@ class Look:
     T_run_base: Transform
     scan: KeyScan | None = None
     view: LandmarkView | None = None
+    is_level: bool = True  # base stands as on a floor, so that walls are where a plan has them
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -273,7 +274,7 @@ class MapLocalizer:
 
     def _with_walls(self, fix: Fix, latest: Sequence[Look]) -> Fix | None:
         """Return a place by landmarks as the walls there tell it, None where they contradict it."""
-        if not fix.is_by_view or self._walls is None:
+        if not (fix.is_by_view and latest[-1].is_level) or self._walls is None:
             return fix
         window = self._window(fix.T_map_base, self._travelled)
         by_walls, are_refuted = self._near_walls(latest, fix.T_map_base, window)
@@ -340,15 +341,12 @@ class MapLocalizer:
         return None, there.known_ratio >= _KNOWN_MIN and there.is_refuted
 
     def _fix(self, newest: Look, T_base: Transform, match: PlanRegistration) -> Fix:
-        """Return the pose by walls, near the height and tilt of T_base (4, 4): on a floor there.
-
-        A look without a scan keeps these: it may be tilted.
-        """
+        """Return the pose by walls, near the height and tilt of T_base (4, 4): on a floor there."""
         T_plane = planar.to_transform(planar.from_transform(T_base))
         T_near = planar.to_transform(match.T_target_query) @ se3.inverse(T_plane) @ T_base
         return Fix(
             stamp_ns=newest.stamp_ns,
-            T_map_base=T_near if newest.scan is None else self._standing(T_near),
+            T_map_base=self._standing(T_near),
             T_run_base=newest.T_run_base,
             covariance=on_floor(match.covariance),
         )
