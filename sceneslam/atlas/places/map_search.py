@@ -106,11 +106,11 @@ class MapSearch:
 
     def look(self, look: Look) -> None:
         """Compare a look with the map, if it is time and no search is running."""
-        if self._began_ns is None:
-            self._began_ns = look.stamp_ns
         localizer = self._localizer
         if localizer is None:
             return
+        if self._began_ns is None:
+            self._began_ns = look.stamp_ns
         latest = [*self._recent[1 - _RECENT :], look]
         if look.scan is not None:
             self._recent = latest
