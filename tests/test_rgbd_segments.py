@@ -90,3 +90,15 @@ def test_camera_that_comes_back_in_time_begins_nothing():
     module.shutdown()
     assert answer.status is TrackingStatus.TRACKING
     assert error_m(answer.T_local_base, SEEN // 2) < 0.03
+
+
+@pytest.mark.parametrize("keyframe_limit", [3, 5, 8, 12])
+def test_map_of_two_segments_that_is_full_goes_on(keyframe_limit):
+    """Keyframes are removed from either segment, and the last one of a segment, too."""
+    module = make(keyframe_limit=keyframe_limit)
+    answers = [module.track(image) for image in images()]
+    revised, layers = module.get_trajectory(), module.get_map()
+    module.shutdown()
+    held = [answer.stamp_ns for answer in answers if answer.status is not TrackingStatus.LOST]
+    assert revised.stamps_ns.tolist() == held
+    assert len(layers.pose_graph.stamps_ns) == keyframe_limit

@@ -220,12 +220,13 @@ class MapHistory:
         """Refer frames and edges of removed keyframes to other keyframes."""
         for keyframe_id in sorted(set(self._keyframes) - set(self._map.keyframes.ids)):
             edge = self._graph.remove(keyframe_id)
-            if edge is not None:
-                gone, heir = self._keyframes[keyframe_id], self._keyframes[edge.first]
-                T_heir_gone = se3.inverse(heir.T_local_base) @ gone.T_local_base
-                self._frames.hand_over(keyframe_id, edge.first, T_heir_gone)
-                self.segments.replace(keyframe_id, edge.first)
-                self.reference = edge.first if self.reference == keyframe_id else self.reference
+            # What nothing is connected to stays where it was guessed to be.
+            heir_id = self._map.keyframes.ids[0] if edge is None else edge.first
+            gone, heir = self._keyframes[keyframe_id], self._keyframes[heir_id]
+            T_heir_gone = se3.inverse(heir.T_local_base) @ gone.T_local_base
+            self._frames.hand_over(keyframe_id, heir_id, T_heir_gone)
+            self.segments.replace(keyframe_id, None if edge is None else heir_id)
+            self.reference = heir_id if self.reference == keyframe_id else self.reference
             del self._keyframes[keyframe_id]
             self.recognizer.places.remove(keyframe_id)
 

@@ -40,10 +40,11 @@ class Segments:
         guess = _Guess(T_local_base=T_local_base.copy(), covariance=unknown_motion(lost_s))
         self._guesses[keyframe_id] = guess
 
-    def replace(self, gone: int, heir: int) -> None:
-        """Replace a removed keyframe by another one of its segment."""
-        if gone in self._guesses:
-            self._guesses[heir] = self._guesses.pop(gone)
+    def replace(self, gone: int, heir: int | None) -> None:
+        """Replace a removed keyframe by another one of its segment; None: it was the last one."""
+        guess = self._guesses.pop(gone, None)
+        if guess is not None and heir is not None:
+            self._guesses[heir] = guess
 
     def update(self) -> None:
         """Update after a correction, which may have joined segments."""
