@@ -25,15 +25,25 @@ def pose(index):
     return se3.from_xy_yaw(0.1 + 0.005 * step, 0.3, AWAY_RAD - TURN_RAD * step)
 
 
+def by_camera(T_room_base, time_s):
+    one = observation_at(T_room_base, time_s)
+    return replace(one, scan=None, points_lidar=None, T_odom_base=None, gyro_base=None)
+
+
 @cache
 def images():
     """Observations of a camera alone, two seconds of which were cut out."""
     seen = []
     for index in range(IMAGES):
         time_s = index / RATE_HZ + (GAP_S if index >= SEEN else 0.0)
-        one = observation_at(pose(index), time_s)
-        seen.append(replace(one, scan=None, points_lidar=None, T_odom_base=None, gyro_base=None))
+        seen.append(by_camera(pose(index), time_s))
     return seen
+
+
+@cache
+def turn():
+    """Observations of a camera alone that turns once around."""
+    return [by_camera(se3.from_xy_yaw(0.0, 0.0, 0.09 * i), i / RATE_HZ) for i in range(70)]
 
 
 def error_m(T_local_base, index):
@@ -102,3 +112,19 @@ def test_map_of_two_segments_that_is_full_goes_on(keyframe_limit):
     held = [answer.stamp_ns for answer in answers if answer.status is not TrackingStatus.LOST]
     assert revised.stamps_ns.tolist() == held
     assert len(layers.pose_graph.stamps_ns) == keyframe_limit
+
+
+@pytest.mark.parametrize("keyframe_limit", [3, 5, 8])
+def test_keyframes_of_a_full_map_stay_connected(keyframe_limit):
+    """One that is removed may be all that the newest one was seen with."""
+    module = make(keyframe_limit=keyframe_limit, keyframe_step_m=0.05)
+    for image in turn():
+        module.track(image)
+    graph = module.get_map().pose_graph
+    module.shutdown()
+    first, second = graph.edges.T
+    reached = np.zeros(len(graph.stamps_ns), bool)
+    reached[0] = True
+    for _ in reached:
+        reached[first[reached[second]]] = reached[second[reached[first]]] = True
+    assert len(reached) == keyframe_limit and reached.all()

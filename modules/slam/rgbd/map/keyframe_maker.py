@@ -58,8 +58,6 @@ class KeyframeMaker:
         deep_rows = landmark_ids[:0] if fix is None else fix.deep_rows
         keyframe_id = self._map.insert(keyframe, deep_rows=deep_rows)
         triangulate(self._map, keyframe_id)
-        if segment is not None:  # the insertion may have removed one of its keyframes
-            segment = segment & set(self._map.keyframes.ids)
         join_duplicates(self._map, keyframe, segment)
         self._memory.insert(fix, view.depth_m, guessed_s=guessed_s)
         self._mapping.insert(keyframe_id, view)

@@ -88,7 +88,6 @@ class MapHistory:
 
         `guessed_s`: time without a pose if its pose is a guess; then it begins a segment.
         """
-        self._follow_removals()
         keyframe_id = self._map.keyframes.ids[-1]
         keyframe = self._map.keyframes[keyframe_id]
         self._graph.insert(keyframe_id)
@@ -101,6 +100,8 @@ class MapHistory:
         self.recognizer.places.insert(keyframe_id, keyframe.features.descriptors)
         self._closer.insert(Query(keyframe_id=keyframe_id, depth_m=depth_m))
         self.reference = keyframe_id
+        self._map.keep_limits()  # only now, as what it removes may connect the new one
+        self._follow_removals()
 
     def segment(self, landmark_ids: NDArray[np.int64]) -> set[int] | None:
         """Return the keyframes of the landmarks' (N,) segment; None: there is only one segment."""
@@ -110,7 +111,6 @@ class MapHistory:
 
     def step(self) -> Transform | None:
         """Do one image's share of loop closing; return T_new_old of the current pose, if moved."""
-        self._follow_removals()
         corrections = self._closer.step()
         if corrections:
             self.revision += 1

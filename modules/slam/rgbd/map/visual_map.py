@@ -142,7 +142,8 @@ class VisualMap:
     def insert(self, keyframe: Keyframe, *, deep_rows: NDArray[np.int64]) -> int:
         """Add a keyframe: fuse its landmarks, and make new ones of its other features.
 
-        Returns its id. `deep_rows` (N,) are the features whose depth agrees with their landmark.
+        Returns its id, and drops landmarks that are seldom found again. `deep_rows` (N,) are the
+        features whose depth agrees with their landmark.
         """
         features, ids = keyframe.features, keyframe.landmark_ids
         known = np.flatnonzero(ids != NO_LANDMARK)
@@ -158,7 +159,9 @@ class VisualMap:
         )
         learn_shifts(self.landmarks, self.camera, keyframe)
         keyframe_id = self.keyframes.insert(keyframe)
-        self._keep_limits()
+        table = self.landmarks
+        judged = table.alive & (table.expected >= _PROBATION)
+        self.drop(np.flatnonzero(judged & (table.found < _MIN_FOUND_RATIO * table.expected)))
         return keyframe_id
 
     def correct(self, T_local_base: Mapping[int, Transform]) -> None:
@@ -215,16 +218,13 @@ class VisualMap:
             reach_m=distance_m * _SCALES.take(keyframe.features.levels[rows]),
         )
 
-    def _keep_limits(self) -> None:
-        """Remove landmarks that are seldom found again, and keyframes beyond the limits."""
-        table = self.landmarks
-        judged = table.alive & (table.expected >= _PROBATION)
-        self.drop(np.flatnonzero(judged & (table.found < _MIN_FOUND_RATIO * table.expected)))
+    def keep_limits(self) -> None:
+        """Remove keyframes beyond the limits, and the landmarks that no other one shows."""
         while len(self.keyframes) > self._keyframe_limit or (
-            len(table) > self._landmark_limit and len(self.keyframes) > _FEWEST_KEYFRAMES
+            len(self.landmarks) > self._landmark_limit and len(self.keyframes) > _FEWEST_KEYFRAMES
         ):
             self.keyframes.remove(self.keyframes.most_redundant())
-            orphans = table.alive.copy()
+            orphans = self.landmarks.alive.copy()
             orphans[self.keyframes.landmarks_of(self.keyframes.ids)] = False
             self.drop(np.flatnonzero(orphans))
 
