@@ -78,6 +78,7 @@ def test_map_stays_within_its_limits_and_forgets_only_redundant_keyframes():
     visual_map = empty_map(CAMERA, keyframe_limit=10, landmark_limit=100_000)
     for step in range(30):
         visual_map.insert(keyframe_at(0.1 * step), deep_rows=np.zeros(0, np.int64))
+        visual_map.keep_limits()
     assert len(visual_map.keyframes) == 10
     assert len(visual_map.landmarks) == 10 * 60
     positions = [keyframe.T_local_base[0, 3] for keyframe in visual_map.keyframes.all()]
