@@ -6,6 +6,7 @@ import os
 import select
 import shutil
 import signal
+import subprocess
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -88,6 +89,29 @@ def test_a_program_gives_a_layer_by_its_fields(name):
         layers(reply)
 
 
+ADRIFT = """
+#include "sceneslam.hpp"
+struct Adrift : sceneslam::Slam {
+  std::string sensors() const override { return "odometry"; }
+  void activate(const sceneslam::Fields&) override {}
+  std::vector<sceneslam::Pose> track(const sceneslam::Fields& observation) override {
+    sceneslam::Pose pose;
+    pose.stamp_ns = *observation.values<std::int64_t>("stamp_ns");
+    pose.has_covariance = pose.has_map_covariance = true;
+    for (int k = 0; k < 36; k += 7) pose.covariance[k] = 2.0, pose.map_covariance[k] = 3.0;
+    if (is_lost) pose.status = sceneslam::Status::lost, pose.can_begin = true;
+    is_lost = true;
+    return {pose};
+  }
+  bool is_lost = false;
+};
+int main() {
+  Adrift adrift;
+  return sceneslam::serve(adrift);
+}
+"""
+
+
 @pytest.fixture(scope="module")
 def wheels(tmp_path_factory):
     """Give the C++ example, built."""
@@ -96,6 +120,22 @@ def wheels(tmp_path_factory):
     out = tmp_path_factory.mktemp("programs") / "wheels"
     build("wheels", out)
     return out
+
+
+def test_program_in_cpp_says_all_that_a_pose_has(started, tmp_path):
+    compiler = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
+    if compiler is None:
+        pytest.skip("there is no C++ compiler")
+    (tmp_path / "adrift.cpp").write_text(ADRIFT)
+    command = [compiler, "-std=c++17", "-I", FOLDER, tmp_path / "adrift.cpp", "-o", "adrift"]
+    subprocess.run(command, check=True, cwd=tmp_path)
+    module = started(tmp_path / "adrift")
+    module.activate(RIG)
+    held, lost = (module.track(observation(index)) for index in range(2))
+    assert held.status is TrackingStatus.TRACKING and not held.can_begin
+    np.testing.assert_array_equal(held.covariance, 2.0 * np.eye(6))
+    np.testing.assert_array_equal(held.map_covariance, 3.0 * np.eye(6))
+    assert lost.status is TrackingStatus.LOST and lost.can_begin
 
 
 def test_what_is_packed_is_read_again():

@@ -57,22 +57,23 @@ class Pipeline:
     def report(self, observation: Observation, revision: int) -> Tracking:
         """Return the pose at an observation that was recorded."""
         newest = self._newest
+        exact = newest if newest is not None and newest.stamp_ns == observation.stamp_ns else None
         if newest is not None and newest.status is TrackingStatus.LOST:
             status = TrackingStatus.LOST
-        elif newest is not None and newest.stamp_ns == observation.stamp_ns:
-            status = newest.status
-            self._T_local_base = newest.T_local_base
+        elif exact is not None:
+            status, self._T_local_base = exact.status, exact.T_local_base
         else:
             status = self._carry_on(observation)
-        is_exact = newest is not None and newest.stamp_ns == observation.stamp_ns
         return Tracking(
             stamp_ns=observation.stamp_ns,
             T_local_base=self._T_local_base.copy(),
             status=status,
-            covariance=newest.covariance if newest is not None and is_exact else None,
+            covariance=None if exact is None else exact.covariance,
+            map_covariance=None if exact is None else exact.map_covariance,
             quality_ratio=newest.quality_ratio if newest is not None else 0.0,
             inliers=newest.inliers if newest is not None else 0,
             revision=revision,
+            can_begin=newest is not None and newest.can_begin,
         )
 
     def trajectory(self) -> Trajectory:

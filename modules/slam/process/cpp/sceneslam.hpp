@@ -106,8 +106,9 @@ struct Pose {
   Status status = Status::tracking;
   double quality_ratio = 1.0;  // 0 (nothing matched) to 1
   std::int64_t inliers = 0;
-  bool has_covariance = false;  // for all poses of an answer, or for none
-  Matrix6 covariance{};
+  bool has_covariance = false, has_map_covariance = false;  // for all poses of an answer, or none
+  Matrix6 covariance{}, map_covariance{};  // the latter: of the drift of the program's own map
+  bool can_begin = false;  // lost, and the sensors show enough to begin a map here
 };
 
 // A SLAM system. An exception ends the program; SceneSLAM goes on with another module.
@@ -190,20 +191,22 @@ inline std::vector<std::uint8_t> pack(Head head, const Fields& fields) {
 }
 
 inline Fields as_fields(const std::vector<Pose>& poses) {
-  std::vector<std::int64_t> stamps, statuses, inliers;
-  std::vector<double> transforms, qualities, covariances;
+  std::vector<std::int64_t> stamps, statuses, inliers, begins;
+  std::vector<double> transforms, qualities, covariances, of_map;
+  const auto add = [](auto& to, const auto& from) { to.insert(to.end(), from.begin(), from.end()); };
   for (const auto& pose : poses) {
     stamps.push_back(pose.stamp_ns), statuses.push_back(static_cast<std::int64_t>(pose.status));
-    inliers.push_back(pose.inliers), qualities.push_back(pose.quality_ratio);
-    transforms.insert(transforms.end(), pose.T_local_base.begin(), pose.T_local_base.end());
-    if (pose.has_covariance)
-      covariances.insert(covariances.end(), pose.covariance.begin(), pose.covariance.end());
+    inliers.push_back(pose.inliers), begins.push_back(pose.can_begin);
+    qualities.push_back(pose.quality_ratio), add(transforms, pose.T_local_base);
+    if (pose.has_covariance) add(covariances, pose.covariance);
+    if (pose.has_map_covariance) add(of_map, pose.map_covariance);
   }
   const std::uint64_t count = poses.size();
   Fields fields;
   fields.put("stamps_ns", stamps, {count}), fields.put("status", statuses, {count});
   fields.put("quality_ratio", qualities, {count}), fields.put("inliers", inliers, {count});
-  fields.put("T_local_base", transforms, {count, 4, 4});
+  fields.put("T_local_base", transforms, {count, 4, 4}), fields.put("can_begin", begins, {count});
+  if (!of_map.empty()) fields.put("map_covariance", of_map, {count, 6, 6});
   if (!covariances.empty()) fields.put("covariance", covariances, {count, 6, 6});
   return fields;
 }
@@ -213,10 +216,8 @@ inline Fields reply(Slam& slam, const std::string& kind, const Fields& asked) {
   if (kind == "hello") fields.put_text("requires", slam.sensors());
   if (kind == "activate") slam.activate(asked);
   if (kind == "scene") slam.set_scene(asked.text("scene"));
-  if (kind == "track") {
-    fields = as_fields(slam.track(asked));
-    fields.put<std::int64_t>("revision", {slam.revision()});
-  }
+  if (kind == "track")
+    fields = as_fields(slam.track(asked)), fields.put<std::int64_t>("revision", {slam.revision()});
   if (kind == "trajectory") fields = as_fields(slam.trajectory());
   if (kind == "map") fields = slam.map();
   return fields;
@@ -238,8 +239,7 @@ inline int serve(Slam& slam) {
       detail::write_all(wire, detail::pack(head, fields));
     } catch (const std::exception& error) {
       Fields fields;
-      fields.put_text("text", error.what());
-      std::memcpy(head.kind, "error", 6);
+      fields.put_text("text", error.what()), std::memcpy(head.kind, "error", 6);
       detail::write_all(wire, detail::pack(head, fields));
       return 1;
     }
