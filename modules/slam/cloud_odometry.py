@@ -16,11 +16,11 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers, PointLayer
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
-from sceneslam.types.trajectory import Trajectory
 
 from .cloud_map import CloudMap
 from .clouds import Cloud, CloudReader
 from .degeneracy import Localizability
+from .local import LocalModule
 
 _POINTS_MIN = 50  # fewer do not constrain six degrees of freedom
 _DEPTH_VOXEL_M = 0.1
@@ -35,7 +35,7 @@ _DIFFUSE = 1e6  # prediction's covariance in units of a cloud's, if ICP decides 
 
 
 @dataclass(kw_only=True, eq=False)
-class CloudOdometry(ABC):
+class CloudOdometry(LocalModule, ABC):
     """Implements `SlamModule` by a `CloudMap`; the settings are described in each YAML file."""
 
     voxel_m: float | None
@@ -90,12 +90,6 @@ class CloudOdometry(ABC):
         self._T_local_base = se3.identity()
         self._has_map, self._interval_s = False, _INTERVAL_S
 
-    def set_pose(self, T_map_local: se3.Transform) -> None:  # noqa: B027
-        """Do nothing: poses are reported in `local`."""
-
-    def set_scene(self, scene: str) -> None:  # noqa: B027
-        """Do nothing: geometry does not depend on the scene."""
-
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base (4, 4) [m] at the observation."""
         if self._reader is None or self._icp is None:
@@ -127,10 +121,6 @@ class CloudOdometry(ABC):
         return self._predictor.tracking(
             observation, self._T_local_base, status, quality_ratio=overlap_ratio, inliers=inliers
         )
-
-    def get_trajectory(self) -> Trajectory:
-        """Return no poses: registration with a local map does not revise poses."""
-        return Trajectory.empty()
 
     def get_map(self) -> MapLayers:
         """Return the voxel map in `local`, within the sensor's current range."""

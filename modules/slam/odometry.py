@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
-from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor, Wheels
-from sceneslam.types.trajectory import Trajectory
+
+from .local import LocalModule
 
 _DEVIATION_MIN = 1e-4  # m and rad: smallest standard deviation
 
 
 @dataclass(kw_only=True, eq=False)
-class Odometry:
+class Odometry(LocalModule):
     """Dead reckoning, without settings."""
 
     _wheels: Wheels = field(init=False)
@@ -40,12 +40,6 @@ class Odometry:
         self._T_local_base = se3.identity()
         self._covariance = np.eye(6) * _DEVIATION_MIN**2
 
-    def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Do nothing: poses are reported in `local`."""
-
-    def set_scene(self, scene: str) -> None:
-        """Do nothing: odometry does not depend on the scene."""
-
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base (4, 4) [m]; LOST without odometry.
 
@@ -58,17 +52,6 @@ class Odometry:
             self._move(se3.inverse(before) @ T_odom_base)
         self._T_odom_base = T_odom_base
         return self._answer(observation, TrackingStatus.TRACKING)
-
-    def get_trajectory(self) -> Trajectory:
-        """Return no poses: dead reckoning does not revise poses."""
-        return Trajectory.empty()
-
-    def get_map(self) -> MapLayers:
-        """Return no layers: dead reckoning makes no map."""
-        return MapLayers()
-
-    def shutdown(self) -> None:
-        """Do nothing."""
 
     def _move(self, T_prev_curr: se3.Transform) -> None:
         distance_m = float(np.linalg.norm(T_prev_curr[:3, 3]))

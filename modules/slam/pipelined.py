@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from sceneslam.interfaces import PipelinedSlam, closes_own_loops
 from sceneslam.motion.late import Pipeline
-from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking
@@ -12,8 +11,10 @@ from sceneslam.types.ranges import check_least
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
+from .local import LocalModule
 
-class Pipelined:
+
+class Pipelined(LocalModule):
     """Implements `SlamModule` by a `PipelinedSlam`.
 
     Until the pose of an observation arrives, the newest pose is extrapolated by odometry (constant
@@ -41,9 +42,6 @@ class Pipelined:
         """Start a session."""
         self._pipeline, self._revision = Pipeline(self._late_max_s), 0
         self._system.activate(rig)
-
-    def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Do nothing: poses are reported in `local`."""
 
     def set_scene(self, scene: str) -> None:
         """Pass the scene to the system."""

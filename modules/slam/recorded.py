@@ -7,16 +7,16 @@ import numpy as np
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.input_files import given_path
-from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.recorded import RecordedTrajectory, read_recorded
 from sceneslam.types.rig import Rig, Sensor
-from sceneslam.types.trajectory import Trajectory
+
+from .local import LocalModule
 
 _BASE_FRAMES = ("", "base", "base_link")  # frames that need no extrinsics
 
 
-class Recorded:
+class Recorded(LocalModule):
     """Returns recorded poses; the settings are described in `conf/slam/recorded.yaml`.
 
     Between two recorded poses it interpolates, which looks ahead by less than one gap. LOST before
@@ -57,12 +57,6 @@ class Recorded:
         self._ready_ns, self._T_local_world = None, None
         self._T_local_base = se3.identity()
 
-    def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Do nothing: poses are reported in `local`."""
-
-    def set_scene(self, scene: str) -> None:
-        """Do nothing: recorded poses do not depend on the scene."""
-
     def track(self, observation: Observation) -> Tracking:
         """Return the recorded T_local_base (4, 4) [m]; LOST without one."""
         if self._ready_ns is None:
@@ -74,17 +68,6 @@ class Recorded:
             self._T_local_world = se3.inverse(T_world_base)
         self._T_local_base = self._T_local_world @ T_world_base
         return self._answer(observation.stamp_ns, TrackingStatus.TRACKING)
-
-    def get_trajectory(self) -> Trajectory:
-        """Return no poses: recorded poses are not revised."""
-        return Trajectory.empty()
-
-    def get_map(self) -> MapLayers:
-        """Return no layers: only poses were recorded."""
-        return MapLayers()
-
-    def shutdown(self) -> None:
-        """Do nothing."""
 
     def _pose_at(self, stamp_ns: int) -> se3.Transform | None:
         """Return T_world_base (4, 4) [m] at a stamp, None in a gap or outside of the recording."""

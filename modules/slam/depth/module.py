@@ -14,6 +14,7 @@ from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
+from ..local import LocalModule
 from ..surfaces.registration import CameraPrior, Samples, SurfaceRegistration, samples_of
 from ..surfaces.surface import DepthSurfaceReader, Doubles, Surface
 from .certainty import DepthCertainty
@@ -26,7 +27,7 @@ _SAMPLES_MIN = 100
 
 
 @dataclass(kw_only=True, eq=False)
-class DepthSlam:
+class DepthSlam(LocalModule):
     """Registers depth images with keyframes; settings as in `conf/slam/depth.yaml`."""
 
     keyframe_overlap_ratio: float
@@ -72,12 +73,6 @@ class DepthSlam:
         self._T_local_base = se3.identity()
         self._reference, self._revision = 0, 0
 
-    def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Do nothing: poses are reported in `local`."""
-
-    def set_scene(self, scene: str) -> None:
-        """Do nothing: depth does not depend on the scene."""
-
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base (4, 4) [m] at the observation."""
         prediction = self._predictor.predict(observation)
@@ -108,9 +103,6 @@ class DepthSlam:
     def get_map(self) -> MapLayers:
         """Return the keyframes' cloud in `local`."""
         return MapLayers(points=PointLayer(points=self._map.cloud(self.cloud_voxel_m)))
-
-    def shutdown(self) -> None:
-        """Do nothing; the map stays readable."""
 
     def _start(
         self, observation: Observation, surface: Surface, samples: Samples, prediction: Prediction

@@ -18,8 +18,8 @@ from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.maps import MapLayers, PointLayer, PoseGraphLayer
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
-from sceneslam.types.trajectory import Trajectory
 
+from ..local import LocalModule
 from .keyframes import DirectKeyframes
 from .view import Comparison, DirectView, Tracker
 
@@ -39,7 +39,7 @@ class _Located:
 
 
 @dataclass(kw_only=True, eq=False)
-class DirectSlam:
+class DirectSlam(LocalModule):
     """Registers images with depth; the settings are described in `conf/slam/direct.yaml`."""
 
     width_px: int
@@ -79,12 +79,6 @@ class DirectSlam:
         self._T_local_key = self._T_local_last = se3.identity()  # of cam
         self._T_local_base = se3.identity()
 
-    def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Do nothing: poses are reported in `local`."""
-
-    def set_scene(self, scene: str) -> None:
-        """Do nothing: tracking does not depend on the scene."""
-
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base (4, 4) [m] at the observation."""
         prediction = self._predictor.predict(observation)
@@ -110,19 +104,12 @@ class DirectSlam:
         can_begin = bool(np.count_nonzero(view.depth_m) >= _PIXELS_MIN)
         return self._bridge(observation, prediction, can_coast=False, can_begin=can_begin)
 
-    def get_trajectory(self) -> Trajectory:
-        """Return no poses: nothing is revised."""
-        return Trajectory.empty()
-
     def get_map(self) -> MapLayers:
         """Return the keyframes' cloud and their graph, in `local`."""
         T_cam_base = se3.inverse(self._camera.T_base_cam)
         graph: PoseGraphLayer | None = self._keyframes.graph(T_cam_base)
         points: PointLayer | None = self._keyframes.cloud()
         return MapLayers(points=points, pose_graph=graph)
-
-    def shutdown(self) -> None:
-        """Do nothing; the map stays readable."""
 
     def _locate(self, view: DirectView) -> _Located | None:
         """Return the view's pose relative to the keyframe, else to the previous view."""

@@ -16,8 +16,8 @@ from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import LaserScan, Observation, Tracking, TrackingStatus
 from sceneslam.types.planar import Matrix, spatial_covariance, to_transform, turn
 from sceneslam.types.rig import Rig, Sensor
-from sceneslam.types.trajectory import Trajectory
 
+from ..local import LocalModule
 from .frontend import Estimate, FrontEnd, ScanSettings
 from .keyframes import ScanKeyframes
 from .layers import map_layers
@@ -36,7 +36,7 @@ _LEVEL_DEVIATION = 0.01  # m and rad: standard deviation of z, roll and pitch on
 
 
 @dataclass(kw_only=True, eq=False)
-class LaserSlam:
+class LaserSlam(LocalModule):
     """2D SLAM from a laser, or from a lidar or depth image converted to a scan: x, y, yaw.
 
     The fields are the settings; `conf/slam/laser.yaml` describes each one.
@@ -99,12 +99,6 @@ class LaserSlam:
             self._T_base_laser = se3.identity() if rig.laser is None else rig.laser.T_base_laser
         self._front_end = self._make_front_end(rig)
 
-    def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Do nothing: the poses are in `local`, independent of T_map_local."""
-
-    def set_scene(self, scene: str) -> None:
-        """Do nothing: a laser sees the same by day and by night."""
-
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base at the observation."""
         if self._front_end is None:
@@ -120,10 +114,6 @@ class LaserSlam:
             inliers=estimate.inliers,
             can_begin=estimate.can_begin,
         )
-
-    def get_trajectory(self) -> Trajectory:
-        """Return no trajectory: the atlas closes the loops."""
-        return Trajectory.empty()
 
     def get_map(self) -> MapLayers:
         """Return the scans of all keyframes, in `local`."""

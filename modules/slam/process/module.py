@@ -12,7 +12,6 @@ import numpy as np
 from sceneslam.motion.late import Pipeline
 from sceneslam.supervision.limits import Limits
 from sceneslam.supervision.restarted import Restarted
-from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, ModuleError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking
@@ -20,6 +19,7 @@ from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import Command
 from sceneslam.types.trajectory import Trajectory
 
+from ..local import LocalModule
 from .fields import answers, layers, observation_fields, required, rig_fields, trajectory
 from .program import Program
 from .protocol import Fields, ProtocolError, text
@@ -27,7 +27,7 @@ from .protocol import Fields, ProtocolError, text
 Value = TypeVar("Value")
 
 
-class ProcessSlam(Restarted):
+class ProcessSlam(LocalModule, Restarted):
     """Implements `SlamModule`, `Restartable` and `Concurrent` by one run of a program per session.
 
     Any error of the program ends it, and the call raises ModuleError with one sentence. The next
@@ -88,9 +88,6 @@ class ProcessSlam(Restarted):
         self._layers = None
         self._is_active = True
         self._ask("activate", rig_fields(rig), self._limits.start_deadline_s, lambda _: None)
-
-    def set_pose(self, T_map_local: se3.Transform) -> None:
-        """Do nothing: poses are reported in `local`."""
 
     def set_scene(self, scene: str) -> None:
         """Send the scene to the program."""
