@@ -45,52 +45,37 @@ class GenzIcp(CloudOdometry):
 
     def make_map(self, voxel_m: float, reader: CloudReader) -> CloudMap:
         """Return the library's map."""
-        return _GenzMap(
-            voxel_m=voxel_m,
-            range_max_m=reader.range_m[1],
-            points_desired=self.points_desired,
-            planarity_max=self.planarity_max,
-            initial_threshold_m=self.initial_threshold_m or 2.0 * voxel_m,
-            motion_min_m=self.motion_min_m or 0.1 * voxel_m,
-            iterations_max=self.iterations_max,
-        )
+        return _GenzMap(self, voxel_m, reader)
 
 
 class _GenzMap(CloudMap):
     """The library's parts, in the order of its pipeline."""
 
-    def __init__(
-        self,
-        *,
-        voxel_m: float,
-        range_max_m: float,
-        points_desired: int,
-        planarity_max: float,
-        initial_threshold_m: float,
-        motion_min_m: float,
-        iterations_max: int,
-    ) -> None:
+    def __init__(self, settings: GenzIcp, voxel_m: float, reader: CloudReader) -> None:
         from genz_icp.pybind import genz_icp_pybind as parts
 
+        range_max_m = reader.range_m[1]
         super().__init__(voxel_m=voxel_m, range_max_m=range_max_m)
+        self.capture_m = settings.initial_threshold_m or 2.0 * voxel_m
         self._parts: Any = parts
-        self._voxel_m, self._points_desired = voxel_m, points_desired
+        self._voxel_m, self._points_desired = voxel_m, settings.points_desired
         self._map: Any = parts._VoxelHashMap(
             voxel_size=voxel_m,
             max_distance=range_max_m,
             map_cleanup_radius=range_max_m,
-            planarity_threshold=planarity_max,
+            planarity_threshold=settings.planarity_max,
             max_points_per_voxel=1,
         )
         self._registration: Any = parts._Registration(
-            max_num_iterations=iterations_max, convergence_criterion=1e-4, max_num_threads=1
+            max_num_iterations=settings.iterations_max,
+            convergence_criterion=1e-4,
+            max_num_threads=1,
         )
         self._threshold: Any = parts._AdaptiveThreshold(
-            initial_threshold=initial_threshold_m,
-            min_motion_th=motion_min_m,
+            initial_threshold=self.capture_m,
+            min_motion_th=settings.motion_min_m or 0.1 * voxel_m,
             max_range=range_max_m,
         )
-        self.capture_m = initial_threshold_m
 
     def register(
         self, cloud: Cloud, T_local_guess: se3.Transform, observation: Observation

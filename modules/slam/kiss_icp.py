@@ -31,51 +31,37 @@ class KissIcp(CloudOdometry):
 
     def make_map(self, voxel_m: float, reader: CloudReader) -> CloudMap:
         """Return the library's map."""
-        return _KissMap(
-            voxel_m=voxel_m,
-            initial_threshold_m=self.initial_threshold_m or 2.0 * voxel_m,
-            motion_min_m=self.motion_min_m or (0.3 if reader.is_depth else 0.1) * voxel_m,
-            range_max_m=reader.range_m[1],
-            points_per_voxel=self.points_per_voxel,
-            iterations_max=self.iterations_max,
-        )
+        return _KissMap(self, voxel_m, reader)
 
 
 class _KissMap(CloudMap):
     """KISS-ICP's parts, combined so that its result is checked before the map is updated."""
 
-    def __init__(
-        self,
-        *,
-        voxel_m: float,
-        initial_threshold_m: float,
-        motion_min_m: float,
-        range_max_m: float,
-        points_per_voxel: int,
-        iterations_max: int,
-    ) -> None:
+    def __init__(self, settings: KissIcp, voxel_m: float, reader: CloudReader) -> None:
         from kiss_icp.config import config as parts
         from kiss_icp.config.parser import KISSConfig
         from kiss_icp.kiss_icp import KissICP
 
+        super().__init__(voxel_m=voxel_m, range_max_m=reader.range_m[1])
+        self.capture_m = settings.initial_threshold_m or 2.0 * voxel_m
         # Constructed without validation, since the class would also read environment variables.
         config: Any = KISSConfig.model_construct(
-            data=parts.DataConfig(max_range=range_max_m, min_range=0.0, deskew=False),
-            mapping=parts.MappingConfig(voxel_size=voxel_m, max_points_per_voxel=points_per_voxel),
+            data=parts.DataConfig(max_range=reader.range_m[1], min_range=0.0, deskew=False),
+            mapping=parts.MappingConfig(
+                voxel_size=voxel_m, max_points_per_voxel=settings.points_per_voxel
+            ),
             registration=parts.RegistrationConfig(
-                max_num_iterations=iterations_max,
+                max_num_iterations=settings.iterations_max,
                 convergence_criterion=1e-4,
                 max_num_threads=1,  # more threads change the order of sums
             ),
             adaptive_threshold=parts.AdaptiveThresholdConfig(
                 fixed_threshold=None,
-                initial_threshold=initial_threshold_m,
-                min_motion_th=motion_min_m,
+                initial_threshold=self.capture_m,
+                min_motion_th=settings.motion_min_m or (0.3 if reader.is_depth else 0.1) * voxel_m,
             ),
         )
         self._odometry: Any = KissICP(config)
-        self.capture_m = initial_threshold_m
-        super().__init__(voxel_m=voxel_m, range_max_m=range_max_m)
 
     def register(
         self, cloud: Cloud, T_local_guess: se3.Transform, observation: Observation
