@@ -50,7 +50,6 @@ class CloudOdometry(LocalModule, ABC):
     turn_max_rad_s: float
     _reader: CloudReader | None = field(default=None, init=False)
     _icp: CloudMap | None = field(default=None, init=False)
-    _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
     _predictor: Predictor = field(init=False)
 
     def __post_init__(self) -> None:
@@ -87,7 +86,6 @@ class CloudOdometry(LocalModule, ABC):
         noise = np.array([self.noise_m or 0.2 * voxel_m, self.noise_rad]) ** 2
         self._noise = np.repeat(noise, 3)  # variances of a registration
         self._predictor = Predictor(rig)
-        self._T_local_base = se3.identity()
         self._has_map, self._interval_s = False, _INTERVAL_S
 
     def track(self, observation: Observation) -> Tracking:
@@ -99,27 +97,27 @@ class CloudOdometry(LocalModule, ABC):
         twist_s = self._predictor.model.velocity if self.deskew else np.zeros(6)
         cloud = self._reader.read_unswept(observation, twist_s)
         if cloud is None:
-            return self._bridge(observation, prediction, can_coast=True)
+            return self._predictor.bridged(observation, prediction, can_coast=self._has_map)
         if len(cloud) < _POINTS_MIN:
-            return self._bridge(observation, prediction, can_coast=False)
+            return self._predictor.bridged(observation, prediction)
         T_local_icp = self._icp.register(cloud, prediction.T_local_base, observation)
         if T_local_icp is None or not np.isfinite(T_local_icp).all():
-            return self._bridge(observation, prediction, can_coast=False)
+            return self._predictor.bridged(observation, prediction)
         overlap_ratio, inliers = self._icp.overlap(T_local_icp)
         if self._has_map and not (
             overlap_ratio >= self.overlap_min_ratio
             and self._is_plausible(observation, prediction, T_local_icp)
             and (overlap_ratio >= _SAME_RATIO or self._is_near(cloud, observation, prediction))
         ):
-            return self._bridge(observation, prediction, can_coast=False, can_begin=True)
+            return self._predictor.bridged(observation, prediction, can_begin=True)
         shape = self._icp.localizability()
-        self._T_local_base = self._fuse(observation, prediction, T_local_icp, shape)
-        self._icp.accept(prediction.T_local_base, self._T_local_base)
+        T_local_base = self._fuse(observation, prediction, T_local_icp, shape)
+        self._icp.accept(prediction.T_local_base, T_local_base)
         self._has_map = True
         is_open = shape.ratios[0] < self.weak_ratio
         status = TrackingStatus.DEGRADED if is_open else TrackingStatus.TRACKING
         return self._predictor.tracking(
-            observation, self._T_local_base, status, quality_ratio=overlap_ratio, inliers=inliers
+            observation, T_local_base, status, quality_ratio=overlap_ratio, inliers=inliers
         )
 
     def get_map(self) -> MapLayers:
@@ -188,22 +186,4 @@ class CloudOdometry(LocalModule, ABC):
         return bool(
             np.linalg.norm(moved[:3, 3]) <= share * self._speed_max_m_s * duration_s + 0.05
             and se3.rotation_angle_rad(moved) <= share * self.turn_max_rad_s * duration_s + 0.05
-        )
-
-    def _bridge(
-        self,
-        observation: Observation,
-        prediction: Prediction,
-        *,
-        can_coast: bool,
-        can_begin: bool = False,
-    ) -> Tracking:
-        """Return the pose by odometry, or shortly by constant velocity, else LOST."""
-        can_coast = can_coast and self._has_map
-        status = self._predictor.bridge(observation, prediction, can_coast=can_coast)
-        is_lost = status is TrackingStatus.LOST
-        kept = self._predictor.T_local_measured if is_lost else prediction.T_local_base
-        self._T_local_base = kept
-        return self._predictor.tracking(
-            observation, self._T_local_base, status, can_begin=can_begin
         )

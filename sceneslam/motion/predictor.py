@@ -39,7 +39,7 @@ class Prediction:
 class Predictor:
     """Propagates a pose and its covariance from one observation to the next.
 
-    For every observation call `predict`, then one of `measure`, `coast`, `lose`, `bridge`.
+    For every observation call `predict`, then `measure`, `coast`, `lose`, `bridge` or `bridged`.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -123,6 +123,20 @@ class Predictor:
             return TrackingStatus.DEGRADED if is_known else TrackingStatus.TRACKING
         self.lose(prediction)
         return TrackingStatus.LOST
+
+    def bridged(
+        self,
+        observation: Observation,
+        prediction: Prediction,
+        *,
+        can_coast: bool = False,
+        can_begin: bool = False,
+    ) -> Tracking:
+        """Continue by `bridge`; return the predicted pose, or the last measured one as LOST."""
+        status = self.bridge(observation, prediction, can_coast=can_coast)
+        is_lost = status is TrackingStatus.LOST
+        T_local_base = self.T_local_measured if is_lost else prediction.T_local_base
+        return self.tracking(observation, T_local_base, status, can_begin=can_begin)
 
     def tracking(
         self,

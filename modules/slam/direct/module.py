@@ -7,7 +7,7 @@ few corners but shading. This module adds checks of the result, and its covarian
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,6 @@ class DirectSlam(LocalModule):
     weak_m: float
     weak_rad: float
     cloud_voxel_m: float
-    _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -77,14 +76,14 @@ class DirectSlam(LocalModule):
         self._key: DirectView | None = None
         self._last: DirectView | None = None
         self._T_local_key = self._T_local_last = se3.identity()  # of cam
-        self._T_local_base = se3.identity()
 
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base (4, 4) [m] at the observation."""
         prediction = self._predictor.predict(observation)
         image, depth_m = observation.image_bgr, observation.depth_m
         if image is None or depth_m is None:
-            return self._bridge(observation, prediction, can_coast=True)
+            can_coast = self._key is not None
+            return self._predictor.bridged(observation, prediction, can_coast=can_coast)
         width, height = self._camera.size_wh
         if image.shape[:2] != (height, width) or depth_m.shape != (height, width):
             raise InputError(
@@ -94,7 +93,7 @@ class DirectSlam(LocalModule):
         view = self._tracker.view(image, depth_m)
         if self._key is None or self._last is None:
             if np.count_nonzero(view.depth_m) < _PIXELS_MIN:
-                return self._bridge(observation, prediction, can_coast=False)
+                return self._predictor.bridged(observation, prediction)
             return self._begin(observation, prediction, view)
         found = self._locate(view)
         if found is not None:
@@ -102,7 +101,7 @@ class DirectSlam(LocalModule):
         if prediction.is_measured:
             return self._begin(observation, prediction, view)
         can_begin = bool(np.count_nonzero(view.depth_m) >= _PIXELS_MIN)
-        return self._bridge(observation, prediction, can_coast=False, can_begin=can_begin)
+        return self._predictor.bridged(observation, prediction, can_begin=can_begin)
 
     def get_map(self) -> MapLayers:
         """Return the keyframes' cloud and their graph, in `local`."""
@@ -131,13 +130,13 @@ class DirectSlam(LocalModule):
         is_first = self._key is None
         is_known = is_first and not self._predictor.is_lost
         self._predictor.coast(prediction)
-        self._T_local_base = prediction.T_local_base
-        self._add_keyframe(observation, view, None)
+        T_local_base = prediction.T_local_base
+        self._add_keyframe(observation, view, T_local_base @ self._camera.T_base_cam, None)
         if is_first:
-            self._predictor.measure(observation, self._T_local_base, prediction.covariance)
+            self._predictor.measure(observation, T_local_base, prediction.covariance)
         status = TrackingStatus.TRACKING if is_known else TrackingStatus.DEGRADED
         return self._predictor.tracking(
-            observation, self._T_local_base, status, quality_ratio=1.0 if is_first else 0.0
+            observation, T_local_base, status, quality_ratio=1.0 if is_first else 0.0
         )
 
     def _hold(
@@ -156,16 +155,16 @@ class DirectSlam(LocalModule):
         T_local_seen = located.T_local_cam @ se3.inverse(T_base_cam)
         off = se3.log(se3.inverse(prediction.T_local_base) @ T_local_seen)
         gain = covariance @ information
-        self._T_local_base = se3.orthonormal(prediction.T_local_base @ se3.exp(gain @ off))
-        self._predictor.measure(observation, self._T_local_base, covariance, information)
-        T_local_cam = self._T_local_base @ T_base_cam
+        T_local_base = se3.orthonormal(prediction.T_local_base @ se3.exp(gain @ off))
+        self._predictor.measure(observation, T_local_base, covariance, information)
+        T_local_cam = T_local_base @ T_base_cam
         T_key_cam = se3.inverse(self._T_local_key) @ T_local_cam
         is_far = (
             np.linalg.norm(T_key_cam[:3, 3]) > self.keyframe_step_m
             or se3.rotation_angle_rad(T_key_cam) > self.keyframe_turn_rad
         )
         if is_far:
-            self._add_keyframe(observation, view, found.information)
+            self._add_keyframe(observation, view, T_local_cam, found.information)
         self._last, self._T_local_last = view, T_local_cam
         limits = np.repeat([self.weak_m, self.weak_rad], 3)
         is_weak = (np.diag(np.linalg.pinv(information, hermitian=True)) > limits**2).any()
@@ -173,34 +172,20 @@ class DirectSlam(LocalModule):
         status = TrackingStatus.DEGRADED if is_weak else TrackingStatus.TRACKING
         return self._predictor.tracking(
             observation,
-            self._T_local_base,
+            T_local_base,
             status,
             quality_ratio=found.matched_ratio,
             inliers=found.matched,
         )
 
     def _add_keyframe(
-        self, observation: Observation, view: DirectView, information: NDArray[np.float64] | None
+        self,
+        observation: Observation,
+        view: DirectView,
+        T_local_cam: se3.Transform,
+        information: NDArray[np.float64] | None,
     ) -> None:
         """Make the view the keyframe; without `information` it has no edge to the last one."""
         self._key = self._last = view
-        self._T_local_key = self._T_local_last = self._T_local_base @ self._camera.T_base_cam
-        self._keyframes.add(observation.stamp_ns, view, self._T_local_key, information)
-
-    def _bridge(
-        self,
-        observation: Observation,
-        prediction: Prediction,
-        *,
-        can_coast: bool,
-        can_begin: bool = False,
-    ) -> Tracking:
-        """Return the pose by odometry, or shortly by constant velocity, else LOST."""
-        can_coast = can_coast and self._key is not None
-        status = self._predictor.bridge(observation, prediction, can_coast=can_coast)
-        is_lost = status is TrackingStatus.LOST
-        kept = self._predictor.T_local_measured if is_lost else prediction.T_local_base
-        self._T_local_base = kept
-        return self._predictor.tracking(
-            observation, self._T_local_base, status, can_begin=can_begin
-        )
+        self._T_local_key = self._T_local_last = T_local_cam
+        self._keyframes.add(observation.stamp_ns, view, T_local_cam, information)
