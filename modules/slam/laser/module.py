@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sceneslam.motion.model import MotionModel
 from sceneslam.scans.depth_scan import DepthScanner
 from sceneslam.scans.lidar_scan import LidarScanner
+from sceneslam.scans.occupancy_grid import scan_layer
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers
@@ -20,7 +21,6 @@ from sceneslam.types.rig import Rig, Sensor
 from ..local import LocalModule
 from .frontend import Estimate, FrontEnd, ScanSettings
 from .keyframes import ScanKeyframes
-from .layers import map_layers
 from .matcher import Matcher
 from .relocalizer import ScanRelocalizer
 from .surface import ScanSurfaceReader
@@ -119,12 +119,14 @@ class LaserSlam(LocalModule):
         """Return the scans of all keyframes, in `local`."""
         if self._front_end is None:
             return MapLayers()
-        return map_layers(
-            self._front_end.keyframes,
-            self._T_base_laser,
+        frames = self._front_end.keyframes.frames
+        scans = scan_layer(
+            [frame.scan for frame in frames],
+            [to_transform(frame.T_local_base) @ self._T_base_laser for frame in frames],
             cell_m=self.resolution_m,
             range_max_m=self.range_max_m,
         )
+        return MapLayers(scans=scans)
 
     def shutdown(self) -> None:
         """Free the depth tables; the map stays."""
