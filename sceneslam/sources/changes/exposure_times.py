@@ -14,7 +14,6 @@ from sceneslam.sources.changes.wrapped import Wrapped
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.input_files import given_path, read_text
 from sceneslam.types.observation import Observation
-from sceneslam.types.truth import GroundTruth
 
 _COLUMNS = "`stamp_s exposure_s` or `stamp_s exposure_s gain`, the stamps rising, the rest above 0"
 
@@ -42,10 +41,6 @@ class ExposureTimes(Wrapped):
                 yield observation
             else:
                 yield replace(observation, exposure_ratio=self._ratio(observation.stamp_ns * 1e-9))
-
-    def ground_truth(self) -> GroundTruth | None:
-        """Return the source's truth."""
-        return self._source.ground_truth()
 
     def _ratio(self, stamp_s: float) -> float:
         return float(self._ratios[int(np.argmin(np.abs(self._stamps_s - stamp_s)))])

@@ -16,7 +16,6 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.ranges import check_least
 from sceneslam.types.rig import Sensor
 from sceneslam.types.se3 import Transform
-from sceneslam.types.truth import GroundTruth
 
 SENSORS = tuple(sensor.field for sensor in Sensor)
 FAULTS = ("dropout", "blackout", "nan", "clock", "duplicate", "disorder", "reset")
@@ -80,10 +79,6 @@ class FaultySource(Wrapped):
                 late = None
         if late is not None:
             yield late
-
-    def ground_truth(self) -> GroundTruth | None:
-        """Return the source's ground truth."""
-        return self._source.ground_truth()
 
     def _silenced(
         self, fault: str | None, observation: Observation, rng: np.random.Generator

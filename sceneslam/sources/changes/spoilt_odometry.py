@@ -17,7 +17,6 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.ranges import check_above, check_among, check_least
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
-from sceneslam.types.truth import GroundTruth
 
 LASTING = ("reversed", "frozen", "slipping")  # for some seconds, repeatedly
 ALWAYS = ("scaled", "turning", "late", "absent")
@@ -98,10 +97,6 @@ class SpoiltOdometry(Wrapped):
                 yield replace(observation, T_odom_base=locked(T_odom_base @ off))
             else:
                 yield replace(observation, T_odom_base=locked(T_spoilt))
-
-    def ground_truth(self) -> GroundTruth | None:
-        """Return the source's ground truth."""
-        return self._source.ground_truth()
 
     def _motion(self, T_prev_curr: Transform, *, is_lying: bool) -> Transform:
         """Return the reported motion for a true one T_prev_curr (4, 4) [m]."""

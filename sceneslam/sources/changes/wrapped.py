@@ -11,10 +11,11 @@ from sceneslam.interfaces import Live, LiveFeed, Logged, Source
 from sceneslam.sources.spanned import Spanned, TimeSpan
 from sceneslam.sources.survey.survey import Survey, Surveyed
 from sceneslam.types.rig import Rig
+from sceneslam.types.truth import GroundTruth
 
 
 class Wrapped:
-    """Passes on rig, length, faults, live feed, time span and logged stamps of its source."""
+    """Passes on everything of its source but the observations."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
@@ -43,6 +44,10 @@ class Wrapped:
     def span(self) -> TimeSpan | None:
         """Return the source's time span, None if unknown."""
         return self._source.span if isinstance(self._source, Spanned) else None
+
+    def ground_truth(self) -> GroundTruth | None:
+        """Return the source's ground truth, None if unknown."""
+        return self._source.ground_truth()
 
     def survey(self) -> Survey | None:
         """Return the source's survey, None if unknown; effects are not included."""

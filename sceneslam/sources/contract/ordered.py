@@ -16,7 +16,6 @@ from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
 from sceneslam.types.trajectory import STAMP_MAX_NS
-from sceneslam.types.truth import GroundTruth
 
 _LOG = logging.getLogger(__name__)
 _PERIODS = 4  # one or two frames lost in a row are common
@@ -77,10 +76,6 @@ class Ordered(Wrapped):
             self._note_gap(last_ns, mended)
             yield mended
         self._tell_of_rests()
-
-    def ground_truth(self) -> GroundTruth | None:
-        """Return the source's ground truth."""
-        return self._source.ground_truth()
 
     def _mended(self, observation: Observation) -> Observation:
         mended = self._odometer.smooth(cleaned(observation, self._log), self._log)

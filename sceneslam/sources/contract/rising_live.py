@@ -14,7 +14,6 @@ from sceneslam.sources.contract.odometer import Odometer
 from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.types.observation import Observation
 from sceneslam.types.run import Event
-from sceneslam.types.truth import GroundTruth
 
 
 class RisingLive(Wrapped):
@@ -51,10 +50,6 @@ class RisingLive(Wrapped):
                 T_smooth_odom = odometer.T_smooth_odom.ravel().tolist()
                 self._tell("odometry_jump", stamp_ns, T_smooth_odom=T_smooth_odom)
             yield mended
-
-    def ground_truth(self) -> GroundTruth | None:
-        """Return the source's ground truth."""
-        return self._source.ground_truth()
 
     def measured_ns(self, observation: Observation) -> int:
         """Return the time [ns] at which an observation was measured, on the monotonic clock."""
