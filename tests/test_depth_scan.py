@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneslam.scans.depth_scan import DepthScanner, scan_frame, scan_from_depth
+from sceneslam.scans.depth_scan import DepthScanner, scan_frame
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.rig import Camera, optical_to_rep103
@@ -43,6 +43,12 @@ def depth_of_floor(camera):
     with np.errstate(divide="ignore"):
         depth = -camera.T_base_cam[2, 3] / rays_base(camera)[..., 2]
     return np.where((depth > 0) & (depth < 50), depth, 0).astype(np.float32)
+
+
+def scan_from_depth(depth_m, camera, *, stamp_ns, height_min_m=None, height_max_m=None):
+    band = {"height_min_m": height_min_m, "height_max_m": height_max_m}
+    scanner = DepthScanner(camera, beams=180, stride_px=2, **band)
+    return scanner.scan(depth_m, stamp_ns=stamp_ns)
 
 
 def points_base(scan, T_base_laser):

@@ -34,27 +34,6 @@ def scan_frame(camera: Camera) -> se3.Transform:
     return se3.from_xy_yaw(x_m, y_m, float(np.arctan2(axis[1], axis[0])))
 
 
-def scan_from_depth(
-    depth_m: NDArray[np.float32],
-    camera: Camera,
-    *,
-    stamp_ns: int,
-    height_min_m: float | None = None,
-    height_max_m: float | None = None,
-    beams: int = 180,
-    stride_px: int = 2,
-) -> LaserScan:
-    """Return the scan of one depth image (H, W) [m]; for several images, keep a DepthScanner."""
-    scanner = DepthScanner(
-        camera,
-        height_min_m=height_min_m,
-        height_max_m=height_max_m,
-        beams=beams,
-        stride_px=stride_px,
-    )
-    return scanner.scan(depth_m, stamp_ns=stamp_ns)
-
-
 class DepthScanner:
     """Converts one camera's depth images to scans: the nearest return per beam within a band."""
 
