@@ -45,10 +45,8 @@ def depth_of_floor(camera):
     return np.where((depth > 0) & (depth < 50), depth, 0).astype(np.float32)
 
 
-def scan_from_depth(depth_m, camera, *, stamp_ns, height_min_m=None, height_max_m=None):
-    band = {"height_min_m": height_min_m, "height_max_m": height_max_m}
-    scanner = DepthScanner(camera, beams=180, stride_px=2, **band)
-    return scanner.scan(depth_m, stamp_ns=stamp_ns)
+def scan_from_depth(depth_m, camera, *, stamp_ns, **band):
+    return DepthScanner(camera, beams=180, stride_px=2, **band).scan(depth_m, stamp_ns=stamp_ns)
 
 
 def points_base(scan, T_base_laser):
@@ -171,9 +169,9 @@ def test_wrong_arguments_are_named():
     with pytest.raises(ConfigError, match="height_max_m"):
         DepthScanner(camera, height_min_m=1.0, height_max_m=0.5, beams=90, stride_px=2)
     with pytest.raises(ConfigError, match="beams"):
-        DepthScanner(camera, height_min_m=None, height_max_m=None, beams=1, stride_px=2)
+        DepthScanner(camera, beams=1, stride_px=2)
     with pytest.raises(ConfigError, match="stride_px"):
-        DepthScanner(camera, height_min_m=None, height_max_m=None, beams=90, stride_px=0)
+        DepthScanner(camera, beams=90, stride_px=0)
     with pytest.raises(ConfigError, match="height_min_m"):
         DepthScanner(camera, height_min_m=50.0, height_max_m=60.0, beams=90, stride_px=2)
     with pytest.raises(InputError, match=r"expected \(480, 640\), got \(240, 320\)"):

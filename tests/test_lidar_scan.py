@@ -11,8 +11,7 @@ from sceneslam.types.rig import Lidar
 
 def scanner_at(T_base_lidar, **band):
     lidar = Lidar(range_m=(1.0, 60.0), T_base_lidar=T_base_lidar)
-    values = {"height_min_m": None, "height_max_m": None, "beams": 360, **band}
-    return LidarScanner(lidar, **values)
+    return LidarScanner(lidar, **{"beams": 360, **band})
 
 
 def room_lidar(T_base_lidar):

@@ -11,7 +11,7 @@ from sceneslam.scans.occupancy_grid import OccupancyGrid
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import HybridMap, PointLayer
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Camera, Rig
+from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform, apply
 
 _KEY_BITS = 21  # of a voxel's index along each axis
@@ -34,7 +34,9 @@ class GridAndPoints:
         self._rig, self._grid = rig, OccupancyGrid(self._resolution_m)
         self._keys = np.zeros(0, np.int64)  # of the voxels with a point, sorted
         self._points, self._colors = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-        self._scanner = None if rig.camera is None else _scanner(rig.camera)
+        self._scanner: DepthScanner | None = None
+        if rig.camera is not None:  # with the paper's range of heights
+            self._scanner = DepthScanner(rig.camera, beams=180, stride_px=2)
 
     def add(self, observation: Observation, T_map_base: Transform) -> None:
         """Add an observation at T_map_base (4, 4) [m]."""
@@ -85,8 +87,3 @@ class GridAndPoints:
         self._keys = np.union1d(self._keys, keys[is_new])
         self._points = np.concatenate([self._points, points[first[is_new]]])
         self._colors = np.concatenate([self._colors, colors[first[is_new]]])
-
-
-def _scanner(camera: Camera) -> DepthScanner:
-    """Return the converter of depth to scans, with the paper's range of heights."""
-    return DepthScanner(camera, height_min_m=None, height_max_m=None, beams=180, stride_px=2)

@@ -41,8 +41,8 @@ class DepthScanner:
         self,
         camera: Camera,
         *,
-        height_min_m: float | None,
-        height_max_m: float | None,
+        height_min_m: float | None = None,
+        height_max_m: float | None = None,
         beams: int,
         stride_px: int,
     ) -> None:

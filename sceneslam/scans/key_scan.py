@@ -42,19 +42,11 @@ class KeyScanner:
             self._laser = None
         self._lidar: LidarScanner | None = None
         if rig.lidar is not None:
-            self._lidar = LidarScanner(
-                rig.lidar, height_min_m=None, height_max_m=None, beams=_BEAMS
-            )
+            self._lidar = LidarScanner(rig.lidar, beams=_BEAMS)
         self._depth: DepthScanner | None = None
         if rig.camera is not None:
             try:
-                self._depth = DepthScanner(
-                    rig.camera,
-                    height_min_m=None,
-                    height_max_m=None,
-                    beams=_DEPTH_BEAMS,
-                    stride_px=_STRIDE_PX,
-                )
+                self._depth = DepthScanner(rig.camera, beams=_DEPTH_BEAMS, stride_px=_STRIDE_PX)
             except ConfigError:  # it sees only the floor or the ceiling
                 self._depth = None
 

@@ -24,8 +24,8 @@ class LidarScanner:
         self,
         lidar: Lidar,
         *,
-        height_min_m: float | None,
-        height_max_m: float | None,
+        height_min_m: float | None = None,
+        height_max_m: float | None = None,
         beams: int,
     ) -> None:
         """Compute the frame of the scans.
