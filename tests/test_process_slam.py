@@ -294,9 +294,9 @@ def test_a_program_that_is_killed_is_replaced_by_the_fallback_and_comes_back(sta
 
     def feed(index):
         if index == 30:
-            os.kill(module._program._popen.pid, signal.SIGKILL)
+            os.kill(module._running._popen.pid, signal.SIGKILL)
         while index == 40 and not module.is_ready:  # a recording does not wait for a start
-            starting = [module._program._stdout] if module._program else []
+            starting = [module._running._stdout] if module._running else []
             select.select(starting, [], [], 1.0 if starting else 0.01)
         return observation(index)
 

@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 _DYING_S = 0.5  # if it dies within this time after a request, it was probably dead before
 
 
-class IsolatedModule(Restarted):
+class IsolatedModule(Restarted[Process]):
     """Implements `SlamModule`, `Restartable` and `Concurrent`; `make` builds the module.
 
     The end of the process ends the session: the call raises ModuleError with the reason, a new
@@ -40,7 +40,6 @@ class IsolatedModule(Restarted):
         self._name, self._make = name, make
         self._requires: tuple[frozenset[Sensor], ...] | None = None
         self._closes_loops = False
-        self._process: Process | None = None
         self._start()
 
     @property
@@ -61,7 +60,7 @@ class IsolatedModule(Restarted):
     def activate(self, rig: Rig) -> None:
         """Start a session, in a new process if the last one died; may wait for a restart."""
         self._bury()
-        was_idle, asked_s = self._process is not None and self._is_greeted, monotonic()
+        was_idle, asked_s = self._running is not None and self._is_greeted, monotonic()
         try:
             self._begin(rig)
         except ProcessDeathError:
@@ -107,28 +106,24 @@ class IsolatedModule(Restarted):
 
     def close(self) -> None:
         """End the process. May be called twice."""
-        if self._process is not None:
-            self._process.end()
-        self._process, self._is_active = None, False
+        if self._running is not None:
+            self._running.end()
+        self._running, self._is_active = None, False
 
     def _begin(self, rig: Rig) -> None:
         self._restarts.await_start()
-        if self._process is None:
+        if self._running is None:
             self._start()
         self._await_built()
         self._is_active = True
         self._call(self._limits.start_deadline_s, "activate", rig)
 
-    @property
-    def _running(self) -> Process | None:
-        return self._process
-
     def _start(self) -> None:
         """Start a process that builds the module, without waiting."""
         self._is_greeted = self._is_active = False
-        self._process = Process(self._limits)
+        self._running = Process(self._limits)
         level = logging.getLogger().getEffectiveLevel()
-        self._process.submit("build", self._make, level, self._limits.memory_limit_mb)
+        self._running.submit("build", self._make, level, self._limits.memory_limit_mb)
 
     def _await_built(self) -> None:
         if not self._is_greeted:
@@ -141,33 +136,33 @@ class IsolatedModule(Restarted):
         return self._answer(deadline_s)
 
     def _ask(self, method: str, *arguments: object) -> None:
-        if self._process is None or not self._is_active:
+        if self._running is None or not self._is_active:
             raise ModuleError(f"{method}: its process ended, and the session with it")
         try:
-            self._process.submit(method, *arguments)
+            self._running.submit(method, *arguments)
         except ProcessDeathError:
             self._replace()
             raise
 
     def _answer(self, deadline_s: float) -> Any:
-        if self._process is None:
+        if self._running is None:
             raise ModuleError("its process ended")
         try:
-            return self._process.collect(deadline_s)
+            return self._running.collect(deadline_s)
         except ProcessDeathError:
             self._replace()
             raise
 
     def _bury(self) -> None:
         """Detect a process that died while it was idle."""
-        if self._process is not None and not self._process.is_alive:
+        if self._running is not None and not self._running.is_alive:
             _log.warning("%s: its process died while it was idle", self._name)
-            self._process.end()
+            self._running.end()
             self.note_failure()
             self._replace()
 
     def _replace(self) -> None:
         """Start the next process if a restart is allowed; it builds the module in parallel."""
-        self._process, self._is_active, self._is_greeted = None, False, False
+        self._running, self._is_active, self._is_greeted = None, False, False
         if self._restarts.wait_s(monotonic()) == 0 and self._requires is not None:
             self._start()

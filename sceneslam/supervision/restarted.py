@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from time import monotonic
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 from sceneslam.supervision.limits import Limits, Restarts
 
@@ -22,11 +22,15 @@ class Running(Protocol):
         ...
 
 
-class Restarted(ABC):
+P = TypeVar("P", bound=Running)
+
+
+class Restarted(ABC, Generic[P]):
     """Restarts its process, with delays and up to a limit."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits, self._restarts = limits, Restarts(limits)
+        self._running: P | None = None  # None: not started yet, or ended
         self._is_active = False  # a session is running in the process
         self._is_greeted = False  # the first request has been answered
 
@@ -49,11 +53,6 @@ class Restarted(ABC):
         """Record that a session failed; the delay before the next one grows."""
         if not self.is_spent:  # else the session was refused, which is not a failure
             self._restarts.note_failure(monotonic())
-
-    @property
-    @abstractmethod
-    def _running(self) -> Running | None:
-        """Return the process, None before the first start."""
 
     @abstractmethod
     def _start(self) -> None:

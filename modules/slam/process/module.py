@@ -27,7 +27,7 @@ from .protocol import Fields, ProtocolError, text
 Value = TypeVar("Value")
 
 
-class ProcessSlam(LocalModule, Restarted):
+class ProcessSlam(LocalModule, Restarted[Program]):
     """Implements `SlamModule`, `Restartable` and `Concurrent` by one run of a program per session.
 
     Any error of the program ends it, and the call raises ModuleError with one sentence. The next
@@ -51,7 +51,6 @@ class ProcessSlam(LocalModule, Restarted):
         self.closes_loops = closes_loops
         self._command, self._late_max_s = command, late_max_s
         self._requires: tuple[frozenset[Sensor], ...] | None = None
-        self._program: Program | None = None
         self._pipeline = Pipeline(late_max_s)
         self._revision = 0
         self._observation: Observation | None = None  # submitted, and not yet collected
@@ -81,7 +80,7 @@ class ProcessSlam(LocalModule, Restarted):
         if self._is_active:
             self._close()
         self._restarts.await_start()
-        if self._program is None:
+        if self._running is None:
             self._start()
         self._greet()
         self._pipeline, self._revision = Pipeline(self._late_max_s), 0
@@ -131,22 +130,18 @@ class ProcessSlam(LocalModule, Restarted):
         if not self._is_active:
             return
         try:
-            if self._program is not None:
+            if self._running is not None:
                 self.get_map()
         finally:
             self._close()
         if self._restarts.wait_s(monotonic()) == 0:
             self._start()
 
-    @property
-    def _running(self) -> Program | None:
-        return self._program
-
     def _start(self) -> None:
         """Start the program and send the first request, without waiting."""
         self._is_greeted = self._is_active = False
-        self._program = Program(self._command, self._limits)
-        self._program.send("hello", {}, self._limits.start_deadline_s)
+        self._running = Program(self._command, self._limits)
+        self._running.send("hello", {}, self._limits.start_deadline_s)
 
     def _greet(self) -> None:
         if not self._is_greeted:
@@ -159,23 +154,23 @@ class ProcessSlam(LocalModule, Restarted):
 
     def _bury(self) -> None:
         """Detect a program that ended while it was idle."""
-        if self._program is not None and not self._program.is_alive:
+        if self._running is not None and not self._running.is_alive:
             self.note_failure()
 
     def _close(self) -> None:
-        if self._program is not None:
-            self._program.end()
-        self._program, self._is_active, self._is_greeted = None, False, False
+        if self._running is not None:
+            self._running.end()
+        self._running, self._is_active, self._is_greeted = None, False, False
 
     def _kill(self) -> None:
-        if self._program is not None:
-            self._program.refuse("failed")
+        if self._running is not None:
+            self._running.refuse("failed")
         self._close()
 
     def _own_program(self) -> Program:
-        if self._program is None:
+        if self._running is None:
             raise ModuleError("the program ended, and the session with it")
-        return self._program
+        return self._running
 
     def _session(self) -> Program:
         if not self._is_active:
