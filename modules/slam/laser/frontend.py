@@ -22,7 +22,6 @@ from sceneslam.types.planar import (
     to_transform,
     turn,
 )
-from sceneslam.types.se3 import Transform
 
 from .doubt import Doubt
 from .field import LikelihoodField
@@ -60,8 +59,6 @@ class ScanSettings:
     beams_min: int
     inlier_min_ratio: float
     predict_max_s: float
-    range_max_m: float
-    T_base_laser: Transform
 
 
 @dataclass(slots=True)
@@ -288,7 +285,7 @@ class FrontEnd:
         self._field = LikelihoodField(
             self.keyframes.latest(),
             self.settings.resolution_m,
-            self.keyframes.free(self.settings.T_base_laser, self.settings.range_max_m),
+            self.keyframes.free(self.reader.T_base_laser, self.reader.range_max_m),
         )
 
 

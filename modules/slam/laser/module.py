@@ -168,29 +168,23 @@ class LaserSlam(LocalModule):
             degeneracy_ratio=self.degeneracy_ratio,
             shift_m=self.depth_shift_m if from_depth else 0.0,
         )
+        reader = ScanSurfaceReader(
+            T_base_laser=self._T_base_laser,
+            range_max_m=self.range_max_m,
+            noise_m=self.depth_noise_m if from_depth else self.laser_noise_m,
+            noise_per_m=self.depth_noise_per_m if from_depth else 0.0,
+        )
         return FrontEnd(
             settings=ScanSettings(
                 resolution_m=self.resolution_m,
                 beams_min=self.beams_min,
                 inlier_min_ratio=self.inlier_min_ratio,
                 predict_max_s=self.predict_max_s,
-                range_max_m=self.range_max_m,
-                T_base_laser=self._T_base_laser,
             ),
             matcher=matcher,
-            relocalizer=ScanRelocalizer(
-                matcher=matcher,
-                range_max_m=self.range_max_m,
-                resolution_m=self.resolution_m,
-                T_base_laser=self._T_base_laser,
-            ),
+            relocalizer=ScanRelocalizer(matcher=matcher, reader=reader),
             motion=MotionModel(rig),
-            reader=ScanSurfaceReader(
-                T_base_laser=self._T_base_laser,
-                range_max_m=self.range_max_m,
-                noise_m=self.depth_noise_m if from_depth else self.laser_noise_m,
-                noise_per_m=self.depth_noise_per_m if from_depth else 0.0,
-            ),
+            reader=reader,
             keyframes=ScanKeyframes(
                 keyframe_distance_m=self.keyframe_distance_m,
                 keyframe_angle_rad=self.keyframe_angle_rad,

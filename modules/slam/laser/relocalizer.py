@@ -8,13 +8,12 @@ import numpy as np
 
 from sceneslam.types.observation import LaserScan
 from sceneslam.types.planar import Planar
-from sceneslam.types.se3 import Transform
 
 from .field import LikelihoodField
 from .free_space import FreeSpace
 from .matcher import Match, Matcher
 from .prior import MotionPrior, difference
-from .surface import SurfacePoints
+from .surface import ScanSurfaceReader, SurfacePoints
 from .wide_search import Found, WideSearch
 
 _WINDOW_M, _WINDOW_RAD, _SCORE_MIN = 3.0, 0.8, 0.5
@@ -35,9 +34,7 @@ class ScanRelocalizer:
     """Searches the field of the latest submaps for a scan."""
 
     matcher: Matcher
-    range_max_m: float
-    resolution_m: float
-    T_base_laser: Transform
+    reader: ScanSurfaceReader
 
     def near(
         self, surfaces: SurfacePoints, field: LikelihoodField, predicted: Planar, turned_rad: float
@@ -85,8 +82,8 @@ class ScanRelocalizer:
     ) -> bool:
         """Tell whether scan or map has surfaces where the other saw through."""
         there = surfaces.moved(pose)
-        seen = FreeSpace([scan], [pose], self.T_base_laser, self.range_max_m)
-        view = LikelihoodField(there, self.resolution_m, seen)
+        seen = FreeSpace([scan], [pose], self.reader.T_base_laser, self.reader.range_max_m)
+        view = LikelihoodField(there, field.resolution_m, seen)
         ours, theirs = field.refuted_ratio(there.points), view.refuted_ratio(field.points)
         return ours > _OURS_RATIO or theirs > _THEIRS_RATIO
 
