@@ -69,7 +69,7 @@ def test_points_that_err_together_count_as_few():
     bent_m = clean_m + 0.02 * (np.arange(clean_m.shape[1]) > clean_m.shape[1] / 2) * (clean_m > 0)
     found = []
     for image_m in (depth_image(ROOM, np.eye(4), seed=1), np.asarray(bent_m, np.float32)):
-        known = SurfaceKeyframe(reader.read(clean_m), T, stamp_ns=0)
+        known = SurfaceKeyframe(reader.read(clean_m), T)
         samples = samples_of(reader.read(image_m), reader.grid)
         prior = CameraPrior(T, np.eye(6))
         found.append(register(samples, prior, [known], reader.grid, weak_ratio=0.005))
@@ -209,8 +209,8 @@ def test_a_view_is_found_again_by_three_keyframes_if_they_show_its_larger_part(
     known_m, image_m = (depth_image(ROOM, np.eye(4), seed=seed) for seed in (0, 1))
     known_m[:, round(known_ratio * CAMERA.size_wh[0]) :] = 0.0
     keyframes = KeyframeMap(reader.grid)
-    for stamp_ns in range(3):
-        keyframes.add(reader.read(known_m), CAMERA.T_base_cam, stamp_ns=stamp_ns)
+    for _ in range(3):
+        keyframes.add(reader.read(known_m), CAMERA.T_base_cam)
     image = reader.read(image_m)
     localizer = DepthLocalizer(keyframes, matched_min_ratio=0.4, weak_ratio=0.005)
     vague = CameraPrior(CAMERA.T_base_cam, np.eye(6))
@@ -370,9 +370,9 @@ def test_a_registration_that_hardly_measures_a_direction_leaves_it_to_tracking(
 
     monkeypatch.setattr("sceneslam.modules.slam.depth.pose_graph.register", beside)
     tracked = [CAMERA.T_base_cam, se3.from_xy_yaw(0.0, 0.2, 0.0) @ CAMERA.T_base_cam]
-    for stamp_ns, T_local_cam in enumerate(tracked):
+    for T_local_cam in tracked:
         known = np.diag([0.2**2 if is_guessed else 1e-6, *[1e-6] * 5])
-        graph.connect(keyframes.add(surface, T_local_cam, stamp_ns=stamp_ns), known)
+        graph.connect(keyframes.add(surface, T_local_cam), known)
     graph.finish()
     moved = se3.inverse(tracked[1]) @ keyframes[1].T_local_cam
     low, high = (0.04, 0.05) if is_guessed else (0.0, 0.005)

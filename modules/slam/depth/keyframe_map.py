@@ -41,9 +41,9 @@ class KeyframeMap:
     def __getitem__(self, index: int) -> SurfaceKeyframe:
         return self.keyframes[index]
 
-    def add(self, surface: Surface, T_local_cam: se3.Transform, *, stamp_ns: int) -> int:
+    def add(self, surface: Surface, T_local_cam: se3.Transform) -> int:
         """Add a keyframe at T_local_cam (4, 4) [m]; return its index."""
-        self.keyframes.append(SurfaceKeyframe(surface, T_local_cam, stamp_ns=stamp_ns))
+        self.keyframes.append(SurfaceKeyframe(surface, T_local_cam))
         return len(self.keyframes) - 1
 
     def overlaps(self, samples: Samples, T_local_cam: se3.Transform) -> Sequence[Overlap]:

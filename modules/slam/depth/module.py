@@ -109,7 +109,7 @@ class DepthSlam(LocalModule):
     ) -> Tracking:
         """Make the first keyframe of the session, or after tracking was lost."""
         T_local_cam = prediction.T_local_base @ self._camera.T_base_cam
-        self._add_keyframe(observation, surface, T_local_cam, prediction.covariance)
+        self._add_keyframe(surface, T_local_cam, prediction.covariance)
         is_first = len(self._map) == 1 and not self._predictor.is_lost
         self._T_local_base = prediction.T_local_base
         self._predictor.measure(observation, self._T_local_base, prediction.covariance)
@@ -152,23 +152,17 @@ class DepthSlam(LocalModule):
             information=back.T @ found.information @ back,
         )
         weak = found.localizability.weak_twists(self.weak_ratio)
-        self._extend(observation, surface, samples, found.T_local_cam)
+        self._extend(surface, samples, found.T_local_cam)
         status = TrackingStatus.DEGRADED if len(weak) else TrackingStatus.TRACKING
         return self._answer(observation, status, found.matched_ratio, found.matched)
 
-    def _extend(
-        self,
-        observation: Observation,
-        surface: Surface,
-        samples: Samples,
-        T_local_cam: se3.Transform,
-    ) -> None:
+    def _extend(self, surface: Surface, samples: Samples, T_local_cam: se3.Transform) -> None:
         """Add the image to the map: as a new keyframe, or fused into an existing one."""
         overlaps = self._map.overlaps(samples, T_local_cam)
         best = overlaps[0]
         self._reference = best.index
         if best.ratio < self.keyframe_overlap_ratio:
-            self._add_keyframe(observation, surface, T_local_cam, self._predictor.covariance)
+            self._add_keyframe(surface, T_local_cam, self._predictor.covariance)
             return
         self._map[best.index].fuse(surface, T_local_cam, self._map.grid)
         if self._graph.advance():
@@ -180,14 +174,10 @@ class DepthSlam(LocalModule):
             self._revision += 1
 
     def _add_keyframe(
-        self,
-        observation: Observation,
-        surface: Surface,
-        T_local_cam: se3.Transform,
-        covariance: Doubles,
+        self, surface: Surface, T_local_cam: se3.Transform, covariance: Doubles
     ) -> None:
         """Add a keyframe at a pose with its covariance (6, 6), in base."""
-        self._reference = self._map.add(surface, T_local_cam, stamp_ns=observation.stamp_ns)
+        self._reference = self._map.add(surface, T_local_cam)
         in_cam = se3.carried(covariance, se3.inverse(self._camera.T_base_cam))
         self._graph.connect(self._reference, in_cam)
 

@@ -17,8 +17,7 @@ _COUNT_MAX = 50.0  # largest number of images in a plane's mean
 class SurfaceKeyframe:
     """A surface at a pose in `local`, which the pose graph may move."""
 
-    def __init__(self, surface: Surface, T_local_cam: se3.Transform, *, stamp_ns: int) -> None:
-        self.stamp_ns = stamp_ns
+    def __init__(self, surface: Surface, T_local_cam: se3.Transform) -> None:
         self.planes = surface.planes.copy()  # (N, 4), cam: see Surface
         self.noise_per_m = surface.noise_per_m
         self._disparity = surface.disparity.copy()

@@ -120,7 +120,7 @@ class DepthConstraints:
     def look(self, keyframe_id: int, depth_m: NDArray[np.float32]) -> None:
         """Add a keyframe's depth image (H, W) [m]."""
         surface = self._reader.read(depth_m)
-        self._views[keyframe_id] = SurfaceKeyframe(surface, se3.identity(), stamp_ns=0)
+        self._views[keyframe_id] = SurfaceKeyframe(surface, se3.identity())
         self._samples[keyframe_id] = samples_of(surface, self._reader.grid)
         for oldest in list(self._views)[:-_KEPT]:
             del self._views[oldest], self._samples[oldest]
