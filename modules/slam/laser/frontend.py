@@ -128,7 +128,7 @@ class FrontEnd:
             if again is not None and (not believed or _is_better(again, match)):
                 match = again
         if not self._believes(match):
-            return self._distrust(observation, predicted, motion, match, scan, surfaces)
+            return self._distrust(predicted, motion, match, scan, surfaces)
         if self._is_lost or (is_known and not match.weighs_sources):
             self.motion.skip()  # a jump, also where the wheels missed it, tells no velocity
             self.motion.slow_down()
@@ -232,7 +232,6 @@ class FrontEnd:
 
     def _distrust(
         self,
-        observation: Observation,
         predicted: Planar,
         motion: Motion,
         match: Match,
@@ -249,7 +248,10 @@ class FrontEnd:
             self._failures = 0
         return self._guess(predicted, TrackingStatus.DEGRADED)
 
-    def _guess(self, predicted: Planar, status: TrackingStatus) -> Estimate:
+    def _guess(
+        self, predicted: Planar, status: TrackingStatus, *, can_begin: bool = False
+    ) -> Estimate:
+        """Continue from a pose that was not measured."""
         self._pose = predicted
         return Estimate(
             T_local_base=predicted,
@@ -258,26 +260,19 @@ class FrontEnd:
             status=status,
             quality_ratio=0.0,
             inliers=0,
+            can_begin=can_begin,
         )
 
     def _lose(self, *, can_begin: bool) -> Estimate:
         """Stay at the last tracked pose; the robot may be anywhere that it can have come to."""
-        self._pose, self._is_lost = self._held_pose, True
+        self._is_lost = True
         lost_s = 0.0
         if self._stamp_ns is not None and self._held_ns is not None:
             lost_s = (self._stamp_ns - self._held_ns) * 1e-9
         moved = (UNKNOWN_VELOCITY * lost_s)[[0, 0, 1]]
         self._covariance = np.diag(moved**2) + self._held_covariance
         self.motion.stop()
-        return Estimate(
-            T_local_base=self._held_pose,
-            covariance=self._covariance,
-            map_covariance=self._doubt.covariance(self._held_pose),
-            status=TrackingStatus.LOST,
-            quality_ratio=0.0,
-            inliers=0,
-            can_begin=can_begin,
-        )
+        return self._guess(self._held_pose, TrackingStatus.LOST, can_begin=can_begin)
 
     def _extend(self, T_local_base: Planar, scan: LaserScan, surfaces: SurfacePoints) -> None:
         """Make the scan a keyframe."""
