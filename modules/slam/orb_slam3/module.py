@@ -8,23 +8,12 @@ process, and both processes exchange only messages of the protocol.
 from __future__ import annotations
 
 import importlib.util
-import json
-import sys
 from pathlib import Path
 
 from sceneslam.supervision.limits import Limits
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.run import Command
 
-from ..process.module import ProcessSlam
-
-# The path is set after start-up: files in the user's folder must not shadow standard modules.
-_MAIN = """
-import json, sys
-settings, *sys.path = sys.argv[1:]
-from sceneslam.modules.slam.orb_slam3.worker import main
-main(json.loads(settings))
-"""
+from ..process.module import ProcessSlam, python_command
 
 
 class OrbSlam3(ProcessSlam):
@@ -52,6 +41,5 @@ class OrbSlam3(ProcessSlam):
             "features": feature_count,
             "fast": fast_threshold,
         }
-        arguments = ["-P", "-c", _MAIN, json.dumps(settings), *sys.path]
-        command = Command([sys.executable, *arguments])
+        command = python_command("sceneslam.modules.slam.orb_slam3.worker", settings)
         super().__init__(command=command, late_max_s=late_max_s, limits=limits, closes_loops=True)

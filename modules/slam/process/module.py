@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import shutil
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping
 from time import monotonic
 from typing import Any, TypeVar
 
@@ -25,6 +27,19 @@ from .program import Program
 from .protocol import Fields, ProtocolError, text
 
 Value = TypeVar("Value")
+# The path is set after start-up: files in the user's folder must not shadow standard modules.
+_MAIN = """
+import json, sys
+settings, *sys.path = sys.argv[1:]
+from {module} import main
+main(json.loads(settings))
+"""
+
+
+def python_command(module: str, settings: Mapping[str, object]) -> Command:
+    """Return the command that calls `main(settings)` of a Python module, in another process."""
+    main = _MAIN.format(module=module)
+    return Command([sys.executable, "-P", "-c", main, json.dumps(settings), *sys.path])
 
 
 class ProcessSlam(LocalModule, Restarted[Program]):

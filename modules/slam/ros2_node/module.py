@@ -7,9 +7,7 @@ DDS on the other. Deadlines, restarts and late poses are handled by `process`.
 from __future__ import annotations
 
 import importlib.util
-import json
 import shutil
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
@@ -21,17 +19,10 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import Command
 
-from ..process.module import ProcessSlam
+from ..process.module import ProcessSlam, python_command
 
 POSES = ("odometry", "pose", "tf")
 MAPS = ("grid", "points")
-# The path is set after start-up: files in the user's folder must not shadow standard modules.
-_MAIN = """
-import json, sys
-settings, *sys.path = sys.argv[1:]
-from sceneslam.modules.slam.ros2_node.client import main
-main(json.loads(settings))
-"""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -108,9 +99,7 @@ class Ros2Node(ProcessSlam):
             "deviation_max_m": deviation_max_m,
             "network": asdict(network),
         }
-        bridge = Command(
-            [sys.executable, "-P", "-c", _MAIN, json.dumps(settings), *sys.path],
-        )
+        bridge = python_command("sceneslam.modules.slam.ros2_node.client", settings)
         super().__init__(
             command=bridge, late_max_s=late_max_s, limits=limits, closes_loops=closes_loops
         )
