@@ -50,11 +50,7 @@ class FaultyModule:
         self._module, self._jump_m = module, jump_m
         self._lasting_ns = round(lasting_s * 1e9)
         self._plan = FaultPlan(
-            kinds=tuple(faults),
-            known=FAULTS,
-            rate_ratio=rate_ratio,
-            seed=seed,
-            record=Path(record),
+            kinds=faults, known=FAULTS, rate_ratio=rate_ratio, seed=seed, record=record
         )
         self._silent_until_ns: int | None = None
         self._T_wrong_local = se3.identity()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic_ns
@@ -20,7 +21,7 @@ class FaultPlan:
     a process that is started again does not run into the fault that killed it.
     """
 
-    kinds: tuple[str, ...]
+    kinds: Sequence[str]
     known: tuple[str, ...]  # the kinds that there are
     rate_ratio: float  # of the observations
     seed: int
@@ -28,6 +29,7 @@ class FaultPlan:
     _struck: set[int] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        self.kinds, self.record = tuple(self.kinds), Path(self.record)  # a YAML has list and text
         check_among(self.known, faults=self.kinds)
         check_between(0, 1, rate_ratio=self.rate_ratio)
         check_least(0, seed=self.seed)

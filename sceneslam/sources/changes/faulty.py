@@ -46,11 +46,7 @@ class FaultySource(Wrapped):
         self._lasting_ns = round(lasting_s * 1e9)
         self._clock_jump_ns = round(clock_jump_s * 1e9)
         self._plan = FaultPlan(
-            kinds=tuple(faults),
-            known=FAULTS,
-            rate_ratio=rate_ratio,
-            seed=seed,
-            record=Path(record),
+            kinds=faults, known=FAULTS, rate_ratio=rate_ratio, seed=seed, record=record
         )
 
     def __iter__(self) -> Iterator[Observation]:
