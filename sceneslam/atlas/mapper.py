@@ -225,7 +225,9 @@ class Mapper:
         count, own = len(self._loaded.submaps), self._collector.chain
         moved = self._solved.T_map_loaded
         loaded = self._loaded.T_map_node if moved is None else moved
-        nodes = [*self._known_nodes()]
+        # While a run goes on that was located, nodes are solved in its own frame.
+        is_in_map = self._is_over or not self.is_placed
+        nodes = [*self._solved.T_map_node] if is_in_map else []
         if nodes:
             T_map_run = nodes[-1] @ se3.inverse(own.T_run_node[len(nodes) - 1])
             nodes += [T_map_run @ T_run_node for T_run_node in own.T_run_node[len(nodes) :]]
@@ -348,12 +350,6 @@ class Mapper:
         last = len(solved) - 1
         later = solved[last] @ se3.inverse(T_map_node[last]) @ T_map_node[last + 1 :]
         return SolvedRun(T_map_node=np.concatenate([solved, later]), loops=loops)
-
-    def _known_nodes(self) -> NDArray[np.float64]:
-        """Return the nodes (N, 4, 4) that were solved, in the map that the run is in."""
-        if self.is_placed and not self._is_over:  # nodes were solved in the run's own frame
-            return np.zeros((0, 4, 4))
-        return self._solved.T_map_node
 
     def _made_localizer(
         self, rig: Rig, views: Sequence[tuple[Transform, Landmarks]]

@@ -104,7 +104,8 @@ class LastingMap:
         if not saved.submaps and seal_of(self._save) is not None:
             self._fault(f"the run has nothing to save, the map that was in {self._save} stays")
         elif self._write(saved, mapper.is_found):
-            note("map_saved", stamp_ns, submaps=len(saved.submaps), loops=_loops(saved))
+            loops = sum(edge.is_loop for edge in saved.edges)
+            note("map_saved", stamp_ns, submaps=len(saved.submaps), loops=loops)
             apart = len(np.unique(saved.pieces)) - 1
             if apart:
                 _log.warning(
@@ -151,7 +152,3 @@ class LastingMap:
 
 def _folder(path: str | None) -> Path | None:
     return None if path is None else Path(path).expanduser().resolve()
-
-
-def _loops(saved: SavedMap) -> int:
-    return sum(edge.kind.name == "LOOP" for edge in saved.edges)

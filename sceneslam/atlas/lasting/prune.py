@@ -38,16 +38,9 @@ def prune(saved: SavedMap) -> SavedMap:
 
 
 def _is_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
-    return _are_views_covered(saved, node, others) and _is_ground_covered(saved, node, others)
-
-
-def _are_views_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
-    """Tell whether one of the others' views shows as much as each view of a submap."""
-    return bool(are_covered(saved.views_of([node]), saved.views_of(others)).all())
-
-
-def _is_ground_covered(saved: SavedMap, node: int, others: list[int]) -> bool:
-    """Tell whether others show a submap's walls, and what is free in it."""
+    """Tell whether others show a submap's walls, what is free in it, and as much as its views."""
+    if not are_covered(saved.views_of([node]), saved.views_of(others)).all():
+        return False
     plan, plane = saved.submaps[node].plan, saved.plane
     walls, free = plan.points.astype(np.float64), plan.free_points()
     ground = np.concatenate([walls, free])

@@ -95,7 +95,7 @@ class RunGraph:
         """Look for loops to the submaps of a run that are new; solve without the loaded map."""
         self._place(chain)
         self._search(chain, is_level=is_level)
-        agreeing = self._agreeing()
+        agreeing = self._believed([self._found.loops[index] for index in self._found.largest()])
         if agreeing != self._agreed:
             # What did not fit before is left out until it does, or to the end of the run.
             used = [edge for edge in agreeing if self._is_used(edge)]
@@ -158,10 +158,6 @@ class RunGraph:
             own_loops=tuple(own_loops),
             T_map_loaded=solved.T_map_node[:count] if around else None,
         )
-
-    def _agreeing(self) -> list[Edge]:
-        """Return the loops that agree with each other; one alone is not believed."""
-        return self._believed([self._found.loops[index] for index in self._found.largest()])
 
     def _believed(self, loops: Sequence[Edge]) -> list[Edge]:
         """Return the loops but those that are alone between two pieces of the run.
