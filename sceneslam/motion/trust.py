@@ -98,9 +98,9 @@ def evidence_of_a_lie(
     return by_inertia - _log_likelihood(wheels, wheels_variance * unit + covariance)
 
 
-def student_cost(squared: Matrix | float, size: int) -> Matrix:
+def student_cost(squared: Matrix | float, size: int, freedom: float = _STUDENT) -> Matrix:
     """Return the negative log-density of Student's distribution at squared normalised errors."""
-    return np.asarray(0.5 * (_STUDENT + size) * np.log1p(squared / _STUDENT))
+    return np.asarray(0.5 * (freedom + size) * np.log1p(squared / freedom))
 
 
 def _log_likelihood(missed: NDArray[np.float64], covariance: Matrix) -> float:

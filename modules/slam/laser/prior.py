@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.motion.trust import student_cost
 from sceneslam.types.planar import Matrix, Planar, wrap
 
 _REACH_SIGMAS = 10.0  # farther away is less than a thousandth of the prior, heavy as its tails are
@@ -53,7 +54,7 @@ class MotionPrior:
 
     def cost_at(self, pose: Planar) -> float:
         """Return the negative logarithm of the prior at a pose, relative to its peak."""
-        tails = (_tail(each, n, self.freedom) for n, each in self._squared(pose).items())
+        tails = (student_cost(each, n, self.freedom) for n, each in self._squared(pose).items())
         return float(sum(tails)) - float(np.log(self.probability))
 
     def cost_least(self, information: Matrix) -> float:
@@ -83,7 +84,7 @@ class MotionPrior:
         off = -self.off(centre)
         near = np.sum((offsets_m - off[:2]) ** 2, axis=1) / max(sigma[0], sigma[1]) ** 2
         turned = ((turns - off[2]) / sigma[2]) ** 2
-        tails = _tail(near, 2, self.freedom) + _tail(turned, 1, self.freedom)[:, None]
+        tails = student_cost(near, 2, self.freedom) + student_cost(turned, 1, self.freedom)[:, None]
         return np.asarray(tails - np.log(self.probability))
 
     def _squared(self, pose: Planar) -> dict[int, float]:
@@ -103,8 +104,3 @@ def difference(pose: Planar, other: Planar) -> Planar:
 def is_apart(off: Planar) -> bool:
     """Tell whether poses that differ by `off` (3,) are farther apart than a cost is quadratic."""
     return bool(max(abs(off[0]), abs(off[1])) > _SAME_M or abs(off[2]) > _SAME_RAD)
-
-
-def _tail(squared: NDArray[np.float64] | float, size: int, freedom: float) -> NDArray[np.float64]:
-    """Return the negative log-density of Student's distribution at squared deviations."""
-    return np.asarray(0.5 * (freedom + size) * np.log1p(squared / freedom))
