@@ -112,7 +112,6 @@ def test_the_plan_of_a_piece_is_that_of_its_submaps_the_newest_last():
     nodes = [[0, 0, 0], [0, -CELL, 0], [0, 0, 0]]
     saved = map_of(room, inside, plan_of("##"), nodes=nodes, pieces=[0, 0, 1])
     assert text_of(saved.plan()) == [".....", "#...#", "....."]
-    assert text_of(saved.plan(newest_wins=False)) == [".....", "#####", "....."]
     assert text_of(saved.plan(1)) == ["##"] and not len(saved.plan(2))
 
 

@@ -205,18 +205,11 @@ def test_wide_search_finds_the_pose_and_says_where_it_cannot():
     truth = np.array([7.3, 0.2, 0.4])
     scan = reader.read(scan_at(walls, se3.from_xy_yaw(*truth), stamp_ns=0, **VIEW))
     around = truth + np.array([1.7, -1.2, 0.3])
-    found = search.find(
-        scan.points, around, window_m=2.5, window_rad=0.5, score_min=0.5, alike_ratio=0.85
-    )[0]
+    found = search.find(scan.points, around, window_m=2.5, window_rad=0.5, alike_ratio=0.85)[0]
     assert np.abs(found.T_submap_base - truth)[:2].max() < 0.15
     assert abs(found.T_submap_base[2] - truth[2]) < 0.05
     away = around + np.array([30.0, 0.0, 0.0])
-    assert (
-        search.find(
-            scan.points, away, window_m=2.5, window_rad=0.5, score_min=0.5, alike_ratio=0.85
-        )
-        == []
-    )
+    assert search.find(scan.points, away, window_m=2.5, window_rad=0.5, alike_ratio=0.85) == []
 
 
 def test_wide_search_in_a_corridor_is_ambiguous():
@@ -226,9 +219,7 @@ def test_wide_search_in_a_corridor_is_ambiguous():
     walls = np.array([[[-200, -1], [200, -1]], [[-200, 1], [200, 1]]], float)
     scan = reader.read(scan_at(walls, np.eye(4), stamp_ns=0, beams=1440))
     search = WideSearch(LikelihoodField(scan, 0.05))
-    found = search.find(
-        scan.points, np.zeros(3), window_m=3.0, window_rad=0.3, score_min=0.5, alike_ratio=0.85
-    )
+    found = search.find(scan.points, np.zeros(3), window_m=3.0, window_rad=0.3, alike_ratio=0.85)
     best, second = (one.T_submap_base for one in found[:2])
     assert found[1].score > 0.85 * found[0].score and abs(best[0] - second[0]) > 0.5
 

@@ -41,7 +41,7 @@ class OpenSession:
         """Return its poses, as reported and as revised."""
         online = trajectory_of(self.stamps_ns, self.poses)
         return SessionTrajectories(
-            module=self.module, T_map_local=self.T_map_local, online=online, revised=self.revised
+            T_map_local=self.T_map_local, online=online, revised=self.revised
         )
 
 

@@ -19,7 +19,6 @@ _ROUNDING = 1e-9  # of products of transforms
 class SessionTrajectories:
     """A session as its module reported it, and as the module revised it at its end."""
 
-    module: str
     T_map_local: Transform
     online: Trajectory  # T_local_base
     revised: Trajectory  # T_local_base; empty: as reported

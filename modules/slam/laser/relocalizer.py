@@ -16,7 +16,7 @@ from .prior import MotionPrior, difference
 from .surface import ScanSurfaceReader, SurfacePoints
 from .wide_search import Found, WideSearch
 
-_WINDOW_M, _WINDOW_RAD, _SCORE_MIN = 3.0, 0.8, 0.5
+_WINDOW_M, _WINDOW_RAD = 3.0, 0.8
 _ALIKE_RATIO = 0.85  # a second pose with this share of the best score makes it ambiguous
 # Anywhere: experiments/laser.md, "After seconds without scans".
 _LIKELY_RATIO = 0.7  # of the best score: such poses are compared with it
@@ -100,7 +100,6 @@ def _search(
         predicted,
         window_m=window[0],
         window_rad=window[1],
-        score_min=_SCORE_MIN,
         alike_ratio=alike_ratio,
     )
 

@@ -21,6 +21,7 @@ _CELL_M = 0.1  # the finest shift, at least; the refinement starts from there
 _LEVELS = 4  # shifts of 0.1, 0.2, 0.4, 0.8 m
 _POINTS = 100  # of the scan; more do not change the result
 _BEAM = 32  # nodes of the first descent, whose best score bounds the second
+_SCORE_MIN = 0.5  # with less, a pose does not fit
 _NODES_MAX = 4000  # best nodes kept per level
 _APART_M, _APART_RAD = 0.5, 0.15  # and this far away from better ones, is another one
 _POSES_MAX = 8
@@ -75,7 +76,6 @@ class WideSearch:
         *,
         window_m: float,
         window_rad: float,
-        score_min: float,
         alike_ratio: float,
     ) -> list[Found]:
         """Return the poses near `around` where points (N, 2) [m] fit, the best first."""
@@ -90,7 +90,7 @@ class WideSearch:
         cells = np.floor(local / self._cell_m).astype(np.int32) - self._origin.astype(np.int32)
         roots = self._roots(cells, window_m)
         first = self._descend(cells, roots, 0.0, _BEAM)
-        limit = max(score_min, alike_ratio * float(first.bound.max(initial=0.0)))
+        limit = max(_SCORE_MIN, alike_ratio * float(first.bound.max(initial=0.0)))
         leaves = self._descend(cells, roots, limit, _NODES_MAX)
         return self._peaks(leaves, yaws, around)
 

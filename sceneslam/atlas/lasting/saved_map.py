@@ -56,9 +56,9 @@ class SavedMap:
         """Return the nodes (N, 3) in the plane [m, m, rad]."""
         return planar.from_transforms(self.T_map_node)
 
-    def plan(self, piece: int = 0, *, newest_wins: bool = True) -> FloorPlan:
+    def plan(self, piece: int = 0) -> FloorPlan:
         """Return the floor plan of a piece, in its frame; raises InputError as `check_size`."""
-        return join(self._placed(piece), newest_wins=newest_wins)
+        return join(self._placed(piece), newest_wins=True)
 
     def check_size(self) -> None:
         """Raise InputError if the plan of the first piece, which runs load, is too large."""

@@ -38,8 +38,7 @@ class Hold:
         self.is_trusted = False  # another module may start from its last pose
         self.wheels_lie = False  # by the module's motion and the robot's inertia
         self.wheels_jumped = False  # then: their velocity changed as no robot's can
-        self.is_asked = False  # it was given the last observation
-        self.answer: Tracking | None = None  # its answer to that, unless it is lost
+        self.answer: Tracking | None = None  # to the last observation, unless it is lost
         self.tracking: Tracking | None = None  # the same, if usable
         self.degraded_ns = -1  # stamp of its last answer that was DEGRADED
         self.is_revised = False  # its last pose jumped because it corrected its past
@@ -73,7 +72,7 @@ class Hold:
 
     def ask(self, runner: Runner, observation: Observation) -> Tracking | None:
         """Return a module's answer if its pose may be used; raises ModuleError as the runner."""
-        self.is_trusted, self.answer, self.tracking, self.is_asked = False, None, None, True
+        self.is_trusted, self.answer, self.tracking = False, None, None
         if not runner.can_use(observation):
             self.spare(observation)
             if self._fed_ns is None or observation.stamp_ns - self._fed_ns > 2 * self._period_ns:
@@ -102,7 +101,7 @@ class Hold:
 
     def spare(self, observation: Observation) -> None:
         """Record an observation that is not given to the module."""
-        self.is_trusted, self.answer, self.tracking, self.is_asked = False, None, None, False
+        self.is_trusted, self.answer, self.tracking = False, None, None
         self._judge(observation, None)
 
     @property
