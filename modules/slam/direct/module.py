@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sceneslam.motion.predictor import Prediction, Predictor
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
-from sceneslam.types.maps import MapLayers, PointLayer, PoseGraphLayer
+from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
 
@@ -106,9 +106,8 @@ class DirectSlam(LocalModule):
     def get_map(self) -> MapLayers:
         """Return the keyframes' cloud and their graph, in `local`."""
         T_cam_base = se3.inverse(self._camera.T_base_cam)
-        graph: PoseGraphLayer | None = self._keyframes.graph(T_cam_base)
-        points: PointLayer | None = self._keyframes.cloud()
-        return MapLayers(points=points, pose_graph=graph)
+        graph = self._keyframes.graph(T_cam_base)
+        return MapLayers(points=self._keyframes.cloud(), pose_graph=graph)
 
     def _locate(self, view: DirectView) -> _Located | None:
         """Return the view's pose relative to the keyframe, else to the previous view."""

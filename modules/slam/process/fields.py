@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types import se3
 from sceneslam.types.maps import LAYER_TYPES, MapLayers
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
@@ -143,9 +144,7 @@ def _rigid(array: NDArray[Any], count: int) -> NDArray[np.float64]:
     T_local_base = array.astype(np.float64)
     if not np.isfinite(T_local_base).all():
         raise ProtocolError("sent a T_local_base that is not finite")
-    rotations = T_local_base[:, :3, :3]
-    skew = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(initial=0.0)
-    if skew > _SKEW_MAX or (np.linalg.det(rotations) < 0).any():
+    if (se3.skew(T_local_base) > _SKEW_MAX).any():
         raise ProtocolError("sent a T_local_base that is not a rotation")
     if (T_local_base[:, 3] != (0, 0, 0, 1)).any():
         raise ProtocolError("sent a T_local_base whose last row is not 0 0 0 1")
