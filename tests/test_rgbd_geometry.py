@@ -7,7 +7,7 @@ from rgbd_features import features_at, random_descriptors
 
 from sceneslam.modules.slam.rgbd.locate.matching import match_anywhere, match_near
 from sceneslam.modules.slam.rgbd.locate.pose_errors import PoseErrors
-from sceneslam.modules.slam.rgbd.locate.pose_solver import Measurements, PoseSolver
+from sceneslam.modules.slam.rgbd.locate.pose_solver import Measurements, PoseSolver, Prior
 from sceneslam.modules.slam.rgbd.locate.residuals import Sightings
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
@@ -117,6 +117,35 @@ def test_pose_without_any_depth_is_still_found():
     assert estimate is not None
     assert np.abs(estimate.T_local_base - T_local_base).max() < 1e-6
     assert estimate.depth_agreement_ratio == 1.0
+
+
+def test_a_wall_whose_tilt_is_mistaken_moves_no_camera_that_a_gyro_leads():
+    """Far away, a turn of the camera and a shift look like a tilt of the wall."""
+    rng = np.random.default_rng(0)
+    uv_px = rng.uniform([0, 0], CAMERA.size_wh, (200, 2))
+    rays = (uv_px - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy]
+    points_cam = 10.0 * np.column_stack([rays, np.ones(200)])
+    tilted_cam = points_cam.copy()
+    tilted_cam[:, 2] += 0.05 * points_cam[:, 0]
+    T_true = se3.identity()
+    measured = Measurements(
+        points_local=se3.apply(T_true @ CAMERA.T_base_cam, tilted_cam),
+        seen=Sightings(
+            uv_px=uv_px,
+            sigma_px=np.full(200, 2.0),
+            depth_m=np.zeros(200),
+            inverse_depth_sigma_per_m=np.full(200, 0.003),
+        ),
+    )
+    solver = PoseSolver(CAMERA, seed=0)
+    deviations = np.array([0.05] * 3 + [0.001] * 3)
+    prior = Prior(T_local_base=T_true, information=np.diag(deviations**-2.0))
+    alone, led = (solver.refine(measured, T_true, given) for given in (None, prior))
+    assert np.linalg.norm(alone.T_local_base[:3, 3]) > 0.4
+    assert np.linalg.norm(led.T_local_base[:3, 3]) < 0.1
+    turned_rad = [se3.rotation_angle_rad(one.T_local_base) for one in (alone, led)]
+    assert turned_rad[0] > 0.04 and turned_rad[1] < 0.006
+    assert (np.diag(led.covariance) < deviations**2).all()
 
 
 def test_covariance_is_the_spread_of_the_estimates():

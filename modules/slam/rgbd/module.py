@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,6 +167,7 @@ class RgbdSlam:
 
     def _build(self, alignment: Alignment | None) -> RgbdParts:
         parts = RgbdParts(self._settings, self._camera, alignment)
+        self._localizer = parts.localizer
         self._eye, self._health, self._search = parts.eye, parts.health, parts.search
         self._map, self._mapping, self._memory = parts.map, parts.mapping, parts.memory
         self._layers, self._place_rule = parts.layers, parts.place_rule
@@ -218,6 +220,7 @@ class RgbdSlam:
             fused = led(
                 found,
                 prediction,
+                partial(self._localizer.together, view.features, self._held_ids),
                 turn_radps=self._turn_radps(view.observation),
                 duration_s=self._predictor.unmeasured_s(view.observation),
             )

@@ -48,22 +48,22 @@ class RgbdParts:
             keyframe_limit=settings.keyframe_limit,
             landmark_limit=settings.landmark_limit,
         )
-        localizer = VisualLocalizer(
+        self.localizer = VisualLocalizer(
             self.map,
             PoseSolver(camera, seed=settings.seed),
             radius_px=settings.search_radius_px,
             min_inliers=settings.min_inliers,
         )
-        self.eye = RectifyingExtractor(self.map, localizer, extractor)
+        self.eye = RectifyingExtractor(self.map, self.localizer, extractor)
         self.memory = MapHistory(
             self.map,
-            localizer,
+            self.localizer,
             self.eye,
             min_inliers=settings.degraded_inliers,
             is_repeatable=settings.is_repeatable,
         )
         relocalizer = Relocalizer(self.map.keyframes, self.memory.recognizer)
-        self.search = Search(localizer, relocalizer)
+        self.search = Search(self.localizer, relocalizer)
         self.mapping = LocalMapping(
             depth_camera, self.map, alignment=alignment, is_repeatable=settings.is_repeatable
         )

@@ -6,11 +6,12 @@ whose corners all err alike.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.motion.predictor import Prediction
 from sceneslam.types import se3
@@ -18,6 +19,7 @@ from sceneslam.types.covariance import UNKNOWN_VELOCITY
 from sceneslam.types.se3 import Transform
 
 from ..locate.localizer import VisualFix
+from ..locate.pose_solver import Prior
 from ..map.keyframes import Keyframe, OdometryPose, motion_between
 from .pose_constraints import PoseConstraint
 
@@ -46,33 +48,66 @@ class OdometryIntegrator:
 
 
 def led(
-    fix: VisualFix, prediction: Prediction, *, turn_radps: float | None, duration_s: float
+    found: VisualFix,
+    prediction: Prediction,
+    together: Callable[[Prior], VisualFix | None],
+    *,
+    turn_radps: float | None,
+    duration_s: float,
 ) -> VisualFix | None:
     """Return a pose that an image shows, fused with odometry; None if that contradicts the gyro.
 
     `turn_radps` is the turn rate by the gyro, None without one; `duration_s` is the time since the
-    last pose. A pose that contradicts odometry is fused once more as if wheels slipped, and then as
-    if the clocks of camera and gyro differed.
+    last pose. If a pose contradicts odometry, wheels may have slipped: then the image is solved
+    `together` with what is left of it, as landmarks far away look about the same after a turn and
+    a shift. If that fails, too, the clocks of camera and gyro may differ.
     """
-    found = fix.estimate
-    measured = _CORRELATED * found.covariance
-    off = se3.log(se3.inverse(prediction.T_local_base) @ found.T_local_base)
     slip_m, unknown_rad = UNKNOWN_VELOCITY * duration_s
     late_rad = unknown_rad if turn_radps is None else _CLOCKS_S * turn_radps
-    for slips in ((0.0, 0.0), (slip_m, 0.0), (slip_m, late_rad)):
-        predicted = prediction.covariance + np.diag(np.repeat(slips, 3) ** 2)
-        total = predicted + measured
-        if off @ np.linalg.solve(total, off) > _CHI2:
-            continue
-        gain = predicted @ np.linalg.inv(total)
-        covariance = (np.eye(6) - gain) @ predicted
-        estimate = replace(
-            found,
-            T_local_base=se3.orthonormal(prediction.T_local_base @ se3.exp(gain @ off)),
-            covariance=0.5 * (covariance + covariance.T),
-        )
-        return replace(fix, estimate=estimate)
-    return None
+    return (
+        _fused(found, prediction)
+        or _held(_spread(prediction, slip_m, 0.0), together)
+        or _fused(found, _spread(prediction, slip_m, late_rad))
+    )
+
+
+def _spread(prediction: Prediction, off_m: float, off_rad: float) -> Prediction:
+    """Return a prediction with larger deviations."""
+    more = np.diag(np.repeat([off_m, off_rad], 3) ** 2)
+    return replace(prediction, covariance=prediction.covariance + more)
+
+
+def _fused(found: VisualFix, prediction: Prediction) -> VisualFix | None:
+    """Return the mean of a pose and a prediction by their covariances; None: they contradict."""
+    estimate, predicted = found.estimate, prediction.covariance
+    off = se3.log(se3.inverse(prediction.T_local_base) @ estimate.T_local_base)
+    total = predicted + _CORRELATED * estimate.covariance
+    if off @ np.linalg.solve(total, off) > _CHI2:
+        return None
+    gain = predicted @ np.linalg.inv(total)
+    T_local_base = se3.orthonormal(prediction.T_local_base @ se3.exp(gain @ off))
+    return _with(found, T_local_base, (np.eye(6) - gain) @ predicted)
+
+
+def _held(
+    prediction: Prediction, together: Callable[[Prior], VisualFix | None]
+) -> VisualFix | None:
+    """Return the pose by image and prediction together; None if it is far from the latter."""
+    information = np.asarray(np.linalg.inv(prediction.covariance))
+    prior = Prior(T_local_base=prediction.T_local_base, information=_CORRELATED * information)
+    found = together(prior)
+    if found is None:
+        return None
+    off = prior.off(found.estimate.T_local_base)
+    if off @ information @ off > _CHI2:
+        return None
+    return _with(found, found.estimate.T_local_base, _CORRELATED * found.estimate.covariance)
+
+
+def _with(found: VisualFix, T_local_base: Transform, covariance: NDArray[np.float64]) -> VisualFix:
+    covariance = 0.5 * (covariance + covariance.T)
+    estimate = replace(found.estimate, T_local_base=T_local_base, covariance=covariance)
+    return replace(found, estimate=estimate)
 
 
 def odometry_constraints(

@@ -13,7 +13,7 @@ from sceneslam.types.se3 import Transform
 from ..map.visual_map import VisualMap
 from ..see.features import Features
 from .matching import Matches, match_anywhere, match_near
-from .pose_solver import Consensus, Measurements, PoseEstimate, PoseSolver
+from .pose_solver import Consensus, Measurements, PoseEstimate, PoseSolver, Prior
 from .residuals import Sightings
 
 _RADIUS_REFINED_PX = 10.0
@@ -81,6 +81,18 @@ class VisualLocalizer:
                 return fix
         return None
 
+    def together(
+        self, features: Features, held_ids: NDArray[np.int64], prior: Prior
+    ) -> VisualFix | None:
+        """Return the pose by the image and a prior, where the image shows the map there.
+
+        The landmarks are those around `held_ids` (N,).
+        """
+        local_ids = self._map.around(held_ids)
+        found = self._look(features, prior.T_local_base, local_ids, self._radius_px)
+        there = Consensus(T_local_base=prior.T_local_base, inlier_rows=np.arange(len(found)))
+        return self._confirm(features, found, there, prior)
+
     def beside(self, features: Features, fix: VisualFix) -> VisualFix | None:
         """Return the pose found by matching again from a pose of the same image."""
         found = self._look(
@@ -108,7 +120,11 @@ class VisualLocalizer:
         return self._confirm(features, found, self._solver.search(found.measured))
 
     def _confirm(
-        self, features: Features, rough: _Found, consensus: Consensus | None
+        self,
+        features: Features,
+        rough: _Found,
+        consensus: Consensus | None,
+        prior: Prior | None = None,
     ) -> VisualFix | None:
         """Return the final pose, from all landmarks that are found with a nearly correct pose."""
         if consensus is None or len(consensus.inlier_rows) < self._min_inliers:
@@ -118,7 +134,7 @@ class VisualLocalizer:
         found = self._look(features, T_local_base, local_ids, _RADIUS_REFINED_PX)
         if len(found) < self._min_inliers:
             return None
-        estimate = self._solver.refine(found.measured, T_local_base)
+        estimate = self._solver.refine(found.measured, T_local_base, prior)
         if estimate is None:
             return None
         count, possible = int(estimate.inliers.sum()), min(len(found.expected_ids), len(features))

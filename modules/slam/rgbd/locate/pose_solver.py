@@ -32,6 +32,18 @@ class Measurements:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Prior:
+    """What other sensors tell of a pose."""
+
+    T_local_base: Transform
+    information: NDArray[np.float64]  # (6, 6), se3.log order, base frame
+
+    def off(self, T_local_base: Transform) -> NDArray[np.float64]:
+        """Return by which twist (6,) a pose (4, 4) differs."""
+        return se3.log(se3.inverse(self.T_local_base) @ T_local_base)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Consensus:
     """A rough pose and the measurements that agree with it."""
 
@@ -87,6 +99,7 @@ class PoseSolver:
     def __init__(self, camera: Camera, *, seed: int) -> None:
         self._camera, self._seed = camera, seed
         self._T_cam_base = se3.inverse(camera.T_base_cam)
+        self._to_base = se3.adjoint(camera.T_base_cam)
 
     def search(self, measured: Measurements) -> Consensus | None:
         """Return the pose that most pixels agree with (AP3P, RANSAC), None if not found."""
@@ -122,14 +135,16 @@ class PoseSolver:
             inlier_rows=np.flatnonzero(end.inliers),
         )
 
-    def refine(self, measured: Measurements, T_local_base: Transform) -> PoseEstimate | None:
+    def refine(
+        self, measured: Measurements, T_local_base: Transform, prior: Prior | None = None
+    ) -> PoseEstimate | None:
         """Return the pose that minimises pixel and inverse-depth errors, None if that fails.
 
-        Its covariance is of a twist of the base, T_local_base @ exp(xi). Residuals as in stereo
-        bundle adjustment: a depth camera's disparity error is constant, so its depth error grows
-        with the square.
+        Those of the `prior`, if there is one, count as well. The covariance is of a twist of the
+        base, T_local_base @ exp(xi). Residuals as in stereo bundle adjustment: a depth camera's
+        disparity error is constant, so its depth error grows with the square.
         """
-        end = self._descend(measured, T_local_base, _REFINEMENT_STEPS)
+        end = self._descend(measured, T_local_base, _REFINEMENT_STEPS, prior)
         if end is None:
             return None
         inliers, residuals = end.inliers, end.errors.residuals[:2, end.inliers].ravel()
@@ -140,7 +155,7 @@ class PoseSolver:
             residuals=residuals,
             jacobian=by_pixel,
             sigma_px=measured.seen.sigma_px[inliers],
-            normal=by_pixel @ by_pixel.T + by_depth @ by_depth.T,
+            normal=by_pixel @ by_pixel.T + by_depth @ by_depth.T + self._known(prior),
         )
         # If the errors are larger than their sigmas, the covariance is scaled up.
         covariance = se3.carried(np.linalg.inv(end.normal), self._camera.T_base_cam)
@@ -155,7 +170,11 @@ class PoseSolver:
         )
 
     def _descend(
-        self, measured: Measurements, T_local_base: Transform, steps: int
+        self,
+        measured: Measurements,
+        T_local_base: Transform,
+        steps: int,
+        prior: Prior | None = None,
     ) -> _Descent | None:
         """Return the result of Gauss-Newton, which rejects outliers after every step."""
         T_cam_local = se3.inverse(T_local_base @ self._camera.T_base_cam)
@@ -166,7 +185,10 @@ class PoseSolver:
         for _ in range(steps):
             rows = found.rows(found.scale(inliers, depth_inliers)).reshape(7, -1)
             products = rows @ rows.T
-            normal, slopes = products[:6, :6], products[:6, 6]
+            normal, slopes = products[:6, :6] + self._known(prior), products[:6, 6]
+            if prior is not None:
+                off = prior.off(se3.inverse(T_cam_local) @ self._T_cam_base)
+                slopes = slopes + self._to_base.T @ prior.information @ off
             step = _solve(normal, slopes)
             if step is None:
                 return None
@@ -185,6 +207,12 @@ class PoseSolver:
             inliers=inliers,
             depth_inliers=depth_inliers,
         )
+
+    def _known(self, prior: Prior | None) -> NDArray[np.float64]:
+        """Return a prior's normal matrix (6, 6) of a twist of the camera."""
+        if prior is None:
+            return np.zeros((6, 6))
+        return np.asarray(self._to_base.T @ prior.information @ self._to_base)
 
 
 def _solve(normal: NDArray[np.float64], slopes: NDArray[np.float64]) -> NDArray[np.float64] | None:
