@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,68 +30,19 @@ from .see.view import View
 from .settings import RgbdSettings
 
 
-class RgbdSlam:
+@dataclass(kw_only=True, eq=False)
+class RgbdSlam(RgbdSettings):
     """Tracks a camera with or without depth: the map and its scale stay when depth is missing.
 
     After ORB-SLAM2's front end (Mur-Artal and Tardos 2017). Without depth, new landmarks are
-    triangulated, with the scale of odometry or of the existing map.
+    triangulated, with the scale of odometry or of the existing map. It closes the loops of its own
+    map. The fields are the settings; `conf/slam/rgbd.yaml` describes each one.
     """
 
-    def __init__(
-        self,
-        *,
-        monocular_scenes: list[str],
-        segment_patience_s: float,
-        feature_count: int,
-        fast_threshold_min: int,
-        fast_noise_ratio: float,
-        sigma_px: float,
-        inverse_depth_sigma_per_m: float,
-        search_radius_px: float,
-        min_inliers: int,
-        degraded_inliers: int,
-        degraded_sigma_m: float,
-        keyframe_step_m: float,
-        keyframe_turn_rad: float,
-        keyframe_inlier_ratio: float,
-        keyframe_limit: int,
-        landmark_limit: int,
-        cloud_stride_px: int,
-        cloud_voxel_m: float,
-        grid_resolution_m: float,
-        is_repeatable: bool,
-        seed: int,
-    ) -> None:
-        self._settings = RgbdSettings(
-            segment_patience_s=segment_patience_s,
-            feature_count=feature_count,
-            fast_threshold_min=fast_threshold_min,
-            fast_noise_ratio=fast_noise_ratio,
-            sigma_px=sigma_px,
-            inverse_depth_sigma_per_m=inverse_depth_sigma_per_m,
-            search_radius_px=search_radius_px,
-            min_inliers=min_inliers,
-            degraded_inliers=degraded_inliers,
-            degraded_sigma_m=degraded_sigma_m,
-            keyframe_step_m=keyframe_step_m,
-            keyframe_turn_rad=keyframe_turn_rad,
-            keyframe_inlier_ratio=keyframe_inlier_ratio,
-            keyframe_limit=keyframe_limit,
-            landmark_limit=landmark_limit,
-            cloud_stride_px=cloud_stride_px,
-            cloud_voxel_m=cloud_voxel_m,
-            grid_resolution_m=grid_resolution_m,
-            is_repeatable=is_repeatable,
-            seed=seed,
-        )
-        self._monocular_scenes = frozenset(monocular_scenes)
-        self._ignores_depth = False
-        self._T_local_base = se3.identity()
-
-    @property
-    def closes_loops(self) -> bool:
-        """Return True: it recognizes places by what is in its images."""
-        return True
+    monocular_scenes: list[str]
+    closes_loops: ClassVar[bool] = True
+    _ignores_depth: bool = field(default=False, init=False)
+    _T_local_base: Transform = field(default_factory=se3.identity, init=False)
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
@@ -114,7 +66,7 @@ class RgbdSlam:
 
     def set_scene(self, scene: str) -> None:
         """Set the scene; in `monocular_scenes` depth is not used."""
-        self._ignores_depth = scene in self._monocular_scenes
+        self._ignores_depth = scene in self.monocular_scenes
 
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base at the observation; LOST if the image does not show the map."""
@@ -166,7 +118,7 @@ class RgbdSlam:
         self._memory.shutdown()
 
     def _build(self, alignment: Alignment | None) -> RgbdParts:
-        parts = RgbdParts(self._settings, self._camera, alignment)
+        parts = RgbdParts(self, self._camera, alignment)
         self._localizer = parts.localizer
         self._eye, self._health, self._search = parts.eye, parts.health, parts.search
         self._map, self._mapping, self._memory = parts.map, parts.mapping, parts.memory

@@ -12,7 +12,7 @@ def _within(low: float, high: float) -> Any:
     return field(metadata={"range": (low, high)})
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(kw_only=True, eq=False)
 class RgbdSettings:
     """All numbers of the configuration; ConfigError for one that is out of its range."""
 
@@ -38,7 +38,7 @@ class RgbdSettings:
     seed: int = _within(0, 2**31 - 1)
 
     def __post_init__(self) -> None:
-        for each in fields(self):
+        for each in (one for one in fields(self) if "range" in one.metadata):
             value, (low, high) = getattr(self, each.name), each.metadata["range"]
             if not (isinstance(value, (int, float)) and low <= value <= high):
                 raise ConfigError(each.name, value, f"{low:g} to {high:g}")
