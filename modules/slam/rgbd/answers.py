@@ -1,4 +1,4 @@
-"""Build the module's answers: tracked, started, repeated image, or lost."""
+"""Build the module's answers: tracked, started, or no pose measured."""
 
 from __future__ import annotations
 
@@ -62,26 +62,17 @@ def placed(answer: Tracking, segments: Segments, segment: set[int]) -> Tracking:
     return replace(answer, status=TrackingStatus.DEGRADED, covariance=covariance)
 
 
-def repeated(stamp_ns: int, T_local_base: Transform, *, revision: int) -> Tracking:
-    """Return the answer when the image repeats: the pose by odometry, else the last pose.
+def unseen(
+    stamp_ns: int, T_local_base: Transform, status: TrackingStatus, *, revision: int
+) -> Tracking:
+    """Return the answer when an image measured no pose, with the pose that is known of.
 
-    The robot may stand still; the covariance is unknown.
+    DEGRADED: the image repeats the last one, the robot may stand still. LOST: the last tracked pose.
     """
     return Tracking(
         stamp_ns=stamp_ns,
         T_local_base=T_local_base.copy(),
-        status=TrackingStatus.DEGRADED,
-        quality_ratio=0.0,
-        revision=revision,
-    )
-
-
-def lost(stamp_ns: int, T_local_base: Transform, *, revision: int) -> Tracking:
-    """Return the answer when tracking is lost, with the last tracked pose."""
-    return Tracking(
-        stamp_ns=stamp_ns,
-        T_local_base=T_local_base.copy(),
-        status=TrackingStatus.LOST,
+        status=status,
         quality_ratio=0.0,
         revision=revision,
     )

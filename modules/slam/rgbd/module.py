@@ -20,7 +20,7 @@ from sceneslam.types.trajectory import Trajectory
 
 from .adjust.odometry_constraints import OdometryIntegrator, led
 from .adjust.renewal import NEWEST, LocatedView, renew, seen_by
-from .answers import held, lost, placed, repeated, started
+from .answers import held, placed, started, unseen
 from .locate.localizer import VisualFix
 from .parts import RgbdParts
 from .see.alignment import Alignment
@@ -240,12 +240,16 @@ class RgbdSlam(RgbdSettings):
         if prediction.is_measured:
             self._T_local_base = prediction.T_local_base
         self._memory.hold(observation.stamp_ns, self._T_local_base, np.zeros(0, np.int64))
-        return repeated(observation.stamp_ns, self._T_local_base, revision=self._memory.revision)
+        return self._unseen(observation, TrackingStatus.DEGRADED)
 
     def _lose(self, observation: Observation, prediction: Prediction) -> Tracking:
         self._predictor.lose(prediction)
         self._is_lost = True
-        return lost(observation.stamp_ns, self._T_local_base, revision=self._memory.revision)
+        return self._unseen(observation, TrackingStatus.LOST)
+
+    def _unseen(self, observation: Observation, status: TrackingStatus) -> Tracking:
+        revision = self._memory.revision
+        return unseen(observation.stamp_ns, self._T_local_base, status, revision=revision)
 
     def _insert_keyframe(
         self,
