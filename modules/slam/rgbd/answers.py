@@ -67,7 +67,7 @@ def unseen(
 ) -> Tracking:
     """Return the answer when an image measured no pose, with the pose that is known of.
 
-    DEGRADED: the image repeats the last one, the robot may stand still. LOST: the last tracked pose.
+    DEGRADED: the image repeats the last one. LOST: it is the last tracked pose.
     """
     return Tracking(
         stamp_ns=stamp_ns,

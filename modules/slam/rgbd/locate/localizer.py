@@ -174,31 +174,20 @@ class VisualLocalizer:
         matches: Matches,
         T_local_base: Transform,
     ) -> _Found:
-        landmark_ids = expected_ids[matches.landmark_rows]
+        """Return the matches, with the landmarks' own covariance as seen from T_local_base."""
+        ids, rows = expected_ids[matches.landmark_rows], matches.feature_rows
+        doubts = self._map.doubts(T_local_base, ids)
+        inverse_depth_sigmas = self._map.inverse_depth_sigmas_per_m(features)[rows]
+        seen = Sightings(
+            uv_px=features.uv_px[rows],
+            sigma_px=np.hypot(self._map.sigma_px(features.levels[rows]), doubts.across_px),
+            depth_m=features.depth_m[rows],
+            inverse_depth_sigma_per_m=np.hypot(inverse_depth_sigmas, doubts.inverse_depth_per_m),
+        )
+        points_local = self._map.landmarks.points_local.take(ids, axis=0)
         return _Found(
             expected_ids=expected_ids,
-            landmark_ids=landmark_ids,
-            feature_rows=matches.feature_rows,
-            measured=self._measured(features, landmark_ids, matches.feature_rows, T_local_base),
-        )
-
-    def _measured(
-        self,
-        features: Features,
-        ids: NDArray[np.int64],
-        rows: NDArray[np.int64],
-        T_local_base: Transform,
-    ) -> Measurements:
-        """Return the measurements, with the landmarks' own covariance as seen from T_local_base."""
-        doubts = self._map.doubts(T_local_base, ids)
-        return Measurements(
-            points_local=self._map.landmarks.points_local.take(ids, axis=0),
-            seen=Sightings(
-                uv_px=features.uv_px[rows],
-                sigma_px=np.hypot(self._map.sigma_px(features.levels[rows]), doubts.across_px),
-                depth_m=features.depth_m[rows],
-                inverse_depth_sigma_per_m=np.hypot(
-                    self._map.inverse_depth_sigmas_per_m(features)[rows], doubts.inverse_depth_per_m
-                ),
-            ),
+            landmark_ids=ids,
+            feature_rows=rows,
+            measured=Measurements(points_local=points_local, seen=seen),
         )
