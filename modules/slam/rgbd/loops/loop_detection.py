@@ -59,12 +59,19 @@ class LoopDetector:
         self._hypothesis: LoopClosure | None = None
 
     def candidate(self, query: Query) -> int | None:
-        """Return the unconnected keyframe that is exceptionally similar to the new one."""
+        """Return the unconnected keyframe that is exceptionally similar to the new one.
+
+        Depth has to verify it: far landmarks look about the same after a turn and a shift. Only a
+        camera that never had any does without.
+        """
         keyframes = self._map.keyframes
         new = keyframes[query.keyframe_id]
+        deep = [k for k in keyframes.ids if not keyframes[k].is_monocular]
+        if deep and new.is_monocular:
+            return None
         known = set(keyframes.covisible(new.landmark_ids, limit=len(keyframes)))
         known |= set(keyframes.ids[-_RECENT:])
-        far = [k for k in keyframes.ids if k not in known]
+        far = [k for k in deep or keyframes.ids if k not in known]
         alike = self._recognizer.places.alike(new.features.descriptors, far)
         if not alike:
             return None
