@@ -1,4 +1,4 @@
-"""A loop is rejected if it contradicts wheels and gyro, or leads to what the map has no more."""
+"""A loop needs depth, odometry that does not contradict it, and keyframes that are still there."""
 
 from types import SimpleNamespace
 
@@ -61,3 +61,37 @@ def test_loop_turns_as_odometry_measured(off_rad, stretch, count):
 @pytest.mark.parametrize(("gone", "count"), [(0, 0), (1, 0), (None, 2)])
 def test_a_loop_is_forgotten_whose_keyframe_was_removed(gone, count):
     assert len(loops(0.0, gone=gone)) == count
+
+
+class Store(dict):
+    """Keyframes of which none shares a landmark with another."""
+
+    ids = property(lambda self: list(self))
+
+    def covisible(self, landmark_ids, *, limit):
+        return []
+
+
+@pytest.mark.parametrize(
+    ("monocular", "expected"),
+    [
+        ([False] * 8, 0),
+        ([True] * 8, 0),
+        ([False] * 7 + [True], None),
+        ([True, False] + [True] * 5 + [False], 1),
+    ],
+    ids=["all with depth", "a camera without", "the newest without", "the oldest without"],
+)
+def test_depth_verifies_a_loop_where_there_ever_was_any(monocular, expected):
+    features = SimpleNamespace(descriptors=None)
+    keyframes = Store(
+        (k, SimpleNamespace(is_monocular=one, features=features, landmark_ids=None))
+        for k, one in enumerate(monocular)
+    )
+
+    def alike(descriptors, ids):
+        return [SimpleNamespace(place_id=k, ratio=0.5) for k in ids]
+
+    recognizer = SimpleNamespace(places=SimpleNamespace(alike=alike))
+    detector = LoopDetector(SimpleNamespace(keyframes=keyframes), recognizer, PoseGraph())
+    assert detector.candidate(Query(keyframe_id=7, depth_m=None)) == expected
