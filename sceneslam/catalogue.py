@@ -54,7 +54,11 @@ def listing(words: Sequence[str]) -> list[str]:
 
 def _options(group: str, folders: Sequence[Path]) -> list[str]:
     """Return a line for each option of a group; later folders override earlier ones."""
-    files = {path.stem: path for folder in folders for path in (folder / group).glob("*.yaml")}
+    files = {
+        path.relative_to(folder / group).with_suffix("").as_posix(): path
+        for folder in folders
+        for path in (folder / group).rglob("*.yaml")
+    }
     width = max(map(len, files), default=0)
     return [f"  {name:{width}}  {first_sentence(files[name])}".rstrip() for name in sorted(files)]
 

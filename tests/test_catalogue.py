@@ -14,11 +14,12 @@ CONF = Path(__file__).parents[1] / "conf"
 
 def test_every_option_is_listed_with_its_first_sentence():
     lines = listing([])
-    options = [path for group in GROUPS for path in (CONF / group).glob("*.yaml")]
+    options = [path for group in GROUPS for path in (CONF / group).rglob("*.yaml")]
     assert len(lines) == len(options) + len(GROUPS) + len(GROUPS) - 1  # a blank between groups
     for path in options:
         assert first_sentence(path), f"{path} begins with no comment"
-        assert any(line.split()[:1] == [path.stem] for line in lines)
+        name = path.relative_to(CONF).with_suffix("").as_posix().split("/", 1)[1]
+        assert any(line.split()[:1] == [name] for line in lines)
 
 
 def test_every_group_of_the_configuration_is_listed():

@@ -47,6 +47,7 @@ def anchors(page):
 
 def test_every_option_is_listed():
     options = (ROOT / "docs" / "options.md").read_text()
-    for group in ("scenario", "source", "effects", "detector", "slam"):
-        for path in (ROOT / "conf" / group).glob("*.yaml"):
-            assert path.stem == "none" or f"`{path.stem}`" in options, f"{group}={path.stem}"
+    for group in ("scenario", "source", "effects", "detector", "slam", "experiment"):
+        for path in (ROOT / "conf" / group).rglob("*.yaml"):
+            name = path.relative_to(ROOT / "conf" / group).with_suffix("").as_posix()
+            assert name == "none" or f"`{name}`" in options, f"{group}={name}"
