@@ -167,6 +167,32 @@ def test_a_pose_that_contradicts_the_gyro_is_not_taken(turn_radps, is_taken):
     assert (fused(T_found, turn_radps=turn_radps, duration_s=0.3) is not None) is is_taken
 
 
+@pytest.mark.parametrize(
+    ("explained", "is_taken"),
+    [(97, True), (60, False)],
+    ids=["a far wall", "near landmarks tell that it is not there"],
+)
+def test_an_image_that_contradicts_the_gyro_is_solved_together_with_it(explained, is_taken):
+    fix = replace(found_at(se3.from_xy_yaw(0.7, 2.3, -0.2)), landmark_ids=np.arange(100))
+    there = replace(found_at(se3.from_xy_yaw(1.02, 0.0, 0.0)), landmark_ids=np.arange(explained))
+    prediction = Prediction(
+        T_local_base=se3.from_xy_yaw(1.0, 0.0, 0.0), covariance=1e-4 * np.eye(6), motion=None
+    )
+    found = led(fix, prediction, lambda prior: there, turn_radps=0.1, duration_s=0.1)
+    assert (found is not None) is is_taken
+    if is_taken:
+        np.testing.assert_allclose(found.estimate.T_local_base, there.estimate.T_local_base)
+        assert len(found.landmark_ids) == explained
+
+
+def test_a_pose_far_from_what_odometry_leaves_open_is_not_taken():
+    fix = replace(found_at(se3.from_xy_yaw(0.7, 2.3, -0.2)), landmark_ids=np.arange(100))
+    prediction = Prediction(
+        T_local_base=se3.from_xy_yaw(1.0, 0.0, 0.0), covariance=1e-4 * np.eye(6), motion=None
+    )
+    assert led(fix, prediction, lambda prior: fix, turn_radps=0.1, duration_s=0.1) is None
+
+
 def test_images_that_show_a_turn_by_a_shift_are_corrected_by_the_gyro():
     fix = found_at(se3.from_xy_yaw(1.0, 0.6, -0.06))  # a wall 10 m ahead looks the same
     along = np.array([0, 10.0, 0, 0, 0, -1.0])

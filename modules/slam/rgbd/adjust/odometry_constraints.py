@@ -26,6 +26,7 @@ from .pose_constraints import PoseConstraint
 _CLOCKS_S = 0.05  # between a camera's and a gyro's stamps
 _SLIP = 3.0  # [sigma] of the distance; beyond, wheels probably slip
 _CORRELATED = 4.0  # images of the same landmarks err alike; 1 and 4 were tried in one hall
+_EXPLAINED_RATIO = 0.8  # of the landmarks; 0.9 to 1.05 where a far wall had turned the camera
 _CHI2 = 16.8  # 99 % of six degrees of freedom
 
 
@@ -60,13 +61,16 @@ def led(
     `turn_radps` is the turn rate by the gyro, None without one; `duration_s` is the time since the
     last pose. If a pose contradicts odometry, wheels may have slipped: then the image is solved
     `together` with what is left of it, as landmarks far away look about the same after a turn and
-    a shift. If that fails, too, the clocks of camera and gyro may differ.
+    a shift. Where that explains less of the image, the pose is fused with what is left. Last, the
+    clocks of camera and gyro may differ.
     """
     slip_m, unknown_rad = UNKNOWN_VELOCITY * duration_s
     late_rad = unknown_rad if turn_radps is None else _CLOCKS_S * turn_radps
+    slipping = _spread(prediction, slip_m, 0.0)
     return (
         _fused(found, prediction)
-        or _held(_spread(prediction, slip_m, 0.0), together)
+        or _held(found, slipping, together)
+        or _fused(found, slipping)
         or _fused(found, _spread(prediction, slip_m, late_rad))
     )
 
@@ -90,13 +94,18 @@ def _fused(found: VisualFix, prediction: Prediction) -> VisualFix | None:
 
 
 def _held(
-    prediction: Prediction, together: Callable[[Prior], VisualFix | None]
+    alone: VisualFix, prediction: Prediction, together: Callable[[Prior], VisualFix | None]
 ) -> VisualFix | None:
-    """Return the pose by image and prediction together; None if it is far from the latter."""
+    """Return the pose by image and prediction together; None if it is far from either.
+
+    What the image shows `alone` has to be explained by it, too: near landmarks tell a slip.
+    """
     information = np.asarray(np.linalg.inv(prediction.covariance))
+    # The image's covariance is _CORRELATED times what its pixels say: the solver takes pixels as
+    # they are, and so the prior as that much surer; what comes out is scaled back.
     prior = Prior(T_local_base=prediction.T_local_base, information=_CORRELATED * information)
     found = together(prior)
-    if found is None:
+    if found is None or len(found.landmark_ids) < _EXPLAINED_RATIO * len(alone.landmark_ids):
         return None
     off = prior.off(found.estimate.T_local_base)
     if off @ information @ off > _CHI2:
