@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
@@ -58,7 +59,8 @@ class Pipeline:
         """Return the pose at an observation that was recorded."""
         newest = self._newest
         exact = newest if newest is not None and newest.stamp_ns == observation.stamp_ns else None
-        if newest is not None and newest.status is TrackingStatus.LOST:
+        is_lost = newest is not None and newest.status is TrackingStatus.LOST
+        if is_lost:
             status = TrackingStatus.LOST
         elif exact is not None:
             status, self._T_local_base = exact.status, exact.T_local_base
@@ -69,12 +71,19 @@ class Pipeline:
             T_local_base=self._T_local_base.copy(),
             status=status,
             covariance=None if exact is None else exact.covariance,
-            map_covariance=None if exact is None else exact.map_covariance,
+            map_covariance=None if newest is None or is_lost else self._drift(newest),
             quality_ratio=newest.quality_ratio if newest is not None else 0.0,
             inliers=newest.inliers if newest is not None else 0,
             revision=revision,
-            can_begin=newest is not None and newest.can_begin,
+            can_begin=newest is not None and is_lost and newest.can_begin,
         )
+
+    def _drift(self, newest: Tracking) -> NDArray[np.float64] | None:
+        """Return the map's covariance (6, 6) of the newest answer, in the axes of the pose now."""
+        if newest.map_covariance is None:
+            return None
+        T_now_newest = se3.inverse(self._T_local_base) @ newest.T_local_base
+        return se3.carried(newest.map_covariance, T_now_newest)
 
     def trajectory(self) -> Trajectory:
         """Return T_local_base as the program gave it; empty if no answer was late."""
