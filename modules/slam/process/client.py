@@ -48,7 +48,7 @@ class Slam(Protocol):
 def pose(
     stamp_ns: int, T_local_base: NDArray[np.float64], status: int = TRACKING, **more: Any
 ) -> dict[str, Any]:
-    """Return a reply with one pose (4, 4) [m]; `more`: covariance, quality_ratio, can_begin."""
+    """Return a reply with one pose (4, 4) [m]; `more`: covariance, quality_ratio and the like."""
     reply = {"stamps_ns": [stamp_ns], "T_local_base": [T_local_base], "status": [status]}
     return {**reply, **{name: [value] for name, value in more.items()}}
 

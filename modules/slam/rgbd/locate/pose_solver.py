@@ -155,7 +155,7 @@ class PoseSolver:
             residuals=residuals,
             jacobian=by_pixel,
             sigma_px=measured.seen.sigma_px[inliers],
-            normal=by_pixel @ by_pixel.T + by_depth @ by_depth.T + self._known(prior),
+            normal=by_pixel @ by_pixel.T + by_depth @ by_depth.T,
         )
         # If the errors are larger than their sigmas, the covariance is scaled up.
         covariance = se3.carried(np.linalg.inv(end.normal), self._camera.T_base_cam)

@@ -61,8 +61,8 @@ class LoopDetector:
     def candidate(self, query: Query) -> int | None:
         """Return the unconnected keyframe that is exceptionally similar to the new one.
 
-        Depth has to verify it: far landmarks look about the same after a turn and a shift. Only a
-        camera that never had any does without.
+        Depth has to verify it: far landmarks look about the same after a turn and a shift. Only
+        where no keyframe of the map has depth, loops do without.
         """
         keyframes = self._map.keyframes
         new = keyframes[query.keyframe_id]

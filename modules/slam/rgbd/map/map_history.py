@@ -44,7 +44,7 @@ class MapHistory:
     ) -> None:
         self._map, self._eye = visual_map, eye
         self._graph, self._frames = PoseGraph(), FrameLog()
-        self._keyframes: dict[int, Keyframe] = {}  # including those just removed from the map
+        self._keyframes: dict[int, Keyframe] = {}  # as the map has them
         self.recognizer = PlaceRecognizer(visual_map, localizer, min_inliers=min_inliers)
         detector = LoopDetector(visual_map, self.recognizer, self._graph)
         self._closer = VisualLoopCloser(

@@ -46,7 +46,7 @@ class Doubts:
 
 
 class VisualMap:
-    """Landmarks and keyframes in `local`, kept within limits."""
+    """Landmarks and keyframes in `local`, kept within limits by `keep_limits`."""
 
     def __init__(
         self,
