@@ -7,6 +7,7 @@ import pytest
 from fakes import PERIOD_NS, RIG, observation, true_pose
 
 from sceneslam.modules.slam.pipelined import Pipelined
+from sceneslam.motion.late import Pipeline
 from sceneslam.testing import check_module
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
@@ -142,3 +143,30 @@ def test_impossible_patience_is_refused():
 def test_system_of_another_kind_is_refused():
     with pytest.raises(ConfigError, match="system"):
         Pipelined("my_slam.MyPipeline", 0.5)
+
+
+def said(answers):
+    """Return what a system that says `answers` (index of observation -> fields) is taken to say."""
+    pipeline, found = Pipeline(late_max_s=1.0), []
+    for index in range(6):
+        seen = observation(index)
+        pipeline.note(seen)
+        if index in answers:
+            given = {"T_local_base": true_pose(seen.stamp_ns), "status": TrackingStatus.TRACKING}
+            pipeline.take([Tracking(stamp_ns=seen.stamp_ns, **given | answers[index])])
+        found.append(pipeline.report(seen, 0))
+    return found
+
+
+def test_the_drift_of_a_systems_map_is_that_of_its_newest_answer():
+    answers = said({k: {"map_covariance": (k + 1.0) * np.eye(6)} for k in (0, 1, 4)})
+    yaw_variance = [answer.map_covariance[5, 5] for answer in answers]
+    np.testing.assert_allclose(yaw_variance, [1, 2, 2, 2, 5, 5])
+    T = se3.inverse(answers[3].T_local_base) @ answers[1].T_local_base
+    np.testing.assert_allclose(answers[3].map_covariance, se3.carried(2.0 * np.eye(6), T))
+
+
+def test_a_system_may_begin_anew_only_where_it_says_that_it_is_lost():
+    lost = {"status": TrackingStatus.LOST, "can_begin": True}
+    assert [answer.can_begin for answer in said({0: {}, 2: lost})] == [0, 0, 1, 1, 1, 1]
+    assert not any(answer.can_begin for answer in said({0: {"can_begin": True}}))
