@@ -18,6 +18,7 @@ from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
+from ..local import LocalModule
 from .adjust.odometry_constraints import OdometryIntegrator, led
 from .adjust.renewal import NEWEST, LocatedView, renew, seen_by
 from .answers import held, placed, started, unseen
@@ -31,7 +32,7 @@ from .settings import RgbdSettings
 
 
 @dataclass(kw_only=True, eq=False)
-class RgbdSlam(RgbdSettings):
+class RgbdSlam(LocalModule, RgbdSettings):
     """Tracks a camera with or without depth: the map and its scale stay when depth is missing.
 
     After ORB-SLAM2's front end (Mur-Artal and Tardos 2017). Without depth, new landmarks are
@@ -60,9 +61,6 @@ class RgbdSlam(RgbdSettings):
         self._T_local_base = se3.identity()
         self._held_ids = np.zeros(0, np.int64)  # landmarks that support the newest pose
         self._observations, self._is_lost = 0, False
-
-    def set_pose(self, T_map_local: Transform) -> None:
-        """Do nothing: the poses are in `local`, independent of T_map_local."""
 
     def set_scene(self, scene: str) -> None:
         """Set the scene; in `monocular_scenes` depth is not used."""
