@@ -106,6 +106,27 @@ def test_information_is_that_of_the_residuals():
     assert tracker.compare(views[1], views[0], off).matched_ratio < found.matched_ratio
 
 
+@pytest.mark.parametrize(("sees_noise", "share_max"), [(False, 1.0), (True, 0.05)])
+def test_the_noise_of_a_dark_image_says_nothing_of_where_it_is(sees_noise, share_max):
+    """A flat wall, seen twice from one place: along it, only the image can tell."""
+    tracker, random = Tracker(CAMERA, 640, 0.3, 0.4), np.random.default_rng(0)
+    width, height = CAMERA.size_wh
+    depth_m = np.full((height, width), 2.0, np.float32)
+    texture = cv2.GaussianBlur(random.uniform(0, 255, (height, width)), (0, 0), 4) * 2 - 100
+
+    def information(contrast):
+        views = []
+        for _ in range(2):
+            grey = 20.0 + contrast * texture + random.normal(0.0, 5.0, texture.shape)
+            image = cv2.cvtColor(grey.clip(0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+            views.append(tracker.view(image, depth_m))
+        return tracker.compare(views[1], views[0], np.eye(4)).information[0, 0]
+
+    lit = information(1.0)
+    assert lit > 1e4  # within 1 cm
+    assert (information(0.0) < share_max * lit) or not sees_noise
+
+
 @pytest.mark.parametrize(("key", "value"), [("width_px", 0), ("matched_min_ratio", 1.0)])
 def test_a_setting_that_makes_no_sense_is_named(key, value):
     with pytest.raises(ConfigError, match=key):

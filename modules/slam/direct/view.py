@@ -129,13 +129,18 @@ class Tracker:
             # Noise of grey values, by the differences.
             missed = other.grey[row[rows], column[rows]] - greys[rows]
             missed = missed - np.median(missed)  # exposure
-            grey_sigma = max(spread(missed), _GREY_SIGMA_MIN)
+            noise = spread(missed)
+            grey_sigma = max(noise, _GREY_SIGMA_MIN)
             # Derivatives of both residuals, grey(pixel) and depth(pixel) - z, over their sigmas
             # (Steinbruecker et al., ICCVW 2011); the information is J' J.
             photometric = np.einsum("ni,nij->nj", slopes[:, 0], jacobians[:, :2]) / grey_sigma
             geometric = np.einsum("ni,nij->nj", slopes[:, 1], jacobians[:, :2]) - jacobians[:, 2]
             geometric /= sigma_m[rows, None]
-            information = (photometric.T @ photometric + geometric.T @ geometric) / _CORRELATION
+            # A slope is half a difference of two greys, and so has half the variance of their
+            # noise, a quarter of that of `missed`: by it, darkness would say where it is.
+            by_noise = 0.5 * noise / grey_sigma * jacobians[:, :2].reshape(-1, 6)
+            seen = photometric.T @ photometric - by_noise.T @ by_noise
+            information = (_positive(seen) + geometric.T @ geometric) / _CORRELATION
         return Comparison(information=information, compared=int(inside.sum()), matched=len(rows))
 
 
@@ -166,6 +171,12 @@ def _jacobians(
     )
     moved = np.concatenate([np.broadcast_to(np.eye(3), minus_hat.shape), minus_hat], axis=2)
     return np.asarray(projection @ (T_other_view[:3, :3] @ moved))
+
+
+def _positive(matrix: Doubles) -> Doubles:
+    """Return a symmetric matrix without its negative part."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray(vectors @ np.diag(np.maximum(values, 0.0)) @ vectors.T)
 
 
 def _slopes(view: DirectView, row: NDArray[np.int64], column: NDArray[np.int64]) -> Doubles:
