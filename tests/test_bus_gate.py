@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from driving import GATE, drive, events, policy
+from driving import GATE, dark_from, drive, events, policy
 from fakes import PERIOD_NS, RIG, TWIST, ExactModule, observation, true_pose
 
 from sceneslam.bus.decision import Action, Situation, StandbyTrial, decide
@@ -106,6 +106,35 @@ def test_candidate_that_slides_is_refused_while_the_old_module_holds():
     )
     assert events(log, "refused")[0]["to"] == "dark"
     assert set(atlas.pose_modules) == {"bright"}
+
+
+class Certain(ExactModule):
+    """States that it is certain, and moves so many times as far as the robot does."""
+
+    def __init__(self, ratio, requires=ExactModule.requires):
+        super().__init__()
+        self.ratio, self.requires = ratio, requires
+
+    def track(self, observation):
+        tracking = super().track(observation)
+        T_local_base = tracking.T_local_base.copy()
+        T_local_base[:3, 3] *= self.ratio
+        return replace(tracking, T_local_base=T_local_base, covariance=1e-6 * np.eye(6))
+
+
+BY_WHEELS = (frozenset({Sensor.ODOMETRY}),)
+
+
+@pytest.mark.parametrize(
+    ("requires", "is_refused"), [(ExactModule.requires, True), (BY_WHEELS, False)]
+)
+def test_a_certain_candidate_is_refused_where_wheels_and_the_old_module_agree(requires, is_refused):
+    """A module that only follows the wheels is no witness for them."""
+    modules = {"bright": Certain(1.0, requires), "dark": Certain(1.5)}
+    dark = dark_from(40)
+    _, atlas, log, _ = drive(modules, steps=65, gate=GATE, handover="rewind", scene_at=dark)
+    assert bool(events(log, "refused")) is is_refused
+    assert (atlas.pose_modules[-1] == "bright") is is_refused
 
 
 @pytest.mark.parametrize("lost", [range(0), range(50, 51), range(48, 53)])

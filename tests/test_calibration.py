@@ -41,6 +41,24 @@ def test_bias_that_is_learnt_late_is_taken_off_once(bias):
     assert abs(headings[-1] - headings[1500]) < 0.35 * bias
 
 
+@pytest.mark.parametrize(
+    ("wheels_rad", "missed_rad"), [(0.001, 0.0), (0.003, 0.398), (-0.001, -0.398)]
+)
+def test_wheels_miss_what_they_turn_otherwise_than_the_gyro(wheels_rad, missed_rad):
+    """In 200 observations, of which one has no odometry: nothing is known of its interval."""
+    reckoning, T_step = DeadReckoning(RIG, None), se3.from_xy_yaw(0.02, 0.0, wheels_rad)
+    assert reckoning.witness.missed_rad == 0.0
+    for index in range(201):
+        one = seen(index, 0.0, [0.0, 0.0, 0.001 / (PERIOD_NS / 1e9)], has_odometry=index != 100)
+        if index != 100:
+            one = replace(one, T_odom_base=np.linalg.matrix_power(T_step, index))
+        reckoning.correct(one, "")
+    assert reckoning.witness.missed_rad == pytest.approx(missed_rad, abs=0.15)  # or a bias
+    assert not reckoning.witness.is_vouched
+    without = DeadReckoning(replace(RIG, sensors=RIG.sensors - {Sensor.GYRO}), None)
+    assert without.witness.missed_rad is None
+
+
 def tracked(T_local_base, *, deviation_m=0.003, inliers=100, revision=0):
     return Tracking(
         stamp_ns=0,

@@ -8,7 +8,7 @@ from driving import GATE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneslam.bus.judging.gate import Gate, GateSettings
+from sceneslam.bus.judging.gate import NOBODY, Gate, GateSettings, Witness
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.rig import Wheels
@@ -173,7 +173,7 @@ def test_a_past_corrected_at_the_end_of_a_loss_is_no_motion():
     assert all(trusted(judged(module, revised_at=70))[70:])
 
 
-def witnessed(module, *, odometry=arc, steps=100, deviation_m=0.005):
+def witnessed(module, *, odometry=arc, steps=100, deviation_m=0.005, witness=lambda step: NOBODY):
     """Return the judgements of a module that states how certain it is."""
     gate = Gate(GATE, Wheels())
     return [
@@ -182,16 +182,17 @@ def witnessed(module, *, odometry=arc, steps=100, deviation_m=0.005):
             T_local_base=module(step),
             T_odom_base=odometry(step),
             deviation_m=deviation_m,
+            witness=witness(step),
         )
         for step in range(steps)
     ]
 
 
-def frozen(first, last):
-    """Stand still between two steps of an arc, and go on from there."""
+def frozen(first, last, along=arc):
+    """Stand still between two steps of a path, and go on from there."""
 
     def pose(step):
-        return arc(min(step, first) + max(step - last, 0))
+        return along(min(step, first) + max(step - last, 0))
 
     return pose
 
@@ -245,3 +246,40 @@ def test_a_module_that_is_less_certain_than_wheels_are_is_not_believed_against_t
 def test_a_module_that_jumps_is_found_though_the_wheels_have_another_size():
     judgements = witnessed(jumping(60, 1.0), odometry=scaled(0.7))
     assert trusted(judgements)[59] and not any(trusted(judgements)[61:])
+
+
+@pytest.mark.parametrize("step", [2, 3, 4, 6])
+def test_a_module_that_jumps_at_once_after_it_began_is_found_however_certain_it_is(step):
+    judgements = witnessed(jumping(step, 0.4), steps=20)
+    assert judgements[step].is_wrong
+    assert not any(judgement.wheels_lie for judgement in judgements)
+
+
+def spinning(step):
+    """Turn twice as far as the robot does."""
+    return arc(step, turn_rad_s=0.4)
+
+
+@pytest.mark.parametrize(("missed_rad_s", "is_lie"), [(0.0, False), (0.03, False), (0.2, True)])
+def test_a_turn_that_wheels_and_gyro_agree_on_refutes_a_certain_module(missed_rad_s, is_lie):
+    def gyro(step):
+        return Witness(missed_rad=missed_rad_s * PERIOD_S * step)
+
+    last = witnessed(spinning, witness=gyro)[-1]
+    assert last.wheels_lie is is_lie and last.is_wrong is not is_lie
+    assert witnessed(spinning)[-1].wheels_lie  # without a gyro
+
+
+def test_what_a_gyro_says_of_the_wheels_turn_is_not_said_of_their_distance():
+    def straight(step):
+        return arc(step, turn_rad_s=0.0)
+
+    agreeing, lie = Witness(missed_rad=0.0), frozen(40, 90, along=straight)
+    judgements = witnessed(straight, odometry=lie, steps=80, witness=lambda step: agreeing)
+    assert not any(judgement.is_wrong for judgement in judgements) and judgements[-1].wheels_lie
+
+
+def test_wheels_that_another_module_moves_with_refute_a_certain_module():
+    vouched = witnessed(scaled(0.75), witness=lambda step: Witness(is_vouched=True))
+    assert vouched[-1].is_wrong and not any(judgement.wheels_lie for judgement in vouched)
+    assert witnessed(scaled(0.75))[-1].wheels_lie

@@ -143,7 +143,8 @@ class Bus:
         self._watch.look(observation)
         observation = self._reckoning.correct(observation, self.active)
         self._changeover.submit(observation)
-        self._estimator.track(observation, by_velocity=self._has_other())
+        witness = self._reckoning.witness
+        self._estimator.track(observation, witness, by_velocity=self._has_other())
         self._reckoning.learn(self._estimator.session.hold, self.active)
         outcome = self._do(observation)
         while outcome is not None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.handover import Handover
-from sceneslam.bus.judging.gate import Gate
+from sceneslam.bus.judging.gate import Gate, Witness
 from sceneslam.bus.judging.hold import Hold
 from sceneslam.bus.judging.runner import Legacy, Runner
 from sceneslam.bus.observation_buffer import BufferedObservation, ObservationBuffer
@@ -54,11 +54,14 @@ class Estimator:
         """Return the stamp of the newest observation."""
         return self._memory.newest.stamp_ns
 
-    def track(self, observation: Observation, *, by_velocity: bool) -> None:
-        """Give the observation its pose; if the module violates its contract, log that."""
+    def track(self, observation: Observation, witness: Witness, *, by_velocity: bool) -> None:
+        """Give the observation its pose; if the module violates its contract, log that.
+
+        `witness` says what is known of the odometry without the module.
+        """
         self._keep_maps(waits=False)
         session, was_placed = self.session, self.session.is_placed
-        moment = session.advance(observation, by_velocity=by_velocity)
+        moment = session.advance(observation, by_velocity=by_velocity, witness=witness)
         self._tell(observation.stamp_ns)
         if session.hold.suspect_since_ns is not None and session.fault is None:
             since_ns = max(session.hold.suspect_since_ns, session.from_ns)

@@ -138,7 +138,13 @@ class Handover:
             T_map_bridged = session.predict(
                 session.bridge.copy(), given, by_velocity=True, T_prev_curr=motion
             )
-        found = session.advance(given, by_velocity=True, T_prev_curr=motion, is_given=is_given)
+        found = session.advance(
+            given,
+            by_velocity=True,
+            T_prev_curr=motion,
+            is_given=is_given,
+            witness=moment.witness,
+        )
         if session.fault is not None:
             raise session.fault
         if session.tracking is not None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.bus.bridge import Bridge
+from sceneslam.bus.judging.gate import Witness
 from sceneslam.types.observation import Observation, Tracking
 from sceneslam.types.se3 import Transform
 
@@ -27,11 +28,18 @@ class BufferedObservation:
     turn: NDArray[np.float64] | None  # (3, 3) rotation since the previous entry, if trusted
     tracking: Tracking | None  # the active module's answer, also where its pose is not used
     is_trusted: bool  # a module that was not suspect was tracking, as certain as usual
+    vouches: bool = False  # then: it measures without wheels, and moved as they and the gyro say
+    missed_rad: float | None = None  # yaw by wheels alone since the start, less the gyro's
 
     @property
     def stamp_ns(self) -> int:
         """Return the observation's stamp."""
         return self.observation.stamp_ns
+
+    @property
+    def witness(self) -> Witness:
+        """Return what is known of the odometry, for a module that gets the observation later."""
+        return Witness(missed_rad=self.missed_rad, is_vouched=self.is_trusted and self.vouches)
 
 
 class ObservationBuffer:

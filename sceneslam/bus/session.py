@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.bus.bridge import Bridge
+from sceneslam.bus.judging.gate import NOBODY, Witness
 from sceneslam.bus.judging.hold import Health, Hold
 from sceneslam.bus.judging.runner import Runner
 from sceneslam.bus.observation_buffer import BufferedObservation
@@ -68,23 +69,25 @@ class ModuleSession:
         by_velocity: bool,
         T_prev_curr: Transform | None = None,
         is_given: bool = True,
+        witness: Witness = NOBODY,
     ) -> BufferedObservation:
         """Return the observation with its pose: the module's, or a bridged one.
 
         The module is spared the observation unless `is_given`.
         Odometry bridges; else constant velocity, if `by_velocity` or while the module's sensors
-        are silent; else `T_prev_curr`, the motion as it was estimated at the time.
+        are silent; else `T_prev_curr`, the motion as it was estimated at the time. `witness` says
+        what is known of the odometry without the module.
         """
         self.fault, self.tracking = None, None
         try:
             if is_given and self.is_running:
-                self.tracking = self._ask(observation)
+                self.tracking = self._ask(observation, witness)
             else:
                 self.hold.spare(observation)
             if self.tracking is not None:
                 T_map_tracked = self._place(observation, self.tracking)
                 self.tracking = self._doubted(self.tracking)
-                return self._moment(observation, T_map_tracked)
+                return self._moment(observation, T_map_tracked, witness)
         except ModuleError as error:
             self.fault, self.tracking = error, None
         if not self.is_running:
@@ -96,7 +99,7 @@ class ModuleSession:
             by_velocity=by_velocity or is_silent,
             T_prev_curr=T_prev_curr,
         )
-        return self._moment(observation, T_map_base)
+        return self._moment(observation, T_map_base, witness)
 
     def predict(
         self,
@@ -115,10 +118,10 @@ class ModuleSession:
             T_map_base = bridge.follow(observation, T_prev_curr)
         return T_map_base
 
-    def _ask(self, observation: Observation) -> Tracking | None:
+    def _ask(self, observation: Observation, witness: Witness) -> Tracking | None:
         """Return the module's answer if it may be used; raises ModuleError as the runner does."""
         assert self.runner is not None
-        tracking = self.hold.ask(self.runner, observation)
+        tracking = self.hold.ask(self.runner, observation, witness)
         self.is_acquitted = False
         if self.hold.is_suspect:
             self.is_placed = False  # it is placed anew at the robot's next pose
@@ -167,7 +170,7 @@ class ModuleSession:
         return replace(tracking, map_covariance=drift)
 
     def _moment(
-        self, observation: Observation, T_map_base: Transform | None
+        self, observation: Observation, T_map_base: Transform | None, witness: Witness
     ) -> BufferedObservation:
         tracking = self.tracking
         return BufferedObservation(
@@ -178,4 +181,6 @@ class ModuleSession:
             turn=self.hold.turn if self.is_running else None,
             tracking=self.hold.answer if tracking is None else tracking,
             is_trusted=tracking is not None and self.hold.is_trusted,
+            vouches=self.runner is not None and self.hold.agrees and not self.runner.needs_wheels,
+            missed_rad=witness.missed_rad,
         )

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.bus.judging.gate import GateSettings
+from sceneslam.bus.judging.gate import GateSettings, Witness
 from sceneslam.bus.judging.hold import Hold
 from sceneslam.bus.judging.wheel_scale import WheelScale
 from sceneslam.motion.model import MotionModel
@@ -43,6 +43,12 @@ class DeadReckoning:
         self._T_corrected_base: Transform | None = None  # the same, corrected
         self._is_gap = False  # the last observation had no odometry
         self._turned_rad = 0.0  # rotation angle since the observation before [rad]
+        self._missed_rad = 0.0  # yaw by wheels alone since the start, less the gyro's
+
+    @property
+    def witness(self) -> Witness:
+        """Return what the gyro says of the wheels at the newest observation."""
+        return Witness(missed_rad=None if self._motion is None else self._missed_rad)
 
     def correct(self, observation: Observation, module: str) -> Observation:
         """Return the observation for a module, corrected by the calibration so far."""
@@ -61,6 +67,7 @@ class DeadReckoning:
             return observation
         T_prev_curr = se3.inverse(before) @ now
         if turn is not None and not is_gap:  # the gyro does not cover a gap
+            self._missed_rad += se3.yaw_rad(T_prev_curr) - se3.yaw_rad(turn)
             T_prev_curr = self._turned(T_prev_curr, turn)
         if self._learns:
             self._turned_rad = float(se3.rotation_angle_rad(T_prev_curr))

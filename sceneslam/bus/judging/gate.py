@@ -37,6 +37,17 @@ class GateSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Witness:
+    """What others than the judged module say of the odometry at an observation."""
+
+    missed_rad: float | None = None  # yaw by wheels alone since the start, less the gyro's
+    is_vouched: bool = False  # another module, which measures without wheels, moved as they did
+
+
+NOBODY = Witness()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Judgement:
     """How far a module's motion is trusted at one observation."""
 
@@ -74,6 +85,7 @@ class _Sample:
     T_odom_base: Transform
     way_m: float  # distance driven until then
     turn_rad: float  # turned until then
+    missed_rad: float | None  # of wheels alone until then, by the gyro
 
     @property
     def R_local_odom(self) -> NDArray[np.float64]:
@@ -88,6 +100,7 @@ class _Excess:
     distance: float
     turn: float
     apart_m: float  # of points 1 m ahead of base, which move in a turn as well
+    is_refuted: bool  # the turn is too much, and wheels and gyro, each alone, agree on it
 
 
 class Gate:
@@ -100,12 +113,13 @@ class Gate:
     def __init__(self, settings: GateSettings, wheels: Wheels) -> None:
         self._sigmas, self._wheels = settings.sigmas, wheels
         self._samples: list[_Sample] = []  # by rising stamp, back to the longest horizon
+        self._first: _Sample | None = None  # with which the activation began
         self._T_odom_base: Transform | None = None
         self._odom_ns = 0  # when odometry was there last
         self._unchecked = Judgement(is_trusted=True)  # while the next odometry is awaited
         self._way_m, self._turn_rad = 0.0, 0.0
         self._within_since_ns = 0  # since when both have been within bounds
-        self._has_jumped = False  # the module has jumped as no robot can, since the two agreed
+        self._is_module = False  # the module was at fault, since the two agreed
         self._have_wheels_jumped = False  # the same of the wheels
         self._is_wheels = False  # the wheels were at fault, since the two agreed
         self._is_acute = False  # the shortest horizon shows a disagreement
@@ -122,6 +136,7 @@ class Gate:
         T_odom_base: Transform | None,
         is_revised: bool = False,
         deviation_m: float | None = None,
+        witness: Witness = NOBODY,
     ) -> Judgement:
         """Return how far the module is trusted at an observation.
 
@@ -147,8 +162,9 @@ class Gate:
             T_odom_base=T_odom_base,
             way_m=self._way_m,
             turn_rad=self._turn_rad,
+            missed_rad=witness.missed_rad,
         )
-        judgement = self._judge(now, deviation_m) if self._samples else self._begin(now)
+        judgement = self._judge(now, deviation_m, witness) if self._samples else self._begin(now)
         self._samples.append(now)
         self._unchecked = Judgement(
             is_trusted=judgement.is_trusted, wheels_lie=judgement.wheels_lie
@@ -166,11 +182,11 @@ class Gate:
             sample.T_local_base = T_new_old @ sample.T_local_base
 
     def _begin(self, now: _Sample) -> Judgement:
-        self._within_since_ns = now.stamp_ns
+        self._first, self._within_since_ns = now, now.stamp_ns
         self._usual(now, 0.0)
         return Judgement(is_trusted=False)
 
-    def _judge(self, now: _Sample, deviation_m: float | None) -> Judgement:
+    def _judge(self, now: _Sample, deviation_m: float | None, witness: Witness) -> Judgement:
         found = self._anchors(now.stamp_ns)
         excesses = [_excess(then, now, self._sigmas, self._wheels) for then in found]
         newest = max(excesses[0].distance, excesses[0].turn)
@@ -187,7 +203,9 @@ class Gate:
         is_long = now.stamp_ns - self._within_since_ns >= _PROBATION_NS
         if is_long:
             # They belong to another disagreement.
-            self._has_jumped = self._have_wheels_jumped = self._is_wheels = False
+            self._is_module = self._have_wheels_jumped = self._is_wheels = False
+        if is_wrong and (witness.is_vouched or any(excess.is_refuted for excess in excesses)):
+            self._is_module, self._is_wheels = True, False  # two against one
         apart_m = max(excess.apart_m for excess in excesses)
         if is_wrong and self._is_wheels_fault(found[-1], now, apart_m, deviation_m):
             self._distances, self._usual_excess = RecentMedian(_USUAL_KEPT, width=1), 0.0
@@ -218,12 +236,12 @@ class Gate:
         by_module, by_wheels = self._jumps(now)
         least_m_s = max(_JUMP_M_S, _EXPLAINED * apart_m / _STEP_S)
         self._have_wheels_jumped |= by_wheels > max(least_m_s, _JUMP_RATIO * by_module)
-        if deviation_m is not None and deviation_m <= wheels_m and not self._has_jumped:
+        if deviation_m is not None and deviation_m <= wheels_m and not self._is_module:
             # A change of velocity is made of three positions, weighted 1, -2, 1.
             noise_m_s = math.sqrt(6.0) * deviation_m / _STEP_S
             least_m_s = max(least_m_s, _JUMP_SIGMAS * noise_m_s)
-            self._has_jumped = by_module > max(least_m_s, _JUMP_RATIO * by_wheels)
-            self._is_wheels = not self._has_jumped
+            self._is_module = by_module > max(least_m_s, _JUMP_RATIO * by_wheels)
+            self._is_wheels = not self._is_module
         return self._is_wheels
 
     def _jumps(self, now: _Sample) -> tuple[float, float]:
@@ -231,6 +249,10 @@ class Gate:
         late = [*self._samples[self._until(now.stamp_ns - _LATE_NS) :], now]
         times_s = np.array([(sample.stamp_ns - now.stamp_ns) / 1e9 for sample in late])
         before = np.searchsorted(times_s, times_s - _STEP_S, side="right") - 1
+        after = before.copy()  # whose velocity is the one before
+        if late[0] is self._first:  # since then there are shorter intervals only
+            before[1:] = np.maximum(before[1:], 0)
+            after = np.where(before > 0, before, np.arange(len(late)) - 1)
         is_known = before >= 0
         elapsed_s = (times_s - times_s[before])[is_known, None]
         found = []
@@ -238,7 +260,9 @@ class Gate:
             points = np.array([T[:3, 3] + T[:3, 0] for T in poses])
             velocities = np.full_like(points, np.nan)
             velocities[is_known] = (points - points[before])[is_known] / elapsed_s
-            changes = np.linalg.norm(velocities - velocities[before], axis=1)[is_known]
+            # Over a short interval, an error of position makes a larger one of velocity.
+            changes = np.linalg.norm(velocities - velocities[after], axis=1)[is_known]
+            changes *= np.minimum(elapsed_s[:, 0] / _STEP_S, 1.0)
             changes = changes[np.isfinite(changes)]
             found.append(float(changes.max(initial=0.0)))
         return found[0], found[1]
@@ -284,11 +308,16 @@ def _excess(then: _Sample, now: _Sample, sigmas: float, wheels: Wheels) -> _Exce
     floor_m = sigmas * _DISTANCE_M
     bound_m = floor_m + sigmas * wheels.drift_ratio * way_m
     deviation_rad = _TURN_RAD + wheels.drift_ratio * turned_rad + wheels.drift_rad_per_m * way_m
+    bound_rad = sigmas * deviation_rad
+    missed_rad = math.inf
+    if then.missed_rad is not None and now.missed_rad is not None:
+        missed_rad = abs(now.missed_rad - then.missed_rad)
     broken = apart_m / (floor_m + _BROKEN_RATIO * way_m)
     return _Excess(
         distance=apart_m / bound_m,
-        turn=max(apart_rad / (sigmas * deviation_rad), broken),
+        turn=max(apart_rad / bound_rad, broken),
         apart_m=apart_m + apart_rad,
+        is_refuted=missed_rad <= bound_rad < apart_rad,
     )
 
 

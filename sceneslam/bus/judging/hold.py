@@ -10,7 +10,7 @@ from statistics import median_low
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.bus.judging.gate import Gate
+from sceneslam.bus.judging.gate import NOBODY, Gate, Witness
 from sceneslam.bus.judging.recent import CovarianceMonitor
 from sceneslam.bus.judging.runner import Runner
 from sceneslam.types import se3
@@ -36,6 +36,7 @@ class Hold:
         self.is_suspect = False  # from a disagreement on until it has agreed for long enough
         self.suspect_since_ns: int | None = None  # where suspicion begins: since when it may err
         self.is_trusted = False  # another module may start from its last pose
+        self.agrees = False  # for some time it has moved as wheels and gyro say
         self.wheels_lie = False  # by the module's motion and the robot's inertia
         self.wheels_jumped = False  # then: their velocity changed as no robot's can
         self.answer: Tracking | None = None  # to the last observation, unless it is lost
@@ -70,7 +71,9 @@ class Hold:
             return Health.SUSPECT
         return Health.LOST if self.status is TrackingStatus.LOST else Health.SILENT
 
-    def ask(self, runner: Runner, observation: Observation) -> Tracking | None:
+    def ask(
+        self, runner: Runner, observation: Observation, witness: Witness = NOBODY
+    ) -> Tracking | None:
         """Return a module's answer if its pose may be used; raises ModuleError as the runner."""
         self.is_trusted, self.answer, self.tracking = False, None, None
         if not runner.can_use(observation):
@@ -84,7 +87,8 @@ class Hold:
         is_lost = tracking.status is TrackingStatus.LOST
         is_tracking = tracking.status is TrackingStatus.TRACKING
         covariance = tracking.covariance if is_tracking else None
-        self._judge(observation, None if is_lost else tracking.T_local_base, covariance)
+        T_local_base = None if is_lost else tracking.T_local_base
+        self._judge(observation, T_local_base, covariance, witness)
         self.answer = None if is_lost else tracking
         if tracking.status is TrackingStatus.DEGRADED:
             self.degraded_ns = tracking.stamp_ns
@@ -130,9 +134,10 @@ class Hold:
         observation: Observation,
         T_local_base: Transform | None,
         covariance: NDArray[np.float64] | None = None,
+        witness: Witness = NOBODY,
     ) -> None:
         """Compare the module's motion with the odometry's."""
-        self.turn, self.suspect_since_ns = None, None
+        self.turn, self.suspect_since_ns, self.agrees = None, None, False
         T_odom_prev, self._T_odom_prev = self._T_odom_prev, observation.T_odom_base
         if self._gate is None:
             return
@@ -142,7 +147,9 @@ class Hold:
             T_odom_base=observation.T_odom_base,
             is_revised=self.is_revised,
             deviation_m=None if covariance is None else _deviation_m(covariance),
+            witness=witness,
         )
+        self.agrees = judgement.is_trusted and judgement.turn_agrees
         if T_local_base is not None:
             self.wheels_lie, self.wheels_jumped = judgement.wheels_lie, judgement.wheels_jumped
         if judgement.is_wrong:

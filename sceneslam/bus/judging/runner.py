@@ -53,6 +53,7 @@ class Runner:
         self._module = module
         # Sensors in every set are needed; if the sets share none, any of their sensors will do.
         common = frozenset[Sensor].intersection(*module.requires)
+        self.needs_wheels = Sensor.ODOMETRY in common  # its motion may be theirs
         self._sensors = common or frozenset[Sensor]().union(*module.requires)
 
     @property
