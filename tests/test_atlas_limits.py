@@ -92,8 +92,8 @@ def test_loops_of_modules_have_their_stamps_and_the_inverse_of_their_information
         is_loop=np.array([False, False, True]),
     )
     (closed,) = closed_loops([MapLayers(), MapLayers(pose_graph=graph)])
-    assert (closed.from_ns, closed.to_ns) == (10, 30)
-    np.testing.assert_array_equal(closed.T_from_to, at(3.0))
+    assert (closed.first, closed.second) == (10, 30)
+    np.testing.assert_array_equal(closed.T_first_second, at(3.0))
     expected = np.diag([0.25, 0.04, 1.0, 0.01, 1.0, 1.0]) + 1e-6 * np.eye(6)
     np.testing.assert_allclose(closed.covariance, expected)
 

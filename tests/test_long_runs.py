@@ -171,6 +171,7 @@ def test_scans_beyond_the_limit_are_thinned_to_every_second_one():
     thin([session], 0.1, 64 * 600)  # half of that is for 35 scans
     assert session.layers.scans.stamps_ns.tolist() == list(range(0, 64, 2))
     assert session.layers.scans.ranges_m.shape == (32, 100)
+    assert not np.shares_memory(session.layers.scans.ranges_m, scans.ranges_m)  # those are freed
     thin([session], 0.1, 1.0)
     assert session.layers.scans.stamps_ns.tolist() == [0]
 

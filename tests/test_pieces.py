@@ -18,6 +18,7 @@ from sceneslam.types import se3
 from sceneslam.types.covariance import unknown_motion
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.rig import Laser, Rig, Sensor
+from sceneslam.types.run import BRIDGED
 from sceneslam.types.trajectory import Trajectory
 
 RIG = Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser())
@@ -136,3 +137,24 @@ def test_one_loop_between_two_pieces_is_not_believed_whatever_loops_there_are_wi
     assert graph._believed([within, across]) == [within]
     assert graph._believed([within, across, again]) == [within, across, again]
     assert graph._believed([within]) == [] and graph._believed([across]) == []
+
+
+def test_a_piece_begins_where_its_module_answered_though_poses_were_guessed_before(
+    monkeypatch, tmp_path
+):
+    """The bus tells poses bridged at constant velocity with the session that they lead to."""
+    add, begun = Atlas.add, dict[int, int]()
+
+    def bridged_first(atlas, stamp_ns, T_map_base, module, covariance, map_covariance):
+        session = len(atlas._sessions) - 1
+        begun.setdefault(session, stamp_ns)
+        if session and stamp_ns < begun[session] + 5 * PERIOD_NS:
+            module, covariance, map_covariance = BRIDGED, None, None
+        add(atlas, stamp_ns, T_map_base, module, covariance, map_covariance)
+
+    monkeypatch.setattr(Atlas, "add", bridged_first)
+    walls, path = furnished(np.random.default_rng(0)), laps(1)
+    lap = len(path)
+    carried(walls, path[: lap // 6], path[lap // 2 :], save=str(tmp_path / "map"))
+    saved, _ = read_map_files(tmp_path / "map")
+    assert len(np.unique(saved.pieces)) == 2

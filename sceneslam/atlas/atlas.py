@@ -296,7 +296,7 @@ class Atlas:
                 index=index,
                 module=session.module,
                 T_map_local=T_map_local,
-                trajectory=session.revised if len(session.revised) else session.trajectories.online,
+                trajectory=session.revised if len(session.revised) else session.online,
             )
             for index, (session, T_map_local) in enumerate(zip(self._sessions, placed, strict=True))
         )
@@ -366,7 +366,7 @@ class Atlas:
 
     def _revise(self) -> Revised:
         return revise(
-            [session.trajectories for session in self._sessions],
+            self._sessions,
             np.array(self._path.stamps_ns, np.int64),
             np.array(self._path.poses).reshape(-1, 4, 4),
             np.array(self._path.sessions, np.int64),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,25 +88,22 @@ def _thin_scans(sessions: Sequence[OpenSession], most: float) -> None:
         for session in sessions:
             scans = session.layers.scans
             if scans is not None:
-                names = [each.name for each in fields(scans) if each.name != "cell_m"]
-                halved = {name: getattr(scans, name)[::2] for name in names}
-                session.layers = replace(session.layers, scans=replace(scans, **halved))
+                rows = np.arange(0, len(scans.stamps_ns), 2)  # copied: a slice keeps the others
+                session.layers = replace(session.layers, scans=_taken(scans, rows))
+
+
+def _taken(layer: Any, rows: NDArray[np.intp]) -> Any:
+    """Return a layer with these rows of its arrays."""
+    arrays = {each.name: getattr(layer, each.name) for each in fields(layer)}
+    taken = {name: of[rows] for name, of in arrays.items() if isinstance(of, np.ndarray)}
+    return replace(layer, **taken)
 
 
 def _of(layers: MapLayers, rows: NDArray[np.intp], marks: NDArray[np.intp]) -> MapLayers:
     """Return layers with these rows of their points and landmarks."""
     points, landmarks = layers.points, layers.landmarks
-    if points is not None:
-        colors = points.colors_bgr
-        points = PointLayer(
-            points=points.points[rows], colors_bgr=None if colors is None else colors[rows]
-        )
-    if landmarks is not None:
-        landmarks = LandmarkLayer(
-            points=landmarks.points[marks],
-            first_stamps_ns=landmarks.first_stamps_ns[marks],
-            sightings=landmarks.sightings[marks],
-        )
+    points = None if points is None else _taken(points, rows)
+    landmarks = None if landmarks is None else _taken(landmarks, marks)
     return replace(layers, points=points, landmarks=landmarks)
 
 

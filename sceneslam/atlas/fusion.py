@@ -47,11 +47,6 @@ class _PlacedGrid:
     layer: GridLayer
     corners: NDArray[np.float64]  # (4, 2) [m], map
 
-    @property
-    def resolution_m(self) -> float:
-        """Return the size of a cell."""
-        return float(self.layer.resolution_m)
-
 
 def fuse(
     placed: Sequence[Placed], *, voxel_m: float, pose_graph: PoseGraphLayer | None = None
@@ -74,15 +69,15 @@ def fuse(
     cloud, color = np.concatenate(points), np.concatenate(colors)
     owner = np.concatenate([np.zeros(0, np.uint8), *owners])
     keep = one_per_voxel(cloud, owner, voxel_m)
-    seen = [one for one in placed if one.layers.landmarks is not None]
+    landmarks, landmark_modules = _join_landmarks(placed, modules)
     return HybridMap(
         points=PointLayer(points=cloud[keep], colors_bgr=color[keep]),
         point_modules=owner[keep],
         modules=modules,
         grid=_fuse_grids(_fitting([grid for one in placed for grid in _grids(one)], voxel_m)),
         pose_graph=pose_graph,
-        landmarks=_join_landmarks([(one.T_map_local, one.layers.landmarks) for one in seen]),
-        landmark_modules=_owners(seen, modules),
+        landmarks=landmarks,
+        landmark_modules=landmark_modules,
     )
 
 
@@ -112,27 +107,23 @@ def _grids(one: Placed) -> list[_PlacedGrid]:
 
 
 def _join_landmarks(
-    placed: Sequence[tuple[Transform, LandmarkLayer | None]],
-) -> LandmarkLayer | None:
-    """Return all sessions' landmarks (N, 3) [m], map; shared landmarks occur once per session."""
-    layers = [(T, layer) for T, layer in placed if layer is not None]
-    if not layers:
-        return None
-    return LandmarkLayer(
-        points=np.concatenate([se3.apply(T, one.points).astype(np.float32) for T, one in layers]),
-        first_stamps_ns=np.concatenate([one.first_stamps_ns for _, one in layers]),
-        sightings=np.concatenate([one.sightings for _, one in layers]).astype(np.int64),
+    placed: Sequence[Placed], modules: tuple[str, ...]
+) -> tuple[LandmarkLayer | None, NDArray[np.uint8] | None]:
+    """Return all sessions' landmarks (N, 3) [m], map, and the module index of each.
+
+    Shared landmarks occur once per session.
+    """
+    seen = [(one, layer) for one in placed if (layer := one.layers.landmarks) is not None]
+    if not seen:
+        return None, None
+    points = [se3.apply(one.T_map_local, layer.points).astype(np.float32) for one, layer in seen]
+    landmarks = LandmarkLayer(
+        points=np.concatenate(points),
+        first_stamps_ns=np.concatenate([layer.first_stamps_ns for _, layer in seen]),
+        sightings=np.concatenate([layer.sightings for _, layer in seen]).astype(np.int64),
     )
-
-
-def _owners(seen: Sequence[Placed], modules: tuple[str, ...]) -> NDArray[np.uint8] | None:
-    """Return the module index of each landmark."""
-    owners = [
-        np.full(len(one.layers.landmarks.points), modules.index(one.module), np.uint8)
-        for one in seen
-        if one.layers.landmarks is not None
-    ]
-    return np.concatenate(owners) if owners else None
+    numbers = [np.uint8(modules.index(one.module)) for one, _ in seen]
+    return landmarks, np.repeat(numbers, [len(layer.points) for _, layer in seen])
 
 
 def one_per_voxel(
@@ -164,14 +155,14 @@ def _fitting(placed: Sequence[_PlacedGrid], voxel_m: float) -> list[_PlacedGrid]
 
 def _rank(one: _PlacedGrid, voxel_m: float) -> tuple[float, float]:
     """Return a sort key: grids with other cells than `voxel_m`, or a far reach, come last."""
-    cell_m = one.resolution_m
+    cell_m = one.layer.resolution_m
     return max(cell_m / voxel_m, voxel_m / cell_m), float(np.abs(one.corners).max())
 
 
 def _bounds(placed: Sequence[_PlacedGrid]) -> NDArray[np.float64]:
     """Return the lowest column and row of the grids, and the ends (2, 2), in the finest cells."""
     corners = np.concatenate([one.corners for one in placed])
-    cell_m = min(one.resolution_m for one in placed)
+    cell_m = min(one.layer.resolution_m for one in placed)
     return np.array([np.floor(corners.min(axis=0) / cell_m), np.ceil(corners.max(axis=0) / cell_m)])
 
 
@@ -179,7 +170,7 @@ def _fuse_grids(placed: Sequence[_PlacedGrid]) -> GridLayer | None:
     """Return the sum of the grids' log odds in `map`, at the finest grid's resolution."""
     if not placed:
         return None
-    resolution_m = min(one.resolution_m for one in placed)
+    resolution_m = min(one.layer.resolution_m for one in placed)
     low, end = _bounds(placed)
     columns, rows = (end - low).astype(int)
     origin_xy_m = (float(low[0] * resolution_m), float(low[1] * resolution_m))

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.atlas.revision import SessionTrajectories
 from sceneslam.atlas.rows import Rows
 from sceneslam.atlas.submaps.collector import Known
 from sceneslam.atlas.uncertainty import Covariance
@@ -37,12 +36,9 @@ class OpenSession:
     revised: Trajectory = field(default_factory=Trajectory.empty)  # T_local_base
 
     @property
-    def trajectories(self) -> SessionTrajectories:
-        """Return its poses, as reported and as revised."""
-        online = trajectory_of(self.stamps_ns, self.poses)
-        return SessionTrajectories(
-            T_map_local=self.T_map_local, online=online, revised=self.revised
-        )
+    def online(self) -> Trajectory:
+        """Return its poses as reported."""
+        return trajectory_of(self.stamps_ns, self.poses)
 
 
 @dataclass(slots=True)
@@ -89,6 +85,8 @@ class PosePath:
         """
         if self.stamps_ns and stamp_ns <= self.stamps_ns[-1]:
             return
+        if module == BRIDGED and (not self.sessions or session != self.sessions[-1]):
+            session = self.sessions[-1] if self.sessions else -1  # it begins with its first answer
         if map_covariance is None and len(self.poses) and session == self.sessions[-1]:
             before = _square(self._maps[-1])
             if not np.isnan(before[0, 0]):

@@ -8,20 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.atlas.pose_path import OpenSession
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
-from sceneslam.types.trajectory import Trajectory
 
 _ROUNDING = 1e-9  # of products of transforms
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SessionTrajectories:
-    """A session as its module reported it, and as the module revised it at its end."""
-
-    T_map_local: Transform
-    online: Trajectory  # T_local_base
-    revised: Trajectory  # T_local_base; empty: as reported
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -33,7 +24,7 @@ class Revised:
 
 
 def revise(
-    sessions: Sequence[SessionTrajectories],
+    sessions: Sequence[OpenSession],
     stamps_ns: NDArray[np.int64],
     T_map_base: NDArray[np.float64],
     pose_sessions: NDArray[np.int64],
@@ -56,7 +47,7 @@ def revise(
 
 
 def _corrections(
-    session: SessionTrajectories, carried: Transform, stamps_ns: NDArray[np.int64]
+    session: OpenSession, carried: Transform, stamps_ns: NDArray[np.int64]
 ) -> tuple[Transform, NDArray[np.float64]]:
     """Return the revised T_map_local (4, 4), and T_new_told (N, 4, 4) of the poses in `map`."""
     online, revised, T_map_local = session.online, session.revised, carried @ session.T_map_local

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -25,9 +24,6 @@ class Rows:
         """Return a copy of one row."""
         row = range(self._count)[index]
         return np.array(self._blocks[row // _BLOCK][row % _BLOCK])
-
-    def __iter__(self) -> Iterator[NDArray[np.float64]]:
-        return (self[index] for index in range(self._count))
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Return a copy of all rows (N, *shape)."""

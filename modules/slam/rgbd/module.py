@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from sceneslam.types.trajectory import Trajectory
 from ..local import LocalModule
 from .adjust.odometry_constraints import OdometryIntegrator, led
 from .adjust.renewal import NEWEST, LocatedView, renew, seen_by
-from .answers import held, placed, started, unseen
 from .locate.localizer import VisualFix
 from .parts import RgbdParts
 from .see.alignment import Alignment
@@ -29,6 +28,8 @@ from .see.sizes import check_sizes
 from .see.turn_rate import expected_rate
 from .see.view import View
 from .settings import RgbdSettings
+
+_START_VARIANCE = 1e-8  # the first pose is the origin by definition
 
 
 @dataclass(kw_only=True, eq=False)
@@ -160,8 +161,13 @@ class RgbdSlam(LocalModule, RgbdSettings):
         self._hold_pose(view.observation, view.T_predicted, prediction.covariance)
         self._insert_keyframe(view, set(), guessed_s=guessed_s)
         self._memory.hold(view.observation.stamp_ns, self._T_local_base, np.zeros(0, np.int64))
-        is_first, revision = self._observations == 1, self._memory.revision
-        return started(view, self._T_local_base, is_first=is_first, revision=revision)
+        is_first = self._observations == 1  # the motion before it is known by odometry at best
+        return self._answer(
+            view.observation,
+            TrackingStatus.TRACKING if is_first else TrackingStatus.DEGRADED,
+            covariance=_START_VARIANCE * np.eye(6) if is_first else None,
+            inliers=view.features.deep_count,
+        )
 
     def _hold(self, view: View, found: VisualFix, prediction: Prediction) -> Tracking | None:
         """Accept a pose, and extend the map if a keyframe is due; None if the gyro contradicts."""
@@ -205,11 +211,18 @@ class RgbdSlam(LocalModule, RgbdSettings):
             covariance = self._certainty.covariance(view, fix, T_local_base, around)
             if self._health.is_unsure(covariance - self._certainty.by_wheels):
                 status = TrackingStatus.DEGRADED
-        revision = self._memory.revision
-        answer = held(
-            view, fix, T_local_base, status=status, covariance=covariance, revision=revision
+        if segment is not None:  # that of its position counts, too
+            measured = np.zeros((6, 6)) if covariance is None else covariance
+            guessed = self._memory.segments.covariance(segment, T_local_base, measured)
+            if guessed is not None:
+                status, covariance = TrackingStatus.DEGRADED, guessed
+        return self._answer(
+            view.observation,
+            status,
+            covariance=covariance,
+            quality_ratio=min(1.0, fix.found_ratio(view.features)),
+            inliers=len(fix.landmark_ids),
         )
-        return answer if segment is None else placed(answer, self._memory.segments, segment)
 
     def _turn_radps(self, observation: Observation) -> float | None:
         """Return the turn rate by the gyro since the last observation, None without one."""
@@ -238,16 +251,22 @@ class RgbdSlam(LocalModule, RgbdSettings):
         if prediction.is_measured:
             self._T_local_base = prediction.T_local_base
         self._memory.hold(observation.stamp_ns, self._T_local_base, np.zeros(0, np.int64))
-        return self._unseen(observation, TrackingStatus.DEGRADED)
+        return self._answer(observation, TrackingStatus.DEGRADED, quality_ratio=0.0)
 
     def _lose(self, observation: Observation, prediction: Prediction) -> Tracking:
         self._predictor.lose(prediction)
         self._is_lost = True
-        return self._unseen(observation, TrackingStatus.LOST)
+        return self._answer(observation, TrackingStatus.LOST, quality_ratio=0.0)
 
-    def _unseen(self, observation: Observation, status: TrackingStatus) -> Tracking:
-        revision = self._memory.revision
-        return unseen(observation.stamp_ns, self._T_local_base, status, revision=revision)
+    def _answer(self, observation: Observation, status: TrackingStatus, **more: Any) -> Tracking:
+        """Return the answer with the newest pose; LOST: the last one that was tracked."""
+        return Tracking(
+            stamp_ns=observation.stamp_ns,
+            T_local_base=self._T_local_base.copy(),
+            status=status,
+            revision=self._memory.revision,
+            **more,
+        )
 
     def _insert_keyframe(
         self,

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types.covariance import covariance_of
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.se3 import Transform
@@ -18,24 +17,15 @@ _UNMEASURED = 1e-6  # 1/m^2, 1/rad^2: information in a direction that was not me
 _ROUNDING = np.diag(np.full(6, 1e-6))  # makes a covariance invertible: 1 mm, 1 mrad
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class OwnLoop:
-    """A motion between two stamps of a run."""
-
-    from_ns: int
-    to_ns: int
-    T_from_to: Transform
-    covariance: NDArray[np.float64]  # (6, 6) of se3.log order, axes of `to`
-
-
-def closed_loops(maps: Sequence[MapLayers]) -> list[OwnLoop]:
-    """Return the loops within each map, by which its module corrected the map."""
+def closed_loops(maps: Sequence[MapLayers]) -> list[Edge]:
+    """Return the loops within each map, by which its module corrected it, from stamp to stamp."""
     return [
-        OwnLoop(
-            from_ns=int(graph.stamps_ns[first]),
-            to_ns=int(graph.stamps_ns[second]),
-            T_from_to=T_from_to,
+        Edge(
+            first=int(graph.stamps_ns[first]),
+            second=int(graph.stamps_ns[second]),
+            T_first_second=T_from_to,
             covariance=covariance_of(information, unmeasured=_UNMEASURED) + _ROUNDING,
+            kind=EdgeKind.LOOP,
         )
         for graph in (layers.pose_graph for layers in maps)
         if graph is not None

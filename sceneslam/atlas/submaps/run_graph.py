@@ -23,14 +23,14 @@ from sceneslam.atlas.submaps.graph import (
     solve,
 )
 from sceneslam.atlas.submaps.loop_query import NEIGHBOURS, LoopQuery
-from sceneslam.atlas.submaps.own_loops import OwnLoop, Path, closed_loops
+from sceneslam.atlas.submaps.own_loops import Path, closed_loops
 from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.piece_loops import PieceLoops
 from sceneslam.atlas.submaps.plan_loops import PlanLoops
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.atlas.submaps.uprights import straightened, uprights
 from sceneslam.atlas.submaps.view_loops import ViewLoops
-from sceneslam.graphs.edge import Edge, EdgeKind
+from sceneslam.graphs.edge import Edge
 from sceneslam.types import se3
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.se3 import Transform
@@ -295,21 +295,17 @@ class _Ends:
         T_run_node = np.array(self._chain.T_run_node)
         return np.asarray(np.array(T_map_run)[np.maximum(last, 0)] @ T_run_node)
 
-    def edges_of(self, loops: Sequence[OwnLoop]) -> list[Edge]:
-        """Return a module's own loops as edges between submaps, without those within one."""
+    def edges_of(self, loops: Sequence[Edge]) -> list[Edge]:
+        """Return a module's own loops, between submaps, without those within one."""
         found = []
         for loop in loops:
-            start, end = self.of(loop.from_ns), self.of(loop.to_ns)
+            start, end = self.of(loop.first), self.of(loop.second)
             if start is None or end is None or start[0] == end[0]:
                 continue
             (first, T_first_from), (second, T_second_to) = start, end
+            T = T_first_from @ loop.T_first_second @ se3.inverse(T_second_to)
+            carried = se3.carried(loop.covariance, T_second_to)
             found.append(
-                Edge(
-                    first=first,
-                    second=second,
-                    T_first_second=T_first_from @ loop.T_from_to @ se3.inverse(T_second_to),
-                    covariance=se3.carried(loop.covariance, T_second_to),
-                    kind=EdgeKind.LOOP,
-                )
+                replace(loop, first=first, second=second, T_first_second=T, covariance=carried)
             )
         return found

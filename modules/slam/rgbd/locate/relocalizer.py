@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
-from sceneslam.types.se3 import Transform
 
 from ..map.keyframes import KeyframeStore
 from ..see.features import Features
@@ -47,15 +46,10 @@ class Relocalizer:
         """Return the most similar keyframes that were taken elsewhere."""
         here = seen.fix.estimate.T_local_base
         poses = {k: self._keyframes[k].T_local_base for k in alike}
-        return [k for k, T in poses.items() if not _is_near(here, T, _AWAY_M, _AWAY_RAD)][:_RIVALS]
+        away = {k: se3.inverse(here) @ T for k, T in poses.items()}
+        return [k for k, T in away.items() if not se3.is_within(T, _AWAY_M, _AWAY_RAD)][:_RIVALS]
 
 
 def _is_same_place(one: Recognition, other: Recognition) -> bool:
     T_local_base, T_other = (seen.fix.estimate.T_local_base for seen in (one, other))
-    return _is_near(T_local_base, T_other, _SAME_M, _SAME_RAD)
-
-
-def _is_near(T_local_a: Transform, T_local_b: Transform, gap_m: float, turn_rad: float) -> bool:
-    T_a_b = se3.inverse(T_local_a) @ T_local_b
-    is_close = np.linalg.norm(T_a_b[:3, 3]) < gap_m
-    return bool(is_close and se3.rotation_angle_rad(T_a_b) < turn_rad)
+    return se3.is_within(se3.inverse(T_local_base) @ T_other, _SAME_M, _SAME_RAD)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.graphs.edge import Edge
 from sceneslam.types import se3
 from sceneslam.types.covariance import unknown_motion
 from sceneslam.types.se3 import Transform
@@ -66,6 +65,4 @@ class Segments:
         if guess is None:
             return None
         T_start_base = se3.inverse(guess.T_local_base) @ T_local_base
-        begun = Edge(first=0, second=1, T_first_second=se3.identity(), covariance=guess.covariance)
-        way = Edge(first=1, second=2, T_first_second=T_start_base, covariance=measured)
-        return begun.then(way).covariance
+        return se3.carried(guess.covariance, se3.inverse(T_start_base)) + measured
