@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from rgbd_features import features_at, random_descriptors
+from test_rgbd_bundle import exact_bundle
 
+from sceneslam.modules.slam.rgbd.adjust.mapping_work import MappingWork, Task
 from sceneslam.modules.slam.rgbd.adjust.pose_constraints import DepthConstraints
 from sceneslam.modules.slam.rgbd.see.alignment import Alignment
-from sceneslam.modules.slam.rgbd.see.alignment_search import AlignmentSearch, Pair
+from sceneslam.modules.slam.rgbd.see.alignment_search import AlignmentSearch, Pair, Shown
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 
@@ -119,3 +122,24 @@ def test_surfaces_constrain_two_keyframes_where_they_truly_are():
     assert found is not None
     assert found.T_one_other == pytest.approx(T_true, abs=2e-3)
     assert constraints.between(0, 7, T_true) is None
+
+
+def test_a_search_that_finds_nothing_does_not_keep_all_images():
+    """Every fourth pixel has depth, as of a projected lidar: there are corners, but no surfaces."""
+    work, rng = MappingWork(CAMERA, CAMERA, None), np.random.default_rng(0)
+    bundle, depth_m = exact_bundle(rng), np.zeros(CAMERA.size_wh[::-1], np.float32)
+    depth_m[::2, ::2] = 2.0
+    features = features_at(rng.uniform(50, 400, (100, 2)), random_descriptors(rng, 100))
+    for step in range(70):
+        ids, shown = list(range(step, step + 5)), Shown(features=features, depth_m=depth_m)
+        work(
+            Task(
+                bundle=bundle,
+                keyframe_ids=ids,
+                free_ids=ids[:0],
+                fresh={ids[-1]: shown},
+                by_odometry=[],
+            )
+        )
+    assert not work._search.is_over
+    assert len(work._searched) == 60  # those that can still be registered

@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sceneslam.modules.slam.rgbd.loops.loop_detection import LoopDetector, Query
+from sceneslam.graphs.edge import Edge
+from sceneslam.modules.slam.rgbd.loops.loop_detection import LoopClosure, LoopDetector, Query
 from sceneslam.modules.slam.rgbd.loops.pose_graph import PoseGraph
 from sceneslam.modules.slam.rgbd.map.keyframes import OdometryPose
 from sceneslam.types import se3
@@ -95,3 +96,19 @@ def test_depth_verifies_a_loop_where_there_ever_was_any(monocular, expected):
     recognizer = SimpleNamespace(places=SimpleNamespace(alike=alike))
     detector = LoopDetector(SimpleNamespace(keyframes=keyframes), recognizer, PoseGraph())
     assert detector.candidate(Query(keyframe_id=7, depth_m=None)) == expected
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, np.pi / 4, np.pi / 2])
+def test_two_right_loops_agree_however_the_camera_turned_between_them(turn_rad):
+    """Each is vague along its own line of sight: far landmarks have vague depth."""
+    rng, covariance = np.random.default_rng(0), np.diag([0.05, *[0.005] * 2, *[0.003] * 3]) ** 2
+    poses = {1: np.eye(4), 2: se3.from_xy_yaw(0.3, 0.0, turn_rad)}
+    keyframes = {k: SimpleNamespace(T_local_base=T) for k, T in poses.items()}
+    detector = LoopDetector(SimpleNamespace(keyframes=keyframes), None, PoseGraph())
+
+    def loop(k):
+        T = poses[k] @ se3.exp(rng.multivariate_normal(np.zeros(6), covariance))
+        edge = Edge(first=0, second=k, T_first_second=T, covariance=covariance)
+        return LoopClosure(edge=edge, T_local_base=T)
+
+    assert sum(detector._agree(loop(1), loop(2)) for _ in range(200)) >= 195

@@ -9,6 +9,7 @@ from rgbd_features import AT_REST, empty_map, features_at, random_descriptors
 
 from sceneslam.modules.slam.rgbd.locate.localizer import VisualLocalizer
 from sceneslam.modules.slam.rgbd.locate.pose_solver import PoseSolver
+from sceneslam.modules.slam.rgbd.loops.loop_fusion import fuse_duplicates
 from sceneslam.modules.slam.rgbd.map.keyframes import DepthView, Keyframe, KeyframeStore
 from sceneslam.modules.slam.rgbd.map.landmarks import LandmarkTable, Looks
 from sceneslam.modules.slam.rgbd.map.layers import LayerBuilder
@@ -217,7 +218,8 @@ def test_nearest_keyframe_can_be_asked_for_among_the_old_ones_alone():
     here = se3.from_xy_yaw(2.0, 0.0, 0.0)
     assert store.nearest(here, per_m=1.0, per_rad=1.0) == 0.0
     assert store.nearest(here, per_m=1.0, per_rad=1.0, but_latest=1) == pytest.approx(1.0)
-    assert store.nearest(here, per_m=1.0, per_rad=1.0, but_latest=3) == np.inf
+    for but_latest in (3, 4, 5, 20):
+        assert store.nearest(here, per_m=1.0, per_rad=1.0, but_latest=but_latest) == np.inf
 
 
 @pytest.mark.parametrize(("shown", "is_found"), [(40, False), (120, True)])
@@ -237,3 +239,41 @@ def test_a_pose_is_told_only_where_a_tenth_of_what_should_show_is_found(shown, i
     ids = visual_map.keyframes.landmarks_of([0])
     fix = localizer.near(features, se3.identity(), ids)
     assert (fix is not None) == is_found
+
+
+def test_joining_two_sides_of_a_loop_leaves_no_keyframe_with_a_landmark_twice():
+    """A keyframe shows 30 of 60 corners as the old side does, and beside them all copies."""
+    visual_map, rng = empty_map(CAMERA, keyframe_limit=99), np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-1.0, 1.0, (60, 2)), np.full(60, 3.0)])
+    descriptors, nothing = random_descriptors(rng, 60), np.full(60, -1)
+
+    def seen(x_m, off_px=0.0):
+        T_local_cam = se3.from_xy_yaw(x_m, 0.0, 0.0) @ CAMERA.T_base_cam
+        ahead = se3.apply(se3.inverse(T_local_cam), se3.apply(CAMERA.T_base_cam, points))
+        scale = [CAMERA.fx, CAMERA.fy] / ahead[:, 2:]
+        return ahead[:, :2] * scale + [CAMERA.cx, CAMERA.cy] + off_px, ahead[:, 2]
+
+    def insert(x_m, seen_px, landmark_ids):
+        T_local_base = se3.from_xy_yaw(x_m, 0.0, 0.0)
+        uv_px, depth_m = seen_px
+        alike = np.tile(descriptors, (len(uv_px) // 60, 1))
+        features = features_at(uv_px, alike, depth_m=depth_m)
+        ids = np.array(landmark_ids)
+        mapped = replace(keyframe_at(0.0), T_local_base=T_local_base, features=features)
+        mapped = replace(mapped, landmark_ids=ids)
+        return visual_map.insert(mapped, deep_rows=np.zeros(0, np.int64))
+
+    old = insert(0.0, seen(0.0), nothing)
+    ids_old = visual_map.keyframes[old].landmark_ids.copy()
+    for _ in range(10):  # more of the old side than are looked at
+        insert(0.0, seen(0.0), ids_old)
+    new = insert(0.1, seen(0.1), nothing)
+    ids_new = visual_map.keyframes[new].landmark_ids.copy()
+    ids_both = [*np.where(np.arange(60) < 30, ids_old, -1), *ids_new]
+    twice = [np.concatenate(parts) for parts in zip(seen(0.05), seen(0.05, 2.0), strict=True)]
+    both = insert(0.05, twice, ids_both)
+    fuse_duplicates(visual_map, old=old, new=new)
+    for k in (old, new, both):
+        shown = visual_map.keyframes[k].landmark_ids
+        shown = shown[shown >= 0]
+        assert len(shown) == len(np.unique(shown))

@@ -169,7 +169,7 @@ def check_arrays(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
         raise InputError(f"node_scans: expected a scan in every submap: {path}")
     if len(arrays["edge_covariance"]) and not _are_positive(arrays["edge_covariance"]):
         raise InputError(f"edge_covariance: expected positive definite matrices: {path}")
-    sizes = -(-arrays["node_grid_shape"].prod(axis=1) // 8)
+    sizes = -(-arrays["node_grid_shape"].prod(axis=1, dtype=np.float64) // 8)
     totals = {
         "scans": arrays["node_scans"],
         "points": arrays["node_points"],

@@ -36,7 +36,10 @@ class _Piece:
             (planar.between(query.plane[query.second], query.plane[one]), query.submaps[one].plan)
             for one in newest
         ]
-        match = None if self.walls is None else self.walls.locate(join(placed))
+        try:
+            match = None if self.walls is None else self.walls.locate(join(placed))
+        except InputError:  # of a plan that is too large
+            return None
         if match is None:
             return None
         T_map_node = self.map.standing(planar.to_transform(match.T_target_query))

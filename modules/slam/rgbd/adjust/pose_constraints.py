@@ -6,7 +6,7 @@ all pixels, independent of the colours' calibration. Both together err less than
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,6 +116,11 @@ class DepthConstraints:
         self._reader, self._T_depth_cam = DepthSurfaceReader(depth_camera), T_depth_cam
         self._views: dict[int, SurfaceKeyframe] = {}
         self._samples: dict[int, Samples] = {}
+
+    @property
+    def known_ids(self) -> Set[int]:
+        """Return the keyframes that can still be registered."""
+        return self._views.keys()
 
     def look(self, keyframe_id: int, depth_m: NDArray[np.float32]) -> None:
         """Add a keyframe's depth image (H, W) [m]."""

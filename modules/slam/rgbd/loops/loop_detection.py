@@ -152,5 +152,6 @@ class LoopDetector:
         T_tracked = se3.inverse(T_first) @ T_second
         T_looped = se3.inverse(earlier.T_local_base) @ later.T_local_base
         xi = se3.log(se3.inverse(T_tracked) @ T_looped)
-        covariance = motion_covariance(T_tracked, earlier.edge.covariance + later.edge.covariance)
+        carried = se3.carried(earlier.edge.covariance, se3.inverse(T_looped))
+        covariance = motion_covariance(T_tracked, carried + later.edge.covariance)
         return float(xi @ np.linalg.solve(covariance, xi)) <= _CHI2

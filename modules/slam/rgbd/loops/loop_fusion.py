@@ -41,9 +41,11 @@ def _fuse_into(visual_map: VisualMap, keyframe_id: int, old_ids: NDArray[np.int6
     matches = matches.only(~np.isin(keyframe.landmark_ids[matches.feature_rows], old_ids))
     kept = prediction.ids[matches.landmark_rows]
     doubles = keyframe.landmark_ids[matches.feature_rows]
-    keyframe.landmark_ids[matches.feature_rows] = kept
     is_double = doubles != NO_LANDMARK
-    _unite(visual_map, kept[is_double], doubles[is_double])
+    keyframe.landmark_ids[matches.feature_rows[~is_double]] = kept[~is_double]
+    kept, doubles = kept[is_double], doubles[is_double]
+    is_one = ~visual_map.keyframes.show_both(kept, doubles)
+    _unite(visual_map, kept[is_one], doubles[is_one])
 
 
 def _unite(visual_map: VisualMap, kept: NDArray[np.int64], doubles: NDArray[np.int64]) -> None:

@@ -198,7 +198,7 @@ class KeyframeStore:
         Only keyframes `among` these (None: all) without the `but_latest` newest ones count;
         infinity if there are none.
         """
-        ids = self.ids[: len(self) - but_latest]
+        ids = self.ids[: max(len(self) - but_latest, 0)]
         asked = [self._keyframes[k] for k in ids if among is None or k in among]
         if not asked:
             return float("inf")

@@ -107,7 +107,8 @@ class MapHistory:
         """Return the keyframes of the landmarks' (N,) segment; None: there is only one segment."""
         if not self.segments.are_many:
             return None
-        return self.segments.around(self._map.keyframes.covisible(landmark_ids, limit=1)[0])
+        seen = self._map.keyframes.covisible(landmark_ids, limit=1)
+        return self.segments.around(seen[0]) if seen else None
 
     def step(self) -> Transform | None:
         """Do one image's share of loop closing; return T_new_old of the current pose, if moved."""
