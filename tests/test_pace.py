@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from driving import assert_exact, dark_from, drive, events
 from fakes import PERIOD_NS, ExactModule, observation
@@ -109,30 +108,18 @@ def test_nothing_is_spared_to_a_module_that_is_lost():
 @pytest.mark.parametrize("change", [{"step_m": 0.01}, {"period_s": 0.1}])
 def test_observation_after_more_time_or_motion_is_not_spared(change):
     pace = Pace(replace(EVERY_THIRD, **change))
-    pace.give(observation(0))
+    pace.last = observation(0)
     assert not pace.spares(observation(1))
     assert Pace(EVERY_THIRD).spares(observation(1)) is False  # nothing was given yet
     pace = Pace(EVERY_THIRD)
-    pace.give(observation(0))
+    pace.last = observation(0)
     assert pace.spares(observation(1)) and not pace.spares(observation(3))
 
 
 def test_nothing_is_spared_without_odometry():
     pace = Pace(EVERY_THIRD)
-    pace.give(observation(0, has_odometry=False))
+    pace.last = observation(0, has_odometry=False)
     assert not pace.spares(observation(1, has_odometry=False))
-
-
-def test_gyro_samples_of_spared_observations_are_given_with_the_next():
-    sample = np.array([[-0.05, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 2.0]])
-    first, second, third = (replace(observation(i), gyro_base=sample) for i in range(3))
-    pace = Pace(EVERY_THIRD)
-    assert pace.give(first) is first
-    pace.spare(second)
-    np.testing.assert_allclose(
-        pace.give(third).gyro_base[:, 0], [-0.15, -0.1, -0.05, 0.0], atol=1e-12
-    )
-    assert pace.give(third) is third
 
 
 @pytest.mark.parametrize("name", ["period_s", "step_m"])

@@ -46,7 +46,7 @@ class Bridge:
         `is_jump`: the pose jumped by a correction, so that no velocity is derived from it.
         """
         if is_jump:
-            self._before, self._known, self._T_odom_base = None, None, None
+            self._before, self._known, self._T_map_base = None, None, T_map_base  # not a motion
         self._note(observation.stamp_ns, T_map_base)
         self._move(observation, T_map_base)
 

@@ -74,9 +74,13 @@ class Candidates:
         """Return the modules that were not tried and have not failed, in the table's order."""
         return [key for key in self.of(self.scene) if key not in self.tried]
 
-    def postpone(self, stamp_ns: int, *, is_in_vain: bool) -> None:
-        """Delay the next trial of the first choice, for longer after each trial that failed."""
-        self._retries = self._retries + 1 if is_in_vain else 0
+    def postpone(self, stamp_ns: int, *, is_in_vain: bool | None) -> None:
+        """Delay the next trial of the first choice, for longer after each trial that failed.
+
+        `is_in_vain` is None where that is not known.
+        """
+        if is_in_vain is not None:
+            self._retries = self._retries + 1 if is_in_vain else 0
         self.retry_ns = stamp_ns + (self._retry_ns << min(self._retries, _DOUBLINGS))
 
 
@@ -207,7 +211,10 @@ class Changeover:
             self._end_trial()
             return
         is_given_time = stamp_ns - trial.ready_ns < self._policy.retry_s * 1e9  # it may need motion
-        if handover is not None and handover.is_lost and not is_given_time:
+        if handover is None:
+            return
+        handover.forget()
+        if (handover.is_lost or handover.is_silent) and not is_given_time:
             self._end_trial()
 
     def close(self) -> None:
@@ -243,7 +250,9 @@ class Changeover:
             why = "lost" if handover.is_lost else "silent"
             return self._refuse(attempt.runner, stamp_ns, why)
         self._estimator.accept(handover)
-        is_in_vain = self._now.held_ns < round(self._policy.confirm_window_s * 1e9)
+        is_in_vain = None
+        if self._now.active and self._now.health is not Health.HELD:  # what it leaves has ended
+            is_in_vain = self._now.held_ns < round(self._policy.confirm_window_s * 1e9)
         self._candidates.postpone(stamp_ns, is_in_vain=is_in_vain)
         self._log_choice("decision", stamp_ns, attempt.runner.key)
         return True

@@ -88,12 +88,17 @@ class Handover:
                 given += self._go_on_to(moment)
         return True
 
+    def forget(self) -> None:
+        """Forget what it did on trial: its poses are not the robot's."""
+        self.trail, self.tracked = [], []
+
     def settle(self) -> None:
         """Place the module, which has caught up, at the pose of the newest observation.
 
         Its earlier observations belong to its trial, not to the hand-over. Raises ModuleError.
         """
-        last, anchor = self.tracked[-1], self._memory.newest
+        last, anchor = self.session.hold.tracking, self._memory.newest
+        assert last is not None, "it tracks now"
         self._began_ns, self._cost_ns = anchor.stamp_ns, 0
         self.anchor, self.trail, self.tracked = anchor, [], [last]
         bridge = self.session.bridge = anchor.bridge.copy()
@@ -124,15 +129,13 @@ class Handover:
     def _advance(
         self, moment: BufferedObservation, motion: Transform | None, *, is_given: bool
     ) -> None:
-        """Continue to a buffered observation, given with the gyro samples of skipped ones."""
+        """Continue to a buffered observation."""
         session, given = self.session, moment.observation
         was_placed = session.is_placed
         if is_given and self.runner.can_use(given):
-            given = self._pace.give(given)
-        else:
-            self._pace.spare(given)
-            if self._spared_ns or not is_given:
-                self._spared_ns.append(given.stamp_ns)
+            self._pace.last = given
+        elif self._spared_ns or not is_given:
+            self._spared_ns.append(given.stamp_ns)
         T_map_bridged = None
         if is_given and was_placed and self._spared_ns:
             T_map_bridged = session.predict(

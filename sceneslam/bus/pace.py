@@ -30,12 +30,11 @@ class Pace:
 
     def __init__(self, settings: PaceSettings) -> None:
         self._settings = settings
-        self._last: Observation | None = None  # last observation that the module was given
-        self._spared: list[Observation] = []  # skipped since then
+        self.last: Observation | None = None  # that the module was given
 
     def spares(self, observation: Observation) -> bool:
         """Tell whether an observation can be skipped because little time and motion passed."""
-        last, settings = self._last, self._settings
+        last, settings = self.last, self._settings
         if last is None or last.T_odom_base is None or observation.T_odom_base is None:
             return False
         T_last_now = se3.inverse(last.T_odom_base) @ observation.T_odom_base
@@ -44,14 +43,3 @@ class Pace:
             and float(np.linalg.norm(T_last_now[:3, 3])) < settings.step_m
             and float(se3.rotation_angle_rad(T_last_now)) < settings.step_m
         )
-
-    def spare(self, observation: Observation) -> None:
-        """Record a skipped observation."""
-        self._spared.append(observation)
-
-    def give(self, observation: Observation) -> Observation:
-        """Return an observation for the module, with the gyro samples of the skipped ones."""
-        spared, self._spared, self._last = self._spared, [], observation
-        for older in reversed(spared):
-            observation = observation.with_samples_of(older)
-        return observation

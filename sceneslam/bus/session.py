@@ -83,6 +83,8 @@ class ModuleSession:
             if is_given and self.is_running:
                 self.tracking = self._ask(observation, witness)
             else:
+                if self.runner is not None:
+                    self.runner.skip(observation)
                 self.hold.spare(observation)
             if self.tracking is not None:
                 T_map_tracked = self._place(observation, self.tracking)

@@ -57,15 +57,23 @@ class Observation:
         """Tell whether this observation holds a measurement of `sensor`."""
         return getattr(self, sensor.field) is not None
 
-    def with_samples_of(self, older: Observation) -> Observation:
-        """Return this observation with the gyro and accelerometer samples of an older one, too."""
-        shift = np.array([(older.stamp_ns - self.stamp_ns) / 1e9, 0.0, 0.0, 0.0])
+    def samples(self) -> Observation:
+        """Return its gyro and accelerometer samples alone."""
+        kept = {sensor.field: getattr(self, sensor.field) for sensor in Sensor if sensor.is_sampled}
+        return Observation(stamp_ns=self.stamp_ns, **kept)
+
+    def with_samples_of(self, *older: Observation) -> Observation:
+        """Return this observation with the gyro and accelerometer samples of older ones, too."""
         joined: dict[str, NDArray[np.float64]] = {}
         for name in (sensor.field for sensor in Sensor if sensor.is_sampled):
-            before, after = getattr(older, name), getattr(self, name)
-            if before is not None:
-                parts = [before + shift] if after is None else [before + shift, after]
-                joined[name] = np.concatenate(parts)
+            parts = [
+                samples + np.array([(one.stamp_ns - self.stamp_ns) / 1e9, 0.0, 0.0, 0.0])
+                for one in older
+                if (samples := getattr(one, name)) is not None
+            ]
+            if parts:
+                now = getattr(self, name)
+                joined[name] = np.concatenate(parts if now is None else [*parts, now])
         return replace(self, **joined) if joined else self  # type: ignore[arg-type]
 
     def turn_by_gyro(self, duration_s: float) -> NDArray[np.float64] | None:

@@ -22,6 +22,7 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform, Vector
 
+_UNKNOWN_RAD = 1e3  # added to what wheels miss where the gyro does not say: no more comparable
 _OF_GATE = 0.5  # share of what the gate accepts, by which the odometry is corrected at most
 
 
@@ -43,6 +44,7 @@ class DeadReckoning:
         self._T_corrected_base: Transform | None = None  # the same, corrected
         self._is_gap = False  # the last observation had no odometry
         self._turned_rad = 0.0  # rotation angle since the observation before [rad]
+        self._is_turn_measured = False  # by the gyro, at the last observation
         self._missed_rad = 0.0  # yaw by wheels alone since the start, less the gyro's
 
     @property
@@ -66,9 +68,12 @@ class DeadReckoning:
             self._T_corrected_base = now
             return observation
         T_prev_curr = se3.inverse(before) @ now
+        missed_rad = _UNKNOWN_RAD
         if turn is not None and not is_gap:  # the gyro does not cover a gap
-            self._missed_rad += se3.yaw_rad(T_prev_curr) - se3.yaw_rad(turn)
+            if self._is_turn_measured:
+                missed_rad = se3.yaw_rad(T_prev_curr) - se3.yaw_rad(turn)
             T_prev_curr = self._turned(T_prev_curr, turn)
+        self._missed_rad += missed_rad
         if self._learns:
             self._turned_rad = float(se3.rotation_angle_rad(T_prev_curr))
         learnt = self._taught(module)
@@ -88,7 +93,8 @@ class DeadReckoning:
         if self._learns and module:
             if module not in self._scales:
                 self._scales[module] = WheelScale(deviation=self._drift, limit=self._limit)
-            self._scales[module].learn(hold, self._T_odom_base, self._turned_rad)
+            measured = None if self._is_gap else self._T_odom_base
+            self._scales[module].learn(hold, measured, self._turned_rad)
 
     def close(self, stamp_ns: int, log: EventLog) -> None:
         """Log the calibration, if there is one. May be called twice."""
@@ -106,7 +112,10 @@ class DeadReckoning:
         """Return the rotation (3, 3) since the last observation, None without a gyro."""
         if self._motion is None:
             return None
-        return self._motion.predict(observation).T_prev_curr[:3, :3]
+        motion = self._motion.predict(observation)
+        duration_s = self._motion.duration_s
+        self._is_turn_measured = observation.turn_by_gyro(duration_s) is not None
+        return motion.T_prev_curr[:3, :3]
 
     def _turned(self, T_prev_curr: Transform, turn: NDArray[np.float64]) -> Transform:
         """Return the odometry's motion with the gyro's rotation, or its yaw if that is biased."""

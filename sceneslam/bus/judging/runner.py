@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from array import array
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
@@ -20,6 +21,7 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
+_SKIPPED_MAX = 2000  # observations whose samples are kept: a minute at 30 per second
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,6 +51,7 @@ class Runner:
         self._ending: Future[Legacy] | None = None
         self._is_active = False
         self._may_restart = True
+        self._skipped = deque[Observation](maxlen=_SKIPPED_MAX)  # samples not given to it yet
         self._submitted: Observation | None = None  # observation whose answer was not collected yet
         self._module = module
         # Sensors in every set are needed; if the sets share none, any of their sensors will do.
@@ -80,6 +83,7 @@ class Runner:
     def start(self, rig: Rig, scene: str) -> None:
         """Start the next activation of the module; `has_started` returns the result."""
         self.T_map_local, self.is_failed = None, False
+        self._skipped.clear()
         with self._timed():
             self._starting = self._executor.submit(self._activate, rig, scene)
 
@@ -106,6 +110,10 @@ class Runner:
         """Tell whether the observation holds data of any sensor that the module uses."""
         return any(observation.has(sensor) for sensor in self._sensors)
 
+    def skip(self, observation: Observation) -> None:
+        """Keep the gyro samples of an observation that the module is not given, for its next."""
+        self._skipped.append(observation.samples())
+
     def submit(self, observation: Observation) -> None:
         """Submit an observation to a module in its own process; `track` collects the answer.
 
@@ -113,8 +121,8 @@ class Runner:
         """
         if isinstance(self._module, Concurrent) and self.can_use(observation):
             with self._timed(), self._asking("failed while tracking"):
-                self._module.submit(observation)
-                self._submitted = observation
+                self._submitted = self._joined(observation)
+                self._module.submit(self._submitted)
 
     def track(self, observation: Observation) -> Tracking:
         """Return the module's answer; raises ModuleError on an exception or an invalid pose."""
@@ -162,7 +170,13 @@ class Runner:
             answer = self._module.collect()
             if submitted.stamp_ns == observation.stamp_ns:
                 return answer
-        return self._module.track(observation)
+        return self._module.track(self._joined(observation))
+
+    def _joined(self, observation: Observation) -> Observation:
+        """Return an observation with the samples of those that the module was not given."""
+        skipped = list(self._skipped)
+        self._skipped.clear()
+        return observation.with_samples_of(*skipped)
 
     def _drain(self) -> None:
         """Discard a pending answer, so that the module can take another observation."""
