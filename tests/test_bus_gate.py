@@ -59,6 +59,16 @@ def test_suspicion_costs_no_pose_where_odometry_is_missing(index):
     assert len(atlas.trajectory) == 150 and errors_m(atlas.trajectory).max() < 1e-9
 
 
+def test_a_module_that_slides_in_what_it_catches_up_on_is_bridged_from_before_it_slid():
+    """It starts for six seconds, and slides in what it gets after that."""
+    modules = {"bright": ExactModule(lost=range(30, 1000)), "dark": Sliding(50, 70)}
+    options = {"steps": 200, "gate": GATE, "handover": "rewind", "startup_s": {"dark": 6.0}}
+    _, atlas, log, _ = drive(modules, **options)
+    assert events(log, "handover")[-1]["stamp_ns"] > 80 * PERIOD_NS
+    assert atlas.pose_modules[-1] == "dark" and BRIDGED in atlas.pose_modules[45:75]
+    assert len(atlas.trajectory) == 200 and errors_m(atlas.trajectory).max() < 1e-9
+
+
 def test_sliding_module_without_the_gate_does_harm():
     _, atlas, _, _ = drive({"bright": Sliding(40, 60)}, steps=150, table=ONE)
     assert errors_m(atlas.trajectory).max() > 1.9

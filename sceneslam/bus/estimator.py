@@ -12,7 +12,7 @@ from sceneslam.bus.handover import Handover
 from sceneslam.bus.judging.gate import Gate, Witness
 from sceneslam.bus.judging.hold import Hold
 from sceneslam.bus.judging.runner import Legacy, Runner
-from sceneslam.bus.observation_buffer import BufferedObservation, ObservationBuffer
+from sceneslam.bus.observation_buffer import BufferedObservation, ObservationBuffer, bridged
 from sceneslam.bus.pace import Pace
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.session import ModuleSession, Suspicion
@@ -137,15 +137,7 @@ class Estimator:
         untrusted, before = self._memory.after(since_ns), self._memory.last_until(since_ns)
         if before is None or not untrusted:
             return moment
-        bridge, bridged = before.bridge.copy(), []
-        for each in [*untrusted, moment]:
-            T_map_base = bridge.predict(each.observation, by_velocity=False, turn=each.turn)
-            if T_map_base is None:  # without odometry; the next odometry continues from the last
-                T_map_base = bridge.copy().predict(each.observation, by_velocity=True)
-            told = replace(each, T_map_base=T_map_base, module=BRIDGED, bridge=bridge.copy())
-            told.is_trusted = False
-            bridged.append(told)
-        return self._retell(bridged)
+        return self._retell(bridged(before, [*untrusted, moment]))
 
     def _acquit(self, suspicion: Suspicion, moment: BufferedObservation) -> BufferedObservation:
         """Take the remembered poses of a suspicion from the module after all.

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from time import perf_counter_ns
 
-from sceneslam.bus.observation_buffer import BufferedObservation, ObservationBuffer
+from sceneslam.bus.observation_buffer import BufferedObservation, ObservationBuffer, bridged
 from sceneslam.bus.pace import Pace
 from sceneslam.bus.session import ModuleSession
 from sceneslam.types import se3
@@ -162,6 +162,16 @@ class Handover:
             self._spared_ns, self._given_ns = [], moment.stamp_ns
         if moment is not self.anchor or moment.module == BRIDGED:
             self.trail.append(replace(found, observation=moment.observation))
+        if session.hold.suspect_since_ns is not None:
+            self._distrust(session.hold.suspect_since_ns)
+
+    def _distrust(self, since_ns: int) -> None:
+        """Replace the module's poses after `since_ns` by bridged ones."""
+        first = bisect_right(self.trail, since_ns, key=lambda each: each.stamp_ns)
+        before = self.trail[first - 1] if first else self.anchor
+        self.trail[first:] = bridged(before, self.trail[first:])
+        self.tracked = [one for one in self.tracked if one.stamp_ns <= since_ns]
+        self.session.bridge = (self.trail or [self.anchor])[-1].bridge.copy()
 
     def _motion_to(self, moment: BufferedObservation) -> Transform | None:
         """Return the motion (4, 4) since the previous observation, as it was estimated then."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.judging.gate import Witness
 from sceneslam.types.observation import Observation, Tracking
+from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
 
 _BULKY = ("image_bgr", "depth_m", "points_lidar", "point_times_s")
@@ -40,6 +42,21 @@ class BufferedObservation:
     def witness(self) -> Witness:
         """Return what is known of the odometry, for a module that gets the observation later."""
         return Witness(missed_rad=self.missed_rad, is_vouched=self.is_trusted and self.vouches)
+
+
+def bridged(
+    before: BufferedObservation, moments: Sequence[BufferedObservation]
+) -> list[BufferedObservation]:
+    """Return moments with poses that are bridged from the one before them."""
+    bridge, found = before.bridge.copy(), []
+    for each in moments:
+        T_map_base = bridge.predict(each.observation, by_velocity=False, turn=each.turn)
+        if T_map_base is None:  # without odometry; the next odometry continues from the last
+            T_map_base = bridge.copy().predict(each.observation, by_velocity=True)
+        told = replace(each, T_map_base=T_map_base, module=BRIDGED, bridge=bridge.copy())
+        told.is_trusted = False
+        found.append(told)
+    return found
 
 
 class ObservationBuffer:
