@@ -138,7 +138,7 @@ class Seen:
 
 def test_a_sensor_is_silent_after_two_of_its_periods():
     def asked(*seen_ns, silent_ns):
-        hold = Hold(silence_ns=3 * S, gate=None)
+        hold = Hold(patience_ns=3 * S, gate=None)
         for stamp_ns in seen_ns:
             hold.ask(Seen(), replace(observation(0), stamp_ns=stamp_ns))
         hold.ask(Seen(), replace(observation(0), image_bgr=None, stamp_ns=silent_ns))
@@ -161,7 +161,7 @@ def test_a_sensor_is_silent_after_two_of_its_periods():
 
 @pytest.mark.parametrize("method", ["set_pose", "set_scene", "track"])
 def test_a_failed_module_has_answered_no_later_observation(method):
-    module, hold = ExactModule(), Hold(silence_ns=S, gate=None)
+    module, hold = ExactModule(), Hold(patience_ns=S, gate=None)
     runner = Runner("bright", module, InStep())
     runner.start(RIG, "Bright")
     setattr(module, method, lambda _: hostile.throw("Exception"))

@@ -283,7 +283,7 @@ def test_the_velocity_is_known_by_clouds_alone():
     for observation in observations:
         module.track(observation)
     right = se3.log(se3.inverse(poses[-2]) @ poses[-1])[:3] / 0.1  # 5 m/s
-    assert np.linalg.norm(module._predictor.model.velocity[:3] - right) < 0.5
+    assert np.linalg.norm(module._predictor.model.inertia.velocity[:3] - right) < 0.5
 
 
 @pytest.mark.parametrize("lost", [4, 20])

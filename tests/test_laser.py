@@ -302,6 +302,8 @@ def test_robot_that_was_turned_by_hand_is_found_again():
     ]
     module = active()
     trackings = [module.track(observation) for observation in late[:81]]
-    assert (module._front_end.motion.velocity == 0).all()  # what wheels missed tells no velocity
+    assert (
+        module._front_end.motion.inertia.velocity == 0
+    ).all()  # what wheels missed tells no velocity
     trackings += [module.track(observation) for observation in late[81:]]
     assert errors(path, trackings)[80:].max() < 0.02

@@ -217,7 +217,7 @@ def test_gyro_turns_the_base_without_its_bias():
     drive = Drive()
     for _ in range(200):  # at rest: nobody teaches
         drive.step(speed=0.0, rate=0.0, gyro=constant_rate(0.0, 0.01), teaches=False)
-    assert drive.model.gyro_bias == pytest.approx([0.01] * 3, abs=0.001)
+    assert drive.model.turns.gyro_bias == pytest.approx([0.01] * 3, abs=0.001)
     drive.step(speed=0.0, rate=0.0, gyro=constant_rate(0.5, 0.01), teaches=False)  # wheels slip
     assert se3.yaw_rad(drive.last.T_prev_curr) == pytest.approx(0.05, abs=2e-4)
 
@@ -226,7 +226,7 @@ def test_robot_that_is_carried_does_not_teach_the_gyro_a_bias():
     drive = Drive()
     for _ in range(100):
         drive.step(speed=0.0, rate=0.0, gyro=constant_rate(0.3), teaches=False)
-    assert np.abs(drive.model.gyro_bias).max() < 0.002
+    assert np.abs(drive.model.turns.gyro_bias).max() < 0.002
 
 
 def test_without_wheels_the_velocity_goes_on_and_the_gyro_turns_it():
@@ -256,7 +256,7 @@ def test_velocity_that_nothing_measures_lasts_as_long_as_velocities_did_before(s
             model.learn(se3.from_xy_yaw(speed * PERIOD_S, 0.0, 0.0), SCAN)
         elif step > 200:
             model.learn(se3.identity(), blind)
-        velocities.append(model.velocity[0])
+        velocities.append(model.inertia.velocity[0])
     assert velocities[200] == pytest.approx(0.5, rel=0.02)
     assert share[0] < velocities[-1] / 0.5 < share[1]
 
@@ -270,7 +270,7 @@ def test_velocity_without_wheels_is_that_of_several_measurements_where_one_is_un
         if step:
             seen = np.sqrt(np.diag(noisy)) * rng.standard_normal(6)
             model.learn(se3.from_xy_yaw(0.5 / 30, 0.0, 0.0) @ se3.exp(seen), noisy)
-            off.append(model.velocity[:2] - [0.5, 0.0])
+            off.append(model.inertia.velocity[:2] - [0.5, 0.0])
     assert np.sqrt(np.mean(np.square(off[30:]))) < 0.1
 
 
@@ -280,7 +280,7 @@ def test_first_motion_after_a_stop_is_no_velocity():
     model.stop()
     model.predict(Observation(stamp_ns=100_000_000))
     model.learn(se3.from_xy_yaw(2.0, 0.0, 0.0), SCAN)  # of longer than the one step
-    assert not model.velocity.any()
+    assert not model.inertia.velocity.any()
     model.predict(Observation(stamp_ns=200_000_000))
     model.learn(se3.from_xy_yaw(0.1, 0.0, 0.0), SCAN)
-    assert model.velocity[0] == pytest.approx(1.0, rel=0.01)
+    assert model.inertia.velocity[0] == pytest.approx(1.0, rel=0.01)

@@ -94,7 +94,7 @@ class CloudOdometry(LocalModule, ABC):
             raise RuntimeError("track() before activate()")
         prediction = self._predictor.predict(observation)
         self._icp.listen(observation)
-        twist_s = self._predictor.model.velocity if self.deskew else np.zeros(6)
+        twist_s = self._predictor.model.inertia.velocity if self.deskew else np.zeros(6)
         cloud = self._reader.read_unswept(observation, twist_s)
         if cloud is None:
             return self._predictor.bridged(observation, prediction, can_coast=self._has_map)
@@ -168,7 +168,7 @@ class CloudOdometry(LocalModule, ABC):
         if prediction.is_measured or not is_interrupted:
             return True
         assert self._icp is not None
-        moved_m, turned_rad = self._predictor.model.wandered(unmeasured_s)
+        moved_m, turned_rad = self._predictor.model.inertia.wandered(unmeasured_s)
         arm_m = np.median(np.linalg.norm(cloud, axis=1))
         off_m = _SIGMAS * np.hypot(moved_m, arm_m * turned_rad)
         return bool(off_m <= self._icp.capture_m)

@@ -9,7 +9,7 @@ from time import perf_counter_ns
 from statemachine import State, StateMachine
 
 from sceneslam.bus.changeover import Candidates, Changeover, Outcome
-from sceneslam.bus.decision import Action, Decision, DecisionLog, Situation, decide
+from sceneslam.bus.decision import GO_ON, Action, Decision, Situation, decide, in_json
 from sceneslam.bus.estimator import Estimator
 from sceneslam.bus.judging.dead_reckoning import DeadReckoning
 from sceneslam.bus.judging.hold import Health
@@ -110,7 +110,7 @@ class Bus:
             log=log,
             catch_up_steps=catch_up_steps,
         )
-        self._decisions = DecisionLog(log)
+        self._situation: Situation | None = None  # at the last decision
         self._do: _Step  # what the state does with an observation
         self._go_on: _Step  # the same for the observation at which the state was entered
         self._machine = BusMachine(self)
@@ -212,7 +212,9 @@ class Bus:
         self._changeover.try_on(observation.stamp_ns)
         situation = self._look(observation)
         verdict = decide(self._policy, situation)
-        self._decisions.add(situation, verdict)
+        if situation != self._situation or verdict != GO_ON:  # more than its time changed
+            self._log.add("situation", **in_json(situation), verdict=in_json(verdict))
+        self._situation = situation
         if verdict.action is Action.TELL:
             self._candidates.serve(situation.scene, situation.choices[1:], 0)
             self._changeover.tell_scene(observation.stamp_ns)

@@ -13,7 +13,6 @@ from typing import Any
 
 from sceneslam.bus.judging.hold import Health
 from sceneslam.bus.policy import Policy
-from sceneslam.storage.events import EventLog
 
 
 class StandbyTrial(StrEnum):
@@ -129,20 +128,6 @@ def _is_adrift(policy: Policy, now: Situation) -> bool:
 def _patience_ns(policy: Policy, now: Situation) -> int:
     share = _BLIND if now.is_blind else 1.0
     return round(share * policy.lost_patience_s * 1e9)
-
-
-class DecisionLog:
-    """Logs a situation whenever more than its time changed, and every verdict but `go on`."""
-
-    def __init__(self, log: EventLog) -> None:
-        self._log = log
-        self._last: Situation | None = None
-
-    def add(self, now: Situation, verdict: Decision) -> None:
-        """Log a decision with its inputs."""
-        if now != self._last or verdict != GO_ON:
-            self._log.add("situation", **in_json(now), verdict=in_json(verdict))
-        self._last = now
 
 
 def in_json(record: Situation | Decision) -> dict[str, Any]:

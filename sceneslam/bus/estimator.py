@@ -105,7 +105,6 @@ class Estimator:
             self._memory,
             anchor=anchor,
             pace=Pace(self._policy.catch_up),
-            patience_ns=round(self._policy.lost_patience_s * 1e9),
         )
 
     def accept(self, handover: Handover) -> None:
@@ -268,5 +267,5 @@ class Estimator:
     def _new_session(self, runner: Runner | None, bridge: Bridge) -> ModuleSession:
         settings = self._policy.gate if self._policy.handover != "cold" else None
         gate = None if settings is None else Gate(settings, self._rig.wheels)
-        hold = Hold(silence_ns=round(self._policy.lost_patience_s * 1e9), gate=gate)
+        hold = Hold(patience_ns=round(self._policy.lost_patience_s * 1e9), gate=gate)
         return ModuleSession(runner, hold, bridge)

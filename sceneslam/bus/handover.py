@@ -31,13 +31,12 @@ class Handover:
         *,
         anchor: BufferedObservation,
         pace: Pace,
-        patience_ns: int,
     ) -> None:
         assert session.runner is not None
         self.session, self.runner, self.anchor = session, session.runner, anchor
         self.trail: list[BufferedObservation] = []  # after the anchor; with it, if it is bridged
         self.tracked: list[Tracking] = []  # its answers from the anchor on, while it tracks
-        self._pace, self._memory, self._patience_ns = pace, memory, patience_ns
+        self._pace, self._memory = pace, memory
         self._spared_ns: list[int] = []  # of observations skipped since it tracked
         self._given_ns = anchor.stamp_ns  # the last that it was given and tracked
         self._began_ns, self._done_ns = anchor.stamp_ns, anchor.stamp_ns - 1
@@ -56,7 +55,7 @@ class Handover:
     def is_silent(self) -> bool:
         """Tell whether the module has got no data for so long that it would be left at once."""
         since_ns = self.session.hold.unheld_since_ns
-        return since_ns is not None and self._done_ns - since_ns >= self._patience_ns
+        return since_ns is not None and self._done_ns - since_ns >= self.session.hold.patience_ns
 
     def tracked_ns(self, stamp_ns: int) -> int:
         """Return how long it has tracked without a break, 0 if not at the newest observation."""

@@ -41,10 +41,10 @@ class MotionModel:
     def __init__(self, rig: Rig) -> None:
         self._wheels, self._gyro = rig.wheels, rig.gyro
         self._floors = np.array([rig.wheels.floor_m, rig.wheels.floor_rad])
-        self._inertia = Inertia(Sensor.ODOMETRY in rig.sensors)
+        self.inertia = Inertia(Sensor.ODOMETRY in rig.sensors)
         self._noise = [NoiseRatio(rig.wheels.noise_ratio) for _ in range(2)]  # distance, turn
         self._lies = [LieDetector() for _ in range(2)]
-        self._turns = TurnErrors(rig.gyro.bias_radps)
+        self.turns = TurnErrors(rig.gyro.bias_radps)
         self._distance = DistanceError(rig.wheels.drift_ratio, drift=_WEAR * rig.wheels.drift_ratio)
         self._axle = DistanceError(rig.wheels.axle_m, drift=_WEAR * rig.wheels.axle_m)
         self._stamp_ns: int | None = None
@@ -68,28 +68,6 @@ class MotionModel:
         """Return the probabilities (2,) that the wheels are wrong now: distance, turn."""
         return np.array([lie.lying for lie in self._lies])
 
-    @property
-    def gyro_bias(self) -> NDArray[np.float64]:
-        """Return the estimated gyro bias (3,) [rad/s], base axes."""
-        return self._turns.gyro_bias
-
-    @property
-    def measures_tilt(self) -> bool:
-        """Tell whether the gyro's bias about the horizontal axes is known."""
-        return self._turns.knows_level_bias
-
-    @property
-    def velocity(self) -> NDArray[np.float64]:
-        """Return the base's twist (6,) [m/s, rad/s] in se3.log order, 0 if unknown."""
-        return self._inertia.velocity
-
-    def wandered(self, duration_s: float) -> NDArray[np.float64]:
-        """Return how far (2,) [m, rad] the robot may be from where it would be without a change.
-
-        As it has moved so far, after a time in which nothing measured its motion.
-        """
-        return self._inertia.wandered(duration_s)
-
     def predict(self, observation: Observation) -> Motion:
         """Return the motion from the last observation to this one, which becomes the last."""
         before_ns, self._stamp_ns = self._stamp_ns, observation.stamp_ns
@@ -107,14 +85,14 @@ class MotionModel:
         gap = self._gap
         wheels, guess = (
             self._take_odometry(observation, duration_s),
-            self._inertia.predict(duration_s),
+            self.inertia.predict(duration_s),
         )
-        turn = self._turns.by_gyro(observation, duration_s)
+        turn = self.turns.by_gyro(observation, duration_s)
         if turn is not None:
-            noise_rad = self._turns.gyro_bias_deviation * duration_s + self._gyro.noise_rad
+            noise_rad = self.turns.gyro_bias_deviation * duration_s + self._gyro.noise_rad
             guess = guess.turned(turn, noise_rad, duration_s)
             if wheels is not None and gap is None:
-                self._turns.compare(
+                self.turns.compare(
                     turn,
                     se3.yaw_rad(wheels.T),
                     causes=wheels.causes,
@@ -123,7 +101,7 @@ class MotionModel:
                 )
                 wheels = wheels.turned(turn, noise_rad, duration_s)
         if self._is_weighed and wheels is not None and gap is None:
-            self._judge(self._inertia.evidence(wheels, guess, duration_s))
+            self._judge(self.inertia.evidence(wheels, guess, duration_s))
         self._since_s += duration_s
         self._since_guess = self._since_guess.then(guess)
         if wheels is not None and self._since_wheels is not None:
@@ -133,7 +111,7 @@ class MotionModel:
         motion = motion_of(
             wheels,
             guess,
-            self._inertia.anywhere(guess, duration_s),
+            self.inertia.anywhere(guess, duration_s),
             lying=self.lying,
             is_measured=wheels is not None and self._since_wheels is not None,
         )
@@ -155,13 +133,13 @@ class MotionModel:
         """
         self._is_weighed = evidence is not None
         duration_s, wheels, guess = self._since_s, self._since_wheels, self._since_guess
-        had_velocity = self._inertia.is_known
+        had_velocity = self.inertia.is_known
         if duration_s <= 0.0 or not self._is_followed:  # the interval is unknown
             self.skip()
             return
         if evidence is not None:
             self._judge(evidence)
-        self._inertia.learn(
+        self.inertia.learn(
             *self._with_wheels(T_before_now, covariance), guess=guess, duration_s=duration_s
         )
         self._forget()
@@ -199,7 +177,7 @@ class MotionModel:
                 float(off[1]), se3.yaw_rad(wheels.T), float(wheels.variance[0] + measured[1, 1])
             )
         if self._lies[1].lying < BELIEVED:
-            self._turns.learn(
+            self.turns.learn(
                 float(off[2]), wheels.causes, float(wheels.variance[1] + measured[2, 2])
             )
 
@@ -215,7 +193,7 @@ class MotionModel:
         wheels = self._since_wheels
         if wheels is None:
             return T_before_now, covariance
-        R = np.diag((self._inertia.noise_of(wheels, self.lying, self._since_s))[[0, 0, 1]])
+        R = np.diag((self.inertia.noise_of(wheels, self.lying, self._since_s))[[0, 0, 1]])
         gain = covariance[:, _PLANAR] @ np.linalg.inv(covariance[np.ix_(_PLANAR, _PLANAR)] + R)
         off = se3.log(se3.inverse(T_before_now) @ wheels.T)[_PLANAR]
         return T_before_now @ se3.exp(gain @ off), updated(covariance, gain, np.eye(6)[_PLANAR], R)
@@ -233,7 +211,7 @@ class MotionModel:
 
     def slow_down(self) -> None:
         """Reset the velocity only."""
-        self._inertia.reset()
+        self.inertia.reset()
 
     def _forget(self) -> None:
         """Restart the comparison; odometry that is missing now has to restart, too."""
@@ -271,7 +249,7 @@ class MotionModel:
         amounts = np.array(
             [distance_m + _METRE_PER_TURN * angle_rad, angle_rad + _TURN_PER_METRE * distance_m]
         )
-        missed_rad = self._turns.of_wheels(forward_m, yaw_rad)
+        missed_rad = self.turns.of_wheels(forward_m, yaw_rad)
         position_m = T_prev_curr[:3, 3] * (1.0 + self._distance.ratio)
         T_axle = se3.from_parts(T_prev_curr[:3, :3], position_m) @ se3.from_xy_yaw(0, 0, missed_rad)
         T_axle_base = se3.from_xy_yaw(self._axle.ratio, 0.0, 0.0)

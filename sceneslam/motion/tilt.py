@@ -63,7 +63,7 @@ class Tilt:
         `turn` (3, 3) is the model's since the last observation.
         """
         T_odom_base, duration_s = observation.T_odom_base, self._model.duration_s
-        if not self._model.measures_tilt:
+        if not self._model.turns.knows_level_bias:
             return None
         if self._R_level_base is None:
             if T_odom_base is None:

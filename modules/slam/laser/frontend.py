@@ -170,7 +170,7 @@ class FrontEnd:
         held = np.linalg.pinv(H, rcond=1e-9, hermitian=True) @ H
         covariance = held @ self._covariance @ held.T
         position_m2 = max(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]), 0.0)
-        usual = self.motion.wandered((observation.stamp_ns - self._held_ns) * 1e-9)
+        usual = self.motion.inertia.wandered((observation.stamp_ns - self._held_ns) * 1e-9)
         known = np.sqrt([position_m2, covariance[2, 2]])
         near = _REACH_SIGMAS * np.minimum(known, usual)
         is_within = near <= (self.matcher.window_m, self.matcher.window_rad)

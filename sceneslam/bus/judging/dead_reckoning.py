@@ -102,8 +102,8 @@ class DeadReckoning:
         learnt = self._taught("")
         if learnt is not None:
             known |= {"wheel_scale": learnt.scale, "scale_deviation": learnt.variance**0.5}
-        if self._motion is not None and self._motion.gyro_bias.any():
-            known |= {"gyro_bias_radps": self._motion.gyro_bias.tolist()}
+        if self._motion is not None and self._motion.turns.gyro_bias.any():
+            known |= {"gyro_bias_radps": self._motion.turns.gyro_bias.tolist()}
         if known:
             log.add("calibration", stamp_ns, **known)
         self._scales, self._motion = {}, None
@@ -119,7 +119,7 @@ class DeadReckoning:
 
     def _turned(self, T_prev_curr: Transform, turn: NDArray[np.float64]) -> Transform:
         """Return the odometry's motion with the gyro's rotation, or its yaw if that is biased."""
-        if self._motion is not None and self._motion.measures_tilt:
+        if self._motion is not None and self._motion.turns.knows_level_bias:
             return se3.from_parts(turn, T_prev_curr[:3, 3])
         return se3.with_yaw(T_prev_curr, se3.yaw_rad(turn))
 
@@ -127,7 +127,7 @@ class DeadReckoning:
         if self._motion is None or observation.gyro_base is None:
             return observation
         gyro = observation.gyro_base.copy()
-        gyro[:, 1:] -= self._motion.gyro_bias
+        gyro[:, 1:] -= self._motion.turns.gyro_bias
         gyro.setflags(write=False)
         return replace(observation, gyro_base=gyro)
 

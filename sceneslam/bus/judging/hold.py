@@ -32,7 +32,7 @@ class Health(StrEnum):
 class Hold:
     """Follows one activation of a module: since when it tracks, is lost, silent or suspect."""
 
-    def __init__(self, *, silence_ns: int, gate: Gate | None) -> None:
+    def __init__(self, *, patience_ns: int, gate: Gate | None) -> None:
         self.status: TrackingStatus | None = None  # None before its first answer
         self.is_suspect = False  # from a disagreement on until it has agreed for long enough
         self.suspect_since_ns: int | None = None  # where suspicion begins: since when it may err
@@ -56,7 +56,7 @@ class Hold:
         self._revision = 0
         self._judged_ns = 0  # when a pose was compared with the odometry last
         self._fed_ns: int | None = None  # when its sensors last delivered data
-        self._silence_ns = silence_ns  # a guess of their period, until there are intervals
+        self.patience_ns = patience_ns  # also a guess of their period, until there are intervals
         self._intervals_ns: deque[int] = deque(maxlen=3)  # between their last data
 
     @property
@@ -115,7 +115,7 @@ class Hold:
     def _period_ns(self) -> int:
         """Return the median of the last intervals: one may be a gap, or of a burst."""
         if not self._intervals_ns:
-            return self._silence_ns
+            return self.patience_ns
         return median_low(self._intervals_ns)
 
     def _feed(self, tracking: Tracking) -> None:

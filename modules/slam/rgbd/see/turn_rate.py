@@ -34,7 +34,7 @@ class TurnRate:
 def expected_rate(observation: Observation, predictor: Predictor) -> NDArray[np.float64]:
     """Return the predicted turn rate (3,) [rad/s], by the gyro if available."""
     rate = _gyro_rate(observation, predictor)
-    return predictor.model.velocity[3:] if rate is None else rate
+    return predictor.model.inertia.velocity[3:] if rate is None else rate
 
 
 def measured_rate(
@@ -60,4 +60,4 @@ def _gyro_rate(observation: Observation, predictor: Predictor) -> NDArray[np.flo
     gyro = observation.gyro_base
     if gyro is None or not len(gyro) or not np.isfinite(gyro[:, 1:4]).all():
         return None
-    return np.asarray(gyro[:, 1:4].mean(axis=0) - predictor.model.gyro_bias)
+    return np.asarray(gyro[:, 1:4].mean(axis=0) - predictor.model.turns.gyro_bias)
