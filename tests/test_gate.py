@@ -283,3 +283,14 @@ def test_wheels_that_another_module_moves_with_refute_a_certain_module():
     vouched = witnessed(scaled(0.75), witness=lambda step: Witness(is_vouched=True))
     assert vouched[-1].is_wrong and not any(judgement.wheels_lie for judgement in vouched)
     assert witnessed(scaled(0.75))[-1].wheels_lie
+
+
+def test_a_first_answer_that_is_a_little_off_is_no_jump():
+    """Its map holds one scan then; the wheels have begun to tell the wrong sign before."""
+
+    def module(step):
+        return se3.from_xy_yaw(-0.06, 0.0, 0.0) @ arc(step) if step == 1 else arc(step)
+
+    judgements = witnessed(module, odometry=reversing(0, 60), steps=20, deviation_m=0.02)
+    assert not any(judgement.is_wrong for judgement in judgements)
+    assert judgements[-1].wheels_lie

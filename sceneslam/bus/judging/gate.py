@@ -254,17 +254,15 @@ class Gate:
             before[1:] = np.maximum(before[1:], 0)
             after = np.where(before > 0, before, np.arange(len(late)) - 1)
         is_known = before >= 0
-        elapsed_s = (times_s - times_s[before])[is_known, None]
+        elapsed_s = np.where(is_known, times_s - times_s[before], np.nan)
+        # Over a short interval, an error of position makes a larger one of velocity.
+        share = np.minimum(np.minimum(elapsed_s, 2.0 * elapsed_s[after]), _STEP_S) / _STEP_S
         found = []
         for poses in ([one.T_local_base for one in late], [one.T_odom_base for one in late]):
             points = np.array([T[:3, 3] + T[:3, 0] for T in poses])
-            velocities = np.full_like(points, np.nan)
-            velocities[is_known] = (points - points[before])[is_known] / elapsed_s
-            # Over a short interval, an error of position makes a larger one of velocity.
-            changes = np.linalg.norm(velocities - velocities[after], axis=1)[is_known]
-            changes *= np.minimum(elapsed_s[:, 0] / _STEP_S, 1.0)
-            changes = changes[np.isfinite(changes)]
-            found.append(float(changes.max(initial=0.0)))
+            velocities = (points - points[before]) / elapsed_s[:, None]
+            changes = share * np.linalg.norm(velocities - velocities[after], axis=1)
+            found.append(float(changes[np.isfinite(changes)].max(initial=0.0)))
         return found[0], found[1]
 
     def _usual(self, now: _Sample, excess: float) -> float:
