@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hydra import compose, initialize_config_module
 from hydra.utils import get_class
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,8 +18,10 @@ from sceneslam.sources.changes.dim_sensor import DimSensor
 from sceneslam.sources.changes.effects import LightsOut
 from sceneslam.sources.changes.light_schedule import LightSchedule
 from sceneslam.sources.spanned import TimeSpan
+from sceneslam.testing.room import RIG
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.truth import GroundTruth, SceneChange
 
 _CONF = Path(__file__).resolve().parents[1] / "conf" / "effects" / "lights_out.yaml"
@@ -46,7 +49,8 @@ def film(image_bgr: np.ndarray = GREY) -> Film:
         [
             Observation(stamp_ns=5 * 10**9 + index * 10**8, image_bgr=image_bgr, depth_m=DEPTH)
             for index in range(101)
-        ]
+        ],
+        rig=RIG,
     )
 
 
@@ -202,5 +206,26 @@ def test_wrong_values_are_named_by_their_key(key: str, changes: dict[str, Any]) 
 
 def test_shares_need_a_source_that_knows_its_duration() -> None:
     with pytest.raises(ConfigError, match="schedule_unit"):
-        lights_out(Listed([]))
-    assert list(lights_out(Listed([]), schedule_unit="seconds")) == []
+        lights_out(Listed([], rig=RIG))
+    assert list(lights_out(Listed([], rig=RIG), schedule_unit="seconds")) == []
+
+
+EVERY = sorted(path.stem for path in _CONF.parent.glob("*.yaml") if path.stem != "none")
+ON_ANYTHING = {"faults", "laps"}
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_an_effect_on_a_sensor_that_the_source_lacks_is_refused(name: str, tmp_path: Path) -> None:
+    (tmp_path / "times.txt").write_text("1.0 0.01\n")
+    words = [f"effects={name}", "seed=1", "+effects.source=null"]
+    words += [f"effects.path={tmp_path}/times.txt"] if name == "exposure_times" else []
+    with initialize_config_module("sceneslam.conf", version_base="1.3"):
+        node: Any = OmegaConf.to_container(compose("config", overrides=words).effects, resolve=True)
+    make = get_class(node.pop("_target_"))
+    assert make(**node | {"source": film()})
+    lidar = Listed([], rig=Rig(sensors=frozenset({Sensor.POINTS})))
+    if name in ON_ANYTHING:
+        assert make(**node | {"source": lidar})
+        return
+    with pytest.raises(ConfigError, match="allowed: with a source that has"):
+        make(**node | {"source": lidar})

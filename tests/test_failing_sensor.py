@@ -18,7 +18,7 @@ from sceneslam.testing.room import RIG, observation_at
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Sensor
+from sceneslam.types.rig import Rig, Sensor
 
 SENSOR = {
     "camera": "image_bgr",
@@ -79,7 +79,7 @@ def differs(one, other, name):
 
 @pytest.mark.parametrize("failure", FAILURES)
 def test_one_sensor_changes_within_the_span_and_no_other(failure):
-    source = Listed(list(drive()))
+    source = Listed(list(drive()), rig=RIG)
     found = list(failing(source, failure))
     own = SENSOR[failure.split("_")[0]]
     changed = [
@@ -96,7 +96,7 @@ def test_one_sensor_changes_within_the_span_and_no_other(failure):
 
 @pytest.mark.parametrize("failure", FAILURES)
 def test_failure_is_the_same_for_the_same_seed(failure):
-    first, second = (list(failing(Listed(list(drive())), failure)) for _ in range(2))
+    first, second = (list(failing(Listed(list(drive()), rig=RIG), failure)) for _ in range(2))
     own = SENSOR[failure.split("_")[0]]
     assert not any(differs(one, other, own) for one, other in zip(first, second, strict=True))
 
@@ -104,14 +104,16 @@ def test_failure_is_the_same_for_the_same_seed(failure):
 @pytest.mark.parametrize("failure", sorted(FAILURES.keys() - {"camera_dirty"}))
 def test_failure_is_named_within_a_second_and_nothing_before(failure):
     one = detector()
-    votes = [one.get_scene(seen).scene for seen in failing(Listed(list(drive())), failure)]
+    votes = [one.get_scene(seen).scene for seen in failing(Listed(list(drive()), rig=RIG), failure)]
     assert set(votes[:20]) == {"Bright"}
     assert set(votes[30:40]) == {scene_of(failure)}
 
 
 def test_dirt_shows_once_the_robot_has_turned():
     dirt = Dirt(RIG)
-    ratios = [dirt(seen) for seen in failing(Listed(list(drive())), "camera_dirty", seed=4)]
+    ratios = [
+        dirt(seen) for seen in failing(Listed(list(drive()), rig=RIG), "camera_dirty", seed=4)
+    ]
     assert max(ratios[:20]) < 0.001 and min(ratios[30:40]) > 0.02
 
 
@@ -141,6 +143,13 @@ def test_invalid_span_is_named(spans_s):
 def test_unknown_failure_is_named_with_those_that_there_are():
     with pytest.raises(ConfigError, match="camera_frozen"):
         failing(film(), "camera_melted")
+
+
+@pytest.mark.parametrize("failure", FAILURES)
+def test_failure_of_a_sensor_that_the_source_lacks_is_refused(failure):
+    sensors = frozenset(one for one in Sensor if one.field != SENSOR[failure.split("_")[0]])
+    with pytest.raises(ConfigError, match=f"failure: got '{failure}', allowed: with a source"):
+        failing(Listed([], rig=Rig(sensors=sensors)), failure)
 
 
 def test_rules_on_sensors_that_the_rig_lacks_are_left_out():

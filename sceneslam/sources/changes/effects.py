@@ -12,9 +12,10 @@ from sceneslam.interfaces import Source
 from sceneslam.ros.pixels import locked
 from sceneslam.sources.changes.dim_sensor import DimSensor
 from sceneslam.sources.changes.light_schedule import LightSchedule, check_steps
-from sceneslam.sources.changes.wrapped import Wrapped
+from sceneslam.sources.changes.wrapped import Wrapped, check_sensor
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Sensor
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth, SceneChange
 
@@ -58,6 +59,7 @@ class LightsOut(Wrapped):
         steps = check_steps(schedule, is_ratio=schedule_unit == "ratio")
         if lights != "story":
             steps = [[0.0, 1.0 if lights == "on" else 0.0]]
+        check_sensor(source, Sensor.IMAGE, lights=lights)
         super().__init__(source)
         self._ambient_ratio = ambient_ratio
         self._seed = seed

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.interfaces import Source
-from sceneslam.sources.changes.wrapped import Wrapped
+from sceneslam.sources.changes.wrapped import Wrapped, check_sensor
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.input_files import given_path, read_text
 from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Sensor
 
 _COLUMNS = "`stamp_s exposure_s` or `stamp_s exposure_s gain`, the stamps rising, the rest above 0"
 
@@ -28,6 +29,7 @@ class ExposureTimes(Wrapped):
     def __init__(self, source: Source, path: str, reference_s: float | None) -> None:
         if reference_s is not None and not 0 < reference_s < np.inf:
             raise ConfigError("reference_s", reference_s, "seconds above 0, or null")
+        check_sensor(source, Sensor.IMAGE, path=path)
         super().__init__(source)
         rows = _read(given_path(path))
         self._stamps_s = rows[:, 0]

@@ -8,8 +8,8 @@ from itertools import groupby
 import numpy as np
 
 from sceneslam.interfaces import Source
-from sceneslam.sources.changes.failures import FAILURES, scene_of
-from sceneslam.sources.changes.wrapped import Wrapped
+from sceneslam.sources.changes.failures import FAILURES, scene_of, sensor_of
+from sceneslam.sources.changes.wrapped import Wrapped, check_sensor
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
 from sceneslam.types.ranges import check_among, check_least
@@ -43,6 +43,7 @@ class FailingSensor(Wrapped):
                 allowed = "[from, to], seconds from 0 on, rising, one span after the other"
                 raise ConfigError("spans_s", span_s, allowed)
             ends.append(span_s[1])
+        check_sensor(source, sensor_of(failure), failure=failure)
         super().__init__(source)
         self._failure, self._seed = failure, seed
         self._spans_s = spans_s

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sceneslam.ros.pixels import locked
 from sceneslam.types import se3
 from sceneslam.types.observation import LaserScan, Observation
+from sceneslam.types.rig import Sensor
 from sceneslam.types.se3 import Transform
 
 Image = NDArray[np.uint8]  # (H, W, 3) BGR
@@ -197,6 +198,19 @@ FAILURES: Mapping[str, Callable[[Random], Failure]] = {
     "wheels_slipping": lambda rng: _Wheels(rng.uniform(1.6, 3.0)),
     "wheels_reversed": lambda rng: _Wheels(-1.0),
 }
+
+
+_SENSORS = {
+    "camera": Sensor.IMAGE,
+    "depth": Sensor.DEPTH,
+    "laser": Sensor.SCAN,
+    "wheels": Sensor.ODOMETRY,
+}
+
+
+def sensor_of(failure: str) -> Sensor:
+    """Return the sensor that a failure changes."""
+    return _SENSORS[failure.partition("_")[0]]
 
 
 def scene_of(failure: str) -> str:

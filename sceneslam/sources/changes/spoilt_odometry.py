@@ -10,7 +10,7 @@ import numpy as np
 
 from sceneslam.interfaces import Source
 from sceneslam.ros.pixels import locked
-from sceneslam.sources.changes.wrapped import Wrapped
+from sceneslam.sources.changes.wrapped import Wrapped, check_sensor
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
@@ -52,6 +52,7 @@ class SpoiltOdometry(Wrapped):
         check_least(0, ratio=ratio, late_s=late_s, spike_m=spike_m, spike_rad=spike_rad, seed=seed)
         if len(lasting_s) != 2 or lasting_s[0] > lasting_s[1]:
             raise ConfigError("lasting_s", lasting_s, "[least, most], seconds")
+        check_sensor(source, Sensor.ODOMETRY, lie=lie)
         super().__init__(source)
         self._lie, self._seed = lie, seed
         self._every_s, self._lasting_s = every_s, lasting_s

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from sceneslam.interfaces import Live, LiveFeed, Logged, Source
 from sceneslam.sources.spanned import Spanned, TimeSpan
 from sceneslam.sources.survey.survey import Survey, Surveyed
-from sceneslam.types.rig import Rig
+from sceneslam.types.errors import ConfigError
+from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.truth import GroundTruth
 
 
@@ -63,6 +64,13 @@ class Wrapped:
             return self.span.start_ns
         first = next(iter(self._source), None)
         return None if first is None else first.stamp_ns
+
+
+def check_sensor(source: Source, sensor: Sensor, **settings: object) -> None:
+    """Raise ConfigError for settings that change a sensor if the source does not have it."""
+    for name, value in settings.items():
+        if sensor not in source.rig.sensors:
+            raise ConfigError(name, value, f"with a source that has {sensor.words}")
 
 
 def logged_ns(source: Source | None, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
