@@ -6,11 +6,14 @@ import cv2
 import numpy as np
 import pytest
 from configured import config
+from ros_recordings import STAMP_NS, Recorder
 
 from sceneslam.app import run
+from sceneslam.sources.bag.open_recording import open_recording
 from sceneslam.sources.carmen import Carmen
 from sceneslam.sources.kitti import Kitti
 from sceneslam.sources.rosbag import RosBag
+from sceneslam.sources.survey.bag_sample import survey_recording
 from sceneslam.sources.survey.preflight import preflight
 from sceneslam.sources.survey.survey import Stream, Survey
 from sceneslam.sources.tum_rgbd import TumRgbd
@@ -152,6 +155,82 @@ def test_sensors_without_a_common_time_are_noticed():
     streams = [stream(Sensor.IMAGE), stream(Sensor.DEPTH, STAMPS_NS + 10**15)]
     rig = Rig(sensors=frozenset({Sensor.IMAGE, Sensor.DEPTH}))
     assert "have no time in common" in preflight(Survey(streams=streams), rig).warnings[0]
+
+
+STREAMS = {Sensor.IMAGE: "/image", Sensor.DEPTH: "/depth", Sensor.SCAN: "/scan"}
+CAMERA_RIG = Rig(
+    sensors=frozenset({Sensor.IMAGE, Sensor.DEPTH}),
+    camera=Camera(size_wh=(4, 3), fx=4.0, fy=4.0, cx=1.5, cy=1.0),
+)
+
+
+def sampled(path, times_s, *, is_slow, tolerance_s=0.02):
+    """Return the survey of a recording with messages at `times_s` of some topics."""
+    messages = [(STAMP_NS + round(at * 1e9), topic) for topic in times_s for at in times_s[topic]]
+    with Recorder(path) as recorder:
+        for at_ns, topic in sorted(messages):
+            if topic == "/image":
+                recorder.image(topic, at_ns, np.zeros((3, 4, 3), np.uint8))
+            elif topic == "/depth":
+                recorder.image(topic, at_ns, np.full((3, 4, 1), 2000, np.uint16), "16UC1")
+            else:
+                recorder.scan(topic, at_ns, [1.0] * 21)
+    recording = open_recording(path)
+    recording.is_slow = is_slow  # as a bag that bzip2 packed
+    topics = {sensor: topic for sensor, topic in STREAMS.items() if topic in times_s}
+    return survey_recording(recording, topics, depth_scale=1000.0, sync_tolerance_s=tolerance_s)
+
+
+def every(period_s, since_s, until_s):
+    return np.arange(since_s, until_s, period_s).tolist()
+
+
+@pytest.mark.parametrize("is_slow", [False, True])
+def test_first_and_last_stamp_are_the_recordings_however_little_is_sampled(tmp_path, is_slow):
+    first_s, first_ns = 150e-9, STAMP_NS + 150  # a float64 of nanoseconds is 85 ns later
+    times_s = {"/scan": every(0.1, first_s, 20), "/of_another_robot": every(0.1, 1, 60)}
+    survey = sampled(tmp_path / "scans.mcap", times_s, is_slow=is_slow)
+    (scans,) = survey.streams
+    assert scans.stamps_ns[[0, -1]].tolist() == [first_ns, first_ns + 19_900_000_000]
+    assert scans.sampled_ns[1][0] == first_ns
+    assert len(scans.stamps_ns) < scans.count == 200
+    assert all(len(span_ns) for span_ns in scans.sampled_ns)
+    (line,) = preflight(survey, Rig(sensors=frozenset({Sensor.SCAN}))).lines
+    assert "; sampled: 10 Hz, 100% of beams return" in line
+
+
+PLAUSIBLE = {  # times [s] of images and depth images
+    "depth that begins late": (every(0.1, 0, 3), every(0.1, 0.5, 3)),
+    "an image in three": (every(0.3, 0, 3), every(0.1, 0.1, 3)),
+    "an image in two seconds": (every(1.9, 0, 60), every(0.1, 0.25, 60)),
+    "a depth image in two seconds": (every(0.1, 0, 60), every(1.9, 0.25, 60)),
+}
+
+
+@pytest.mark.parametrize("is_slow", [False, True])
+@pytest.mark.parametrize(("images_s", "depths_s"), PLAUSIBLE.values(), ids=PLAUSIBLE)
+def test_what_a_sample_does_not_hold_is_not_missing(tmp_path, images_s, depths_s, is_slow):
+    times_s = {"/image": images_s, "/depth": depths_s}
+    survey = sampled(tmp_path / "views.mcap", times_s, is_slow=is_slow)
+    found = preflight(survey, CAMERA_RIG)
+    assert found.warnings == ()
+    assert "; sampled: " in found.lines[1] and "median depth 2.00 m" in found.lines[1]
+
+
+@pytest.mark.parametrize("is_slow", [False, True])
+def test_images_without_their_depth_are_noticed_in_a_sample(tmp_path, is_slow):
+    times_s = {"/image": every(0.03, 0, 20), "/depth": every(0.03, 0.015, 20)}
+    survey = sampled(tmp_path / "views.mcap", times_s, is_slow=is_slow, tolerance_s=0.01)
+    (warning,) = preflight(survey, CAMERA_RIG).warnings
+    assert "only 0% of the images have depth within source.sync_tolerance_s 0.01" in warning
+
+
+def test_a_short_recording_is_read_as_a_whole(tmp_path):
+    times_s = {"/image": every(0.1, 0, 4.5), "/depth": every(0.1, 0.5, 4.5)}
+    survey = sampled(tmp_path / "views.mcap", times_s, is_slow=False)
+    image, depth = preflight(survey, CAMERA_RIG).lines
+    assert "sampled" not in image and "89% with depth" in image
+    assert "40 messages, 10 Hz" in depth
 
 
 def test_real_recordings_with_their_own_settings_give_no_warning(shared_data):

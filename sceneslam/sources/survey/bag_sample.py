@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from sceneslam.ros import decode
 from sceneslam.ros.clouds import cloud
 from sceneslam.ros.pixels import DepthUnits
 from sceneslam.sources.bag.recording import Message, Recording
-from sceneslam.sources.survey.survey import Stream, Survey
+from sceneslam.sources.survey.survey import Stamps, Stream, Survey
 from sceneslam.types.rig import Sensor
 
 _STRETCHES, _STRETCH_NS = 5, 1_000_000_000
@@ -30,10 +31,17 @@ def survey_recording(
     silent: Sequence[str] = (),
     odd: Sequence[str] = (),
 ) -> Survey:
-    """Return the streams of a recording, sampled in time spans of a second."""
-    taken: dict[Sensor, list[int]] = {sensor: [] for sensor in topics}
-    samples = _Samples(DepthUnits.unlimited(depth_scale))
-    for stretch in _stretches(recording, topics):
+    """Return the streams of a recording, sampled in time spans of a second.
+
+    The first and the last message of every topic are read, too.
+    """
+    used = sorted(set(topics.values()))
+    firsts = [one for topic in used for one in islice(recording.messages({topic}), 1)]
+    lasts = [one for topic in used if (one := recording.last(topic)) is not None]
+    start_ns = min((one.log_ns for one in firsts), default=0)
+    end_ns = max((one.log_ns for one in lasts), default=0)
+    samples = _Samples(topics, DepthUnits.unlimited(depth_scale))
+    for stretch in (firsts, *_stretches(recording, used, start_ns, end_ns), lasts):
         samples.begin()
         for message in stretch:
             value = recording.decode(message)
@@ -41,14 +49,14 @@ def survey_recording(
                 continue
             stamp_ns = decode.stamp_ns(value) or message.log_ns
             for sensor in (one for one, topic in topics.items() if topic == message.topic):
-                taken[sensor].append(stamp_ns)
                 samples.take(sensor, stamp_ns, value)
     streams = [
         Stream(
             sensor=sensor,
             place=topic,
             count=recording.topics[topic].count,
-            stamps_ns=np.array(sorted(taken[sensor]), np.int64),
+            stamps_ns=np.unique(np.concatenate(samples.stamps_ns(sensor))),
+            sampled_ns=samples.stamps_ns(sensor),
         )
         for sensor, topic in topics.items()
     ]
@@ -68,22 +76,28 @@ def survey_recording(
     )
 
 
-def _stretches(recording: Recording, topics: Mapping[Sensor, str]) -> Iterator[Iterator[Message]]:
+def _stretches(
+    recording: Recording, topics: Collection[str], start_ns: int, end_ns: int
+) -> Iterator[Iterator[Message]]:
+    """Yield the messages of disjoint time spans, evenly distributed; a short recording as a whole.
+
+    `start_ns` and `end_ns` are the recording times of the topics' first and last message.
+    """
     count, length_ns = _STRETCHES, _STRETCH_NS
     if recording.is_slow:
         count, length_ns = _SLOW_STRETCHES, _SLOW_STRETCH_NS
-    start_ns, end_ns = recording.span_ns
-    last_ns = max(start_ns, end_ns - length_ns)
-    for from_ns in sorted({int(at) for at in np.linspace(start_ns, last_ns, count)}):
+    step_ns = max(length_ns, (end_ns - start_ns - length_ns) // max(count - 1, 1))
+    for number in range(count):
+        from_ns = start_ns + number * step_ns
         yield _stretch(recording, topics, from_ns, from_ns + length_ns)
 
 
 def _stretch(
-    recording: Recording, topics: Mapping[Sensor, str], from_ns: int, to_ns: int
+    recording: Recording, topics: Collection[str], from_ns: int, to_ns: int
 ) -> Iterator[Message]:
-    messages = recording.messages(set(topics.values()), from_ns)
+    messages = recording.messages(topics, from_ns)
     for _, message in zip(range(_MOST_MESSAGES), messages, strict=False):
-        if message.log_ns > to_ns:
+        if message.log_ns >= to_ns:
             return
         yield message
 
@@ -91,8 +105,9 @@ def _stretch(
 class _Samples:
     """The contents of the sampled messages."""
 
-    def __init__(self, units: DepthUnits) -> None:
+    def __init__(self, sensors: Collection[Sensor], units: DepthUnits) -> None:
         self._units = units
+        self._stamps_ns: dict[Sensor, list[list[int]]] = {sensor: [] for sensor in sensors}
         self._counts: dict[Sensor, int] = {}
         self.is_scaled = False  # depth is stored as integers
         self.depths_m: list[Any] = []
@@ -105,9 +120,12 @@ class _Samples:
     def begin(self) -> None:
         """Begin a time span."""
         self._counts = {}
+        for spans in self._stamps_ns.values():
+            spans.append([])
 
     def take(self, sensor: Sensor, stamp_ns: int, value: Any) -> None:
-        """Add a message's contents if it is one of the first of its time span."""
+        """Add a message's stamp, and its contents if it is one of the first of its time span."""
+        self._stamps_ns[sensor][-1].append(stamp_ns)
         if sensor is Sensor.ODOMETRY:
             T_odom_base = decode.transform(value.pose.pose.position, value.pose.pose.orientation)
             if T_odom_base is not None:
@@ -118,6 +136,10 @@ class _Samples:
         elif self._counts.get(sensor, 0) < _MOST_SAMPLES:
             self._counts[sensor] = self._counts.get(sensor, 0) + 1
             self._decode(sensor, stamp_ns, value)
+
+    def stamps_ns(self, sensor: Sensor) -> Sequence[Stamps]:
+        """Return the stamps (N,), rising, of each time span."""
+        return [np.array(sorted(span), np.int64) for span in self._stamps_ns[sensor]]
 
     def _decode(self, sensor: Sensor, stamp_ns: int, value: Any) -> None:
         if sensor is Sensor.DEPTH:

@@ -47,27 +47,30 @@ def preflight(survey: Survey, rig: Rig) -> Preflight:
 
 
 def _line(stream: Stream, survey: Survey, camera: Camera | None) -> str:
-    rate_hz = stream.rate_hz
-    parts = [f"{stream.sensor.value:8} {stream.place}: {stream.count} messages"]
-    if rate_hz is not None:
+    known = [f"{stream.sensor.value:8} {stream.place}: {stream.count} messages"]
+    sampled: list[str] = []  # what a part of the messages tells
+    rates = sampled if stream.is_sampled else known
+    if stream.rate_hz is not None:
+        rates.append(f"{stream.rate_hz:.3g} Hz")
+    if len(stream.stamps_ns) > 1:
         first_s, last_s = stream.stamps_ns[[0, -1]] * 1e-9
-        parts += [f"{rate_hz:.3g} Hz", f"stamps {first_s:.3f} to {last_s:.3f} s"]
+        known.append(f"stamps {first_s:.3f} to {last_s:.3f} s")
     paired = survey.paired_ratio()
     if stream.sensor is Sensor.IMAGE and paired is not None:
-        parts.append(f"{paired:.0%} with depth")
-    if stream.sensor is Sensor.DEPTH and camera is not None:
+        rates.append(f"{paired:.0%} with depth")
+    if stream.sensor is Sensor.DEPTH and camera is not None and survey.depths_m:
         depths_m = _measured(survey.depths_m)
         median = f"{np.median(depths_m):.2f} m" if len(depths_m) else "none measured"
-        parts.append(f"median depth {median}")
+        sampled.append(f"median depth {median}")
     if stream.sensor is Sensor.SCAN and survey.scans:
         ranges_m = _returns(survey)
         share = len(ranges_m) / max(sum(len(scan.ranges_m) for scan in survey.scans), 1)
-        parts.append(f"{share:.0%} of beams return")
-        parts += [f"median range {np.median(ranges_m):.2f} m"] if len(ranges_m) else []
+        sampled.append(f"{share:.0%} of beams return")
+        sampled += [f"median range {np.median(ranges_m):.2f} m"] if len(ranges_m) else []
     if stream.sensor is Sensor.POINTS and survey.clouds:
         distances_m = _distances(survey.clouds)
-        parts += [f"median distance {np.median(distances_m):.1f} m"] if len(distances_m) else []
-    return ", ".join(parts)
+        sampled += [f"median distance {np.median(distances_m):.1f} m"] if len(distances_m) else []
+    return "; sampled: ".join(", ".join(parts) for parts in (known, sampled) if parts)
 
 
 def _of_time(survey: Survey) -> Iterator[str]:

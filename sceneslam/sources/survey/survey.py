@@ -15,6 +15,8 @@ from sceneslam.types.se3 import Transform
 
 Stamps = NDArray[np.int64]
 
+_FEWEST_PAIRED = 4  # sampled images: one or two without depth are no rule
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Stream:
@@ -23,12 +25,19 @@ class Stream:
     sensor: Sensor
     place: str  # topic or file
     count: int  # in the whole recording
-    stamps_ns: Stamps  # (N,) rising; all, or those in the sampled time spans
+    stamps_ns: Stamps  # (N,) rising; all, or the first, the last and the sampled ones
+    sampled_ns: Sequence[Stamps] = ()  # (M,) rising, of each sampled time span
+
+    @property
+    def is_sampled(self) -> bool:
+        """Tell whether stamps between the first and the last are missing."""
+        return bool(self.sampled_ns) and len(self.stamps_ns) < self.count
 
     @property
     def rate_hz(self) -> float | None:
         """Return the rate by the median period, None for fewer than two measurements."""
-        periods_ns = np.diff(self.stamps_ns)
+        spans_ns = self.sampled_ns if self.is_sampled else [self.stamps_ns]
+        periods_ns = np.concatenate([np.diff(span_ns) for span_ns in spans_ns])
         periods_ns = periods_ns[periods_ns > 0]
         return 1e9 / float(np.median(periods_ns)) if len(periods_ns) else None
 
@@ -55,22 +64,42 @@ class Survey:
         return next((one for one in self.streams if one.sensor is sensor), None)
 
     def apart_s(self) -> NDArray[np.float64]:
-        """Return the time (N,) [s] between each image and the depth image nearest in time."""
+        """Return the time (N,) [s] between each image and the depth image nearest in time.
+
+        In a sample, only images between two depth images count: others may have their depth
+        outside of the sample.
+        """
         image, depth = self.stream(Sensor.IMAGE), self.stream(Sensor.DEPTH)
         if image is None or depth is None or not len(depth.stamps_ns):
             return np.zeros(0)
-        depth_ns = np.sort(depth.stamps_ns)
-        after = np.searchsorted(depth_ns, image.stamps_ns)
-        near = np.clip(np.stack([after - 1, after]), 0, len(depth_ns) - 1)
-        apart_ns = np.abs(depth_ns[near] - image.stamps_ns).min(axis=0)
-        return np.asarray(apart_ns * 1e-9)
+        if not depth.is_sampled:
+            return _apart_s(image.stamps_ns, depth.stamps_ns)
+        spans_ns = zip(image.sampled_ns, depth.sampled_ns, strict=True)
+        return np.concatenate([_apart_s(_between(*span), span[1]) for span in spans_ns])
 
     def paired_ratio(self) -> float | None:
-        """Return the share of images with depth within the tolerance, None where unknown."""
-        apart_s = self.apart_s()
-        if not len(apart_s) or self.sync_tolerance_s is None:
+        """Return the share of images with depth within the tolerance.
+
+        None where unknown, or where fewer than four sampled images count.
+        """
+        apart_s, depth = self.apart_s(), self.stream(Sensor.DEPTH)
+        fewest = _FEWEST_PAIRED if depth is not None and depth.is_sampled else 1
+        if len(apart_s) < fewest or self.sync_tolerance_s is None:
             return None
         return float((apart_s <= self.sync_tolerance_s).mean())
+
+
+def _between(image_ns: Stamps, depth_ns: Stamps) -> Stamps:
+    """Return the images' stamps (N,) from the first depth image's on, before the last one's."""
+    if not len(depth_ns):
+        return image_ns[:0]
+    return np.asarray(image_ns[(image_ns >= depth_ns[0]) & (image_ns < depth_ns[-1])])
+
+
+def _apart_s(image_ns: Stamps, depth_ns: Stamps) -> NDArray[np.float64]:
+    after = np.searchsorted(depth_ns, image_ns)
+    near = np.clip(np.stack([after - 1, after]), 0, len(depth_ns) - 1)
+    return np.asarray(np.abs(depth_ns[near] - image_ns).min(axis=0) * 1e-9)
 
 
 @runtime_checkable
