@@ -53,6 +53,19 @@ def test_a_folder_that_was_named_belongs_to_one_run_at_a_time(tmp_path):
     assert RunFolder.claim(tmp_path / "a" / "b").path == tmp_path / "a" / "b"
 
 
+@pytest.mark.parametrize(("first", "second"), [("run", "sweep"), ("sweep", "run")])
+def test_a_folder_of_a_run_is_not_that_of_a_sweep(tmp_path, first, second):
+    claimed = RunFolder.claim(tmp_path / "a", kind=first)
+    with pytest.raises(ConfigError, match=f"it is the folder of a {first}"):
+        RunFolder.claim(tmp_path / "a", kind=second)
+    claimed.close()
+    with pytest.raises(ConfigError, match=f"it is the folder of a {first}"):
+        RunFolder.claim(tmp_path / "a", kind=second)
+    RunFolder.claim(tmp_path / "a", kind=first).clear()
+    with pytest.raises(ConfigError, match=f"it is the folder of a {first}"):
+        RunFolder.claim(tmp_path / "a", kind=second)
+
+
 def test_a_folder_with_foreign_files_is_refused_and_left_as_it_is(tmp_path):
     for name in ("figures/fig1.png", "map/survey.pgm", "trajectory_gps.tum"):
         (tmp_path / name).parent.mkdir(exist_ok=True)

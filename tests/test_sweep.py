@@ -21,11 +21,13 @@ from omegaconf import OmegaConf
 
 from sceneslam.collect.status import State, Status
 from sceneslam.config.check import check_keys
+from sceneslam.storage.folder import RunFolder
 from sceneslam.sweep.__main__ import main
 from sceneslam.sweep.backends import Basic, Joblib, Ray, Submitit
 from sceneslam.sweep.supervise import JobOrder, run_job
 from sceneslam.sweep.sweep import run_sweep
 from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.files import MARK
 
 ROOT = Path(__file__).parents[1]
 JOBS = ("+scenario=single", "source=mcap", "source.path=room.mcap", "slam@slam.only=odometry")
@@ -164,6 +166,20 @@ def test_folders_that_collide_are_refused(folder):
     code, _, errors = sweep(folder, *MIXED, "hydra.sweep.dir=out", "hydra.sweep.subdir=same")
     assert code == 2 and "hydra.sweep.subdir: got 'same'" in errors
     assert not list((folder / "out").glob("*/metrics.json"))
+
+
+@pytest.mark.parametrize("kind", ["run", "sweep"])
+def test_a_run_and_a_sweep_share_no_folder(folder, kind):
+    RunFolder.claim(folder / "out", kind=kind).close()
+    if kind == "run":
+        code, _, errors = sweep(folder, *MIXED, "hydra.sweep.dir=out")
+    else:
+        words = [sys.executable, "-m", "sceneslam", *JOBS, "hydra.run.dir=out"]
+        own = os.environ | {"PYTHONPATH": str(ROOT)}
+        done = subprocess.run(words, cwd=folder, env=own, capture_output=True, text=True)
+        code, errors = done.returncode, done.stderr
+    assert code == 2 and f"it is the folder of a {kind}" in errors
+    assert [path.name for path in (folder / "out").iterdir()] == [MARK]
 
 
 def test_job_that_a_real_time_signal_ends_is_settled(tmp_path):

@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         runs = read_runs(options.runs)
         if any((out / name).exists() for name in ("trajectory.tum", "journal.bin")):
             raise ConfigError("--out", str(out), "a folder that holds no run")
-        with closing(RunFolder.claim(out, key="--out")) as claimed:
+        with closing(RunFolder.claim(out, kind="comparison", key="--out")) as claimed:
             claimed.clear()
             page = write_page(out, runs)
     except SceneSlamError as error:

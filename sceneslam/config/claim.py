@@ -35,7 +35,9 @@ class ClaimFolder(Callback):
         node = config.hydra[kind]
         raw = str(OmegaConf.to_container(node, resolve=False)["dir"])  # type: ignore[index,call-overload]
         try:
-            self._folder = RunFolder.claim(Path(node.dir), is_stamped="${now:" in raw, key=key)
+            self._folder = RunFolder.claim(
+                Path(node.dir), kind=kind, is_stamped="${now:" in raw, key=key
+            )
         except ConfigError as error:
             sys.stderr.write(f"error: {error}\n")
             raise SystemExit(_UNUSABLE) from error

@@ -1,4 +1,4 @@
-"""A run's folder: locked by one run at a time; files of others in it are not changed."""
+"""The folder of a run, sweep, ...: locked while it is written; files of others stay."""
 
 from __future__ import annotations
 
@@ -36,8 +36,10 @@ class RunFolder:
     _lock: int | None  # descriptor of the lock file; None: this process has the lock already
 
     @classmethod
-    def claim(cls, path: Path, *, is_stamped: bool = False, key: str = "folder") -> RunFolder:
-        """Create a folder, or use one that is empty or was written by runs.
+    def claim(
+        cls, path: Path, *, kind: str = "run", is_stamped: bool = False, key: str = "folder"
+    ) -> RunFolder:
+        """Create a folder, or use one that is empty or belongs to the same `kind` of results.
 
         `is_stamped`: its name is a time; if it exists, a number is added (`_1`). Raises ConfigError
         for `key` if the folder holds other files, is in use by a run, or cannot be created.
@@ -45,7 +47,7 @@ class RunFolder:
         made = _Made(path=path, folders=[])
         try:
             made = _make(path.absolute(), is_stamped)
-            return cls(made.path, _take(made, key))
+            return cls(made.path, _take(made, kind, key))
         except OSError as error:
             _unmake(made)
             allowed = f"a folder that can be written ({text_of(error)})"
@@ -133,7 +135,7 @@ def _mkdir(folder: Path) -> bool:
     return True
 
 
-def _take(made: _Made, key: str) -> int | None:
+def _take(made: _Made, kind: str, key: str) -> int | None:
     """Lock and write the lock file of a folder; None if this process has the lock already."""
     path = made.path
     if not (path / MARK).exists():
@@ -145,14 +147,16 @@ def _take(made: _Made, key: str) -> int | None:
             if not _is_own(other):
                 by = f"process {other.get('pid')} on {other.get('host')} is"
                 raise ConfigError(key, str(path), f"a folder that no run is writing; {by}")
+            _refuse_kind(path, kind, key)
             os.close(mark)
             return None
         if not _is_there(mark, path / MARK):  # removed between opening and locking
             os.close(mark)
-            return _take(made, key)
+            return _take(made, kind, key)
+        _refuse_kind(path, kind, key)
         is_new, names = os.fstat(mark).st_size == 0, owned(path)
         _refuse_foreign(path, {one for one in _NAMES if (path / one).exists()} - {*names}, key)
-        about = {"sceneslam": sceneslam.__version__, **_who()}
+        about = {"sceneslam": sceneslam.__version__, "kind": kind, **_who()}
         _write_mark(path, about | {"is_new": is_new, "made": made.folders}, names)
     except (OSError, ConfigError):
         os.close(mark)
@@ -179,6 +183,14 @@ def _refuse_foreign(path: Path, foreign: set[str], key: str) -> None:
         more = f" and {len(foreign) - 1} more" if len(foreign) > 1 else ""
         holds = f"it holds files that no run wrote: {min(foreign)}{more}"
         raise ConfigError(key, str(path), f"a new folder, or an empty one ({holds})")
+
+
+def _refuse_kind(path: Path, kind: str, key: str) -> None:
+    """Refuse a folder of another kind; older versions wrote none."""
+    other = _read_mark(path).get("kind", kind)
+    if other != kind:
+        allowed = f"a new folder, or that of a {kind} (it is the folder of a {other})"
+        raise ConfigError(key, str(path), allowed)
 
 
 def _is_locked(mark: int) -> bool:
