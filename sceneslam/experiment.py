@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from sceneslam.app import run
 from sceneslam.config.build import opened_source
-from sceneslam.config.check import check_given, first_line
+from sceneslam.config.check import check_given, check_maps_apart, first_line
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.overlay import command_of, comment_of
 from sceneslam.config.provenance import provenance, save_config
@@ -80,6 +80,7 @@ class _Trials:
         check_least(1, jobs=jobs)
         self._key, self._folder, self._overrides, self._jobs = key, folder, overrides, jobs
         self._bar = bar  # over all runs, as some experiments request them one by one
+        self._atlases: dict[str, Mapping[str, Any]] = {}  # by the name of the trial
         self.done: list[Ran] = []
 
     def run(self, trials: Iterable[Trial]) -> Iterator[TrialResult]:
@@ -89,6 +90,8 @@ class _Trials:
         this number runs in parallel, each in a process of its own.
         """
         configs = [(trial, self._compose(trial)) for trial in trials]
+        self._atlases |= {trial.name: config.get("atlas") or {} for trial, config in configs}
+        check_maps_apart(self._atlases.values())
         _try_sources([config for _, config in configs])
         self._bar.total = self._bar.n + len(configs)
         for (trial, config), _ in zip(configs, self._made(configs), strict=True):

@@ -275,6 +275,7 @@ def test_a_mistake_is_one_sentence(folder, overrides, sentence):
         ("matrix", ("matrix.stories=[there_and_bak]", "matrix.seeds=[0]"), "source.story: got"),
         ("table", ("+table.recordings.x=['source=tum_rgbd','source.path=no']",), "a folder: no"),
         ("table", ("table.modules=[depht]",), "Could not find 'slam/depht'"),
+        ("matrix", ("matrix.seeds=[0]", "atlas.save=map"), "atlas.save: got 'map'"),
         ("tune", ("tune.space.window.key=policy.windw_s",), "override 'policy.windw_s'"),
     ],
 )

@@ -10,6 +10,7 @@ import shlex
 import signal
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from time import monotonic, sleep
 
@@ -20,7 +21,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from sceneslam.collect.status import State, Status
-from sceneslam.config.check import check_keys
+from sceneslam.config.check import check_keys, check_maps_apart
 from sceneslam.storage.folder import RunFolder
 from sceneslam.sweep.__main__ import main
 from sceneslam.sweep.backends import Basic, Joblib, Ray, Submitit
@@ -166,6 +167,28 @@ def test_folders_that_collide_are_refused(folder):
     code, _, errors = sweep(folder, *MIXED, "hydra.sweep.dir=out", "hydra.sweep.subdir=same")
     assert code == 2 and "hydra.sweep.subdir: got 'same'" in errors
     assert not list((folder / "out").glob("*/metrics.json"))
+
+
+def test_jobs_that_would_lose_maps_of_each_other_are_refused(folder):
+    code, _, errors = sweep(folder, *MIXED, "atlas.save=map", "hydra.sweep.dir=out")
+    assert code == 2 and errors.startswith("error: atlas.save: got 'map', allowed: a folder of its")
+    assert not (folder / "map").exists() and not (folder / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("maps", "is_allowed"),
+    [
+        ([("a", None), ("b", None)], True),
+        ([("a", None), ("a/", None)], False),
+        ([("a", "a"), ("a", "a")], True),  # one run after the other extends it
+        ([("a", "b"), ("a", "b")], False),
+        ([(None, "b"), (None, "b")], True),
+    ],
+)
+def test_maps_of_runs_that_are_composed_together_stay_apart(maps, is_allowed):
+    runs = [{"save": save, "load": load} for save, load in maps]
+    with nullcontext() if is_allowed else pytest.raises(ConfigError, match=r"atlas\.save: got 'a"):
+        check_maps_apart(runs)
 
 
 @pytest.mark.parametrize("kind", ["run", "sweep"])

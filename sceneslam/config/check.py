@@ -10,7 +10,7 @@ import re
 import sys
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import Any
@@ -79,6 +79,22 @@ def check_keys(config: Mapping[str, Any]) -> None:
             hint = f" (did you mean {close[0]}?)" if close else ""
             raise ConfigError(key, config[key], f"{', '.join(TOP_LEVEL)}{hint}")
     check_given(config, "")
+
+
+def check_maps_apart(runs: Iterable[Mapping[str, Any]]) -> None:
+    """Raise ConfigError if two runs save a map in one folder: that of the first would be lost.
+
+    `runs` are the tables `atlas` of the runs. A map that a run loads is not lost where it saves.
+    """
+    taken: set[Path] = set()
+    for atlas in runs:
+        save, load = (Path(str(atlas.get(key))).resolve() for key in ("save", "load"))
+        if atlas.get("save") is None or save == load:
+            continue
+        if save in taken:
+            allowed = "a folder of its own for every run, or the one in atlas.load"
+            raise ConfigError("atlas.save", atlas["save"], allowed)
+        taken.add(save)
 
 
 def check_node(node: object, key: str, *, allow: Sequence[str], positional: int = 0) -> None:

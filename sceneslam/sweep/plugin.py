@@ -12,6 +12,7 @@ from typing import Any, cast
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus, configure_log, setup_globals
@@ -23,6 +24,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from sceneslam.collect.status import State, Status
+from sceneslam.config.check import check_maps_apart
 from sceneslam.config.resolve import without_hydra
 from sceneslam.config.settings import DETECT_ONLY
 from sceneslam.storage.folder import RunFolder, give_back
@@ -60,6 +62,7 @@ class SweepLauncher(Launcher):
         if len(set(folders)) < len(folders):
             subdir = self._config.hydra.sweep.subdir
             raise ConfigError("hydra.sweep.subdir", subdir, "a folder of its own for every job")
+        check_maps_apart(map(_maps, configs))
         for folder, config in zip(folders, configs, strict=True):
             _prepare(folder, config)
         run_sweep(sweep, folders, self._launcher, Path.cwd())
@@ -138,6 +141,12 @@ def register() -> None:
             node=OmegaConf.load(path),
             provider="sceneslam",
         )
+
+
+def _maps(config: DictConfig) -> dict[str, Any]:
+    """Return where a job's map is saved and loaded."""
+    HydraConfig.instance().set_config(config)  # of which `${hydra:job.num}` is read
+    return {key: OmegaConf.select(config, f"atlas.{key}") for key in ("save", "load")}
 
 
 def _prepare(folder: Path, config: DictConfig) -> None:
