@@ -375,6 +375,18 @@ def test_nothing_is_written_into_a_map(tmp_path, capsys, command, name):
     save_map_files(map_of(WALL, WALL), tmp_path / "map")
 
 
+def test_an_export_replaces_an_earlier_one_and_nothing_else(tmp_path, capsys):
+    save_map_files(map_of(WALL), tmp_path / "map")
+    command = ["export", str(tmp_path / "map"), "--out"]
+    for _ in range(2):
+        assert main([*command, str(tmp_path / "out")]) == 0
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "grid.yaml").write_text("mine")
+    assert main([*command, str(tmp_path / "mine")]) == 2
+    assert "files that no run wrote: grid.yaml" in capsys.readouterr().err
+    assert (tmp_path / "mine" / "grid.yaml").read_text() == "mine"
+
+
 @pytest.mark.parametrize("command", ["info", "export", "merge"])
 def test_a_map_that_is_too_large_to_draw_is_named(tmp_path, capsys, command):
     folder = str(tmp_path / "map")
@@ -382,3 +394,4 @@ def test_a_map_that_is_too_large_to_draw_is_named(tmp_path, capsys, command):
     out = [] if command == "info" else ["--out", str(tmp_path / "out")]
     assert main([command, folder, *out]) == 2
     assert capsys.readouterr().err.startswith("error: a floor plan of 403 m x 401 m, allowed")
+    assert command == "merge" or not (tmp_path / "out").exists()

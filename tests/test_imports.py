@@ -20,7 +20,7 @@ ALLOWED = {  # package -> what of ours it may import
     "sceneslam/scans": {"types", "scans"},
     "sceneslam/views": {"types", "views"},
     "sceneslam/graphs": {"types", "graphs"},
-    "sceneslam/maps": {"types", "scans", "graphs", "atlas", "streams", "maps"},
+    "sceneslam/maps": {"types", "scans", "graphs", "atlas", "storage", "streams", "maps"},
     "sceneslam/testing": {"types", "interfaces", "testing"},
     "sceneslam/supervision": {"types", "interfaces", "supervision"},
     "sceneslam/storage": {"types", "interfaces", "storage"},

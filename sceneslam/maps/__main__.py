@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 from sceneslam.atlas.lasting.map_files import (
@@ -18,6 +19,7 @@ from sceneslam.atlas.lasting.merge import join_pieces, side_by_side
 from sceneslam.atlas.lasting.prune import prune
 from sceneslam.maps.export import export
 from sceneslam.maps.inspect import described, flaws
+from sceneslam.storage.folder import RunFolder
 from sceneslam.streams import secure_streams
 from sceneslam.types.errors import InputError, SceneSlamError, text_of
 
@@ -78,8 +80,11 @@ def _prune(options: argparse.Namespace) -> int:
 def _export(options: argparse.Namespace) -> int:
     if (options.out / HEAD).exists() or seal_of(options.out.absolute().parent) is not None:
         raise InputError(f"a map is saved in a folder of its own, choose another: {options.out}")
-    for path in export(load_map_files(options.map), options.out):
-        print(path)
+    saved = load_map_files(options.map)
+    saved.check_size()
+    with closing(RunFolder.claim(options.out, kind="map's export", key="--out")):
+        for path in export(saved, options.out):
+            print(path)
     return OK
 
 
