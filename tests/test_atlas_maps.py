@@ -387,6 +387,13 @@ def test_an_export_replaces_an_earlier_one_and_nothing_else(tmp_path, capsys):
     assert (tmp_path / "mine" / "grid.yaml").read_text() == "mine"
 
 
+def test_an_export_says_which_pieces_it_leaves_out(tmp_path, capsys):
+    save_map_files(map_of(WALL, WALL, WALL, pieces=[0, 1, 2]), tmp_path / "map")
+    assert main(["export", str(tmp_path / "map"), "--out", str(tmp_path / "out")]) == 1
+    assert capsys.readouterr().err == "error: pieces beside the first, which are not exported: 2\n"
+    assert (tmp_path / "out" / "grid.yaml").exists()
+
+
 @pytest.mark.parametrize("command", ["info", "export", "merge"])
 def test_a_map_that_is_too_large_to_draw_is_named(tmp_path, capsys, command):
     folder = str(tmp_path / "map")

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
+
 from sceneslam.atlas.lasting.map_files import (
     HEAD,
     check_map_folder,
@@ -27,7 +29,7 @@ OK, INCOMPLETE, UNUSABLE = 0, 1, 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, 1 if the map has errors, 2 if it is not a map."""
+    """Run the command; return 0, 1 if something is wrong or left out, 2 if it is not a map."""
     options = _parser().parse_args(arguments)
     try:
         return int(options.act(options))
@@ -85,7 +87,12 @@ def _export(options: argparse.Namespace) -> int:
     with closing(RunFolder.claim(options.out, kind="map's export", key="--out")):
         for path in export(saved, options.out):
             print(path)
-    return OK
+    left_out = len(np.unique(saved.pieces)) - 1
+    if left_out:
+        print(
+            f"error: pieces beside the first, which are not exported: {left_out}", file=sys.stderr
+        )
+    return INCOMPLETE if left_out else OK
 
 
 def _parser() -> argparse.ArgumentParser:
