@@ -387,6 +387,16 @@ def test_an_export_replaces_an_earlier_one_and_nothing_else(tmp_path, capsys):
     assert (tmp_path / "mine" / "grid.yaml").read_text() == "mine"
 
 
+@pytest.mark.parametrize("again", ["map", "copy"])
+def test_a_map_is_not_merged_with_itself(tmp_path, capsys, again):
+    for name in ("map", "copy"):
+        save_map_files(map_of(WALL), tmp_path / name)
+    first, second, out = (str(tmp_path / name) for name in ("map", again, "out"))
+    assert main(["merge", first, second, "--out", out]) == 2
+    assert f"this one is given again: {tmp_path / again}" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_an_export_says_which_pieces_it_leaves_out(tmp_path, capsys):
     save_map_files(map_of(WALL, WALL, WALL, pieces=[0, 1, 2]), tmp_path / "map")
     assert main(["export", str(tmp_path / "map"), "--out", str(tmp_path / "out")]) == 1

@@ -55,6 +55,7 @@ def _check(options: argparse.Namespace) -> int:
 
 def _merge(options: argparse.Namespace) -> int:
     check_map_folder(options.out)
+    _refuse_repeated((options.map, *options.others))
     saved = load_map_files(options.map)
     for other in options.others:
         saved = side_by_side(saved, load_map_files(other))
@@ -67,6 +68,17 @@ def _merge(options: argparse.Namespace) -> int:
             file=sys.stderr,
         )
     return INCOMPLETE if result.apart else OK
+
+
+def _refuse_repeated(folders: Sequence[Path]) -> None:
+    """Raise InputError for a map that is given twice: its measurements would count twice."""
+    seen: set[str] = set()
+    for folder in folders:
+        seal = seal_of(folder)
+        if seal in seen:
+            raise InputError(f"each map is merged once, this one is given again: {folder}")
+        if seal is not None:
+            seen.add(seal)
 
 
 def _prune(options: argparse.Namespace) -> int:
