@@ -1,6 +1,7 @@
 """Components that break every promise they can: the run goes on, and says what was wrong."""
 
 import os
+import re
 import threading
 import time
 from contextlib import suppress
@@ -91,7 +92,9 @@ def test_a_detector_that_fails_is_stopped_and_its_last_scene_stays(tmp_path, how
     detector = {"_target_": "hostile_parts.Votes", "how": how}
     finished = run(hostile_config(detector=detector), tmp_path)
     assert finished.faults == () and len(finished.trajectory) == 100
-    assert what in (tmp_path / "events.jsonl").read_text()
+    (sentence,) = finished.metrics["shortfalls"]
+    assert re.match(r"detector failed once at \d\.\d s: failed while voting: ", sentence)
+    assert what in sentence
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,9 @@ class Watch:
             raise
         except BaseException as error:
             self.is_working = False
-            self._log.add_fault(observation.stamp_ns, f"the detector failed: {text_of(error)}")
+            self._log.add_fault(
+                observation.stamp_ns, f"detector failed while voting: {text_of(error)}"
+            )
         self.spent_us.append((perf_counter_ns() - began_ns) / 1e3)
         if vote is None:
             return
