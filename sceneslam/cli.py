@@ -66,7 +66,7 @@ def main() -> None:
         codes.append(OK)  # the job has begun
         codes.append(carry_out(config).code)
 
-    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises instead of exiting
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of exiting
     try:
         sys.argv[1:] = _words(sys.argv[1:]) or ["--help"]
         job()

@@ -71,6 +71,12 @@ def test_mistake_is_one_sentence_without_a_traceback(folder, overrides, sentence
     assert "Traceback" not in done.stderr + done.stdout
 
 
+def test_a_mistake_is_one_sentence_whatever_is_set_for_hydra(folder, monkeypatch):
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    done = call(folder, *SINGLE, "policy.typo=1")
+    assert done.returncode == 2 and done.stderr.startswith("error: ")
+
+
 def test_a_folder_that_cannot_be_made_is_one_sentence(folder):
     words = [*command(*SINGLE)[:-1], "hydra.run.dir=room.mcap/out"]
     done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=120)
