@@ -27,7 +27,14 @@ from sceneslam.catalogue import listing
 from sceneslam.config import files
 from sceneslam.config.resolve import resolved
 from sceneslam.config.settings import DETECT_ONLY
-from sceneslam.config.words import check_trust, how_to_quote, is_override, readable, shortened
+from sceneslam.config.words import (
+    check_choices,
+    check_trust,
+    how_to_quote,
+    is_override,
+    readable,
+    shortened,
+)
 from sceneslam.detection.run import detect
 from sceneslam.doctor import examine
 from sceneslam.evaluation.report.summary import summary_lines
@@ -157,6 +164,7 @@ def carry_out(config: DictConfig) -> Ended:
     folder = Path(HydraConfig.get().runtime.output_dir)
     try:
         check_trust(config, HydraConfig.get().overrides.task)
+        check_choices(HydraConfig.get().overrides.task)
         if config.get("experiment"):
             verdict = run_experiment(config, folder)
             print("\n".join([*verdict_lines(verdict), f"report  {_short(folder)}/report.html"]))

@@ -60,6 +60,10 @@ def test_run_says_what_happened_in_ten_lines_at_most(folder):
         ((*SINGLE, "scenes={Dark: [only]}"), "use +scenes={Dark: [only]}"),
         ((*SINGLE, "policy.gate=null", "sinks=null"), "error: sinks=null: a group holds options"),
         ((*SINGLE, "scenes.Any=[onyl]"), "scenes.Any: got ['onyl']"),
+        (
+            (*SINGLE, "effects=[lights_out,depth_gap]"),
+            "effects: got ['lights_out', 'depth_gap'], allowed: one of them at a time",
+        ),
         ((*SINGLE, "--config-dir", "nowhere", "seed=1"), "nowhere' not found"),
         ((*SINGLE, "scenes.Any=[only"), "scenes.Any=[only: no viable"),
     ],

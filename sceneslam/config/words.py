@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from itertools import accumulate
 from typing import Any
 
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, QuotedString
 from hydra.errors import HydraException
@@ -91,6 +92,16 @@ def check_trust(config: DictConfig, words: Sequence[str]) -> None:
             given,
             "the packages named on the command line itself; a file cannot allow its own code",
         )
+
+
+def check_choices(words: Sequence[str]) -> None:
+    """Raise ConfigError for several options of one group: Hydra would mix their keys."""
+    for one in filter(None, map(_parsed, words)):
+        value = _plain(one.value())
+        if not isinstance(value, list) or len(value) < 2:
+            continue
+        if GlobalHydra.instance().config_loader().get_group_options(one.key_or_group):
+            raise ConfigError(one.get_key_element().lstrip("+"), value, "one of them at a time")
 
 
 def typed_targets(words: Sequence[str]) -> Any:
