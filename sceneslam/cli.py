@@ -47,6 +47,7 @@ from sceneslam.types.trajectory import Trajectory
 
 OK, INCOMPLETE, UNUSABLE = 0, 1, 2
 CONFIG = "pkg://sceneslam.conf"
+_UNBEGUN = "stopped before the first observation"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,8 +85,10 @@ def main() -> None:
     except SystemExit as stop:  # Hydra exits with 0 after --help, whatever was printed
         if stop.code:
             raise
-    except KeyboardInterrupt:  # also ends a sweep
-        codes.append(INCOMPLETE)
+    except KeyboardInterrupt as stop:  # also ends a sweep
+        if not codes:
+            print(f"error: {_UNBEGUN}", file=sys.stderr)
+        codes.append(INCOMPLETE if codes and str(stop) != _UNBEGUN else UNUSABLE)
     # The results of a run are in its folder, whatever standard output lost.
     sys.exit(max(codes) if codes else _printed())
 
@@ -183,8 +186,10 @@ def carry_out(config: DictConfig) -> Ended:
         print(f"error: {text_of(error)}", file=sys.stderr)
         return Ended(code=UNUSABLE, errors=(text_of(error),))
     except KeyboardInterrupt as stop:
-        print(f"error: {str(stop) or 'stopped before the first observation'}", file=sys.stderr)
-        raise
+        is_experiment = bool(config.get("experiment"))  # whose trials may be finished
+        said = str(stop) or ("stopped between the trials" if is_experiment else _UNBEGUN)
+        print(f"error: {said}", file=sys.stderr)
+        raise KeyboardInterrupt(said) from stop
     errors = (*finished.faults, *finished.metrics["shortfalls"])
     for sentence in errors:
         print(f"error: {sentence}", file=sys.stderr)
@@ -219,7 +224,7 @@ def _run(config: DictConfig, folder: Path) -> Finished:
             faults = tuple(f"reference: {fault}" for fault in finished.faults)
             return replace(finished, faults=faults)
         if finished.is_stop_requested:
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt(f"{_UNBEGUN}; the reference is saved")
         reference = finished.trajectory
     return run(resolved(config), folder, title=title, reference=reference, say=_say_before)
 

@@ -143,6 +143,40 @@ def test_command_answers_ctrl_c_while_it_saves(folder, times):
     assert (folder / "out" / "metrics.json").exists() is (times == 1)
 
 
+SLOW_START = """
+import signal
+import sys
+from sceneslam import __main__ as program
+def press(*_, **__):
+    signal.raise_signal(signal.SIGINT)
+sys.argv[1:] = ["+scenario=single", "run.report=false"]
+exec(sys.stdin.read())
+program.main()
+"""
+
+
+@pytest.mark.parametrize(
+    "pressed_in",
+    [
+        "program.register = press",
+        "from hydra._internal.hydra import Hydra; Hydra.compose_config = press",
+        "program.cli.check_trust = press",
+    ],
+)
+def test_ctrl_c_before_the_first_observation_is_one_sentence(tmp_path, pressed_in):
+    done = subprocess.run(
+        [sys.executable, "-c", SLOW_START],
+        input=pressed_in,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 2
+    assert done.stderr == "error: stopped before the first observation\n"
+
+
 def test_ctrl_c_while_the_reference_is_saved_is_before_the_run_itself(folder):
     done = pressed(folder, 1, "reference={seed:1}")
     assert done.returncode == 1 and "stopped before the first observation" in done.stderr
