@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from ros_recordings import make_source
 
+from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
-from sceneslam.types.rig import Sensor
+from sceneslam.types.rig import Sensor, optical_to_rep103
 
 POINTS = np.random.default_rng(4).normal(size=(50, 4)).astype("<f4")
 
@@ -55,6 +56,37 @@ def test_poses_of_twelve_numbers_are_truth(tmp_path: Path) -> None:
     np.testing.assert_array_equal(truth.positions_m[:, 0], [0, 1, 2])
     np.savetxt(folder / "poses.txt", rows[:2])
     with pytest.raises(InputError, match="expected 3 lines of 12"):
+        make_source("kitti", folder).ground_truth()
+
+
+def write_camera_poses(folder: Path, T_cam_lidar: np.ndarray) -> None:
+    """Write what the odometry benchmark has: the camera's poses along its z axis, and `Tr`."""
+    rows = np.tile(np.eye(4)[:3], (3, 1, 1))
+    rows[:, 2, 3] = [0, 1, 2]
+    np.savetxt(folder / "poses.txt", rows.reshape(3, 12))
+    numbers = " ".join(map(str, T_cam_lidar[:3].ravel()))
+    (folder / "calib.txt").write_text(f"P0: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: {numbers}\n")
+
+
+def test_poses_of_the_camera_become_poses_of_the_lidar(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "a")
+    T_cam_lidar = se3.inverse(optical_to_rep103())
+    T_cam_lidar[:3, 3] = [-0.01, -0.05, -0.29]
+    write_camera_poses(folder, T_cam_lidar)
+    T_gt_base = make_source("kitti", folder).ground_truth().trajectory.T_world_base
+    np.testing.assert_allclose(T_gt_base[:, :3, 3], [[0, 0, 0], [1, 0, 0], [2, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(T_gt_base[:, :3, :3], np.tile(np.eye(3), (3, 1, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [("1 0 0", "expected 12 numbers, got '1 0 0'"), ("1 " * 12, "expected a rotation")],
+)
+def test_a_calibration_that_is_no_transform_is_named(tmp_path: Path, wrong: str, says: str) -> None:
+    folder = make_folder(tmp_path / "a")
+    write_camera_poses(folder, np.eye(4))
+    (folder / "calib.txt").write_text(f"Tr: {wrong}\n")
+    with pytest.raises(InputError, match=rf"Tr: {says}.*calib\.txt"):
         make_source("kitti", folder).ground_truth()
 
 

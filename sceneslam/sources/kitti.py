@@ -34,8 +34,9 @@ class Kitti(StampedScans):
     """Gives one observation per scan; base is the lidar.
 
     `velodyne/*.bin` (odometry benchmark) or `velodyne_points/data/*.bin` (raw data). Times are read
-    from times.txt or timestamps.txt, else 10 Hz. Ground truth is read from groundtruth_tum.txt or
-    poses*.txt, as poses of the lidar.
+    from times.txt or timestamps.txt, else 10 Hz. Ground truth is groundtruth_tum.txt, the lidar's
+    poses, or poses*.txt: the camera's poses if calib.txt beside it has `Tr` (odometry benchmark,
+    SemanticKITTI), else the lidar's.
     """
 
     def __init__(self, path: str, range_m: list[float]) -> None:
@@ -71,7 +72,7 @@ class Kitti(StampedScans):
         return Survey(streams=[lidar], clouds=[points for points in scans if points is not None])
 
     def ground_truth(self) -> GroundTruth | None:
-        """Return the drive's true poses, None without a file of poses."""
+        """Return the true poses T_gt_lidar of the drive, None without a file of poses."""
         tum = self._folder / "groundtruth_tum.txt"
         if tum.is_file():
             return GroundTruth(trajectory=Trajectory.read_tum(tum))
@@ -80,7 +81,10 @@ class Kitti(StampedScans):
         return None
 
     def _read_poses(self, path: Path) -> Trajectory:
-        """Return the poses of a file: per line, twelve numbers, rows 1 to 3 of T_gt_lidar [m]."""
+        """Return the lidar's poses by a file: per line, rows 1 to 3 of a matrix (4, 4) [m].
+
+        It is T_gt_lidar; with `Tr` in calib.txt it is the pose of the camera.
+        """
         try:
             rows = np.loadtxt(path, ndmin=2, dtype=np.float64)
         except ValueError as err:
@@ -97,6 +101,8 @@ class Kitti(StampedScans):
             text = read_text(path).splitlines()
             numbers = [n for n, line in enumerate(text, start=1) if line.partition("#")[0].strip()]
             raise InputError(f"poses: line {numbers[wrong[0]]} has no rotation: {path}")
+        T_cam_lidar = _read_T_cam_lidar(path.with_name("calib.txt"))
+        T_gt_base = se3.inverse(T_cam_lidar) @ T_gt_base @ T_cam_lidar
         return Trajectory(stamps_ns=self._stamps_ns, T_world_base=T_gt_base)
 
     def _jobs(self) -> Iterator[Callable[[], NDArray[np.float32] | None]]:
@@ -110,6 +116,22 @@ def _scan_files(folder: Path) -> Sequence[Path]:
         if files:
             return files
     raise InputError(f"no scans, expected velodyne/*.bin or velodyne_points/data/*.bin: {folder}")
+
+
+def _read_T_cam_lidar(path: Path) -> se3.Transform:
+    """Return `Tr` of a calib.txt, the identity without; raises InputError if it is no transform."""
+    T_cam_lidar = se3.identity()
+    for line in read_text(path).splitlines() if path.is_file() else ():
+        key, _, numbers = line.partition(":")
+        if key.strip() != "Tr":
+            continue
+        try:
+            T_cam_lidar[:3] = np.array(numbers.split(), dtype=np.float64).reshape(3, 4)
+        except ValueError as err:
+            raise InputError(f"Tr: expected 12 numbers, got {numbers.strip()!r}: {path}") from err
+        if not np.isfinite(T_cam_lidar).all() or se3.skew(T_cam_lidar) > _SKEW_MAX:
+            raise InputError(f"Tr: expected a rotation and a translation: {path}")
+    return T_cam_lidar
 
 
 def _read_times_ns(folder: Path, count: int) -> NDArray[np.int64]:
