@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from ros_recordings import make_source
 
+from sceneslam.sources.survey.preflight import preflight
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.rig import Sensor, optical_to_rep103
@@ -18,6 +19,15 @@ def make_folder(path: Path, name: str = "velodyne", count: int = 3) -> Path:
     for index in range(count):
         (path / name / f"{index:06d}.bin").write_bytes(POINTS.tobytes())
     return path
+
+
+def write_camera_poses(folder: Path, T_cam_lidar: np.ndarray) -> None:
+    """Write what the odometry benchmark has: the camera's poses along its z axis, and `Tr`."""
+    rows = np.tile(np.eye(4)[:3], (3, 1, 1))
+    rows[:, 2, 3] = [0, 1, 2]
+    np.savetxt(folder / "poses.txt", rows.reshape(3, 12))
+    numbers = " ".join(map(str, T_cam_lidar[:3].ravel()))
+    (folder / "calib.txt").write_text(f"P0: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: {numbers}\n")
 
 
 def test_the_drive_is_read_with_its_truth(shared_data: Path) -> None:
@@ -39,6 +49,28 @@ def test_both_layouts_are_read_at_ten_hertz(tmp_path: Path, name: str) -> None:
     np.testing.assert_array_equal(found[0].points_lidar, POINTS[:, :3])
 
 
+@pytest.mark.parametrize("name", ["velodyne", "velodyne_points/data"])
+def test_the_folder_of_the_scans_stands_for_its_drive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    folder = make_folder(tmp_path / "a", name)
+    (folder / "times.txt").write_text("5.0\n5.2\n5.4\n")
+    write_camera_poses(folder, np.eye(4))
+    monkeypatch.chdir(folder / name)
+    for given in (folder / name, "."):
+        source = make_source("kitti", given)
+        assert [one.stamp_ns for one in source] == [5_000_000_000, 5_200_000_000, 5_400_000_000]
+        assert len(source.ground_truth().trajectory) == 3
+        assert not source.survey().odd
+
+
+def test_assumed_stamps_are_a_warning(tmp_path: Path) -> None:
+    source = make_source("kitti", make_folder(tmp_path / "a"))
+    (warning,) = preflight(source.survey(), source.rig).warnings
+    assert warning.startswith("no times.txt: the scans are assumed to come at 10 Hz")
+    assert warning.endswith(str(tmp_path / "a"))
+
+
 def test_the_dates_of_raw_drives_are_stamps(tmp_path: Path) -> None:
     folder = make_folder(tmp_path / "a", "velodyne_points/data", 1)
     times = "2011-09-26 13:02:25.964389445\n"
@@ -57,15 +89,6 @@ def test_poses_of_twelve_numbers_are_truth(tmp_path: Path) -> None:
     np.savetxt(folder / "poses.txt", rows[:2])
     with pytest.raises(InputError, match="expected 3 lines of 12"):
         make_source("kitti", folder).ground_truth()
-
-
-def write_camera_poses(folder: Path, T_cam_lidar: np.ndarray) -> None:
-    """Write what the odometry benchmark has: the camera's poses along its z axis, and `Tr`."""
-    rows = np.tile(np.eye(4)[:3], (3, 1, 1))
-    rows[:, 2, 3] = [0, 1, 2]
-    np.savetxt(folder / "poses.txt", rows.reshape(3, 12))
-    numbers = " ".join(map(str, T_cam_lidar[:3].ravel()))
-    (folder / "calib.txt").write_text(f"P0: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: {numbers}\n")
 
 
 def test_poses_of_the_camera_become_poses_of_the_lidar(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from sceneslam.types.rig import Lidar, Rig, Sensor
 from sceneslam.types.trajectory import Trajectory, parse_stamp_ns
 from sceneslam.types.truth import GroundTruth
 
-_FOLDERS = ("velodyne", "velodyne_points/data", ".")
+_FOLDERS = ("velodyne", "velodyne_points/data")
 _TIMES = ("times.txt", "velodyne_points/timestamps.txt", "timestamps.txt")
 _PERIOD_NS = 100_000_000
 _POINT_BYTES = 16  # float32 x y z reflectance
@@ -33,19 +33,20 @@ _SKEW_MAX = 1e-2  # entries of R^T R - I of a rotation written with three decima
 class Kitti(StampedScans):
     """Gives one observation per scan; base is the lidar.
 
-    `velodyne/*.bin` (odometry benchmark) or `velodyne_points/data/*.bin` (raw data). Times are read
-    from times.txt or timestamps.txt, else 10 Hz. Ground truth is groundtruth_tum.txt, the lidar's
-    poses, or poses*.txt: the camera's poses if calib.txt beside it has `Tr` (odometry benchmark,
-    SemanticKITTI), else the lidar's.
+    `path` is a drive: `velodyne/*.bin` (odometry benchmark) or `velodyne_points/data/*.bin` (raw
+    data), or its folder of scans. Times are read from times.txt or timestamps.txt, else 10 Hz.
+    Ground truth is groundtruth_tum.txt, the lidar's poses, or poses*.txt: the camera's poses if
+    calib.txt beside it has `Tr` (odometry benchmark, SemanticKITTI), else the lidar's.
     """
 
     def __init__(self, path: str, range_m: list[float]) -> None:
         low_m, high_m = checked_range_m("range_m", range_m)
-        self._folder = given_folder(path)
-        self._files = _scan_files(self._folder)
+        self._files = _scan_files(given_folder(path))
+        self._folder = _drive(self._files[0].parent)
+        self._times = next((one for name in _TIMES if (one := self._folder / name).is_file()), None)
         super().__init__(
             Rig(sensors=frozenset({Sensor.POINTS}), lidar=Lidar(range_m=(low_m, high_m))),
-            _read_times_ns(self._folder, len(self._files)),
+            _read_times_ns(self._times, len(self._files)),
         )
 
     def __iter__(self) -> Iterator[Observation]:
@@ -69,7 +70,12 @@ class Kitti(StampedScans):
             stamps_ns=self._stamps_ns,
         )
         scans = [_read_scan(self._files[at]) for at in spread(len(self._files), _SAMPLES)]
-        return Survey(streams=[lidar], clouds=[points for points in scans if points is not None])
+        assumed = f"no times.txt: the scans are assumed to come at 10 Hz: {self._folder}"
+        return Survey(
+            streams=[lidar],
+            clouds=[points for points in scans if points is not None],
+            odd=[] if self._times else [assumed],
+        )
 
     def ground_truth(self) -> GroundTruth | None:
         """Return the true poses T_gt_lidar of the drive, None without a file of poses."""
@@ -111,11 +117,17 @@ class Kitti(StampedScans):
 
 
 def _scan_files(folder: Path) -> Sequence[Path]:
-    for name in _FOLDERS:
+    for name in (*_FOLDERS, "."):
         files = sorted((folder / name).glob("*.bin"))
         if files:
             return files
     raise InputError(f"no scans, expected velodyne/*.bin or velodyne_points/data/*.bin: {folder}")
+
+
+def _drive(folder: Path) -> Path:
+    """Return the drive's folder by that of its scans, which may be the same."""
+    whole = folder.absolute()
+    return next((whole.parents[name.count("/")] for name in _FOLDERS if whole.match(name)), folder)
 
 
 def _read_T_cam_lidar(path: Path) -> se3.Transform:
@@ -134,22 +146,18 @@ def _read_T_cam_lidar(path: Path) -> se3.Transform:
     return T_cam_lidar
 
 
-def _read_times_ns(folder: Path, count: int) -> NDArray[np.int64]:
+def _read_times_ns(path: Path | None, count: int) -> NDArray[np.int64]:
     """Return the stamps (N,) [ns] of `count` scans; without a file of times, 10 Hz from zero.
 
     Raises InputError if the file has another number of lines or an invalid time.
     """
-    for name in _TIMES:
-        path = folder / name
-        if path.is_file():
-            lines = [line.strip() for line in read_text(path).splitlines()]
-            stamps = [_stamp_ns(line, path) for line in lines if line and line[0] != "#"]
-            if len(stamps) != count:
-                raise InputError(
-                    f"times: expected {count} as there are scans, got {len(stamps)}: {path}"
-                )
-            return np.array(stamps, dtype=np.int64)
-    return np.arange(count, dtype=np.int64) * _PERIOD_NS
+    if path is None:
+        return np.arange(count, dtype=np.int64) * _PERIOD_NS
+    lines = [line.strip() for line in read_text(path).splitlines()]
+    stamps = [_stamp_ns(line, path) for line in lines if line and line[0] != "#"]
+    if len(stamps) != count:
+        raise InputError(f"times: expected {count} as there are scans, got {len(stamps)}: {path}")
+    return np.array(stamps, dtype=np.int64)
 
 
 def _stamp_ns(line: str, path: Path) -> int:

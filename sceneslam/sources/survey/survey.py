@@ -56,7 +56,7 @@ class Survey:
     T_odom_base: Sequence[Transform] = ()  # ... these N poses
     gyro_radps: Sequence[NDArray[np.float64]] = ()  # (3,) each
     unplaced: Sequence[str] = ()  # frames of sensors that no transform connects with the base
-    odd: Sequence[str] = ()  # sentences about who publishes
+    odd: Sequence[str] = ()  # sentences about who publishes, and what is assumed
     silent: Sequence[str] = ()  # announced topics without a message
 
     def stream(self, sensor: Sensor) -> Stream | None:
