@@ -119,20 +119,41 @@ def overwrite(folder: Path, name: str, stored: np.ndarray) -> None:
 @pytest.mark.parametrize(
     ("name", "stored", "says"),
     [
-        ("depth/2.png", COLOR[..., 0], r"expected 16 bit.*got 8 bit in 1: .*depth/2\.png"),
-        ("depth/2.png", COLOR, "got 8 bit in 3"),
+        ("depth/0.png", COLOR[..., 0], "8 bit in 1, not 16 bit in one channel"),
+        ("depth/2.png", COLOR, "8 bit in 3, not 16 bit in one channel"),
+        ("depth/0.png", DEPTH[::2, ::2], "20x15 pixels, not 40x30"),
+        ("rgb/0.png", COLOR[::2, ::2], "20x15 pixels, not 40x30"),
     ],
 )
-def test_images_of_another_kind_end_the_reading(
+def test_one_image_of_another_kind_is_left_out_and_named(
     tmp_path: Path, name: str, stored: np.ndarray, says: str
 ) -> None:
     folder = make_folder(tmp_path / "a")
     overwrite(folder, name, stored)
-    reading = iter(make(folder))
-    assert next(reading).has(Sensor.DEPTH)
-    next(reading)
-    with pytest.raises(InputError, match=says):
-        next(reading)
+    source = make(folder)
+    found = list(source)
+    assert len(source.survey().depths_m) == (3 if "depth" in name else 4)
+    assert sum(one.has(Sensor.IMAGE) + one.has(Sensor.DEPTH) for one in found) == 7
+    assert source.faults == [f"image left out, it has {says}: 1 time at {folder / name}"]
+
+
+@pytest.mark.parametrize(
+    ("stored", "says"),
+    [
+        (COLOR[..., 0], r"the first has 8 bit in 1, not 16 bit in one channel: .*depth/1\.png"),
+        (DEPTH[::2, ::2], r"the first has 20x15 pixels, not 40x30: .*depth/1\.png"),
+    ],
+)
+def test_depth_that_is_all_of_another_kind_is_refused(
+    tmp_path: Path, stored: np.ndarray, says: str
+) -> None:
+    folder = make_folder(tmp_path / "a")
+    for index in (1, 2, 3):
+        overwrite(folder, f"depth/{index}.png", stored)
+    assert len(list(make(folder))) == 4
+    (folder / "depth" / "0.png").unlink()
+    with pytest.raises(InputError, match=f"depth: no image that was looked at fits, {says}"):
+        make(folder)
 
 
 @pytest.mark.parametrize(

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.ros import pixels
+from sceneslam.sources.survey.survey import spread
 from sceneslam.types.errors import InputError
 from sceneslam.types.observation import Observation
+
+SAMPLES = 8  # images of a kind that are read before a run
+
+_as_stored = partial(pixels.decode, flags=cv2.IMREAD_UNCHANGED)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,13 +46,9 @@ class FrameReader:
     def __init__(self, size_wh: tuple[int, int], units: pixels.DepthUnits) -> None:
         self._size_wh = size_wh
         self._units = units
-        self._has_depth = False  # True after the first depth image of the first colour image's size
 
     def read(self, frame: FrameFiles) -> ReadFrame:
-        """Return the frame's observation; an image of another size is treated as damaged.
-
-        Raises InputError for depth that is not 16 bit, or if the first one has another size.
-        """
+        """Return the frame's observation; an image of another kind is treated as damaged."""
         problems: dict[str, Path] = {}
         image_bgr = self._image(frame.color, problems)
         depth_m = None if frame.depth is None else self._depth(frame.depth, problems)
@@ -54,58 +58,86 @@ class FrameReader:
         return ReadFrame(observation=observation, problems=problems)
 
     def depth_m(self, path: Path) -> NDArray[np.float32] | None:
-        """Return a depth image (H, W) [m], None if unreadable; raises InputError as `read`."""
+        """Return a depth image (H, W) [m], None if it is unreadable or of another kind."""
         return self._depth(path, {})
 
+    def check_depth(self, paths: Iterable[Path]) -> None:
+        """Raise InputError if all depth images that can be read are of another kind."""
+        odd = ""
+        for path in paths:
+            stored = _decoded(path, "", _as_stored, {})
+            if stored is None:
+                continue
+            kind = self._odd_depth(stored)
+            if not kind:
+                return
+            odd = odd or f"{kind}: {path}"
+        if odd:
+            raise InputError(f"depth: no image that was looked at fits, the first has {odd}")
+
     def _image(self, path: Path, problems: dict[str, Path]) -> NDArray[np.uint8] | None:
-        data = _bytes(path, "colour image is missing", problems)
-        image_bgr = None if data is None else pixels.decode_bgr(data)
+        image_bgr = _decoded(path, "colour image", pixels.decode_bgr, problems)
         if image_bgr is None:
-            if data is not None:
-                problems["colour image is damaged"] = path
             return None
-        return image_bgr if self._has_size(path, image_bgr, problems) else None
+        if kind := self._odd_size(image_bgr):
+            problems[f"image left out, it has {kind}"] = path
+            return None
+        return image_bgr
 
     def _depth(self, path: Path, problems: dict[str, Path]) -> NDArray[np.float32] | None:
-        data = _bytes(path, "depth image is missing", problems)
-        stored = None if data is None else pixels.decode(data, cv2.IMREAD_UNCHANGED)
+        stored = _decoded(path, "depth image", _as_stored, problems)
         if stored is None:
-            if data is not None:
-                problems["depth image is damaged"] = path
             return None
-        if stored.dtype != np.uint16 or stored.ndim != 2:
-            channels = 1 if stored.ndim == 2 else stored.shape[2]
-            raise InputError(
-                f"depth image: expected 16 bit in one channel, got {8 * stored.itemsize} bit "
-                f"in {channels}: {path}"
-            )
-        if not self._has_size(path, stored, problems):
-            if not self._has_depth:  # then all depth images have another size
-                raise InputError(f"depth: {next(reversed(problems))}: {path}")
+        if kind := self._odd_depth(stored):
+            problems[f"image left out, it has {kind}"] = path
             return None
-        self._has_depth = True
         return self._units.of_integers(stored)
 
-    def _has_size(
-        self, path: Path, picture: NDArray[np.generic], problems: dict[str, Path]
-    ) -> bool:
-        height, width = picture.shape[:2]
-        expected = f"{self._size_wh[0]}x{self._size_wh[1]}"
-        if (width, height) != self._size_wh:
-            problems[f"image left out, it has {width}x{height} pixels, not {expected}"] = path
-        return (width, height) == self._size_wh
+    def _odd_depth(self, stored: NDArray[np.generic]) -> str:
+        """Return what a depth image has that none should have, "" if it is right."""
+        if stored.dtype != np.uint16 or stored.ndim != 2:
+            channels = 1 if stored.ndim == 2 else stored.shape[2]
+            return f"{8 * stored.itemsize} bit in {channels}, not 16 bit in one channel"
+        return self._odd_size(stored)
+
+    def _odd_size(self, stored: NDArray[np.generic]) -> str:
+        height, width = stored.shape[:2]
+        if (width, height) == self._size_wh:
+            return ""
+        return f"{width}x{height} pixels, not {self._size_wh[0]}x{self._size_wh[1]}"
 
 
-def first_size_wh(frames: Iterable[FrameFiles]) -> tuple[int, int]:
-    """Return width and height [px] of the first readable colour image, else raise InputError."""
-    last = Path()
+def usual_size_wh(frames: Sequence[FrameFiles]) -> tuple[int, int]:
+    """Return width and height [px] of most of some colour images, from the first to the last.
+
+    If none of them can be read it is that of the first that can; raises InputError without one.
+    """
+    sampled = Counter(filter(None, (_size_wh(frames[at]) for at in spread(len(frames), SAMPLES))))
+    if sampled:
+        return sampled.most_common(1)[0][0]
     for frame in frames:
-        data = _bytes(frame.color, "", {})
-        image_bgr = None if data is None else pixels.decode_bgr(data)
-        if image_bgr is not None:
-            return int(image_bgr.shape[1]), int(image_bgr.shape[0])
-        last = frame.color
-    raise InputError(f"none of the colour images can be read, the last being: {last}")
+        if size_wh := _size_wh(frame):
+            return size_wh
+    raise InputError(f"none of the colour images can be read, the last being: {frames[-1].color}")
+
+
+def _size_wh(frame: FrameFiles) -> tuple[int, int] | None:
+    image_bgr = _decoded(frame.color, "", pixels.decode_bgr, {})
+    return None if image_bgr is None else (image_bgr.shape[1], image_bgr.shape[0])
+
+
+def _decoded(
+    path: Path,
+    name: str,
+    decode: Callable[[bytes], NDArray[Any] | None],
+    problems: dict[str, Path],
+) -> NDArray[Any] | None:
+    """Return the pixels of a file, None if it is missing or damaged, as `problems` then says."""
+    data = _bytes(path, f"{name} is missing", problems)
+    stored = None if data is None else decode(data)
+    if data is not None and stored is None:
+        problems[f"{name} is damaged"] = path
+    return stored
 
 
 def _bytes(path: Path, problem: str, problems: dict[str, Path]) -> bytes | None:

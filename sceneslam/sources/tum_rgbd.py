@@ -11,7 +11,13 @@ import numpy as np
 
 from sceneslam.ros.pixels import DepthUnits
 from sceneslam.sources.faults import FaultLog
-from sceneslam.sources.frame_files import FrameFiles, FrameReader, ReadFrame, first_size_wh
+from sceneslam.sources.frame_files import (
+    SAMPLES,
+    FrameFiles,
+    FrameReader,
+    ReadFrame,
+    usual_size_wh,
+)
 from sceneslam.sources.intrinsics import (
     Intrinsics,
     checked_above_zero,
@@ -30,7 +36,6 @@ from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
-_SAMPLES = 8  # depth images that are read for a survey
 _NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 _KNOWN = {  # published calibrations of the benchmark
     ("freiburg1", "fr1"): Intrinsics(
@@ -88,7 +93,7 @@ class TumRgbd:
             for color, depth in zip(colors, matches, strict=True)
         ]
         self._camera = Camera(
-            size_wh=first_size_wh(self._frames),
+            size_wh=usual_size_wh(self._frames),
             fx=intrinsics.fx,
             fy=intrinsics.fy,
             cx=intrinsics.cx,
@@ -98,6 +103,7 @@ class TumRgbd:
         )
         self._sensors = frozenset({Sensor.IMAGE, Sensor.DEPTH} if depths else {Sensor.IMAGE})
         self._reader = FrameReader(self._camera.size_wh, DepthUnits(depth_scale, range_m))
+        self._reader.check_depth(self._sampled())
         self._faults = FaultLog()
 
     @property
@@ -134,7 +140,7 @@ class TumRgbd:
         """Return the stamps of both lists and some depth images."""
         units = DepthUnits.unlimited(self._depth_scale)
         reader = FrameReader(self._camera.size_wh, units)
-        depths = [reader.depth_m(self._depths[at].path) for at in self._sampled()]
+        depths = [reader.depth_m(path) for path in self._sampled()]
         return Survey(
             streams=[
                 Stream(
@@ -154,8 +160,9 @@ class TumRgbd:
             depths_m=[depth_m for depth_m in depths if depth_m is not None],
         )
 
-    def _sampled(self) -> Sequence[int]:
-        return spread(len(self._depths), _SAMPLES) if self._depths else ()
+    def _sampled(self) -> Iterator[Path]:
+        for at in spread(len(self._depths), SAMPLES):
+            yield self._depths[at].path
 
     def ground_truth(self) -> GroundTruth | None:
         """Return groundtruth.txt (poses of the camera's optical frame) as poses of `base`."""
