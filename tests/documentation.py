@@ -56,7 +56,8 @@ def write_recordings(folder: Path) -> None:
         ):
             path = folder / "freiburg1" / name / f"{index}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(path), picture)
+            large = cv2.resize(picture, (640, 480), interpolation=cv2.INTER_NEAREST)  # as TUM's are
+            cv2.imwrite(str(path), large)
             lists[name].append(f"{observation.stamp_ns * 1e-9:.6f} {name}/{index}.png")
     writer.close()
     _write_film(folder / "clip.mp4")

@@ -9,6 +9,7 @@ import pytest
 from ros_recordings import make_source
 
 from sceneslam.interfaces import Source
+from sceneslam.sources.survey.preflight import preflight
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.rig import Sensor, optical_to_rep103
 
@@ -17,14 +18,19 @@ COLOR = np.full((30, 40, 3), 90, np.uint8)
 DEPTH = np.full((30, 40), 10000, np.uint16)
 
 
-def make_folder(path: Path, count: int = 4, depth_delay_s: float = 0.005) -> Path:
+def make_folder(
+    path: Path,
+    count: int = 4,
+    depth_delay_s: float = 0.005,
+    size_wh: tuple[int, int] = (40, 30),
+) -> Path:
     """Write a folder of `count` frames at 10 Hz."""
     for name in ("rgb", "depth"):
         (path / name).mkdir(parents=True)
     colors, depths = ["# timestamp filename"], ["# timestamp filename"]
     for index in range(count):
-        cv2.imwrite(str(path / "rgb" / f"{index}.png"), COLOR)
-        cv2.imwrite(str(path / "depth" / f"{index}.png"), DEPTH)
+        cv2.imwrite(str(path / "rgb" / f"{index}.png"), cv2.resize(COLOR, size_wh))
+        cv2.imwrite(str(path / "depth" / f"{index}.png"), cv2.resize(DEPTH, size_wh))
         colors.append(f"{100 + index * 0.1:.6f} rgb/{index}.png")
         depths.append(f"{100 + index * 0.1 + depth_delay_s:.6f} depth/{index}.png")
     (path / "rgb.txt").write_text("\n".join(colors))
@@ -83,8 +89,20 @@ def test_truth_of_the_camera_becomes_truth_of_the_base(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "fx"), [("x_freiburg2_desk", 520.9), ("fr3-office", 535.4)])
-def test_the_benchmarks_cameras_are_known(tmp_path: Path, name: str, fx: float) -> None:
-    assert make_source("tum_rgbd", make_folder(tmp_path / name)).rig.camera.fx == fx
+def test_the_benchmarks_cameras_are_known_and_named(tmp_path: Path, name: str, fx: float) -> None:
+    source = make_source("tum_rgbd", make_folder(tmp_path / name, size_wh=(640, 480)))
+    assert source.rig.camera.fx == fx
+    (line, _) = preflight(source.survey(), source.rig).lines
+    assert line.endswith(f"camera of {'freiburg2' if fx == 520.9 else 'freiburg3'}")
+
+
+def test_the_benchmarks_cameras_have_one_size(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "freiburg1_x", size_wh=(848, 480))
+    with pytest.raises(ConfigError, match=r"images of 640x480, not 848x480 pixels") as caught:
+        make_source("tum_rgbd", folder)
+    assert caught.value.key == "camera.fx"
+    source = make(folder)
+    assert "camera of" not in preflight(source.survey(), source.rig).lines[0]
 
 
 def test_an_unknown_folder_asks_for_the_camera(tmp_path: Path) -> None:

@@ -37,24 +37,23 @@ from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
 _NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
-_KNOWN = {  # published calibrations of the benchmark
-    ("freiburg1", "fr1"): Intrinsics(
+_KNOWN_SIZE_WH = (640, 480)  # [px]
+_KNOWN = {  # published calibrations of the benchmark, for images of this size
+    "freiburg1": Intrinsics(
         fx=517.3,
         fy=516.5,
         cx=318.6,
         cy=255.3,
         distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
     ),
-    ("freiburg2", "fr2"): Intrinsics(
+    "freiburg2": Intrinsics(
         fx=520.9,
         fy=521.0,
         cx=325.1,
         cy=249.7,
         distortion=(0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
     ),
-    ("freiburg3", "fr3"): Intrinsics(
-        fx=535.4, fy=539.2, cx=320.1, cy=247.6, distortion=_NO_DISTORTION
-    ),
+    "freiburg3": Intrinsics(fx=535.4, fy=539.2, cx=320.1, cy=247.6, distortion=_NO_DISTORTION),
 }
 
 
@@ -62,7 +61,8 @@ class TumRgbd:
     """Gives one observation per line of rgb.txt, with the depth nearest to it in time.
 
     `camera` (fx, fy, cx, cy, distortion) may be null for the benchmark's own recordings, which are
-    known by their folder's name. `base` is at the camera's origin, with REP-103 axes.
+    known by their folder's name and have 640x480 pixels. `base` is at the camera's origin, with
+    REP-103 axes.
     """
 
     def __init__(
@@ -81,7 +81,6 @@ class TumRgbd:
         colors = read_list(self._folder / "rgb.txt")
         if not colors:
             raise InputError(f"the list has no images: {self._folder / 'rgb.txt'}")
-        intrinsics = given or _known_intrinsics(self._folder)
         has_depth = (self._folder / "depth.txt").is_file()
         depths = read_list(self._folder / "depth.txt") if has_depth else ()
         self._colors, self._depths = colors, depths
@@ -92,8 +91,11 @@ class TumRgbd:
             FrameFiles(stamp_ns=color.stamp_ns, color=color.path, depth=_path(depth))
             for color, depth in zip(colors, matches, strict=True)
         ]
+        size_wh = usual_size_wh(self._frames)
+        self._assumed = "" if given else _known_camera(self._folder, size_wh)
+        intrinsics = given or _KNOWN[self._assumed]
         self._camera = Camera(
-            size_wh=usual_size_wh(self._frames),
+            size_wh=size_wh,
             fx=intrinsics.fx,
             fy=intrinsics.fy,
             cx=intrinsics.cx,
@@ -157,6 +159,7 @@ class TumRgbd:
             ],
             sync_tolerance_s=self._sync_tolerance_s,
             depth_scale=self._depth_scale,
+            assumed_camera=self._assumed,
             depths_m=[depth_m for depth_m in depths if depth_m is not None],
         )
 
@@ -185,12 +188,19 @@ def _path(file: StampedFile | None) -> Path | None:
     return None if file is None else file.path
 
 
-def _known_intrinsics(folder: Path) -> Intrinsics:
-    """Return the calibration of a recording of the benchmark; raises ConfigError for others."""
+def _known_camera(folder: Path, size_wh: tuple[int, int]) -> str:
+    """Return the benchmark's camera that a folder's name names.
+
+    Raises ConfigError without one, or if the images are not as large as the benchmark's.
+    """
     name = folder.resolve().name.lower()
-    for tags, intrinsics in _KNOWN.items():
-        if any(tag in name for tag in tags):
-            return intrinsics
-    raise ConfigError(
-        "camera.fx", None, f"a number [px], with fy, cx and cy: folder {name!r} names no TUM camera"
-    )
+    wanted = "a number [px], with fy, cx and cy"
+    for camera in _KNOWN:
+        if camera not in name and camera.replace("freiburg", "fr") not in name:
+            continue
+        if size_wh != _KNOWN_SIZE_WH:
+            known, got = (f"{width}x{height}" for width, height in (_KNOWN_SIZE_WH, size_wh))
+            why = f"the calibration of {camera} is for images of {known}, not {got} pixels"
+            raise ConfigError("camera.fx", None, f"{wanted}: {why}")
+        return camera
+    raise ConfigError("camera.fx", None, f"{wanted}: folder {name!r} names no TUM camera")

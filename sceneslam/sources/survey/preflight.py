@@ -58,6 +58,8 @@ def _line(stream: Stream, survey: Survey, camera: Camera | None) -> str:
     paired = survey.paired_ratio()
     if stream.sensor is Sensor.IMAGE and paired is not None:
         rates.append(f"{paired:.0%} with depth")
+    if stream.sensor is Sensor.IMAGE and survey.assumed_camera:
+        known.append(f"camera of {survey.assumed_camera}")
     if stream.sensor is Sensor.DEPTH and camera is not None and survey.depths_m:
         depths_m = _measured(survey.depths_m)
         median = f"{np.median(depths_m):.2f} m" if len(depths_m) else "none measured"
