@@ -133,13 +133,14 @@ class Certain(ExactModule):
 
 
 BY_WHEELS = (frozenset({Sensor.ODOMETRY}),)
+SCALED = (frozenset({Sensor.IMAGE, Sensor.DEPTH}), frozenset({Sensor.IMAGE, Sensor.ODOMETRY}))
 
 
 @pytest.mark.parametrize(
-    ("requires", "is_refused"), [(ExactModule.requires, True), (BY_WHEELS, False)]
+    ("requires", "is_refused"), [(ExactModule.requires, True), (BY_WHEELS, False), (SCALED, False)]
 )
 def test_a_certain_candidate_is_refused_where_wheels_and_the_old_module_agree(requires, is_refused):
-    """A module that only follows the wheels is no witness for them."""
+    """A module that needs wheels, here where there is no depth, is no witness for them."""
     modules = {"bright": Certain(1.0, requires), "dark": Certain(1.5)}
     dark = dark_from(40)
     _, atlas, log, _ = drive(modules, steps=65, gate=GATE, handover="rewind", scene_at=dark)

@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from driving import GATE, drive, events
+from driving import drive
 from fakes import PERIOD_NS, ExactModule, observation
 
 from sceneslam.bus.changeover import Changeover
-from sceneslam.types import se3
 from sceneslam.types.observation import TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
 
@@ -103,35 +102,3 @@ def test_a_trial_without_data_ends():
 
     kept = trials({"bright": ExactModule(), "dark": ByWheels()}, feed)
     assert 0 < len(kept) < 250  # of 370 observations: the waits between trials grow
-
-
-def straight(index):
-    return se3.from_xy_yaw(0.1 * index, 0.0, 0.0)
-
-
-class Straight(ExactModule):
-    """Drives straight on, and is certain of that."""
-
-    def track(self, observation):
-        tracking = super().track(observation)
-        T_local_base = straight(observation.stamp_ns / PERIOD_NS)
-        return replace(tracking, T_local_base=T_local_base, covariance=1e-6 * np.eye(6))
-
-
-def test_wheels_are_believed_again_some_time_after_the_module_that_refuted_them_is_lost():
-    """They stand still from 5 to 7 s; the module is lost from 6.5 s on."""
-
-    def feed(index):
-        frozen = min(max(index, 50), 70) - 50
-        return replace(observation(index), T_odom_base=straight(index - frozen))
-
-    only = {"bright": Straight(lost=range(65, 300))}
-    table = {"Bright": ["bright"], "Dark": ["bright"]}
-    options = {"gate": GATE, "handover": "rewind", "table": table, "lost_patience_s": 1.0}
-    _, atlas, log, _ = drive(only, steps=300, feed=feed, **options)
-    believed = [
-        (event["stamp_ns"] / 1e9, event["is_believed"]) for event in events(log, "odometry")
-    ]
-    assert [told for _, told in believed] == [False, True]
-    assert believed[1][0] == pytest.approx(6.4 + 5.0, abs=0.15)
-    assert atlas.trajectory.stamps_ns[-1] == 299 * PERIOD_NS

@@ -294,3 +294,21 @@ def test_a_first_answer_that_is_a_little_off_is_no_jump():
     judgements = witnessed(module, odometry=reversing(0, 60), steps=20, deviation_m=0.02)
     assert not any(judgement.is_wrong for judgement in judgements)
     assert judgements[-1].wheels_lie
+
+
+def test_a_ramp_refutes_no_module():
+    """Wheels and gyro agree on the yaw; only the module sees that it climbs."""
+
+    def climbing(step):
+        pitched = -np.deg2rad(15.0) * min(max(step - 30, 0), 20) / 20
+        T = np.eye(4)
+        T[:3, :3] = se3.so3_exp(np.array([0.0, pitched, 0.0]))
+        T[:3, 3] = [0.05 * step * np.cos(pitched), 0.0, -0.05 * step * np.sin(pitched)]
+        return T
+
+    judgements = witnessed(
+        climbing,
+        odometry=lambda step: arc(step, turn_rad_s=0.0),
+        witness=lambda step: Witness(missed_rad=0.0),
+    )
+    assert not any(judgement.is_wrong for judgement in judgements)

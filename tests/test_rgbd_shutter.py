@@ -10,8 +10,11 @@ from sceneslam.modules.slam.rgbd.locate.pose_solver import Measurements, PoseSol
 from sceneslam.modules.slam.rgbd.locate.residuals import Sightings
 from sceneslam.modules.slam.rgbd.map.keyframes import NO_LANDMARK, Keyframe, nothing_seen
 from sceneslam.modules.slam.rgbd.see.shutter import RollingShutter, Turning, moves_px_per_s
+from sceneslam.modules.slam.rgbd.see.turn_rate import measured_rate
+from sceneslam.motion.predictor import Predictor
 from sceneslam.types import se3
-from sceneslam.types.rig import Camera
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Camera, Rig, Sensor
 
 CAMERA = Camera(size_wh=(640, 480), fx=525.0, fy=520.0, cx=319.0, cy=241.0, T_base_cam=np.eye(4))
 LANDMARKS = 300
@@ -140,3 +143,12 @@ def test_global_shutter_and_camera_at_rest_are_left_alone():
     assert np.array_equal(learnt.straighten(features, np.zeros(3)).uv_px, features.uv_px)
     none = replace(features, uv_px=features.uv_px[:0], levels=features.levels[:0])
     assert len(learnt.straighten(none, np.ones(3))) == 0
+
+
+def test_the_turn_rate_after_a_gap_is_that_of_the_newest_samples():
+    """The camera was away for five seconds, in which it turned; it rests since one second."""
+    times_s = np.arange(-5.0, 0.0, 0.01)
+    gyro = np.column_stack([times_s, np.zeros((500, 2)), np.where(times_s < -1.0, 0.8, 0.0)])
+    seen = Observation(stamp_ns=0, gyro_base=gyro)
+    found = measured_rate(seen, Predictor(Rig(sensors=frozenset({Sensor.GYRO}))), se3.identity())
+    np.testing.assert_array_equal(found.rate_base, 0.0)

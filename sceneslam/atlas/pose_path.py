@@ -64,7 +64,7 @@ class PosePath:
     modules: list[str] = field(default_factory=list)
     sessions: array[int] = field(
         default_factory=lambda: array("q")
-    )  # the open session, -1 before the first
+    )  # its session, -1 before the first; bridged: the one before, until the new one answers
     # Upper triangles as reported, of the poses in the modules' maps, and of these; NaN: none.
     _covariances: Rows = field(default_factory=lambda: Rows(len(_NONE)))
     _maps: Rows = field(default_factory=lambda: Rows(len(_NONE)))

@@ -165,12 +165,13 @@ class Handover:
             self._distrust(session.hold.suspect_since_ns)
 
     def _distrust(self, since_ns: int) -> None:
-        """Replace the module's poses after `since_ns` by bridged ones."""
+        """Replace the module's poses after `since_ns` by bridged ones, where all can be bridged."""
         first = bisect_right(self.trail, since_ns, key=lambda each: each.stamp_ns)
         before = self.trail[first - 1] if first else self.anchor
-        self.trail[first:] = bridged(before, self.trail[first:])
-        self.tracked = [one for one in self.tracked if one.stamp_ns <= since_ns]
-        self.session.bridge = (self.trail or [self.anchor])[-1].bridge.copy()
+        found = bridged(before, self.trail[first:])
+        if found and all(one.T_map_base is not None for one in found):
+            self.trail[first:] = found
+            self.session.bridge = found[-1].bridge.copy()
 
     def _motion_to(self, moment: BufferedObservation) -> Transform | None:
         """Return the motion (4, 4) since the previous observation, as it was estimated then."""

@@ -13,7 +13,7 @@ Matrix = NDArray[np.float64]
 _DOUBT = 10.0  # weight of the prior of a noise, in comparisons
 _MEMORY = 200.0  # comparisons in its posterior, about
 _STUDENT = 4.0  # degrees of freedom: an error of 5 standard deviations has weight 1/6
-_HONEST_S, LYING_S = 300.0, 5.0  # mean durations of correct and of wrong odometry
+_HONEST_S, _LYING_S = 300.0, 5.0  # mean durations of correct and of wrong odometry
 _EVIDENCE_MAX = 3.0  # log-likelihood ratio of one comparison; consecutive ones correlate
 _LYING_MAX = 0.999
 
@@ -64,12 +64,12 @@ class LieDetector:
     Proc. IEEE 1989.
     """
 
-    lying: float = LYING_S / (_HONEST_S + LYING_S)
+    lying: float = _LYING_S / (_HONEST_S + _LYING_S)
 
     def wait(self, duration_s: float) -> None:
         """Predict over `duration_s`: a fault may begin or end."""
-        rest = LYING_S / (_HONEST_S + LYING_S)
-        stays = math.exp(-duration_s * (1.0 / _HONEST_S + 1.0 / LYING_S))
+        rest = _LYING_S / (_HONEST_S + _LYING_S)
+        stays = math.exp(-duration_s * (1.0 / _HONEST_S + 1.0 / _LYING_S))
         self.lying = rest + (self.lying - rest) * stays
 
     def judge(self, evidence: float) -> None:

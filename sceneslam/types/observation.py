@@ -74,6 +74,7 @@ class Observation:
             if parts:
                 now = getattr(self, name)
                 joined[name] = np.concatenate(parts if now is None else [*parts, now])
+                joined[name].setflags(write=False)
         return replace(self, **joined) if joined else self  # type: ignore[arg-type]
 
     def turn_by_gyro(self, duration_s: float) -> NDArray[np.float64] | None:

@@ -100,7 +100,7 @@ class _Excess:
     distance: float
     turn: float
     apart_m: float  # of points 1 m ahead of base, which move in a turn as well
-    is_refuted: bool  # the turn is too much, and wheels and gyro, each alone, agree on it
+    is_refuted: bool  # the yaw is too much, though the wheels alone turned as the gyro did
 
 
 class Gate:
@@ -119,9 +119,9 @@ class Gate:
         self._unchecked = Judgement(is_trusted=True)  # while the next odometry is awaited
         self._way_m, self._turn_rad = 0.0, 0.0
         self._within_since_ns = 0  # since when both have been within bounds
-        self._is_module = False  # the module was at fault, since the two agreed
+        self._module_erred = False  # the module was at fault, since the two agreed
         self._have_wheels_jumped = False  # the same of the wheels
-        self._is_wheels = False  # the wheels were at fault, since the two agreed
+        self._wheels_erred = False  # the wheels were at fault, since the two agreed
         self._is_acute = False  # the shortest horizon shows a disagreement
         # The newest excesses of distance while the wheels were right.
         self._distances = RecentMedian(_USUAL_KEPT, width=1)
@@ -203,9 +203,9 @@ class Gate:
         is_long = now.stamp_ns - self._within_since_ns >= _PROBATION_NS
         if is_long:
             # They belong to another disagreement.
-            self._is_module = self._have_wheels_jumped = self._is_wheels = False
+            self._module_erred = self._have_wheels_jumped = self._wheels_erred = False
         if is_wrong and (witness.is_vouched or any(excess.is_refuted for excess in excesses)):
-            self._is_module, self._is_wheels = True, False  # two against one
+            self._module_erred, self._wheels_erred = True, False  # two against one
         apart_m = max(excess.apart_m for excess in excesses)
         if is_wrong and self._is_wheels_fault(found[-1], now, apart_m, deviation_m):
             self._distances, self._usual_excess = RecentMedian(_USUAL_KEPT, width=1), 0.0
@@ -236,32 +236,32 @@ class Gate:
         by_module, by_wheels = self._jumps(now)
         least_m_s = max(_JUMP_M_S, _EXPLAINED * apart_m / _STEP_S)
         self._have_wheels_jumped |= by_wheels > max(least_m_s, _JUMP_RATIO * by_module)
-        if deviation_m is not None and deviation_m <= wheels_m and not self._is_module:
+        if deviation_m is not None and deviation_m <= wheels_m and not self._module_erred:
             # A change of velocity is made of three positions, weighted 1, -2, 1.
             noise_m_s = math.sqrt(6.0) * deviation_m / _STEP_S
             least_m_s = max(least_m_s, _JUMP_SIGMAS * noise_m_s)
-            self._is_module = by_module > max(least_m_s, _JUMP_RATIO * by_wheels)
-            self._is_wheels = not self._is_module
-        return self._is_wheels
+            self._module_erred = by_module > max(least_m_s, _JUMP_RATIO * by_wheels)
+            self._wheels_erred = not self._module_erred
+        return self._wheels_erred
 
     def _jumps(self, now: _Sample) -> tuple[float, float]:
         """Return the largest recent changes of velocity [m/s]: the module's, the wheels'."""
         late = [*self._samples[self._until(now.stamp_ns - _LATE_NS) :], now]
         times_s = np.array([(sample.stamp_ns - now.stamp_ns) / 1e9 for sample in late])
         before = np.searchsorted(times_s, times_s - _STEP_S, side="right") - 1
-        after = before.copy()  # whose velocity is the one before
+        earlier = before.copy()  # whose velocity it is compared with
         if late[0] is self._first:  # since then there are shorter intervals only
             before[1:] = np.maximum(before[1:], 0)
-            after = np.where(before > 0, before, np.arange(len(late)) - 1)
+            earlier = np.where(before > 0, before, np.arange(len(late)) - 1)
         is_known = before >= 0
         elapsed_s = np.where(is_known, times_s - times_s[before], np.nan)
         # Over a short interval, an error of position makes a larger one of velocity.
-        share = np.minimum(np.minimum(elapsed_s, 2.0 * elapsed_s[after]), _STEP_S) / _STEP_S
+        share = np.minimum(np.minimum(elapsed_s, 2.0 * elapsed_s[earlier]), _STEP_S) / _STEP_S
         found = []
         for poses in ([one.T_local_base for one in late], [one.T_odom_base for one in late]):
             points = np.array([T[:3, 3] + T[:3, 0] for T in poses])
             velocities = (points - points[before]) / elapsed_s[:, None]
-            changes = share * np.linalg.norm(velocities - velocities[after], axis=1)
+            changes = share * np.linalg.norm(velocities - velocities[earlier], axis=1)
             found.append(float(changes[np.isfinite(changes)].max(initial=0.0)))
         return found[0], found[1]
 
@@ -315,7 +315,7 @@ def _excess(then: _Sample, now: _Sample, sigmas: float, wheels: Wheels) -> _Exce
         distance=apart_m / bound_m,
         turn=max(apart_rad / bound_rad, broken),
         apart_m=apart_m + apart_rad,
-        is_refuted=missed_rad <= bound_rad < apart_rad,
+        is_refuted=missed_rad <= bound_rad < abs(se3.yaw_rad(R_local_odom.T @ now.R_local_odom)),
     )
 
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from sceneslam.bus.judging.gate import NOBODY, Gate, Witness
 from sceneslam.bus.judging.recent import CovarianceMonitor
 from sceneslam.bus.judging.runner import Runner
-from sceneslam.motion.trust import LYING_S
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.se3 import Transform
@@ -54,7 +53,6 @@ class Hold:
         self._gate = gate
         self._covariances = CovarianceMonitor()
         self._revision = 0
-        self._judged_ns = 0  # when a pose was compared with the odometry last
         self._fed_ns: int | None = None  # when its sensors last delivered data
         self.patience_ns = patience_ns  # also a guess of their period, until there are intervals
         self._intervals_ns: deque[int] = deque(maxlen=3)  # between their last data
@@ -154,10 +152,7 @@ class Hold:
         )
         self.agrees = judgement.is_trusted and judgement.turn_agrees
         if T_local_base is not None:
-            self._judged_ns = observation.stamp_ns
             self.wheels_lie, self.wheels_jumped = judgement.wheels_lie, judgement.wheels_jumped
-        elif observation.stamp_ns - self._judged_ns > LYING_S * 1e9:
-            self.wheels_lie = self.wheels_jumped = False  # no lie lasts for ever
         if judgement.is_wrong:
             self.suspect_since_ns = None if self.is_suspect else judgement.since_ns
             self.is_suspect = True

@@ -21,7 +21,7 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
-_SKIPPED_MAX = 2000  # observations whose samples are kept: a minute at 30 per second
+_SKIPPED_MAX = 2000  # observations whose samples are kept, the newest: a minute at 30 per second
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -56,7 +56,7 @@ class Runner:
         self._module = module
         # Sensors in every set are needed; if the sets share none, any of their sensors will do.
         common = frozenset[Sensor].intersection(*module.requires)
-        self.needs_wheels = Sensor.ODOMETRY in common  # its motion may be theirs
+        self.needs_wheels = False  # on this robot: its motion, or its scale, may be theirs
         self._sensors = common or frozenset[Sensor]().union(*module.requires)
 
     @property
@@ -84,6 +84,8 @@ class Runner:
         """Start the next activation of the module; `has_started` returns the result."""
         self.T_map_local, self.is_failed = None, False
         self._skipped.clear()
+        usable = [sensors for sensors in self._module.requires if sensors <= rig.sensors]
+        self.needs_wheels = bool(usable) and all(Sensor.ODOMETRY in sensors for sensors in usable)
         with self._timed():
             self._starting = self._executor.submit(self._activate, rig, scene)
 

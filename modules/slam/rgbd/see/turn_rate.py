@@ -15,6 +15,7 @@ from sceneslam.types.se3 import Transform
 _GYRO_RAD_PER_S = 0.02  # standard deviation of a gyro's turn rate
 _TURN_RAD_PER_S2 = 6.0  # hand-held acceleration: a mean rate is half a step old
 _TURN_RAD_PER_S = 1.0  # standard deviation without any measurement
+_NEWEST_S = 0.1  # of the gyro: an image takes less
 _STEP_MAX_S = 0.5  # over a longer step a mean rate is useless
 
 
@@ -56,8 +57,9 @@ def measured_rate(
 
 
 def _gyro_rate(observation: Observation, predictor: Predictor) -> NDArray[np.float64] | None:
-    """Return the mean turn rate (3,) [rad/s] of an observation's gyro, None without one."""
+    """Return the mean turn rate (3,) [rad/s] by the newest gyro samples, None without any."""
     gyro = observation.gyro_base
     if gyro is None or not len(gyro) or not np.isfinite(gyro[:, 1:4]).all():
         return None
+    gyro = gyro[gyro[:, 0] > gyro[-1, 0] - _NEWEST_S]  # after a gap there are older ones
     return np.asarray(gyro[:, 1:4].mean(axis=0) - predictor.model.turns.gyro_bias)
