@@ -146,6 +146,7 @@ def test_command_answers_ctrl_c_while_it_saves(folder, times):
 SLOW_START = """
 import signal
 import sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
 from sceneslam import __main__ as program
 def press(*_, **__):
     signal.raise_signal(signal.SIGINT)
