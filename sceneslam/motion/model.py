@@ -49,6 +49,7 @@ class MotionModel:
         self._axle = DistanceError(rig.wheels.axle_m, drift=_WEAR * rig.wheels.axle_m)
         self._stamp_ns: int | None = None
         self.duration_s = 0.0  # between the last two observations
+        self.is_turn_measured = False  # by the gyro, between them
         self._T_odom_base: Transform | None = None  # the last odometry
         self._silent_s = 0.0  # time since then
         self._gap: Transform | None = None  # predicted motion since then; None: no gap
@@ -88,6 +89,7 @@ class MotionModel:
             self.inertia.predict(duration_s),
         )
         turn = self.turns.by_gyro(observation, duration_s)
+        self.is_turn_measured = turn is not None
         if turn is not None:
             noise_rad = self.turns.gyro_bias_deviation * duration_s + self._gyro.noise_rad
             guess = guess.turned(turn, noise_rad, duration_s)

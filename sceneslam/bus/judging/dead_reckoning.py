@@ -44,7 +44,6 @@ class DeadReckoning:
         self._T_corrected_base: Transform | None = None  # the same, corrected
         self._is_gap = False  # the last observation had no odometry
         self._turned_rad = 0.0  # rotation angle since the observation before [rad]
-        self._is_turn_measured = False  # by the gyro, at the last observation
         self._missed_rad = 0.0  # yaw by wheels alone since the start, less the gyro's
 
     @property
@@ -70,7 +69,7 @@ class DeadReckoning:
         T_prev_curr = se3.inverse(before) @ now
         missed_rad = _UNKNOWN_RAD
         if turn is not None and not is_gap:  # the gyro does not cover a gap
-            if self._is_turn_measured:
+            if self._motion is not None and self._motion.is_turn_measured:
                 missed_rad = se3.yaw_rad(T_prev_curr) - se3.yaw_rad(turn)
             T_prev_curr = self._turned(T_prev_curr, turn)
         self._missed_rad += missed_rad
@@ -112,10 +111,7 @@ class DeadReckoning:
         """Return the rotation (3, 3) since the last observation, None without a gyro."""
         if self._motion is None:
             return None
-        motion = self._motion.predict(observation)
-        duration_s = self._motion.duration_s
-        self._is_turn_measured = observation.turn_by_gyro(duration_s) is not None
-        return motion.T_prev_curr[:3, :3]
+        return self._motion.predict(observation).T_prev_curr[:3, :3]
 
     def _turned(self, T_prev_curr: Transform, turn: NDArray[np.float64]) -> Transform:
         """Return the odometry's motion with the gyro's rotation, or its yaw if that is biased."""
