@@ -19,7 +19,7 @@ from sceneslam.atlas.submaps.submap import LENGTH_M, TURN_RAD
 from sceneslam.atlas.uncertainty import MAPPED, Covariance, Drift, drifted
 from sceneslam.graphs.edge import Edge
 from sceneslam.types import se3
-from sceneslam.types.covariance import grown
+from sceneslam.types.covariance import grown, semidefinite
 from sceneslam.types.trajectory import Trajectory
 
 _LEAST = 1e-10 * np.eye(6)  # (10 um, 10 urad)^2: keeps the graph well-conditioned
@@ -133,8 +133,8 @@ def _difference(a: Trajectory, b: Trajectory) -> tuple[Covariance, float] | None
     off = se3.log(se3.inverse(se3.inverse(T_a[0]) @ T_a) @ se3.inverse(T_b[0]) @ T_b)
     noise = np.diff(off, axis=0)  # between poses so near one another that nothing drifts
     drift = off.T @ off - noise.T @ noise  # the first difference is 0
-    values, vectors = np.linalg.eigh(drift / (2.0 * np.minimum(submaps, 1.0)).sum())
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T), float(submaps[-1])
+    drift = semidefinite(drift / (2.0 * np.minimum(submaps, 1.0)).sum())
+    return drift, float(submaps[-1])
 
 
 def _moved(T_map_base: NDArray[np.float64]) -> NDArray[np.float64]:

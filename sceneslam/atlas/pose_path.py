@@ -14,6 +14,7 @@ from sceneslam.atlas.rows import Rows
 from sceneslam.atlas.submaps.collector import Known
 from sceneslam.atlas.uncertainty import Covariance
 from sceneslam.types import se3
+from sceneslam.types.covariance import semidefinite
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.run import BRIDGED, SessionStart
 from sceneslam.types.se3 import Transform
@@ -155,9 +156,7 @@ def _semidefinite(rows: Rows) -> NDArray[np.float64]:
     """Return reported covariances (N, 6, 6), positive semidefinite; NaN: not reported."""
     covariances = _square(np.asarray(rows))
     given = ~np.isnan(covariances[:, 0, 0])
-    values, vectors = np.linalg.eigh(covariances[given])
-    scaled = vectors * np.maximum(values, 0.0)[:, None, :]
-    covariances[given] = scaled @ np.swapaxes(vectors, 1, 2)
+    covariances[given] = semidefinite(covariances[given])
     return covariances
 
 

@@ -210,10 +210,10 @@ class Changeover:
             self._log.add_fault(stamp_ns, str(error))
             self._end_trial()
             return
-        is_given_time = stamp_ns - trial.ready_ns < self._policy.retry_s * 1e9  # it may need motion
         if handover is None:
             return
         handover.forget()
+        is_given_time = stamp_ns - trial.ready_ns < self._policy.retry_s * 1e9  # it may need motion
         if (handover.is_lost or handover.is_silent) and not is_given_time:
             self._end_trial()
 

@@ -23,6 +23,13 @@ def covariance_of(information: Matrix, *, unmeasured: float) -> Matrix:
     return np.asarray((vectors / np.maximum(values, unmeasured)) @ vectors.T)
 
 
+def semidefinite(matrices: Matrix) -> Matrix:
+    """Return symmetric matrices (..., N, N) without their negative parts."""
+    values, vectors = np.linalg.eigh(matrices)
+    scaled = vectors * np.maximum(values, 0.0)[..., None, :]
+    return np.asarray(scaled @ np.swapaxes(vectors, -1, -2))
+
+
 def unknown_motion(lost_s: float) -> Matrix:
     """Return the covariance (6, 6) [m, rad] of the motion in a time of which nothing is known."""
     deviations = np.minimum(UNKNOWN_VELOCITY * lost_s, [np.inf, _ANY_RAD])
@@ -31,8 +38,7 @@ def unknown_motion(lost_s: float) -> Matrix:
 
 def grown(first: Matrix, last: Matrix, T_last_first: Transform) -> Matrix:
     """Return the growth (6, 6) of a covariance between two poses of one map, in the last's axes."""
-    values, vectors = np.linalg.eigh(last - se3.carried(first, T_last_first))
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+    return semidefinite(last - se3.carried(first, T_last_first))
 
 
 def updated(before: Matrix, gain: Matrix, seen: Matrix, noise: Matrix) -> Matrix:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
+from sceneslam.types.covariance import semidefinite
 from sceneslam.types.rig import Camera
 from sceneslam.types.spread import spread
 
@@ -140,7 +141,7 @@ class Tracker:
             # noise, a quarter of that of `missed`: by it, darkness would say where it is.
             by_noise = 0.5 * noise / grey_sigma * jacobians[:, :2].reshape(-1, 6)
             seen = photometric.T @ photometric - by_noise.T @ by_noise
-            information = (_positive(seen) + geometric.T @ geometric) / _CORRELATION
+            information = (semidefinite(seen) + geometric.T @ geometric) / _CORRELATION
         return Comparison(information=information, compared=int(inside.sum()), matched=len(rows))
 
 
@@ -171,12 +172,6 @@ def _jacobians(
     )
     moved = np.concatenate([np.broadcast_to(np.eye(3), minus_hat.shape), minus_hat], axis=2)
     return np.asarray(projection @ (T_other_view[:3, :3] @ moved))
-
-
-def _positive(matrix: Doubles) -> Doubles:
-    """Return a symmetric matrix without its negative part."""
-    values, vectors = np.linalg.eigh(matrix)
-    return np.asarray(vectors @ np.diag(np.maximum(values, 0.0)) @ vectors.T)
 
 
 def _slopes(view: DirectView, row: NDArray[np.int64], column: NDArray[np.int64]) -> Doubles:

@@ -69,8 +69,8 @@ class MappingWork:
             self._depth_constraints.look(keyframe_id, shown.depth_m)
             if not self._search.is_over:
                 self._searched[keyframe_id] = shown
-        known = self._searched.keys() & self._depth_constraints.known_ids
-        self._searched = {k: shown for k, shown in self._searched.items() if k in known}
+        for gone in self._searched.keys() - self._depth_constraints.known_ids:
+            del self._searched[gone]
         poses = dict(zip(task.keyframe_ids, task.bundle.T_local_cam, strict=True))
         for other in sorted(task.fresh.keys() & poses.keys()):
             for one in task.free_ids:

@@ -56,5 +56,4 @@ def _unite(visual_map: VisualMap, kept: NDArray[np.int64], doubles: NDArray[np.i
     )
     table.expected[kept] += table.expected[doubles]
     table.found[kept] += table.found[doubles]
-    visual_map.keyframes.rename_landmarks(doubles, kept)
-    table.remove(doubles)
+    visual_map.join(kept, doubles)
