@@ -111,9 +111,9 @@ class _Trials:
         reader, writer = context.Pipe(duplex=False)
         pool = ProcessPoolExecutor(self._jobs, context, initializer=_end_with, initargs=(reader,))
         with reader, writer, pool:
-            # An input is rendered once, by the first run that reads it.
+            # A source is rendered once. Effects are left to the runs: they note what struck.
             inputs = {
-                _input_of(config): config
+                json.dumps(config["source"], default=str): config | {"effects": None}
                 for (_, config), folder in zip(configs, folders, strict=True)
                 if _finished_by(folder) != provenance(config)
             }

@@ -224,6 +224,17 @@ def test_a_trial_whose_process_is_killed_is_one_sentence(tmp_path):
         list(trials._made([(Trial(name="trial"), killed)]))
 
 
+def test_faults_of_runs_beside_each_other_strike_in_the_runs_alone(tmp_path):
+    record = tmp_path / "trial" / "struck.jsonl"
+    target = "sceneslam.sources.changes.faulty.FaultySource"
+    rates = {"rate_ratio": 1.0, "lasting_s": 0.5, "clock_jump_s": 1.0, "seed": 0}
+    struck = {"_target_": target, "faults": ["duplicate"], "record": str(record), **rates}
+    settings = config(run__report=False, effects=struck)
+    list(_Trials("matrix", tmp_path, [], 2, None)._made([(Trial(name="trial"), settings)]))
+    seen = json.loads((tmp_path / "trial" / "metrics.json").read_text())["observations"]
+    assert len(record.read_text().splitlines()) == seen  # each once, the first one too
+
+
 @pytest.mark.parametrize("read", [_prepare, lambda settings: _try_sources([settings])])
 def test_a_live_source_that_was_tried_before_the_trials_is_closed(monkeypatch, read):
     monkeypatch.setattr(LiveFeedSource, "is_open", True)
