@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+from sceneslam.modules.slam.direct.comparison import compare, settle
 from sceneslam.modules.slam.direct.module import DirectSlam
 from sceneslam.modules.slam.direct.view import Tracker
 from sceneslam.testing import RIG, room_observation
@@ -99,11 +100,26 @@ def test_information_is_that_of_the_residuals():
         for seen in (room_observation(index) for index in (0, 3))
     ]
     T_other_view = tracker.register(views[1], views[0])
-    found = tracker.compare(views[1], views[0], T_other_view)
+    found = compare(tracker, views[1], views[0], T_other_view)
     assert found.matched_ratio > 0.9
     assert np.linalg.eigvalsh(found.information).min() > 0
     off = T_other_view @ se3.exp(np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    assert tracker.compare(views[1], views[0], off).matched_ratio < found.matched_ratio
+    assert compare(tracker, views[1], views[0], off).matched_ratio < found.matched_ratio
+
+
+@pytest.mark.parametrize("is_first", [True, False])
+def test_views_settle_at_or_beside_the_start_where_they_agree_better(is_first):
+    tracker = Tracker(CAMERA, 320, 0.3, 0.4)
+    seen = [shaded(index) for index in (0, 3)]
+    first, second = (tracker.view(one.image_bgr, one.depth_m) for one in seen)
+    T_room_cam = [room_observation(index).T_odom_base @ CAMERA.T_base_cam for index in (0, 3)]
+    T_true = se3.inverse(T_room_cam[0]) @ T_room_cam[1]
+    near = T_true @ se3.exp(np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.02]))
+    far = T_true @ se3.exp(np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.0]))
+    T_found, found = settle(tracker, second, first, (near, far) if is_first else (far, near))
+    off = se3.log(se3.inverse(T_true) @ T_found)
+    assert np.linalg.norm(off[:3]) < 0.003 and np.linalg.norm(off[3:]) < 0.01, off
+    assert found.misfit < compare(tracker, second, first, near).misfit
 
 
 @pytest.mark.parametrize(("sees_noise", "share_max"), [(False, 1.0), (True, 0.05)])
@@ -120,7 +136,7 @@ def test_the_noise_of_a_dark_image_says_nothing_of_where_it_is(sees_noise, share
             grey = 20.0 + contrast * texture + random.normal(0.0, 5.0, texture.shape)
             image = cv2.cvtColor(grey.clip(0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
             views.append(tracker.view(image, depth_m))
-        return tracker.compare(views[1], views[0], np.eye(4)).information[0, 0]
+        return compare(tracker, views[1], views[0], np.eye(4)).information[0, 0]
 
     lit = information(1.0)
     assert lit > 1e4  # within 1 cm

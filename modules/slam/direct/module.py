@@ -2,7 +2,8 @@
 
 Photometric and depth residuals are minimised by OpenCV's RGB-D odometry (after Steinbruecker, Sturm
 and Cremers, "Real-Time Visual Odometry from Dense RGB-D Images", ICCVW 2011). It suits rooms with
-few corners but shading. This module adds checks of the result, and its covariance.
+few corners but shading. OpenCV takes no guess, and slides where an image says little: this module
+holds its result against the predicted pose, and adds checks and a covariance.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
 
 from ..local import LocalModule
+from .comparison import Comparison, settle
 from .keyframes import DirectKeyframes
-from .view import Comparison, DirectView, Tracker
+from .view import DirectView, Tracker
 
 _POSITIVE = (
     "width_px keyframe_step_m keyframe_turn_rad step_max_m turn_max_rad weak_m weak_rad "
@@ -95,7 +97,7 @@ class DirectSlam(LocalModule):
             if np.count_nonzero(view.depth_m) < _PIXELS_MIN:
                 return self._predictor.bridged(observation, prediction)
             return self._begin(observation, prediction, view)
-        found = self._locate(view)
+        found = self._locate(view, prediction.T_local_base @ self._camera.T_base_cam)
         if found is not None:
             return self._hold(observation, prediction, view, found)
         if prediction.is_measured:
@@ -109,14 +111,18 @@ class DirectSlam(LocalModule):
         graph = self._keyframes.graph(T_cam_base)
         return MapLayers(points=self._keyframes.cloud(), pose_graph=graph)
 
-    def _locate(self, view: DirectView) -> _Located | None:
-        """Return the view's pose relative to the keyframe, else to the previous view."""
+    def _locate(self, view: DirectView, T_local_guess: se3.Transform) -> _Located | None:
+        """Return the view's pose relative to the keyframe, else to the previous view.
+
+        OpenCV takes no guess: the pose where the views agree best may be nearer to that of cam.
+        """
         candidates = ((self._key, self._T_local_key), (self._last, self._T_local_last))
         for other, T_local_other in candidates:
             T_other_cam = None if other is None else self._tracker.register(view, other)
             if other is None or T_other_cam is None:
                 continue
-            found = self._tracker.compare(view, other, T_other_cam)
+            T_other_guess = se3.inverse(T_local_other) @ T_local_guess
+            T_other_cam, found = settle(self._tracker, view, other, (T_other_cam, T_other_guess))
             is_enough = found.compared >= _PIXELS_MIN
             if is_enough and found.matched_ratio >= self.matched_min_ratio:
                 return _Located(T_local_other @ T_other_cam, found)

@@ -1,4 +1,4 @@
-"""Downscaled and undistorted images with depth, and their comparison."""
+"""Downscaled and undistorted images with depth, and their registration by OpenCV."""
 
 from __future__ import annotations
 
@@ -10,18 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
-from sceneslam.types.covariance import semidefinite
 from sceneslam.types.rig import Camera
-from sceneslam.types.spread import spread
 
 Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
-
-_STEP_PX = 4  # distance between compared pixels
-_DEPTH_NOISE = (0.003, 0.0015)  # sigma = a + b z^2 [m], structured light
-_GATE_SIGMAS = 5.0  # larger differences of depth are other surfaces
-_GREY_SIGMA_MIN = 3.0  # grey values: smallest image noise
-_CORRELATION = 100.0  # correlated pixels with the information of one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -31,20 +22,6 @@ class DirectView:
     grey: NDArray[np.uint8]  # (h, w)
     depth_m: Floats  # (h, w), 0 = missing
     frame: Any  # prepared by OpenCV
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Comparison:
-    """The agreement of two views at a relative pose."""
-
-    information: Doubles  # (6, 6) of se3.log order, cam
-    compared: int  # pixels with depth in both views
-    matched: int  # of these, on the same surface
-
-    @property
-    def matched_ratio(self) -> float:
-        """Return the share of compared pixels that agree."""
-        return self.matched / max(self.compared, 1)
 
 
 class Tracker:
@@ -101,88 +78,3 @@ class Tracker:
         if not found or not np.isfinite(T_other_view).all():
             return None
         return se3.orthonormal(np.asarray(T_other_view, np.float64))
-
-    def compare(
-        self, view: DirectView, other: DirectView, T_other_view: se3.Transform
-    ) -> Comparison:
-        """Return the agreement of two views at T_other_view (4, 4) [m], and its information."""
-        # Project the view's points into the other image.
-        points_view = self.points(view, _STEP_PX).astype(np.float64)
-        greys = view.grey[::_STEP_PX, ::_STEP_PX].reshape(-1).astype(np.float64)
-        points = np.asarray(se3.apply(T_other_view, points_view), np.float64)
-        z = np.maximum(points[:, 2], 1e-6)
-        pixels = points[:, :2] / z[:, None] * [self.K[0, 0], self.K[1, 1]] + self.K[:2, 2]
-        place = np.rint(pixels).astype(np.int64)
-        height, width = other.grey.shape
-        inside = (points_view[:, 2] > 0) & (points[:, 2] > 0)
-        inside &= (place >= 1).all(axis=1) & (place < [width - 1, height - 1]).all(axis=1)
-        column, row = np.where(inside[:, None], place, 1).T
-        depth_there = other.depth_m[row, column].astype(np.float64)
-        inside &= depth_there > 0
-        # Points match where the other depth agrees within its noise.
-        sigma_m = _DEPTH_NOISE[0] + _DEPTH_NOISE[1] * z**2
-        matched = inside & (np.abs(depth_there - z) < _GATE_SIGMAS * sigma_m)
-        rows = np.flatnonzero(matched)
-        information = np.zeros((6, 6))
-        if len(rows):
-            jacobians = _jacobians(points_view[rows], T_other_view, points[rows], self.K)
-            slopes = _slopes(other, row[rows], column[rows])
-            # Noise of grey values, by the differences.
-            missed = other.grey[row[rows], column[rows]] - greys[rows]
-            missed = missed - np.median(missed)  # exposure
-            noise = spread(missed)
-            grey_sigma = max(noise, _GREY_SIGMA_MIN)
-            # Derivatives of both residuals, grey(pixel) and depth(pixel) - z, over their sigmas
-            # (Steinbruecker et al., ICCVW 2011); the information is J' J.
-            photometric = np.einsum("ni,nij->nj", slopes[:, 0], jacobians[:, :2]) / grey_sigma
-            geometric = np.einsum("ni,nij->nj", slopes[:, 1], jacobians[:, :2]) - jacobians[:, 2]
-            geometric /= sigma_m[rows, None]
-            # A slope is half a difference of two greys, and so has half the variance of their
-            # noise, a quarter of that of `missed`: by it, darkness would say where it is.
-            by_noise = 0.5 * noise / grey_sigma * jacobians[:, :2].reshape(-1, 6)
-            seen = photometric.T @ photometric - by_noise.T @ by_noise
-            information = (semidefinite(seen) + geometric.T @ geometric) / _CORRELATION
-        return Comparison(information=information, compared=int(inside.sum()), matched=len(rows))
-
-
-def _jacobians(
-    points_view: Doubles, T_other_view: se3.Transform, points: Doubles, K: Doubles
-) -> Doubles:
-    """Return (N, 3, 6): derivative of pixel and depth in the other view by the view's twist."""
-    # Derivative of (u, v, z) by the point in the other camera: pinhole projection.
-    x, y, z = points.T
-    zero = np.zeros_like(z)
-    projection = np.stack(
-        [
-            np.stack([K[0, 0] / z, zero, -K[0, 0] * x / z**2], axis=-1),
-            np.stack([zero, K[1, 1] / z, -K[1, 1] * y / z**2], axis=-1),
-            np.stack([zero, zero, np.ones_like(z)], axis=-1),
-        ],
-        axis=1,
-    )
-    # Derivative of the point by a twist on the right, T exp(xi): R (I, -[p]x).
-    a, b, c = points_view.T
-    minus_hat = np.stack(
-        [
-            np.stack([zero, c, -b], axis=-1),
-            np.stack([-c, zero, a], axis=-1),
-            np.stack([b, -a, zero], axis=-1),
-        ],
-        axis=1,
-    )
-    moved = np.concatenate([np.broadcast_to(np.eye(3), minus_hat.shape), minus_hat], axis=2)
-    return np.asarray(projection @ (T_other_view[:3, :3] @ moved))
-
-
-def _slopes(view: DirectView, row: NDArray[np.int64], column: NDArray[np.int64]) -> Doubles:
-    """Return (N, 2, 2): gradients of grey value and depth [m] along x and y [1/px], at pixels."""
-    found = []
-    for picture in (view.grey.astype(np.float64), view.depth_m.astype(np.float64)):
-        along_x = 0.5 * (picture[row, column + 1] - picture[row, column - 1])
-        along_y = 0.5 * (picture[row + 1, column] - picture[row - 1, column])
-        found.append(np.stack([along_x, along_y], axis=-1))
-    depth = view.depth_m
-    around = [depth[row, column + d] for d in (-1, 1)] + [depth[row + d, column] for d in (-1, 1)]
-    steps = np.ptp(np.stack([*around, depth[row, column]]), axis=0)
-    found[1][steps > 0.05 * depth[row, column]] = 0.0  # an edge, or missing neighbours: no gradient
-    return np.stack(found, axis=1)
