@@ -24,14 +24,14 @@ from .local import LocalModule
 
 _POINTS_MIN = 50  # fewer do not constrain six degrees of freedom
 _DEPTH_VOXEL_M = 0.1
-# Deviation of what two clouds say of the motion between them, over that of their poses: most of the
-# error is that of the map, which both share. 0.05 to 0.14 voxels from one cloud to the next.
-_STEP_RATIO = 0.25
+# Deviations of what two clouds say of the motion between them: over that of a pose, since most of
+# its error is that of the map, which both share (0.05 to 0.14 voxels remain), and of the turn.
+_STEP_RATIO, _STEP_RAD = 0.25, 0.0025
 _SIGMAS = 2.0  # of the robot's motion since the last cloud: how far a guess may be off
 _INTERVAL_S, _SHARE = 1.0, 0.1  # usual interval of clouds at first, and weight of the newest
 _INTERRUPTED = 3.0  # times the usual interval between two poses
 _SAME_RATIO = 0.9  # of a cloud in known voxels: it shows what was seen before the interruption
-_DIFFUSE = 1e6  # prediction's covariance in units of a cloud's, if ICP decides alone
+_DIFFUSE = 1e6  # prediction's variances in units of a cloud's, if ICP decides alone
 
 
 @dataclass(kw_only=True, eq=False)
@@ -43,7 +43,6 @@ class CloudOdometry(LocalModule, ABC):
     depth_stride_px: int
     deskew: bool
     noise_m: float | None
-    noise_rad: float
     overlap_min_ratio: float
     weak_ratio: float
     speed_max_m_s: float | None
@@ -83,8 +82,7 @@ class CloudOdometry(LocalModule, ABC):
         voxel_m = self.voxel_m or derived_m
         self._icp = self.make_map(voxel_m, self._reader)
         self._speed_max_m_s = self.speed_max_m_s or 0.5 * range_max_m
-        noise = np.array([self.noise_m or 0.2 * voxel_m, self.noise_rad]) ** 2
-        self._noise = np.repeat(noise, 3)  # variances of a registration
+        self._noise_m = self.noise_m or 0.2 * voxel_m
         self._predictor = Predictor(rig)
         self._has_map, self._interval_s = False, _INTERVAL_S
 
@@ -143,18 +141,19 @@ class CloudOdometry(LocalModule, ABC):
         result is used, except for directions that the cloud's shape does not constrain: there the
         prediction is used.
         """
-        held = shape.held(self.weak_ratio)
-        information = held.T @ np.diag(1.0 / self._noise) @ held
+        information = shape.information(self._noise_m, self.weak_ratio)
         covariance = np.asarray(np.linalg.inv(np.linalg.inv(prediction.covariance) + information))
         if not self._has_map:
             self._predictor.measure(observation, T_local_icp, covariance)
             return T_local_icp
         is_known = prediction.is_measured
-        predicted = prediction.covariance if is_known else _DIFFUSE * np.diag(self._noise)
+        predicted = prediction.covariance if is_known else _DIFFUSE * self._noise_m**2 * np.eye(6)
         gain = np.linalg.solve(np.linalg.inv(predicted) + information, information)
         off = se3.log(se3.inverse(prediction.T_local_base) @ T_local_icp)
         T_local_base = np.asarray(prediction.T_local_base @ se3.exp(gain @ off))
-        steps = information / _STEP_RATIO**2
+        held = shape.held(self.weak_ratio)
+        step = np.repeat([_STEP_RATIO * self._noise_m, _STEP_RAD], 3)
+        steps = held.T @ np.diag(step**-2.0) @ held
         interval_s = self._predictor.unmeasured_s(observation)
         self._interval_s += _SHARE * (interval_s - self._interval_s)
         self._predictor.measure(observation, T_local_base, covariance, steps)

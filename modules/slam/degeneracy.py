@@ -40,6 +40,15 @@ class Localizability:
         strong = self.directions[:, self.ratios >= ratio_min]
         return np.asarray(np.linalg.solve(self.scale, strong @ strong.T @ self.scale))
 
+    def information(self, noise_m: float, ratio_min: float) -> Doubles:
+        """Return the information (6, 6) of a twist, by the deviation of points seen from all sides.
+
+        A direction has as much of it as normals face it, one below `ratio_min` none.
+        """
+        seen = np.where(self.ratios >= ratio_min, np.minimum(self.ratios, 1.0), 0.0)
+        shape = (self.directions * seen) @ self.directions.T
+        return np.asarray(self.scale.T @ shape @ self.scale / noise_m**2)
+
     def reach_m(self, covariance: Doubles, ratio_min: float) -> float:
         """Return the points' deviation by a pose's covariance (6, 6) along what is not weak."""
         seen = self.directions[:, self.ratios >= ratio_min].T @ self.scale
