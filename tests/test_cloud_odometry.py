@@ -113,6 +113,21 @@ def test_a_direction_that_the_cloud_leaves_open_follows_the_prediction():
     assert np.trace(weak[-1].covariance) > np.trace(held[-1].covariance)
 
 
+def test_a_direction_that_surfaces_face_less_follows_the_wheels_more():
+    """Both slide as far; of x a tenth is held, y is held in full."""
+    x, y = (0.01, 0.0), (0.0, 0.01)
+    off_m, deviation_m = [], []
+    for axis, along in enumerate((x, y)):
+        slip = {
+            index: lambda T, along=along: T @ se3.from_xy_yaw(*along, 0.0) for index in range(1, 8)
+        }
+        found, _ = driven(slip)
+        T_true = se3.inverse(room_observation(0).T_odom_base) @ room_observation(7).T_odom_base
+        off_m.append(abs((se3.inverse(T_true) @ found[7].T_local_base)[axis, 3]))
+        deviation_m.append(np.sqrt(found[7].covariance[axis, axis]))
+    assert off_m[0] < 0.5 * off_m[1] and deviation_m[0] > 1.2 * deviation_m[1]
+
+
 @pytest.mark.parametrize(
     ("key", "value"), [("noise_m", 0.0), ("overlap_min_ratio", 1.1), ("weak_ratio", -0.1)]
 )
