@@ -107,6 +107,15 @@ def test_information_is_that_of_the_residuals():
     assert compare(tracker, views[1], views[0], off).matched_ratio < found.matched_ratio
 
 
+def test_a_frozen_image_is_not_tracked():
+    """It says with certainty that nothing moves; depth says that something does."""
+    module, first = active(), room_observation(0)
+    module.track(first)
+    later = [replace(room_observation(k), image_bgr=first.image_bgr) for k in range(1, 10)]
+    assert {module.track(one).status for one in later} == {TrackingStatus.DEGRADED}
+    assert module.track(room_observation(10)).status is TrackingStatus.TRACKING
+
+
 @pytest.mark.parametrize("is_first", [True, False])
 def test_views_settle_at_or_beside_the_start_where_they_agree_better(is_first):
     tracker = Tracker(CAMERA, 320, 0.3, 0.4)

@@ -97,6 +97,8 @@ class DirectSlam(LocalModule):
             if np.count_nonzero(view.depth_m) < _PIXELS_MIN:
                 return self._predictor.bridged(observation, prediction)
             return self._begin(observation, prediction, view)
+        if view.is_frozen(self._last):
+            return self._predictor.bridged(observation, prediction, can_coast=True)
         found = self._locate(view, prediction.T_local_base @ self._camera.T_base_cam)
         if found is not None:
             return self._hold(observation, prediction, view, found)
