@@ -30,6 +30,7 @@ _POSITIVE = (
     "cloud_voxel_m"
 )
 _PIXELS_MIN = 300  # smallest number of pixels that both views show
+_FROZEN_NS = 100_000_000  # an image is repeated where one was lost, but not for longer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,6 +76,7 @@ class DirectSlam(LocalModule):
         self._tracker = Tracker(rig.camera, self.width_px, self.step_max_m, self.turn_max_rad)
         self._predictor = Predictor(rig)
         self._keyframes = DirectKeyframes(self._tracker, self.cloud_voxel_m)
+        self._new_ns = 0  # [ns] stamp at which the last image came first
         self._key: DirectView | None = None
         self._last: DirectView | None = None
         self._T_local_key = self._T_local_last = se3.identity()  # of cam
@@ -96,8 +98,11 @@ class DirectSlam(LocalModule):
         if self._key is None or self._last is None:
             if np.count_nonzero(view.depth_m) < _PIXELS_MIN:
                 return self._predictor.bridged(observation, prediction)
+            self._new_ns = observation.stamp_ns
             return self._begin(observation, prediction, view)
-        if view.is_frozen(self._last):
+        if not view.shows_same(self._last):
+            self._new_ns = observation.stamp_ns
+        elif observation.stamp_ns - self._new_ns > _FROZEN_NS:
             return self._predictor.bridged(observation, prediction, can_coast=True)
         found = self._locate(view, prediction.T_local_base @ self._camera.T_base_cam)
         if found is not None:

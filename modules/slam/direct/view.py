@@ -23,7 +23,7 @@ class DirectView:
     depth_m: Floats  # (h, w), 0 = missing
     frame: Any  # prepared by OpenCV
 
-    def is_frozen(self, before: DirectView) -> bool:
+    def shows_same(self, before: DirectView) -> bool:
         """Tell whether the image is the one before, to the last bit, beside another depth."""
         is_same = bool(self.grey.any()) and np.array_equal(self.grey, before.grey)
         return is_same and not np.array_equal(self.depth_m, before.depth_m)
