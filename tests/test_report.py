@@ -19,7 +19,9 @@ from evaluation_runs import (
     timings,
     true_loop,
 )
+from matplotlib.figure import Figure
 
+from sceneslam.evaluation.figures import style as look
 from sceneslam.evaluation.figures.features import feature_limits
 from sceneslam.evaluation.figures.run_figures import write_figures
 from sceneslam.evaluation.figures.time import draw_timeline
@@ -86,6 +88,21 @@ def test_trajectory_has_a_colour_per_module(tmp_path):
     image = cv2.imread(str(tmp_path / "map.png"))[:, :, ::-1].astype(int)
     for color in ([0, 114, 178], [213, 94, 0]):
         assert np.count_nonzero(np.abs(image - color).max(axis=2) < 8) > 300
+
+
+@pytest.mark.parametrize(
+    ("share", "text", "is_named"),
+    [
+        (0.5, "CameraFrozen", True),
+        (0.12, "Camera\nFrozen", True),
+        (0.05, "Camera\nFrozen", False),
+    ],
+)
+def test_a_stretch_of_time_is_named_as_far_as_there_is_room(share, text, is_named):
+    axes = Figure(figsize=(look.WIDTH_IN, 4.0)).subplots()
+    found, size = look.fitted(axes, "CameraFrozen", share)
+    assert found == text and bool(size) is is_named
+    assert size <= look.fitted(axes, "Dark", share)[1] or not is_named
 
 
 @pytest.mark.parametrize(("dropped", "is_marked"), [(0, False), (3, True)])

@@ -26,6 +26,8 @@ BRIDGED = "#777777"
 INK, MUTED, LINE, PAPER = "#222222", "#666666", "#DDDDDD", "#FFFFFF"
 _STRETCHES = 900  # of a curve; the PNG has as many pixels
 WIDTH_IN = 6.0  # small, so that 11 pt stay legible when a phone shrinks the figure
+_NAME_PT = (7.0, 11.0)  # font sizes of names of stretches
+_GLYPH = 0.62  # width of a letter, in font sizes
 SCENE_TINTS = ("#FBF3D0", "#CFD6E4", "#DDEBDD", "#EFDCE6", "#E3E3E3")
 _TINT_OF = {"Bright": SCENE_TINTS[0], "Dark": SCENE_TINTS[1]}
 _PAGE_COLORS = {  # CSS variables of report.html
@@ -186,15 +188,31 @@ def draw_bands(
     for band in bands:
         color = colors.get(band.label, BRIDGED)
         axes.axvspan(band.start_s, band.end_s, color=color, alpha=alpha, linewidth=0, zorder=0)
-        if band.end_s - band.start_s > 0.06 * total_s:
+        share = (band.end_s - band.start_s) / max(total_s, 1e-9)
+        name, size = fitted(axes, band.label or "bridged", share)
+        if size:
             centre_s = 0.5 * (band.start_s + band.end_s)
             axes.text(
                 centre_s,
                 0.985,
-                band.label or "bridged",
+                name,
                 transform=axes.get_xaxis_transform(),
                 ha="center",
                 va="top",
-                fontsize=11,
+                fontsize=size,
                 color=INK,
             )
+
+
+def fitted(axes: Any, name: str, share: float) -> tuple[str, float]:
+    """Return a name as it fits into a share of the width, in two lines at need, and its font size.
+
+    The size is 0 where there is no room.
+    """
+    width_pt = share * axes.get_window_extent().width * 72.0 / axes.figure.dpi
+    broken = re.sub(r"(?<=[a-z])(?=[A-Z])| ", "\n", name, count=1)
+    sizes = {
+        text: width_pt / (_GLYPH * (1 + max(map(len, text.split("\n"))))) for text in (name, broken)
+    }
+    text = name if sizes[name] >= _NAME_PT[0] else broken
+    return text, min(_NAME_PT[1], sizes[text]) if sizes[text] >= _NAME_PT[0] else 0.0

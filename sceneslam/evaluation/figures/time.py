@@ -192,8 +192,9 @@ def _draw_bar(
 ) -> None:
     width_s = max(bar.end_s - bar.start_s, 0.002 * total_s)
     axes.barh(row, width_s, left=bar.start_s, height=0.62, color=color, linewidth=0)
-    if name_it and width_s > 0.08 * total_s:
-        axes.text(bar.start_s + width_s / 2, row, bar.label, ha="center", va="center", fontsize=11)
+    name, size = look.fitted(axes, bar.label, width_s / max(total_s, 1e-9))
+    if name_it and size:
+        axes.text(bar.start_s + width_s / 2, row, name, ha="center", va="center", fontsize=size)
 
 
 def _draw_trouble(axes: Any, result: RunResult, module: str, row: int) -> None:
