@@ -1,15 +1,14 @@
-"""The agreement of two views at a pose, and the pose where they agree best."""
+"""The agreement of two views at a pose."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
-from sceneslam.types.covariance import covariance_of, semidefinite
+from sceneslam.types.covariance import semidefinite
 from sceneslam.types.spread import spread
 
 from .view import DirectView, Tracker
@@ -20,9 +19,7 @@ _STEP_PX = 4  # distance between compared pixels
 _DEPTH_NOISE = (0.003, 0.0015)  # sigma = a + b z^2 [m], structured light
 _GATE_SIGMAS = 5.0  # larger differences of depth are other surfaces
 _GREY_SIGMA_MIN = 3.0  # grey values: smallest image noise
-_ROBUST_SIGMAS = 2.0  # a residual pulls no more than one so large
 _CORRELATION = 100.0  # correlated pixels with the information of one
-_NOT_HELD = 1e-9  # share of all information, added to every direction
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -30,8 +27,7 @@ class Comparison:
     """The agreement of two views at a relative pose."""
 
     information: Doubles  # (6, 6) of se3.log order, cam
-    step: Doubles  # (6,) twist of the view to where they agree better, by Gauss-Newton
-    misfit: float  # negative logarithm of the likelihood, per compared pixel
+    misfit: float  # negative logarithm of the likelihood, per pixel
     compared: int  # pixels with depth in both views
     matched: int  # of these, on the same surface
 
@@ -39,22 +35,6 @@ class Comparison:
     def matched_ratio(self) -> float:
         """Return the share of compared pixels that agree."""
         return self.matched / max(self.compared, 1)
-
-
-def settle(
-    tracker: Tracker, view: DirectView, other: DirectView, starts: Sequence[se3.Transform]
-) -> tuple[se3.Transform, Comparison]:
-    """Return T_other_view (4, 4) [m] where two views agree best, and their agreement there.
-
-    The best of `starts`, or a Gauss-Newton step from it where they agree better there.
-    """
-    poses = [*starts]
-    tried = [compare(tracker, view, other, start) for start in starts]
-    best = int(np.argmin([one.misfit for one in tried]))
-    poses.append(se3.orthonormal(poses[best] @ se3.exp(tried[best].step)))
-    tried.append(compare(tracker, view, other, poses[-1]))
-    best = best if tried[best].misfit <= tried[-1].misfit else -1
-    return poses[best], tried[best]
 
 
 def compare(
@@ -85,12 +65,11 @@ def compare(
     if not matched.any():
         return Comparison(
             information=np.zeros((6, 6)),
-            step=np.zeros(6),
             misfit=np.inf,
             compared=len(rows),
             matched=0,
         )
-    gates = np.minimum(deeper**2, _GATE_SIGMAS**2)
+    apart = _squared(deeper)
     rows, deeper, sigma_m = rows[matched], deeper[matched], sigma_m[matched]
     row, column, slopes = row[matched], column[matched], slopes[matched]
     brighter = other.grey[row, column] + beside[matched, 0] - greys[rows]
@@ -107,18 +86,18 @@ def compare(
     # A slope is half a difference of two greys, and so has half the variance of their noise, a
     # quarter of that of `brighter`: by it, darkness would say where it is.
     by_noise = 0.5 * noise / grey_sigma * jacobians[:, :2].reshape(-1, 6)
-    by_grey, by_depth = photometric.T @ photometric, geometric.T @ geometric
-    seen = semidefinite(by_grey - by_noise.T @ by_noise)
-    least = _NOT_HELD * float(np.trace(by_grey + by_depth))
-    pull = photometric.T @ np.clip(brighter / grey_sigma, -_ROBUST_SIGMAS, _ROBUST_SIGMAS)
-    pull += geometric.T @ np.clip(deeper, -_ROBUST_SIGMAS, _ROBUST_SIGMAS)
+    seen = semidefinite(photometric.T @ photometric - by_noise.T @ by_noise)
     return Comparison(
-        information=(seen + by_depth) / _CORRELATION,
-        step=-covariance_of(by_grey + by_depth, unmeasured=least) @ pull,
-        misfit=float(np.log(grey_sigma) + 0.5 * gates.mean()),
+        information=(seen + geometric.T @ geometric) / _CORRELATION,
+        misfit=float(np.log(grey_sigma) + 0.5 * (_squared(brighter / grey_sigma) + apart)),
         compared=int(inside.sum()),
         matched=len(rows),
     )
+
+
+def _squared(sigmas: Doubles) -> float:
+    """Return the mean square of errors (N,) in units of their deviations, gross ones cut off."""
+    return float(np.minimum(sigmas**2, _GATE_SIGMAS**2).mean())
 
 
 def _jacobians(

@@ -21,7 +21,7 @@ from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
 
 from ..local import LocalModule
-from .comparison import Comparison, settle
+from .comparison import Comparison, compare
 from .keyframes import DirectKeyframes
 from .view import DirectView, Tracker
 
@@ -103,7 +103,7 @@ class DirectSlam(LocalModule):
         if not view.shows_same(self._last):
             self._new_ns = observation.stamp_ns
         elif observation.stamp_ns - self._new_ns > _FROZEN_NS:
-            return self._predictor.bridged(observation, prediction, can_coast=True)
+            return self._predictor.bridged(observation, prediction)
         found = self._locate(view, prediction.T_local_base @ self._camera.T_base_cam)
         if found is not None:
             return self._hold(observation, prediction, view, found)
@@ -121,19 +121,30 @@ class DirectSlam(LocalModule):
     def _locate(self, view: DirectView, T_local_guess: se3.Transform) -> _Located | None:
         """Return the view's pose relative to the keyframe, else to the previous view.
 
-        OpenCV takes no guess: the pose where the views agree best may be nearer to that of cam.
+        By OpenCV, which takes no guess, or by the guess of cam, where the views agree better.
         """
         candidates = ((self._key, self._T_local_key), (self._last, self._T_local_last))
         for other, T_local_other in candidates:
             T_other_cam = None if other is None else self._tracker.register(view, other)
             if other is None or T_other_cam is None:
                 continue
-            T_other_guess = se3.inverse(T_local_other) @ T_local_guess
-            T_other_cam, found = settle(self._tracker, view, other, (T_other_cam, T_other_guess))
-            is_enough = found.compared >= _PIXELS_MIN
-            if is_enough and found.matched_ratio >= self.matched_min_ratio:
+            guess = se3.inverse(T_local_other) @ T_local_guess
+            poses = [T_other_cam, guess] if self._is_near(guess) else [T_other_cam]
+            tried = [(pose, compare(self._tracker, view, other, pose)) for pose in poses]
+            agree = [one for one in tried if self._is_enough(one[1])]
+            if agree:
+                T_other_cam, found = min(agree, key=lambda one: one[1].misfit)
                 return _Located(T_local_other @ T_other_cam, found)
         return None
+
+    def _is_near(self, T_other_cam: se3.Transform) -> bool:
+        """Tell whether a pose is within the limits of a step."""
+        step_m, turn_rad = np.linalg.norm(T_other_cam[:3, 3]), se3.rotation_angle_rad(T_other_cam)
+        return bool(step_m <= self.step_max_m and turn_rad <= self.turn_max_rad)
+
+    def _is_enough(self, found: Comparison) -> bool:
+        """Tell whether enough is compared, and agrees."""
+        return found.compared >= _PIXELS_MIN and found.matched_ratio >= self.matched_min_ratio
 
     def _begin(
         self, observation: Observation, prediction: Prediction, view: DirectView

@@ -24,9 +24,14 @@ class DirectView:
     frame: Any  # prepared by OpenCV
 
     def shows_same(self, before: DirectView) -> bool:
-        """Tell whether the image is the one before, to the last bit, beside another depth."""
-        is_same = bool(self.grey.any()) and np.array_equal(self.grey, before.grey)
-        return is_same and not np.array_equal(self.depth_m, before.depth_m)
+        """Tell whether the image is the one before, to the last bit, beside another depth.
+
+        One that is black or white all over may come again.
+        """
+        is_same = np.array_equal(self.grey, before.grey)
+        if not is_same or np.array_equal(self.depth_m, before.depth_m):
+            return False
+        return bool(np.ptp(np.percentile(self.grey, [25, 75])) > 0)
 
 
 class Tracker:
