@@ -113,7 +113,7 @@ class _Trials:
         with reader, writer, pool:
             # A source is rendered once. Effects are left to the runs: they note what struck.
             inputs = {
-                json.dumps(config["source"], default=str): config | {"effects": None}
+                _input_of(bare := config | {"effects": None}): bare
                 for (_, config), folder in zip(configs, folders, strict=True)
                 if _finished_by(folder) != provenance(config)
             }

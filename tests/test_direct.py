@@ -113,7 +113,7 @@ def test_a_frozen_image_is_not_tracked():
     module.track(first)
     later = [replace(room_observation(k), image_bgr=first.image_bgr) for k in range(1, 10)]
     found = [module.track(one).status for one in later]
-    assert found[0] is TrackingStatus.TRACKING  # one image that is repeated is none that is frozen
+    assert found[0] is TrackingStatus.TRACKING  # cameras repeat single images
     assert set(found[3:]) <= {TrackingStatus.DEGRADED, TrackingStatus.LOST}
     assert module.track(room_observation(10)).status is TrackingStatus.TRACKING
 

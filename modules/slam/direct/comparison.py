@@ -62,13 +62,10 @@ def compare(
     sigma_m = _DEPTH_NOISE[0] + _DEPTH_NOISE[1] * z**2
     deeper = (other.depth_m[row, column] + beside[:, 1] - z) / sigma_m
     matched = np.abs(deeper) < _GATE_SIGMAS
+    compared = len(rows)
     if not matched.any():
-        return Comparison(
-            information=np.zeros((6, 6)),
-            misfit=np.inf,
-            compared=len(rows),
-            matched=0,
-        )
+        nothing = np.zeros((6, 6))
+        return Comparison(information=nothing, misfit=np.inf, compared=compared, matched=0)
     apart = _squared(deeper)
     rows, deeper, sigma_m = rows[matched], deeper[matched], sigma_m[matched]
     row, column, slopes = row[matched], column[matched], slopes[matched]
@@ -90,7 +87,7 @@ def compare(
     return Comparison(
         information=(seen + geometric.T @ geometric) / _CORRELATION,
         misfit=float(np.log(grey_sigma) + 0.5 * (_squared(brighter / grey_sigma) + apart)),
-        compared=int(inside.sum()),
+        compared=compared,
         matched=len(rows),
     )
 
