@@ -468,6 +468,10 @@ class TrajectoryLog(Protocol):
         """
         ...
 
+    def add_final(self, stamps_ns: NDArray[np.int64], T_new_old: NDArray[np.float64]) -> None:
+        """Record the correction of the end in place of all others, of the poses as revised."""
+        ...
+
     def add_end(self, session: int, revised: Trajectory) -> None:
         """Record the revised poses of a session; empty if not revised."""
         ...

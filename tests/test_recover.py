@@ -22,6 +22,7 @@ from sceneslam.storage.journal import MAGIC, Journal, JournalHeader, read_journa
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.files import AppendedFile
+from sceneslam.types.maps import MapLayers
 from sceneslam.types.trajectory import Trajectory
 
 RESULTS = ("trajectory.tum", "trajectory_online.tum", "metrics.json", "report.html")
@@ -190,6 +191,37 @@ def test_an_atlas_that_is_told_a_journal_is_the_one_it_was_kept_of(tmp_path, see
         np.testing.assert_array_equal(one.T_world_base, two.T_world_base)
     assert atlas.pose_modules == again.pose_modules
     np.testing.assert_allclose(atlas.covariances(True), again.covariances(True), rtol=1e-12)
+
+
+def test_a_cut_off_run_is_corrected_once(tmp_path):
+    """A correction of the mapper, while the run lasts, is of the poses as they were told."""
+    journal = Journal(tmp_path / "journal.bin", HEAD)
+    atlas = Atlas(voxel_m=0.1)
+    atlas.keep_journal(journal)
+    told, revised = (
+        np.stack([se3.from_xy_yaw(0, y_m, 0) for y_m in of]) for of in ([0, 1], [0, 0])
+    )
+    first = atlas.begin_session("a", se3.identity())
+    for stamp_ns in range(2):
+        atlas.add_local(stamp_ns, told[stamp_ns])
+        atlas.add(stamp_ns, told[stamp_ns], "a")
+    atlas.close_session(
+        first, MapLayers(), Trajectory(stamps_ns=np.arange(2), T_world_base=revised)
+    )
+    atlas.begin_session("b", told[1])
+    atlas.correct(Correction(stamps_ns=np.arange(2), T_new_old=revised @ se3.inverse(told)))
+    atlas.add_local(2, se3.identity())
+    atlas.add(2, told[1], "b")
+    for stop in ("killed", "mapped"):
+        if stop != "killed":  # nothing is left to be corrected
+            atlas.end_with(Correction.none())
+        journal.flush()
+        again = Atlas(voxel_m=0.1)
+        read_journal(tmp_path / "journal.bin", _Retold(again))
+        for one in (atlas, again):
+            assert one.online.positions_m[:, 1].tolist() == [0.0, 1.0, 0.0]
+            np.testing.assert_allclose(one.trajectory.positions_m, 0.0, atol=1e-12)
+            assert one.sessions[1].T_map_local[1, 3] == pytest.approx(0.0)
 
 
 def test_a_journal_read_up_to_any_byte_is_the_beginning_of_what_was_told(tmp_path):

@@ -54,6 +54,7 @@ class Atlas:
         self._mapper: Mapper | None = None  # None while only poses are given
         self._note: Note | None = None
         self._correction = Correction.none()
+        self._is_over = False  # the correction is of the poses as revised, before: as told
         self._voxel_m = voxel_m
         self._sessions: list[OpenSession] = []
         self._closing: frozenset[str] = frozenset()  # modules that close loops themselves
@@ -140,7 +141,7 @@ class Atlas:
         revised = self._revise().T_map_base
         at = partial(self._revised_at, revised)
         layers = [session.layers for session in self._sessions]
-        self._end_with(self._mapper.finish(at, layers))
+        self.end_with(self._mapper.finish(at, layers))
         self._lasting.faults += self._mapper.faults
         self._lasting.finish(self._mapper, self._path.stamps_ns[-1], self._note)
 
@@ -149,22 +150,18 @@ class Atlas:
         _log.info("submaps", exc_info=error)
         if self._mapper is not None:
             self._mapper.close()
-        self._end_with(Correction.none())
+        self.end_with(Correction.none())
         self._mapper = None
         unsaved = ", its map is not saved from here on" if self._lasting.saves else ""
         self._lasting.faults.append(
             f"the run goes on without submaps and loops{unsaved}: {text_of(error)}"
         )
 
-    def _end_with(self, final: Correction) -> None:
-        """Take the final correction; in the journal, poses where it has no node stay as given."""
-        before, self._correction = self._correction, final
-        if self._journal is None:
-            return
-        gone_ns = np.setdiff1d(before.stamps_ns, final.stamps_ns)
-        stays = Correction(stamps_ns=gone_ns, T_new_old=np.tile(np.eye(4), (len(gone_ns), 1, 1)))
-        whole = stays.updated(final)
-        self._journal.add_correction(whole.stamps_ns, whole.T_new_old)
+    def end_with(self, final: Correction) -> None:
+        """Take the final correction, which is of the poses as their modules revised them."""
+        if self._journal is not None:
+            self._journal.add_final(final.stamps_ns, final.T_new_old)
+        self._correction, self._is_over = final, True
 
     def begin_session(self, module: str, T_map_local: Transform) -> int:
         """Open a session of a module placed at T_map_local (4, 4) (Eq. 1); return its number."""
@@ -253,7 +250,7 @@ class Atlas:
         if not self._path.stamps_ns:
             return Trajectory.empty()
         stamps_ns = np.array(self._path.stamps_ns, np.int64)
-        poses = self._correction.apply(stamps_ns, self._revise().T_map_base)
+        poses = self._correction.apply(stamps_ns, self._corrected().T_map_base)
         return Trajectory(stamps_ns=stamps_ns, T_world_base=poses)
 
     def session_starts(self) -> list[SessionStart]:
@@ -290,7 +287,7 @@ class Atlas:
     @property
     def sessions(self) -> tuple[Session, ...]:
         """Return every session so far, as revised."""
-        placed = self._placed(self._revise().T_map_local)
+        placed = self._placed(self._corrected().T_map_local)
         return tuple(
             Session(
                 index=index,
@@ -306,7 +303,7 @@ class Atlas:
 
         If the run was located in a loaded map, the grid shows both.
         """
-        revised = self._revise().T_map_local
+        revised = self._corrected().T_map_local
         placed = [
             Placed(
                 module=session.module,
@@ -363,6 +360,13 @@ class Atlas:
     def _revised_at(self, revised: NDArray[np.float64], stamp_ns: int) -> Transform | None:
         row = self._path.row_at(stamp_ns)
         return None if row is None else np.asarray(revised[row])
+
+    def _corrected(self) -> Revised:
+        """Return the poses that the correction applies to."""
+        if self._is_over or not len(self._correction.stamps_ns):
+            return self._revise()
+        told = np.array(self._path.poses).reshape(-1, 4, 4)
+        return Revised(T_map_local=[one.T_map_local for one in self._sessions], T_map_base=told)
 
     def _revise(self) -> Revised:
         return revise(

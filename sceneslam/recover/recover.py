@@ -117,6 +117,9 @@ class _Retold:
     def add_correction(self, stamps_ns: NDArray[np.int64], T_new_old: NDArray[np.float64]) -> None:
         self._atlas.correct(Correction(stamps_ns=stamps_ns, T_new_old=T_new_old))
 
+    def add_final(self, stamps_ns: NDArray[np.int64], T_new_old: NDArray[np.float64]) -> None:
+        self._atlas.end_with(Correction(stamps_ns=stamps_ns, T_new_old=T_new_old))
+
     def add_end(self, session: int, revised: Trajectory) -> None:
         self._atlas.close_session(session, MapLayers(), revised)
 

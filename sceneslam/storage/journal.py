@@ -12,6 +12,7 @@
 | `P` | stamp, T_map_base, two covariances (each a byte 1 and 21 numbers, or a byte 0), its module |
 | `R` | stamp from which on poses are taken back |
 | `M` | stamps and T_new_old at which the atlas corrects the poses otherwise than before |
+| `F` | the same of the end: all of it, of the poses as their modules revised them |
 | `C` | a session's number; stamps and T_local_base as its module revised them at its end |
 
 A pose takes about 410 bytes, 580 with a covariance of the map. The file goes when the run's results
@@ -37,7 +38,7 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
 JOURNAL = "journal.bin"
-MAGIC = b"SceneSLAM journal 2\n"
+MAGIC = b"SceneSLAM journal 3\n"
 _HEAD = struct.Struct("<cII")
 _STAMP = struct.Struct("<q")
 _UPPER = np.triu_indices(6)
@@ -106,6 +107,10 @@ class Journal:
     def add_correction(self, stamps_ns: NDArray[np.int64], T_new_old: NDArray[np.float64]) -> None:
         """Record the correction of poses, T_new_old (N, 4, 4) [m], at stamps (N,)."""
         self._add(b"M", _poses(stamps_ns, T_new_old))
+
+    def add_final(self, stamps_ns: NDArray[np.int64], T_new_old: NDArray[np.float64]) -> None:
+        """Record the final correction of revised poses, T_new_old (N, 4, 4) [m], at stamps (N,)."""
+        self._add(b"F", _poses(stamps_ns, T_new_old))
 
     def add_end(self, session: int, revised: Trajectory) -> None:
         """Record the revised trajectory of a session."""
@@ -215,6 +220,11 @@ def _tell_correction(log: TrajectoryLog, body: bytes) -> None:
     log.add_correction(correction.stamps_ns, correction.T_world_base)
 
 
+def _tell_final(log: TrajectoryLog, body: bytes) -> None:
+    final = _trajectory(body)
+    log.add_final(final.stamps_ns, final.T_world_base)
+
+
 def _tell_end(log: TrajectoryLog, body: bytes) -> None:
     log.add_end(_number(body), _trajectory(body[_STAMP.size :]))
 
@@ -225,6 +235,7 @@ _TELL = {
     b"P": _tell_pose,
     b"R": _tell_rewind,
     b"M": _tell_correction,
+    b"F": _tell_final,
     b"C": _tell_end,
 }
 
