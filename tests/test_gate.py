@@ -144,6 +144,15 @@ def test_a_corrected_past_is_no_motion():
     assert all(trusted(judged(jumping(30, 1.0), revised_at=30))[10:])
 
 
+def test_a_past_corrected_while_odometry_is_missing_is_no_motion():
+    def with_a_gap(step):
+        return None if step in (30, 31) else arc(step)
+
+    judgements = judged(jumping(30, 1.0), odometry=with_a_gap, revised_at=30)
+    assert all(trusted(judgements)[10:])
+    assert not judged(jumping(30, 1.0), odometry=with_a_gap)[32].is_trusted
+
+
 @settings(deadline=None)
 @given(st.lists(st.floats(-3, 3), min_size=12, max_size=12))
 def test_judgement_does_not_depend_on_where_the_frames_are(values):

@@ -118,6 +118,7 @@ class Gate:
         self._odom_ns = 0  # when odometry was there last
         self._unchecked = Judgement(is_trusted=True)  # while the next odometry is awaited
         self._way_m, self._turn_rad = 0.0, 0.0
+        self._is_revised = False  # the module corrected its past since the last sample
         self._within_since_ns = 0  # since when both have been within bounds
         self._module_erred = False  # the module was at fault, since the two agreed
         self._have_wheels_jumped = False  # the same of the wheels
@@ -144,6 +145,7 @@ class Gate:
         independent motion. `is_revised`: the module corrected its past, so that its pose jumps
         without motion. `deviation_m`: standard deviation of the module's position, None if unknown.
         """
+        self._is_revised |= is_revised
         if T_odom_base is None:
             is_silent = stamp_ns - self._odom_ns > _PROBATION_NS
             return Judgement(is_trusted=True) if is_silent else self._unchecked
@@ -154,8 +156,9 @@ class Gate:
             self._turn_rad += _angle_rad(T_odom_base[:3, :3] - T_odom_prev[:3, :3])
         if T_local_base is None:
             return Judgement(is_trusted=False)
-        if is_revised and self._samples:
+        if self._is_revised and self._samples:
             self._move_past(self._samples[-1], T_local_base, T_odom_base)
+        self._is_revised = False
         now = _Sample(
             stamp_ns=stamp_ns,
             T_local_base=T_local_base,
