@@ -107,6 +107,16 @@ def test_information_is_that_of_the_residuals():
     assert compare(tracker, views[1], views[0], off).matched_ratio < found.matched_ratio
 
 
+def test_a_moment_without_depth_leaves_the_keyframe_as_it_is():
+    module = active()
+    for index in range(3):
+        module.track(room_observation(index))
+    blank = np.full_like(room_observation(3).depth_m, np.nan)
+    found = module.track(replace(room_observation(3), depth_m=blank))
+    assert found.status is TrackingStatus.DEGRADED
+    assert module.track(room_observation(4)).status is TrackingStatus.TRACKING
+
+
 def test_a_frozen_image_is_not_tracked():
     """It says with certainty that nothing moves; depth says that something does."""
     module, first = active(), room_observation(0)

@@ -36,11 +36,13 @@ def test_landmarks_fuse_by_inverse_variance_and_reuse_rows():
     table.fuse(ids, points_local=np.ones((1, 3)), information=3 * eye)
     assert table.points_local[ids] == pytest.approx(0.75 * np.ones((1, 3)))
     assert table.covariance[ids] == pytest.approx(0.25 * eye)
+    table.shift(ids, np.ones((1, 3)))
     table.remove(ids)
     many = np.repeat(eye, 10_000, axis=0)
     ids = table.add(points_local=np.zeros((10_000, 3)), information=many, looks=looks(10_000))
     assert ids.tolist() == list(range(10_000))
     assert len(table) == 10_000
+    assert not table.shift_local.any()
 
 
 def keyframe_at(x_m, landmark_ids=(), count=60, camera=CAMERA):
@@ -269,6 +271,8 @@ def test_joining_two_sides_of_a_loop_leaves_no_keyframe_with_a_landmark_twice():
         insert(0.0, seen(0.0), ids_old)
     new = insert(0.1, seen(0.1), nothing)
     ids_new = visual_map.keyframes[new].landmark_ids.copy()
+    kept = ids_old.copy()
+    visual_map.landmarks.scale_sigma[[*ids_old, *ids_new]] = 0.1  # by wheels, not by depth
     ids_both = [*np.where(np.arange(60) < 30, ids_old, -1), *ids_new]
     twice = [np.concatenate(parts) for parts in zip(seen(0.05), seen(0.05, 2.0), strict=True)]
     both = insert(0.05, twice, ids_both)
@@ -277,3 +281,4 @@ def test_joining_two_sides_of_a_loop_leaves_no_keyframe_with_a_landmark_twice():
         shown = visual_map.keyframes[k].landmark_ids
         shown = shown[shown >= 0]
         assert len(shown) == len(np.unique(shown))
+    assert visual_map.landmarks.scale_sigma[kept].tolist() == [0.1] * 60

@@ -3,11 +3,14 @@
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from test_rgbd import make
 
+from sceneslam.modules.slam.rgbd.loops.pose_graph import PoseGraph
+from sceneslam.modules.slam.rgbd.map.segments import Segments
 from sceneslam.testing.room import observation_at
 from sceneslam.types import se3
 from sceneslam.types.observation import TrackingStatus
@@ -128,3 +131,21 @@ def test_keyframes_of_a_full_map_stay_connected(keyframe_limit):
     for _ in reached:
         reached[first[reached[second]]] = reached[second[reached[first]]] = True
     assert len(reached) == keyframe_limit and reached.all()
+
+
+def test_what_a_guess_costs_lies_where_the_map_has_its_keyframe_now():
+    """A turn that may be 2 rad off, seen from 3 m away, after the map moved by 1 m."""
+    graph, keyframes = PoseGraph(), {}
+    for k in range(2):
+        graph.insert(k)
+        keyframes[k] = SimpleNamespace(T_local_base=se3.from_xy_yaw(float(k), 0.0, 0.0))
+    segments = Segments(graph, keyframes)
+    segments.begin(1, lost_s=1.0)
+    spread_m2 = [
+        segments.covariance({1}, se3.from_xy_yaw(x_m, 0.0, 0.0), np.zeros((6, 6)))[1, 1]
+        for x_m in (1.0, 4.0)
+    ]
+    for keyframe in keyframes.values():
+        keyframe.T_local_base = se3.from_xy_yaw(1.0, 0.0, 0.0) @ keyframe.T_local_base
+    moved_m2 = segments.covariance({1}, se3.from_xy_yaw(5.0, 0.0, 0.0), np.zeros((6, 6)))[1, 1]
+    assert moved_m2 == pytest.approx(spread_m2[1]) and spread_m2[1] > 2.0 * spread_m2[0]

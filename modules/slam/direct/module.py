@@ -95,8 +95,9 @@ class DirectSlam(LocalModule):
                 f"and {depth_m.shape}"
             )
         view = self._tracker.view(image, depth_m)
+        can_begin = bool(np.count_nonzero(view.depth_m) >= _PIXELS_MIN)
         if self._key is None or self._last is None:
-            if np.count_nonzero(view.depth_m) < _PIXELS_MIN:
+            if not can_begin:
                 return self._predictor.bridged(observation, prediction)
             self._new_ns = observation.stamp_ns
             return self._begin(observation, prediction, view)
@@ -107,9 +108,8 @@ class DirectSlam(LocalModule):
         found = self._locate(view, prediction.T_local_base @ self._camera.T_base_cam)
         if found is not None:
             return self._hold(observation, prediction, view, found)
-        if prediction.is_measured:
+        if prediction.is_measured and can_begin:
             return self._begin(observation, prediction, view)
-        can_begin = bool(np.count_nonzero(view.depth_m) >= _PIXELS_MIN)
         return self._predictor.bridged(observation, prediction, can_begin=can_begin)
 
     def get_map(self) -> MapLayers:

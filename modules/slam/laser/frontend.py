@@ -128,7 +128,7 @@ class FrontEnd:
             if again is not None and (not believed or _is_better(again, match)):
                 match = again
         if not self._believes(match):
-            return self._distrust(predicted, motion, match, scan, surfaces)
+            return self._distrust(predicted, predicted_then, motion, match, scan, surfaces)
         if self._is_lost or (is_known and not match.weighs_sources):
             self.motion.skip()  # a jump, also where the wheels missed it, tells no velocity
             self.motion.slow_down()
@@ -233,18 +233,22 @@ class FrontEnd:
     def _distrust(
         self,
         predicted: Planar,
+        predicted_then: Planar,
         motion: Motion,
         match: Match,
         scan: LaserScan,
         surfaces: SurfacePoints,
     ) -> Estimate:
-        """Continue without the match: by dead reckoning, or else as lost."""
+        """Continue without the match: by dead reckoning, or else as lost.
+
+        `predicted_then` is the pose at the scan.
+        """
         self._failures += 1
         if not motion.is_measured:
             return self._lose(can_begin=True)
         unknown = match.overlap_ratio < _OVERLAP_MIN_RATIO or self._failures >= _FAILURES_MAX
-        if unknown and self.keyframes.is_due(predicted):
-            self._extend(predicted, scan, surfaces)
+        if unknown and self.keyframes.is_due(predicted_then):
+            self._extend(predicted_then, scan, surfaces)
             self._failures = 0
         return self._guess(predicted, TrackingStatus.DEGRADED)
 

@@ -85,8 +85,8 @@ class RgbdSlam(LocalModule, RgbdSettings):
             observation.image_bgr,
             T_predicted=prediction.T_local_base,
             rate_base=expected_rate(observation, self._predictor),
+            odometry=odometry,
         )
-        view = replace(view, odometry=odometry)
         fix = None
         if len(self._map.keyframes):
             fix = self._search.find(view, self._held_ids, is_lost=self._is_lost)
@@ -140,11 +140,10 @@ class RgbdSlam(LocalModule, RgbdSettings):
 
     def _recall(self) -> None:
         """Continue from the map as corrected by adjustment or loops."""
-        self._predictor.correct(self._mapping.step())
-        T_new_old = self._memory.step()
-        if T_new_old is not None:
-            self._T_local_base = T_new_old @ self._T_local_base
-            self._predictor.correct(T_new_old)
+        for T_new_old in (self._mapping.step(), self._memory.step()):
+            if T_new_old is not None:
+                self._T_local_base = T_new_old @ self._T_local_base
+                self._predictor.correct(T_new_old)
 
     def _is_unknown(self, view: View, prediction: Prediction) -> bool:
         is_far = self._keyframe_rule.is_far(view.T_predicted, self._map.keyframes)

@@ -57,6 +57,7 @@ def renew(parts: RgbdParts, seen: Mapping[int, LocatedView]) -> dict[int, Transf
             old.view.image_bgr,
             T_predicted=np.asarray(T_new_old @ old.T_local_base),
             rate_base=parts.map.camera.T_base_cam[:3, :3] @ old.view.turning.rate_cam,
+            odometry=old.view.odometry,
         )
         fix = parts.search.find(view, held_ids, is_lost=False) if poses else None
         T_local_base = view.T_predicted if fix is None else fix.estimate.T_local_base

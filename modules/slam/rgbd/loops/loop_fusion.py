@@ -51,9 +51,11 @@ def _fuse_into(visual_map: VisualMap, keyframe_id: int, old_ids: NDArray[np.int6
 def _unite(visual_map: VisualMap, kept: NDArray[np.int64], doubles: NDArray[np.int64]) -> None:
     """Merge the measurements of duplicates (N,) into the landmarks that are kept (N,)."""
     table = visual_map.landmarks
+    scale_sigma = np.minimum(table.scale_sigma[kept], table.scale_sigma[doubles])
     table.fuse(
         kept, points_local=table.points_local[doubles], information=table.information[doubles]
     )
+    table.scale_sigma[kept] = scale_sigma  # without depth neither of them measured it
     table.expected[kept] += table.expected[doubles]
     table.found[kept] += table.found[doubles]
     visual_map.join(kept, doubles)

@@ -69,7 +69,7 @@ class LandmarkTable:
         self.describe(ids, looks)
         self.scale_sigma[ids] = scale_sigma
         self.alive[ids], self.expected[ids], self.found[ids] = True, 1, 1
-        self.sightings[ids] = 0
+        self.sightings[ids], self.shift_local[ids] = 0, 0.0
         return ids
 
     def fuse(

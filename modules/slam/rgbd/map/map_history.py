@@ -50,7 +50,7 @@ class MapHistory:
         self._closer = VisualLoopCloser(
             visual_map, detector, self._graph, is_repeatable=is_repeatable
         )
-        self.segments = Segments(self._graph)
+        self.segments = Segments(self._graph, self._keyframes)
         self.reference = _NEVER_SAW  # the keyframe that the newest frame refers to
         self.revision = 0  # increases with every correction
         self._before = Trajectory.empty()  # poses of the map that this one replaced
@@ -95,7 +95,7 @@ class MapHistory:
             for edge in self._edges(keyframe_id, fix):
                 self._graph.connect(edge)
         else:
-            self.segments.begin(keyframe_id, keyframe.T_local_base, lost_s=guessed_s)
+            self.segments.begin(keyframe_id, lost_s=guessed_s)
         self._keyframes[keyframe_id] = keyframe
         self.recognizer.places.insert(keyframe_id, keyframe.features.descriptors)
         self._closer.insert(Query(keyframe_id=keyframe_id, depth_m=depth_m))
@@ -226,7 +226,7 @@ class MapHistory:
             gone, heir = self._keyframes[keyframe_id], self._keyframes[heir_id]
             T_heir_gone = se3.inverse(heir.T_local_base) @ gone.T_local_base
             self._frames.hand_over(keyframe_id, heir_id, T_heir_gone)
-            self.segments.replace(keyframe_id, None if edge is None else heir_id)
+            self.segments.replace(keyframe_id, None if edge is None else heir_id, T_heir_gone)
             self.reference = heir_id if self.reference == keyframe_id else self.reference
             del self._keyframes[keyframe_id]
             self.recognizer.places.remove(keyframe_id)

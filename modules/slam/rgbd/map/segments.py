@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,38 +12,31 @@ from sceneslam.types.covariance import unknown_motion
 from sceneslam.types.se3 import Transform
 
 from ..loops.pose_graph import PoseGraph
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Guess:
-    """The assumed pose at which a segment began."""
-
-    T_local_base: Transform
-    covariance: NDArray[np.float64]  # (6, 6) of se3.log order [m, rad], base frame
+from .keyframes import Keyframe
 
 
 class Segments:
     """The segments not yet connected to the first one, each by one of its keyframes."""
 
-    def __init__(self, graph: PoseGraph) -> None:
-        self._graph = graph
-        self._guesses: dict[int, _Guess] = {}
+    def __init__(self, graph: PoseGraph, keyframes: Mapping[int, Keyframe]) -> None:
+        self._graph, self._keyframes = graph, keyframes
+        # By keyframe the covariance (6, 6) of its assumed pose, of se3.log order [m, rad], in base.
+        self._guesses: dict[int, NDArray[np.float64]] = {}
 
     @property
     def are_many(self) -> bool:
         """Tell whether there is more than one segment."""
         return bool(self._guesses)
 
-    def begin(self, keyframe_id: int, T_local_base: Transform, *, lost_s: float) -> None:
+    def begin(self, keyframe_id: int, *, lost_s: float) -> None:
         """Begin a segment by a keyframe at an assumed pose, after `lost_s` without a pose."""
-        guess = _Guess(T_local_base=T_local_base.copy(), covariance=unknown_motion(lost_s))
-        self._guesses[keyframe_id] = guess
+        self._guesses[keyframe_id] = unknown_motion(lost_s)
 
-    def replace(self, gone: int, heir: int | None) -> None:
+    def replace(self, gone: int, heir: int | None, T_heir_gone: Transform) -> None:
         """Replace a removed keyframe by another one of its segment; None: it was the last one."""
         guess = self._guesses.pop(gone, None)
         if guess is not None and heir is not None:
-            self._guesses[heir] = guess
+            self._guesses[heir] = se3.carried(guess, T_heir_gone)
 
     def update(self) -> None:
         """Update after a correction, which may have joined segments."""
@@ -61,8 +54,8 @@ class Segments:
 
         None for a segment that is connected to the first one.
         """
-        guess = next((guess for k, guess in self._guesses.items() if k in segment), None)
-        if guess is None:
+        start = next((k for k in self._guesses if k in segment), None)
+        if start is None:
             return None
-        T_start_base = se3.inverse(guess.T_local_base) @ T_local_base
-        return se3.carried(guess.covariance, se3.inverse(T_start_base)) + measured
+        T_base_start = se3.inverse(T_local_base) @ self._keyframes[start].T_local_base
+        return se3.carried(self._guesses[start], T_base_start) + measured

@@ -14,6 +14,7 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
 
 from ..locate.localizer import VisualFix, VisualLocalizer
+from ..map.keyframes import OdometryPose
 from ..map.shifts import shifts_px_per_s
 from ..map.visual_map import VisualMap
 from .features import FeatureExtractor
@@ -54,6 +55,7 @@ class RectifyingExtractor:
         *,
         T_predicted: Transform,
         rate_base: NDArray[np.float64],
+        odometry: OdometryPose | None,
     ) -> View:
         """Return the view of an image taken while the base turned at `rate_base` (3,) [rad/s]."""
         gray = np.asarray(cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY), np.uint8)
@@ -68,6 +70,7 @@ class RectifyingExtractor:
             features=self._shutter.straighten(features, turning.rate_cam),
             T_predicted=T_predicted,
             turning=turning,
+            odometry=odometry,
         )
 
     def settle(self, view: View, fix: VisualFix, predictor: Predictor) -> tuple[View, VisualFix]:

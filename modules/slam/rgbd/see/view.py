@@ -27,7 +27,7 @@ class View:
     features: Features
     T_predicted: Transform  # T_local_base, before the image is used
     turning: Turning
-    odometry: OdometryPose | None = None
+    odometry: OdometryPose | None
 
     @property
     def shows_enough(self) -> bool:
