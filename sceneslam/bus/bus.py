@@ -89,10 +89,7 @@ class Bus:
         self.bus_us = array("d")
         self._policy, self._log = policy, log
         self._watch = Watch(
-            detector,
-            rig,
-            log,
-            scene_filter=policy.make_scene_filter(detector.scenes),
+            detector, rig, log, scene_filter=policy.make_scene_filter(detector.scenes)
         )
         self.detector_us = self._watch.spent_us  # time that each vote took
         self._reckoning = DeadReckoning(rig, policy.gate if policy.handover != "cold" else None)

@@ -81,12 +81,7 @@ class Estimator:
             self._log.add_fault(moment.stamp_ns, str(session.fault))
 
     def begin(
-        self,
-        runner: Runner,
-        since_ns: int | None,
-        *,
-        is_trial: bool,
-        from_ns: int | None = None,
+        self, runner: Runner, since_ns: int | None, *, is_trial: bool, from_ns: int | None = None
     ) -> Handover:
         """Begin to hand over to a module that has started.
 
@@ -100,12 +95,7 @@ class Estimator:
         if from_ns is not None:
             anchor = self._memory.after(from_ns - 1)[0]
         session = self._new_session(runner, anchor.bridge.copy())
-        return Handover(
-            session,
-            self._memory,
-            anchor=anchor,
-            pace=Pace(self._policy.catch_up),
-        )
+        return Handover(session, self._memory, anchor=anchor, pace=Pace(self._policy.catch_up))
 
     def accept(self, handover: Handover) -> None:
         """Make a module that has caught up the active one, and shut the old one down."""

@@ -141,11 +141,7 @@ class Handover:
                 session.bridge.copy(), given, by_velocity=True, T_prev_curr=motion
             )
         found = session.advance(
-            given,
-            by_velocity=True,
-            T_prev_curr=motion,
-            is_given=is_given,
-            witness=moment.witness,
+            given, by_velocity=True, T_prev_curr=motion, is_given=is_given, witness=moment.witness
         )
         if session.fault is not None:
             raise session.fault

@@ -96,10 +96,7 @@ class ModuleSession:
             self.hold.lose(observation.stamp_ns)
         is_silent = self.hold.status is not TrackingStatus.LOST
         T_map_base = self.predict(
-            self.bridge,
-            observation,
-            by_velocity=by_velocity or is_silent,
-            T_prev_curr=T_prev_curr,
+            self.bridge, observation, by_velocity=by_velocity or is_silent, T_prev_curr=T_prev_curr
         )
         return self._moment(observation, T_map_base, witness)
 
