@@ -82,11 +82,6 @@ class Inertia:
         T_now_next = se3.exp(self.velocity * np.repeat(self._kept_s(duration_s), 3))
         return replace(still(), T=T_now_next, variance=variance)
 
-    def anywhere(self, guess: Step, duration_s: float) -> Step:
-        """Return the motion of a robot whose velocity is unknown."""
-        variance = np.array([(UNKNOWN_VELOCITY[0] * duration_s) ** 2, guess.variance[1]])
-        return replace(guess, variance=np.maximum(variance, guess.variance))
-
     def wandered(self, duration_s: float) -> NDArray[np.float64]:
         """Return how far (2,) [m, rad] the robot may be from a prediction, as it has moved so far.
 

@@ -113,7 +113,7 @@ class MotionModel:
         motion = motion_of(
             wheels,
             guess,
-            self.inertia.anywhere(guess, duration_s),
+            duration_s=duration_s,
             lying=self.lying,
             is_measured=wheels is not None and self._since_wheels is not None,
         )

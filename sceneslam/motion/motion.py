@@ -105,24 +105,28 @@ def still() -> Step:
 def motion_of(
     wheels: Step | None,
     guess: Step,
-    anywhere: Step,
     *,
+    duration_s: float,
     lying: NDArray[np.float64],
     is_measured: bool,
 ) -> Motion:
     """Return the motion with distance and turn by the wheels, unless they are wrong or missing.
 
-    `lying` (2,): the probabilities of that. `guess` is by inertia; `anywhere` is what a robot of
-    unknown velocity does, the distance if neither wheels nor inertia are right.
+    `lying` (2,): the probabilities of that. `guess` is by inertia. If neither is right, the
+    distance is that of a robot whose velocity is unknown, in `duration_s`.
     """
     if wheels is None:
         distances, turns = [(guess, 1.0)], [(guess, 1.0)]
     else:
         distances, turns = (_ranked(wheels, guess, p) for p in lying.tolist())
+    reach = np.array([(UNKNOWN_VELOCITY[0] * duration_s) ** 2, 0.0])
+    anywhere = replace(guess, variance=np.maximum(reach, guess.variance))
     distances.append((anywhere, _RARE))
     best, *others = (
-        replace(
-            _motion(distance, turn, is_measured=is_measured),
+        Motion(
+            T_prev_curr=se3.from_parts(turn.T[:3, :3], distance.T[:3, 3]),
+            covariance=np.diag(np.repeat([distance.variance[0], turn.variance[1]], 3)),
+            is_measured=is_measured,
             is_guessed=(distance is not wheels, turn is not wheels),
             is_unknown=distance is anywhere,
             probability=max(p_distance * p_turn, _RARE),
@@ -137,12 +141,3 @@ def _ranked(wheels: Step, guess: Step, lying: float) -> list[tuple[Step, float]]
     """Return both sources with their probabilities, the one that is used first."""
     sources = [(wheels, 1.0 - lying), (guess, lying)]
     return sources[::-1] if lying >= BELIEVED else sources
-
-
-def _motion(distance: Step, turn: Step, *, is_measured: bool) -> Motion:
-    variance = np.repeat([distance.variance[0], turn.variance[1]], 3)
-    return Motion(
-        T_prev_curr=se3.from_parts(turn.T[:3, :3], distance.T[:3, 3]),
-        covariance=np.diag(variance),
-        is_measured=is_measured,
-    )
