@@ -1,7 +1,6 @@
 """Dead reckoning of motions that are known."""
 
 import numpy as np
-import pytest
 
 from sceneslam.interfaces import SlamModule
 from sceneslam.modules.slam.odometry import Odometry
@@ -58,13 +57,12 @@ def test_standing_still_adds_no_doubt():
     np.testing.assert_allclose(covariances[0], covariances[-1], atol=1e-12)
 
 
-@pytest.mark.parametrize("broken", [None, np.full((4, 4), np.nan)])
-def test_missing_odometry_is_lost_and_its_way_is_made_up_for(broken):
+def test_missing_odometry_is_lost_and_its_way_is_made_up_for():
     module = active()
     observations = arc(20)
     held = [module.track(observation) for observation in observations[:10]][-1]
     for observation in observations[10:15]:
-        lost = module.track(Observation(stamp_ns=observation.stamp_ns, T_odom_base=broken))
+        lost = module.track(Observation(stamp_ns=observation.stamp_ns, T_odom_base=None))
         assert lost.status is TrackingStatus.LOST
         np.testing.assert_array_equal(lost.T_local_base, held.T_local_base)
     back = module.track(observations[15])

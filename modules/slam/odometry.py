@@ -46,7 +46,7 @@ class Odometry(LocalModule):
         After a gap, the motion over the gap is that of odometry.
         """
         before, T_odom_base = self._T_odom_base, observation.T_odom_base
-        if T_odom_base is None or not np.isfinite(T_odom_base).all():
+        if T_odom_base is None:
             return self._answer(observation, TrackingStatus.LOST)
         if before is not None:
             self._move(se3.inverse(before) @ T_odom_base)

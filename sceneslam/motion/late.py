@@ -34,8 +34,6 @@ class Pipeline:
     def note(self, observation: Observation) -> None:
         """Record an observation that was given to the program."""
         T_odom_base = observation.T_odom_base
-        if T_odom_base is not None and not np.isfinite(T_odom_base).all():
-            T_odom_base = None
         self._waiting[observation.stamp_ns] = T_odom_base
         if self._first_ns is None:
             self._first_ns, self._T_odom_newest = observation.stamp_ns, T_odom_base

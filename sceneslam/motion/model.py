@@ -224,7 +224,7 @@ class MotionModel:
     def _take_odometry(self, observation: Observation, duration_s: float) -> Step | None:
         """Return the motion since the last odometry, None if it is missing now or was before."""
         self._silent_s += duration_s
-        T_before, T_odom_base = self._T_odom_base, _finite(observation.T_odom_base)
+        T_before, T_odom_base = self._T_odom_base, observation.T_odom_base
         if T_odom_base is None:
             if T_before is None:
                 self._since_wheels = None
@@ -262,7 +262,3 @@ class MotionModel:
             amounts=amounts,
             causes=np.array([forward_m, yaw_rad, 0.0]),
         )
-
-
-def _finite(T_odom_base: Transform | None) -> Transform | None:
-    return T_odom_base if T_odom_base is not None and np.isfinite(T_odom_base).all() else None
