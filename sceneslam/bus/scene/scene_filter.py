@@ -14,9 +14,9 @@ class ConfirmedScene:
     """A scene that the votes so far confirm."""
 
     stamp_ns: int  # of the vote that confirmed it
-    since_ns: int  # of the first vote that supports it
     scene: str
     previous: str | None
+    since_ns: int  # of the first vote that supports it
 
 
 class SceneFilter(Protocol):

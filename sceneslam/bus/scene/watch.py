@@ -6,7 +6,7 @@ import logging
 import math
 from array import array
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from numbers import Real
 from time import perf_counter_ns
 from typing import Any
@@ -36,13 +36,7 @@ def log_vote(
         }
     log.add("vote", vote.stamp_ns, scene=vote.scene, value=vote.value, **details)
     if confirmed is not None:
-        log.add(
-            "scene",
-            confirmed.stamp_ns,
-            scene=confirmed.scene,
-            previous=confirmed.previous,
-            since_ns=confirmed.since_ns,
-        )
+        log.add("scene", **asdict(confirmed))
 
 
 class Watch:
