@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
+from sceneslam.types.ranges import check_least
 
 
 @dataclass(slots=True, kw_only=True)
@@ -19,10 +19,7 @@ class PaceSettings:
     step_m: float  # the same number limits turns [rad]: landmarks are 1 m away or more
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not 0 <= value < float("inf"):
-                raise ConfigError(field.name, value, "0 or more")
+        check_least(0, period_s=self.period_s, step_m=self.step_m)
 
 
 class Pace:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sceneslam.bus.scene.scene_filter import ConfirmedScene
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import UNSURE, SceneVote
+from sceneslam.types.ranges import check_above
 
 
 @dataclass(slots=True, kw_only=True)
@@ -26,9 +27,7 @@ class BayesSettings:
     confirm_probability: float  # of a scene to be confirmed
 
     def __post_init__(self) -> None:
-        for name in ("mean_dwell_s", "correlation_s"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise ConfigError(name, getattr(self, name), "seconds above 0")
+        check_above(0, mean_dwell_s=self.mean_dwell_s, correlation_s=self.correlation_s)
         if not 0 < self.error_ratio < 1:
             raise ConfigError("error_ratio", self.error_ratio, "above 0 and below 1")
         if not 0.5 < self.confirm_probability < 1:
