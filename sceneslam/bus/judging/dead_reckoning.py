@@ -53,8 +53,9 @@ class DeadReckoning:
 
     def correct(self, observation: Observation, module: str) -> Observation:
         """Return the observation for a module, corrected by the calibration so far."""
-        turn = self._turn(observation)
-        if self._tilt is not None and turn is not None:
+        turn = None  # (3, 3) since the last observation, None without a gyro
+        if self._motion is not None and self._tilt is not None:
+            turn = self._motion.predict(observation).T_prev_curr[:3, :3]
             self.up_base = self._tilt.update(observation, turn)
         before, now = self._T_odom_base, observation.T_odom_base
         is_gap, self._is_gap = self._is_gap, now is None
@@ -106,12 +107,6 @@ class DeadReckoning:
         if known:
             log.add("calibration", stamp_ns, **known)
         self._scales, self._motion = {}, None
-
-    def _turn(self, observation: Observation) -> NDArray[np.float64] | None:
-        """Return the rotation (3, 3) since the last observation, None without a gyro."""
-        if self._motion is None:
-            return None
-        return self._motion.predict(observation).T_prev_curr[:3, :3]
 
     def _turned(self, T_prev_curr: Transform, turn: NDArray[np.float64]) -> Transform:
         """Return the odometry's motion with the gyro's rotation, or its yaw if that is biased."""
