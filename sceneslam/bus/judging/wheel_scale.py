@@ -71,20 +71,15 @@ class WheelScale:
         here = _here(hold, T_odom_base)
         if here is None:
             return  # the span goes on
-        mark, self._mark = self._mark, here
-        if mark is None or not here.continues(mark):
-            self._turned_rad = 0.0
-            return
-        odom_m = float(np.linalg.norm(_way(mark.T_odom_base, here.T_odom_base)))
-        if self._turned_rad > _TURN_MAX_RAD:
-            self._turned_rad = 0.0
-        elif odom_m < _SPAN_M:
-            self._mark = mark
-        else:
+        mark = self._mark
+        if mark is not None and here.continues(mark) and self._turned_rad <= _TURN_MAX_RAD:
+            odom_m = float(np.linalg.norm(_way(mark.T_odom_base, here.T_odom_base)))
+            if odom_m < _SPAN_M:
+                return
             way_m, variance_m2 = _measured(mark, here)
             missed_m = way_m - odom_m * (1.0 + self._error.ratio)
             self._error.learn(missed_m, odom_m, variance_m2 + _SLIP_M**2 * odom_m)
-            self._turned_rad = 0.0
+        self._mark, self._turned_rad = here, 0.0
 
 
 def _here(hold: Hold, T_odom_base: Transform | None) -> _Mark | None:
