@@ -207,13 +207,9 @@ class MotionModel:
 
     def stop(self) -> None:
         """Reset velocity and odometry: the base is no longer tracked."""
-        self.slow_down()
+        self.inertia.reset()
         self._forget()
         self._since_wheels, self._is_followed = None, False
-
-    def slow_down(self) -> None:
-        """Reset the velocity only."""
-        self.inertia.reset()
 
     def _forget(self) -> None:
         """Restart the comparison; odometry that is missing now has to restart, too."""

@@ -105,7 +105,7 @@ class Predictor:
         self.coast(prediction)
         if not prediction.is_measured:
             self.T_local_base = se3.from_parts(rotation, position)
-        self.model.slow_down()
+        self.model.inertia.reset()
         self.is_lost = True
 
     def bridge(

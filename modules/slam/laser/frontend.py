@@ -131,7 +131,7 @@ class FrontEnd:
             return self._distrust(predicted, predicted_then, motion, match, scan, surfaces)
         if self._is_lost or (is_known and not match.weighs_sources):
             self.motion.skip()  # a jump, also where the wheels missed it, tells no velocity
-            self.motion.slow_down()
+            self.motion.inertia.reset()
         else:
             self._teach(match, T_then_now, motion)
         self._doubt.add(match, priors)
