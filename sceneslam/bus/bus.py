@@ -165,7 +165,7 @@ class Bus:
 
     def candidate_left(self) -> bool:
         """Tell whether the scene has a module that has not been tried yet."""
-        return bool(self._candidates.left())
+        return bool(self._changeover.queue)
 
     def fallback_active(self) -> bool:
         """Tell whether a module other than the first choice runs, or will run again."""

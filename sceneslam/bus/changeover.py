@@ -70,10 +70,6 @@ class Candidates:
         """Note that a module is being tried."""
         self.tried |= {key}
 
-    def left(self) -> list[str]:
-        """Return the modules that were not tried and have not failed, in the table's order."""
-        return [key for key in self.of(self.scene) if key not in self.tried]
-
     def postpone(self, stamp_ns: int, *, is_in_vain: bool | None) -> None:
         """Delay the next trial of the first choice, for longer after each trial that failed.
 
@@ -116,7 +112,7 @@ class Changeover:
         self._now: Situation  # at the decision that is carried out
         self._verdict: Decision
         self._since_ns: int | None  # when the scene that calls for it began
-        self._queue: list[str] = []  # its candidates that were not tried yet
+        self.queue: list[str] = []  # its candidates that were not tried yet
         self._attempt: _Attempt | None = None
         self._trial: _Attempt | None = None
 
@@ -137,13 +133,13 @@ class Changeover:
         if verdict.reason != "return":
             self._end_trial()
         self._now, self._verdict, self._since_ns = now, verdict, since_ns
-        self._queue = list(verdict.to)
+        self.queue = list(verdict.to)
 
     def go_on(self, stamp_ns: int) -> Outcome | None:
         """Advance the change by one candidate or one observation; return None until it is over."""
-        while self._attempt is not None or self._queue:
+        while self._attempt is not None or self.queue:
             if self._attempt is None:
-                runner = self._runners[self._queue.pop(0)]
+                runner = self._runners[self.queue.pop(0)]
                 from_ns = None
                 if runner is self._estimator.active:
                     from_ns = self._estimator.session.hold.adrift_since_ns
@@ -278,7 +274,7 @@ class Changeover:
         """Tell whether there is an alternative to a lost module; the paper has no such check."""
         if self._policy.handover == "cold":
             return False
-        return bool(self._queue) or self._estimator.session.hold.is_held
+        return bool(self.queue) or self._estimator.session.hold.is_held
 
     def _refuse(self, runner: Runner, stamp_ns: int, why: str) -> bool:
         runner.retire()
