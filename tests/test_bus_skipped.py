@@ -69,8 +69,8 @@ def trials(modules, feed):
     """Return how much each trial kept at its observations."""
     kept, try_on = [], Changeover.try_on
 
-    def spy(changeover, stamp_ns):
-        try_on(changeover, stamp_ns)
+    def spy(changeover):
+        try_on(changeover)
         trial = changeover._trial
         if trial is not None and trial.handover is not None:
             kept.append(len(trial.handover.trail) + len(trial.handover.tracked))

@@ -203,10 +203,10 @@ class Bus:
         return Outcome.SUCCESS
 
     def _change_over(self, observation: Observation) -> Outcome | None:
-        return self._changeover.go_on(observation.stamp_ns)
+        return self._changeover.go_on()
 
     def _decide(self, observation: Observation) -> Outcome | None:
-        self._changeover.try_on(observation.stamp_ns)
+        self._changeover.try_on()
         situation = self._look(observation)
         verdict = decide(self._policy, situation)
         if situation != self._situation or verdict != GO_ON:  # more than its time changed
@@ -214,9 +214,9 @@ class Bus:
         self._situation = situation
         if verdict.action is Action.TELL:
             self._candidates.serve(situation.scene, situation.choices[1:], 0)
-            self._changeover.tell_scene(observation.stamp_ns)
+            self._changeover.tell_scene()
         elif verdict.action is Action.TRY:
-            self._changeover.begin_trial(verdict.to[0], observation.stamp_ns)
+            self._changeover.begin_trial(verdict.to[0])
         elif verdict.action is Action.SWITCH:
             self._begin(situation, verdict)
             return Outcome.FAILURE

@@ -135,7 +135,7 @@ class Changeover:
         self._now, self._verdict, self._since_ns = now, verdict, since_ns
         self.queue = list(verdict.to)
 
-    def go_on(self, stamp_ns: int) -> Outcome | None:
+    def go_on(self) -> Outcome | None:
         """Advance the change by one candidate or one observation; return None until it is over."""
         while self._attempt is not None or self.queue:
             if self._attempt is None:
@@ -147,9 +147,9 @@ class Changeover:
                     if not runner.is_failed and not is_adrift:
                         break  # the active module stays, as the fallback
                     self._estimator.retire()  # before it is started again
-                self._attempt = self._start(runner, stamp_ns)
+                self._attempt = self._start(runner)
                 self._attempt.from_ns = from_ns
-            is_accepted = self._lead(self._attempt, stamp_ns)
+            is_accepted = self._lead(self._attempt)
             if is_accepted is None:
                 return None
             key, self._attempt = self._attempt.runner.key, None
@@ -163,22 +163,22 @@ class Changeover:
         if active is not None and active.is_failed:
             self._estimator.retire()
         elif active is not None and self._verdict.reason == "scene":
-            self.tell_scene(stamp_ns)
+            self.tell_scene()
         return Outcome.FAILURE
 
-    def tell_scene(self, stamp_ns: int) -> None:
+    def tell_scene(self) -> None:
         """Inform the active module, which stays, of the scene that it serves now."""
         assert self._estimator.active is not None
         try:
             self._estimator.active.set_scene(self._candidates.scene)
         except ModuleError as error:
-            self._log.add_fault(stamp_ns, str(error))
+            self._log.add_fault(self._estimator.now_ns, str(error))
 
-    def begin_trial(self, key: str, stamp_ns: int) -> None:
+    def begin_trial(self, key: str) -> None:
         """Run the scene's first choice on standby beside the fallback; its poses are not used."""
-        ready_ns = self._ready_ns(key, stamp_ns)
+        ready_ns = self._ready_ns(key)
         self._trial = _Attempt(runner=self._runners[key], ready_ns=ready_ns, is_trial=True)
-        self.try_on(stamp_ns)
+        self.try_on()
 
     def submit(self, observation: Observation) -> None:
         """Submit an observation to the module on trial, which runs beside the active one."""
@@ -190,7 +190,7 @@ class Changeover:
             self._log.add_fault(observation.stamp_ns, str(error))
             self._end_trial()
 
-    def try_on(self, stamp_ns: int) -> None:
+    def try_on(self) -> None:
         """Feed the module on trial until it fails, stays lost or is the first choice no longer."""
         trial = self._trial
         if trial is None:
@@ -201,16 +201,16 @@ class Changeover:
             self._trial = None
             return
         try:
-            handover = self._caught_up(trial, stamp_ns)
+            handover = self._caught_up(trial)
         except ModuleError as error:
-            self._log.add_fault(stamp_ns, str(error))
+            self._log.add_fault(self._estimator.now_ns, str(error))
             self._end_trial()
             return
         if handover is None:
             return
         handover.forget()
-        is_given_time = stamp_ns - trial.ready_ns < self._policy.retry_s * 1e9  # it may need motion
-        if (handover.is_lost or handover.is_silent) and not is_given_time:
+        waited_ns = self._estimator.now_ns - trial.ready_ns  # it may need motion
+        if (handover.is_lost or handover.is_silent) and waited_ns >= self._policy.retry_s * 1e9:
             self._end_trial()
 
     def close(self) -> None:
@@ -220,42 +220,42 @@ class Changeover:
             self._attempt.runner.retire()
             self._attempt = None
 
-    def _start(self, runner: Runner, stamp_ns: int) -> _Attempt:
+    def _start(self, runner: Runner) -> _Attempt:
         """Begin to start a module, which may take seconds."""
         self._candidates.use(runner.key)
         if self._trial is not None and self._trial.runner is runner:
             attempt, self._trial = self._trial, None
             return attempt
-        ready_ns = self._ready_ns(runner.key, stamp_ns)
-        if self._policy.handover == "cold" and ready_ns > stamp_ns:
+        ready_ns = self._ready_ns(runner.key)
+        if self._policy.handover == "cold" and ready_ns > self._estimator.now_ns:
             self._estimator.retire()  # the paper shuts a module down before it starts the next
         return _Attempt(runner=runner, ready_ns=ready_ns)
 
-    def _lead(self, attempt: _Attempt, stamp_ns: int) -> bool | None:
+    def _lead(self, attempt: _Attempt) -> bool | None:
         """Advance one candidate; return whether it took over, None while undecided."""
         try:
-            handover = self._caught_up(attempt, stamp_ns)
+            handover = self._caught_up(attempt)
             if handover is not None and attempt.is_trial:
                 handover.settle()
         except ModuleError as error:
-            self._log.add_fault(stamp_ns, str(error))
-            return self._refuse(attempt.runner, stamp_ns, "failed")
+            self._log.add_fault(self._estimator.now_ns, str(error))
+            return self._refuse(attempt.runner, "failed")
         if handover is None:
             return None
         if (handover.is_lost or handover.is_silent) and self._can_refuse():
             why = "lost" if handover.is_lost else "silent"
-            return self._refuse(attempt.runner, stamp_ns, why)
+            return self._refuse(attempt.runner, why)
         self._estimator.accept(handover)
         is_in_vain = None
         if self._now.active and self._now.health is not Health.HELD:  # what it leaves has ended
             is_in_vain = self._now.held_ns < round(self._policy.confirm_window_s * 1e9)
-        self._candidates.postpone(stamp_ns, is_in_vain=is_in_vain)
-        self._log_choice("decision", stamp_ns, attempt.runner.key)
+        self._candidates.postpone(self._estimator.now_ns, is_in_vain=is_in_vain)
+        self._log_choice("decision", attempt.runner.key)
         return True
 
-    def _caught_up(self, attempt: _Attempt, stamp_ns: int) -> Handover | None:
+    def _caught_up(self, attempt: _Attempt) -> Handover | None:
         """Start or advance a candidate; return its hand-over once it has caught up."""
-        if stamp_ns < attempt.ready_ns:
+        if self._estimator.now_ns < attempt.ready_ns:
             return None
         runner, is_trial = attempt.runner, attempt.is_trial
         if not attempt.is_begun:
@@ -276,16 +276,16 @@ class Changeover:
             return False
         return bool(self.queue) or self._estimator.session.hold.is_held
 
-    def _refuse(self, runner: Runner, stamp_ns: int, why: str) -> bool:
+    def _refuse(self, runner: Runner, why: str) -> bool:
         runner.retire()
-        self._candidates.postpone(stamp_ns, is_in_vain=True)
-        self._log_choice("refused", stamp_ns, runner.key, why=why)
+        self._candidates.postpone(self._estimator.now_ns, is_in_vain=True)
+        self._log_choice("refused", runner.key, why=why)
         return False
 
-    def _log_choice(self, event: str, stamp_ns: int, key: str, **more: str) -> None:
+    def _log_choice(self, event: str, key: str, **more: str) -> None:
         self._log.add(
             event,
-            stamp_ns,
+            self._estimator.now_ns,
             scene=self._candidates.scene,
             **{"from": self._now.active or None, "to": key},
             reason=self._verdict.reason,
@@ -299,11 +299,12 @@ class Changeover:
             self._candidates.postpone(self._estimator.now_ns, is_in_vain=True)
         self._trial = None
 
-    def _ready_ns(self, key: str, stamp_ns: int) -> int:
+    def _ready_ns(self, key: str) -> int:
         """Return when a module that is started now can take its first observation."""
+        now_ns = self._estimator.now_ns
         if self._run_began_ns is None:
-            self._run_began_ns = stamp_ns
+            self._run_began_ns = now_ns
         startup_ns = round(self._policy.startup_s.get(key, 0.0) * 1e9)
         if self._policy.handover == "warm":
-            return max(stamp_ns, self._run_began_ns + startup_ns)  # loaded when the run began
-        return stamp_ns + startup_ns
+            return max(now_ns, self._run_began_ns + startup_ns)  # loaded when the run began
+        return now_ns + startup_ns
