@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sceneslam.motion.motion import BELIEVED, Step, still
 from sceneslam.motion.trust import NoiseRatio, student_cost
 from sceneslam.types import se3
-from sceneslam.types.covariance import UNKNOWN_VELOCITY, updated
+from sceneslam.types.covariance import UNKNOWN_VELOCITY, Matrix, updated
 
 _ACCELERATION = np.array([1.5, 4.0])  # m/s^2, rad/s^2: largest usual of a robot
 _USUAL = {False: 1.0, True: 1 / 3}  # of that: deviation of the acceleration, by: has wheels
@@ -30,8 +30,6 @@ _STEP = np.array([1e-4, 1e-4])  # m, rad: least standard deviation of a predicte
 _FASTEST = np.array([25.0, 20.0])  # m/s, rad/s: deviation of a velocity that was never measured
 _UNUSED = 1e6  # m^2, rad^2: variance of what is not used
 _MISSED = (0.05, 0.1)  # m, rad: standard deviation of a predicted motion before it is learnt
-
-Matrix = NDArray[np.float64]
 
 
 @dataclass(slots=True)

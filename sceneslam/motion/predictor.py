@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sceneslam.motion.model import MotionModel
 from sceneslam.motion.motion import Motion
 from sceneslam.types import se3
-from sceneslam.types.covariance import covariance_of
+from sceneslam.types.covariance import Matrix, covariance_of
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
-
-Matrix = NDArray[np.float64]
 
 _FIRST_DEVIATION = 1e-4  # m and rad: of the first pose, which defines `local`
 _UNMEASURED = 0.01  # 1/m^2, 1/rad^2: information in directions that a sensor does not measure

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-Matrix = NDArray[np.float64]
+from sceneslam.types.covariance import Matrix
 
 _DOUBT = 10.0  # weight of the prior of a noise, in comparisons
 _MEMORY = 200.0  # comparisons in its posterior, about
