@@ -84,10 +84,8 @@ class MotionModel:
         for lie in self._lies:
             lie.wait(duration_s)
         gap = self._gap
-        wheels, guess = (
-            self._take_odometry(observation, duration_s),
-            self.inertia.predict(duration_s),
-        )
+        wheels = self._take_odometry(observation, duration_s)
+        guess = self.inertia.predict(duration_s)
         turn = self.turns.by_gyro(observation, duration_s)
         self.is_turn_measured = turn is not None
         if turn is not None:
