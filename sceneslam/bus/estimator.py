@@ -35,7 +35,7 @@ class Estimator:
         self._policy, self._rig, self._back_end, self._log = policy, rig, back_end, log
         # The active module's; the paper's (cold) hand-over uses its last pose and nothing after it.
         self.session = self._new_session(None, Bridge(is_active=policy.handover != "cold"))
-        self._memory = ObservationBuffer(
+        self._memory = ObservationBuffer(  # of the newest observation alone, unless it rewinds
             span_s=policy.buffer_s if policy.handover == "rewind" else 0.0,
             limit_mb=policy.buffer_mb,
             keeps_sensors=has_choice,
@@ -89,9 +89,7 @@ class Estimator:
         now, whatever the kind of hand-over. `from_ns`: the first observation that it gets, where
         none before it is of use.
         """
-        anchor = self._memory.newest
-        if self._policy.handover == "rewind" and not is_trial:
-            anchor = self._memory.anchor(since_ns)
+        anchor = self._memory.newest if is_trial else self._memory.anchor(since_ns)
         if from_ns is not None:
             anchor = self._memory.after(from_ns - 1)[0]
         session = self._new_session(runner, anchor.bridge.copy())
