@@ -156,7 +156,7 @@ class Handover:
                 self._bend(session.tracking, T_bridged_base)
             self._spared_ns, self._given_ns = [], moment.stamp_ns
         if moment is not self.anchor or moment.module == BRIDGED:
-            self.trail.append(replace(found, observation=moment.observation))
+            self.trail.append(found)
         if session.hold.suspect_since_ns is not None:
             self._distrust(session.hold.suspect_since_ns)
 
@@ -183,10 +183,10 @@ class Handover:
         """
         xi, given_s = se3.log(T_bridged_base), (tracking.stamp_ns - self._given_ns) / 1e9
         first = bisect_right(self.trail, self._given_ns, key=lambda each: each.stamp_ns)
-        for index, moment in enumerate(self.trail[first:], first):
+        for moment in self.trail[first:]:
             share = (moment.stamp_ns - self._given_ns) / 1e9 / given_s
             bent = moment.bridge.follow(moment.observation, se3.exp(share * xi))
-            moment = self.trail[index] = replace(moment, T_map_base=bent)
+            moment.T_map_base = bent
             if moment.stamp_ns in self._spared_ns:
                 assert self.runner.T_map_local is not None
                 T_local_base = se3.inverse(self.runner.T_map_local) @ bent
