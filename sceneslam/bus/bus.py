@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from time import perf_counter_ns
 
 from statemachine import State, StateMachine
@@ -87,12 +88,14 @@ class Bus:
             for key, module in modules.items()
         }
         self.bus_us = array("d")
+        if policy.handover == "cold":
+            policy = replace(policy, gate=None)  # the paper has no such check
         self._policy, self._log = policy, log
         self._watch = Watch(
             detector, rig, log, scene_filter=policy.make_scene_filter(detector.scenes)
         )
         self.detector_us = self._watch.spent_us  # time that each vote took
-        self._reckoning = DeadReckoning(rig, policy.gate if policy.handover != "cold" else None)
+        self._reckoning = DeadReckoning(rig, policy.gate)
         self._estimator = Estimator(
             policy=policy, rig=rig, back_end=back_end, log=log, has_choice=len(modules) > 1
         )

@@ -253,7 +253,7 @@ class Estimator:
                 self._back_end.close_session(session, layers, legacy.trajectory)
 
     def _new_session(self, runner: Runner | None, bridge: Bridge) -> ModuleSession:
-        settings = self._policy.gate if self._policy.handover != "cold" else None
+        settings = self._policy.gate
         gate = None if settings is None else Gate(settings, self._rig.wheels)
         hold = Hold(patience_ns=round(self._policy.lost_patience_s * 1e9), gate=gate)
         return ModuleSession(runner, hold, bridge)
