@@ -11,7 +11,7 @@ from fakes import PERIOD_NS, RIG, ExactModule, observation
 
 from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.changeover import Candidates
-from sceneslam.bus.judging.gate import Gate, GateSettings, Judgement
+from sceneslam.bus.judging.gate import NOBODY, Gate, GateSettings, Judgement
 from sceneslam.bus.judging.hold import Health, Hold
 from sceneslam.bus.judging.recent import CovarianceMonitor, RecentMedian
 from sceneslam.bus.judging.runner import Runner
@@ -140,8 +140,8 @@ def test_a_sensor_is_silent_after_two_of_its_periods():
     def asked(*seen_ns, silent_ns):
         hold = Hold(patience_ns=3 * S, gate=None)
         for stamp_ns in seen_ns:
-            hold.ask(Seen(), replace(observation(0), stamp_ns=stamp_ns))
-        hold.ask(Seen(), replace(observation(0), image_bgr=None, stamp_ns=silent_ns))
+            hold.ask(Seen(), replace(observation(0), stamp_ns=stamp_ns), NOBODY)
+        hold.ask(Seen(), replace(observation(0), image_bgr=None, stamp_ns=silent_ns), NOBODY)
         return hold
 
     held = asked(0, S // 10, silent_ns=3 * S // 10)
@@ -166,13 +166,13 @@ def test_a_failed_module_has_answered_no_later_observation(method):
     runner.start(RIG, "Bright")
     setattr(module, method, lambda _: hostile.throw("Exception"))
     session = ModuleSession(runner, hold, Bridge(is_active=True))
-    session.advance(observation(0), by_velocity=True)
+    session.advance(observation(0), by_velocity=True, witness=NOBODY)
     if method == "set_scene":
         with pytest.raises(ModuleError):
             runner.set_scene("Dark")
     assert session.health is Health.FAILED
     hold.ask = lambda *_: pytest.fail("it was asked")
-    session.advance(observation(1), by_velocity=True)
+    session.advance(observation(1), by_velocity=True, witness=NOBODY)
     assert session.tracking is None and hold.tracking is None
     assert hold.answer is None and not hold.is_trusted
 

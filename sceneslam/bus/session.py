@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.bus.bridge import Bridge
-from sceneslam.bus.judging.gate import NOBODY, Witness
+from sceneslam.bus.judging.gate import Witness
 from sceneslam.bus.judging.hold import Health, Hold
 from sceneslam.bus.judging.runner import Runner
 from sceneslam.bus.observation_buffer import BufferedObservation
@@ -67,9 +67,9 @@ class ModuleSession:
         observation: Observation,
         *,
         by_velocity: bool,
+        witness: Witness,
         T_prev_curr: Transform | None = None,
         is_given: bool = True,
-        witness: Witness = NOBODY,
     ) -> BufferedObservation:
         """Return the observation with its pose: the module's, or a bridged one.
 

@@ -71,9 +71,7 @@ class Hold:
             return Health.SUSPECT
         return Health.LOST if self.status is TrackingStatus.LOST else Health.SILENT
 
-    def ask(
-        self, runner: Runner, observation: Observation, witness: Witness = NOBODY
-    ) -> Tracking | None:
+    def ask(self, runner: Runner, observation: Observation, witness: Witness) -> Tracking | None:
         """Return a module's answer if its pose may be used; raises ModuleError as the runner."""
         self.is_trusted, self.answer, self.tracking = False, None, None
         if not runner.can_use(observation):
