@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-_OUTLIER = 3.0  # standard deviations: larger errors do not come from the tyres
+OUTLIER = 3.0  # standard deviations: larger errors are not systematic
 
 
 @dataclass(slots=True)
@@ -32,7 +32,7 @@ class DistanceError:
         """
         self.variance += self.drift**2
         innovation_m2 = self.variance * amount**2 + variance_m2
-        limit_m = _OUTLIER * math.sqrt(innovation_m2)
+        limit_m = OUTLIER * math.sqrt(innovation_m2)
         gain = self.variance * amount / innovation_m2
         self.ratio += gain * min(max(missed_m, -limit_m), limit_m)
         self.variance *= 1.0 - gain * amount

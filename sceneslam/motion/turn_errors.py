@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.motion.distance_error import OUTLIER
 from sceneslam.types.observation import Observation
 
 # Standard deviations before the first measurement: unequal wheels cause an error per metre, a wrong
 # wheel base an error per radian.
 _PER_METRE_RAD, _PER_RADIAN = 0.05, 0.05
 _DRIFT = 1e-3  # growth of a deviation per comparison, as a share of the first: tyres wear
-_OUTLIER = 3.0  # standard deviations: larger errors have other causes
 _WINDOW_S = 0.5  # over which the gyro is compared with the wheels
 _REST_RAD = 5e-4  # largest turn of a robot at rest, over a window
 
@@ -67,7 +67,7 @@ class TurnErrors:
     def learn(self, missed_rad: float, causes: NDArray[np.float64], variance: float) -> None:
         """Update by the error of a turn against a measured one; `causes` (3,) [m, rad, s]."""
         spread, innovation = self._spread(causes, variance)
-        limit = _OUTLIER * math.sqrt(innovation)
+        limit = OUTLIER * math.sqrt(innovation)
         self._update(min(max(missed_rad, -limit), limit), causes, spread / innovation)
 
     def compare(
@@ -95,11 +95,11 @@ class TurnErrors:
         self._window = _Window()
         noise = _REST_RAD**2 if window.is_rest else window.variance
         spread, innovation = self._spread(window.causes, noise)
-        if abs(window.missed_rad) > _OUTLIER * math.sqrt(innovation):
+        if abs(window.missed_rad) > OUTLIER * math.sqrt(innovation):
             return  # a wheel slips, or the robot is carried
         self._update(window.missed_rad, window.causes, spread / innovation)
         level = window.level_rad / window.duration_s
-        if window.is_rest and np.abs(level).max() <= _OUTLIER * self.gyro_bias_radps:
+        if window.is_rest and np.abs(level).max() <= OUTLIER * self.gyro_bias_radps:
             self._rests = min(self._rests + 1.0, 64.0)
             self._level_radps = self._level_radps + level / self._rests
 
