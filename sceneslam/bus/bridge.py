@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.motion.motion import KEPT_S
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
 from sceneslam.types.se3 import Transform
-
-_VELOCITY_NS = 500_000_000  # a robot without measurements is assumed to keep its velocity so long
 
 
 class Bridge:
@@ -95,7 +94,7 @@ class Bridge:
         return self.T_map_base
 
     def _is_recent(self, stamp_ns: int) -> bool:
-        return self._known is not None and stamp_ns - self._known[0] <= _VELOCITY_NS
+        return self._known is not None and self.unknown_s(stamp_ns) <= KEPT_S
 
     def _at_constant_velocity(self, elapsed_ns: int) -> Transform:
         """Return the motion in `elapsed_ns` at the velocity of the last two measured poses."""

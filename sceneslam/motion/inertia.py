@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.motion.motion import BELIEVED, Step, still
+from sceneslam.motion.motion import BELIEVED, KEPT_S, Step, still
 from sceneslam.motion.trust import NoiseRatio, student_cost
 from sceneslam.types import se3
 from sceneslam.types.covariance import UNKNOWN_VELOCITY, Matrix, updated
@@ -25,7 +25,6 @@ _USUAL = {False: 1.0, True: 1 / 3}  # of that: deviation of the acceleration, by
 _LASTS_S = 0.5, 20.0  # shortest and longest time constant of a velocity; it begins with the first
 _CHANGED = np.array([0.1, 0.1]) ** 2  # (m/s)^2, (rad/s)^2: weight of that beginning
 _JUMP = 3.0  # times the acceleration: a larger change of velocity is a jump
-_KEPT_S = 0.5  # for so long an unmeasured velocity is kept as it is
 _STEP = np.array([1e-4, 1e-4])  # m, rad: least standard deviation of a predicted step
 _FASTEST = np.array([25.0, 20.0])  # m/s, rad/s: deviation of a velocity that was never measured
 _UNUSED = 1e6  # m^2, rad^2: variance of what is not used
@@ -66,7 +65,7 @@ class Inertia:
         """
         lasts_s = np.minimum(self._lasts_s, np.clip(self._measured_s, *_LASTS_S))
         kept_s = -lasts_s * np.expm1(-duration_s / lasts_s)
-        return np.asarray(np.maximum(kept_s, min(duration_s, _KEPT_S)))
+        return np.asarray(np.maximum(kept_s, min(duration_s, KEPT_S)))
 
     def reset(self) -> None:
         """Reset the velocity."""

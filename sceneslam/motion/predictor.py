@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sceneslam.motion.model import MotionModel
-from sceneslam.motion.motion import Motion
+from sceneslam.motion.motion import KEPT_S, Motion
 from sceneslam.types import se3
 from sceneslam.types.covariance import Matrix, covariance_of
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
@@ -16,7 +16,6 @@ from sceneslam.types.se3 import Transform
 
 _FIRST_DEVIATION = 1e-4  # m and rad: of the first pose, which defines `local`
 _UNMEASURED = 0.01  # 1/m^2, 1/rad^2: information in directions that a sensor does not measure
-_COAST_S = 0.5  # after this time without a measurement a predicted pose is lost
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,7 +65,7 @@ class Predictor:
 
     def is_long_unmeasured(self, observation: Observation) -> bool:
         """Tell whether the last measured pose is so old that a predicted one is lost."""
-        return self.unmeasured_s(observation) > _COAST_S
+        return self.unmeasured_s(observation) > KEPT_S
 
     def measure(
         self,
