@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+_log = logging.getLogger(__name__)
 _SHOWN = 400  # characters of a value in a message
 
 
@@ -42,3 +47,16 @@ def text_of(error: BaseException) -> str:
     except Exception:
         return kind
     return f"{kind}: {said}" if said else kind
+
+
+@contextmanager
+def calling(what: str) -> Iterator[None]:
+    """Raise any exception of a plug-in, which is called within, as ModuleError; Ctrl-C passes."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        sentence = f"{what}: {text_of(error)}"
+        _log.info(sentence, exc_info=error)
+        raise ModuleError(sentence) from error

@@ -13,7 +13,7 @@ from time import perf_counter_ns
 
 from sceneslam.bus.judging.answers import checked_layers, checked_tracking, checked_trajectory
 from sceneslam.interfaces import Concurrent, Restartable, SlamModule
-from sceneslam.types.errors import ModuleError, text_of
+from sceneslam.types.errors import ModuleError, calling
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking
 from sceneslam.types.rig import Rig, Sensor
@@ -191,7 +191,7 @@ class Runner:
     def _asking(self, what: str) -> Iterator[None]:
         """Record a failure before it is raised again."""
         try:
-            with self._calling(what):
+            with calling(f"slam.{self.key} {what}"):
                 yield
         except ModuleError:
             self.is_failed = True
@@ -201,7 +201,7 @@ class Runner:
     def _ask_restartable(self, ask: Callable[[Restartable], object]) -> bool:
         """Return an answer of a failed module; one that raises is not started again."""
         try:
-            with self._calling("could not tell whether it can be started again"):
+            with calling(f"slam.{self.key} could not tell whether it can be started again"):
                 module = self._module
                 return self._may_restart and isinstance(module, Restartable) and bool(ask(module))
         except ModuleError as error:
@@ -213,23 +213,11 @@ class Runner:
     def _parting(self, what: str, lost: list[str]) -> Iterator[None]:
         """Continue without a result that a module cannot give; add its description to `lost`."""
         try:
-            with self._calling(what):
+            with calling(f"slam.{self.key} {what}"):
                 yield
         except ModuleError as error:
             _log.warning(str(error))
             lost.append(str(error))
-
-    @contextmanager
-    def _calling(self, what: str) -> Iterator[None]:
-        """Turn any exception of a call, but Ctrl-C, into a ModuleError."""
-        try:
-            yield
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:
-            sentence = f"slam.{self.key} {what}: {text_of(error)}"
-            _log.info(sentence, exc_info=error)
-            raise ModuleError(sentence) from error
 
     @contextmanager
     def _timed(self) -> Iterator[None]:

@@ -14,7 +14,7 @@ from typing import Any
 from sceneslam.bus.scene.scene_filter import ConfirmedScene, SceneFilter
 from sceneslam.interfaces import Detector
 from sceneslam.storage.events import EventLog
-from sceneslam.types.errors import ModuleError, text_of
+from sceneslam.types.errors import ModuleError, calling
 from sceneslam.types.observation import UNSURE, Observation, SceneVote
 from sceneslam.types.rig import Rig
 
@@ -50,10 +50,8 @@ class Watch:
         self.confirmed: ConfirmedScene | None = None  # last, None before the first
         self._detector, self._log = detector, log
         self._filter = scene_filter
-        try:
+        with calling("detector could not be activated"):
             detector.activate(rig)
-        except Exception as error:
-            raise ModuleError(f"detector could not be activated: {text_of(error)}") from error
 
     def look(self, observation: Observation) -> None:
         """Get a vote for the observation; log it and the scene that it confirms."""
@@ -61,14 +59,12 @@ class Watch:
         vote: SceneVote | None = None
         try:
             if self.is_working:
-                vote = self._checked(self._detector.get_scene(observation), observation.stamp_ns)
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:
+                with calling("detector failed while voting"):
+                    found = self._detector.get_scene(observation)
+                    vote = self._checked(found, observation.stamp_ns)
+        except ModuleError as error:
             self.is_working = False
-            self._log.add_fault(
-                observation.stamp_ns, f"detector failed while voting: {text_of(error)}"
-            )
+            self._log.add_fault(observation.stamp_ns, str(error))
         self.spent_us.append((perf_counter_ns() - began_ns) / 1e3)
         if vote is None:
             return
@@ -79,11 +75,10 @@ class Watch:
     def close(self) -> None:
         """Shut the detector down. May be called twice."""
         try:
-            self._detector.shutdown()
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:
-            _log.warning("the detector could not be shut down: %s", text_of(error))
+            with calling("the detector could not be shut down"):
+                self._detector.shutdown()
+        except ModuleError as error:
+            _log.warning(str(error))
 
     def _checked(self, vote: object, stamp_ns: int) -> SceneVote:
         """Return a vote at a stamp for a known scene; raises TypeError or ValueError."""
