@@ -18,7 +18,7 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 
 _TRIAL_NS = 1_000_000_000  # the first choice tracks this long on standby before it takes over again
-_DOUBLINGS = 3  # how often the time until the first choice is tried again doubles
+_DOUBLINGS = 3  # of the time until the first choice is tried again: from `retry_s` of 2 s to 16 s
 
 
 class Outcome(Enum):

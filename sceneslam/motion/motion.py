@@ -12,7 +12,9 @@ from sceneslam.types import se3
 from sceneslam.types.covariance import UNKNOWN_VELOCITY
 from sceneslam.types.se3 import Transform
 
-KEPT_S = 0.5  # for so long a velocity that nothing measures is kept as it is
+# For so long a velocity that nothing measures is kept as it is; that of a camera in a hand lasts
+# 0.4 s or more (experiments/liars/README.md).
+KEPT_S = 0.5
 BELIEVED = 0.5  # wheels are not used if they are wrong with this probability
 _CERTAIN = 100.0  # nats: more is the same, and exp(710) is no number
 _RARE = 0.003  # least probability of an alternative: one scan in 300

@@ -17,6 +17,7 @@ _PER_METRE_RAD, _PER_RADIAN = 0.05, 0.05
 _DRIFT = 1e-3  # growth of a deviation per comparison, as a share of the first: tyres wear
 _WINDOW_S = 0.5  # over which the gyro is compared with the wheels
 _REST_RAD = 5e-4  # largest turn of a robot at rest, over a window
+_RESTS_MAX = 64.0  # windows at rest over which the bias is averaged: 32 s
 
 
 @dataclass(slots=True)
@@ -100,7 +101,7 @@ class TurnErrors:
         self._update(window.missed_rad, window.causes, spread / innovation)
         level = window.level_rad / window.duration_s
         if window.is_rest and np.abs(level).max() <= OUTLIER * self.gyro_bias_radps:
-            self._rests = min(self._rests + 1.0, 64.0)
+            self._rests = min(self._rests + 1.0, _RESTS_MAX)
             self._level_radps = self._level_radps + level / self._rests
 
     def _spread(

@@ -59,7 +59,8 @@ class Judgement:
     wheels_jumped: bool = False  # then: their velocity changed as no robot's can
 
 
-# Motions are compared over each: a jump shows in the shorter, a slow slide in the longer.
+# Motions are compared over each: a jump shows in the shorter, a slow slide in the longer
+# (experiments/openloris.md).
 _HORIZONS_NS = (1_000_000_000, 5_000_000_000)
 _PROBATION_NS = 1_000_000_000  # a module is trusted after agreeing over a whole horizon
 # Any two motions differ by this: sensor clocks 0.05 s apart at 0.6 m/s and 20 deg/s.

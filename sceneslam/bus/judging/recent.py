@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-_UNUSUAL = 2.0  # times the usual standard deviation
+# Times the usual standard deviation. white_wall, five seeds: 0.31 cm at 1.5, 0.30 at 2, 0.46 at 3.
+_UNUSUAL = 2.0
 _KEPT = 300  # poses in the median: 10 s at 30 Hz, longer than it takes to reach a wall
 
 

@@ -22,7 +22,8 @@ from sceneslam.types.se3 import Transform
 _DRIFT = 0.002  # standard deviation of the change between spans: tyres wear, floors change
 _SPAN_M = 0.5  # distance between two poses that are compared
 _TURN_MAX_RAD = 1.0  # between them: wheels that turn it 2 % too far shorten the chord by 0.2 %
-_SLIP_M = 0.011  # standard deviation of the wheels' slip over 1 m; grows with the square root
+# Standard deviation of the wheels' slip over 1 m, 1.5 % over a span; grows with the square root.
+_SLIP_M = 0.011
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
