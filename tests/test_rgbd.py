@@ -176,6 +176,8 @@ def test_arrays_of_the_wrong_size_and_a_rig_without_camera_are_refused():
     small = replace(camera_only(0), image_bgr=np.zeros((24, 32, 3), np.uint8))
     with pytest.raises(InputError, match="image_bgr"):
         module.track(small)
+    with pytest.raises(InputError, match=r"image_bgr: expected \(.*, 3\)"):
+        module.track(replace(camera_only(0), image_bgr=camera_only(0).image_bgr[..., 0]))
     with pytest.raises(InputError, match="depth_m"):
         module.track(replace(camera_only(0), depth_m=np.ones((24, 32), np.float32)))
     with pytest.raises(InputError, match="camera"):

@@ -62,11 +62,7 @@ class CloudReader:
             return None if points is None else points.astype(np.float64)
         if observation.depth_m is None or self._camera is None:
             return None
-        width, height = self._camera.size_wh
-        if observation.depth_m.shape != (height, width):
-            raise InputError(
-                f"depth_m: expected ({height}, {width}), got {observation.depth_m.shape}"
-            )
+        self._camera.check_size("depth_m", observation.depth_m)
         start = self._stride_px // 2
         depth = observation.depth_m[start :: self._stride_px, start :: self._stride_px]
         return np.asarray(self._rays_cam * depth.reshape(-1, 1).astype(np.float64))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sceneslam.scans.band import checked_band
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import LaserScan
 from sceneslam.types.rig import Camera
 
@@ -69,9 +69,7 @@ class DepthScanner:
         beam at the camera's depth limit is NaN too: only returns that noise shortens are measured
         there. Raises InputError if the image has another size than the camera.
         """
-        width, height = self._camera.size_wh
-        if depth_m.shape != (height, width):
-            raise InputError(f"depth_m: expected ({height}, {width}), got {depth_m.shape}")
+        self._camera.check_size("depth_m", depth_m)
         depths = depth_m[:: self._stride_px, :: self._stride_px].ravel()[self._pixels]
         heights = self._camera_height_m + self._height_ratio * depths
         valid = self._camera.measures(depths)

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import Enum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.types.errors import ConfigError
+from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.ranges import check_above, check_least
 from sceneslam.types.se3 import Transform, identity
 
@@ -67,6 +68,12 @@ class Camera:
     def K(self) -> NDArray[np.float64]:
         """Return the (3, 3) intrinsic matrix [px]."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    def check_size(self, name: str, image: NDArray[Any], *channels: int) -> None:
+        """Raise InputError if an image (H, W, *channels) has another size than the camera."""
+        width, height = self.size_wh
+        if image.shape != (height, width, *channels):
+            raise InputError(f"{name}: expected {(height, width, *channels)}, got {image.shape}")
 
     def measures(self, depth_m: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Return (...) whether depths (...) [m] are valid: above 0, and within the range."""

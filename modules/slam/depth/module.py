@@ -78,11 +78,7 @@ class DepthSlam(LocalModule):
         prediction = self._predictor.predict(observation)
         if observation.depth_m is None:
             return self._bridge(observation, prediction, can_coast=True)
-        width, height = self._camera.size_wh
-        if observation.depth_m.shape != (height, width):
-            raise InputError(
-                f"depth_m: expected ({height}, {width}), got {observation.depth_m.shape}"
-            )
+        self._camera.check_size("depth_m", observation.depth_m)
         surface = self._reader.read(observation.depth_m)
         samples = samples_of(surface, self._reader.grid)
         if len(samples) < _SAMPLES_MIN:

@@ -88,12 +88,8 @@ class DirectSlam(LocalModule):
         if image is None or depth_m is None:
             can_coast = self._key is not None
             return self._predictor.bridged(observation, prediction, can_coast=can_coast)
-        width, height = self._camera.size_wh
-        if image.shape[:2] != (height, width) or depth_m.shape != (height, width):
-            raise InputError(
-                f"image_bgr, depth_m: expected ({height}, {width}), got {image.shape[:2]} "
-                f"and {depth_m.shape}"
-            )
+        self._camera.check_size("image_bgr", image, 3)
+        self._camera.check_size("depth_m", depth_m)
         view = self._tracker.view(image, depth_m)
         can_begin = bool(np.count_nonzero(view.depth_m) >= _PIXELS_MIN)
         if self._key is None or self._last is None:

@@ -24,7 +24,6 @@ from .adjust.renewal import NEWEST, LocatedView, renew, seen_by
 from .locate.localizer import VisualFix
 from .parts import RgbdParts
 from .see.alignment import Alignment
-from .see.sizes import check_sizes
 from .see.turn_rate import expected_rate
 from .see.view import View
 from .settings import RgbdSettings
@@ -69,7 +68,10 @@ class RgbdSlam(LocalModule, RgbdSettings):
 
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base at the observation; LOST if the image does not show the map."""
-        check_sizes(observation, self._camera)
+        if observation.image_bgr is not None:
+            self._camera.check_size("image_bgr", observation.image_bgr, 3)
+        if observation.depth_m is not None:
+            self._camera.check_size("depth_m", observation.depth_m)
         if self._ignores_depth:
             observation = replace(observation, depth_m=None)
         self._observations += 1
