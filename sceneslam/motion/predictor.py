@@ -35,7 +35,7 @@ class Prediction:
 class Predictor:
     """Propagates a pose and its covariance from one observation to the next.
 
-    For every observation call `predict`, then `measure`, `coast`, `lose`, `bridge` or `bridged`.
+    For every observation call `predict`, then `measure`, `coast`, `lose` or `bridged`.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -104,22 +104,6 @@ class Predictor:
         self.model.inertia.reset()
         self.is_lost = True
 
-    def bridge(
-        self, observation: Observation, prediction: Prediction, *, can_coast: bool
-    ) -> TrackingStatus:
-        """Continue without a measurement; return the status of the pose.
-
-        With odometry it is DEGRADED; else at the last velocity, for a short time and if
-        `can_coast`, TRACKING; else LOST.
-        """
-        can_coast = can_coast and not self.is_long_unmeasured(observation)
-        if prediction.is_measured or can_coast:
-            self.coast(prediction)
-            is_known = prediction.is_measured
-            return TrackingStatus.DEGRADED if is_known else TrackingStatus.TRACKING
-        self.lose(prediction)
-        return TrackingStatus.LOST
-
     def bridged(
         self,
         observation: Observation,
@@ -128,11 +112,19 @@ class Predictor:
         can_coast: bool = False,
         can_begin: bool = False,
     ) -> Tracking:
-        """Continue by `bridge`; return the predicted pose, or the last measured one as LOST."""
-        status = self.bridge(observation, prediction, can_coast=can_coast)
-        is_lost = status is TrackingStatus.LOST
-        T_local_base = self.T_local_measured if is_lost else prediction.T_local_base
-        return self.tracking(observation, T_local_base, status, can_begin=can_begin)
+        """Continue without a measurement; return the predicted pose, else the last measured one.
+
+        With odometry it is DEGRADED; else at the last velocity, for a short time and if
+        `can_coast`, TRACKING; else LOST.
+        """
+        is_known = prediction.is_measured
+        if not is_known and (not can_coast or self.is_long_unmeasured(observation)):
+            self.lose(prediction)
+            status = TrackingStatus.LOST
+            return self.tracking(observation, self.T_local_measured, status, can_begin=can_begin)
+        self.coast(prediction)
+        status = TrackingStatus.DEGRADED if is_known else TrackingStatus.TRACKING
+        return self.tracking(observation, prediction.T_local_base, status)
 
     def tracking(
         self,
@@ -142,7 +134,6 @@ class Predictor:
         *,
         quality_ratio: float = 0.0,
         inliers: int = 0,
-        revision: int = 0,
         can_begin: bool = False,
     ) -> Tracking:
         """Return the answer with a pose (4, 4); the covariance is the predictor's unless LOST."""
@@ -153,7 +144,6 @@ class Predictor:
             covariance=None if status is TrackingStatus.LOST else self.covariance.copy(),
             quality_ratio=quality_ratio,
             inliers=inliers,
-            revision=revision,
             can_begin=can_begin and status is TrackingStatus.LOST,
         )
 

@@ -34,7 +34,6 @@ class DepthSlam(LocalModule):
     matched_min_ratio: float
     weak_ratio: float
     cloud_voxel_m: float
-    _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
     _predictor: Predictor = field(init=False)
     _map: KeyframeMap = field(init=False)
 
@@ -70,25 +69,29 @@ class DepthSlam(LocalModule):
         self._certainty = DepthCertainty(rig.camera.T_base_cam)
         self._history = PoseHistory(self._map)
         self._predictor = Predictor(rig)
-        self._T_local_base = se3.identity()
         self._reference, self._revision = 0, 0
 
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base (4, 4) [m] at the observation."""
         prediction = self._predictor.predict(observation)
         if observation.depth_m is None:
-            return self._bridge(observation, prediction, can_coast=True)
+            can_coast = len(self._map) > 0
+            return self._answer(
+                self._predictor.bridged(observation, prediction, can_coast=can_coast)
+            )
         self._camera.check_size("depth_m", observation.depth_m)
         surface = self._reader.read(observation.depth_m)
         samples = samples_of(surface, self._reader.grid)
         if len(samples) < _SAMPLES_MIN:
-            return self._bridge(observation, prediction, can_coast=False)
+            return self._answer(self._predictor.bridged(observation, prediction))
         if not len(self._map):
             return self._start(observation, surface, samples, prediction)
         found = self._locate(observation, samples, surface, prediction)
         if found is None:
             can_begin = bool(samples.localizability().ratios[0] >= self.weak_ratio)
-            return self._bridge(observation, prediction, can_coast=False, can_begin=can_begin)
+            return self._answer(
+                self._predictor.bridged(observation, prediction, can_begin=can_begin)
+            )
         return self._hold(observation, surface, samples, prediction, found)
 
     def get_trajectory(self) -> Trajectory:
@@ -103,14 +106,16 @@ class DepthSlam(LocalModule):
     def _start(
         self, observation: Observation, surface: Surface, samples: Samples, prediction: Prediction
     ) -> Tracking:
-        """Make the first keyframe of the session, or after tracking was lost."""
+        """Make the first keyframe of the session."""
         T_local_cam = prediction.T_local_base @ self._camera.T_base_cam
         self._add_keyframe(surface, T_local_cam, prediction.covariance)
-        is_first = len(self._map) == 1 and not self._predictor.is_lost
-        self._T_local_base = prediction.T_local_base
-        self._predictor.measure(observation, self._T_local_base, prediction.covariance)
-        status = TrackingStatus.TRACKING if is_first else TrackingStatus.DEGRADED
-        return self._answer(observation, status, 1.0, len(samples))
+        status = TrackingStatus.DEGRADED if self._predictor.is_lost else TrackingStatus.TRACKING
+        T_local_base = prediction.T_local_base
+        self._predictor.measure(observation, T_local_base, prediction.covariance)
+        tracking = self._predictor.tracking(
+            observation, T_local_base, status, quality_ratio=1.0, inliers=len(samples)
+        )
+        return self._answer(tracking)
 
     def _locate(
         self, observation: Observation, samples: Samples, surface: Surface, prediction: Prediction
@@ -140,17 +145,23 @@ class DepthSlam(LocalModule):
         back = se3.adjoint(se3.inverse(T_base_cam))
         self._certainty.follow(found, samples)
         covariance = np.linalg.inv(found.information + self._prior(prediction).information)
-        self._T_local_base = found.T_local_cam @ se3.inverse(T_base_cam)
         self._predictor.measure(
             observation,
-            self._T_local_base,
+            found.T_local_cam @ se3.inverse(T_base_cam),
             se3.carried(covariance, T_base_cam),
             information=back.T @ found.information @ back,
         )
         weak = found.localizability.weak_twists(self.weak_ratio)
         self._extend(surface, samples, found.T_local_cam)
         status = TrackingStatus.DEGRADED if len(weak) else TrackingStatus.TRACKING
-        return self._answer(observation, status, found.matched_ratio, found.matched)
+        tracking = self._predictor.tracking(
+            observation,
+            self._predictor.T_local_base,
+            status,
+            quality_ratio=found.matched_ratio,
+            inliers=found.matched,
+        )
+        return self._answer(tracking)
 
     def _extend(self, surface: Surface, samples: Samples, T_local_cam: se3.Transform) -> None:
         """Add the image to the map: as a new keyframe, or fused into an existing one."""
@@ -166,7 +177,6 @@ class DepthSlam(LocalModule):
             self._graph.solve()
             T_new_old = self._map[best.index].T_local_cam @ T_cam_local
             self._predictor.correct(T_new_old)
-            self._T_local_base = self._predictor.T_local_base
             self._revision += 1
 
     def _add_keyframe(
@@ -177,41 +187,12 @@ class DepthSlam(LocalModule):
         in_cam = se3.carried(covariance, se3.inverse(self._camera.T_base_cam))
         self._graph.connect(self._reference, in_cam)
 
-    def _bridge(
-        self,
-        observation: Observation,
-        prediction: Prediction,
-        *,
-        can_coast: bool,
-        can_begin: bool = False,
-    ) -> Tracking:
-        """Return the pose by odometry, or shortly by constant velocity, else LOST."""
-        can_coast = can_coast and len(self._map) > 0
-        status = self._predictor.bridge(observation, prediction, can_coast=can_coast)
-        if status is not TrackingStatus.LOST:
-            self._T_local_base = prediction.T_local_base
-        return self._answer(observation, status, 0.0, 0, can_begin=can_begin)
-
-    def _answer(
-        self,
-        observation: Observation,
-        status: TrackingStatus,
-        quality_ratio: float,
-        inliers: int,
-        *,
-        can_begin: bool = False,
-    ) -> Tracking:
-        if status is not TrackingStatus.LOST and len(self._map):
-            self._history.add(observation.stamp_ns, self._reference, self._T_local_base)
-        tracking = self._predictor.tracking(
-            observation,
-            self._T_local_base,
-            status,
-            quality_ratio=quality_ratio,
-            inliers=inliers,
-            revision=self._revision,
-            can_begin=can_begin,
-        )
-        if tracking.covariance is None:
-            return tracking
-        return replace(tracking, covariance=self._certainty.covariance(tracking.covariance))
+    def _answer(self, tracking: Tracking) -> Tracking:
+        """Return the answer with the map's revision and certainty; its pose joins the history."""
+        covariance = tracking.covariance
+        if covariance is not None:  # it has a pose
+            covariance = self._certainty.covariance(covariance)
+            if len(self._map):
+                T_local_base = tracking.T_local_base
+                self._history.add(tracking.stamp_ns, self._reference, T_local_base)
+        return replace(tracking, covariance=covariance, revision=self._revision)
