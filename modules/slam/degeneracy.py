@@ -29,12 +29,6 @@ class Localizability:
     directions: Doubles  # (6, 6), one per column: the motion [m, m] of the points
     scale: Doubles  # (6, 6): takes a twist (se3.log order) of the points' frame to such a motion
 
-    def weak_twists(self, ratio_min: float) -> Doubles:
-        """Return the twists (K, 6) of the points' frame that lie below `ratio_min`."""
-        return np.asarray(
-            np.linalg.solve(self.scale, self.directions[:, self.ratios < ratio_min]).T
-        )
-
     def held(self, ratio_min: float) -> Doubles:
         """Return the projection (6, 6) of a twist on the directions that are not weak."""
         strong = self.directions[:, self.ratios >= ratio_min]

@@ -151,9 +151,9 @@ class DepthSlam(LocalModule):
             se3.carried(covariance, T_base_cam),
             information=back.T @ found.information @ back,
         )
-        weak = found.localizability.weak_twists(self.weak_ratio)
         self._extend(surface, samples, found.T_local_cam)
-        status = TrackingStatus.DEGRADED if len(weak) else TrackingStatus.TRACKING
+        is_open = found.localizability.ratios[0] < self.weak_ratio
+        status = TrackingStatus.DEGRADED if is_open else TrackingStatus.TRACKING
         tracking = self._predictor.tracking(
             observation,
             self._predictor.T_local_base,
