@@ -182,7 +182,8 @@ class CloudOdometry(LocalModule, ABC):
         moved = se3.inverse(T_before) @ T_local_icp
         share = 0.2 if is_known else 1.0
         duration_s = max(self._predictor.unmeasured_s(observation), 0.02)
-        return bool(
-            np.linalg.norm(moved[:3, 3]) <= share * self._speed_max_m_s * duration_s + 0.05
-            and se3.rotation_angle_rad(moved) <= share * self.turn_max_rad_s * duration_s + 0.05
+        return se3.is_within(
+            moved,
+            share * self._speed_max_m_s * duration_s + 0.05,
+            share * self.turn_max_rad_s * duration_s + 0.05,
         )

@@ -125,18 +125,14 @@ class DirectSlam(LocalModule):
             if other is None or T_other_cam is None:
                 continue
             guess = se3.inverse(T_local_other) @ T_local_guess
-            poses = [T_other_cam, guess] if self._is_near(guess) else [T_other_cam]
+            is_near = se3.is_within(guess, self.step_max_m, self.turn_max_rad)
+            poses = [T_other_cam, guess] if is_near else [T_other_cam]
             tried = [(pose, compare(self._tracker, view, other, pose)) for pose in poses]
             agree = [one for one in tried if self._is_enough(one[1])]
             if agree:
                 T_other_cam, found = min(agree, key=lambda one: one[1].misfit)
                 return _Located(T_local_other @ T_other_cam, found)
         return None
-
-    def _is_near(self, T_other_cam: se3.Transform) -> bool:
-        """Tell whether a pose is within the limits of a step."""
-        step_m, turn_rad = np.linalg.norm(T_other_cam[:3, 3]), se3.rotation_angle_rad(T_other_cam)
-        return bool(step_m <= self.step_max_m and turn_rad <= self.turn_max_rad)
 
     def _is_enough(self, found: Comparison) -> bool:
         """Tell whether enough is compared, and agrees."""
@@ -178,11 +174,7 @@ class DirectSlam(LocalModule):
         self._predictor.measure(observation, T_local_base, covariance, information)
         T_local_cam = T_local_base @ T_base_cam
         T_key_cam = se3.inverse(self._T_local_key) @ T_local_cam
-        is_far = (
-            np.linalg.norm(T_key_cam[:3, 3]) > self.keyframe_step_m
-            or se3.rotation_angle_rad(T_key_cam) > self.keyframe_turn_rad
-        )
-        if is_far:
+        if not se3.is_within(T_key_cam, self.keyframe_step_m, self.keyframe_turn_rad):
             self._add_keyframe(observation, view, T_local_cam, found.information)
         self._last, self._T_local_last = view, T_local_cam
         limits = np.repeat([self.weak_m, self.weak_rad], 3)

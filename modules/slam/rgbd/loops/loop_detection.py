@@ -126,9 +126,10 @@ class LoopDetector:
         sigmas = np.sqrt(np.diag(covariance))
         turn_rad = _DRIFT_RATIO * way.turned_rad + _SIGMAS * way.sigma_rad
         shift_m = _DRIFT_RATIO * way.length_m + _SIGMAS * way.sigma_m + turn_rad * way.reach_m
-        return bool(
-            se3.rotation_angle_rad(T_error) <= turn_rad + _SIGMAS * sigmas[3:].max()
-            and np.linalg.norm(T_error[:3, 3]) <= shift_m + _SIGMAS * sigmas[:3].max()
+        return se3.is_within(
+            T_error,
+            shift_m + _SIGMAS * sigmas[:3].max(),
+            turn_rad + _SIGMAS * sigmas[3:].max(),
         )
 
     def _loop(self, keyframe_id: int, seen: Recognition) -> LoopClosure:
