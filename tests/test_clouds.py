@@ -29,11 +29,11 @@ def test_sweep_is_undone_to_the_stamp():
         ]
     ).astype(np.float32)
     observation = Observation(stamp_ns=0, points_lidar=swept, point_times_s=times)
-    np.testing.assert_allclose(reader.read_unswept(observation, twist_s), still, atol=0.02)
+    np.testing.assert_allclose(reader.read(observation, twist_s), still, atol=0.02)
     equal = replace(observation, point_times_s=np.full(50, 0.1))
-    assert np.isfinite(reader.read_unswept(equal, twist_s)).all()
+    assert np.isfinite(reader.read(equal, twist_s)).all()
     with pytest.raises(InputError, match="point_times_s: expected 50 values, got 3"):
-        reader.read_unswept(replace(observation, point_times_s=np.zeros(3)), twist_s)
+        reader.read(replace(observation, point_times_s=np.zeros(3)), twist_s)
 
 
 def test_depth_becomes_points_of_base():

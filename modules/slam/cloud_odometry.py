@@ -92,8 +92,8 @@ class CloudOdometry(LocalModule, ABC):
             raise RuntimeError("track() before activate()")
         prediction = self._predictor.predict(observation)
         self._icp.listen(observation)
-        twist_s = self._predictor.model.inertia.velocity if self.deskew else np.zeros(6)
-        cloud = self._reader.read_unswept(observation, twist_s)
+        twist_s = self._predictor.model.inertia.velocity if self.deskew else None
+        cloud = self._reader.read(observation, twist_s)
         if cloud is None:
             return self._predictor.bridged(observation, prediction, can_coast=self._has_map)
         if len(cloud) < _POINTS_MIN:

@@ -33,28 +33,25 @@ class CloudReader:
             self.range_m = rig.lidar.range_m
             self.T_base_sensor = rig.lidar.T_base_lidar
 
-    def read(self, observation: Observation) -> Cloud | None:
-        """Return the valid points (N, 3) [m], base, without motion compensation; None without."""
+    def read(
+        self, observation: Observation, twist_s: NDArray[np.float64] | None = None
+    ) -> Cloud | None:
+        """Return the valid points (N, 3) [m], base; None without.
+
+        Points with times are moved to `base` at the observation's stamp by its twist per second
+        `twist_s` (6,), if given.
+        """
         found = self._sensed(observation)
         if found is None:
             return None
-        return np.asarray(se3.apply(self.T_base_sensor, found[self._valid(found)]))
-
-    def read_unswept(self, observation: Observation, twist_s: NDArray[np.float64]) -> Cloud | None:
-        """Return the valid points (N, 3) [m], in `base` at the observation's stamp.
-
-        `twist_s` (6,) is the twist of `base` per second; without valid times of points, the points
-        are not moved.
-        """
-        times_s = observation.point_times_s
-        if self.is_depth or times_s is None or observation.points_lidar is None:
-            return self.read(observation)
-        found = observation.points_lidar.astype(np.float64)
-        if len(times_s) != len(found):
-            raise InputError(f"point_times_s: expected {len(found)} values, got {len(times_s)}")
         valid = self._valid(found)
         points = np.asarray(se3.apply(self.T_base_sensor, found[valid]))
-        return _moved(points, valid_times_s(times_s[valid]), twist_s)
+        times_s = observation.point_times_s
+        if self.is_depth or times_s is None:
+            return points
+        if len(times_s) != len(found):
+            raise InputError(f"point_times_s: expected {len(found)} values, got {len(times_s)}")
+        return points if twist_s is None else _moved(points, valid_times_s(times_s[valid]), twist_s)
 
     def _sensed(self, observation: Observation) -> Cloud | None:
         if not self.is_depth:
