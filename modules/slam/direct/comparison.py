@@ -113,15 +113,7 @@ def _jacobians(
         axis=1,
     )
     # Derivative of the point by a twist on the right, T exp(xi): R (I, -[p]x).
-    a, b, c = points_view.T
-    minus_hat = np.stack(
-        [
-            np.stack([zero, c, -b], axis=-1),
-            np.stack([-c, zero, a], axis=-1),
-            np.stack([b, -a, zero], axis=-1),
-        ],
-        axis=1,
-    )
+    minus_hat = -se3.hat(points_view)
     moved = np.concatenate([np.broadcast_to(np.eye(3), minus_hat.shape), minus_hat], axis=2)
     return np.asarray(projection @ (T_other_view[:3, :3] @ moved))
 
