@@ -87,13 +87,7 @@ class LayerBuilder:
 
 def _make_scanner(camera: Camera) -> DepthScanner | None:
     try:
-        return DepthScanner(
-            camera,
-            height_min_m=None,
-            height_max_m=None,
-            beams=_BEAMS,
-            stride_px=_SCAN_STRIDE_PX,
-        )
+        return DepthScanner(camera, beams=_BEAMS, stride_px=_SCAN_STRIDE_PX)
     except ConfigError as error:
         _LOG.warning("no occupancy grid from this camera's depth: %s", error)
         return None
