@@ -13,6 +13,7 @@ from sceneslam.types import se3
 from ..surfaces.keyframe import SurfaceKeyframe
 from ..surfaces.registration import Samples, compare
 from ..surfaces.surface import Floats, Grid, Surface
+from ..voxel_cloud import VoxelCloud
 
 _PROBES = 300  # sample points for the overlap
 _PROBE_GATE_M = 0.1
@@ -72,11 +73,10 @@ class KeyframeMap:
 
     def cloud(self, voxel_m: float) -> Floats:
         """Return the surfaces' points (N, 3) [m], local, one per voxel."""
-        if not self.keyframes:
-            return np.zeros((0, 3), np.float32)
-        points = np.vstack([one.points_local(self.grid, _IMAGES_MIN) for one in self.keyframes])
-        _, rows = np.unique(np.floor(points / voxel_m).astype(np.int32), axis=0, return_index=True)
-        return np.asarray(points[np.sort(rows)])
+        cloud = VoxelCloud(voxel_m)
+        for keyframe in self.keyframes:
+            cloud.add(keyframe.points_local(self.grid, _IMAGES_MIN))
+        return cloud.points()
 
     def _nearest(self, probes: Samples, T_local_cam: se3.Transform) -> NDArray[np.int64]:
         """Return the keyframes whose view has the nearest centre."""
