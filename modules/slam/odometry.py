@@ -6,28 +6,19 @@ In a run, the odometry of an observation has the gyro's turn already
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
-from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
-from sceneslam.types.rig import Rig, Sensor, Wheels
+from sceneslam.types.rig import Rig, Sensor
 
 from .local import LocalModule
 
 _DEVIATION_MIN = 1e-4  # m and rad: smallest standard deviation
 
 
-@dataclass(kw_only=True, eq=False)
 class Odometry(LocalModule):
     """Dead reckoning, without settings."""
-
-    _wheels: Wheels = field(init=False)
-    _T_odom_base: se3.Transform | None = field(default=None, init=False)  # last odometry
-    _T_local_base: se3.Transform = field(default_factory=se3.identity, init=False)
-    _covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)), init=False)
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
@@ -36,7 +27,8 @@ class Odometry(LocalModule):
 
     def activate(self, rig: Rig) -> None:
         """Start a session: `local` is at the next observation with odometry."""
-        self._wheels, self._T_odom_base = rig.wheels, None
+        self._wheels = rig.wheels
+        self._T_odom_base: se3.Transform | None = None  # last odometry
         self._T_local_base = se3.identity()
         self._covariance = np.eye(6) * _DEVIATION_MIN**2
 
