@@ -44,7 +44,7 @@ class NodeClient:
         self._encoder = Encoder()
         self._node: subprocess.Popen[bytes] | None = None
         self._sent: dict[int, Transform | None] = {}  # stamp -> T_odom_base
-        self._first: tuple[int, Transform | None] | None = None
+        self._T_odom_first: Transform | None = None
         self._T_local_world: Transform | None = None
         self._given_ns: int | None = None  # stamp of the newest returned pose
 
@@ -83,8 +83,8 @@ class NodeClient:
             raise ProtocolError(f"the node ended with {self._node.returncode}: {command}")
         stamp_ns = int(observation["stamp_ns"])
         T_odom_base = observation.get("T_odom_base")
-        if self._first is None:
-            self._first = (stamp_ns, T_odom_base)
+        if not self._sent:
+            self._T_odom_first = T_odom_base
         self._sent[stamp_ns] = T_odom_base
         while len(self._sent) > _KEPT:
             del self._sent[next(iter(self._sent))]
@@ -130,8 +130,7 @@ class NodeClient:
 
     def _since_first(self, stamp_ns: int) -> Transform:
         """Return the motion by odometry since the first observation, identity without odometry."""
-        assert self._first is not None
-        T_first, T_now = self._first[1], self._sent[stamp_ns]
+        T_first, T_now = self._T_odom_first, self._sent[stamp_ns]
         return np.eye(4) if T_first is None or T_now is None else se3.inverse(T_first) @ T_now
 
     def _send(self, stamp_ns: int, observation: Fields) -> None:
