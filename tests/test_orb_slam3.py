@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from isolation import limits
 
-from sceneslam.modules.slam.orb_slam3.anchor import Anchor, inverse
+from sceneslam.modules.slam.orb_slam3.anchor import Anchor
 from sceneslam.modules.slam.orb_slam3.module import OrbSlam3
 from sceneslam.modules.slam.orb_slam3.scale import Scale
 from sceneslam.modules.slam.orb_slam3.worker import OrbSlam3Worker
@@ -105,7 +105,7 @@ def test_a_new_map_goes_on_where_the_robot_is():
     anchor = Anchor(T_local_cam, T_world_cam)
     np.testing.assert_allclose(anchor.place(T_world_cam), T_local_cam, atol=1e-12)
     T_world_next = T_world_cam @ se3.from_xy_yaw(0.5, 0.0, 0.0)
-    moved = inverse(T_local_cam) @ anchor.place(T_world_next)
+    moved = se3.inverse(T_local_cam) @ anchor.place(T_world_next)
     np.testing.assert_allclose(moved, se3.from_xy_yaw(0.5, 0.0, 0.0), atol=1e-12)
 
 

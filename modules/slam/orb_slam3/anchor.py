@@ -7,15 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Transform = NDArray[np.float64]
-
-
-def inverse(T_a_b: Transform) -> Transform:
-    """Return T_b_a (4, 4) [m]."""
-    T_b_a = np.eye(4)
-    T_b_a[:3, :3] = T_a_b[:3, :3].T
-    T_b_a[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
-    return T_b_a
+from sceneslam.types.se3 import Transform, inverse
 
 
 class Anchor:

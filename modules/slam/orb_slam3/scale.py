@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .anchor import Transform, inverse
+from sceneslam.types.se3 import Transform, inverse
 
 _BASELINE_M = 0.5  # smallest path by odometry for an estimate
 _ALIKE_MIN = 0.9  # smallest cosine between both paths; below, the map is wrong

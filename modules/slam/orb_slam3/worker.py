@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types.errors import InputError
+from sceneslam.types.se3 import Transform, from_quat_xyzw, inverse
 from sceneslam.vocabulary import describe, train
 
 from ..process.client import DEGRADED, LOST, TRACKING, pose, poses, serve
 from ..process.protocol import Fields, as_text
 from ..voxel_cloud import VoxelCloud
-from .anchor import Anchor, Transform, inverse
+from .anchor import Anchor
 from .scale import Scale
 from .settings import write_settings
 
@@ -87,7 +88,8 @@ class OrbSlam3Worker:
         if not len(rows):
             return poses([], [])
         T_cam_base = inverse(self._T_base_cam)
-        placed = [self._anchors[0].place(T) @ T_cam_base for T in _transforms(rows[:, 1:])]
+        T_world_cam = from_quat_xyzw(rows[:, 1:4], rows[:, 4:])
+        placed = [self._anchors[0].place(T) @ T_cam_base for T in T_world_cam]
         # The file's stamps are rounded to microseconds; each is that of the nearest image.
         stamps_ns = np.array(self._stamps_ns, np.int64)
         middles_ns = (stamps_ns[1:] + stamps_ns[:-1]) // 2
@@ -172,21 +174,6 @@ class OrbSlam3Worker:
 
 def _distance(T_a: Transform, T_b: Transform) -> float:
     return float(np.linalg.norm(T_a[:3, 3] - T_b[:3, 3]))
-
-
-def _transforms(rows: NDArray[np.float64]) -> list[Transform]:
-    """Return the transforms (4, 4) of rows x y z qx qy qz qw (N, 7)."""
-    found = []
-    for x, y, z, qx, qy, qz, qw in rows:
-        T = np.eye(4)
-        T[:3, :3] = [
-            [1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qz * qw), 2 * (qx * qz + qy * qw)],
-            [2 * (qx * qy + qz * qw), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qx * qw)],
-            [2 * (qx * qz - qy * qw), 2 * (qy * qz + qx * qw), 1 - 2 * (qx * qx + qy * qy)],
-        ]
-        T[:3, 3] = x, y, z
-        found.append(T)
-    return found
 
 
 def main(settings: dict[str, Any]) -> None:
