@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.motion.model import MotionModel
 from sceneslam.motion.motion import Motion
 from sceneslam.types.covariance import UNKNOWN_VELOCITY
-from sceneslam.types.observation import LaserScan, Observation, TrackingStatus
+from sceneslam.types.observation import LaserScan, Observation, Tracking, TrackingStatus
 from sceneslam.types.planar import (
     Matrix,
     Planar,
@@ -36,36 +37,17 @@ _FAILURES_MAX = 10  # consecutive failed matches before mapping continues from d
 _REACH_SIGMAS = 2.0  # after a gap the robot may be so far from a prediction
 _UNSEEN = np.diag([1e-2, 1e-2, 1e-1])  # 1/m^2, 1/rad^2: information in unconstrained directions
 _DEVIATION_MIN = np.array([1e-3, 1e-3, 5e-4])  # m, m, rad: least standard deviation of a pose
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Estimate:
-    """The robot's pose with its covariance."""
-
-    T_local_base: Planar
-    covariance: Matrix  # axes of local
-    map_covariance: Matrix  # of the map's drift, the same way
-    status: TrackingStatus
-    quality_ratio: float
-    inliers: int
-    can_begin: bool = False  # lost, and the scan is enough to begin a map
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScanSettings:
-    """Which scans are matched, and when a match is accepted."""
-
-    resolution_m: float
-    beams_min: int
-    inlier_min_ratio: float
-    predict_max_s: float
+_LEVEL_DEVIATION = 0.01  # m and rad: standard deviation of z, roll and pitch on a floor
 
 
 @dataclass(slots=True)
 class FrontEnd:
     """The pose estimation of one activation."""
 
-    settings: ScanSettings
+    resolution_m: float  # of the likelihood field
+    beams_min: int  # of a scan that is matched
+    inlier_min_ratio: float  # of a match that is accepted
+    predict_max_s: float  # a usual gap between scans
     matcher: Matcher
     relocalizer: ScanRelocalizer
     motion: MotionModel
@@ -84,7 +66,7 @@ class FrontEnd:
     _field: LikelihoodField | None = field(default=None, init=False)
     _doubt: Doubt = field(default_factory=Doubt, init=False)
 
-    def track(self, observation: Observation, scan: LaserScan | None) -> Estimate:
+    def track(self, observation: Observation, scan: LaserScan | None) -> Tracking:
         """Return the pose at the observation, corrected by its scan if it has one."""
         before, before_ns, known = self._pose, self._stamp_ns, self._covariance
         motion = self.motion.predict(observation)
@@ -135,10 +117,10 @@ class FrontEnd:
         else:
             self._teach(match, T_then_now, motion)
         self._doubt.add(match, priors)
-        estimate = self._hold(observation, compose(match.T_local_base, T_then_now), match)
+        tracking = self._hold(observation, compose(match.T_local_base, T_then_now), match)
         if self.keyframes.is_due(match.T_local_base):
             self._extend(match.T_local_base, scan, surfaces)
-        return estimate
+        return tracking
 
     def _prior(self, known: Matrix, before: Planar, ratio: float, motion: Motion) -> MotionPrior:
         """Return the prior of the pose after a share `ratio` of a motion from `before`."""
@@ -154,7 +136,7 @@ class FrontEnd:
         if scan is None:
             return None
         surfaces = self.reader.read(scan)
-        return surfaces if len(surfaces) >= self.settings.beams_min else None
+        return surfaces if len(surfaces) >= self.beams_min else None
 
     def _reach(self, match: Match, observation: Observation) -> Planar | None:
         """Return how far (2,) [m, rad] the robot may be from a prediction that is vague, else None.
@@ -164,7 +146,7 @@ class FrontEnd:
         """
         if self._held_ns is None:
             return None
-        if observation.stamp_ns - self._held_ns <= self.settings.predict_max_s * 1e9:
+        if observation.stamp_ns - self._held_ns <= self.predict_max_s * 1e9:
             return None
         H = match.information
         held = np.linalg.pinv(H, rcond=1e-9, hermitian=True) @ H
@@ -185,8 +167,8 @@ class FrontEnd:
 
     def _believes(self, match: Match) -> bool:
         return (
-            match.inlier_ratio >= self.settings.inlier_min_ratio
-            and match.inliers >= self.settings.beams_min // 2
+            match.inlier_ratio >= self.inlier_min_ratio
+            and match.inliers >= self.beams_min // 2
             and bool(np.isfinite(match.T_local_base).all())
         )
 
@@ -201,7 +183,7 @@ class FrontEnd:
             motion.evidence(match.probabilities) if match.weighs_sources else None,
         )
 
-    def _hold(self, observation: Observation, pose: Planar, match: Match | None) -> Estimate:
+    def _hold(self, observation: Observation, pose: Planar, match: Match | None) -> Tracking:
         """Accept a pose that was measured by a scan."""
         weak = match is not None and match.weak_directions > 0
         if match is None:
@@ -212,19 +194,16 @@ class FrontEnd:
             self._covariance = match.covariance + np.diag(_DEVIATION_MIN**2)
             self._held_covariance = self._covariance
             self._seen_pose = match.T_local_base
-        return Estimate(
-            T_local_base=pose,
-            covariance=self._covariance,
-            map_covariance=self._doubt.covariance(pose),
-            status=TrackingStatus.DEGRADED if weak else TrackingStatus.TRACKING,
+        return self._answer(
+            TrackingStatus.DEGRADED if weak else TrackingStatus.TRACKING,
             quality_ratio=1.0 if match is None else match.inlier_ratio,
             inliers=0 if match is None else match.inliers,
         )
 
-    def _predict(self, observation: Observation, predicted: Planar, motion: Motion) -> Estimate:
+    def _predict(self, observation: Observation, predicted: Planar, motion: Motion) -> Tracking:
         """Continue without a scan: short gaps between scans are normal, longer ones are not."""
         since_ns = None if self._held_ns is None else observation.stamp_ns - self._held_ns
-        if since_ns is not None and since_ns <= self.settings.predict_max_s * 1e9:
+        if since_ns is not None and since_ns <= self.predict_max_s * 1e9:
             return self._guess(predicted, TrackingStatus.TRACKING)
         if motion.is_measured:
             return self._guess(predicted, TrackingStatus.DEGRADED)
@@ -238,7 +217,7 @@ class FrontEnd:
         match: Match,
         scan: LaserScan,
         surfaces: SurfacePoints,
-    ) -> Estimate:
+    ) -> Tracking:
         """Continue without the match: by dead reckoning, or else as lost.
 
         `predicted_then` is the pose at the scan.
@@ -254,20 +233,12 @@ class FrontEnd:
 
     def _guess(
         self, predicted: Planar, status: TrackingStatus, *, can_begin: bool = False
-    ) -> Estimate:
+    ) -> Tracking:
         """Continue from a pose that was not measured."""
         self._pose = predicted
-        return Estimate(
-            T_local_base=predicted,
-            covariance=self._covariance,
-            map_covariance=self._doubt.covariance(predicted),
-            status=status,
-            quality_ratio=0.0,
-            inliers=0,
-            can_begin=can_begin,
-        )
+        return self._answer(status, quality_ratio=0.0, inliers=0, can_begin=can_begin)
 
-    def _lose(self, *, can_begin: bool) -> Estimate:
+    def _lose(self, *, can_begin: bool) -> Tracking:
         """Stay at the last tracked pose; the robot may be anywhere that it can have come to."""
         self._is_lost = True
         lost_s = 0.0
@@ -278,12 +249,35 @@ class FrontEnd:
         self.motion.stop()
         return self._guess(self._held_pose, TrackingStatus.LOST, can_begin=can_begin)
 
+    def _answer(
+        self, status: TrackingStatus, *, quality_ratio: float, inliers: int, can_begin: bool = False
+    ) -> Tracking:
+        """Return the answer with the newest pose, and its covariances unless it is LOST."""
+        assert self._stamp_ns is not None
+        drift = self._doubt.covariance(self._pose)  # which goes on from there, also if LOST
+        is_lost = status is TrackingStatus.LOST
+        return Tracking(
+            stamp_ns=self._stamp_ns,
+            T_local_base=to_transform(self._pose),
+            status=status,
+            covariance=None if is_lost else self._in_base(self._covariance, _LEVEL_DEVIATION**2),
+            map_covariance=None if is_lost else self._in_base(drift, 0.0),
+            quality_ratio=quality_ratio,
+            inliers=inliers,
+            can_begin=can_begin,
+        )
+
+    def _in_base(self, covariance: Matrix, level: float) -> NDArray[np.float64]:
+        """Return the (6, 6) covariance in base's axes of one in those of local."""
+        G = turn(-float(self._pose[2]))
+        return spatial_covariance(G @ covariance @ G.T, level)
+
     def _extend(self, T_local_base: Planar, scan: LaserScan, surfaces: SurfacePoints) -> None:
         """Make the scan a keyframe."""
         self.keyframes.add(ScanKeyframe(T_local_base=T_local_base, scan=scan), surfaces)
         self._field = LikelihoodField(
             self.keyframes.latest(),
-            self.settings.resolution_m,
+            self.resolution_m,
             self.keyframes.free(self.reader.T_base_laser, self.reader.range_max_m),
         )
 

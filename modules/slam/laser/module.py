@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sceneslam.motion.model import MotionModel
 from sceneslam.scans.depth_scan import DepthScanner
@@ -14,12 +13,12 @@ from sceneslam.scans.occupancy_grid import scan_layer
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers
-from sceneslam.types.observation import LaserScan, Observation, Tracking, TrackingStatus
-from sceneslam.types.planar import Matrix, spatial_covariance, to_transform, turn
+from sceneslam.types.observation import LaserScan, Observation, Tracking
+from sceneslam.types.planar import to_transform
 from sceneslam.types.rig import Rig, Sensor
 
 from ..local import LocalModule
-from .frontend import Estimate, FrontEnd, ScanSettings
+from .frontend import FrontEnd
 from .keyframes import ScanKeyframes
 from .matcher import Matcher
 from .relocalizer import ScanRelocalizer
@@ -32,7 +31,6 @@ _ABOVE_0 = (
 _NOT_BELOW_0 = "depth_noise_per_m depth_shift_m predict_max_s"
 _AT_LEAST_1 = "beams_min submap_keyframes depth_beams depth_stride_px lidar_beams"
 _RATIO = "inlier_min_ratio degeneracy_ratio"
-_LEVEL_DEVIATION = 0.01  # m and rad: standard deviation of z, roll and pitch on a floor
 
 
 @dataclass(kw_only=True, eq=False)
@@ -103,17 +101,7 @@ class LaserSlam(LocalModule):
         """Return T_local_base at the observation."""
         if self._front_end is None:
             raise RuntimeError("track() before activate()")
-        estimate = self._front_end.track(observation, self._scan(observation))
-        return Tracking(
-            stamp_ns=observation.stamp_ns,
-            T_local_base=to_transform(estimate.T_local_base),
-            status=estimate.status,
-            covariance=_in_base(estimate, estimate.covariance, level=_LEVEL_DEVIATION**2),
-            map_covariance=_in_base(estimate, estimate.map_covariance, level=0.0),
-            quality_ratio=estimate.quality_ratio,
-            inliers=estimate.inliers,
-            can_begin=estimate.can_begin,
-        )
+        return self._front_end.track(observation, self._scan(observation))
 
     def get_map(self) -> MapLayers:
         """Return the scans of all keyframes, in `local`."""
@@ -175,12 +163,10 @@ class LaserSlam(LocalModule):
             noise_per_m=self.depth_noise_per_m if from_depth else 0.0,
         )
         return FrontEnd(
-            settings=ScanSettings(
-                resolution_m=self.resolution_m,
-                beams_min=self.beams_min,
-                inlier_min_ratio=self.inlier_min_ratio,
-                predict_max_s=self.predict_max_s,
-            ),
+            resolution_m=self.resolution_m,
+            beams_min=self.beams_min,
+            inlier_min_ratio=self.inlier_min_ratio,
+            predict_max_s=self.predict_max_s,
             matcher=matcher,
             relocalizer=ScanRelocalizer(matcher=matcher, reader=reader),
             motion=MotionModel(rig),
@@ -192,11 +178,3 @@ class LaserSlam(LocalModule):
                 reach_m=2.0 * self.range_max_m,
             ),
         )
-
-
-def _in_base(estimate: Estimate, covariance: Matrix, level: float) -> NDArray[np.float64] | None:
-    """Return the (6, 6) covariance in base's axes, None without a pose."""
-    if estimate.status is TrackingStatus.LOST:
-        return None
-    G = turn(-float(estimate.T_local_base[2]))
-    return spatial_covariance(G @ covariance @ G.T, level)
