@@ -154,7 +154,7 @@ def said(answers):
         if index in answers:
             given = {"T_local_base": true_pose(seen.stamp_ns), "status": TrackingStatus.TRACKING}
             pipeline.take([Tracking(stamp_ns=seen.stamp_ns, **given | answers[index])])
-        found.append(pipeline.report(seen, 0))
+        found.append(pipeline.report(seen))
     return found
 
 

@@ -26,7 +26,7 @@ class Pipelined(LocalModule):
             raise ConfigError("system", system, "a sceneslam.interfaces.PipelinedSlam")
         check_least(0, late_max_s=late_max_s)
         self._system, self._late_max_s = system, late_max_s
-        self._pipeline, self._revision = Pipeline(late_max_s), 0
+        self._pipeline = Pipeline(late_max_s)
 
     @property
     def closes_loops(self) -> bool:
@@ -40,7 +40,7 @@ class Pipelined(LocalModule):
 
     def activate(self, rig: Rig) -> None:
         """Start a session."""
-        self._pipeline, self._revision = Pipeline(self._late_max_s), 0
+        self._pipeline = Pipeline(self._late_max_s)
         self._system.activate(rig)
 
     def set_scene(self, scene: str) -> None:
@@ -52,8 +52,9 @@ class Pipelined(LocalModule):
         self._pipeline.note(observation)
         poses = self._system.feed(observation)
         self._pipeline.take(poses)
-        self._revision = max((pose.revision for pose in poses), default=self._revision)
-        return self._pipeline.report(observation, self._revision)
+        newest = max((pose.revision for pose in poses), default=self._pipeline.revision)
+        self._pipeline.revision = newest
+        return self._pipeline.report(observation)
 
     def get_trajectory(self) -> Trajectory:
         """Return the system's revised poses, else those that came late, if any."""

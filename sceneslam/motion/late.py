@@ -20,6 +20,7 @@ class Pipeline:
     """
 
     def __init__(self, late_max_s: float) -> None:
+        self.revision = 0  # of the answers: it increases when a module corrects its past
         self._late_max_s = late_max_s
         self._waiting: dict[int, se3.Transform | None] = {}  # stamp -> T_odom_base
         self._is_late = False
@@ -53,7 +54,7 @@ class Pipeline:
             self._waiting = {ns: T for ns, T in self._waiting.items() if ns > answer.stamp_ns}
         self._is_late = self._is_late or bool(self._waiting)
 
-    def report(self, observation: Observation, revision: int) -> Tracking:
+    def report(self, observation: Observation) -> Tracking:
         """Return the pose at an observation that was recorded."""
         newest = self._newest
         exact = newest if newest is not None and newest.stamp_ns == observation.stamp_ns else None
@@ -72,7 +73,7 @@ class Pipeline:
             map_covariance=None if newest is None or is_lost else self._drift(newest),
             quality_ratio=newest.quality_ratio if newest is not None else 0.0,
             inliers=newest.inliers if newest is not None else 0,
-            revision=revision,
+            revision=self.revision,
             can_begin=newest is not None and is_lost and newest.can_begin,
         )
 

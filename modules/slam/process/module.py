@@ -67,7 +67,6 @@ class ProcessSlam(LocalModule, Restarted[Program]):
         self._command, self._late_max_s = command, late_max_s
         self._requires: tuple[frozenset[Sensor], ...] | None = None
         self._pipeline = Pipeline(late_max_s)
-        self._revision = 0
         self._observation: Observation | None = None  # submitted, and not yet collected
         self._layers: MapLayers | None = None  # last returned map, None if outdated
         self._start()
@@ -98,7 +97,7 @@ class ProcessSlam(LocalModule, Restarted[Program]):
         if self._running is None:
             self._start()
         self._greet()
-        self._pipeline, self._revision = Pipeline(self._late_max_s), 0
+        self._pipeline = Pipeline(self._late_max_s)
         self._layers = None
         self._is_active = True
         self._ask("activate", rig_fields(rig), self._limits.start_deadline_s, lambda _: None)
@@ -125,7 +124,7 @@ class ProcessSlam(LocalModule, Restarted[Program]):
         observation, self._observation = self._observation, None
         assert observation is not None
         self._receive("track", self._limits.step_deadline_s, self._take)
-        return self._pipeline.report(observation, self._revision)
+        return self._pipeline.report(observation)
 
     def get_trajectory(self) -> Trajectory:
         """Return the program's revised poses, else those that came late, if any."""
@@ -208,5 +207,5 @@ class ProcessSlam(LocalModule, Restarted[Program]):
 
     def _take(self, reply: Fields) -> None:
         self._pipeline.take(answers(reply))
-        revision: Any = reply.get("revision", self._revision)
-        self._revision = int(revision)
+        revision: Any = reply.get("revision", self._pipeline.revision)
+        self._pipeline.revision = int(revision)
