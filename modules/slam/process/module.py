@@ -85,7 +85,9 @@ class ProcessSlam(LocalModule, Restarted[Program]):
 
     def note_failure(self) -> None:
         """Record that a session failed, and end its run of the program."""
-        self._kill()
+        if self._running is not None:
+            self._running.refuse("failed")
+        self._close()
         super().note_failure()
 
     def activate(self, rig: Rig) -> None:
@@ -117,7 +119,7 @@ class ProcessSlam(LocalModule, Restarted[Program]):
         self._pipeline.note(observation)
         self._observation, self._layers = observation, None
         fields = observation_fields(observation)
-        self._session().send("track", fields, self._limits.step_deadline_s)
+        self._own_program(in_session=True).send("track", fields, self._limits.step_deadline_s)
 
     def collect(self) -> Tracking:
         """Return the result of `submit`."""
@@ -176,25 +178,15 @@ class ProcessSlam(LocalModule, Restarted[Program]):
             self._running.end()
         self._running, self._is_active, self._is_greeted = None, False, False
 
-    def _kill(self) -> None:
-        if self._running is not None:
-            self._running.refuse("failed")
-        self._close()
-
-    def _own_program(self) -> Program:
-        if self._running is None:
+    def _own_program(self, *, in_session: bool = False) -> Program:
+        if self._running is None or (in_session and not self._is_active):
             raise ModuleError("the program ended, and the session with it")
         return self._running
-
-    def _session(self) -> Program:
-        if not self._is_active:
-            raise ModuleError("the program ended, and the session with it")
-        return self._own_program()
 
     def _ask(
         self, kind: str, fields: Fields, deadline_s: float, read: Callable[[Fields], Value]
     ) -> Value:
-        self._session().send(kind, fields, deadline_s)
+        self._own_program(in_session=True).send(kind, fields, deadline_s)
         return self._receive(kind, deadline_s, read)
 
     def _receive(self, kind: str, deadline_s: float, read: Callable[[Fields], Value]) -> Value:
