@@ -32,12 +32,12 @@ def sighting(bend, *, size=1.0, is_monocular=False, odometry=None):
         normal=np.eye(6),
     )
     features = features_at(uv_px, random_descriptors(rng, COUNT))
-    gray = np.zeros((480, 640), np.uint8)
+    image_bgr = np.zeros((480, 640, 3), np.uint8)
     estimate = SimpleNamespace(linearised=linearised, covariance=1e-6 * np.eye(6))
     rows = np.arange(COUNT)
     fix = SimpleNamespace(estimate=estimate, feature_rows=rows, landmark_ids=rows)
     view = SimpleNamespace(
-        gray=gray, features=features, is_monocular=is_monocular, odometry=odometry
+        image_bgr=image_bgr, features=features, is_monocular=is_monocular, odometry=odometry
     )
     return view, fix
 

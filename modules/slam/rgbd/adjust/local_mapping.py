@@ -20,7 +20,7 @@ from .window import MapWindow, merge_window, take_window
 _Worker = SideProcess[Task, MappingResult] | Here[Task, MappingResult]
 _TIED_IMAGES = 10  # between merges with depth, whose registration takes 100 to 200 ms
 _FREE_IMAGES = 5  # without depth: triangulated landmarks need it early, as they drift in scale
-_BEGINNING = 16  # first views, kept to rebuild the map: 2.4 MB each
+_BEGINNING = 16  # first views, kept to rebuild the map: 2.1 MB each
 
 
 class LocalMapping:

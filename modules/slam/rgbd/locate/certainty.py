@@ -95,7 +95,7 @@ def common_ratio(view: View, fix: VisualFix) -> float:
     """
     seen: Linearised = fix.estimate.linearised
     pulls = (seen.jacobian * seen.residuals).reshape(6, 2, -1).sum(axis=1)  # (6, N)
-    side_px = view.gray.shape[1] / _CELLS
+    side_px = view.image_bgr.shape[1] / _CELLS
     columns, rows = np.floor(view.features.uv_px[fix.feature_rows].T / side_px).astype(np.int64)
     columns -= columns.min()
     blocks = (rows - rows.min()) * (columns.max() + 1) + columns

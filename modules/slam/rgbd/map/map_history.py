@@ -108,7 +108,7 @@ class MapHistory:
         if not self.segments.are_many:
             return None
         seen = self._map.keyframes.covisible(landmark_ids, limit=1)
-        return self.segments.around(seen[0]) if seen else None
+        return self._graph.connected(seen[0]) if seen else None
 
     def step(self) -> Transform | None:
         """Do one image's share of loop closing; return T_new_old of the current pose, if moved."""
@@ -119,7 +119,7 @@ class MapHistory:
             return corrections.get(self.reference, se3.identity())
         if self._closer.is_solving:
             return None
-        return self._straighten(self._eye.step_s())
+        return self._straighten(self._eye.shutter.step_s())
 
     def trajectory(self) -> Trajectory:
         """Return T_local_base of all tracked frames, corrected by all loops."""

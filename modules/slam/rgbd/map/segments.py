@@ -43,10 +43,6 @@ class Segments:
         first = self._graph.connected(self._graph.ids[0])
         self._guesses = {k: guess for k, guess in self._guesses.items() if k not in first}
 
-    def around(self, keyframe_id: int) -> set[int]:
-        """Return the keyframes of a keyframe's segment."""
-        return self._graph.connected(keyframe_id)
-
     def covariance(
         self, segment: set[int], T_local_base: Transform, measured: NDArray[np.float64]
     ) -> NDArray[np.float64] | None:

@@ -34,7 +34,7 @@ class RectifyingExtractor:
     ) -> None:
         self._landmarks, self._camera = visual_map.landmarks, visual_map.camera
         self._localizer = localizer
-        self._extractor, self._shutter = extractor, RollingShutter(visual_map.camera)
+        self._extractor, self.shutter = extractor, RollingShutter(visual_map.camera)
         self.twist_per_s = np.zeros(6)  # of the newest pose, see Turning
         self._last_bgr: NDArray[np.uint8] | None = None
 
@@ -66,8 +66,7 @@ class RectifyingExtractor:
         return View(
             observation=observation,
             image_bgr=image_bgr,
-            gray=gray,
-            features=self._shutter.straighten(features, turning.rate_cam),
+            features=self.shutter.straighten(features, turning.rate_cam),
             T_predicted=T_predicted,
             turning=turning,
             odometry=odometry,
@@ -76,16 +75,12 @@ class RectifyingExtractor:
     def settle(self, view: View, fix: VisualFix, predictor: Predictor) -> tuple[View, VisualFix]:
         """Return the view and its pose, corrected by the turn rate that the pose gives."""
         turn = measured_rate(view.observation, predictor, fix.estimate.T_local_base)
-        if self._shutter.readout_s and turn.is_unknown:
+        if self.shutter.readout_s and turn.is_unknown:
             for _ in range(_ROUNDS):
                 view, fix = self._turn(view, fix, turn)
                 fix = self._localizer.beside(view.features, fix) or fix
         view, fix = self._turn(view, fix, turn)
         return self._learn(view, fix), fix
-
-    def step_s(self) -> float:
-        """Apply the new readout time, if it changed enough; return the change [s]."""
-        return self._shutter.step_s()
 
     def _turn(self, view: View, fix: VisualFix, turn: TurnRate) -> tuple[View, VisualFix]:
         """Estimate the turn rate from the rows' residuals and the prior rate."""
@@ -93,8 +88,8 @@ class RectifyingExtractor:
         rotation_cam_base = camera.T_base_cam[:3, :3].T
         change = rotation_cam_base @ turn.rate_base - view.turning.rate_cam
         uv_px = view.features.uv_px[fix.feature_rows]
-        change, twist_cam = self._shutter.turn(seen, uv_px, change, turn.sigma_rad_per_s)
-        features = self._shutter.straighten(view.features, change)
+        change, twist_cam = self.shutter.turn(seen, uv_px, change, turn.sigma_rad_per_s)
+        features = self.shutter.straighten(view.features, change)
         moved = (features.uv_px[fix.feature_rows] - uv_px) / seen.sigma_px[:, None]
         residuals = seen.residuals - moved.T.ravel() + twist_cam @ seen.jacobian
         twist = se3.adjoint(camera.T_base_cam) @ twist_cam
@@ -113,6 +108,6 @@ class RectifyingExtractor:
         slope_px -= shifts_px_per_s(
             self._landmarks, self._camera, fix.estimate.T_local_base, fix.landmark_ids
         )
-        twist_cam = self._shutter.learn(fix.estimate.linearised, slope_px)
+        twist_cam = self.shutter.learn(fix.estimate.linearised, slope_px)
         self.twist_per_s = se3.adjoint(self._camera.T_base_cam) @ twist_cam
         return replace(view, turning=replace(view.turning, twist_per_s=self.twist_per_s))

@@ -23,7 +23,6 @@ class View:
 
     observation: Observation
     image_bgr: NDArray[np.uint8]  # (H, W, 3)
-    gray: NDArray[np.uint8]  # (H, W)
     features: Features
     T_predicted: Transform  # T_local_base, before the image is used
     turning: Turning
