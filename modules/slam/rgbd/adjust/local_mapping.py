@@ -72,19 +72,11 @@ class LocalMapping:
         newest = max(self._map.keyframes.ids, default=-1)
         if newest != self._newest:
             self._newest = newest
-            self._window = take_window(self._map, newest)
+            self._window = take_window(self._map, newest, self._fresh)
             if self._window is not None:
-                fresh, self._fresh = self._fresh, {}
-                self._images_left = _TIED_IMAGES if fresh else _FREE_IMAGES
-                self._result = self._process().submit(
-                    Task(
-                        bundle=self._window.bundle,
-                        keyframe_ids=self._window.keyframe_ids,
-                        free_ids=self._window.free_ids,
-                        fresh=fresh,
-                        by_odometry=self._window.by_odometry,
-                    )
-                )
+                self._images_left = _TIED_IMAGES if self._fresh else _FREE_IMAGES
+                self._fresh = {}
+                self._result = self._process().submit(self._window.task)
         return T_new_old
 
     def shutdown(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +14,11 @@ from sceneslam.types.se3 import Transform
 from ..locate.residuals import Sightings
 from ..map.keyframes import NO_LANDMARK
 from ..map.visual_map import VisualMap
+from ..see.alignment_search import Shown
 from .bundle import Adjusted, Bundle
+from .mapping_work import Task
 from .odometry_constraints import odometry_constraints
-from .pose_constraints import PoseConstraint, PoseConstraints
+from .pose_constraints import PoseConstraints
 
 _FREE = 5
 _HELD = 15
@@ -24,22 +27,21 @@ _MAX_SIGMA_M, _MAX_SIGMA_RATIO = 1.0, 1.0  # limits of a landmark; the second of
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapWindow:
-    """A copied part of the map, with its origin in the map."""
+    """A copied part of the map to adjust, with its origin in the map."""
 
-    bundle: Bundle
-    keyframe_ids: list[int]  # (K,), ascending
-    free_ids: list[int]
+    task: Task
     landmark_ids: NDArray[np.int64]  # (L,), ascending
     births: NDArray[np.int64]  # (L,), to distinguish a landmark from a later one of the same id
     feature_rows: NDArray[np.int64]  # (N,), of each sighting in its keyframe
-    by_odometry: list[tuple[tuple[int, int], PoseConstraint]]  # by keyframe ids
     corrections: int  # of the map, when it was copied
 
 
-def take_window(visual_map: VisualMap, keyframe_id: int) -> MapWindow | None:
+def take_window(
+    visual_map: VisualMap, keyframe_id: int, fresh: Mapping[int, Shown]
+) -> MapWindow | None:
     """Return a copy of a keyframe's surroundings: landmarks that two or more keyframes saw.
 
-    None if it shares no landmark with another keyframe.
+    `fresh`: views of new keyframes, by id. None if it shares no landmark with another keyframe.
     """
     store = visual_map.keyframes
     free = store.covisible(store.landmarks_of([keyframe_id]), limit=_FREE)
@@ -76,16 +78,20 @@ def take_window(visual_map: VisualMap, keyframe_id: int) -> MapWindow | None:
         ),
         constraints=PoseConstraints.of([]),
     )
-    return MapWindow(
+    task = Task(
         bundle=bundle,
         keyframe_ids=keyframe_ids,
         free_ids=free,
-        landmark_ids=landmark_ids,
-        births=visual_map.landmarks.births[landmark_ids],
-        feature_rows=of_feature[chosen],
+        fresh=fresh,
         by_odometry=odometry_constraints(
             dict(zip(keyframe_ids, keyframes, strict=True)), visual_map.camera.T_base_cam
         ),
+    )
+    return MapWindow(
+        task=task,
+        landmark_ids=landmark_ids,
+        births=visual_map.landmarks.births[landmark_ids],
+        feature_rows=of_feature[chosen],
         corrections=visual_map.corrections,
     )
 
@@ -97,11 +103,11 @@ def merge_window(visual_map: VisualMap, window: MapWindow, adjusted: Adjusted) -
     that was corrected after the copy was taken does not change.
     """
     store, table = visual_map.keyframes, visual_map.landmarks
-    newest = window.keyframe_ids[-1]
+    newest = window.task.keyframe_ids[-1]
     if window.corrections != visual_map.corrections or newest not in store.ids:
         return se3.identity()
     T_local_base = adjusted.bundle.T_local_cam @ se3.inverse(visual_map.camera.T_base_cam)
-    poses = dict(zip(window.keyframe_ids, T_local_base, strict=True))
+    poses = dict(zip(window.task.keyframe_ids, T_local_base, strict=True))
     T_new_old = poses[newest] @ se3.inverse(store[newest].T_local_base)
     newer = {k: T_new_old @ store[k].T_local_base for k in store.ids if k > newest}
     visual_map.correct({k: T for k, T in (poses | newer).items() if k in store.ids})
@@ -123,7 +129,7 @@ def merge_window(visual_map: VisualMap, window: MapWindow, adjusted: Adjusted) -
 def _forget(visual_map: VisualMap, window: MapWindow, adjusted: Adjusted) -> None:
     """Remove disagreeing sightings from their keyframes."""
     store = visual_map.keyframes
-    for row, keyframe_id in enumerate(window.keyframe_ids):
+    for row, keyframe_id in enumerate(window.task.keyframe_ids):
         wrong = ~adjusted.agrees & (adjusted.bundle.keyframe_rows == row)
         if keyframe_id in store.ids:
             ids = store[keyframe_id].landmark_ids
