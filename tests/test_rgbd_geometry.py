@@ -9,6 +9,7 @@ from sceneslam.modules.slam.rgbd.locate.matching import match_anywhere, match_ne
 from sceneslam.modules.slam.rgbd.locate.pose_errors import PoseErrors
 from sceneslam.modules.slam.rgbd.locate.pose_solver import Measurements, PoseSolver, Prior
 from sceneslam.modules.slam.rgbd.locate.residuals import Sightings
+from sceneslam.modules.slam.rgbd.map.visual_map import ExpectedLandmarks
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 
@@ -45,34 +46,43 @@ def changed(measured, **fields):
     return Measurements(points_local=points_local, seen=replace(measured.seen, **fields))
 
 
+def expected_at(uv_px, descriptors):
+    """Return landmarks that are expected at pixels of level 0."""
+    count = len(descriptors)
+    return ExpectedLandmarks(
+        ids=np.arange(count),
+        uv_px=np.asarray(uv_px, float),
+        levels=np.zeros(count, np.int64),
+        descriptors=descriptors,
+    )
+
+
 def test_match_near_finds_every_landmark_close_to_its_prediction():
     rng = np.random.default_rng(0)
     descriptors, uv_px = random_descriptors(rng, 300), rng.uniform(0, 480, (300, 2))
     order = rng.permutation(300)
     features = features_at(uv_px[order], with_flipped_bits(descriptors[order], 20))
     predicted = uv_px + rng.uniform(-5, 5, (300, 2))
-    matches = match_near(predicted, np.zeros(300, np.int64), descriptors, features, radius_px=10)
+    matches = match_near(expected_at(predicted, descriptors), features, radius_px=10)
     assert len(matches) == 300
     assert (order[matches.feature_rows] == matches.landmark_rows).all()
 
 
 def test_match_near_ignores_twins_outside_the_radius_and_on_other_levels():
     descriptors = random_descriptors(np.random.default_rng(0), 1)
-    level = np.zeros(1, np.int64)
     far = features_at([[111.0, 100.0]], descriptors)
-    other_level = features_at([[101.0, 100.0]], descriptors, levels=level + 3)
-    at = np.array([[100.0, 100.0]])
-    assert len(match_near(at, level, descriptors, far, radius_px=10)) == 0
-    assert len(match_near(at, level, descriptors, other_level, radius_px=10)) == 0
-    assert len(match_near(at, level, descriptors, far, radius_px=12)) == 1
+    other_level = features_at([[101.0, 100.0]], descriptors, levels=np.array([3]))
+    expected = expected_at([[100.0, 100.0]], descriptors)
+    assert len(match_near(expected, far, radius_px=10)) == 0
+    assert len(match_near(expected, other_level, radius_px=10)) == 0
+    assert len(match_near(expected, far, radius_px=12)) == 1
 
 
 def test_match_near_refuses_what_two_features_resemble_alike():
     descriptors = random_descriptors(np.random.default_rng(0), 1)
     twins = features_at([[100.0, 100.0], [104.0, 100.0]], np.repeat(descriptors, 2, axis=0))
-    at = np.array([[102.0, 100.0]])
-    near = match_near(at, np.zeros(1, np.int64), descriptors, twins, radius_px=10)
-    assert len(near) == 0
+    expected = expected_at([[102.0, 100.0]], descriptors)
+    assert len(match_near(expected, twins, radius_px=10)) == 0
 
 
 def test_match_near_equals_the_brute_force_search():
@@ -82,7 +92,7 @@ def test_match_near_equals_the_brute_force_search():
     features = features_at(
         uv_px[::-1] + rng.uniform(-25, 25, (150, 2)), with_flipped_bits(descriptors[::-1], 10)
     )
-    matches = match_near(uv_px, np.zeros(150, np.int64), descriptors, features, radius_px=20)
+    matches = match_near(expected_at(uv_px, descriptors), features, radius_px=20)
     apart = np.linalg.norm(uv_px - features.uv_px[::-1], axis=1)
     assert matches.landmark_rows.tolist() == np.flatnonzero(apart <= 20).tolist()
 

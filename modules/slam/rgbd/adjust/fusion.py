@@ -32,14 +32,7 @@ def join_duplicates(
         others[visual_map.keyframes.landmarks_of(segment)] = True
     others[keyframe.landmark_ids[keyframe.landmark_ids != NO_LANDMARK]] = False
     expected = visual_map.predict(keyframe.T_local_base, np.flatnonzero(others))
-    matches = match_near(
-        expected.uv_px,
-        expected.levels,
-        table.descriptors[expected.ids],
-        keyframe.features,
-        radius_px=_RADIUS_PX,
-        ratio=_RATIO,
-    )
+    matches = match_near(expected, keyframe.features, radius_px=_RADIUS_PX, ratio=_RATIO)
     matches = matches.only(_are_many(table.births[expected.ids], matches.landmark_rows))
     here, there = keyframe.landmark_ids[matches.feature_rows], expected.ids[matches.landmark_rows]
     known = here != NO_LANDMARK

@@ -158,13 +158,7 @@ class VisualLocalizer:
     ) -> _Found:
         """Return the landmarks found within `radius_px` of their pixels at a pose."""
         prediction = self._map.predict(T_local_base, landmark_ids)
-        matches = match_near(
-            prediction.uv_px,
-            prediction.levels,
-            self._map.landmarks.descriptors.take(prediction.ids, axis=0),
-            features,
-            radius_px=radius_px,
-        )
+        matches = match_near(prediction, features, radius_px=radius_px)
         return self._found(features, prediction.ids, matches, T_local_base)
 
     def _found(

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..map.visual_map import ExpectedLandmarks
 from ..see.features import Features
 
 _MAX_HAMMING = 64
@@ -36,24 +37,16 @@ class Matches:
 
 
 def match_near(
-    uv_px: NDArray[np.float64],
-    levels: NDArray[np.int64],
-    descriptors: NDArray[np.uint8],
-    features: Features,
-    *,
-    radius_px: float,
-    ratio: float = 1.0,
+    expected: ExpectedLandmarks, features: Features, *, radius_px: float, ratio: float = 1.0
 ) -> Matches:
-    """Return the matches of landmarks to features within `radius_px` of the predicted pixels.
-
-    `uv_px` (M, 2), `levels` (M,) and `descriptors` (M, 32) are the landmarks' predictions.
-    """
-    if not len(uv_px) or not len(features):
+    """Return the matches of landmarks to features within `radius_px` of the predicted pixels."""
+    if not len(expected.ids) or not len(features):
         return _no_matches()
-    rows, candidates = _pairs_within(uv_px, features.uv_px, radius_px)
-    apart = levels.take(rows) - features.levels.take(candidates)
+    rows, candidates = _pairs_within(expected.uv_px, features.uv_px, radius_px)
+    apart = expected.levels.take(rows) - features.levels.take(candidates)
     near = np.flatnonzero(np.abs(apart) <= _LEVEL_TOLERANCE)
     rows, candidates = rows.take(near), candidates.take(near)
+    descriptors = expected.descriptors
     return match_pairs(rows, candidates, descriptors, features.descriptors, ratio=ratio)
 
 

@@ -31,13 +31,7 @@ def _fuse_into(visual_map: VisualMap, keyframe_id: int, old_ids: NDArray[np.int6
     keyframe = visual_map.keyframes[keyframe_id]
     wanted = np.setdiff1d(old_ids, keyframe.landmark_ids)
     prediction = visual_map.predict(keyframe.T_local_base, wanted)
-    matches = match_near(
-        prediction.uv_px,
-        prediction.levels,
-        visual_map.landmarks.descriptors[prediction.ids],
-        keyframe.features,
-        radius_px=_RADIUS_PX,
-    )
+    matches = match_near(prediction, keyframe.features, radius_px=_RADIUS_PX)
     matches = matches.only(~np.isin(keyframe.landmark_ids[matches.feature_rows], old_ids))
     kept = prediction.ids[matches.landmark_rows]
     doubles = keyframe.landmark_ids[matches.feature_rows]

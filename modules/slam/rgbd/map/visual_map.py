@@ -35,6 +35,7 @@ class ExpectedLandmarks:
     ids: NDArray[np.int64]  # (N,)
     uv_px: NDArray[np.float64]  # (N, 2)
     levels: NDArray[np.int64]  # (N,), of the pyramid
+    descriptors: NDArray[np.uint8]  # (N, 32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -126,10 +127,12 @@ class VisualMap:
             & (levels > -1.5)
             & (levels < LEVELS + 0.5)
         )
+        ids = landmark_ids.take(visible)
         return ExpectedLandmarks(
-            ids=landmark_ids.take(visible),
+            ids=ids,
             uv_px=np.stack([u.take(visible), v.take(visible)], axis=1),
             levels=np.clip(np.rint(levels.take(visible)), 0, LEVELS - 1).astype(np.int64),
+            descriptors=table.descriptors.take(ids, axis=0),
         )
 
     def count_sightings(
