@@ -58,7 +58,7 @@ def twice(overrides: list[str]) -> Row:
 
 def megabytes(module: RgbdSlam) -> float:
     """Return what keyframes, with their words, and living landmarks hold."""
-    visual_map, index = module._map, module._memory.recognizer.places
+    visual_map, index = module._parts.map, module._parts.memory.recognizer.places
     held = 0
     for keyframe in visual_map.keyframes.all():
         features, view = keyframe.features, keyframe.view

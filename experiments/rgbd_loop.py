@@ -83,7 +83,7 @@ def loops(overrides: list[str]) -> Row:
     wrong = (errors[:, 0] > WRONG_M) | (errors[:, 1] > WRONG_RAD)
     return {
         "lost": len(answers) - len(held),
-        "keyframes tracked to places of 10 s before": revisits(module._map.keyframes),
+        "keyframes tracked to places of 10 s before": revisits(module._parts.map.keyframes),
         "loop edges": len(errors),
         "wrong": int(wrong.sum()),
         "worst edge [m]": f"{errors[:, 0].max(initial=0):.3f}",
@@ -179,7 +179,7 @@ def places(overrides: list[str]) -> Row:
     index, stamps, hits, asked, cost_ms = PlaceIndex(), {}, 0, 0, []
     for observation in source:
         module.track(observation)
-        keyframes = module._map.keyframes
+        keyframes = module._parts.map.keyframes
         newest = keyframes.ids[-1] if len(keyframes) else -1
         if newest in stamps or newest < 0:
             continue

@@ -37,7 +37,7 @@ LEVER_M = 1.0  # what a radian counts as where keyframes are laid on the truth
 
 def true_pose(module: RgbdSlam, truth: Trajectory, stamp_ns: int) -> Transform | None:
     """Return where in `local` the truth has the camera, by the keyframes around it."""
-    keyframes = module._map.keyframes
+    keyframes = module._parts.map.keyframes
     near = [keyframes[k] for k in keyframes.covisible(module._held_ids, limit=AROUND)]
     if len(near) < FEWEST:
         return None

@@ -19,8 +19,8 @@ def renewed():
     """Return a module that made its map anew at the last image, of colours that are registered."""
     module = make()
     drive(module, [camera_only(index) for index in range(IMAGES - 1)])
-    assert len(module._mapping.beginning) > 1
-    module._mapping.alignment = Alignment()
+    assert len(module._parts.mapping.beginning) > 1
+    module._parts.mapping.alignment = Alignment()
     answers = drive(module, [camera_only(IMAGES - 1)])
     return module, answers[0]
 

@@ -57,7 +57,7 @@ class RgbdSlam(LocalModule, RgbdSettings):
             raise InputError("rig: rgbd needs the camera's intrinsics, got none")
         self._camera: Camera = rig.camera
         self._predictor, self._odometry = Predictor(rig), OdometryIntegrator()
-        self._build(None)
+        self._parts = RgbdParts(self, self._camera, None)
         self._T_local_base = se3.identity()
         self._held_ids = np.zeros(0, np.int64)  # landmarks that support the newest pose
         self._observations, self._is_lost = 0, False
@@ -80,9 +80,9 @@ class RgbdSlam(LocalModule, RgbdSettings):
         odometry = self._odometry.add(prediction)
         if observation.image_bgr is None:
             return self._lose(observation, prediction)
-        if self._eye.is_repeated(observation.image_bgr):
+        if self._parts.eye.is_repeated(observation.image_bgr):
             return self._repeat(observation, prediction)
-        view = self._eye.look(
+        view = self._parts.eye.look(
             observation,
             observation.image_bgr,
             T_predicted=prediction.T_local_base,
@@ -90,78 +90,75 @@ class RgbdSlam(LocalModule, RgbdSettings):
             odometry=odometry,
         )
         fix = None
-        if len(self._map.keyframes):
-            fix = self._search.find(view, self._held_ids, is_lost=self._is_lost)
+        if len(self._parts.map.keyframes):
+            fix = self._parts.search.find(view, self._held_ids, is_lost=self._is_lost)
         if fix is not None:
-            view, fix = self._eye.settle(view, fix, self._predictor)
+            view, fix = self._parts.eye.settle(view, fix, self._predictor)
             answer = self._hold(view, fix, prediction)
-            if self._mapping.alignment is not None and not view.is_monocular:
-                self._build_anew(view, self._mapping.alignment)
+            if self._parts.mapping.alignment is not None and not view.is_monocular:
+                self._build_anew(view, self._parts.mapping.alignment)
             if answer is not None:
                 return answer
-        if not len(self._map.keyframes) or self._is_unknown(view, prediction):
+        if not len(self._parts.map.keyframes) or self._is_unknown(view, prediction):
             return self._start(view, prediction)
         return self._lose(observation, prediction)
 
     def get_trajectory(self) -> Trajectory:
         """Return T_local_base of every tracked frame, corrected by all loops."""
-        return self._memory.trajectory()
+        return self._parts.memory.trajectory()
 
     def get_map(self) -> MapLayers:
         """Return in `local` the cloud, a planar robot's grid, the pose graph and the landmarks."""
-        layers = self._layers.build(list(self._map.keyframes.all()))
-        graph, landmarks = self._memory.pose_graph(), self._memory.landmarks()
+        parts = self._parts
+        layers = parts.layers.build(list(parts.map.keyframes.all()))
+        graph, landmarks = parts.memory.pose_graph(), parts.memory.landmarks()
         return replace(layers, pose_graph=graph, landmarks=landmarks)
 
     def shutdown(self) -> None:
         """Stop the workers; the map stays readable."""
-        self._mapping.shutdown()
-        self._memory.shutdown()
-
-    def _build(self, alignment: Alignment | None) -> RgbdParts:
-        parts = RgbdParts(self, self._camera, alignment)
-        self._localizer = parts.localizer
-        self._eye, self._health, self._search = parts.eye, parts.health, parts.search
-        self._map, self._mapping, self._memory = parts.map, parts.mapping, parts.memory
-        self._layers, self._place_rule = parts.layers, parts.place_rule
-        self._keyframe_rule, self._maker = parts.keyframe_rule, parts.maker
-        self._certainty = parts.certainty
-        return parts
+        self._parts.mapping.shutdown()
+        self._parts.memory.shutdown()
 
     def _build_anew(self, view: View, alignment: Alignment) -> None:
         """Rebuild the map from its views, as the old one assigned depths to wrong corners."""
-        before, newest = self._memory, LocatedView(view=view, T_local_base=self._T_local_base)
-        segment = before.segment(self._held_ids)
-        seen = seen_by(self._map.keyframes, self._mapping.beginning, segment, newest)
-        self._mapping.shutdown()
-        poses = renew(self._build(alignment), seen)
-        self._memory.follow(before, poses)
+        before, newest = self._parts, LocatedView(view=view, T_local_base=self._T_local_base)
+        segment = before.memory.segment(self._held_ids)
+        seen = seen_by(before.map.keyframes, before.mapping.beginning, segment, newest)
+        before.mapping.shutdown()
+        self._parts = RgbdParts(self, self._camera, alignment)
+        poses = renew(self._parts, seen)
+        self._parts.memory.follow(before.memory, poses)
         self._predictor.correct(poses[NEWEST] @ se3.inverse(self._T_local_base))
         self._T_local_base = poses[NEWEST]
-        self._held_ids = self._map.keyframes.landmarks_of(self._map.keyframes.ids[-1:])
+        keyframes = self._parts.map.keyframes
+        self._held_ids = keyframes.landmarks_of(keyframes.ids[-1:])
 
     def _recall(self) -> None:
         """Continue from the map as corrected by adjustment or loops."""
-        for T_new_old in (self._mapping.step(), self._memory.step()):
+        for T_new_old in (self._parts.mapping.step(), self._parts.memory.step()):
             if T_new_old is not None:
                 self._T_local_base = T_new_old @ self._T_local_base
                 self._predictor.correct(T_new_old)
 
     def _is_unknown(self, view: View, prediction: Prediction) -> bool:
-        is_far = self._keyframe_rule.is_far(view.T_predicted, self._map.keyframes)
+        is_far = self._parts.keyframe_rule.is_far(view.T_predicted, self._parts.map.keyframes)
         unmeasured_s = self._predictor.unmeasured_s(view.observation)
-        return self._place_rule.wants(view, prediction, unmeasured_s=unmeasured_s, is_far=is_far)
+        return self._parts.place_rule.wants(
+            view, prediction, unmeasured_s=unmeasured_s, is_far=is_far
+        )
 
     def _start(self, view: View, prediction: Prediction) -> Tracking:
         """Begin with a keyframe at the prediction; LOST until there is depth or odometry."""
         is_scaled = not view.is_monocular or view.observation.T_odom_base is not None
         if not (view.shows_enough and is_scaled):
             return self._lose(view.observation, prediction)
-        is_placed = prediction.is_measured or not len(self._map.keyframes)
+        is_placed = prediction.is_measured or not len(self._parts.map.keyframes)
         guessed_s = None if is_placed else self._predictor.unmeasured_s(view.observation)
         self._hold_pose(view.observation, view.T_predicted, prediction.covariance)
-        self._insert_keyframe(view, set(), guessed_s=guessed_s)
-        self._memory.hold(view.observation.stamp_ns, self._T_local_base, np.zeros(0, np.int64))
+        self._held_ids = self._parts.insert(view, self._T_local_base, set(), guessed_s=guessed_s)
+        self._parts.memory.hold(
+            view.observation.stamp_ns, self._T_local_base, np.zeros(0, np.int64)
+        )
         is_first = self._observations == 1  # the motion before it is known by odometry at best
         return self._answer(
             view.observation,
@@ -177,14 +174,14 @@ class RgbdSlam(LocalModule, RgbdSettings):
             fused = led(
                 found,
                 prediction,
-                partial(self._localizer.together, view.features, self._held_ids),
+                partial(self._parts.localizer.together, view.features, self._held_ids),
                 turn_radps=self._turn_radps(view.observation),
                 duration_s=self._predictor.unmeasured_s(view.observation),
             )
             if fused is None:
                 return None
             fix = fused
-        status = self._health.judge(fix.estimate)
+        status = self._parts.health.judge(fix.estimate)
         # Over a few frames odometry is more accurate than a pose by few landmarks.
         is_by_odometry = status is TrackingStatus.DEGRADED and prediction.is_measured
         if is_by_odometry:
@@ -200,21 +197,23 @@ class RgbdSlam(LocalModule, RgbdSettings):
                 seen=None if view.is_monocular else seen,
             )
         self._held_ids = fix.landmark_ids
-        self._map.count_sightings(fix.expected_ids, fix.landmark_ids)
-        segment = self._memory.segment(fix.landmark_ids)
-        wanted = self._keyframe_rule.wants(T_local_base, fix, self._map.keyframes, segment)
+        self._parts.map.count_sightings(fix.expected_ids, fix.landmark_ids)
+        segment = self._parts.memory.segment(fix.landmark_ids)
+        wanted = self._parts.keyframe_rule.wants(
+            T_local_base, fix, self._parts.map.keyframes, segment
+        )
         if wanted and (status is TrackingStatus.TRACKING or (is_by_odometry and view.is_monocular)):
-            self._insert_keyframe(view, segment, fix=fix)
-        self._memory.hold(view.observation.stamp_ns, T_local_base, fix.landmark_ids)
+            self._held_ids = self._parts.insert(view, T_local_base, segment, fix=fix)
+        self._parts.memory.hold(view.observation.stamp_ns, T_local_base, fix.landmark_ids)
         covariance = None
         if not is_by_odometry:
-            around = self._memory.around(T_local_base)
-            covariance = self._certainty.covariance(view, fix, T_local_base, around)
-            if self._health.is_unsure(covariance - self._certainty.by_wheels):
+            around = self._parts.memory.around(T_local_base)
+            covariance = self._parts.certainty.covariance(view, fix, T_local_base, around)
+            if self._parts.health.is_unsure(covariance - self._parts.certainty.by_wheels):
                 status = TrackingStatus.DEGRADED
         if segment is not None:  # that of its position counts, too
             measured = np.zeros((6, 6)) if covariance is None else covariance
-            guessed = self._memory.segments.covariance(segment, T_local_base, measured)
+            guessed = self._parts.memory.segments.covariance(segment, T_local_base, measured)
             if guessed is not None:
                 status, covariance = TrackingStatus.DEGRADED, guessed
         return self._answer(
@@ -240,18 +239,18 @@ class RgbdSlam(LocalModule, RgbdSettings):
         seen: NDArray[np.float64] | None = None,
     ) -> None:
         self._T_local_base, self._is_lost = T_local_base, False
-        self._place_rule.restart()
+        self._parts.place_rule.restart()
         information = None if seen is None else np.asarray(np.linalg.inv(seen))
         self._predictor.measure(observation, T_local_base, covariance, information)
 
     def _repeat(self, observation: Observation, prediction: Prediction) -> Tracking:
         """Use odometry's pose, else the last one, as the image repeats the last one."""
-        if self._is_lost or not len(self._map.keyframes):
+        if self._is_lost or not len(self._parts.map.keyframes):
             return self._lose(observation, prediction)
         self._predictor.coast(prediction)
         if prediction.is_measured:
             self._T_local_base = prediction.T_local_base
-        self._memory.hold(observation.stamp_ns, self._T_local_base, np.zeros(0, np.int64))
+        self._parts.memory.hold(observation.stamp_ns, self._T_local_base, np.zeros(0, np.int64))
         return self._answer(observation, TrackingStatus.DEGRADED, quality_ratio=0.0)
 
     def _lose(self, observation: Observation, prediction: Prediction) -> Tracking:
@@ -265,19 +264,6 @@ class RgbdSlam(LocalModule, RgbdSettings):
             stamp_ns=observation.stamp_ns,
             T_local_base=self._T_local_base.copy(),
             status=status,
-            revision=self._memory.revision,
+            revision=self._parts.memory.revision,
             **more,
         )
-
-    def _insert_keyframe(
-        self,
-        view: View,
-        segment: set[int] | None,
-        *,
-        fix: VisualFix | None = None,
-        guessed_s: float | None = None,
-    ) -> None:
-        self._held_ids = self._maker.insert(
-            view, self._T_local_base, segment, fix=fix, guessed_s=guessed_s
-        )
-        self._keyframe_rule.restart()

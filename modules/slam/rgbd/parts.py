@@ -1,23 +1,30 @@
-"""Build the parts of the module from its settings and the camera."""
+"""The parts of the module, built from its settings and the camera."""
 
 from __future__ import annotations
 
-from sceneslam.types.rig import Camera
+import numpy as np
+from numpy.typing import NDArray
 
+from sceneslam.types.rig import Camera
+from sceneslam.types.se3 import Transform
+
+from .adjust.fusion import join_duplicates
 from .adjust.local_mapping import LocalMapping
+from .adjust.triangulation import triangulate
 from .locate.certainty import Certainty
 from .locate.judgement import HealthRule, KeyframeRule, PlaceRule
-from .locate.localizer import VisualLocalizer
+from .locate.localizer import VisualFix, VisualLocalizer
 from .locate.pose_solver import PoseSolver
 from .locate.relocalizer import Relocalizer
 from .locate.search import Search
-from .map.keyframe_maker import KeyframeMaker
+from .map.keyframes import NO_LANDMARK, Keyframe
 from .map.layers import LayerBuilder
 from .map.map_history import MapHistory
 from .map.visual_map import VisualMap
 from .see.alignment import Alignment
 from .see.features import FeatureExtractor
 from .see.rectifying_extractor import RectifyingExtractor
+from .see.view import View
 from .settings import RgbdSettings
 
 
@@ -73,7 +80,6 @@ class RgbdParts:
             cloud_voxel_m=settings.cloud_voxel_m,
             grid_resolution_m=settings.grid_resolution_m,
         )
-        self.maker = KeyframeMaker(self.map, self.layers, self.memory, self.mapping)
         self.keyframe_rule = KeyframeRule(
             step_m=settings.keyframe_step_m,
             turn_rad=settings.keyframe_turn_rad,
@@ -84,3 +90,40 @@ class RgbdParts:
         self.health = HealthRule(
             degraded_inliers=settings.degraded_inliers, degraded_sigma_m=settings.degraded_sigma_m
         )
+
+    def insert(
+        self,
+        view: View,
+        T_local_base: Transform,
+        segment: set[int] | None,
+        *,
+        fix: VisualFix | None = None,
+        guessed_s: float | None = None,
+    ) -> NDArray[np.int64]:
+        """Insert a keyframe at a pose (4, 4) and return the ids (N,) of its landmarks.
+
+        `segment`: the keyframes whose landmarks these may be, None: all. `fix`: the pose found in
+        the map, None for odometry. `guessed_s`: time without a pose if the pose is a guess.
+        """
+        landmark_ids = np.full(len(view.features), NO_LANDMARK)
+        if fix is not None:
+            landmark_ids[fix.feature_rows] = fix.landmark_ids
+        stamp_ns = view.observation.stamp_ns
+        keyframe = Keyframe(
+            stamp_ns=stamp_ns,
+            T_local_base=T_local_base.copy(),
+            features=view.features,
+            landmark_ids=landmark_ids,
+            view=self.layers.view(view.depth_m, view.image_bgr, stamp_ns=stamp_ns),
+            turning=view.turning,
+            is_monocular=view.is_monocular,
+            odometry=view.odometry,
+        )
+        deep_rows = landmark_ids[:0] if fix is None else fix.deep_rows
+        keyframe_id = self.map.insert(keyframe, deep_rows=deep_rows)
+        triangulate(self.map, keyframe_id)
+        join_duplicates(self.map, keyframe, segment)
+        self.memory.insert(fix, view.depth_m, guessed_s=guessed_s)
+        self.mapping.insert(keyframe_id, view)
+        self.keyframe_rule.restart()
+        return np.asarray(landmark_ids[landmark_ids != NO_LANDMARK])

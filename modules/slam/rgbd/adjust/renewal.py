@@ -62,7 +62,7 @@ def renew(parts: RgbdParts, seen: Mapping[int, LocatedView]) -> dict[int, Transf
         fix = parts.search.find(view, held_ids, is_lost=False) if poses else None
         T_local_base = view.T_predicted if fix is None else fix.estimate.T_local_base
         segment = None if poses else set[int]()
-        held_ids = parts.maker.insert(view, T_local_base, segment, fix=fix, guessed_s=None)
+        held_ids = parts.insert(view, T_local_base, segment, fix=fix)
         poses[keyframe_id] = T_local_base
         T_new_old = T_local_base @ se3.inverse(old.T_local_base)
     return poses
