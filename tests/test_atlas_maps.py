@@ -387,14 +387,32 @@ def test_an_export_replaces_an_earlier_one_and_nothing_else(tmp_path, capsys):
     assert (tmp_path / "mine" / "grid.yaml").read_text() == "mine"
 
 
-@pytest.mark.parametrize("again", ["map", "copy"])
-def test_a_map_is_not_merged_with_itself(tmp_path, capsys, again):
-    for name in ("map", "copy"):
-        save_map_files(map_of(WALL), tmp_path / name)
-    first, second, out = (str(tmp_path / name) for name in ("map", again, "out"))
+@pytest.mark.parametrize("again", ["map", "copy", "extended", "pruned"])
+@pytest.mark.parametrize("is_first", [False, True])
+def test_measurements_are_merged_once(tmp_path, capsys, again, is_first):
+    """Other maps may hold the same: a copy, one that a run loaded and saved, or what is left."""
+    saved = map_of(WALL, WALL)
+    walls = (plan_of("#"), WALL, WALL)  # as `mode=update` forgets some, and a run is added
+    others = {"copy": saved, "extended": map_of(*walls, runs=[0, 0, 1]), "pruned": saved.of([1])}
+    for name, one in ({"map": saved} | others).items():
+        save_map_files(one, tmp_path / name)
+    names = [again, "map"] if is_first else ["map", again]
+    first, second, out = (str(tmp_path / name) for name in (*names, "out"))
     assert main(["merge", first, second, "--out", out]) == 2
-    assert f"this one is given again: {tmp_path / again}" in capsys.readouterr().err
+    assert f"one before has submaps of this map: {second}" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_maps_of_runs_that_begin_alike_are_merged(tmp_path):
+    """In the simulator all runs begin with the stamp 0: a submap of one pose may be of any."""
+    for name, run_ns in (("first", 0), ("second", S // 2)):
+        saved = map_of(WALL, WALL)
+        begun, later = saved.submaps
+        begun = replace(begun, stamps_ns=np.zeros(1, np.int64), T_submap_base=np.zeros((1, 3)))
+        later = replace(later, stamps_ns=later.stamps_ns + run_ns)
+        save_map_files(replace(saved, submaps=(begun, later)), tmp_path / name)
+    first, second, out = (str(tmp_path / name) for name in ("first", "second", "out"))
+    assert main(["merge", first, second, "--out", out]) != 2
 
 
 def test_an_export_says_which_pieces_it_leaves_out(tmp_path, capsys):

@@ -19,6 +19,7 @@ from sceneslam.atlas.lasting.map_files import (
 )
 from sceneslam.atlas.lasting.merge import join_pieces, side_by_side
 from sceneslam.atlas.lasting.prune import prune
+from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.maps.export import export
 from sceneslam.maps.inspect import described, flaws
 from sceneslam.storage.folder import RunFolder
@@ -55,10 +56,14 @@ def _check(options: argparse.Namespace) -> int:
 
 def _merge(options: argparse.Namespace) -> int:
     check_map_folder(options.out)
-    _refuse_repeated((options.map, *options.others))
     saved = load_map_files(options.map)
-    for other in options.others:
-        saved = side_by_side(saved, load_map_files(other))
+    for folder in options.others:
+        other = load_map_files(folder)
+        if _measured(saved) & _measured(other):
+            raise InputError(
+                f"each measurement is merged once, one before has submaps of this map: {folder}"
+            )
+        saved = side_by_side(saved, other)
     result = join_pieces(saved)
     save_map_files(result.map, options.out)
     print("\n".join([*described(result.map), f"map  {options.out}"]))
@@ -70,15 +75,16 @@ def _merge(options: argparse.Namespace) -> int:
     return INCOMPLETE if result.apart else OK
 
 
-def _refuse_repeated(folders: Sequence[Path]) -> None:
-    """Raise InputError for a map that is given twice: its measurements would count twice."""
-    seen: set[str] = set()
-    for folder in folders:
-        seal = seal_of(folder)
-        if seal in seen:
-            raise InputError(f"each map is merged once, this one is given again: {folder}")
-        if seal is not None:
-            seen.add(seal)
+def _measured(saved: SavedMap) -> set[tuple[bytes, bytes]]:
+    """Return stamps and poses of each submap, which no later run changes.
+
+    One pose alone may be that of another run: both have the stamp 0 in the simulator.
+    """
+    return {
+        (submap.stamps_ns.tobytes(), submap.T_submap_base.tobytes())
+        for submap in saved.submaps
+        if len(submap.stamps_ns) > 1
+    }
 
 
 def _prune(options: argparse.Namespace) -> int:
