@@ -65,8 +65,9 @@ def _merge(options: argparse.Namespace) -> int:
             )
         saved = side_by_side(saved, other)
     result = join_pieces(saved)
+    lines = described(result.map)  # fails if a piece is too large, before anything is written
     save_map_files(result.map, options.out)
-    print("\n".join([*described(result.map), f"map  {options.out}"]))
+    print("\n".join([*lines, f"map  {options.out}"]))
     if result.apart:
         print(
             f"error: pieces that were not recognized in another and stay apart: {result.apart}",
