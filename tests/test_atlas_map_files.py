@@ -320,6 +320,13 @@ def test_a_run_without_a_submap_replaces_no_map(tmp_path):
     assert own.faults == [f"the run has nothing to save, the map that was in {tmp_path}/map stays"]
 
 
+def test_an_empty_map_that_is_saved_has_no_pieces_apart(tmp_path, caplog):
+    own, run = LastingMap(load=None, save=str(tmp_path), mode="extend", save_every_s=1.0), Mapped()
+    run.saved = empty_map
+    own.finish(run, 0, lambda *_, **__: None)
+    assert (tmp_path / HEAD).exists() and own.faults == [] and caplog.messages == []
+
+
 def test_runs_that_share_a_map_are_told_and_nothing_is_lost(tmp_path):
     folder = str(tmp_path)
     save_map_files(whole_map(), tmp_path)

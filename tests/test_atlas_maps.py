@@ -10,7 +10,7 @@ from test_atlas_places import CELL, plan_of, quality, text_of
 from sceneslam.atlas.lasting.map_files import save_map_files
 from sceneslam.atlas.lasting.merge import join_pieces
 from sceneslam.atlas.lasting.prune import prune
-from sceneslam.atlas.lasting.saved_map import SavedMap, forget_contradicted
+from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map, forget_contradicted
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.submaps.graph import on_floor
@@ -247,12 +247,12 @@ def at(x_m, y_m, weak=0):
 def test_a_piece_is_joined_where_two_of_its_submaps_agree(monkeypatch):
     saved, found = two_pieces(), Found(monkeypatch, [at(9.0, 5.0), None, at(9.0, 7.0)])
     joined = join_pieces(saved)
-    assert (joined.joined, joined.apart) == (1, 0)
-    assert joined.map.pieces.tolist() == [0] * 5
+    assert joined.apart == 0
+    assert joined.pieces.tolist() == [0] * 5
     half = np.pi / 2
     expected = [[0, 0, 0], [10, 0, 0], [9, 5, half], [9, 6, half], [9, 7, half]]
-    np.testing.assert_allclose(joined.map.plane, expected, atol=1e-6)
-    loops = joined.map.edges[3:]
+    np.testing.assert_allclose(joined.plane, expected, atol=1e-6)
+    loops = joined.edges[3:]
     assert [(loop.first, loop.second, loop.kind) for loop in loops] == [
         (1, 2, EdgeKind.LOOP), (1, 4, EdgeKind.LOOP)
     ]  # fmt: skip
@@ -276,7 +276,7 @@ def test_a_piece_straightens_the_one_that_it_is_joined_to(monkeypatch, loops, mi
         edges=[*rough, edge(3, 4, (9.6, 0.0, 0.0)), *loops],
     )
     Found(monkeypatch, [quality(at=(x_m, 0.0, 0.0), weak=0) for x_m in (0.0, 10.0)])
-    along = join_pieces(saved).map.plane[:, 0]
+    along = join_pieces(saved).plane[:, 0]
     np.testing.assert_allclose(along, [0.0, middle_m, 9.6, 0.0, 9.6], atol=0.02)
 
 
@@ -290,7 +290,7 @@ def test_pieces_that_are_joined_stand_as_was_measured(monkeypatch, is_known, pit
         for submap, up, is_up in zip(saved.submaps, ups, known, strict=True)
     ]
     Found(monkeypatch, found)
-    nodes = join_pieces(replace(saved, submaps=tuple(submaps))).map.T_map_node
+    nodes = join_pieces(replace(saved, submaps=tuple(submaps))).T_map_node
     assert abs(-nodes[4, 2, 0] - pitch_rad) < 0.011
 
 
@@ -301,12 +301,12 @@ def test_a_loop_that_no_longer_fits_is_left_out():
     assert list(saved.without_misfits().edges) == edges[:3]
 
 
-@pytest.mark.parametrize(("variance", "joined"), [(1e-6, 0), (0.04, 1)])
-def test_a_piece_is_joined_that_its_own_path_may_have_bent(monkeypatch, variance, joined):
+@pytest.mark.parametrize(("variance", "apart"), [(1e-6, 1), (0.04, 0)])
+def test_a_piece_is_joined_that_its_own_path_may_have_bent(monkeypatch, variance, apart):
     saved = two_pieces()
     edges = [replace(one, covariance=variance * np.eye(6)) for one in saved.edges]
     Found(monkeypatch, [at(9.0, 5.0), None, at(9.0, 7.3)])
-    assert join_pieces(replace(saved, edges=tuple(edges))).joined == joined
+    assert join_pieces(replace(saved, edges=tuple(edges))).apart == apart
 
 
 @pytest.mark.parametrize(
@@ -320,15 +320,15 @@ def test_a_piece_is_joined_that_its_own_path_may_have_bent(monkeypatch, variance
 def test_a_piece_stays_apart_without_two_that_agree(monkeypatch, answers):
     saved, _ = two_pieces(), Found(monkeypatch, answers)
     joined = join_pieces(saved)
-    assert (joined.joined, joined.apart) == (0, 1)
-    assert joined.map.pieces.tolist() == [0, 0, 1, 1, 1] and joined.map.edges == saved.edges
+    assert joined.apart == 1
+    assert joined.pieces.tolist() == [0, 0, 1, 1, 1] and joined.edges == saved.edges
 
 
 def test_pieces_are_numbered_again_where_one_was_joined(monkeypatch):
     saved = replace(two_pieces(), pieces=np.array([0, 0, 3, 3, 5]))
     Found(monkeypatch, [at(9.0, 5.0), at(9.0, 6.0), None])
     joined = join_pieces(saved)
-    assert (joined.joined, joined.apart) == (1, 1) and joined.map.pieces.tolist() == [0, 0, 0, 0, 1]
+    assert joined.apart == 1 and joined.pieces.tolist() == [0, 0, 0, 0, 1]
 
 
 def test_what_was_joined_is_looked_for_again(monkeypatch):
@@ -343,17 +343,17 @@ def test_what_was_joined_is_looked_for_again(monkeypatch):
     far = [quality(at=(x_m, 4.0, np.pi), weak=0) for x_m in (15.0, 14.0)]
     Found(monkeypatch, [*apart, *each, at(20.0, 5.0), at(20.0, 6.0), *far])
     joined = join_pieces(saved)
-    assert (joined.joined, joined.apart) == (2, 0) and joined.map.pieces.tolist() == [0] * 5
+    assert joined.apart == 0 and joined.pieces.tolist() == [0] * 5
 
 
 def test_pieces_are_joined_with_each_other_where_the_first_shows_neither(monkeypatch):
     saved = replace(two_pieces(), pieces=np.array([0, 2, 2, 7, 7]))
     Found(monkeypatch, [None] * 4 + [at(9.0, 5.0), at(9.0, 6.0)] + [None] * 4)
     joined = join_pieces(saved)
-    assert (joined.joined, joined.apart) == (1, 1) and joined.map.pieces.tolist() == [0, 1, 1, 1, 1]
+    assert joined.apart == 1 and joined.pieces.tolist() == [0, 1, 1, 1, 1]
     Found(monkeypatch, [None] * 9)
     joined = join_pieces(saved)
-    assert (joined.joined, joined.apart) == (0, 2) and joined.map.pieces.tolist() == [0, 1, 1, 2, 2]
+    assert joined.apart == 2 and joined.pieces.tolist() == [0, 1, 1, 2, 2]
 
 
 def test_submaps_of_other_runs_are_no_neighbours(monkeypatch):
@@ -420,6 +420,13 @@ def test_an_export_says_which_pieces_it_leaves_out(tmp_path, capsys):
     assert main(["export", str(tmp_path / "map"), "--out", str(tmp_path / "out")]) == 1
     assert capsys.readouterr().err == "error: pieces beside the first, which are not exported: 2\n"
     assert (tmp_path / "out" / "grid.yaml").exists()
+
+
+def test_an_empty_map_leaves_out_no_piece(tmp_path, capsys):
+    save_map_files(empty_map(), tmp_path / "map")
+    assert main(["merge", str(tmp_path / "map"), "--out", str(tmp_path / "out")]) == 0
+    assert main(["export", str(tmp_path / "map"), "--out", str(tmp_path / "exported")]) == 0
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("command", ["info", "export", "merge"])

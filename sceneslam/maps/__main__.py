@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
-import numpy as np
-
 from sceneslam.atlas.lasting.map_files import (
     HEAD,
     check_map_folder,
@@ -64,16 +62,16 @@ def _merge(options: argparse.Namespace) -> int:
                 f"each measurement is merged once, one before has submaps of this map: {folder}"
             )
         saved = side_by_side(saved, other)
-    result = join_pieces(saved)
-    lines = described(result.map)  # fails if a piece is too large, before anything is written
-    save_map_files(result.map, options.out)
+    joined = join_pieces(saved)
+    lines = described(joined)  # fails if a piece is too large, before anything is written
+    save_map_files(joined, options.out)
     print("\n".join([*lines, f"map  {options.out}"]))
-    if result.apart:
+    if joined.apart:
         print(
-            f"error: pieces that were not recognized in another and stay apart: {result.apart}",
+            f"error: pieces that were not recognized in another and stay apart: {joined.apart}",
             file=sys.stderr,
         )
-    return INCOMPLETE if result.apart else OK
+    return INCOMPLETE if joined.apart else OK
 
 
 def _measured(saved: SavedMap) -> set[tuple[bytes, bytes]]:
@@ -106,12 +104,12 @@ def _export(options: argparse.Namespace) -> int:
     with closing(RunFolder.claim(options.out, kind="map's export", key="--out")):
         for path in export(saved, options.out):
             print(path)
-    left_out = len(np.unique(saved.pieces)) - 1
-    if left_out:
+    if saved.apart:
         print(
-            f"error: pieces beside the first, which are not exported: {left_out}", file=sys.stderr
+            f"error: pieces beside the first, which are not exported: {saved.apart}",
+            file=sys.stderr,
         )
-    return INCOMPLETE if left_out else OK
+    return INCOMPLETE if saved.apart else OK
 
 
 def _parser() -> argparse.ArgumentParser:

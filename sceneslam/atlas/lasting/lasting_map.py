@@ -6,8 +6,6 @@ import logging
 from concurrent.futures import Executor, Future
 from pathlib import Path
 
-import numpy as np
-
 from sceneslam.atlas.lasting.map_files import (
     OLD,
     check_map_folder,
@@ -106,14 +104,13 @@ class LastingMap:
         elif self._write(saved, mapper.is_found):
             loops = sum(edge.is_loop for edge in saved.edges)
             note("map_saved", stamp_ns, submaps=len(saved.submaps), loops=loops)
-            apart = len(np.unique(saved.pieces)) - 1
-            if apart:
+            if saved.apart:
                 _log.warning(
                     "the map %s has %d piece%s that nothing joined to the first: a run that loads "
                     "it searches that one alone; `python -m sceneslam.maps merge` may join them",
                     self._save,
-                    apart,
-                    "s" * (apart > 1),
+                    saved.apart,
+                    "s" * (saved.apart > 1),
                 )
 
     def close(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,15 +23,6 @@ _AROUND = 1  # neighbouring submaps on either side that are searched together wi
 _LOOPS_MIN = 2  # agreeing loops, as a single one may come from a similar place
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Joined:
-    """The map after joining its pieces."""
-
-    map: SavedMap
-    joined: int
-    apart: int  # pieces beside the first: fewer than two submaps were recognized
-
-
 def side_by_side(first: SavedMap, second: SavedMap) -> SavedMap:
     """Return both maps in one, the second's pieces and runs after the first's."""
     count, pieces = len(first.submaps), int(first.pieces.max(initial=-1)) + 1
@@ -44,18 +35,21 @@ def side_by_side(first: SavedMap, second: SavedMap) -> SavedMap:
     )
 
 
-def join_pieces(saved: SavedMap) -> Joined:
-    """Return the map with every piece joined to the first one in which it is recognized."""
-    saved, joined, target = _renumbered(saved), 0, 0
+def join_pieces(saved: SavedMap) -> SavedMap:
+    """Return the map with every piece joined to the first one in which it is recognized.
+
+    A piece of which fewer than two submaps are recognized stays apart.
+    """
+    saved, target = _renumbered(saved), 0
     while target <= saved.pieces.max(initial=-1):
         found = None
         for piece in range(target + 1, int(saved.pieces.max()) + 1):
             found = _joined(saved, target, piece)
             if found is not None:
-                saved, joined = _renumbered(found), joined + 1
+                saved = _renumbered(found)
                 break
         target = target + 1 if found is None else 0  # what is larger now may be recognized
-    return Joined(map=saved, joined=joined, apart=max(target - 1, 0))
+    return saved
 
 
 def _joined(saved: SavedMap, target: int, piece: int) -> SavedMap | None:

@@ -52,6 +52,11 @@ class SavedMap:
         return len({submap.run for submap in self.submaps})
 
     @property
+    def apart(self) -> int:
+        """Return how many pieces there are beside the first."""
+        return max(len(np.unique(self.pieces)) - 1, 0)
+
+    @property
     def plane(self) -> NDArray[np.float64]:
         """Return the nodes (N, 3) in the plane [m, m, rad]."""
         return planar.from_transforms(self.T_map_node)
